@@ -1,0 +1,1 @@
+"""A camera that renders the limb and its tags."""

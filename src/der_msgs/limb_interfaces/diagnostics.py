@@ -1,0 +1,59 @@
+"""One diagnostics publisher for every node: `/diagnostics`, once a second."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+
+from limb_interfaces import qos, topics
+
+
+@dataclass
+class Health:
+    """What a node says of itself: a level, a sentence and numbers by name."""
+
+    level: str = "ok"
+    message: str = "running"
+    values: Mapping[str, object] = field(default_factory=dict)
+
+
+_LEVELS = {
+    "ok": DiagnosticStatus.OK,
+    "warning": DiagnosticStatus.WARN,
+    "error": DiagnosticStatus.ERROR,
+    "stale": DiagnosticStatus.STALE,
+}
+
+
+class DiagnosticsPublisher:
+    """Calls ``report`` once a second and publishes what it returns.
+
+    Args:
+        node: the node that the status is about.
+        report: returns the present health; its ``level`` is ok, warning, error or stale.
+        hardware_id: what the node is connected to, if anything.
+    """
+
+    def __init__(self, node: Node, report: Callable[[], Health], hardware_id: str = "") -> None:
+        self._node = node
+        self._report = report
+        self._hardware_id = hardware_id
+        self._publisher = node.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, qos.STATES)
+        self._timer = node.create_timer(1.0, self.publish)
+
+    def publish(self) -> None:
+        """Publish now, without waiting for the next second."""
+        health = self._report()
+        status = DiagnosticStatus(
+            level=_LEVELS[health.level],
+            name=self._node.get_fully_qualified_name(),
+            message=health.message,
+            hardware_id=self._hardware_id,
+            values=[KeyValue(key=key, value=str(value)) for key, value in health.values.items()],
+        )
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(message)

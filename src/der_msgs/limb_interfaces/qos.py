@@ -1,0 +1,40 @@
+"""The QoS profiles of the graph, in one place and by the role of the topic."""
+
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_profile_sensor_data,
+)
+
+COMMANDS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.RELIABLE
+)
+"""Motion commands and paths: none may be lost, and none may reach a node that starts later."""
+
+SETPOINTS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE
+)
+"""Timed setpoints: deep enough for five seconds at 20 Hz."""
+
+STATES = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=20, reliability=ReliabilityPolicy.RELIABLE
+)
+"""Measured and published states, tags and references."""
+
+LATCHED = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+"""The last one is kept for those who come later: plans, calibration."""
+
+IMAGES = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT
+)
+"""A subscriber of images takes the newest and never queues."""
+
+SENSOR_DATA = qos_profile_sensor_data
+"""A publisher of images and camera calibration."""

@@ -1,0 +1,88 @@
+"""Start a node, spin it, and leave with the right exit code whatever ends it."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+
+class ClosableNode(Protocol):
+    """A node that leaves hardware and files in order when it ends."""
+
+    def close(self) -> None:
+        """Vent, flush, release: called exactly once, before the node is destroyed."""
+
+
+def run_node(create: Callable[[], Node], arguments: Sequence[str] | None = None) -> int:
+    """Create a node, spin it until SIGINT or SIGTERM, close it, and return the exit code.
+
+    A node with a ``close`` method has it called while its publishers still work, whatever ended
+    the spinning: a signal, an exception in a callback, or the end of the context. A node that
+    cannot go on sets its attribute ``fatal_error`` to a sentence, and the process ends with it.
+
+    Args:
+        create: makes the node; an exception ends the process with exit code 1 and its message.
+        arguments: command line, `sys.argv` if None.
+
+    Returns:
+        0 after SIGINT or SIGTERM, 1 after an error.
+    """
+    stop = threading.Event()
+    rclpy.init(
+        args=list(arguments) if arguments is not None else None,
+        signal_handler_options=SignalHandlerOptions.NO,
+    )
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    node: Node | None = None
+    exit_code = 0
+    try:
+        node = create()
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        while rclpy.ok() and not stop.is_set():
+            executor.spin_once(timeout_sec=0.1)
+            if fatal := getattr(node, "fatal_error", None):
+                raise RuntimeError(fatal)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except Exception as error:
+        exit_code = 1
+        _complain(node, error)
+    finally:
+        exit_code = max(exit_code, _close(node))
+        with contextlib.suppress(Exception):
+            rclpy.try_shutdown()
+    return exit_code
+
+
+def _complain(node: Node | None, error: Exception) -> None:
+    text = str(error) or type(error).__name__
+    if node is not None:
+        node.get_logger().fatal(text)
+    print(f"error: {text}", file=sys.stderr, flush=True)
+
+
+def _close(node: Node | None) -> int:
+    if node is None:
+        return 0
+    exit_code = 0
+    close = getattr(node, "close", None)
+    if close is not None:
+        try:
+            close()
+        except Exception as error:
+            exit_code = 1
+            _complain(node, error)
+    with contextlib.suppress(Exception):
+        node.destroy_node()
+    return exit_code

@@ -1,0 +1,1 @@
+"""The piecewise-constant-curvature baseline."""

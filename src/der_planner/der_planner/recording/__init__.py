@@ -1,0 +1,1 @@
+"""Bags that survive a kill."""

@@ -1,0 +1,1 @@
+"""The discrete elastic rod with explicit inputs."""

@@ -1,0 +1,1 @@
+"""The simulated limb that stands in for the hardware."""

@@ -1,0 +1,44 @@
+"""Install `der_planner` as an ament_python package."""
+
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+PACKAGE = "der_planner"
+config = sorted(str(path) for path in Path("config").glob("*.*"))
+
+setup(
+    name=PACKAGE,
+    version="0.1.0",
+    packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
+    package_data={PACKAGE: ["py.typed", "data/*"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+        (f"share/{PACKAGE}/config", config),
+    ],
+    install_requires=[
+        "setuptools",
+        "numpy",
+        "scipy",
+        "numba",
+        "PyYAML",
+        "mcap",
+        "rosbags",
+        "matplotlib",
+        "pyelastica",
+    ],
+    extras_require={"test": ["pytest"]},
+    zip_safe=False,
+    maintainer="DER planner maintainers",
+    maintainer_email="maintainers@example.org",
+    description="Plans chamber pressures of a soft limb with a discrete elastic rod, records runs and evaluates them.",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            "planner = der_planner.nodes.planner:main",
+            "recorder = der_planner.nodes.recorder:main",
+            "limb_twin = der_planner.nodes.limb_twin:main",
+        ],
+    },
+)

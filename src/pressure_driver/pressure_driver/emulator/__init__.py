@@ -1,0 +1,1 @@
+"""A valve board on a pseudo-terminal, with its pneumatics."""
