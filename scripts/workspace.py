@@ -255,7 +255,9 @@ def _build_digest() -> str:
         for package in PACKAGES[1:]
         for path in (ROOT / "src" / package / "config").glob("*.*")
     )
-    return _digest(_build_inputs(), extra=(VENV / "made-for.txt").read_text() + "\n".join(configuration))
+    return _digest(
+        _build_inputs(), extra=(VENV / "made-for.txt").read_text() + "\n".join(configuration)
+    )
 
 
 def _ros_setup_lines() -> list[str]:

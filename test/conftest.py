@@ -1,0 +1,64 @@
+"""Fixtures for tests that start nodes: an own ROS domain, processes that never outlive the test."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+SHARED = ROOT.parent / "shared"
+sys.path.insert(0, str(ROOT / "scripts"))
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Return the folder of data outside the project, or skip the test."""
+    folder = SHARED / "data"
+    if not folder.is_dir():
+        pytest.skip(f"needs {folder}, which is not part of the project")
+    return folder
+
+
+class Graph:
+    """Starts nodes in a domain of its own and talks to them.
+
+    ``client`` is the orchestrator's own `GraphClient`: wait_for, wait_ready, subscribe, call.
+    """
+
+    def __init__(self, folder: Path, domain_id: int) -> None:
+        from orchestrator.client import GraphClient
+
+        self.domain_id = domain_id
+        self.folder = folder
+        self.client = GraphClient("test", domain_id=domain_id)
+        self.processes = []
+
+    def start(self, package: str, executable: str, name: str = "", remap=None, **parameters):
+        """Start a node as ``ros2 run`` would; returns its `NodeProcess`."""
+        from orchestrator.processes import NodeProcess
+
+        environment = {**os.environ, "ROS_DOMAIN_ID": str(self.domain_id)}
+        process = NodeProcess(
+            package, executable, parameters, self.folder, remap, environment, name
+        )
+        self.processes.append(process)
+        return process
+
+    def close(self) -> None:
+        for process in self.processes:
+            process.stop(timeout=5.0)
+        self.client.close()
+
+
+@pytest.fixture
+def graph(tmp_path: Path) -> Iterator[Graph]:
+    """Return a `Graph` whose processes end with the test."""
+    # 102 to 231 collides with ephemeral ports on Linux; 0 to 20 is where people work.
+    domain_id = int(os.environ.get("TEST_DOMAIN_ID", 21 + os.getpid() % 80))
+    running = Graph(tmp_path, domain_id)
+    yield running
+    running.close()
