@@ -1,0 +1,197 @@
+"""The air of an emulated valve board: regulators, valves, tubes and chambers, without any clock of its own.
+
+Each chamber has a proportional regulator. Filling is limited by the inlet valve (a ramp), venting
+by the outlet orifice (slower the less pressure is left, reaching zero in finite time), and a chamber
+feels what its neighbour in the pair does, since they share a wall and a manifold. The numbers agree
+with logs of a real limb: 9 kPa/s filling, 2.5 s from 90 to 10 % when a step of 7 kPa is vented, a
+neighbour that rises by up to a quarter of the change and is back within about a second.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray: TypeAlias = NDArray[np.float64]
+
+LARGEST_SUBSTEP = 0.005
+"""[s] Longest explicit step: a sixteenth of the fastest time constant."""
+
+VENT_EXPONENT = 2.0 / 3.0
+"""Outflow grows with this power of the gauge pressure: between an orifice (1/2) and a tube (1)."""
+
+REFERENCE_STEP = 7000.0
+"""[Pa] The vented step whose 90-to-10-% time is `PneumaticsParameters.vent_time`."""
+
+
+@dataclass(frozen=True)
+class PneumaticsParameters:
+    """Nominal values; `Pneumatics` draws each chamber's own around them."""
+
+    fill_rate: float = 9000.0
+    """[Pa/s] of the inlet valve, wide open, at nominal supply."""
+    vent_time: float = 2.5
+    """[s] from 90 to 10 % of a step of `REFERENCE_STEP`."""
+    regulator_time: float = 0.08
+    """[s] time constant of the regulator close to its target."""
+    dead_time: float = 0.03
+    """[s] from a command to the first motion of a valve."""
+    vent_deadband: float = 80.0
+    """[Pa] above target before the outlet valve opens."""
+    fill_coupling: float = 0.45
+    """Share of the rate of a filling chamber that its neighbour sees."""
+    vent_coupling: float = 0.06
+    """Share of the rate of a venting chamber that its neighbour sees."""
+    coupling_time: float = 0.45
+    """[s] in which the neighbour's disturbance decays."""
+    supply_pressure: float = 160e3
+    """[Pa] absolute, of the reservoir."""
+    variation: float = 0.05
+    """Relative standard deviation between chambers, cut at two of them."""
+
+
+class Pneumatics:
+    """Chamber pressures of a board with one pair of chambers per segment.
+
+    All pressures are true absolute pressures in Pa; what the board's sensors make of them is the
+    board's business. The same seed gives the same limb: atmosphere, rates and couplings are drawn
+    from it.
+
+    Args:
+        segment_count: M, number of segments; there are 2M chambers.
+        seed: of the drawn variations.
+        parameters: nominal values.
+
+    Raises:
+        ValueError: ``segment_count`` is less than one.
+    """
+
+    def __init__(
+        self,
+        segment_count: int = 2,
+        seed: int = 0,
+        parameters: PneumaticsParameters | None = None,
+    ) -> None:
+        if segment_count < 1:
+            raise ValueError(f"segment_count must be 1 or more, got {segment_count}")
+        self.parameters = parameters or PneumaticsParameters()
+        self.segment_count = segment_count
+        self.chamber_count = 2 * segment_count
+        generator = np.random.default_rng([seed, 0x9A1B])
+        self.atmosphere = float(101_325.0 + generator.uniform(-700.0, 1500.0))
+        """[Pa] absolute pressure of the room."""
+        self.supply_pressure = self.parameters.supply_pressure
+        """[Pa] absolute pressure of the reservoir; may be changed while running."""
+        self.stuck = np.zeros(self.chamber_count, dtype=bool)
+        """(2M,) chambers whose valves have stopped moving: neither filled nor vented."""
+        self.leak = np.zeros(self.chamber_count)
+        """(2M,) [1/s] rate at which a hole drains the gauge pressure."""
+
+        def vary(nominal: float) -> FloatArray:
+            spread = np.clip(generator.normal(size=self.chamber_count), -2.0, 2.0)
+            return nominal * (1.0 + self.parameters.variation * spread)
+
+        self._fill_rate = vary(self.parameters.fill_rate)
+        self._vent_coefficient = _vent_coefficient(vary(self.parameters.vent_time))
+        self._regulator_time = vary(self.parameters.regulator_time)
+        self._vent_deadband = vary(self.parameters.vent_deadband)
+        self._fill_coupling = vary(self.parameters.fill_coupling)
+        self._vent_coupling = vary(self.parameters.vent_coupling)
+        self._coupling_time = vary(self.parameters.coupling_time)
+        self._dead_time = float(self.parameters.dead_time * generator.uniform(0.7, 1.3))
+        self._neighbour = np.arange(self.chamber_count).reshape(-1, 2)[:, ::-1].ravel()
+
+        self._gauge = np.zeros(self.chamber_count)
+        self._disturbance = np.zeros(self.chamber_count)
+        self._target = np.zeros(self.chamber_count)
+        self._pending: list[tuple[float, FloatArray]] = []
+        self._time = 0.0
+
+    @property
+    def pressure(self) -> FloatArray:
+        """(2M,) [Pa] absolute chamber pressures now."""
+        return self.atmosphere + self._gauge + self._disturbance
+
+    @property
+    def target(self) -> FloatArray:
+        """(2M,) [Pa] absolute pressures the regulators work toward now."""
+        return self.atmosphere + self._target
+
+    @property
+    def valve_opening(self) -> FloatArray:
+        """(2M,) share of the wide open flow that the inlet valves pass now, 0 … 1."""
+        demand = (self._target - self._gauge) / (self._regulator_time * self._fill_rate)
+        return np.where(self.stuck, 0.0, np.clip(demand, 0.0, 1.0))
+
+    def command(self, pressure: ArrayLike) -> None:
+        """Set what the regulators work toward, from one dead time later on.
+
+        Args:
+            pressure: (2M,) [Pa] absolute; below the atmosphere counts as vented.
+
+        Raises:
+            ValueError: wrong length, or a number that is not finite.
+        """
+        wanted = np.asarray(pressure, dtype=np.float64)
+        if wanted.shape != (self.chamber_count,):
+            raise ValueError(f"expected {self.chamber_count} pressures, got shape {wanted.shape}")
+        if not np.isfinite(wanted).all():
+            raise ValueError(f"pressures must be finite, got {wanted.tolist()}")
+        gauge = np.maximum(wanted - self.atmosphere, 0.0)
+        self._pending.append((self._time + self._dead_time, gauge))
+
+    def step(self, duration: float) -> FloatArray:
+        """Let time pass.
+
+        Args:
+            duration: [s], zero or more.
+
+        Returns:
+            (2M,) [Pa] absolute chamber pressures at the end.
+
+        Raises:
+            ValueError: ``duration`` is negative or not finite.
+        """
+        if not (np.isfinite(duration) and duration >= 0.0):
+            raise ValueError(f"duration must be finite and not negative, got {duration}")
+        end = self._time + duration
+        while self._time < end - 1e-12:
+            while self._pending and self._pending[0][0] <= self._time + 1e-12:
+                self._target = self._pending.pop(0)[1]
+            until = min(end, self._pending[0][0]) if self._pending else end
+            substeps = max(1, int(np.ceil((until - self._time) / LARGEST_SUBSTEP - 1e-9)))
+            length = (until - self._time) / substeps
+            for _ in range(substeps):
+                self._advance(length)
+            self._time = until
+        return self.pressure
+
+    def _advance(self, dt: float) -> None:
+        """One explicit step of regulators, valves and the coupling within pairs."""
+        error = self._target - self._gauge
+        demand = error / self._regulator_time
+        headroom = self.supply_pressure - self.atmosphere - self._gauge
+        nominal_head = 0.5 * (self.parameters.supply_pressure - self.atmosphere)
+        inflow = self._fill_rate * np.clip(headroom / nominal_head, 0.0, 1.0)
+        outflow = self._vent_coefficient * np.maximum(self._gauge, 0.0) ** VENT_EXPONENT
+        opens = (error < -self._vent_deadband) | (self._target <= 0.0)
+        rate = np.where(
+            error >= 0.0,
+            np.minimum(demand, inflow),
+            np.where(opens, np.maximum(demand, -outflow), 0.0),
+        )
+        rate = np.where(self.stuck, 0.0, rate) - self.leak * self._gauge
+        self._gauge = np.maximum(self._gauge + dt * rate, 0.0)
+        felt = rate[self._neighbour]
+        source = np.where(felt > 0.0, self._fill_coupling, self._vent_coupling) * felt
+        self._disturbance += dt * (source - self._disturbance / self._coupling_time)
+
+
+def _vent_coefficient(vent_time: FloatArray) -> FloatArray:
+    """Return c of dp/dt = −c p^n from the 90-to-10-% time of a step of `REFERENCE_STEP`."""
+    power = 1.0 - VENT_EXPONENT
+    span = (0.9**power - 0.1**power) / power
+    return np.asarray(REFERENCE_STEP**power * span / vent_time)
