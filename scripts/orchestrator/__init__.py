@@ -1,1 +1,1 @@
-"""What `run_experiment.py` is made of: processes, a client of the graph, trials, and their results."""
+"""What `run_experiment.py` is made of: processes, a client of the graph, trials, results."""

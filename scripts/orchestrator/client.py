@@ -10,13 +10,13 @@ from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from limb_interfaces import qos, topics
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
+from limb_interfaces import qos, topics
 from orchestrator.processes import NodeError, NodeProcess
 
 READY = (DiagnosticStatus.OK, DiagnosticStatus.WARN)
@@ -86,7 +86,7 @@ class GraphClient:
         profile: QoSProfile,
         callback: Callable[[Any], None] | None = None,
     ) -> None:
-        """Keep the newest message of a topic in ``newest[topic]``, and pass each to ``callback``."""
+        """Keep a topic's newest message in ``newest[topic]``; pass each to ``callback``."""
 
         def keep(message: Any) -> None:
             self.newest[topic] = message
@@ -182,7 +182,7 @@ class GraphClient:
         return str(answer.message)
 
     def other_nodes(self, seconds: float = 1.0) -> list[str]:
-        """Return the nodes of the graph's namespace other than this one, after listening a while."""
+        """Return the other nodes of the graph's namespace, after listening for a while."""
         self.spin(seconds)
         found = self.node.get_node_names_and_namespaces()
         own = self.node.get_name()

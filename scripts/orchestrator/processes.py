@@ -89,7 +89,7 @@ class NodeProcess:
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
-                preexec_fn=_die_with_parent,
+                preexec_fn=_die_with_parent,  # noqa: PLW1509 - it allocates nothing
                 env=None if environment is None else dict(environment),
             )
 
@@ -140,7 +140,7 @@ class NodeProcess:
                 os.killpg(self.pid, number)
 
     def stop(self, timeout: float = 8.0) -> int:
-        """End the process with SIGTERM, then SIGKILL after ``timeout`` seconds; return its exit code."""
+        """End it with SIGTERM, after ``timeout`` seconds with SIGKILL; return the exit code."""
         self.measure_cpu()
         self.signal(signal.SIGTERM)
         try:
