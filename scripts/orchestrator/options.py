@@ -1,0 +1,256 @@
+"""The command line of an experiment: what is played, on what, how often, and where to."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+MOTIONS = ("asynchronous", "same_direction", "opposite_direction")
+MODELS = ("der", "pcc")
+METHODS = ("paper", "projected", "optimal")
+DEFAULT_AMPLITUDE = 0.7853981633974483
+
+
+class OptionError(ValueError):
+    """The command line or the hardware file asks for something impossible; says what and why."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One run of one motion under one model.
+
+    Attributes:
+        motion, model, method: names, see MOTIONS, MODELS, METHODS.
+        number: of the trial, from 1.
+        seed: of the twin; the same for every motion and model of a trial.
+    """
+
+    motion: str
+    model: str
+    method: str
+    number: int
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Name of the bag and of every other file of this run."""
+        return f"{self.motion}_{self.model}_{self.method}_trial{self.number}"
+
+
+@dataclass(frozen=True)
+class Hardware:
+    """What stands in place of the twin: parameters of the nodes that touch the hardware.
+
+    Attributes:
+        driver, tracker, planner, recorder: parameters by name for each node.
+        remap: new names of topics by their old ones, for all nodes.
+        limb: the limb file, or None for the one on the command line.
+    """
+
+    driver: dict[str, Any] = field(default_factory=dict)
+    tracker: dict[str, Any] = field(default_factory=dict)
+    planner: dict[str, Any] = field(default_factory=dict)
+    recorder: dict[str, Any] = field(default_factory=dict)
+    remap: dict[str, str] = field(default_factory=dict)
+    limb: str | None = None
+
+    @classmethod
+    def from_yaml(cls, path: Path) -> Hardware:
+        """Read a hardware file (see config/hardware_example.yaml of pressure_driver).
+
+        Raises:
+            OptionError: the file cannot be read, has unknown keys or no serial port.
+        """
+        try:
+            content = yaml.safe_load(path.read_text())
+        except (OSError, yaml.YAMLError) as error:
+            raise OptionError(f"cannot read hardware file {path}: {error}") from error
+        known = [item.name for item in dataclasses.fields(cls)]
+        if not isinstance(content, dict):
+            raise OptionError(f"hardware file {path}: expected the keys {', '.join(known)}")
+        for key in content:
+            if key not in known:
+                raise OptionError(f"hardware file {path}: unknown key '{key}'; known: {known}")
+        hardware = cls(**{key: value for key, value in content.items() if value is not None})
+        if not hardware.driver.get("port"):
+            raise OptionError(
+                f"hardware file {path}: driver.port is missing; `ls /dev/serial/by-id` shows ports"
+            )
+        if not Path(hardware.driver["port"]).exists():
+            raise OptionError(
+                f"hardware file {path}: no serial device {hardware.driver['port']}; is the valve "
+                "board plugged in? `ls /dev/serial/by-id` shows what is there"
+            )
+        return hardware
+
+
+@dataclass(frozen=True)
+class Options:
+    """A parsed and checked command line; see `parser` for what each means."""
+
+    motions: tuple[str, ...]
+    models: tuple[str, ...]
+    method: str
+    trials: int
+    amplitude: float
+    period: float
+    cycles: int
+    limb: Path | None
+    calibrate: bool
+    seed: int
+    out: Path
+    hardware: Hardware | None
+    offline: bool
+    dry_run: bool
+    record_images: bool
+    report: bool
+
+    def plan_of_trials(self) -> list[Trial]:
+        """Return every trial in the order in which they are played."""
+        return [
+            Trial(
+                motion,
+                model,
+                self.method if model == "der" else "paper",
+                number,
+                self.seed + number - 1,
+            )
+            for motion in self.motions
+            for number in range(1, self.trials + 1)
+            for model in self.models
+        ]
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    result = argparse.ArgumentParser(
+        prog="run_experiment.py",
+        description="Play motions on the limb (or its twin) and report the tracking error.",
+        epilog="Without options: Case 2 (same_direction), DER and PCC, one trial each, on the twin",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    what = result.add_argument_group("what is played")
+    what.add_argument(
+        "--motions",
+        nargs="+",
+        default=["same_direction"],
+        metavar="MOTION",
+        help=f"of {', '.join(MOTIONS)}; or all",
+    )
+    what.add_argument(
+        "--models", nargs="+", default=list(MODELS), metavar="MODEL", help=f"of {', '.join(MODELS)}"
+    )
+    what.add_argument(
+        "--method", default="paper", help=f"of {', '.join(METHODS)}; PCC always uses paper"
+    )
+    what.add_argument("--trials", type=int, default=1, help="runs of each motion and model")
+    what.add_argument(
+        "--amplitude", type=float, default=DEFAULT_AMPLITUDE, help="largest bend of a segment [rad]"
+    )
+    what.add_argument("--period", type=float, default=20.0, help="of one cycle [s]")
+    what.add_argument("--cycles", type=int, default=2, help="cycles of the motion")
+    where = result.add_argument_group("on what")
+    where.add_argument(
+        "--limb",
+        type=Path,
+        metavar="FILE",
+        help="limb file; without it each twin is calibrated first",
+    )
+    where.add_argument(
+        "--no-calibration",
+        action="store_true",
+        help="plan with the default limb file, as if the twin were that limb",
+    )
+    where.add_argument(
+        "--seed",
+        type=int,
+        default=1,
+        help="of the first trial's twin; the next trial has the next seed",
+    )
+    where.add_argument(
+        "--hardware",
+        type=Path,
+        metavar="FILE",
+        help="a real valve board and camera instead of the twin",
+    )
+    how = result.add_argument_group("how")
+    how.add_argument(
+        "--offline", action="store_true", help="without ROS, in one process, faster than real time"
+    )
+    how.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="folder of bags, logs, figures and results.json; a folder that holds a stopped "
+        "experiment goes on with it; without it: experiments/ and the time",
+    )
+    how.add_argument("--record-images", action="store_true", help="raw images into the bags, too")
+    how.add_argument("--no-report", action="store_true", help="skip the HTML report at the end")
+    how.add_argument("--dry-run", action="store_true", help="say what would be done, start nothing")
+    return result
+
+
+def parse(arguments: Sequence[str]) -> Options:
+    """Parse and check a command line.
+
+    Raises:
+        OptionError: an unknown name, a number out of range or an unreadable file; says the choices.
+        SystemExit: after --help, or when argparse itself refuses.
+    """
+    given = parser().parse_args(arguments)
+    motions = MOTIONS if given.motions == ["all"] else tuple(dict.fromkeys(given.motions))
+    models = tuple(dict.fromkeys(given.models))
+    _check_names("motion", motions, (*MOTIONS, "all"))
+    _check_names("model", models, MODELS)
+    _check_names("method", (given.method,), METHODS)
+    for name, least, most in (
+        ("trials", 1, 1000),
+        ("cycles", 1, 1000),
+        ("seed", 0, 2**31 - 1000),
+        ("period", 0.5, 600.0),
+        ("amplitude", 0.01, 2.0),
+    ):
+        value = getattr(given, name)
+        if not least <= value <= most:
+            raise OptionError(f"--{name} is {value}: choose {least} to {most}")
+    hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
+    if hardware is not None and given.offline:
+        raise OptionError("--offline simulates everything: it does not go with --hardware")
+    limb = given.limb or (Path(hardware.limb) if hardware and hardware.limb else None)
+    if hardware is not None and limb is None:
+        raise OptionError("--hardware needs a limb file: --limb FILE (scripts/calibrate_limb.py)")
+    return Options(
+        motions=motions,
+        models=models,
+        method=given.method,
+        trials=given.trials,
+        amplitude=given.amplitude,
+        period=given.period,
+        cycles=given.cycles,
+        limb=limb,
+        calibrate=limb is None and not given.no_calibration,
+        seed=given.seed,
+        out=(given.out or _timestamped()).resolve(),
+        hardware=hardware,
+        offline=given.offline,
+        dry_run=given.dry_run,
+        record_images=given.record_images,
+        report=not given.no_report,
+    )
+
+
+def _timestamped() -> Path:
+    return Path("experiments") / time.strftime("%Y-%m-%d_%H-%M-%S")
+
+
+def _check_names(kind: str, names: Sequence[str], known: Sequence[str]) -> None:
+    for name in names:
+        if name not in known:
+            raise OptionError(f"unknown {kind} '{name}': choose of {', '.join(known)}")
