@@ -1,1 +1,11 @@
-"""The discrete elastic rod with explicit inputs."""
+"""The discrete elastic rod with explicit inputs.
+
+`Rod` describes one rod and holds its compiled kernels; `RodState` is where it is; `Trajectory` is where
+it went. All values are SI.
+"""
+
+from der_planner.rod.errors import ConvergenceError
+from der_planner.rod.rod import Rod
+from der_planner.rod.state import RodState, Trajectory
+
+__all__ = ["ConvergenceError", "Rod", "RodState", "Trajectory"]
