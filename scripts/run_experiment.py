@@ -6,7 +6,7 @@
     python3 scripts/run_experiment.py --offline --motions all --trials 5
     python3 scripts/run_experiment.py --hardware my_rig.yaml --limb my_limb.yaml
 
-Sets up what is missing first (ROS 2, Python packages, the built nodes); see --help for every option.
+Sets up what is missing first (ROS 2, Python packages, the nodes); --help shows every option.
 """
 
 from __future__ import annotations
@@ -19,10 +19,9 @@ import workspace
 
 workspace.enter()
 
-from orchestrator.client import GraphError  # noqa: E402
+from orchestrator.errors import GraphError, NodeError  # noqa: E402
 from orchestrator.experiment import run  # noqa: E402
 from orchestrator.options import OptionError, parse  # noqa: E402
-from orchestrator.processes import NodeError  # noqa: E402
 
 
 def _interrupt_once(number: int, _frame: FrameType | None) -> None:

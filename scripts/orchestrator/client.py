@@ -17,13 +17,10 @@ from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
 from limb_interfaces import qos, topics
-from orchestrator.processes import NodeError, NodeProcess
+from orchestrator.errors import GraphError
+from orchestrator.processes import NodeProcess
 
 READY = (DiagnosticStatus.OK, DiagnosticStatus.WARN)
-
-
-class GraphError(RuntimeError):
-    """The graph did not do what was asked; the message says what and why."""
 
 
 class GraphClient:
@@ -189,6 +186,3 @@ class GraphClient:
         return sorted(
             name for name, space in found if space == f"/{topics.NAMESPACE}" and name != own
         )
-
-
-__all__ = ["GraphClient", "GraphError", "NodeError"]

@@ -14,9 +14,10 @@ from typing import Any
 
 from der_msgs.msg import MotionCommand, PressurePlan, PressureState
 from limb_interfaces import qos, stamps, topics
-from orchestrator.client import GraphClient, GraphError
+from orchestrator.client import GraphClient
+from orchestrator.errors import GraphError, NodeError
 from orchestrator.options import Options, Trial
-from orchestrator.processes import NodeError, NodeProcess
+from orchestrator.processes import NodeProcess
 from orchestrator.progress import Progress
 
 READY_TIMEOUT = 180.0

@@ -14,12 +14,10 @@ from typing import Any
 
 import yaml
 
+from orchestrator.errors import NodeError
+
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)
-
-
-class NodeError(RuntimeError):
-    """A node did not start, is not ready or died; the message names it and shows its last words."""
 
 
 def find_executable(package: str, executable: str) -> Path:
