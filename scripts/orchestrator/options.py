@@ -63,7 +63,7 @@ class Hardware:
 
     @classmethod
     def from_yaml(cls, path: Path) -> Hardware:
-        """Read a hardware file (see config/hardware_example.yaml of pressure_driver).
+        """Read a hardware file (see scripts/hardware_example.yaml).
 
         Raises:
             OptionError: the file cannot be read, has unknown keys or no serial port.
