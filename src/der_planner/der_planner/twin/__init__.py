@@ -1,1 +1,5 @@
 """The simulated limb that stands in for the hardware."""
+
+from der_planner.twin.limb_twin import LimbTwin, TwinError, TwinShape
+
+__all__ = ["LimbTwin", "TwinError", "TwinShape"]

@@ -1,0 +1,148 @@
+"""What a seed draws: the hardware of one trial, with everything that the planners' models do not know.
+
+The ranges stand in `RANGES`, around the limb of `Limb.default()`. Nothing here is written to a topic, a
+file or a log that a planner reads.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+SEGMENT_LENGTH = 0.122
+"""Material length of one segment with its share of the fittings [m]."""
+NOMINAL_GAIN = np.deg2rad(0.36) / 100.0
+"""Bend angle per differential pressure of the nominal segment [rad/Pa]."""
+NOMINAL_STIFFNESS = 0.0175
+"""EI of the nominal segment [N·m²]."""
+
+RANGES: dict[str, tuple[float, float]] = {
+    "gain_of_the_day": (0.80, 1.20),  # × nominal, both segments alike
+    "gain_of_a_segment": (0.90, 1.10),  # × nominal, each segment
+    "gain_of_a_chamber": (0.95, 1.05),  # × the segment's, each chamber
+    "bending_stiffness": (0.85, 1.15),  # × nominal
+    "pressure_stiffening": (0.01, 0.05),  # relative EI at a chamber gauge pressure of 10 kPa
+    "cubic_stiffening": (0.01, 0.06),  # relative secant stiffness at 45° of bend
+    "rest_angle": (-3.0, 3.0),  # [deg] each segment
+    "loop_first": (0.06, 0.12),  # friction loop width over a span of 60°, first segment
+    "loop_second": (0.02, 0.06),  # second segment
+    "yield_angle": (8.0, 16.0),  # [deg] of bend over which friction turns round
+    "creep": (0.02, 0.05),  # slow share of the stiffness
+    "creep_time": (15.0, 60.0),  # [s]
+    "fast_creep": (0.15, 0.35),  # fast share of the stiffness
+    "fast_creep_time": (0.02, 0.05),  # [s]
+    "wander": (0.1, 0.3),  # [deg] standard deviation of the rest angle within a run
+    "wander_time": (60.0, 180.0),  # [s] correlation time of it
+    "elongation": (0.001, 0.003),  # strain at a chamber gauge pressure of 10 kPa
+    "end_fitting": (0.003, 0.005),  # [m] stiff length at the clamp and at the tip
+    "connector": (0.006, 0.012),  # [m] stiff length between the segments
+    "fitting_mass": (0.002, 0.008),  # [kg] of the connector and of the tip, with tags
+    "mass_per_length": (0.95, 1.05),  # × 1.066 kg/m
+    "drag": (0.4, 0.7),  # [1/s] mass-proportional damping
+}
+"""Uniform ranges of every number that a seed draws."""
+
+LOOP_SPAN = np.deg2rad(60.0)
+
+
+@dataclass(frozen=True)
+class SegmentHardware:
+    """One segment as built.
+
+    Attributes:
+        flexible_length: of the silicone between its fittings [m].
+        bending_stiffness: EI of the silicone at atmosphere [N·m²].
+        cubic_stiffness: k3 in M = EI κ + k3 κ³ [N·m⁴].
+        pressure_stiffening: relative growth of EI per gauge pressure of a chamber [1/Pa].
+        chamber_gain: bending moment per gauge pressure of the left and the right chamber [N·m/Pa].
+        elongation: axial strain per gauge pressure of a chamber [1/Pa].
+        rest_curvature: at atmosphere [1/m].
+        friction_moment: saturation of the friction between silicone and fibre [N·m].
+        friction_curvature: change of curvature over which the friction turns round [1/m].
+        creep_stiffness, creep_time: Maxwell branches, fast and slow [N·m²], [s].
+        wander, wander_time: standard deviation [1/m] and correlation time [s] of the rest curvature.
+    """
+
+    flexible_length: float
+    bending_stiffness: float
+    cubic_stiffness: float
+    pressure_stiffening: float
+    chamber_gain: tuple[float, float]
+    elongation: float
+    rest_curvature: float
+    friction_moment: float
+    friction_curvature: float
+    creep_stiffness: tuple[float, float]
+    creep_time: tuple[float, float]
+    wander: float
+    wander_time: float
+
+
+@dataclass(frozen=True)
+class Hardware:
+    """A two-segment limb as built.
+
+    Attributes:
+        segments: (M,) from the clamp to the tip.
+        base_fitting, connector, tip_fitting: stiff lengths [m].
+        connector_mass, tip_mass: of what sits on the stiff parts [kg].
+        mass_per_length: of the silicone [kg/m].
+        drag: mass-proportional damping [1/s].
+    """
+
+    segments: tuple[SegmentHardware, ...]
+    base_fitting: float
+    connector: float
+    tip_fitting: float
+    connector_mass: float
+    tip_mass: float
+    mass_per_length: float
+    drag: float
+
+
+def draw(seed: int) -> Hardware:
+    """Draw the hardware of one trial; the same seed gives the same hardware."""
+    generator = np.random.default_rng([20_260, seed])
+
+    def of(name: str) -> float:
+        low, high = RANGES[name]
+        return float(generator.uniform(low, high))
+
+    day = of("gain_of_the_day")
+    base, connector, tip = of("end_fitting"), of("connector"), of("end_fitting")
+    ends = (base, tip)
+    segments = []
+    for index in range(2):
+        length = SEGMENT_LENGTH - ends[index] - 0.5 * connector
+        stiffness = NOMINAL_STIFFNESS * of("bending_stiffness")
+        gain = NOMINAL_GAIN * day * of("gain_of_a_segment") * stiffness / length
+        largest = np.deg2rad(45.0) / length
+        loop = of("loop_first" if index == 0 else "loop_second")
+        segments.append(
+            SegmentHardware(
+                flexible_length=length,
+                bending_stiffness=stiffness,
+                cubic_stiffness=stiffness * of("cubic_stiffening") / largest**2,
+                pressure_stiffening=of("pressure_stiffening") / 1e4,
+                chamber_gain=(gain * of("gain_of_a_chamber"), gain * of("gain_of_a_chamber")),
+                elongation=of("elongation") / 1e4,
+                rest_curvature=float(np.deg2rad(of("rest_angle"))) / length,
+                friction_moment=0.5 * loop * LOOP_SPAN / length * stiffness,
+                friction_curvature=float(np.deg2rad(of("yield_angle"))) / length,
+                creep_stiffness=(stiffness * of("fast_creep"), stiffness * of("creep")),
+                creep_time=(of("fast_creep_time"), of("creep_time")),
+                wander=float(np.deg2rad(of("wander"))) / length,
+                wander_time=of("wander_time"),
+            )
+        )
+    return Hardware(
+        segments=tuple(segments),
+        base_fitting=base,
+        connector=connector,
+        tip_fitting=tip,
+        connector_mass=of("fitting_mass"),
+        tip_mass=of("fitting_mass"),
+        mass_per_length=1.066 * of("mass_per_length"),
+        drag=of("drag"),
+    )

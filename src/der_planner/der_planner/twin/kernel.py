@@ -1,0 +1,200 @@
+"""The time loop of the simulated limb, compiled around PyElastica's own kernels.
+
+PyElastica's module system calls Python code several times a step, which costs more than the physics of
+a rod of twenty elements. Here its kinematic update, its internal forces and torques and its
+accelerations are called in the order of its position Verlet stepper, from one compiled loop. What the
+limb adds - chambers, friction, creep - enters as the constitutive law of PyElastica's bending couple.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from elastica.rod.cosserat_rod import (
+    _compute_bending_twist_strains,
+    _compute_internal_forces,
+    _compute_internal_torques,
+    _update_accelerations,
+)
+from elastica.rod.data_structures import overload_operator_kinematic_numba
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class RodArrays(NamedTuple):
+    """The arrays of a PyElastica `CosseratRod` that its kernels read and write, by its names."""
+
+    position: Array
+    velocity: Array
+    directors: Array
+    omega: Array
+    acceleration: Array
+    alpha: Array
+    volume: Array
+    lengths: Array
+    tangents: Array
+    radius: Array
+    rest_lengths: Array
+    rest_voronoi_lengths: Array
+    dilatation: Array
+    dilatation_rate: Array
+    voronoi_dilatation: Array
+    sigma: Array
+    rest_sigma: Array
+    kappa: Array
+    rest_kappa: Array
+    shear_matrix: Array
+    bend_matrix: Array
+    internal_stress: Array
+    internal_couple: Array
+    internal_forces: Array
+    internal_torques: Array
+    external_forces: Array
+    external_torques: Array
+    mass: Array
+    inertia: Array
+    inverse_inertia: Array
+    ghost_elements: NDArray[np.int32]
+    ghost_vertices: NDArray[np.int32]
+
+
+class Material(NamedTuple):
+    """The bending law at each vertex (K,): parameters, then the state that it remembers.
+
+    moment = stiffness (κ − rest) + cubic (κ − rest)³ + friction_moment z + Σ creep_stiffness q − active
+    """
+
+    flexible_share: Array  # flexible length at a vertex over its Voronoi length
+    stiffness: Array  # [N·m²]
+    cubic: Array  # [N·m⁴]
+    rest: Array  # [1/m]
+    active: Array  # [N·m] moment of the chambers
+    friction_moment: Array  # [N·m]
+    friction_curvature: Array  # [1/m]
+    creep_stiffness: Array  # (2, K) [N·m²]
+    creep_time: Array  # (2, K) [s]
+    curvature: Array  # state: κ at the last step [1/m]
+    friction: Array  # state: z in −1 … 1
+    creep: Array  # state: q (2, K) [1/m]
+
+
+@njit(cache=True)
+def bending_law(material: Material, kappa: Array, couple: Array, dt: float) -> None:
+    """Write the planar bending moment of each vertex (K,) [N·m] and advance what it remembers.
+
+    Friction is a Dahl element, dz = (dκ/κ_f)(1 − z sgn dκ), and creep a Maxwell element,
+    q̇ = κ̇ − q/τ; both are integrated exactly for a constant rate, so any step size is stable.
+    """
+    for k in range(kappa.shape[0]):
+        curvature = kappa[k] / material.flexible_share[k]
+        change = curvature - material.curvature[k]
+        material.curvature[k] = curvature
+        sign = 1.0 if change >= 0.0 else -1.0
+        turn = np.exp(-abs(change) / material.friction_curvature[k])
+        material.friction[k] = sign + (material.friction[k] - sign) * turn
+        strain = curvature - material.rest[k]
+        moment = (
+            material.stiffness[k] * strain
+            + material.cubic[k] * strain**3
+            + material.friction_moment[k] * material.friction[k]
+            - material.active[k]
+        )
+        for branch in range(2):
+            rate = dt / material.creep_time[branch, k]
+            keep = np.exp(-rate)
+            material.creep[branch, k] = (
+                material.creep[branch, k] * keep + change * (1.0 - keep) / rate
+            )
+            moment += material.creep_stiffness[branch, k] * material.creep[branch, k]
+        couple[k] = moment
+
+
+@njit(cache=True)
+def advance(rod: RodArrays, material: Material, steps: int, dt: float, drag: float) -> None:
+    """Advance the limb by ``steps`` position Verlet steps of ``dt`` [s].
+
+    Args:
+        rod: changed in place; its first element is clamped.
+        material: changed in place.
+        steps: number of steps.
+        dt: [s] below the stability limit of the stiffest mode.
+        drag: mass-proportional damping [1/s], integrated exactly.
+    """
+    keep = np.exp(-drag * dt)
+    vertices = rod.kappa.shape[1]
+    moment = np.zeros(vertices)
+    for _ in range(steps):
+        overload_operator_kinematic_numba(
+            0.5 * dt, rod.position, rod.directors, rod.velocity, rod.omega
+        )
+        _compute_bending_twist_strains(rod.directors, rod.rest_voronoi_lengths, rod.kappa)
+        bending_law(material, rod.kappa[0], moment, dt)
+        for k in range(vertices):
+            # PyElastica's couple is B (κ − κ_rest): this rest curvature makes it the law's moment.
+            rod.rest_kappa[0, k] = rod.kappa[0, k] - moment[k] / rod.bend_matrix[0, 0, k]
+        _compute_internal_forces(
+            rod.position,
+            rod.volume,
+            rod.lengths,
+            rod.tangents,
+            rod.radius,
+            rod.rest_lengths,
+            rod.rest_voronoi_lengths,
+            rod.dilatation,
+            rod.voronoi_dilatation,
+            rod.directors,
+            rod.sigma,
+            rod.rest_sigma,
+            rod.shear_matrix,
+            rod.internal_stress,
+            rod.internal_forces,
+            rod.ghost_elements,
+        )
+        _compute_internal_torques(
+            rod.position,
+            rod.velocity,
+            rod.tangents,
+            rod.lengths,
+            rod.rest_lengths,
+            rod.directors,
+            rod.rest_voronoi_lengths,
+            rod.bend_matrix,
+            rod.rest_kappa,
+            rod.kappa,
+            rod.voronoi_dilatation,
+            rod.inertia,
+            rod.omega,
+            rod.internal_stress,
+            rod.internal_couple,
+            rod.dilatation,
+            rod.dilatation_rate,
+            rod.internal_torques,
+            rod.ghost_vertices,
+        )
+        _update_accelerations(
+            rod.acceleration,
+            rod.internal_forces,
+            rod.external_forces,
+            rod.mass,
+            rod.alpha,
+            rod.inverse_inertia,
+            rod.internal_torques,
+            rod.external_torques,
+            rod.dilatation,
+        )
+        _kick(rod, dt, keep)
+        overload_operator_kinematic_numba(
+            0.5 * dt, rod.position, rod.directors, rod.velocity, rod.omega
+        )
+
+
+@njit(cache=True)
+def _kick(rod: RodArrays, dt: float, keep: float) -> None:
+    for i in range(3):
+        for k in range(2, rod.velocity.shape[1]):
+            rod.velocity[i, k] = (rod.velocity[i, k] + dt * rod.acceleration[i, k]) * keep
+        for k in range(1, rod.omega.shape[1]):
+            rod.omega[i, k] = (rod.omega[i, k] + dt * rod.alpha[i, k]) * keep
