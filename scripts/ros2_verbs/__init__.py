@@ -1,0 +1,1 @@
+"""The commands of ``scripts/ros2``, the stand-in for machines without ros2cli: one module each."""

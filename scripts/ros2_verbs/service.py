@@ -1,0 +1,91 @@
+"""``ros2 service``: the services of the graph."""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import yaml
+
+from ros2_verbs.cli import CommandError, add_verb, add_verbs
+from ros2_verbs.messages import Filler, interface
+from ros2_verbs.session import Session, add_session_arguments, is_hidden
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the verbs of ``ros2 service`` and their arguments."""
+    verbs = add_verbs(parser, "service")
+    lister = add_verb(verbs, "list", "Output a list of available services", _list)
+    add_session_arguments(lister)
+    lister.add_argument(
+        "-t", "--show-types", action="store_true", help="Additionally show the service type"
+    )
+    lister.add_argument(
+        "-c", "--count-services", action="store_true", help="Only display the number of services"
+    )
+    lister.add_argument(
+        "--include-hidden-services", action="store_true", help="Consider hidden services as well"
+    )
+    kind = add_verb(verbs, "type", "Output a service's type", _type)
+    add_session_arguments(kind)
+    kind.add_argument("service_name", help="Name of the ROS service to get type")
+    call = add_verb(verbs, "call", "Call a service", _call)
+    call.add_argument("service_name", help="Name of the ROS service to call to")
+    call.add_argument("service_type", help="Type of the ROS service (e.g. 'std_srvs/srv/Empty')")
+    call.add_argument(
+        "values",
+        nargs="?",
+        default="{}",
+        help="Values to fill the service request with in YAML format (e.g. '{a: 1, b: 2}')",
+    )
+    call.add_argument(
+        "-r", "--rate", metavar="N", type=float, help="Repeat the call at a specific rate in Hz"
+    )
+
+
+def _list(options: argparse.Namespace) -> None:
+    with Session(options) as session:
+        session.discover()
+        found = {
+            name: types
+            for name, types in session.services().items()
+            if options.include_hidden_services or not is_hidden(name)
+        }
+    if options.count_services:
+        print(len(found))
+        return
+    for name, types in found.items():
+        print(f"{name} [{', '.join(types)}]" if options.show_types else name)
+
+
+def _type(options: argparse.Namespace) -> int:
+    with Session(options) as session:
+        session.discover(lambda: options.service_name in session.services())
+        types = session.services().get(options.service_name, [])
+    for kind in types:
+        print(kind)
+    return 0 if types else 1
+
+
+def _call(options: argparse.Namespace) -> None:
+    if options.rate is not None and options.rate <= 0:
+        raise CommandError("rate must be greater than zero")
+    kind = interface(options.service_type, "srv")
+    try:
+        values = yaml.safe_load(options.values)
+    except yaml.YAMLError as error:
+        raise CommandError(f"The passed value is no YAML: {error}") from error
+    request = Filler(kind.Request(), values).message
+    with Session(options) as session:
+        client = session.node.create_client(kind, options.service_name)
+        if not client.wait_for_service(timeout_sec=0.2):
+            print("waiting for service to become available...")
+            while not client.wait_for_service(timeout_sec=0.2):
+                session.check()
+        while True:
+            started = time.monotonic()
+            print(f"requester: making request: {request!r}\n")
+            print(f"response:\n{session.answer(client, request)!r}\n")
+            if options.rate is None:
+                return
+            time.sleep(max(0.0, started + 1.0 / options.rate - time.monotonic()))

@@ -1,0 +1,185 @@
+"""A hidden node that looks at the graph, and what every verb asks of it."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.expand_topic_name import expand_topic_name
+from rclpy.parameter import Parameter
+from rclpy.validate_full_topic_name import validate_full_topic_name
+
+from ros2_verbs.cli import CommandError
+
+HIDDEN_PREFIX = "_"
+_AT_LEAST, _AT_MOST = 1.0, 4.0
+_QUIET, _QUIET_WHEN_FOUND = 0.5, 0.2
+"""How long discovery lasts [s], and for how long nothing new must have come."""
+
+
+def add_session_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of every verb that looks at the graph."""
+    parser.add_argument(
+        "--spin-time",
+        type=float,
+        metavar="SPIN_TIME",
+        help="Spin time in seconds to wait for discovery (default: until nothing new appears)",
+    )
+    parser.add_argument(
+        "-s", "--use-sim-time", action="store_true", help="Enable ROS simulation time"
+    )
+    parser.add_argument(
+        "--no-daemon", action="store_true", help="Does nothing: there is no daemon here"
+    )
+
+
+def is_hidden(name: str) -> bool:
+    """Tell whether a name of a topic, service or node is hidden by convention."""
+    return any(part.startswith(HIDDEN_PREFIX) for part in name.split("/") if part)
+
+
+def absolute(name: str) -> str:
+    """Return a node's name with the slash in front."""
+    return name if name.startswith("/") else f"/{name}"
+
+
+class Session:
+    """A node for the time of one command; a context manager.
+
+    Args:
+        options: with ``spin_time`` and ``use_sim_time``, see `add_session_arguments`.
+        name: of the node; hidden and unique if empty.
+    """
+
+    def __init__(self, options: argparse.Namespace, name: str = "") -> None:
+        self._spin_time: float | None = getattr(options, "spin_time", None)
+        rclpy.init(args=[])
+        simulated = getattr(options, "use_sim_time", False)
+        self.node = rclpy.create_node(
+            name or f"{HIDDEN_PREFIX}ros2cli_{os.getpid()}",
+            start_parameter_services=False,
+            parameter_overrides=[Parameter("use_sim_time", value=True)] if simulated else [],
+        )
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        with contextlib.suppress(Exception):
+            self.node.destroy_node()
+        with contextlib.suppress(Exception):
+            rclpy.try_shutdown()
+
+    def check(self) -> None:
+        """Raise if a signal has ended the session.
+
+        Raises:
+            ExternalShutdownException: after SIGTERM.
+        """
+        if not rclpy.ok():
+            raise ExternalShutdownException
+
+    def discover(self, enough: Callable[[], Any] = lambda: False) -> None:
+        """Wait until the graph is known: for the spin time if given, else until it is quiet.
+
+        Args:
+            enough: true when that is found for which the caller looks; ends the wait early.
+        """
+        start = changed = time.monotonic()
+        seen = None
+        while True:
+            self.check()
+            picture = (self.nodes(), self.topics(), self.services())
+            now = time.monotonic()
+            if picture != seen:
+                seen, changed = picture, now
+            elapsed, quiet = now - start, now - changed
+            if quiet >= _QUIET_WHEN_FOUND and enough():
+                return
+            if self._spin_time is not None:
+                if elapsed >= self._spin_time:
+                    return
+            elif elapsed >= _AT_MOST or (elapsed >= _AT_LEAST and quiet >= _QUIET):
+                return
+            time.sleep(0.02)
+
+    def nodes(self) -> list[tuple[str, str]]:
+        """Return name and namespace of every node, sorted by the full name."""
+        found = self.node.get_node_names_and_namespaces()
+        return sorted(found, key=lambda item: full_name(*item))
+
+    def topics(self) -> dict[str, list[str]]:
+        """Return the types of every topic, sorted by name."""
+        return dict(sorted(self.node.get_topic_names_and_types()))
+
+    def services(self) -> dict[str, list[str]]:
+        """Return the types of every service, sorted by name."""
+        return dict(sorted(self.node.get_service_names_and_types()))
+
+    def expand(self, topic: str) -> str:
+        """Return the full name of a topic.
+
+        Raises:
+            CommandError: it is not a valid name.
+        """
+        try:
+            expanded: str = expand_topic_name(
+                topic, self.node.get_name(), self.node.get_namespace()
+            )
+            validate_full_topic_name(expanded)
+        except Exception as error:
+            raise CommandError(str(error)) from error
+        return expanded
+
+    def find_node(self, name: str, include_hidden: bool = True) -> bool:
+        """Discover until a node is there; tell whether it is."""
+        wanted = absolute(name)
+        if not include_hidden and wanted.rsplit("/", 1)[-1].startswith(HIDDEN_PREFIX):
+            return False
+        self.discover(lambda: self._has_node(wanted))
+        return self._has_node(wanted)
+
+    def _has_node(self, wanted: str) -> bool:
+        return any(full_name(*item) == wanted for item in self.nodes())
+
+    def call(self, kind: Any, service: str, request: Any) -> Any:
+        """Call a service of a node and return the response.
+
+        Raises:
+            CommandError: the service does not appear within 5 s, or its answer is an error.
+        """
+        client = self.node.create_client(kind, service)
+        if not client.wait_for_service(timeout_sec=5.0):
+            raise CommandError("Wait for service timed out")
+        return self.answer(client, request)
+
+    def answer(self, client: Any, request: Any) -> Any:
+        """Send a request to a service that is there and wait for the response.
+
+        Raises:
+            CommandError: the answer is an error.
+        """
+        future = client.call_async(request)
+        while not future.done():
+            self.check()
+            rclpy.spin_once(self.node, timeout_sec=0.1)
+        if future.result() is None:
+            raise CommandError(f"Exception while calling service: {future.exception()!r}")
+        return future.result()
+
+
+def full_name(name: str, namespace: str) -> str:
+    """Return a node's full name."""
+    return f"{namespace}{'' if namespace.endswith('/') else '/'}{name}"
