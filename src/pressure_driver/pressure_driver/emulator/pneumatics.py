@@ -1,10 +1,10 @@
-"""The air of an emulated valve board: regulators, valves, tubes and chambers, without any clock of its own.
+"""The air of an emulated valve board: regulators, valves, tubes and chambers, without a clock.
 
 Each chamber has a proportional regulator. Filling is limited by the inlet valve (a ramp), venting
-by the outlet orifice (slower the less pressure is left, reaching zero in finite time), and a chamber
-feels what its neighbour in the pair does, since they share a wall and a manifold. The numbers agree
-with logs of a real limb: 9 kPa/s filling, 2.5 s from 90 to 10 % when a step of 7 kPa is vented, a
-neighbour that rises by up to a quarter of the change and is back within about a second.
+by the outlet orifice (slower the less pressure is left, reaching zero in finite time), and a
+chamber feels what its neighbour in the pair does, since they share a wall and a manifold. The
+numbers agree with logs of a real limb: 9 kPa/s filling, 2.5 s from 90 to 10 % when a step of 7 kPa
+is vented, a neighbour that rises by up to a quarter of the change and is back after about a second.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class PneumaticsParameters:
     """Share of the rate of a venting chamber that its neighbour sees."""
     coupling_time: float = 0.45
     """[s] in which the neighbour's disturbance decays."""
-    supply_pressure: float = 160e3
+    supply_pressure: float = 140e3
     """[Pa] absolute, of the reservoir."""
     variation: float = 0.05
     """Relative standard deviation between chambers, cut at two of them."""
@@ -174,7 +174,7 @@ class Pneumatics:
         error = self._target - self._gauge
         demand = error / self._regulator_time
         headroom = self.supply_pressure - self.atmosphere - self._gauge
-        nominal_head = 0.5 * (self.parameters.supply_pressure - self.atmosphere)
+        nominal_head = 0.25 * (self.parameters.supply_pressure - self.atmosphere)
         inflow = self._fill_rate * np.clip(headroom / nominal_head, 0.0, 1.0)
         outflow = self._vent_coefficient * np.maximum(self._gauge, 0.0) ** VENT_EXPONENT
         opens = (error < -self._vent_deadband) | (self._target <= 0.0)

@@ -1,0 +1,261 @@
+"""The driver without ROS: state machine, protocol and telemetry behind one lock.
+
+The port's thread calls the methods of `pressure_driver.link.LinkClient`; everybody else calls
+`arm`, `vent`, `offer` and `snapshot`.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from pressure_driver.monitor import Monitor, MonitorLimits, chamber_gauge
+from pressure_driver.protocols.base import (
+    BoardIdentity,
+    BoardReport,
+    BoardText,
+    Echo,
+    Event,
+    HostProtocol,
+    Telemetry,
+)
+from pressure_driver.safety import Mode, SafetyLimits, SafetyMachine
+from pressure_driver.schedule import Counters, Schedule, ScheduleLimits, Setpoint, Verdict
+
+STANDARD_ATMOSPHERE = 101_325.0
+"""[Pa] on the wire until the room's has been measured; only vent commands are sent before."""
+
+
+@dataclass(frozen=True)
+class CoreSettings:
+    """Everything that makes one driver."""
+
+    schedule: ScheduleLimits = field(default_factory=ScheduleLimits)
+    monitor: MonitorLimits = field(default_factory=MonitorLimits)
+    safety: SafetyLimits = field(default_factory=SafetyLimits)
+    period: int = 50_000_000
+    """[ns] of the ticks."""
+    interpolate: bool = False
+    atmosphere: float = 0.0
+    """[Pa] absolute; 0 to measure it."""
+    command_validity: float = 0.25
+    """[s] after which a board with a watchdog vents by itself."""
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The driver at one tick; see `der_msgs/PressureState` for the meaning."""
+
+    tick: int
+    mode: Mode
+    faults: tuple[str, ...]
+    setpoint: Setpoint | None
+    commanded_differential: tuple[float, ...]
+    commanded_chamber: tuple[float, ...]
+    measured_differential: tuple[float, ...]
+    measured_chamber: tuple[float, ...]
+    valve_opening: tuple[float, ...]
+    supply_pressure: float
+    telemetry_age: float
+    round_trip: float
+    counters: Counters
+
+
+class DriverCore:
+    """Decides what the board is told, and keeps what it says.
+
+    Args:
+        protocol: the driver's end of the board's language.
+        settings: limits and times.
+        steady: returns the steady clock in s.
+        notify: is called after each tick, from the port's thread.
+        log: takes a sentence for the log and whether it is a warning.
+    """
+
+    def __init__(
+        self,
+        protocol: HostProtocol,
+        settings: CoreSettings,
+        steady: Callable[[], float] = time.monotonic,
+        notify: Callable[[], None] = lambda: None,
+        log: Callable[[str, bool], None] = lambda text, warning: None,
+    ) -> None:
+        self.protocol = protocol
+        self.settings = settings
+        self.identity: BoardIdentity | None = None
+        self._steady = steady
+        self._notify = notify
+        self._log = log
+        self._lock = threading.RLock()
+        self._schedule = Schedule(settings.schedule, settings.period, settings.interpolate)
+        self._monitor = Monitor(protocol.chamber_count, settings.monitor, settings.atmosphere)
+        self._machine = SafetyMachine(self._schedule, self._monitor, settings.safety)
+        self._last_tick = 0
+        self._last_mode = Mode.DISARMED
+        self._awaiting_echo: deque[tuple[int | None, float]] = deque(maxlen=64)
+        self._round_trip = float("nan")
+        self._pending_number: int | None = None
+        self.last_text = ""
+
+    # ------------------------------------------------------------------ from any thread
+
+    def arm(self) -> tuple[bool, str]:
+        """Allow pressure; returns whether, and a sentence."""
+        with self._lock:
+            result = self._machine.arm(self._steady())
+            self._note_mode()
+            return result
+
+    def vent(self) -> tuple[bool, str]:
+        """Open all chambers and refuse setpoints until armed again."""
+        with self._lock:
+            result = self._machine.vent(self._steady())
+            self._note_mode()
+            return result
+
+    def offer(self, setpoint: Setpoint, wall: int) -> Verdict:
+        """Take a setpoint; ``wall`` is the wall clock now in ns."""
+        with self._lock:
+            return self._machine.offer(setpoint, wall)
+
+    def refuse(self, reason: str) -> None:
+        """Count an input that could not even be read as a setpoint."""
+        with self._lock:
+            self._schedule.refuse(reason)
+
+    def obstacles(self) -> list[str]:
+        """Return what forbids arming now."""
+        with self._lock:
+            return self._machine.obstacles(self._steady())
+
+    @property
+    def atmosphere(self) -> float:
+        """[Pa] measured or given; NaN before."""
+        return self._monitor.atmosphere
+
+    @property
+    def last_refusal(self) -> str:
+        """Why the last setpoint that was not accepted was not."""
+        return self._schedule.reason
+
+    @property
+    def waiting(self) -> int:
+        """Setpoints that have not come into force yet."""
+        return self._schedule.waiting
+
+    def snapshot(self) -> Snapshot:
+        """Return the driver as it is now."""
+        with self._lock:
+            monitor, machine = self._monitor, self._machine
+            gauge = monitor.gauge
+            base = monitor.atmosphere if monitor.rest_known() else STANDARD_ATMOSPHERE
+            return Snapshot(
+                tick=self._last_tick,
+                mode=machine.mode,
+                faults=tuple(machine.faults),
+                setpoint=self._schedule.current,
+                commanded_differential=machine.differential,
+                commanded_chamber=tuple((base + chamber_gauge(machine.differential)).tolist()),
+                measured_differential=tuple((gauge[0::2] - gauge[1::2]).tolist()),
+                measured_chamber=tuple(monitor.chamber_pressure.tolist()),
+                valve_opening=tuple(monitor.valve_opening.tolist()),
+                supply_pressure=monitor.supply_pressure,
+                telemetry_age=monitor.telemetry_age(self._steady()),
+                round_trip=self._round_trip,
+                counters=Counters(**vars(self._schedule.counters)),
+            )
+
+    # ------------------------------------------------------------- from the port's thread
+
+    def opening(self) -> bytes:
+        """Greet and vent: whatever the board held before, it lets go of now."""
+        with self._lock:
+            self.protocol.reset()
+            self._monitor.forget()
+            self._awaiting_echo.clear()
+            self._machine.link_fault = ""
+            return self.protocol.start() + self._vent_bytes()
+
+    def tick(self, instant: int) -> bytes:
+        """Return the command of this tick."""
+        with self._lock:
+            now = self._steady()
+            if instant < self._last_tick:
+                self._schedule.forget_ticks()
+            self._last_tick = instant
+            action = self._machine.tick(instant, now)
+            if action.dump:
+                return self._vent_bytes()
+            data, self._pending_number = self.protocol.setpoint(
+                action.differential, self._wire_atmosphere(), self.settings.command_validity
+            )
+            return data
+
+    def sent(self, instant: int) -> None:  # noqa: ARG002 - the protocol of the link
+        """Do what can wait until the bytes are out."""
+        with self._lock:
+            now = self._steady()
+            self._monitor.command(self._machine.differential, now)
+            self._awaiting_echo.append((self._pending_number, now))
+            self._note_mode()
+        self._notify()
+
+    def received(self, data: bytes) -> None:
+        """Decode what the board has sent."""
+        with self._lock:
+            now = self._steady()
+            for event in self.protocol.decode(data):
+                self._take(event, now)
+
+    def lost(self, reason: str) -> None:
+        """The port is gone: everything that was armed faults."""
+        with self._lock:
+            self._machine.link_fault = reason
+            self._monitor.forget()
+            self._note_mode()
+
+    def farewell(self) -> bytes:
+        """Return the vent command."""
+        with self._lock:
+            return self._vent_bytes()
+
+    def _wire_atmosphere(self) -> float:
+        return self._monitor.atmosphere if self._monitor.rest_known() else STANDARD_ATMOSPHERE
+
+    def _vent_bytes(self) -> bytes:
+        data, self._pending_number = self.protocol.vent(self._wire_atmosphere())
+        return data
+
+    def _take(self, event: Event, now: float) -> None:
+        if isinstance(event, Telemetry):
+            # Rest pressures are measured only where nothing has been asked of the chambers.
+            resting = self._machine.mode in (Mode.DISARMED, Mode.FAULT)
+            self._monitor.receive(event, now, resting)
+        elif isinstance(event, Echo):
+            self._take_echo(event, now)
+        elif isinstance(event, BoardReport):
+            self._log(f"board: {event.text}", True)
+            if event.fatal:
+                self._machine.fail(f"board reports: {event.text}")
+        elif isinstance(event, BoardIdentity):
+            self.identity = event
+        elif isinstance(event, BoardText):
+            self.last_text = event.text
+            self._log(f"board: {event.text}", False)
+
+    def _take_echo(self, echo: Echo, now: float) -> None:
+        while self._awaiting_echo:
+            number, sent = self._awaiting_echo.popleft()
+            if echo.sequence is None or number == echo.sequence:
+                self._round_trip = now - sent
+                return
+
+    def _note_mode(self) -> None:
+        mode = self._machine.mode
+        if mode is not self._last_mode:
+            reasons = ": " + "; ".join(self._machine.faults) if mode is Mode.FAULT else ""
+            self._log(f"{self._last_mode.name} -> {mode.name}{reasons}", mode is Mode.FAULT)
+            self._last_mode = mode

@@ -1,0 +1,187 @@
+"""The firmware of an emulated valve board: commands in, telemetry out, air in between."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pressure_driver.emulator.faults import Faults
+from pressure_driver.emulator.pneumatics import Pneumatics
+from pressure_driver.protocols.base import BoardCommand, BoardProtocol, BoardReading
+
+SENSOR_OFFSET = 200.0
+"""[Pa] Sensors read up to this much too high, each its own."""
+SENSOR_NOISE = 5.0
+"""[Pa] Standard deviation of a reading."""
+
+
+@dataclass(frozen=True)
+class ReceivedCommand:
+    """A command as the board saw it on the wire."""
+
+    stamp: int
+    """[ns] arrival of its first byte."""
+    pressure: tuple[float, ...]
+    """(2M,) [Pa] absolute, decoded from the wire."""
+    vent: bool
+
+
+class EmulatedBoard:
+    """Regulates the chambers of a `Pneumatics` as commanded over the wire.
+
+    Args:
+        protocol: the firmware's end of the language.
+        pneumatics: the air.
+        seed: of sensor errors and of random faults.
+    """
+
+    def __init__(self, protocol: BoardProtocol, pneumatics: Pneumatics, seed: int = 0) -> None:
+        self.protocol = protocol
+        self.pneumatics = pneumatics
+        self.faults = Faults()
+        self._generator = np.random.default_rng([seed, 0xB0A2D])
+        count = pneumatics.chamber_count
+        self._offset: NDArray[np.float64] = self._generator.uniform(0.0, SENSOR_OFFSET, count)
+        self._chunks: deque[tuple[int, int]] = deque()
+        self._stream_length = 0
+        self._time = 0.0
+        self._valid_until: float | None = None
+        self._sequence = 0
+        self._target = np.full(count, pneumatics.atmosphere)
+        self._vented = True
+        self.atmosphere = 0.0
+        """[Pa] what the board takes for the room's pressure, measured when it boots."""
+        self.boot()
+
+    def boot(self) -> bytes:
+        """Restart: vent, measure the room, greet."""
+        self._vent()
+        self._sequence = 0
+        self.atmosphere = float(np.mean(self.pneumatics.pressure + self._offset))
+        return self.protocol.boot(self.atmosphere)
+
+    def set_faults(self, faults: Faults) -> None:
+        """Have these faults from now on, and no others."""
+        self.faults = faults
+        air = self.pneumatics
+        air.stuck[:] = False
+        air.leak[:] = 0.0
+        for chamber in faults.stuck:
+            air.stuck[chamber] = True
+        for chamber, rate in faults.leaks.items():
+            air.leak[chamber] = rate
+        air.supply_pressure = (
+            air.parameters.supply_pressure if faults.supply is None else faults.supply
+        )
+        self._apply()
+
+    def receive(self, data: bytes, stamp: int) -> tuple[list[ReceivedCommand], bytes]:
+        """Take bytes from the host.
+
+        Args:
+            data: as they come.
+            stamp: [ns] arrival of the first of them.
+
+        Returns:
+            The commands that became complete, and what the board answers.
+        """
+        if self.faults.drop > 0.0 and self._generator.random() < self.faults.drop:
+            return [], b""
+        data = self.faults.damage(data, self._generator)
+        self._chunks.append((self._stream_length, stamp))
+        self._stream_length += len(data)
+        received: list[ReceivedCommand] = []
+        answer = b""
+        for command in self.protocol.decode(data):
+            if self.faults.deaf:
+                continue
+            answer += self._execute(command)
+            if command.kind in ("setpoint", "vent"):
+                received.append(
+                    ReceivedCommand(
+                        self._stamp_of(command.first_byte),
+                        self._wire_pressure(command),
+                        command.kind == "vent",
+                    )
+                )
+        return received, self.faults.damage(answer, self._generator)
+
+    def _stamp_of(self, place: int) -> int:
+        """Return when the byte at this place of the stream arrived."""
+        while len(self._chunks) > 1 and self._chunks[1][0] <= place:
+            self._chunks.popleft()
+        return self._chunks[0][1]
+
+    def _wire_pressure(self, command: BoardCommand) -> tuple[float, ...]:
+        if command.pressure is None:
+            return (self.atmosphere,) * self.pneumatics.chamber_count
+        if self.protocol.gauge:
+            return tuple(self.atmosphere + value for value in command.pressure)
+        return command.pressure
+
+    def _execute(self, command: BoardCommand) -> bytes:
+        if command.sequence is not None:
+            self._sequence = command.sequence
+        if command.kind == "vent":
+            self._vent()
+        elif command.kind == "setpoint" and command.pressure is not None:
+            self._regulate(np.asarray(command.pressure))
+            if command.valid_for is not None:
+                self._valid_until = self._time + command.valid_for
+        return self.protocol.reply(command, self.reading())
+
+    def _vent(self) -> None:
+        self._target = np.full(self.pneumatics.chamber_count, self.pneumatics.atmosphere)
+        self._valid_until = None
+        self._vented = True
+        self._apply()
+
+    def _regulate(self, pressure: NDArray[np.float64]) -> None:
+        """Translate wire pressures to true targets, as firmware with imperfect sensors does."""
+        room = self.pneumatics.atmosphere
+        if self.protocol.gauge:
+            self._target = room + np.maximum(pressure, 0.0)
+        elif self.protocol.pairwise:
+            low = np.minimum(pressure[0::2], pressure[1::2]).repeat(2)
+            difference = pressure - low
+            reading = self.atmosphere + difference
+            self._target = np.where(difference > 0.0, reading - self._offset, room)
+        else:
+            self._target = pressure - self._offset
+        self._vented = bool(np.all(self._target <= room))
+        self._apply()
+
+    def _apply(self) -> None:
+        target = self._target.copy()
+        for chamber in self.faults.runaway:
+            target[chamber] = self.pneumatics.supply_pressure
+        self.pneumatics.command(target)
+
+    def step(self, duration: float) -> NDArray[np.float64]:
+        """Let time pass and return the true chamber pressures (2M,) [Pa] absolute."""
+        self._time += duration
+        if self._valid_until is not None and self._time > self._valid_until:
+            self._vent()
+        return self.pneumatics.step(duration)
+
+    def reading(self) -> BoardReading:
+        """Return what the sensors say now."""
+        noise = self._generator.normal(0.0, SENSOR_NOISE, self.pneumatics.chamber_count)
+        return BoardReading(
+            time=self._time,
+            chamber_pressure=tuple((self.pneumatics.pressure + self._offset + noise).tolist()),
+            atmosphere=self.atmosphere,
+            valve_opening=tuple(self.pneumatics.valve_opening.tolist()),
+            supply_pressure=self.pneumatics.supply_pressure,
+            last_sequence=self._sequence,
+            vented=self._vented,
+        )
+
+    def telemetry(self) -> bytes:
+        """Return the bytes of one report; nothing while muted."""
+        if self.faults.mute:
+            return b""
+        return self.faults.damage(self.protocol.telemetry(self.reading()), self._generator)

@@ -1,0 +1,150 @@
+"""The ROS node of the emulated valve board. It publishes what the twin needs and takes nothing."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from der_msgs.msg import ChamberPressures
+from limb_interfaces import qos, topics
+from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
+from limb_interfaces.parameters import declare
+from limb_interfaces.runner import run_node
+from limb_interfaces.stamps import stamp_from_nanoseconds
+from pressure_driver.emulator.board import EmulatedBoard, ReceivedCommand
+from pressure_driver.emulator.faults import FaultError, Faults
+from pressure_driver.emulator.pneumatics import Pneumatics
+from pressure_driver.emulator.port import EmulatedPort
+from pressure_driver.emulator.runner import BoardRunner
+from pressure_driver.protocols import NAMES, board_protocol
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+
+class BoardEmulator(Node):
+    """A valve board on a pseudo-terminal, with its air."""
+
+    def __init__(self) -> None:
+        super().__init__("board_emulator", namespace=topics.NAMESPACE)
+        self.fatal_error = ""
+        self._declare()
+        segment_count, seed = self._value("segment_count"), self._value("seed")
+        pneumatics = Pneumatics(segment_count, seed)
+        protocol = board_protocol(self._value("protocol"), 2 * segment_count)
+        self._board = EmulatedBoard(protocol, pneumatics, seed)
+        self._port = EmulatedPort(self._value("port_link"), self._value("baud_rate"))
+        self._air: deque[tuple[int, list[float]]] = deque(maxlen=100)
+        self._commands: deque[ReceivedCommand] = deque(maxlen=1000)
+        self._sequences = [0, 0]
+        self._guard = self.create_guard_condition(self._publish)
+        self._air_publisher = self.create_publisher(
+            ChamberPressures, topics.TWIN_CHAMBER_PRESSURES, qos.STATES
+        )
+        self._command_publisher = self.create_publisher(
+            ChamberPressures, topics.TWIN_BOARD_COMMANDS, qos.SETPOINTS
+        )
+        self._runner = BoardRunner(
+            self._board,
+            self._port,
+            self._on_air,
+            self._on_command,
+            self._value("real_time_priority"),
+            self._value("reset_on_open"),
+        )
+        self._runner.set_faults(self._parse(self._value("faults")))
+        self.add_on_set_parameters_callback(self._on_parameters)
+        self._runner.start()
+        DiagnosticsPublisher(self, self._report, hardware_id=str(self._port.link))
+        self.create_timer(0.2, self._watch)
+        self.get_logger().info(f"{self._value('protocol')} board on {self._port.link}")
+
+    def _declare(self) -> None:
+        declare(self, "port_link", "/tmp/der_limb_board_0", "symbolic link to the pseudo-terminal")
+        declare(self, "protocol", "ezloop", "language of the board", choices=NAMES)
+        declare(
+            self,
+            "baud_rate",
+            115200,
+            "[baud] pace of the bytes, 0: none",
+            at_least=0,
+            at_most=4_000_000,
+        )
+        declare(self, "segment_count", 2, "M, pairs of chambers", at_least=1, at_most=16)
+        declare(self, "seed", 0, "of sensors, valves and the day's atmosphere", at_least=0)
+        declare(self, "reset_on_open", True, "opening the port restarts the board")
+        declare(
+            self, "real_time_priority", 10, "SCHED_FIFO priority, 0: none", at_least=0, at_most=90
+        )
+        declare(
+            self,
+            "faults",
+            "",
+            "comma-separated, e.g. 'stick:1,leak:2'; may be set at run time",
+            read_only=False,
+        )
+
+    def _value(self, name: str) -> object:
+        return self.get_parameter(name).value
+
+    def _parse(self, text: str) -> Faults:
+        return Faults.parse(text.split(","), self._board.pneumatics.chamber_count)
+
+    def _on_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        for parameter in parameters:
+            if parameter.name == "faults":
+                try:
+                    faults = self._parse(parameter.value)
+                except FaultError as error:
+                    return SetParametersResult(successful=False, reason=str(error))
+                self._runner.set_faults(faults)
+                self.get_logger().info(f"faults: {parameter.value or 'none'}")
+        return SetParametersResult(successful=True)
+
+    def _on_air(self, stamp: int, pressure: object) -> None:
+        self._air.append((stamp, pressure.tolist()))
+        self._guard.trigger()
+
+    def _on_command(self, command: ReceivedCommand) -> None:
+        self._commands.append(command)
+        self._guard.trigger()
+
+    def _publish(self) -> None:
+        while self._commands:
+            command = self._commands.popleft()
+            self._send(self._command_publisher, 1, command.stamp, command.pressure)
+        while self._air:
+            stamp, pressure = self._air.popleft()
+            self._send(self._air_publisher, 0, stamp, pressure)
+
+    def _send(self, publisher: object, stream: int, stamp: int, pressure: object) -> None:
+        message = ChamberPressures(sequence=self._sequences[stream], pressure=pressure)
+        message.header.stamp = stamp_from_nanoseconds(stamp)
+        self._sequences[stream] += 1
+        publisher.publish(message)
+
+    def _report(self) -> Health:
+        faults = self.get_parameter("faults").value
+        values = {
+            "port": self._port.link,
+            "host_present": self._port.host_present,
+            "commands_received": self._sequences[1],
+            "commands_rejected": self._board.protocol.rejected,
+            "faults": faults or "none",
+        }
+        if faults:
+            return Health("warning", f"emulated faults: {faults}", values)
+        return Health("ok", "regulating", values)
+
+    def _watch(self) -> None:
+        if self._runner.error is not None:
+            error = self._runner.error
+            self.fatal_error = f"the emulated board ended: {type(error).__name__}: {error}"
+
+    def close(self) -> None:
+        """Remove the port."""
+        self._runner.close()
+
+
+def main() -> int:
+    """Run the emulated board until SIGINT or SIGTERM."""
+    return run_node(BoardEmulator)

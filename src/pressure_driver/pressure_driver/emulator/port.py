@@ -1,0 +1,147 @@
+"""A pseudo-terminal that behaves as a USB serial port: a stable name, a baud rate, an unplug."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pty
+import tty
+from collections import deque
+from pathlib import Path
+
+BITS_PER_BYTE = 10
+"""Start bit, eight data bits, stop bit."""
+
+
+class EmulatedPort:
+    """The board's end of the line.
+
+    Bytes to the host leave at the baud rate; bytes from the host reach the firmware when the last
+    of them would have come over a real line.
+
+    Args:
+        link: path of the symbolic link that a driver opens.
+        baud_rate: [baud] of both directions; 0 for a line without delay.
+
+    Raises:
+        FileExistsError: something that is not a symbolic link stands at ``link``.
+    """
+
+    def __init__(self, link: str, baud_rate: int) -> None:
+        self.link = Path(link)
+        self._byte_time = round(BITS_PER_BYTE * 1e9 / baud_rate) if baud_rate else 0
+        self._master: int | None = None
+        self._outgoing = bytearray()
+        self._sent_until = 0
+        self._incoming: deque[tuple[int, int, bytes]] = deque()
+        self._line_free = 0
+        self.host_present = False
+        self.plug()
+
+    def plug(self) -> None:
+        """Appear, under the stable name."""
+        if self._master is not None:
+            return
+        if self.link.exists() and not self.link.is_symlink():
+            raise FileExistsError(
+                f"{self.link} is in the way: remove it, or set the parameter 'port_link'"
+            )
+        master, slave = pty.openpty()
+        tty.setraw(slave)
+        device = os.ttyname(slave)
+        os.close(slave)
+        os.set_blocking(master, False)
+        temporary = self.link.with_name(f"{self.link.name}.{os.getpid()}")
+        with contextlib.suppress(FileNotFoundError):
+            temporary.unlink()
+        temporary.symlink_to(device)
+        temporary.replace(self.link)
+        self._master = master
+
+    def unplug(self) -> None:
+        """Disappear, in the middle of whatever was being said."""
+        if self._master is None:
+            return
+        with contextlib.suppress(OSError):
+            self.link.unlink()
+        os.close(self._master)
+        self._master = None
+        self.host_present = False
+        self._outgoing.clear()
+        self._incoming.clear()
+
+    def watched(self) -> list[int]:
+        """Return the descriptors to wait for; empty while no host has the port open."""
+        return [self._master] if self._master is not None and self.host_present else []
+
+    def read(self, now: int) -> bool:
+        """Take what the host has sent; ``now`` in ns of the wall clock.
+
+        Returns:
+            Whether a host has just opened the port.
+        """
+        if self._master is None:
+            return False
+        was_present = self.host_present
+        try:
+            data = os.read(self._master, 4096)
+            self.host_present = True
+        except BlockingIOError:
+            self.host_present = True
+            return not was_present
+        except OSError:  # nobody has the other end open
+            self.host_present = False
+            self._outgoing.clear()
+            return False
+        first = max(now, self._line_free)
+        self._line_free = first + len(data) * self._byte_time
+        self._incoming.append((self._line_free, first, data))
+        return not was_present
+
+    def arrived(self, now: int) -> list[tuple[int, bytes]]:
+        """Return (arrival of the first byte [ns], bytes) of what the firmware can read now."""
+        ready = []
+        while self._incoming and self._incoming[0][0] <= now:
+            _, first, data = self._incoming.popleft()
+            ready.append((first, data))
+        return ready
+
+    def send(self, data: bytes) -> None:
+        """Queue bytes for the host; they are dropped while nobody listens."""
+        if self.host_present:
+            self._outgoing += data
+
+    def pump(self, now: int) -> None:
+        """Write as many queued bytes as the line has had time for."""
+        if not self._outgoing or self._master is None:
+            self._sent_until = now
+            return
+        count = len(self._outgoing)
+        if self._byte_time:
+            count = min(count, (now - self._sent_until) // self._byte_time)
+        if count <= 0:
+            return
+        try:
+            written = os.write(self._master, bytes(self._outgoing[:count]))
+        except BlockingIOError:
+            self._outgoing.clear()  # the host does not read: a real line loses bytes, too
+            return
+        except OSError:
+            self.host_present = False
+            self._outgoing.clear()
+            return
+        del self._outgoing[:written]
+        self._sent_until = max(self._sent_until + written * self._byte_time, now - 10**8)
+
+    def next_event(self, now: int) -> int:
+        """Return the time [ns] until the line needs service, if no byte comes first."""
+        waits = [20_000_000]
+        if self._incoming:
+            waits.append(self._incoming[0][0] - now)
+        if self._outgoing:
+            waits.append(2_000_000)
+        return max(0, min(waits))
+
+    def close(self) -> None:
+        """Remove the port for good."""
+        self.unplug()

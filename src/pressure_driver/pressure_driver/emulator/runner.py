@@ -1,0 +1,140 @@
+"""Runs an emulated board on its port in real time, in a thread of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pressure_driver.emulator.board import EmulatedBoard, ReceivedCommand
+from pressure_driver.emulator.faults import Faults
+from pressure_driver.emulator.port import EmulatedPort
+
+NANOSECONDS = 1_000_000_000
+TELEMETRY_PERIOD = 50_000_000
+"""[ns] 20 Hz, as boards report."""
+AIR_PERIOD = 20_000_000
+"""[ns] 50 Hz, at which chamber pressures are published."""
+
+
+class BoardRunner:
+    """Keeps the firmware, the air and the line going.
+
+    Args:
+        board: firmware and air.
+        port: the line.
+        on_air: takes the wall time [ns] and the true chamber pressures (2M,) [Pa], at 50 Hz.
+        on_command: takes each command that the board has received.
+        real_time_priority: SCHED_FIFO priority, 0 for none.
+        reset_on_open: a host that opens the port restarts the board, as on boards whose reset is
+            wired to DTR.
+    """
+
+    def __init__(
+        self,
+        board: EmulatedBoard,
+        port: EmulatedPort,
+        on_air: Callable[[int, NDArray[np.float64]], None] = lambda stamp, pressure: None,
+        on_command: Callable[[ReceivedCommand], None] = lambda command: None,
+        real_time_priority: int = 0,
+        reset_on_open: bool = True,
+    ) -> None:
+        self.board = board
+        self.port = port
+        self.error: Exception | None = None
+        self._on_air = on_air
+        self._on_command = on_command
+        self._priority = real_time_priority
+        self._reset_on_open = reset_on_open
+        self._requests: deque[Faults] = deque()
+        self._delayed: deque[tuple[int, bytes]] = deque()
+        self._replug_at: int | None = None
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="board", daemon=True)
+
+    def start(self) -> None:
+        """Power up."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Power down and remove the port."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join(2.0)
+        self.port.close()
+
+    def set_faults(self, faults: Faults) -> None:
+        """Have these faults from the next moment on, and no others. From any thread."""
+        self._requests.append(faults)
+
+    def _run(self) -> None:
+        if self._priority > 0:
+            with contextlib.suppress(OSError, PermissionError):
+                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(self._priority))
+        try:
+            self._loop()
+        except Exception as error:
+            self.error = error
+
+    def _loop(self) -> None:
+        now = time.time_ns()
+        next_telemetry, next_air, air_time = now, now, now
+        while not self._stop.is_set():
+            now = time.time_ns()
+            due = min(next_telemetry, next_air) - now
+            wait = max(0, min(due, self.port.next_event(now))) / NANOSECONDS
+            select.select(self.port.watched(), [], [], wait)
+            now = time.time_ns()
+            self._serve_line(now)
+            while self._requests:
+                self._apply(self._requests.popleft(), now)
+            if self._replug_at is not None and now >= self._replug_at:
+                self._replug_at = None
+                self.port.plug()
+            if now >= next_air or now >= next_telemetry:
+                elapsed = (now - air_time) / NANOSECONDS
+                # A wall clock that was set must not blow up the air.
+                pressure = self.board.step(min(max(elapsed, 0.0), 0.5))
+                air_time = now
+                if now >= next_air:
+                    self._on_air(now, pressure)
+                    next_air = _following(next_air, now, AIR_PERIOD)
+            if now >= next_telemetry:
+                delay = round(self.board.faults.delay * NANOSECONDS)
+                self._delayed.append((now + delay, self.board.telemetry()))
+                next_telemetry = _following(next_telemetry, now, TELEMETRY_PERIOD)
+            while self._delayed and self._delayed[0][0] <= now:
+                self.port.send(self._delayed.popleft()[1])
+
+    def _serve_line(self, now: int) -> None:
+        if self.port.read(now) and self._reset_on_open:
+            self.port.send(self.board.boot())
+        for stamp, data in self.port.arrived(now):
+            commands, answer = self.board.receive(data, stamp)
+            if answer:
+                self.port.send(answer)
+            for command in commands:
+                self._on_command(command)
+        self.port.pump(now)
+
+    def _apply(self, faults: Faults, now: int) -> None:
+        self.board.set_faults(faults)
+        if faults.unplugged:
+            self.port.unplug()
+            self._replug_at = None
+            if faults.replug_after is not None:
+                self._replug_at = now + round(faults.replug_after * NANOSECONDS)
+        else:
+            self.port.plug()
+
+
+def _following(due: int, now: int, period: int) -> int:
+    """Return the next multiple after a due one, skipping what has been missed."""
+    return due + max(1, (now - due) // period + 1) * period

@@ -1,0 +1,202 @@
+"""The ROS node of the pressure driver: parameters, topics and services around `DriverCore`."""
+
+from __future__ import annotations
+
+import gc
+import math
+import time
+from collections import deque
+
+from der_msgs.msg import PressureSetpoint, PressureState
+from limb_interfaces import qos, topics
+from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
+from limb_interfaces.parameters import ParameterError
+from limb_interfaces.runner import run_node
+from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
+from pressure_driver.core import DriverCore, Snapshot
+from pressure_driver.grid import TickGrid
+from pressure_driver.link import SerialLink
+from pressure_driver.parameters import read_parameters
+from pressure_driver.protocols import host_protocol
+from pressure_driver.safety import Mode
+from pressure_driver.schedule import Setpoint, Verdict
+from rclpy.node import Node
+from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import Trigger
+
+PASCAL_PER_HECTOPASCAL = 100.0
+
+
+class PressureDriver(Node):
+    """Plays `pressure_setpoint` on the board, publishes `pressure_state`, serves `arm` and `vent`."""
+
+    def __init__(self) -> None:
+        super().__init__("pressure_driver", namespace=topics.NAMESPACE)
+        self.fatal_error = ""
+        if self.get_parameter("use_sim_time").value:
+            raise ParameterError(
+                "parameter 'use_sim_time' is true: the driver moves air in real time; leave it out"
+            )
+        options = read_parameters(self)
+        self._options = options
+        protocol = host_protocol(options.protocol, 2 * options.core.schedule.segment_count)
+        self._ticks: deque[Snapshot] = deque(maxlen=100)
+        self._guard = self.create_guard_condition(self._publish_ticks)
+        self._core = DriverCore(
+            protocol, options.core, notify=self._on_tick, log=self._log_from_thread
+        )
+        self._link = SerialLink(
+            options.port,
+            options.baud_rate or protocol.baud_rate,
+            TickGrid(options.core.period),
+            self._core,
+            options.real_time_priority,
+            lambda text: self._log_from_thread(text, True),
+        )
+        self._state_publisher = self.create_publisher(
+            PressureState, topics.PRESSURE_STATE, qos.STATES
+        )
+        self.create_subscription(
+            PressureSetpoint, topics.PRESSURE_SETPOINT, self._on_setpoint, qos.SETPOINTS
+        )
+        if options.accept_cmd_u_t:
+            self.create_subscription(Float64MultiArray, "cmd_u_t", self._on_cmd_u_t, qos.SETPOINTS)
+        self.create_service(Trigger, "~/arm", self._on_arm)
+        self.create_service(Trigger, "~/vent", self._on_vent)
+        self._diagnostics = DiagnosticsPublisher(self, self._report, hardware_id=self._link.port)
+        self.create_timer(0.2, self._watch_link)
+        self._link.start()
+        self.get_logger().info(
+            f"{protocol.name} board on {self._link.port}: vented, waiting for `arm`"
+        )
+        gc.collect()
+        gc.freeze()  # fewer and shorter collections while the port's thread keeps time
+
+    # ------------------------------------------------------------------------------ inputs
+
+    def _on_setpoint(self, message: PressureSetpoint) -> None:
+        setpoint = Setpoint(
+            stamp=nanoseconds(message.header.stamp),
+            differential=tuple(message.differential_pressure),
+            plan_id=message.plan_id,
+            index=message.index,
+        )
+        self._offer(setpoint)
+
+    def _on_cmd_u_t(self, message: Float64MultiArray) -> None:
+        """Untimed differences in hPa, as labs publish them from MATLAB."""
+        differential = tuple(value * PASCAL_PER_HECTOPASCAL for value in message.data)
+        self._offer(Setpoint(stamp=0, differential=differential, plan_id="cmd_u_t"))
+
+    def _offer(self, setpoint: Setpoint) -> None:
+        verdict = self._core.offer(setpoint, time.time_ns())
+        if verdict is not Verdict.ACCEPTED:
+            self.get_logger().warning(
+                f"{verdict.value}: {self._core.last_refusal}", throttle_duration_sec=1.0
+            )
+
+    def _on_arm(self, _: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
+        answer.success, answer.message = self._core.arm()
+        return answer
+
+    def _on_vent(self, _: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
+        answer.success, answer.message = self._core.vent()
+        self._link.urge()
+        return answer
+
+    # ----------------------------------------------------------------------------- outputs
+
+    def _on_tick(self) -> None:
+        """Hand a picture of the tick to the executor; runs in the port's thread."""
+        self._ticks.append(self._core.snapshot())
+        self._guard.trigger()
+
+    def _publish_ticks(self) -> None:
+        while self._ticks:
+            self._state_publisher.publish(self._state_message(self._ticks.popleft()))
+
+    def _state_message(self, snapshot: Snapshot) -> PressureState:
+        message = PressureState(
+            mode=int(snapshot.mode),
+            faults=list(snapshot.faults),
+            commanded_differential=snapshot.commanded_differential,
+            measured_differential=snapshot.measured_differential,
+            commanded_chamber=snapshot.commanded_chamber,
+            measured_chamber=snapshot.measured_chamber,
+            valve_opening=snapshot.valve_opening,
+            supply_pressure=snapshot.supply_pressure,
+            telemetry_age=snapshot.telemetry_age,
+            round_trip=snapshot.round_trip,
+            setpoints_accepted=snapshot.counters.accepted,
+            setpoints_executed=snapshot.counters.executed,
+            setpoints_late=snapshot.counters.late,
+            setpoints_duplicate=snapshot.counters.duplicate,
+            setpoints_refused=snapshot.counters.refused,
+            bytes_sent=self._link.bytes_sent,
+            bytes_received=self._link.bytes_received,
+        )
+        message.header.stamp = stamp_from_nanoseconds(snapshot.tick)
+        message.header.frame_id = topics.BASE_FRAME
+        if snapshot.setpoint is not None:
+            message.plan_id = snapshot.setpoint.plan_id
+            message.index = snapshot.setpoint.index
+            message.setpoint_stamp = stamp_from_nanoseconds(snapshot.setpoint.stamp)
+        return message
+
+    def _report(self) -> Health:
+        snapshot = self._core.snapshot()
+        obstacles = self._core.obstacles()
+        protocol = self._core.protocol
+        values: dict[str, object] = {
+            "mode": snapshot.mode.name,
+            "faults": "; ".join(snapshot.faults) or "none",
+            "obstacles_to_arming": "; ".join(obstacles) or "none",
+            "last_refusal": self._core.last_refusal or "none",
+            "protocol": protocol.name,
+            "protocol_weaknesses": "; ".join(protocol.weaknesses) or "none",
+            "atmosphere_pa": f"{self._core.atmosphere:.0f}",
+            "telemetry_age_s": f"{snapshot.telemetry_age:.3f}",
+            "round_trip_s": f"{snapshot.round_trip:.4f}",
+            "damaged_frames": protocol.rejected,
+            "setpoints_waiting": self._core.waiting,
+            "setpoints_superseded": snapshot.counters.superseded,
+            "ticks_missed": self._link.grid.missed,
+            "clock_steps": self._link.grid.clock_steps,
+            "reconnects": self._link.reconnects,
+            "real_time_priority": self._link.real_time,
+        }
+        level, text = self._judge(snapshot, obstacles)
+        return Health(level, text, values)
+
+    def _judge(self, snapshot: Snapshot, obstacles: list[str]) -> tuple[str, str]:
+        """Return the level and the sentence of the diagnostics."""
+        weaknesses = self._core.protocol.weaknesses
+        if snapshot.mode is Mode.FAULT:
+            return "error", "FAULT: " + "; ".join(snapshot.faults)
+        if snapshot.mode is Mode.DISARMED and obstacles:
+            waiting = not math.isfinite(self._core.atmosphere)
+            return ("stale" if waiting else "error"), "waiting for: " + "; ".join(obstacles)
+        if weaknesses:
+            return "warning", f"{snapshot.mode.name}; {self._core.protocol.name}: " + weaknesses[0]
+        return "ok", snapshot.mode.name
+
+    def _watch_link(self) -> None:
+        if self._link.error is not None:
+            error = self._link.error
+            self.fatal_error = f"the serial thread ended: {type(error).__name__}: {error}"
+
+    def _log_from_thread(self, text: str, warning: bool) -> None:
+        logger = self.get_logger()
+        (logger.warning if warning else logger.info)(text)
+
+    def close(self) -> None:
+        """Vent the board and release the port."""
+        self._core.vent()
+        if not self._link.close():
+            raise RuntimeError(f"the thread of {self._link.port} did not end; check the valves")
+        self.get_logger().info("vented and closed")
+
+
+def main() -> int:
+    """Run the driver until SIGINT or SIGTERM; the board is vented whatever ends it."""
+    return run_node(PressureDriver)

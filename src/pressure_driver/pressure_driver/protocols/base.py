@@ -1,0 +1,179 @@
+"""What every board protocol offers to the two ends of the line.
+
+Decoders take any split of the byte stream, throw nothing, and count what they had to reject.
+Pressures are in Pa on this side of a protocol, whatever unit the wire carries.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+
+@dataclass(frozen=True)
+class Telemetry:
+    """What a board has measured; None where this message says nothing about it."""
+
+    chamber_pressure: tuple[float, ...] | None = None
+    """(2M,) [Pa] absolute, as the board's sensors read."""
+    valve_opening: tuple[float, ...] | None = None
+    """(2M,) 0 … 1."""
+    supply_pressure: float | None = None
+    """[Pa] absolute, of the reservoir."""
+
+
+@dataclass(frozen=True)
+class Echo:
+    """The board repeats that it has received a command."""
+
+    sequence: int | None = None
+    """Number of the command; None where the protocol has no numbers: the oldest not yet echoed."""
+
+
+@dataclass(frozen=True)
+class BoardReport:
+    """The board says that it is in trouble, or that it has acted on its own."""
+
+    text: str
+    fatal: bool
+
+
+@dataclass(frozen=True)
+class BoardText:
+    """Free text of the board: boot messages, warnings."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class BoardIdentity:
+    """What the board says of itself when asked."""
+
+    chamber_count: int
+    smallest_pressure: float
+    """[Pa] gauge."""
+    largest_pressure: float
+    """[Pa] gauge."""
+    firmware: str
+
+
+Event = Telemetry | Echo | BoardReport | BoardText | BoardIdentity
+
+
+class HostProtocol(ABC):
+    """The driver's end: encodes commands, decodes what the board says.
+
+    Args:
+        chamber_count: 2M, even.
+
+    Raises:
+        ValueError: the protocol cannot serve so many chambers.
+    """
+
+    name: ClassVar[str]
+    baud_rate: ClassVar[int] = 115200
+    weaknesses: ClassVar[tuple[str, ...]] = ()
+    """What the protocol cannot protect from; shown in the diagnostics."""
+    reports_supply: ClassVar[bool] = False
+    has_watchdog: ClassVar[bool] = False
+
+    def __init__(self, chamber_count: int = 4) -> None:
+        if chamber_count < 2 or chamber_count % 2:
+            raise ValueError(f"chamber_count must be even and positive, got {chamber_count}")
+        self.chamber_count = chamber_count
+        self.rejected = 0
+        """Frames or lines that were damaged and thrown away."""
+
+    @abstractmethod
+    def start(self) -> bytes:
+        """Return what a board must be sent after the port has opened."""
+
+    @abstractmethod
+    def setpoint(
+        self, differential: Sequence[float], atmosphere: float, valid_for: float
+    ) -> tuple[bytes, int | None]:
+        """Encode one command.
+
+        Args:
+            differential: (M,) [Pa]; positive fills the even chamber of the pair.
+            atmosphere: [Pa] absolute, to add where the wire wants absolute pressures.
+            valid_for: [s] after which a board with a watchdog vents by itself.
+
+        Returns:
+            The bytes, and the number that the board's echo will carry (None: it has no numbers).
+        """
+
+    @abstractmethod
+    def vent(self, atmosphere: float) -> tuple[bytes, int | None]:
+        """Encode the command that opens every chamber to the atmosphere."""
+
+    @abstractmethod
+    def decode(self, data: bytes) -> list[Event]:
+        """Take the next bytes of the stream and return what became complete. Never raises."""
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Forget half-received bytes, as after a reconnect."""
+
+
+@dataclass(frozen=True)
+class BoardCommand:
+    """A command as the board understood it."""
+
+    kind: str
+    """``setpoint``, ``vent``, ``hello`` or another word of the protocol."""
+    first_byte: int
+    """Place of its first byte in the stream, counted from 0."""
+    pressure: tuple[float, ...] | None = None
+    """(2M,) [Pa] as sent: absolute or gauge after the protocol's ``gauge``."""
+    valid_for: float | None = None
+    """[s] after which the board vents by itself."""
+    sequence: int | None = None
+    text: str = ""
+
+
+@dataclass(frozen=True)
+class BoardReading:
+    """What the firmware tells at one instant."""
+
+    time: float
+    """[s] since boot."""
+    chamber_pressure: tuple[float, ...]
+    """(2M,) [Pa] absolute, with the sensors' errors."""
+    atmosphere: float
+    """[Pa] that the board took for the room's when it booted."""
+    valve_opening: tuple[float, ...]
+    supply_pressure: float
+    last_sequence: int = 0
+    vented: bool = True
+
+
+class BoardProtocol(ABC):
+    """The firmware's end, for emulators and tests of firmware."""
+
+    gauge: ClassVar[bool] = False
+    """Whether the wire carries pressures above the atmosphere."""
+    pairwise: ClassVar[bool] = False
+    """Whether the board reads a pair of pressures as a difference."""
+
+    def __init__(self, chamber_count: int = 4) -> None:
+        self.chamber_count = chamber_count
+        self.rejected = 0
+
+    def boot(self, atmosphere: float) -> bytes:  # noqa: ARG002 - most boards say nothing
+        """Return what the board says after power-up."""
+        return b""
+
+    @abstractmethod
+    def decode(self, data: bytes) -> list[BoardCommand]:
+        """Take the next bytes from the host and return the commands that became complete."""
+
+    @abstractmethod
+    def telemetry(self, reading: BoardReading) -> bytes:
+        """Return the bytes of one telemetry report."""
+
+    def reply(self, command: BoardCommand, reading: BoardReading) -> bytes:  # noqa: ARG002
+        """Return what the board answers to a command at once."""
+        return b""

@@ -1,0 +1,198 @@
+"""The lab's four-chamber board: ASCII lines at 115200 baud, absolute pressures in hPa.
+
+To the board, up to 20 times a second::
+
+    <1013.25,1088.25,1013.25,1013.25>\\n
+
+The board takes each pair as a difference: it vents the smaller of the two and holds its own
+atmosphere plus the difference in the other. A command with a value above 1250 hPa is ignored whole.
+From the board at 20 Hz::
+
+    [MPR]: 1013.31 1013.02 1014.55 1013.90     chambers, hPa absolute
+    [RPR]: 1401.22                             reservoir, hPa absolute
+    [VAL]: 0.00 0.31 0.00 0.12                 inlet valves, 0 … 1
+
+and free text while it boots (about 12 s after the port has opened, since opening resets it). There
+is no checksum, no echo and no watchdog: it holds the last pressures for ever.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+
+from pressure_driver.protocols.base import (
+    BoardCommand,
+    BoardProtocol,
+    BoardReading,
+    BoardText,
+    Event,
+    HostProtocol,
+    Telemetry,
+)
+from pressure_driver.protocols.lines import LineSplitter
+
+PASCAL_PER_HECTOPASCAL = 100.0
+LARGEST_WIRE_VALUE = 1250.0
+"""[hPa] The board ignores a command that has more."""
+PLAUSIBLE_PRESSURE = (300.0, 4000.0)
+"""[hPa] A chamber or reservoir reading outside is a damaged line."""
+
+_NUMBER = re.compile(r"-?\d{1,6}(?:\.\d{1,6})?")
+
+
+def _numbers(text: str, separator: str | None) -> list[float] | None:
+    """Return the numbers of a list, or None if one of them is not a plain decimal."""
+    parts = text.split(separator)
+    if not all(_NUMBER.fullmatch(part) for part in parts):
+        return None
+    return [float(part) for part in parts]
+
+
+class EzloopHost(HostProtocol):
+    """The driver's end of ``ezloop``."""
+
+    name = "ezloop"
+    weaknesses = (
+        "no watchdog: if this computer dies, the board keeps the last pressures",
+        "no checksum: a damaged number can pass for a pressure",
+    )
+    reports_supply = True
+
+    def __init__(self, chamber_count: int = 4) -> None:
+        super().__init__(chamber_count)
+        self._lines = LineSplitter()
+        self._malformed = 0
+
+    def start(self) -> bytes:
+        """A line end, which finishes whatever an earlier program left half-sent."""
+        return b"\n"
+
+    def setpoint(
+        self,
+        differential: Sequence[float],
+        atmosphere: float,
+        valid_for: float,  # noqa: ARG002 - the board has no watchdog
+    ) -> tuple[bytes, int | None]:
+        """Encode differences as pairs of absolute pressures, to 1 Pa.
+
+        A pair that would pass 1250 hPa is sent lower as a pair: the board only reads differences.
+
+        Raises:
+            ValueError: wrong number of segments, or a difference that the wire cannot carry.
+        """
+        if 2 * len(differential) != self.chamber_count:
+            raise ValueError(
+                f"expected {self.chamber_count // 2} differences, got {len(differential)}"
+            )
+        values: list[float] = []
+        for difference in differential:
+            size = abs(difference) / PASCAL_PER_HECTOPASCAL
+            if not size < LARGEST_WIRE_VALUE / 2:
+                raise ValueError(f"a difference of {difference} Pa does not fit an ezloop command")
+            low = min(atmosphere / PASCAL_PER_HECTOPASCAL, LARGEST_WIRE_VALUE - size)
+            low = math.floor(low * 100.0) / 100.0
+            high = low + round(size, 2)
+            values += [high, low] if difference >= 0.0 else [low, high]
+        return ("<" + ",".join(f"{value:.2f}" for value in values) + ">\n").encode(), None
+
+    def vent(self, atmosphere: float) -> tuple[bytes, int | None]:
+        """Equal pressures in every pair: the board opens both chambers."""
+        return self.setpoint([0.0] * (self.chamber_count // 2), atmosphere, 0.0)
+
+    def decode(self, data: bytes) -> list[Event]:
+        """Return telemetry and free text; damaged lines are counted in ``rejected``."""
+        events: list[Event] = []
+        for _, line in self._lines.feed(data):
+            event = self._parse(line)
+            if event is None:
+                self._malformed += 1
+            else:
+                events.append(event)
+        self.rejected = self._malformed + self._lines.damaged
+        return events
+
+    def _parse(self, line: str) -> Event | None:
+        tag, separator, rest = line.partition(":")
+        if not separator or tag not in ("[MPR]", "[RPR]", "[VAL]"):
+            # A line with a bracket, or of digits only, is the rest of a damaged report.
+            damaged = "[" in line or "]" in line or not any(c.isalpha() for c in line)
+            return None if damaged else BoardText(line)
+        values = _numbers(rest.strip(), None)
+        if values is None:
+            return None
+        low, high = PLAUSIBLE_PRESSURE
+        if tag == "[VAL]":
+            if len(values) != self.chamber_count or not all(0.0 <= v <= 1.0 for v in values):
+                return None
+            return Telemetry(valve_opening=tuple(values))
+        if not all(low <= value <= high for value in values):
+            return None
+        pascals = tuple(value * PASCAL_PER_HECTOPASCAL for value in values)
+        if tag == "[RPR]":
+            return Telemetry(supply_pressure=pascals[0]) if len(values) == 1 else None
+        return Telemetry(chamber_pressure=pascals) if len(values) == self.chamber_count else None
+
+    def reset(self) -> None:
+        """Forget a half-received line."""
+        self._lines.reset()
+
+
+class EzloopBoard(BoardProtocol):
+    """The firmware's end of ``ezloop``."""
+
+    pairwise = True
+    _BUFFER = 200
+
+    def __init__(self, chamber_count: int = 4) -> None:
+        super().__init__(chamber_count)
+        self._position = 0
+        self._start = 0
+        self._body: bytearray | None = None
+
+    def boot(self, atmosphere: float) -> bytes:
+        """Free text, as boards print it while they start."""
+        return (
+            f"valve board, {self.chamber_count} chambers\r\n"
+            f"room pressure {atmosphere / PASCAL_PER_HECTOPASCAL:.2f} hPa\r\nready\r\n"
+        ).encode()
+
+    def decode(self, data: bytes) -> list[BoardCommand]:
+        """Return what stands between ``<`` and ``>``, if it is a list of admissible numbers."""
+        commands: list[BoardCommand] = []
+        for byte in data:
+            if byte == ord("<"):
+                if self._body is not None:
+                    self.rejected += 1
+                self._start, self._body = self._position, bytearray()
+            elif byte == ord(">") and self._body is not None:
+                command = self._parse(self._body.decode("latin-1"))
+                if command is None:
+                    self.rejected += 1
+                else:
+                    commands.append(command)
+                self._body = None
+            elif self._body is not None:
+                self._body.append(byte)
+                if len(self._body) > self._BUFFER:
+                    self.rejected += 1
+                    self._body = None
+            self._position += 1
+        return commands
+
+    def _parse(self, body: str) -> BoardCommand | None:
+        values = _numbers(body, ",")
+        if values is None or len(values) != self.chamber_count:
+            return None
+        if any(value > LARGEST_WIRE_VALUE for value in values):
+            return None
+        pressure = tuple(value * PASCAL_PER_HECTOPASCAL for value in values)
+        return BoardCommand("setpoint", self._start, pressure=pressure)
+
+    def telemetry(self, reading: BoardReading) -> bytes:
+        """Three lines: chambers, reservoir, valves."""
+        chambers = " ".join(f"{p / PASCAL_PER_HECTOPASCAL:.2f}" for p in reading.chamber_pressure)
+        valves = " ".join(f"{v:.2f}" for v in reading.valve_opening)
+        supply = reading.supply_pressure / PASCAL_PER_HECTOPASCAL
+        return f"[MPR]: {chambers}\r\n[RPR]: {supply:.2f}\r\n[VAL]: {valves}\r\n".encode()

@@ -1,0 +1,266 @@
+"""Timed setpoints: which differential pressures are in force at an instant.
+
+The clock is whatever the caller passes in as nanoseconds. A setpoint takes effect at the first tick
+at or after its stamp.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+
+NANOSECONDS = 1_000_000_000
+
+
+class Verdict(Enum):
+    """What became of an offered setpoint."""
+
+    ACCEPTED = "accepted"
+    LATE = "late"
+    DUPLICATE = "duplicate"
+    REFUSED = "refused"
+
+
+@dataclass(frozen=True)
+class Setpoint:
+    """Differential pressures and the instant at which they take effect."""
+
+    stamp: int
+    """[ns] of the wall clock."""
+    differential: tuple[float, ...]
+    """(M,) [Pa]."""
+    plan_id: str = ""
+    index: int = 0
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What the schedule asks for at one tick."""
+
+    setpoint: Setpoint
+    """The one in force."""
+    differential: tuple[float, ...]
+    """(M,) [Pa] its pressures, or interpolated toward the next."""
+    fresh: bool
+    """The setpoint came into force at this tick, or the value moves toward the next."""
+
+
+@dataclass
+class Counters:
+    """What happened to setpoints since the start."""
+
+    accepted: int = 0
+    executed: int = 0
+    late: int = 0
+    duplicate: int = 0
+    refused: int = 0
+    superseded: int = 0
+    """Accepted, but replaced by a new plan or by a later one within the same tick."""
+
+
+@dataclass(frozen=True)
+class ScheduleLimits:
+    """What a setpoint must keep to."""
+
+    segment_count: int = 2
+    pressure_limit: float = 24_000.0
+    """[Pa] largest differential pressure."""
+    slew_limit: float = 200_000.0
+    """[Pa/s] between one setpoint and the next."""
+    horizon: float = 10.0
+    """[s] a stamp may lie ahead."""
+    capacity: int = 4096
+    """Setpoints that may wait."""
+
+
+@dataclass
+class Schedule:
+    """A buffer of timed setpoints with zero-order hold or linear interpolation.
+
+    Args:
+        limits: that every setpoint is checked against.
+        period: [ns] of the ticks.
+        interpolate: move linearly from one setpoint to the next instead of holding.
+    """
+
+    limits: ScheduleLimits
+    period: int = 50_000_000
+    interpolate: bool = False
+    counters: Counters = field(default_factory=Counters)
+    reason: str = ""
+    """Why the last setpoint that was not accepted was not."""
+
+    def __post_init__(self) -> None:
+        self._waiting: list[Setpoint] = []
+        self._current: Setpoint | None = None
+        self._last_tick = -(2**62)
+        self._replaced: set[str] = set()
+
+    @property
+    def waiting(self) -> int:
+        """How many setpoints have not come into force yet."""
+        return len(self._waiting)
+
+    @property
+    def current(self) -> Setpoint | None:
+        """The setpoint in force."""
+        return self._current
+
+    def clear(self) -> None:
+        """Forget everything that waits and what is in force."""
+        self._waiting.clear()
+        self._current = None
+        self._replaced.clear()
+
+    def offer(self, setpoint: Setpoint, now: int, held: Sequence[float]) -> Verdict:
+        """Check a setpoint and keep it until its stamp.
+
+        Args:
+            setpoint: stamp 0 means now.
+            now: [ns] wall clock.
+            held: (M,) [Pa] in force at present, from which the slew of a first one is taken.
+
+        Returns:
+            What became of it; `reason` says why unless it was accepted.
+        """
+        verdict, reason = self._judge(setpoint, now, held)
+        if verdict is Verdict.ACCEPTED:
+            self.counters.accepted += 1
+            return verdict
+        self.reason = reason
+        if verdict is Verdict.LATE:
+            self.counters.late += 1
+        elif verdict is Verdict.DUPLICATE:
+            self.counters.duplicate += 1
+        else:
+            self.counters.refused += 1
+        return verdict
+
+    def refuse(self, reason: str) -> Verdict:
+        """Count a setpoint that was refused for a reason outside the schedule."""
+        self.counters.refused += 1
+        self.reason = reason
+        return Verdict.REFUSED
+
+    def _judge(self, setpoint: Setpoint, now: int, held: Sequence[float]) -> tuple[Verdict, str]:
+        label = f"setpoint {setpoint.index}" + (
+            f" of '{setpoint.plan_id}'" if setpoint.plan_id else ""
+        )
+        if problem := self._value_problem(setpoint):
+            return Verdict.REFUSED, f"{label}: {problem}"
+        if setpoint.stamp == 0:
+            # "Now" is the next tick, whatever the grid has already done.
+            stamp = max(self._tick_of(now), self._last_tick + self.period)
+            setpoint = Setpoint(stamp, setpoint.differential, setpoint.plan_id, setpoint.index)
+        ahead = (setpoint.stamp - now) / NANOSECONDS
+        if ahead > self.limits.horizon:
+            return Verdict.REFUSED, (
+                f"{label}: {ahead:.2f} s ahead, the limit is {self.limits.horizon:g} s"
+            )
+        if self._tick_of(setpoint.stamp) <= self._last_tick:
+            return Verdict.LATE, f"{label}: came {-ahead * 1000:.1f} ms after its stamp"
+        return self._insert(setpoint, label, held)
+
+    def _value_problem(self, setpoint: Setpoint) -> str:
+        values = setpoint.differential
+        if len(values) != self.limits.segment_count:
+            return f"has {len(values)} pressures, expected {self.limits.segment_count}"
+        if not all(math.isfinite(value) for value in values):
+            return f"is not finite: {list(values)}"
+        worst = max(values, key=abs)
+        if abs(worst) > self.limits.pressure_limit:
+            return f"asks for {worst:.0f} Pa, the limit is ±{self.limits.pressure_limit:.0f} Pa"
+        return ""
+
+    def _insert(self, setpoint: Setpoint, label: str, held: Sequence[float]) -> tuple[Verdict, str]:
+        place = bisect.bisect_left(self._waiting, setpoint.stamp, key=lambda s: s.stamp)
+        same_stamp = place < len(self._waiting) and self._waiting[place].stamp == setpoint.stamp
+        replaces = not self._belongs(setpoint)
+        if not replaces:
+            if same_stamp:
+                return Verdict.DUPLICATE, f"{label}: another one has the same stamp"
+            current = self._current
+            if current is not None and current.stamp == setpoint.stamp:
+                return Verdict.DUPLICATE, f"{label}: already executed"
+        if setpoint.plan_id in self._replaced:
+            return Verdict.REFUSED, f"{label}: this plan has been replaced by a newer one"
+        if len(self._waiting) >= self.limits.capacity and not replaces:
+            return Verdict.REFUSED, f"{label}: {len(self._waiting)} setpoints are waiting already"
+        before = self._waiting[place - 1] if place else None
+        after = None if replaces or place >= len(self._waiting) else self._waiting[place]
+        if problem := self._slew_problem(before, setpoint, held) or (
+            self._slew_problem(setpoint, after, held) if after else ""
+        ):
+            return Verdict.REFUSED, f"{label}: {problem}"
+        if replaces:
+            self._replace_from(place)
+        self._waiting.insert(place, setpoint)
+        return Verdict.ACCEPTED, ""
+
+    def _replace_from(self, place: int) -> None:
+        """Drop what an older plan had from this place on, and let it say no more."""
+        newest = self._waiting[-1] if self._waiting else self._current
+        self.counters.superseded += len(self._waiting) - place
+        del self._waiting[place:]
+        if newest is not None and newest.plan_id:
+            self._replaced.add(newest.plan_id)
+
+    def _belongs(self, setpoint: Setpoint) -> bool:
+        """Tell whether the newest known setpoint is of the same plan."""
+        newest = self._waiting[-1] if self._waiting else self._current
+        return newest is None or newest.plan_id == setpoint.plan_id
+
+    def _slew_problem(self, before: Setpoint | None, after: Setpoint, held: Sequence[float]) -> str:
+        if before is None:
+            reference, gap = held, self.period
+            if self._current is not None:
+                gap = max(after.stamp - self._current.stamp, self.period)
+                gap = min(gap, 2 * self.period)
+        else:
+            reference, gap = before.differential, after.stamp - before.stamp
+        duration = max(gap, self.period) / NANOSECONDS
+        slew = max(abs(a - b) for a, b in zip(after.differential, reference, strict=True))
+        slew /= duration
+        if slew > self.limits.slew_limit * (1.0 + 1e-9):
+            return f"changes by {slew:.0f} Pa/s, the limit is {self.limits.slew_limit:.0f} Pa/s"
+        return ""
+
+    def _tick_of(self, stamp: int) -> int:
+        """Return the first tick at or after a stamp."""
+        return -(-stamp // self.period) * self.period
+
+    def sample(self, tick: int) -> Sample | None:
+        """Bring into force what is due at a tick.
+
+        Args:
+            tick: [ns]; ticks must not go backward (see `forget_ticks`).
+
+        Returns:
+            What to command, or None before the first setpoint.
+        """
+        self._last_tick = max(self._last_tick, tick)
+        due = bisect.bisect_right(self._waiting, tick, key=lambda s: s.stamp)
+        if due:
+            self._current = self._waiting[due - 1]
+            del self._waiting[:due]
+            self.counters.executed += 1
+            self.counters.superseded += due - 1
+        current = self._current
+        if current is None:
+            return None
+        if not (self.interpolate and self._waiting):
+            return Sample(current, current.differential, fresh=bool(due))
+        following = self._waiting[0]
+        share = (tick - current.stamp) / (following.stamp - current.stamp)
+        moved = tuple(
+            a + share * (b - a)
+            for a, b in zip(current.differential, following.differential, strict=True)
+        )
+        return Sample(current, moved, fresh=True)
+
+    def forget_ticks(self) -> None:
+        """Accept earlier stamps again, as after the wall clock was set back."""
+        self._last_tick = -(2**62)
