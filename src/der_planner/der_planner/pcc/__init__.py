@@ -1,1 +1,5 @@
-"""The piecewise-constant-curvature baseline."""
+"""The piecewise-constant-curvature baseline: kinematics and dynamics of n segments."""
+
+from der_planner.pcc.model import Pcc
+
+__all__ = ["Pcc"]

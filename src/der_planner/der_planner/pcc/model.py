@@ -1,0 +1,225 @@
+"""The piecewise-constant-curvature limb: kinematics, exact dynamics and its inverse.
+
+Each segment is one circular arc with one bend angle; the mass is spread over the arc (or lumped at the
+end of each segment, as parts of the literature do). The equation of motion is
+
+    M(q) q̈ + (C(q, q̇) + D(q)) q̇ + K (q − q_rest) = G u + Q_gravity
+
+with q the (n,) bend angles [rad], u the (n,) differential pressures [Pa] and G the moment gains.
+Damping is the same physical damping as the rod's: mass-proportional per segment, ∫ c μ JᵀJ ds, plus
+Kelvin-Voigt in the stiffness.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from der_planner.limb import Limb
+from der_planner.pcc import kernels
+
+Vector = NDArray[np.float64]
+MassModel = Literal["distributed", "lumped"]
+
+QUADRATURE_POINTS = 8
+"""Gauss-Legendre points a segment: exact to rounding for bends below 180 degrees."""
+SUBSTEP = 0.005
+
+
+class Pcc:
+    """A limb of n constant-curvature segments.
+
+    Args:
+        limb: the physical parameters; the same file as the rod's.
+        mass: ``distributed`` along the arcs, or ``lumped`` at the end of each segment.
+
+    Raises:
+        ValueError: unknown mass model.
+    """
+
+    def __init__(self, limb: Limb, mass: MassModel = "distributed") -> None:
+        segments = limb.segments
+        self.limb = limb
+        self.segment_count = limb.segment_count
+        self.lengths = np.array([s.length for s in segments])
+        self.connector = float(limb.connector_length)
+        self.masses = np.array([s.mass_per_length * s.length for s in segments])
+        self.damping = np.array([s.damping for s in segments])
+        self.stiffness = np.array([s.bending_stiffness / s.length for s in segments])
+        self.cubic = np.array([s.cubic_stiffness / s.length**3 for s in segments])
+        self.rest = np.array([s.rest_curvature * s.length for s in segments])
+        self.material_damping = np.array([s.material_damping for s in segments])
+        self.gain = np.array([s.moment_gain for s in segments])
+        self.gravity = np.array(limb.gravity[:2], dtype=float)
+        if mass == "distributed":
+            nodes, weights = np.polynomial.legendre.leggauss(QUADRATURE_POINTS)
+            self.fractions, self.weights = (nodes + 1) / 2, weights / 2
+        elif mass == "lumped":
+            self.fractions, self.weights = np.ones(1), np.ones(1)
+        else:
+            raise ValueError(f"mass must be 'distributed' or 'lumped', got {mass!r}")
+
+    def _check(self, name: str, value: ArrayLike) -> Vector:
+        array = np.asarray(value, dtype=float)
+        if array.shape != (self.segment_count,) or not np.all(np.isfinite(array)):
+            raise ValueError(
+                f"{name} must be {self.segment_count} finite numbers, one a segment, got {value!r}"
+            )
+        return array
+
+    def tip(self, bend_angles: ArrayLike) -> Vector:
+        """Return the tip (..., 2) [m] for bend angles (..., n) [rad]."""
+        angles = np.asarray(bend_angles, dtype=float)
+        position = np.zeros(angles.shape[:-1], dtype=complex)
+        heading = np.ones(angles.shape[:-1], dtype=complex)
+        for j in range(self.segment_count):
+            if j:
+                position = position + heading * self.connector
+            position = position + heading * self.lengths[j] * _arc(angles[..., j])
+            heading = heading * np.exp(1j * angles[..., j])
+        return np.stack([position.real, position.imag], axis=-1)
+
+    def tip_jacobian(self, bend_angles: ArrayLike) -> Vector:
+        """Return ∂tip/∂bend angles (2, n) [m/rad] at one configuration (n,) [rad]."""
+        q = self._check("bend_angles", bend_angles)
+        J = np.zeros(q.size, dtype=complex)
+        H = np.zeros((q.size, q.size), dtype=complex)
+        last = self.segment_count - 1
+        kernels.point_derivatives(q, self.lengths, self.connector, last, 1.0, J, H)
+        return np.stack([J.real, J.imag])
+
+    def curve(self, bend_angles: ArrayLike, points_per_segment: int = 12) -> Vector:
+        """Return points (P, 2) [m] of the centreline from clamp to tip for one configuration."""
+        q = self._check("bend_angles", bend_angles)
+        position, heading = 0j, 1 + 0j
+        points = [position]
+        for j, angle in enumerate(q):
+            if j:
+                position += heading * self.connector
+                points.append(position)
+            for fraction in np.arange(1, points_per_segment + 1) / points_per_segment:
+                arc = fraction * _arc(np.array(fraction * angle))
+                points.append(complex(position + heading * self.lengths[j] * arc))
+            position = points[-1]
+            heading *= np.exp(1j * angle)
+        line = np.array(points)
+        return np.column_stack([line.real, line.imag])
+
+    def matrices(self, bend_angles: ArrayLike, rates: ArrayLike) -> tuple[Vector, Vector, Vector]:
+        """Return inertia M, Coriolis C and damping D, each (n, n), with Ṁ = C + Cᵀ.
+
+        Args:
+            bend_angles: (n,) [rad].
+            rates: (n,) [rad/s].
+        """
+        M, C, D, _ = self._inertia(self._check("bend_angles", bend_angles), np.asarray(rates))
+        return M, C, D + np.diag(self.stiffness * self.material_damping)
+
+    def _inertia(self, q: Vector, v: Vector) -> tuple[Vector, Vector, Vector, Vector]:
+        result: tuple[Vector, Vector, Vector, Vector] = kernels.inertia(
+            q, v, self.lengths, self.connector, self.masses, self.damping, self.gravity,
+            self.fractions, self.weights,
+        )  # fmt: skip
+        return result
+
+    def elastic_torque(self, bend_angles: ArrayLike) -> Vector:
+        """Return the elastic torque (..., n) [N·m] that opposes bend angles (..., n) [rad]."""
+        bend = np.asarray(bend_angles, dtype=float) - self.rest
+        torque: Vector = self.stiffness * bend + self.cubic * bend**3
+        return torque
+
+    def energy(self, bend_angles: ArrayLike, rates: ArrayLike) -> float:
+        """Return kinetic plus elastic plus gravity's potential energy [J]."""
+        q, v = self._check("bend_angles", bend_angles), self._check("rates", rates)
+        M = self._inertia(q, v)[0]
+        bend = q - self.rest
+        elastic = 0.5 * self.stiffness @ bend**2 + 0.25 * self.cubic @ bend**4
+        potential = 0.0
+        J, H = np.zeros(q.size, dtype=complex), np.zeros((q.size, q.size), dtype=complex)
+        for j, mass in enumerate(self.masses):
+            for sigma, weight in zip(self.fractions, self.weights, strict=True):
+                point = kernels.point_derivatives(
+                    q, self.lengths, self.connector, j, sigma, J, H
+                )
+                height = point.real * self.gravity[0] + point.imag * self.gravity[1]
+                potential -= mass * weight * height
+        return float(0.5 * v @ M @ v + elastic + potential)
+
+    def pressures(self, angles: ArrayLike, rates: ArrayLike, accelerations: ArrayLike) -> Vector:
+        """Invert the dynamics: u = Λ† τ with τ = M q̈ + (C + D) q̇ + K (q − q_rest) − Q_gravity.
+
+        Args:
+            angles, rates, accelerations: (K, n) in rad, rad/s and rad/s².
+
+        Returns:
+            (K, n) differential pressures [Pa].
+        """
+        q, v, a = (np.atleast_2d(np.asarray(x, dtype=float)) for x in (angles, rates, accelerations))
+        torque = self.elastic_torque(q) + self.stiffness * self.material_damping * v
+        for k in range(len(q)):
+            M, C, D, weight = self._inertia(q[k], v[k])
+            torque[k] += M @ a[k] + (C + D) @ v[k] - weight
+        pressures: Vector = torque / self.gain
+        return pressures
+
+    def simulate(
+        self,
+        command: ArrayLike,
+        period: float,
+        angles: ArrayLike | None = None,
+        rates: ArrayLike | None = None,
+        chamber: ArrayLike | None = None,
+        time_constant: float | None = None,
+        substep: float = SUBSTEP,
+    ) -> tuple[Vector, Vector, Vector]:
+        """Roll the model forward under held commands, with the chambers' lag.
+
+        Args:
+            command: (K, n) differential pressures [Pa], each held for ``period`` [s].
+            angles, rates, chamber: state at the first command; at rest and vented if None.
+            time_constant: of the chambers [s]; the limb file's if None, tiny for none.
+            substep: of the integrator [s].
+
+        Returns:
+            Angles [rad], rates [rad/s] and chamber pressures [Pa], each (K, n), at the start of
+            each command.
+        """
+        lag = self.limb.pneumatics.time_constant if time_constant is None else time_constant
+        zero = np.zeros(self.segment_count)
+        result: tuple[Vector, Vector, Vector] = kernels.simulate(
+            self._check("angles", self.rest if angles is None else angles),
+            self._check("rates", zero if rates is None else rates),
+            self._check("chamber", zero if chamber is None else chamber),
+            np.ascontiguousarray(command, dtype=float),
+            period,
+            max(1, round(period / substep)),
+            max(lag, 1e-9),
+            self.limb.pneumatics.fill_rate,
+            self.gain,
+            **self._parameters(),
+        )
+        return result
+
+    def _parameters(self) -> dict[str, Any]:
+        return {
+            "lengths": self.lengths,
+            "connector": self.connector,
+            "masses": self.masses,
+            "damping": self.damping,
+            "gravity": self.gravity,
+            "fractions": self.fractions,
+            "weights": self.weights,
+            "stiffness": self.stiffness,
+            "cubic": self.cubic,
+            "rest": self.rest,
+            "material_damping": self.material_damping,
+        }
+
+
+def _arc(angle: Vector) -> NDArray[np.complex128]:
+    """Return g(angle) = ∫₀¹ exp(i angle η) dη, by half angles: exact and smooth through zero."""
+    half = np.asarray(angle) / 2
+    result: NDArray[np.complex128] = np.sinc(half / np.pi) * np.exp(1j * half)
+    return result

@@ -1,0 +1,125 @@
+"""Forward kinematics that inverse kinematics works on: the rod's own polyline and the arcs.
+
+Both answer the same four questions, so that every planner can be given either.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from der_planner.limb import Limb
+from der_planner.pcc import Pcc
+
+Vector = NDArray[np.float64]
+
+
+class Kinematics(Protocol):
+    """Where the tip is for given bend angles; angles are (..., M) rad, points (..., 2) m."""
+
+    segment_count: int
+
+    def tip(self, bend_angles: ArrayLike) -> Vector:
+        """Return the tip (..., 2)."""
+
+    def tip_jacobians(self, bend_angles: ArrayLike) -> Vector:
+        """Return ∂tip/∂bend angles (..., 2, M)."""
+
+    def curve(self, bend_angles: ArrayLike) -> Vector:
+        """Return the centreline (P, 2) of one configuration (M,)."""
+
+
+class PolylineKinematics:
+    """The planar chain of edges that a discrete rod forms when its segments bend evenly.
+
+    Edge e has rest length ē_e and heading ψ_e = Σ_j W_ej θ_j. Segment j of n nodes from node a turns at
+    its n − 2 inner nodes, hence W_ej = clip((e − a) / (n − 2), 0, 1).
+
+    Args:
+        rest_lengths: (N-1,) edges [m].
+        segments: (first node, node count) of each segment.
+    """
+
+    def __init__(self, rest_lengths: ArrayLike, segments: list[tuple[int, int]]) -> None:
+        self.rest_lengths = np.asarray(rest_lengths, dtype=float)
+        self.segment_count = len(segments)
+        edges = np.arange(len(self.rest_lengths))[:, None]
+        first = np.array([first for first, _ in segments])
+        turns = np.array([count - 2 for _, count in segments])
+        self.turning = np.clip((edges - first) / turns, 0.0, 1.0)
+
+    def _edges(self, bend_angles: ArrayLike) -> NDArray[np.complex128]:
+        heading = np.asarray(bend_angles, dtype=float) @ self.turning.T
+        edges: NDArray[np.complex128] = self.rest_lengths * np.exp(1j * heading)
+        return edges
+
+    def tip(self, bend_angles: ArrayLike) -> Vector:
+        """Return the tip (..., 2) [m] for bend angles (..., M) [rad]."""
+        end = self._edges(bend_angles).sum(axis=-1)
+        return np.stack([end.real, end.imag], axis=-1)
+
+    def tip_jacobians(self, bend_angles: ArrayLike) -> Vector:
+        """Return ∂tip/∂bend angles (..., 2, M) [m/rad]."""
+        columns = 1j * (self._edges(bend_angles) @ self.turning)
+        return np.stack([columns.real, columns.imag], axis=-2)
+
+    def curve(self, bend_angles: ArrayLike) -> Vector:
+        """Return the nodes (N, 2) [m] of one configuration (M,) [rad]."""
+        nodes = np.concatenate([[0], np.cumsum(self._edges(bend_angles))])
+        return np.column_stack([nodes.real, nodes.imag])
+
+    def nodes(self, bend_angles: ArrayLike) -> Vector:
+        """Return the nodes (..., N, 2) [m] for bend angles (..., M) [rad]."""
+        return _points(self._edges(bend_angles))
+
+    def tangents(self, bend_angles: ArrayLike) -> Vector:
+        """Return S = ∂nodes/∂bend angles (..., M, N, 2) [m/rad]."""
+        edges = self._edges(bend_angles)
+        return _points(1j * edges[..., None, :] * self.turning.T)
+
+    def motion(
+        self, angles: ArrayLike, rates: ArrayLike, accelerations: ArrayLike
+    ) -> tuple[Vector, Vector, Vector]:
+        """Return node positions, velocities and accelerations, (..., N, 2) each.
+
+        With edge e = ē exp(iψ): ė = iψ̇ e and ë = (iψ̈ − ψ̇²) e.
+        """
+        edges = self._edges(angles)
+        spin = np.asarray(rates) @ self.turning.T
+        twirl = np.asarray(accelerations) @ self.turning.T
+        return (
+            _points(edges),
+            _points(1j * spin * edges),
+            _points((1j * twirl - spin**2) * edges),
+        )
+
+
+class ArcKinematics:
+    """The tip of constant-curvature arcs; exact for a continuous limb that bends evenly."""
+
+    def __init__(self, limb: Limb) -> None:
+        self.segment_count = limb.segment_count
+        self._model = Pcc(limb)
+
+    def tip(self, bend_angles: ArrayLike) -> Vector:
+        """Return the tip (..., 2) [m] for bend angles (..., M) [rad]."""
+        return self._model.tip(bend_angles)
+
+    def tip_jacobians(self, bend_angles: ArrayLike) -> Vector:
+        """Return ∂tip/∂bend angles (..., 2, M) [m/rad]."""
+        angles = np.asarray(bend_angles, dtype=float)
+        flat = angles.reshape(-1, self.segment_count)
+        parts = np.array([self._model.tip_jacobian(row) for row in flat])
+        return parts.reshape(*angles.shape[:-1], 2, self.segment_count)
+
+    def curve(self, bend_angles: ArrayLike) -> Vector:
+        """Return points (P, 2) [m] of the centreline of one configuration (M,) [rad]."""
+        return self._model.curve(bend_angles)
+
+
+def _points(edges: NDArray[np.complex128]) -> Vector:
+    nodes = np.cumsum(edges, axis=-1)
+    nodes = np.concatenate([np.zeros_like(nodes[..., :1]), nodes], axis=-1)
+    return np.stack([nodes.real, nodes.imag], axis=-1)
