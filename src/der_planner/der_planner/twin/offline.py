@@ -1,0 +1,108 @@
+"""Pressures played on the twin in one process: pneumatics and limb, faster than real time, without ROS."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pressure_driver.emulator.pneumatics import Pneumatics
+
+from der_planner.twin.limb_twin import LimbTwin, TwinError
+
+Array = NDArray[np.float64]
+
+FINE_STEP = 0.01
+"""Chamber pressures are held on the limb for this long [s], half the board's telemetry period."""
+
+
+@dataclass(frozen=True)
+class Playback:
+    """What happened while pressures were played on the twin, sampled at the setpoints' instants.
+
+    Attributes:
+        time: (K,) [s], as given.
+        tip: (K, 2) true tip [m].
+        bend_angles: (K, M) true bend angles [rad].
+        commanded_differential: (K, M) as given [Pa].
+        measured_differential: (K, M) differential pressures in the chambers [Pa].
+        chamber_pressure: (K, 2M) absolute [Pa].
+    """
+
+    time: Array
+    tip: Array
+    bend_angles: Array
+    commanded_differential: Array
+    measured_differential: Array
+    chamber_pressure: Array
+
+
+def play(
+    time: ArrayLike,
+    differential_pressure: ArrayLike,
+    seed: int = 0,
+    *,
+    run: int = 0,
+    lead: float = 1.0,
+    fine_step: float = FINE_STEP,
+) -> Playback:
+    """Play differential pressures on the twin of a seed, from rest.
+
+    Each setpoint takes effect at its instant and holds until the next, as on the graph; row k of the
+    result is the twin at that instant, before the setpoint acts.
+
+    Args:
+        time: (K,) rising instants [s].
+        differential_pressure: (K, M) [Pa].
+        seed: draws limb and pneumatics.
+        run: draws the wandering rest angles of this run of the same hardware.
+        lead: vented time before the first setpoint [s].
+        fine_step: longest time for which the limb feels constant pressures [s].
+
+    Raises:
+        TwinError: the arrays do not fit together or to the twin.
+    """
+    instants = np.asarray(time, dtype=float)
+    wanted = np.asarray(differential_pressure, dtype=float)
+    if instants.ndim != 1 or not instants.size or wanted.ndim != 2 or len(wanted) != instants.size:
+        raise TwinError(
+            f"expected time (K,) and pressures (K, M), got {instants.shape} and {wanted.shape}"
+        )
+    if not np.all(np.isfinite(wanted)) or not np.all(np.diff(instants) > 0):
+        raise TwinError("time must rise and pressures must be finite")
+    pneumatics = Pneumatics(segment_count=wanted.shape[1], seed=seed)
+    twin = LimbTwin(seed, run, atmosphere=pneumatics.atmosphere)
+    if twin.segment_count != wanted.shape[1]:
+        raise TwinError(
+            f"the twin has {twin.segment_count} segments, the pressures {wanted.shape[1]}"
+        )
+    tip = np.empty((instants.size, 2))
+    angles, chambers = np.empty_like(wanted), np.empty((instants.size, 2 * wanted.shape[1]))
+    _advance(pneumatics, twin, lead, fine_step)
+    for k, setpoint in enumerate(wanted):
+        tip[k], angles[k], chambers[k] = twin.tip, twin.bend_angles, pneumatics.pressure
+        pneumatics.command(pneumatics.atmosphere + split(setpoint))
+        if k + 1 < instants.size:
+            _advance(pneumatics, twin, instants[k + 1] - instants[k], fine_step)
+    return Playback(
+        time=instants,
+        tip=tip,
+        bend_angles=angles,
+        commanded_differential=wanted,
+        measured_differential=chambers[:, 0::2] - chambers[:, 1::2],
+        chamber_pressure=chambers,
+    )
+
+
+def split(differential: Array) -> Array:
+    """Return (2M,) gauge pressures: one chamber of each pair carries |u|, the other is vented [Pa]."""
+    pairs: Array = np.stack([np.maximum(differential, 0.0), np.maximum(-differential, 0.0)], axis=1)
+    return pairs.ravel()
+
+
+def _advance(pneumatics: Pneumatics, twin: LimbTwin, duration: float, fine_step: float) -> None:
+    count = max(1, int(np.ceil(duration / fine_step - 1e-9)))
+    for _ in range(count):
+        before = pneumatics.pressure
+        after = pneumatics.step(duration / count)
+        twin.step(0.5 * (before + after), duration / count)
