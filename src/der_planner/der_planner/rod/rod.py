@@ -6,10 +6,16 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from der_planner.limb import Limb
-from der_planner.rod.state import Array, RodState, Trajectory
+from der_planner.rod.errors import ConvergenceError
+from der_planner.rod.linearisation import Linearisation, step_matrices
+from der_planner.rod.mesh import Mesh, array, limb_mesh, positive, require, uniform_mesh
+from der_planner.rod.planar import PlanarBackend, Run
+from der_planner.rod.spatial import SpatialBackend
+from der_planner.rod.state import Array, RodState, Trajectory, positions_of
+from der_planner.rod.statics import even_bend, find_equilibrium
 
 Method = Literal["midpoint", "backward_euler"]
 Plane = Literal["xy", "xz"]
@@ -33,6 +39,28 @@ class Rod:
         damping_diagonal: (4N-1,) D of the mass-proportional damping [kg/s, kg·m²/s].
         external_force: (4N-1,) gravity [N].
     """
+
+    def __init__(self, mesh: Mesh, plane: Plane | None = None) -> None:
+        require(plane in (None, "xy", "xz"), "plane", "'xy', 'xz' or None", plane)
+        self.mesh = mesh
+        self.nodes = mesh.nodes
+        self.segments = mesh.segments
+        self.segment_count = len(mesh.segments)
+        self.plane = plane
+        self.rest_lengths = mesh.rest
+        self.input_gain = mesh.gain
+        self.mass_diagonal = _interleave(mesh.node_mass, mesh.edge_inertia)
+        self.damping_diagonal = _interleave(
+            mesh.node_damping, mesh.edge_inertia * mesh.edge_damping
+        )
+        self.external_force = np.zeros(4 * mesh.nodes - 1)
+        for axis in range(3):
+            self.external_force[axis::4] = mesh.node_mass * mesh.gravity[axis]
+        self._backend = PlanarBackend(mesh, plane) if plane else SpatialBackend(mesh)
+        self.free = self._backend.free
+        self._tolerance = 1e-10 * float(mesh.rest.sum())
+        if plane:
+            self._check_plane(self.external_force, "gravity")
 
     @classmethod
     def uniform(
@@ -79,7 +107,13 @@ class Rod:
         Raises:
             ValueError: a value is out of range; the message says what was expected and what came.
         """
-        raise NotImplementedError
+        mesh = uniform_mesh(
+            length=length, nodes=nodes, EI=EI, EA=EA, GJ=GJ, mass_per_length=mass_per_length,
+            damping=damping, clamp=clamp, gravity=gravity, segments=segments,
+            moment_gain=moment_gain, material_damping=material_damping,
+            rest_curvature=rest_curvature, rest_twist=rest_twist, fixed=fixed,
+        )  # fmt: skip
+        return cls(mesh, plane)
 
     @classmethod
     def from_limb(
@@ -95,17 +129,28 @@ class Rod:
         Each segment gets edges of one length; one connector edge between two segments belongs to
         neither. A `connector_length` of zero centres a regular edge on the boundary instead.
         """
-        raise NotImplementedError
+        if plane == "auto":
+            plane = "xy" if limb.gravity[2] == 0.0 else None
+        return cls(limb_mesh(limb, nodes, clamp), plane)
 
     def straight_state(self) -> RodState:
         """Return the straight, unloaded, resting state."""
-        raise NotImplementedError
+        q = np.zeros(4 * self.nodes - 1)
+        q[0::4] = np.append(0.0, np.cumsum(self.rest_lengths))
+        directors = np.tile([0.0, 1.0, 0.0], (self.nodes - 1, 1))
+        return RodState(q, np.zeros_like(q), directors, np.zeros(self.nodes))
 
     def state(
         self, q: ArrayLike, v: ArrayLike | None = None, *, like: RodState | None = None
     ) -> RodState:
         """Return a state at q (4N-1,), its frames transported from `like` (the straight rod)."""
-        raise NotImplementedError
+        size = 4 * self.nodes - 1
+        base = like or self.straight_state()
+        configuration = array(q, (size,), "q")
+        velocity = np.zeros(size) if v is None else array(v, (size,), "v")
+        self._check_plane(configuration, "q")
+        self._check_plane(velocity, "v")
+        return self._backend.carry_frames(base, configuration, velocity)
 
     def step(
         self,
@@ -125,7 +170,16 @@ class Rod:
         Raises:
             ConvergenceError: Newton's iteration failed.
         """
-        raise NotImplementedError
+        pressures = array(u, (self.segment_count,), "u")[None, None, :]
+        load = self._load(forces)
+        try:
+            return self._run(state, pressures, positive(dt, "dt"), method, load).final
+        except ConvergenceError:
+            if halvings < 1:
+                raise
+        for _ in range(2):
+            state = self.step(state, u, 0.5 * dt, method, forces=forces, halvings=halvings - 1)
+        return state
 
     def simulate(
         self,
@@ -156,7 +210,27 @@ class Rod:
         Raises:
             ConvergenceError: with the step's index and the last good state.
         """
-        raise NotImplementedError
+        require(isinstance(substeps, (int, np.integer)) and substeps > 0, "substeps",
+                "an int of 1 or more", substeps)  # fmt: skip
+        given = np.asarray(pressures, dtype=np.float64)
+        require(given.ndim in (2, 3), "pressures", "(K, M) or (K, substeps, M)", given.shape)
+        intervals = given.shape[0]
+        shape = (intervals, substeps, self.segment_count)
+        if given.ndim == 2:
+            array(given, (intervals, self.segment_count), "pressures")
+            given = np.repeat(given[:, None, :], substeps, axis=1)
+        inputs = array(given, shape, "pressures")
+        h = positive(dt, "dt") / substeps
+        run = self._run(state, inputs, h, method, self._load(forces), linearise)
+        linearisation = None
+        if linearise and run.factors is not None:
+            wanted = self._output_indices(outputs)
+            linearisation = Linearisation(
+                intervals, substeps, wanted, self.free, run.factors,
+                self._backend.rows(wanted), self._backend.free_rows,
+            )  # fmt: skip
+        time = dt * np.arange(intervals + 1)
+        return Trajectory(time, run.q, run.v, run.final, run.iterations, linearisation)
 
     def equilibrium(
         self, u: ArrayLike, *, start: RodState | None = None, forces: ArrayLike | None = None
@@ -166,35 +240,47 @@ class Rod:
         Raises:
             ConvergenceError: neither Newton nor load stepping found one.
         """
-        raise NotImplementedError
+        pressures = array(u, (self.segment_count,), "u")
+        load = self._load(forces)
+        return find_equilibrium(self._backend, start or self.straight_state(), pressures, load)
 
     def positions(self, state: RodState | ArrayLike) -> Array:
         """Return the (N, 3) node positions [m] of a state or of q."""
-        raise NotImplementedError
+        return positions_of(self._as_state(state).q)
 
     def tip(self, state: RodState | ArrayLike) -> Array:
         """Return the (3,) position of the last node [m]."""
-        raise NotImplementedError
+        return self._as_state(state).q[-3:].copy()
 
     def energy(self, state: RodState | ArrayLike) -> float:
         """Return the elastic energy [J]."""
-        raise NotImplementedError
+        return self._backend.energy(self._as_state(state))
 
     def internal_force(self, state: RodState | ArrayLike) -> Array:
         """Return the elastic force −∇E (4N-1,) [N, N·m]."""
-        raise NotImplementedError
+        return -self._backend.gradient_and_hessian(self._as_state(state))[0]
 
     def stiffness(self, state: RodState | ArrayLike) -> Array:
         """Return the elastic Hessian ∇²E (4N-1, 4N-1) [N/m …]."""
-        raise NotImplementedError
+        return self._backend.gradient_and_hessian(self._as_state(state))[1]
 
     def input_matrix(self, state: RodState | ArrayLike) -> Array:
         """Return B(q)Λ (4N-1, M) [N/Pa]: unit couples times Λ; rows of φ are zero."""
-        raise NotImplementedError
+        return self._backend.input_matrix(self._as_state(state))
 
     def control_affine(self, state: RodState, forces: ArrayLike | None = None) -> tuple[Array, Array]:
         """Return f (2F,) and g (2F, M) of ẋ = f(x) + g(x) u, x = (q[free], v[free])."""
-        raise NotImplementedError
+        free = self.free
+        force = (
+            self.internal_force(state)
+            + self._backend.viscous_force(state)
+            - self.damping_diagonal * state.v
+            + self._load(forces)
+        )
+        mass = self.mass_diagonal[free]
+        drift = np.concatenate([state.v[free], force[free] / mass])
+        gain = self.input_matrix(state)[free] / mass[:, None]
+        return drift, np.concatenate([np.zeros_like(gain), gain])
 
     def linearise_step(
         self,
@@ -210,11 +296,19 @@ class Rod:
         x = (q[free], v[free]); by the implicit function theorem at the converged step, with the
         derivative of B(q)u.
         """
-        raise NotImplementedError
+        pressures = array(u, (self.segment_count,), "u")[None, None, :]
+        run = self._run(state, pressures, positive(dt, "dt"), method, self._load(forces), True)
+        if run.factors is None:
+            raise AssertionError("a converged run keeps its factors")
+        return step_matrices(run.factors, self._backend.free_rows)
 
     def bend_angles(self, state: RodState | ArrayLike) -> Array:
         """Return (…, M) the turning of each segment about +z from its first to its last edge [rad]."""
-        raise NotImplementedError
+        q = state.q if isinstance(state, RodState) else np.asarray(state, dtype=np.float64)
+        edges = np.diff(positions_of(q), axis=-2)
+        turns = 2.0 * np.arctan2(*_half_turns(edges))
+        result = [turns[..., first : first + count - 2].sum(-1) for first, count in self.segments]
+        return np.stack(result, axis=-1) if result else np.zeros((*q.shape[:-1], 0))
 
     def configuration_from_bend_angles(self, angles: ArrayLike) -> tuple[Array, Array]:
         """Return q (4N-1,) of a planar rod whose segments bend evenly, and S = ∂q/∂angles (4N-1, M).
@@ -222,7 +316,81 @@ class Rod:
         Args:
             angles: (M,) bend angles [rad], as `bend_angles` measures them.
         """
-        raise NotImplementedError
+        return even_bend(array(angles, (self.segment_count,), "angles"), self.mesh)
 
 
-__all__ = ["Method", "Plane", "Rod", "RodState", "Trajectory", "np"]
+    def _run(
+        self,
+        state: RodState,
+        pressures: Array,
+        dt: float,
+        method: str,
+        load: Array,
+        linearise: bool = False,
+    ) -> Run:
+        require(method in _EXTRAPOLATE, "method", f"one of {sorted(_EXTRAPOLATE)}", method)
+        extrapolate = _EXTRAPOLATE[method]
+        run = self._backend.simulate(
+            state, pressures, dt / extrapolate, extrapolate, load, self._tolerance, 30, linearise
+        )
+        if run.failed_iterations:
+            raise ConvergenceError(
+                f"step {run.steps} of {dt:g} s ({method}) did not converge in "
+                f"{run.failed_iterations} Newton iterations (last update {run.update:.3g}): "
+                "take a shorter step",
+                step=run.steps, residual=run.update, iterations=run.failed_iterations,
+                state=run.final,
+            )  # fmt: skip
+        return run
+
+    def _load(self, forces: ArrayLike | None) -> Array:
+        if forces is None:
+            return self.external_force
+        load = self.external_force.copy()
+        given = array(forces, (self.nodes, 3), "forces")
+        for axis in range(3):
+            load[axis::4] += given[:, axis]
+        self._check_plane(load, "forces")
+        return load
+
+    def _check_plane(self, value: Array, name: str) -> None:
+        if self.plane is None:
+            return
+        outside = np.delete(value, self._backend.index)
+        if outside.any():
+            raise ValueError(
+                f"{name} must stay in the plane {self.plane} of this rod, got {outside.any()} "
+                "components that leave it: build the rod with plane=None"
+            )
+
+    def _as_state(self, state: RodState | ArrayLike) -> RodState:
+        return state if isinstance(state, RodState) else self.state(state)
+
+    def _output_indices(self, outputs: Sequence[int] | None) -> NDArray[np.int64]:
+        if outputs is None:
+            size = 4 * self.nodes - 1
+            return np.array([d for d in range(size - 3, size) if d in self.free], dtype=np.int64)
+        wanted = np.asarray(outputs, dtype=np.int64)
+        rows = self._backend.rows(wanted)
+        require(wanted.ndim == 1 and bool((rows >= 0).all()), "outputs",
+                "indices into q that this rod's plane has", outputs)  # fmt: skip
+        return wanted
+
+
+_EXTRAPOLATE = {"midpoint": 2.0, "backward_euler": 1.0}
+
+
+def _interleave(of_nodes: Array, of_edges: Array) -> Array:
+    result = np.zeros(4 * len(of_nodes) - 1)
+    for axis in range(3):
+        result[axis::4] = of_nodes
+    result[3::4] = of_edges
+    return result
+
+
+def _half_turns(edges: Array) -> tuple[Array, Array]:
+    """Return sine and cosine, up to one factor, of half the turning about z of (…, E, 3) edges."""
+    e, f = edges[..., :-1, :], edges[..., 1:, :]
+    sine = e[..., 0] * f[..., 1] - e[..., 1] * f[..., 0]
+    cosine = e[..., 0] * f[..., 0] + e[..., 1] * f[..., 1]
+    return sine, np.hypot(sine, cosine) + cosine

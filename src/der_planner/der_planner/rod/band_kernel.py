@@ -1,0 +1,181 @@
+"""Banded linear algebra without pivoting, for the matrices of a chain of nodes.
+
+A symmetric matrix of half-bandwidth b is stored by columns: s[j, k] = A[j+k, j], k = 0 … b. A general one
+is stored by rows: a[i, k] = A[i, i+k-b], k = 0 … 2b.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from der_planner.rod.compile import kernel
+from der_planner.rod.state import Array
+
+
+@kernel
+def solve_5(s: Array, r: Array) -> float:
+    """Factor s (n, 6) into LDLᵀ in place, solve into r (n,); return the smallest pivot."""
+    n = r.shape[0]
+    smallest = np.inf
+    for j in range(n - 5):
+        pivot = s[j, 0]
+        smallest = min(smallest, pivot)
+        inverse = 1.0 / pivot
+        rj = r[j]
+        for i in range(1, 6):
+            factor = s[j, i] * inverse
+            for k in range(i, 6):
+                s[j + i, k - i] -= factor * s[j, k]
+            r[j + i] -= factor * rj
+        s[j, 0] = inverse
+    for j in range(n - 5, n):
+        pivot = s[j, 0]
+        smallest = min(smallest, pivot)
+        inverse = 1.0 / pivot
+        for i in range(1, n - j):
+            factor = s[j, i] * inverse
+            for k in range(i, n - j):
+                s[j + i, k - i] -= factor * s[j, k]
+            r[j + i] -= factor * r[j]
+        s[j, 0] = inverse
+    for j in range(n - 1, n - 6, -1):
+        total = r[j]
+        for i in range(1, n - j):
+            total -= s[j, i] * r[j + i]
+        r[j] = total * s[j, 0]
+    for j in range(n - 6, -1, -1):
+        total = r[j]
+        for i in range(1, 6):
+            total -= s[j, i] * r[j + i]
+        r[j] = total * s[j, 0]
+    return smallest
+
+
+@kernel
+def solve_10(s: Array, r: Array) -> float:
+    """As `solve_5` for s (n, 11)."""
+    n = r.shape[0]
+    smallest = np.inf
+    for j in range(n - 10):
+        pivot = s[j, 0]
+        smallest = min(smallest, pivot)
+        inverse = 1.0 / pivot
+        rj = r[j]
+        for i in range(1, 11):
+            factor = s[j, i] * inverse
+            for k in range(i, 11):
+                s[j + i, k - i] -= factor * s[j, k]
+            r[j + i] -= factor * rj
+        s[j, 0] = inverse
+    for j in range(n - 10, n):
+        pivot = s[j, 0]
+        smallest = min(smallest, pivot)
+        inverse = 1.0 / pivot
+        for i in range(1, n - j):
+            factor = s[j, i] * inverse
+            for k in range(i, n - j):
+                s[j + i, k - i] -= factor * s[j, k]
+            r[j + i] -= factor * r[j]
+        s[j, 0] = inverse
+    for j in range(n - 1, n - 11, -1):
+        total = r[j]
+        for i in range(1, n - j):
+            total -= s[j, i] * r[j + i]
+        r[j] = total * s[j, 0]
+    for j in range(n - 11, -1, -1):
+        total = r[j]
+        for i in range(1, 11):
+            total -= s[j, i] * r[j + i]
+        r[j] = total * s[j, 0]
+    return smallest
+
+
+@kernel
+def hold_fixed(s: Array, r: Array, fixed: Array) -> None:
+    """Replace the equations of fixed unknowns in s, r by "no change"."""
+    b = s.shape[1] - 1
+    for d in fixed:
+        r[d] = 0.0
+        s[d, 0] = 1.0
+        for k in range(1, b + 1):
+            s[d, k] = 0.0
+            if d - k >= 0:
+                s[d - k, k] = 0.0
+
+
+@kernel
+def expand(s: Array, a: Array) -> None:
+    """Write the symmetric band s (n, b+1) as a general band a (n, 2b+1)."""
+    n = s.shape[0]
+    b = s.shape[1] - 1
+    a[:] = 0.0
+    for j in range(n):
+        a[j, b] = s[j, 0]
+        for k in range(1, min(b, n - 1 - j) + 1):
+            a[j, b + k] = s[j, k]
+            a[j + k, b - k] = s[j, k]
+
+
+@kernel
+def hold_fixed_general(a: Array, fixed: Array) -> None:
+    """As `hold_fixed` for a general band."""
+    n = a.shape[0]
+    b = (a.shape[1] - 1) // 2
+    for d in fixed:
+        for k in range(2 * b + 1):
+            a[d, k] = 0.0
+        for i in range(max(0, d - b), min(n, d + b + 1)):
+            a[i, d - i + b] = 0.0
+        a[d, b] = 1.0
+
+
+@kernel
+def factor_general(a: Array) -> None:
+    """Replace a general band by L (unit diagonal) and U, with the inverse of U's diagonal in place."""
+    n = a.shape[0]
+    b = (a.shape[1] - 1) // 2
+    for j in range(n):
+        inverse = 1.0 / a[j, b]
+        a[j, b] = inverse
+        for i in range(j + 1, min(n, j + b + 1)):
+            factor = a[i, b + j - i] * inverse
+            a[i, b + j - i] = factor
+            for k in range(1, b + 1):
+                a[i, b + j - i + k] -= factor * a[j, b + k]
+
+
+@kernel
+def solve_columns(a: Array, x: Array) -> None:
+    """Solve L U y = x in place for the columns of x (n, C)."""
+    n = a.shape[0]
+    b = (a.shape[1] - 1) // 2
+    columns = x.shape[1]
+    for i in range(n):
+        for k in range(max(0, i - b), i):
+            factor = a[i, k - i + b]
+            for c in range(columns):
+                x[i, c] -= factor * x[k, c]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, min(n, i + b + 1)):
+            factor = a[i, k - i + b]
+            for c in range(columns):
+                x[i, c] -= factor * x[k, c]
+        inverse = a[i, b]
+        for c in range(columns):
+            x[i, c] *= inverse
+
+
+@kernel
+def solve_transposed(a: Array, x: Array) -> None:
+    """Solve (L U)ᵀ y = x in place for one column x (n,)."""
+    n = a.shape[0]
+    b = (a.shape[1] - 1) // 2
+    for i in range(n):
+        x[i] *= a[i, b]
+        value = x[i]
+        for k in range(i + 1, min(n, i + b + 1)):
+            x[k] -= a[i, k - i + b] * value
+    for i in range(n - 1, -1, -1):
+        value = x[i]
+        for k in range(max(0, i - b), i):
+            x[k] -= a[i, k - i + b] * value

@@ -1,0 +1,139 @@
+"""The exact linearisation of a simulated motion and what can be asked of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from der_planner.rod import sensitivity_kernel
+from der_planner.rod.mesh import array
+from der_planner.rod.state import Array
+
+
+class StepFactors(NamedTuple):
+    """The linearisation of every step, as the kernels keep it (see sensitivity_kernel).
+
+    Attributes:
+        factors: (steps, n, 2b+1) factored derivative of each step's residual.
+        viscous: (steps or 0, n, b+1) viscous matrix times rate.
+        inputs: (steps, n, M) B(q)Λ.
+        inertia: (n,) M·rate² + D·rate. momentum: (n,) M·rate; both zero where fixed.
+        rate: 1/h. extrapolate: 1 for backward Euler, 2 for the midpoint rule.
+    """
+
+    factors: Array
+    viscous: Array
+    inputs: Array
+    inertia: Array
+    momentum: Array
+    rate: float
+    extrapolate: float
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """First-order effect of the pressures on P outputs along a simulated motion of K intervals.
+
+    A product with the K·P × K·M sensitivity (`tangent`) or its transpose (`adjoint`) costs about as much
+    as the simulation's linear solves; the matrix itself (`sensitivity`) K/2 times as much, at vector
+    speed. Both ways are exact for the discrete motion.
+
+    Attributes:
+        intervals: K. steps: S, integrator steps in an interval.
+        outputs: (P,) indices into q.
+        state_indices: indices into q of the free degrees of freedom, for `start` arguments.
+    """
+
+    intervals: int
+    steps: int
+    outputs: NDArray[np.int64]
+    state_indices: NDArray[np.int64]
+    _stored: StepFactors
+    _output_rows: NDArray[np.int64]
+    _state_rows: NDArray[np.int64]
+
+    @property
+    def input_count(self) -> int:
+        """M."""
+        return int(self._stored.inputs.shape[2])
+
+    def tangent(
+        self, pressures: ArrayLike, start: tuple[ArrayLike, ArrayLike] | None = None
+    ) -> Array:
+        """Return the change of the outputs (K+1, P) for a change of the pressures.
+
+        Args:
+            pressures: (K, M) held over the steps of an interval, or (K, S, M) [Pa].
+            start: change of q[free] and v[free] at the beginning, each (F,).
+        """
+        change = self._by_step(pressures)
+        initial = np.zeros((2, self._stored.inertia.shape[0]))
+        if start is not None:
+            for row, value in enumerate(start):
+                initial[row, self._state_rows] = array(value, self._state_rows.shape, "start")
+        out = np.empty((self.intervals + 1, len(self.outputs)))
+        sensitivity_kernel.tangent(change, initial, *self._stored, self._output_rows, out)
+        return out
+
+    def adjoint(self, weights: ArrayLike, *, by_step: bool = False) -> Array:
+        """Return the gradient of Σ weights·outputs by the pressures: the transpose of `tangent`.
+
+        Args:
+            weights: (K+1, P).
+            by_step: keep one row for each step, (K, S, M), instead of (K, M).
+        """
+        weight = array(weights, (self.intervals + 1, len(self.outputs)), "weights")
+        gradient = np.empty((self.intervals, self.steps, self.input_count))
+        start = np.empty((2, self._stored.inertia.shape[0]))
+        sensitivity_kernel.adjoint(weight, *self._stored, self._output_rows, gradient, start)
+        return gradient if by_step else gradient.sum(axis=1)
+
+    def sensitivity(self, pulse: ArrayLike | None = None) -> Array:
+        """Return ∂output/∂input (K+1, P, K, M) [m/Pa], zero where the input comes later.
+
+        Args:
+            pulse: (R, M) pressure in the R integrator steps that follow the start of an interval when
+                that interval's setpoint is raised by one: the response of the pneumatics, for instance.
+                Default: one for the S steps of the interval, zero later.
+        """
+        if pulse is None:
+            shape = np.ones((self.steps, self.input_count))
+        else:
+            rows = np.shape(pulse)[0] if np.ndim(pulse) else 0
+            shape = array(pulse, (rows, self.input_count), "pulse")
+        out = np.zeros((self.intervals + 1, len(self.outputs), self.intervals, self.input_count))
+        sensitivity_kernel.sensitivity(
+            shape, self.intervals, 16, *self._stored, self._output_rows, out
+        )
+        return out
+
+    def _by_step(self, pressures: ArrayLike) -> Array:
+        given = np.asarray(pressures, dtype=np.float64)
+        if given.ndim == 2:
+            held = array(given, (self.intervals, self.input_count), "pressures")
+            return np.ascontiguousarray(np.repeat(held[:, None, :], self.steps, axis=1))
+        return array(given, (self.intervals, self.steps, self.input_count), "pressures")
+
+
+def step_matrices(stored: StepFactors, rows: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Return A (2F, 2F) and B (2F, M) of the first stored step on the unknowns `rows`."""
+    size = stored.inertia.shape[0]
+    count = len(rows)
+    inputs = stored.inputs.shape[2]
+    columns = 2 * count + inputs
+    dq = np.zeros((size, columns))
+    dv = np.zeros((size, columns))
+    y = np.zeros((size, columns))
+    dq[rows, np.arange(count)] = 1.0
+    dv[rows, np.arange(count, 2 * count)] = 1.0
+    y[:, 2 * count :] = stored.inputs[0]
+    viscous = stored.viscous[0] if len(stored.viscous) else np.empty((0, 1))
+    sensitivity_kernel.advance(
+        dq, dv, y, stored.factors[0], viscous, stored.inertia, stored.momentum, stored.rate,
+        stored.extrapolate,
+    )  # fmt: skip
+    both = np.concatenate([dq[rows], dv[rows]])
+    return both[:, : 2 * count], both[:, 2 * count :]

@@ -1,0 +1,283 @@
+"""The numbers of a discrete rod, and how they follow from a uniform rod or from a limb."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from der_planner.limb import Limb
+from der_planner.rod.state import Array
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Every number of a discrete rod of N nodes along x, in SI units.
+
+    Attributes:
+        rest: (N-1,) edge lengths at rest.
+        axial: (N-1,) EA of each edge.
+        edge_mass: (N-1,) mass of each edge.
+        edge_inertia: (N-1,) moment of inertia of each edge about its tangent.
+        edge_damping: (N-1,) mass-proportional damping rate.
+        bend: (N,) EI / l of each node (0 where the rod does not bend, as at a free end).
+        twist: (N,) GJ / l of each node.
+        cubic: (N,) k3 / l³ of each node.
+        viscous: (N,) EI τ / l of each node.
+        rest_kappa: (N, 2) integrated curvature at rest toward +y and +z.
+        rest_twist: (N,) twist at rest.
+        gravity: (3,).
+        ghost: whether a ghost edge behind node 0 clamps the rod.
+        clamped: indices into q that do not move.
+        segments: ((first node, node count), …).
+        gain: (M,) Λ [N/Pa].
+    """
+
+    rest: Array
+    axial: Array
+    edge_mass: Array
+    edge_inertia: Array
+    edge_damping: Array
+    bend: Array
+    twist: Array
+    cubic: Array
+    viscous: Array
+    rest_kappa: Array
+    rest_twist: Array
+    gravity: Array
+    ghost: bool
+    clamped: NDArray[np.int64]
+    segments: tuple[tuple[int, int], ...]
+    gain: Array
+
+    @property
+    def nodes(self) -> int:
+        """N."""
+        return len(self.rest) + 1
+
+    @property
+    def node_mass(self) -> Array:
+        """(N,) half the mass of the edges at each node."""
+        half = 0.5 * self.edge_mass
+        return np.append(half, 0.0) + np.append(0.0, half)
+
+    @property
+    def node_damping(self) -> Array:
+        """(N,) damping coefficient of each node [kg/s]."""
+        half = 0.5 * self.edge_mass * self.edge_damping
+        return np.append(half, 0.0) + np.append(0.0, half)
+
+
+def require(condition: bool, name: str, expected: str, got: object) -> None:
+    """Raise a ValueError that says what was expected of `name` and what came."""
+    if not condition:
+        raise ValueError(f"{name} must be {expected}, got {got!r}")
+
+
+def positive(value: float, name: str) -> float:
+    """Return a positive finite number or raise a ValueError."""
+    require(math.isfinite(value) and value > 0, name, "a positive number", value)
+    return float(value)
+
+
+def not_negative(value: float, name: str) -> float:
+    """Return a finite number of 0 or more or raise a ValueError."""
+    require(math.isfinite(value) and value >= 0, name, "0 or more", value)
+    return float(value)
+
+
+def array(value: ArrayLike, shape: tuple[int, ...], name: str) -> Array:
+    """Return a finite C-contiguous array of the given shape or raise a ValueError."""
+    try:
+        result = np.ascontiguousarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be numbers of shape {shape}: {error}") from error
+    if result.shape != shape:
+        raise ValueError(f"{name} must have shape {shape}, got {result.shape}")
+    if not np.isfinite(result).all():
+        raise ValueError(f"{name} must be finite, got {int((~np.isfinite(result)).sum())} that are not")
+    return result
+
+
+def check_segments(
+    segments: Sequence[tuple[int, int]], nodes: int
+) -> tuple[tuple[int, int], ...]:
+    """Return the segments as pairs of ints; raise a ValueError if they leave the rod or share a node."""
+    last = -1
+    for index, (first, count) in enumerate(segments):
+        name = f"segments[{index}]"
+        require(count >= 3, name, "at least 3 nodes long (two edges)", (first, count))
+        require(first > last, name, f"after node {last}, sharing no node", (first, count))
+        last = first + count - 1
+        require(last < nodes, name, f"within {nodes} nodes", (first, count))
+    return tuple((int(first), int(count)) for first, count in segments)
+
+
+def clamped_indices(clamp: str, fixed: Sequence[int], nodes: int) -> NDArray[np.int64]:
+    """Return the sorted indices into q that a clamp and a user's choice hold."""
+    held = {"ghost": range(3), "inside": range(7), "free": range(0)}
+    require(clamp in held, "clamp", "'ghost', 'inside' or 'free'", clamp)
+    size = 4 * nodes - 1
+    require(all(0 <= d < size for d in fixed), "fixed", f"indices in 0 … {size - 1}", list(fixed))
+    return np.array(sorted({*held[clamp], *map(int, fixed)}), dtype=np.int64)
+
+
+def uniform_mesh(
+    *, length: float, nodes: int, EI: float, EA: float, GJ: float, mass_per_length: float,
+    damping: float, clamp: str, gravity: ArrayLike, segments: Sequence[tuple[int, int]],
+    moment_gain: ArrayLike, material_damping: float, rest_curvature: ArrayLike, rest_twist: float,
+    fixed: Sequence[int],
+) -> Mesh:  # fmt: skip
+    """Return the mesh of `Rod.uniform`; see there for the arguments."""
+    require(isinstance(nodes, (int, np.integer)) and nodes >= 3, "nodes", "an int of 3 or more", nodes)
+    step = positive(length, "length") / (nodes - 1)
+    for value, name in ((EI, "EI"), (EA, "EA"), (GJ, "GJ"), (mass_per_length, "mass_per_length")):
+        positive(value, name)
+    pairs = check_segments(segments, nodes)
+    gain = array(moment_gain, (len(pairs),), "moment_gain")
+    ghost = clamp == "ghost"
+    cell = _cells(np.full(nodes - 1, step), ghost)
+    inverse = np.divide(1.0, cell, out=np.zeros(nodes), where=cell > 0)
+    curvature = array(rest_curvature, (2,), "rest_curvature")
+    edge_mass = np.full(nodes - 1, mass_per_length * step)
+    return Mesh(
+        rest=np.full(nodes - 1, step),
+        axial=np.full(nodes - 1, float(EA)),
+        edge_mass=edge_mass,
+        edge_inertia=edge_mass * (2.0 * EI / EA),
+        edge_damping=np.full(nodes - 1, not_negative(damping, "damping")),
+        bend=EI * inverse,
+        twist=GJ * inverse,
+        cubic=np.zeros(nodes),
+        viscous=EI * not_negative(material_damping, "material_damping") * inverse,
+        rest_kappa=2.0 * np.tan(0.5 * np.outer(cell, curvature)),
+        rest_twist=float(rest_twist) * cell,
+        gravity=array(gravity, (3,), "gravity"),
+        ghost=ghost,
+        clamped=clamped_indices(clamp, fixed, nodes),
+        segments=pairs,
+        gain=np.array([g * (c - 1) / ((c - 2) * step) for g, (_, c) in zip(gain, pairs, strict=True)]),
+    )
+
+
+def _cells(rest: Array, ghost: bool) -> Array:
+    """Return the (N,) Voronoi lengths of the nodes that bend, 0 for those that do not."""
+    cells = np.zeros(len(rest) + 1)
+    cells[1:-1] = 0.5 * (rest[:-1] + rest[1:])
+    cells[0] = 0.5 * rest[0] if ghost else 0.0
+    return cells
+
+
+def limb_mesh(limb: Limb, nodes: int, clamp: str) -> Mesh:
+    """Return the mesh of `Rod.from_limb`; see there for the arguments."""
+    count = limb.segment_count
+    least = 3 * count
+    require(isinstance(nodes, (int, np.integer)) and nodes >= least, "nodes",
+            f"an int of {least} or more for {count} segments", nodes)  # fmt: skip
+    owner, rest, pairs = _segment_edges(limb, nodes)
+    ghost = clamp == "ghost"
+    rigid = limb.connector_length > 0.0
+    # What bends at a node is half of each edge beside it; a rigid connector does not bend.
+    half = np.where((owner < 0) & rigid, 0.0, 0.5 * rest)
+    before, after = np.append(0.0, half), np.append(half, 0.0)
+    before[-1] = after[-1] = 0.0
+    if not ghost:
+        after[0] = 0.0
+    behind, ahead = _nearest_owner(owner)
+
+    def of_edges(name: str) -> Array:
+        values = np.array([getattr(segment, name) for segment in limb.segments])
+        return 0.5 * (values[behind] + values[ahead])
+
+    def of_nodes(name: str) -> tuple[Array, Array]:
+        values = of_edges(name)
+        return np.append(values[0], values), np.append(values, values[-1])
+
+    def compliance(name: str) -> Array:
+        left, right = of_nodes(name)
+        total = before / left + after / right
+        return np.divide(1.0, total, out=np.zeros(nodes), where=total > 0)
+
+    cell = before + after
+    bend = compliance("bending_stiffness")
+    edge_mass = of_edges("mass_per_length") * rest
+    polar = 2.0 * of_edges("bending_stiffness") / of_edges("axial_stiffness")
+    viscous, cubic, rest_kappa = np.zeros(nodes), np.zeros(nodes), np.zeros((nodes, 2))
+    tau = np.maximum(*of_nodes("material_damping"))
+    viscous[:] = bend * tau
+    stiffening = np.minimum(*of_nodes("cubic_stiffness"))
+    np.divide(stiffening, cell**3, out=cubic, where=cell > 0)
+    gain = np.zeros(count)
+    for index, (segment, (first, size)) in enumerate(zip(limb.segments, pairs, strict=True)):
+        inner = slice(first + 1, first + size - 1)
+        step = rest[first]
+        turn = segment.rest_curvature * segment.length / (size - 2)
+        rest_kappa[inner, 0] = 2.0 * math.tan(0.5 * turn)
+        # The couples sit in the middle of the first and last edge: size - 2 edges bend, not the segment.
+        ratio = segment.length / ((size - 2) * step)
+        gain[index] = segment.moment_gain * ratio / step
+        # k3 (κ-κ̄)² against EI is kept when the curvature is spread over the shorter length
+        cubic[inner] /= ratio**2
+    return Mesh(
+        rest=rest,
+        axial=of_edges("axial_stiffness"),
+        edge_mass=edge_mass,
+        edge_inertia=edge_mass * polar,
+        edge_damping=of_edges("damping"),
+        bend=bend,
+        twist=compliance("torsional_stiffness"),
+        cubic=cubic,
+        viscous=viscous,
+        rest_kappa=rest_kappa,
+        rest_twist=np.zeros(nodes),
+        gravity=np.array(limb.gravity, dtype=float),
+        ghost=ghost,
+        clamped=clamped_indices(clamp, (), nodes),
+        segments=pairs,
+        gain=gain,
+    )
+
+
+def _segment_edges(
+    limb: Limb, nodes: int
+) -> tuple[NDArray[np.int64], Array, tuple[tuple[int, int], ...]]:
+    """Return each edge's segment (-1 for a connector), its length, and the segments' nodes."""
+    count = limb.segment_count
+    lengths = np.array([segment.length for segment in limb.segments])
+    available = nodes - 1 - (count - 1)
+    share = lengths / lengths.sum() * available
+    edges = np.maximum(2, np.floor(share).astype(int))
+    while edges.sum() != available:
+        gap = share - edges
+        if edges.sum() < available:
+            edges[len(gap) - 1 - int(np.argmax(gap[::-1]))] += 1
+        else:
+            edges[int(np.argmin(np.where(edges > 2, gap, np.inf)))] -= 1
+    connector = limb.connector_length or float(lengths.sum()) / (nodes - 1)
+    owner: list[int] = []
+    rest: list[float] = []
+    pairs: list[tuple[int, int]] = []
+    for index, size in enumerate(edges):
+        if index > 0:
+            owner.append(-1)
+            rest.append(connector)
+        span = lengths[index]
+        if limb.connector_length == 0.0:  # the connector edge is centred on the segments' boundary
+            span -= 0.5 * connector * ((index > 0) + (index < count - 1))
+        require(span > 0, "nodes", "large enough for the shortest segment", nodes)
+        pairs.append((len(rest), int(size) + 1))
+        owner.extend([index] * int(size))
+        rest.extend([float(span) / int(size)] * int(size))
+    return np.array(owner, dtype=np.int64), np.array(rest), tuple(pairs)
+
+
+def _nearest_owner(owner: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the segments behind and ahead of each edge: the same one unless it is a connector."""
+    behind, ahead = owner.copy(), owner.copy()
+    for j in range(len(owner)):
+        if owner[j] < 0:
+            behind[j], ahead[j] = owner[j - 1], owner[j + 1]
+    return behind, ahead

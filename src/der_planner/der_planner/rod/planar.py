@@ -1,0 +1,222 @@
+"""A rod in a coordinate plane: between the public layout (4N-1,) and the planar kernels (2n,)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from der_planner.rod import planar_kernel
+from der_planner.rod.linearisation import StepFactors
+from der_planner.rod.mesh import Mesh
+from der_planner.rod.state import Array, RodState
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a backend's simulation returned.
+
+    Attributes:
+        q: (K+1, 4N-1). v: likewise.
+        final: the last converged state.
+        steps: steps done. iterations: Newton iterations of all of them.
+        update: size of the last Newton update if a step failed.
+        failed_iterations: iterations of the failed step, 0 if none failed.
+        factors: the linearisation, if asked for.
+    """
+
+    q: Array
+    v: Array
+    final: RodState
+    steps: int
+    iterations: int
+    update: float
+    failed_iterations: int
+    factors: StepFactors | None
+
+
+class PlanarBackend:
+    """Kernels and arrays of a planar rod."""
+
+    def __init__(self, mesh: Mesh, plane: str) -> None:
+        self.mesh = mesh
+        axis = {"xy": 1, "xz": 2}[plane]
+        nodes = mesh.nodes
+        self.ghost = int(mesh.ghost)
+        self.index = (4 * np.arange(nodes)[:, None] + np.array([0, axis])).ravel()
+        held = set(mesh.clamped.tolist())
+        fixed = [k for k, d in enumerate(self.index) if d in held]
+        self.fixed = np.array(
+            [*range(2 * self.ghost), *(k + 2 * self.ghost for k in fixed)], dtype=np.int64
+        )
+        self.free = np.array([d for d in self.index if d not in held], dtype=np.int64)
+        self.free_rows = np.array(
+            [k + 2 * self.ghost for k, d in enumerate(self.index) if d not in held], dtype=np.int64
+        )
+        mass = np.repeat(mesh.node_mass, 2)
+        damping = np.repeat(mesh.node_damping, 2)
+        pad = np.zeros(2 * self.ghost)
+        self.mass = np.concatenate([pad, mass])
+        self.damping = np.concatenate([pad, damping])
+        first = np.array([first + self.ghost for first, _ in mesh.segments], dtype=np.int64)
+        last = np.array(
+            [first + count - 2 + self.ghost for first, count in mesh.segments], dtype=np.int64
+        )
+        one = np.zeros(self.ghost)
+        actuated = plane == "xy"
+        self.rod = (
+            np.concatenate([mesh.rest[: self.ghost], mesh.rest]),
+            np.concatenate([one, mesh.axial]),
+            np.concatenate([one, mesh.bend]),
+            np.concatenate([one, np.ascontiguousarray(mesh.rest_kappa[:, axis - 1])]),
+            np.concatenate([one, mesh.cubic]),
+            np.concatenate([one, mesh.viscous]),
+            first,
+            last,
+            mesh.gain if actuated else np.zeros_like(mesh.gain),
+        )
+        n = nodes + self.ghost
+        self.size = 2 * n
+        self.work = np.zeros((3, self.size))
+        self.band = np.zeros((self.size, 6))
+        self.edge = np.zeros((n - 1, 3))
+        self.turn = np.zeros(n)
+        self.torque = np.zeros((n, 2))
+
+    def extend(self, q: Array) -> Array:
+        """Return the kernels' coordinates of q, with the ghost node."""
+        planar = q[self.index]
+        if not self.ghost:
+            return planar
+        return np.concatenate([[planar[0] - self.mesh.rest[0], planar[1]], planar])
+
+    def extend_rate(self, v: Array) -> Array:
+        """Return a velocity or force (4N-1,) in the kernels' coordinates."""
+        return np.concatenate([np.zeros(2 * self.ghost), v[self.index]])
+
+    def restore(self, x: Array, base: Array) -> Array:
+        """Return copies of base (4N-1,) with the planar coordinates of x (…, 2n)."""
+        result = np.broadcast_to(base, (*x.shape[:-1], base.shape[0])).copy()
+        result[..., self.index] = x[..., 2 * self.ghost :]
+        return result
+
+    def simulate(
+        self,
+        state: RodState,
+        pressures: Array,
+        h: float,
+        extrapolate: float,
+        load: Array,
+        tolerance: float,
+        limit: int,
+        linearise: bool,
+    ) -> Run:
+        """Run the kernel `simulate`; load is (4N-1,)."""
+        intervals, steps, inputs = pressures.shape
+        kept = intervals * steps if linearise else 0
+        viscous = kept if self.mesh.viscous.any() else 0
+        factors = np.empty((kept, self.size, 11))
+        bands = np.empty((viscous, self.size, 6))
+        columns = np.empty((kept, self.size, inputs))
+        x = np.empty((intervals + 1, self.size))
+        rate = np.empty((intervals + 1, self.size))
+        x[0] = self.extend(state.q)
+        rate[0] = self.extend_rate(state.v)
+        done, iterations, update, failed = planar_kernel.simulate(
+            x, rate, pressures, h, extrapolate, tolerance, limit, factors, bands, columns,
+            self.mass, self.damping, self.extend_rate(load), self.fixed, *self.rod,
+        )  # fmt: skip
+        q = self.restore(x, state.q)
+        v = self.restore(rate, state.v)
+        at = done // steps + 1 if failed else intervals
+        final = RodState(q[at].copy(), v[at].copy(), state.directors, state.reference_twist)
+        stored = None
+        if linearise and not failed:
+            stored = StepFactors(factors, bands, columns, *self._diagonals(h), 1.0 / h, extrapolate)
+        return Run(q, v, final, done, iterations, update, failed, stored)
+
+    def _diagonals(self, h: float) -> tuple[Array, Array]:
+        inertia = (self.mass / h + self.damping) / h
+        momentum = self.mass / h
+        inertia[self.fixed] = 0.0
+        momentum[self.fixed] = 0.0
+        return inertia, momentum
+
+    def rows(self, indices: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the kernel's rows of indices into q; -1 for what the plane does not have."""
+        lookup = {int(d): k + 2 * self.ghost for k, d in enumerate(self.index)}
+        return np.array([lookup.get(int(d), -1) for d in indices], dtype=np.int64)
+
+    def solve_static(
+        self, start: RodState, u: Array, load: Array, tolerance: float, limit: int
+    ) -> tuple[RodState, int, float]:
+        """Solve the balance of forces from `start`; iterations are negative without convergence."""
+        x = self.extend(start.q)
+        iterations, update = planar_kernel.newton(
+            x, x.copy(), np.zeros(self.size), 0.0, u, tolerance, limit, self.work, self.band,
+            self.edge, self.turn, self.torque, self.mass, self.damping, self.extend_rate(load),
+            self.fixed, *self.rod,
+        )  # fmt: skip
+        q = self.restore(x, start.q)
+        return RodState(q, 0.0 * q, start.directors, start.reference_twist), iterations, update
+
+    def carry_frames(self, base: RodState, q: Array, v: Array) -> RodState:
+        """Return a state at q; the frames of a planar rod do not matter and stay."""
+        return RodState(q, v, base.directors, base.reference_twist)
+
+    def energy(self, state: RodState) -> float:
+        """Return the elastic energy."""
+        x = self.extend(state.q)
+        return float(planar_kernel.energy(x, self.edge, self.turn, *self.rod))
+
+    def gradient_and_hessian(self, state: RodState) -> tuple[Array, Array]:
+        """Return ∇E (4N-1,) and ∇²E (4N-1, 4N-1); entries off the plane are zero."""
+        x = self.extend(state.q)
+        gradient = np.zeros(self.size)
+        u = np.zeros(len(self.mesh.gain))
+        planar_kernel.assemble(
+            x, np.zeros(self.size), 0.0, u, gradient, self.band, self.edge, self.turn, self.torque,
+            *self.rod,
+        )  # fmt: skip
+        return self._full(gradient), self._full_matrix(band_to_dense(self.band))
+
+    def input_matrix(self, state: RodState) -> Array:
+        """Return B(q)Λ (4N-1, M)."""
+        columns = np.zeros((self.size, len(self.mesh.gain)))
+        planar_kernel.edges_and_turns(self.extend(state.q), self.edge, self.turn)
+        planar_kernel.input_columns(self.edge, *self.rod[-3:], columns)
+        return self._full(columns)
+
+    def viscous_force(self, state: RodState) -> Array:
+        """Return the Kelvin-Voigt force (4N-1,) at a state."""
+        x, v = self.extend(state.q), self.extend_rate(state.v)
+        a = np.zeros((self.size, 11))
+        band = np.zeros((self.size, 6))
+        u = np.zeros(len(self.mesh.gain))
+        planar_kernel.edges_and_turns(x, self.edge, self.turn)
+        planar_kernel.unsymmetric(v, 1.0, u, a, band, self.edge, self.turn, self.rod[5], *self.rod[-3:])
+        return self._full(-band_to_dense(band) @ v)
+
+    def _full(self, planar: Array) -> Array:
+        result = np.zeros((4 * self.mesh.nodes - 1, *planar.shape[1:]))
+        result[self.index] = planar[2 * self.ghost :]
+        return result
+
+    def _full_matrix(self, planar: Array) -> Array:
+        size = 4 * self.mesh.nodes - 1
+        result = np.zeros((size, size))
+        inner = planar[2 * self.ghost :, 2 * self.ghost :]
+        result[np.ix_(self.index, self.index)] = inner
+        return result
+
+
+def band_to_dense(band: Array) -> Array:
+    """Return the full matrix of a symmetric band stored by columns."""
+    size, width = band.shape
+    result = np.diag(band[:, 0].copy())
+    for k in range(1, width):
+        rows = np.arange(k, size)
+        result[rows, rows - k] = band[: size - k, k]
+        result[rows - k, rows] = band[: size - k, k]
+    return result

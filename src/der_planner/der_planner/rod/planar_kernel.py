@@ -1,0 +1,371 @@
+"""Compiled kernels of a rod in a plane: two unknowns a node, half-bandwidth 5.
+
+Symbols: n nodes (with the ghost node, if any), x (2n,) positions, edge j = x_{j+1} − x_j of length |e_j|,
+t its tangent and n̂ its left normal; at node i the turning angle θ and the integrated curvature
+κ = 2 tan(θ/2), κ' = dκ/dθ = 1 + κ²/4, κ'' = κ κ'/2; w = EI/l, c = EI τ/l (Kelvin-Voigt), k3/l³ (cubic).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from der_planner.rod.band_kernel import (
+    expand,
+    factor_general,
+    hold_fixed,
+    hold_fixed_general,
+    solve_5,
+)
+from der_planner.rod.compile import kernel
+from der_planner.rod.state import Array
+
+# A rod's arrays, in the order in which every kernel takes them after its own arguments:
+# rest (n-1,) edge lengths; axial (n-1,) EA; bend (n,) w; rest_kappa (n,); cubic (n,); viscous (n,) c;
+# first (M,), last (M,) edge indices of the segments; gain (M,) Λ.
+
+
+@kernel
+def edges_and_turns(x, edge, turn):
+    """Fill edge (n-1, 3) with t and 1/|e|, turn (n,) with κ at the interior nodes."""
+    n = turn.shape[0]
+    for j in range(n - 1):
+        ex = x[2 * j + 2] - x[2 * j]
+        ey = x[2 * j + 3] - x[2 * j + 1]
+        inverse = 1.0 / np.sqrt(ex * ex + ey * ey)
+        edge[j, 0] = ex * inverse
+        edge[j, 1] = ey * inverse
+        edge[j, 2] = inverse
+    for i in range(1, n - 1):
+        sine = edge[i - 1, 0] * edge[i, 1] - edge[i - 1, 1] * edge[i, 0]
+        cosine = edge[i - 1, 0] * edge[i, 0] + edge[i - 1, 1] * edge[i, 1]
+        turn[i] = 2.0 * sine / (1.0 + cosine)
+
+
+@kernel
+def energy(x, edge, turn, rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain):
+    """Return the elastic energy [J]."""
+    edges_and_turns(x, edge, turn)
+    total = 0.0
+    n = turn.shape[0]
+    for j in range(n - 1):
+        strain = 1.0 / (edge[j, 2] * rest[j]) - 1.0
+        total += 0.5 * axial[j] * strain * strain * rest[j]
+    for i in range(1, n - 1):
+        square = (turn[i] - rest_kappa[i]) ** 2
+        total += 0.5 * bend[i] * square + 0.25 * cubic[i] * square * square
+    return total
+
+
+@kernel
+def assemble(
+    x, v, rate, u, g, s, edge, turn, torque,
+    rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain,
+):  # fmt: skip
+    """Elastic, viscous and actuating terms of the residual and its symmetric derivative.
+
+    g (2n,) becomes ∇E + viscous force − B(q)Λu; s (2n, 6) its derivative by x with v = rate·(x − x_n),
+    of which the unsymmetric part is left out or symmetrised (`unsymmetric` adds what is missing).
+    edge (n-1, 3), turn (n,), torque (n, 2) are work space: t and 1/|e|; κ; moment and its derivative.
+    """
+    n = turn.shape[0]
+    edges_and_turns(x, edge, turn)
+    torque[0, 0] = 0.0
+    torque[0, 1] = 0.0
+    torque[n - 1, 0] = 0.0
+    torque[n - 1, 1] = 0.0
+    for i in range(1, n - 1):
+        kappa = turn[i]
+        slope = 1.0 + 0.25 * kappa * kappa
+        second = 0.5 * kappa * slope
+        delta = kappa - rest_kappa[i]
+        moment = (bend[i] + cubic[i] * delta * delta) * delta
+        tangent = bend[i] + 3.0 * cubic[i] * delta * delta
+        torque[i, 0] = moment * slope
+        torque[i, 1] = tangent * slope * slope + moment * second
+        if viscous[i] != 0.0:
+            turning = turning_rate(v, edge, i)
+            torque[i, 0] += viscous[i] * slope * slope * turning
+            torque[i, 1] += viscous[i] * slope * (slope * rate + 2.0 * second * turning)
+    for k in range(2 * n):
+        g[k] = 0.0
+    # Edge by edge: gradient (gx, gy) and Hessian (hxx, hxy, hyy) by e; then the coupling of two edges.
+    left_xx = left_xy = left_yx = left_yy = 0.0  # coupling of edges j-1 and j, rows of j-1
+    before_xx = before_xy = before_yy = 0.0  # Hessian of edge j-1
+    for j in range(n - 1):
+        tx, ty, il = edge[j, 0], edge[j, 1], edge[j, 2]
+        nx, ny = -ty * il, tx * il  # ∇ of the edge's direction angle
+        tension = axial[j] * (1.0 / (il * rest[j]) - 1.0)
+        bending = torque[j, 0] - torque[j + 1, 0]
+        curving = torque[j, 1] + torque[j + 1, 1]
+        follower = 0.0
+        for m in range(gain.shape[0]):
+            if j == first[m]:
+                follower -= gain[m] * u[m]
+            elif j == last[m]:
+                follower += gain[m] * u[m]
+        along = axial[j] / rest[j]
+        push = bending - follower / il
+        gx = tension * tx + push * nx
+        gy = tension * ty + push * ny
+        # t tᵀ, n̂ n̂ᵀ (in nx, ny scaled by 1/|e|), t n̂ᵀ + n̂ tᵀ
+        side = tension / il + curving
+        cross = follower - bending * il
+        hxx = along * tx * tx + side * nx * nx + 2.0 * cross * tx * nx
+        hxy = along * tx * ty + side * nx * ny + cross * (tx * ny + ty * nx)
+        hyy = along * ty * ty + side * ny * ny + 2.0 * cross * ty * ny
+        if j < n - 2:
+            next_il = edge[j + 1, 2]
+            mx, my = -edge[j + 1, 1] * next_il, edge[j + 1, 0] * next_il
+            tangent = -torque[j + 1, 1]
+            right_xx = tangent * nx * mx
+            right_xy = tangent * nx * my
+            right_yx = tangent * ny * mx
+            right_yy = tangent * ny * my
+        else:
+            right_xx = right_xy = right_yx = right_yy = 0.0
+        k = 2 * j
+        g[k] -= gx
+        g[k + 1] -= gy
+        g[k + 2] = gx
+        g[k + 3] = gy
+        s[k, 0] = before_xx + hxx - 2.0 * left_xx
+        s[k, 1] = before_xy + hxy - left_xy - left_yx
+        s[k + 1, 0] = before_yy + hyy - 2.0 * left_yy
+        # rows of node j+1, columns of node j: −H_jj + C_jᵀ + C_{j+1}ᵀ
+        s[k, 2] = -hxx + left_xx + right_xx
+        s[k, 3] = -hxy + left_xy + right_xy
+        s[k + 1, 1] = -hxy + left_yx + right_yx
+        s[k + 1, 2] = -hyy + left_yy + right_yy
+        # rows of node j+2: −C_{j+1}ᵀ
+        s[k, 4] = -right_xx
+        s[k, 5] = -right_xy
+        s[k + 1, 3] = -right_yx
+        s[k + 1, 4] = -right_yy
+        s[k + 1, 5] = 0.0
+        before_xx, before_xy, before_yy = hxx, hxy, hyy
+        left_xx, left_xy, left_yx, left_yy = right_xx, right_xy, right_yx, right_yy
+    k = 2 * n - 2
+    for column in range(6):
+        s[k, column] = 0.0
+        s[k + 1, column] = 0.0
+    s[k, 0] = before_xx
+    s[k, 1] = before_xy
+    s[k + 1, 0] = before_yy
+
+
+@kernel
+def turning_rate(v, edge, i):
+    """Return dθ/dt at node i for node velocities v."""
+    total = 0.0
+    for side in range(2):
+        j = i - 1 + side
+        ex = v[2 * j + 2] - v[2 * j]
+        ey = v[2 * j + 3] - v[2 * j + 1]
+        along = (edge[j, 0] * ey - edge[j, 1] * ex) * edge[j, 2]
+        total += along if side == 1 else -along
+    return total
+
+
+@kernel
+def unsymmetric(v, rate, u, a, damping, edge, turn, viscous, first, last, gain):
+    """Complete a (2n, 11) to the exact derivative; fill damping (2n, 6) with the viscous matrix·rate.
+
+    Missing in `assemble` are −(Λu/|e|) n̂ tᵀ of a couple that keeps its force while its edge stretches,
+    and c κ'² ∇θ (∇²θ v)ᵀ of the viscous moment.
+    """
+    n = turn.shape[0]
+    damping[:] = 0.0
+    for m in range(gain.shape[0]):
+        for end in range(2):
+            j = first[m] if end == 0 else last[m]
+            force = (-gain[m] if end == 0 else gain[m]) * u[m] * edge[j, 2]
+            tx, ty = edge[j, 0], edge[j, 1]
+            for row in range(4):
+                normal = (-ty if row % 2 == 0 else tx) * (-1.0 if row < 2 else 1.0)
+                for column in range(4):
+                    along = (tx if column % 2 == 0 else ty) * (-1.0 if column < 2 else 1.0)
+                    a[2 * j + row, 5 + column - row] -= force * normal * along
+    gradient = np.empty(6)
+    change = np.empty(6)
+    for i in range(1, n - 1):
+        if viscous[i] == 0.0:
+            continue
+        slope = 1.0 + 0.25 * turn[i] * turn[i]
+        strength = viscous[i] * slope * slope
+        gradient[:] = 0.0
+        change[:] = 0.0
+        for side in range(2):
+            j = i - 1 + side
+            sign = 1.0 if side == 1 else -1.0
+            tx, ty, il = edge[j, 0], edge[j, 1], edge[j, 2]
+            vx = v[2 * j + 2] - v[2 * j]
+            vy = v[2 * j + 3] - v[2 * j + 1]
+            along = (tx * vx + ty * vy) * il * il
+            across = (tx * vy - ty * vx) * il * il
+            k = 2 * side
+            gx, gy = -sign * ty * il, sign * tx * il
+            hx = -sign * (tx * across - ty * along)
+            hy = -sign * (ty * across + tx * along)
+            gradient[k] -= gx
+            gradient[k + 1] -= gy
+            gradient[k + 2] += gx
+            gradient[k + 3] += gy
+            change[k] -= hx
+            change[k + 1] -= hy
+            change[k + 2] += hx
+            change[k + 3] += hy
+        base = 2 * i - 2
+        for row in range(6):
+            for column in range(6):
+                a[base + row, 5 + column - row] += strength * gradient[row] * change[column]
+                if row >= column:
+                    damping[base + column, row - column] += (
+                        strength * rate * gradient[row] * gradient[column]
+                    )
+
+
+@kernel
+def input_columns(edge, first, last, gain, columns):
+    """Fill columns (2n, M) with B(q)Λ for the tangents in edge."""
+    columns[:] = 0.0
+    for m in range(gain.shape[0]):
+        for end in range(2):
+            j = first[m] if end == 0 else last[m]
+            force = -gain[m] if end == 0 else gain[m]
+            columns[2 * j, m] += force * edge[j, 1]
+            columns[2 * j + 1, m] -= force * edge[j, 0]
+            columns[2 * j + 2, m] -= force * edge[j, 1]
+            columns[2 * j + 3, m] += force * edge[j, 0]
+
+
+@kernel
+def newton(
+    x, x_n, v_n, rate, u, tolerance, limit, work, s, edge, turn, torque,
+    mass, damping, load, fixed,
+    rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain,
+):  # fmt: skip
+    """Solve M·rate·((x − x_n)·rate − v_n) + D·rate·(x − x_n) = F(x) for x, from the guess in x.
+
+    rate = 0 is statics. work (3, 2n) holds the residual, the velocity and the last converged guess.
+    Returns (iterations, size of the last update); iterations is negative without convergence.
+    """
+    size = x.shape[0]
+    residual = work[0]
+    v = work[1]
+    largest = 0.25 * rest.min()
+    update = np.inf
+    for iteration in range(limit):
+        for k in range(size):
+            v[k] = (x[k] - x_n[k]) * rate
+        assemble(x, v, rate, u, residual, s, edge, turn, torque,
+                 rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain)  # fmt: skip
+        for k in range(size):
+            residual[k] += mass[k] * rate * (v[k] - v_n[k]) + damping[k] * v[k] - load[k]
+            s[k, 0] += rate * (mass[k] * rate + damping[k])
+        hold_fixed(s, residual, fixed)
+        solve_5(s, residual)
+        update = 0.0
+        for k in range(size):
+            # written so that NaN counts as too large
+            if not abs(residual[k]) <= update:
+                update = abs(residual[k])
+        if not update < 1e6:
+            return -iteration - 1, update
+        scale = 1.0 if update < largest else largest / update
+        for k in range(size):
+            x[k] -= scale * residual[k]
+        if update < tolerance:
+            return iteration + 1, update
+    return -limit, update
+
+
+@kernel
+def simulate(
+    q, v, pressures, h, extrapolate, tolerance, limit,
+    factors, viscous_bands, inputs,
+    mass, damping, load, fixed,
+    rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain,
+):  # fmt: skip
+    """Run K intervals of S steps from q[0], v[0] into q, v (K+1, 2n).
+
+    Each step solves backward Euler over h and goes on to x_n + extrapolate·(x − x_n): 1 is backward
+    Euler, 2 with h = dt/2 the implicit midpoint rule. pressures is (K, S, M). factors (K·S, 2n, 11),
+    viscous_bands (K·S or 0, 2n, 6) and inputs (K·S, 2n, M) receive the linearisation unless empty.
+
+    Returns (steps done, Newton iterations, last update, iterations of the failed step or 0).
+    """
+    intervals, steps, _ = pressures.shape
+    size = q.shape[1]
+    n = size // 2
+    work = np.zeros((3, size))
+    s = np.zeros((size, 6))
+    edge = np.zeros((n - 1, 3))
+    turn = np.zeros(n)
+    torque = np.zeros((n, 2))
+    x = q[0].copy()
+    x_n = q[0].copy()
+    v_n = v[0].copy()
+    acceleration = np.zeros(size)
+    band = np.zeros((size, 6))
+    rate = 1.0 / h
+    total = 0
+    for k in range(intervals):
+        for step in range(steps):
+            u = pressures[k, step]
+            for d in range(size):
+                x[d] = x_n[d] + h * (v_n[d] + h * acceleration[d])
+            for d in fixed:
+                x[d] = x_n[d]
+            iterations, update = newton(
+                x, x_n, v_n, rate, u, tolerance, limit, work, s, edge, turn, torque,
+                mass, damping, load, fixed,
+                rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain)  # fmt: skip
+            index = k * steps + step
+            if iterations < 0:
+                q[k + 1] = x_n
+                v[k + 1] = v_n
+                return index, total - iterations, update, -iterations
+            total += iterations
+            if factors.shape[0] > 0:
+                linearise(x, x_n, rate, u, factors[index], inputs[index], band, work, s, edge, turn,
+                          torque, mass, damping, fixed,
+                          rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain)  # fmt: skip
+                factor_general(factors[index])
+                if viscous_bands.shape[0] > 0:
+                    viscous_bands[index] = band
+            for d in range(size):
+                velocity = (x[d] - x_n[d]) * rate
+                acceleration[d] = (velocity - v_n[d]) * rate
+                x_n[d] += extrapolate * (x[d] - x_n[d])
+                v_n[d] += extrapolate * (velocity - v_n[d])
+        q[k + 1] = x_n
+        v[k + 1] = v_n
+    return intervals * steps, total, 0.0, 0
+
+
+@kernel
+def linearise(
+    x, x_n, rate, u, a, columns, band, work, s, edge, turn, torque, mass, damping, fixed,
+    rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain,
+):  # fmt: skip
+    """Fill a (2n, 11) with the exact derivative of the step's residual at x, columns with B(q)Λ.
+
+    band (2n, 6) receives the viscous matrix times rate. Fixed unknowns have unit rows.
+    """
+    size = x.shape[0]
+    v = work[1]
+    for k in range(size):
+        v[k] = (x[k] - x_n[k]) * rate
+    assemble(x, v, rate, u, work[0], s, edge, turn, torque,
+             rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain)  # fmt: skip
+    for k in range(size):
+        s[k, 0] += rate * (mass[k] * rate + damping[k])
+    expand(s, a)
+    unsymmetric(v, rate, u, a, band, edge, turn, viscous, first, last, gain)
+    hold_fixed_general(a, fixed)
+    hold_fixed(band, work[0], fixed)
+    for d in fixed:
+        band[d, 0] = 0.0
+    input_columns(edge, first, last, gain, columns)
+    for d in fixed:
+        columns[d] = 0.0

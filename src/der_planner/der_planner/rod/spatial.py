@@ -1,0 +1,3 @@
+class SpatialBackend:
+    def __init__(self, mesh):
+        raise NotImplementedError
