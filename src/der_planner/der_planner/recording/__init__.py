@@ -1,1 +1,1 @@
-"""Bags that survive a kill."""
+"""Recording: MCAP bags in rosbag2's layout, their reader and their repair. Nothing here needs ROS."""

@@ -1,0 +1,351 @@
+"""The recorder: every topic of the graph into an MCAP bag, as raw CDR."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+from limb_interfaces import parameters, topics
+from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
+from limb_interfaces.runner import run_node
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
+from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+
+from der_planner.recording.definitions import DefinitionError, find_definition
+from der_planner.recording.layout import RUN_KEY, OfferedQos, TopicSpec
+from der_planner.recording.session import RecordingSession
+from der_planner.recording.writer import COMPRESSIONS, BagWriteError, BagWriter
+
+IMAGE_TYPE = "sensor_msgs/msg/Image"
+MARK_TOPIC = "recorder/mark"
+DEPTH = 200
+IMAGE_DEPTH = 30
+
+
+class Recorder(Node):
+    """Subscribes to whatever is published, and writes it between `start` and `stop`."""
+
+    def __init__(self) -> None:
+        super().__init__("recorder", namespace=topics.NAMESPACE)
+        self._declare_parameters()
+        self._session: RecordingSession | None = None
+        self._last_failure = ""
+        self._subscriptions_by_topic: dict[str, tuple[Subscription, tuple[OfferedQos, ...]]] = {}
+        self._specs: dict[str, TopicSpec] = {}
+        self._latched: dict[str, tuple[int, bytes]] = {}
+        self._refused: dict[str, str] = {}
+        self._marks = 0
+        self._services = [
+            self.create_service(Trigger, "recorder/start", self._on_start),
+            self.create_service(Trigger, "recorder/stop", self._on_stop),
+            self.create_service(SetBool, "recorder/pause", self._on_pause),
+            self.create_service(Trigger, "recorder/mark", self._on_mark),
+        ]
+        self._discover()
+        self._discovery = self.create_timer(0.25, self._discover)
+        self._diagnostics = DiagnosticsPublisher(self, self._health)
+        if self._parameter("autostart"):
+            self._start()
+
+    def close(self) -> None:
+        """Close the bag."""
+        if self._session is not None:
+            self._stop()
+
+    def _declare_parameters(self) -> None:
+        declare = partial(parameters.declare, self)
+        declare(
+            "output",
+            "",
+            "bag folder that the next start makes; empty: a folder named by the time, in the cwd",
+            read_only=False,
+        )
+        declare(
+            "metadata",
+            "{}",
+            "JSON object stored in the next bag: motion, model, method, trial, seed, versions",
+            read_only=False,
+        )
+        declare("record_images", False, "record raw images, too", read_only=False)
+        declare("mark_label", "", "text of the next mark", read_only=False)
+        declare("autostart", False, "start recording at once")
+        declare("topics", ".*", "regular expression that the full topic names must match")
+        declare("exclude", "", "regular expression of full topic names to leave out; empty: none")
+        declare(
+            "compression",
+            "auto",
+            "of the bag's chunks; auto: none with images, else zstd",
+            choices=("auto", *COMPRESSIONS),
+        )
+        declare("split_size", 0, "begin a new file after so many bytes; 0: never", at_least=0)
+        declare("split_duration", 0.0, "begin a new file after so many s; 0: never", at_least=0.0)
+        declare("flush_interval", 1.0, "time between flushes [s]", at_least=0.05, at_most=60.0)
+        declare("queue_size", 256 << 20, "bytes that may wait for the disk", at_least=1 << 20)
+        declare(
+            "minimum_free", 64 << 20, "stop below so many free bytes on the disk; 0: never", at_least=0
+        )
+        self._wanted = self._pattern("topics")
+        self._unwanted = self._pattern("exclude")
+
+    def _parameter(self, name: str):  # noqa: ANN202 - whatever type was declared
+        return self.get_parameter(name).value
+
+    def _pattern(self, name: str) -> re.Pattern[str] | None:
+        text = self._parameter(name)
+        try:
+            return re.compile(text) if text else None
+        except re.error as error:
+            raise parameters.ParameterError(
+                f"parameter '{name}' is '{text}', no regular expression: {error}"
+            ) from error
+
+    # Topics
+
+    def _discover(self) -> None:
+        """Subscribe to what has appeared, and again where publishers changed their QoS."""
+        for name, types in self.get_topic_names_and_types():
+            if not self._is_wanted(name, types[0]):
+                self._unsubscribe(name)
+                continue
+            if len(types) > 1:
+                self._refuse(name, f"has several types: {', '.join(types)}")
+                continue
+            qos = offered_qos(self.get_publishers_info_by_topic(name))
+            present = self._subscriptions_by_topic.get(name)
+            if present is None:
+                self._subscribe(name, types[0], qos)
+            elif qos and qos != present[1] and _profile(types[0], qos) != _profile(
+                types[0], present[1]
+            ):
+                self._unsubscribe(name)
+                self._subscribe(name, types[0], qos)
+            elif qos and not present[1]:
+                self._subscriptions_by_topic[name] = (present[0], qos)
+                self._describe(name, types[0], qos)
+
+    def _is_wanted(self, name: str, type_name: str) -> bool:
+        if type_name == IMAGE_TYPE and not self._parameter("record_images"):
+            return False
+        if self._wanted is not None and not self._wanted.fullmatch(name):
+            return False
+        return self._unwanted is None or not self._unwanted.fullmatch(name)
+
+    def _refuse(self, name: str, reason: str) -> None:
+        if name not in self._refused:
+            self._refused[name] = reason
+            self.get_logger().warning(f"not recording {name}: {reason}")
+
+    def _subscribe(self, name: str, type_name: str, qos: tuple[OfferedQos, ...]) -> None:
+        if name in self._refused:
+            return
+        try:
+            self._describe(name, type_name, qos)
+            package, _, short = type_name.split("/")
+            message_class = getattr(importlib.import_module(f"{package}.msg"), short)
+        except (DefinitionError, ImportError, AttributeError, ValueError) as error:
+            self._refuse(name, str(error))
+            return
+        subscription = self.create_subscription(
+            message_class,
+            name,
+            self._receiver(name),
+            _profile(type_name, qos),
+            raw=True,
+        )
+        self._subscriptions_by_topic[name] = (subscription, qos)
+
+    def _describe(self, name: str, type_name: str, qos: tuple[OfferedQos, ...]) -> None:
+        definition = find_definition(type_name)
+        latched = bool(qos) and all(q.durability == "transient_local" for q in qos)
+        self._specs[name] = TopicSpec(
+            name, type_name, definition.text, definition.type_hash, qos, latched
+        )
+
+    def _unsubscribe(self, name: str) -> None:
+        present = self._subscriptions_by_topic.pop(name, None)
+        if present is not None:
+            self.destroy_subscription(present[0])
+
+    def _receiver(self, name: str):  # noqa: ANN202 - a callback of two arguments
+        def receive(data: bytes, info: dict[str, int]) -> None:
+            arrived = self._now()
+            sent = info.get("source_timestamp", 0) or arrived
+            spec = self._specs[name]
+            if spec.latched:
+                self._latched[name] = (sent, data)
+            if self._session is not None:
+                self._session.put(spec, arrived, sent, data)
+
+        return receive
+
+    def _now(self) -> int:
+        return int(self.get_clock().now().nanoseconds)
+
+    # Services
+
+    def _start(self) -> str:
+        metadata = self._run_metadata()
+        output = self._parameter("output")
+        folder = Path(output) if output else Path(time.strftime("bag_%Y_%m_%d-%H_%M_%S"))
+        compression = self._parameter("compression")
+        if compression == "auto":
+            compression = "none" if self._parameter("record_images") else "zstd"
+        writer = BagWriter(
+            folder.absolute(),
+            {RUN_KEY: metadata},
+            compression=compression,
+            split_bytes=self._parameter("split_size"),
+            split_seconds=self._parameter("split_duration"),
+        )
+        self._session = RecordingSession(
+            writer,
+            flush_interval=self._parameter("flush_interval"),
+            queue_bytes=self._parameter("queue_size"),
+            minimum_free=self._parameter("minimum_free"),
+        )
+        self._last_failure = ""
+        self._marks = 0
+        self._discover()
+        now = self._now()
+        for name, (sent, data) in self._latched.items():
+            self._session.put(self._specs[name], now, sent, data)
+        self.get_logger().info(f"recording into {writer.folder}")
+        return str(writer.folder)
+
+    def _run_metadata(self) -> str:
+        text = self._parameter("metadata")
+        try:
+            value = json.loads(text or "{}")
+        except json.JSONDecodeError as error:
+            raise parameters.ParameterError(f"parameter 'metadata' is no JSON: {error}") from error
+        if not isinstance(value, dict):
+            raise parameters.ParameterError("parameter 'metadata' must be a JSON object: {…}")
+        return json.dumps(value)
+
+    def _stop(self) -> tuple[bool, str]:
+        assert self._session is not None
+        status = self._session.stop()
+        self._session = None
+        self._last_failure = status.failure
+        if status.failure:
+            self.get_logger().error(status.failure)
+            return False, status.failure
+        text = f"{status.folder}: {status.messages} messages, {status.dropped} dropped"
+        self.get_logger().info(f"closed {text}")
+        return True, str(status.folder)
+
+    def _on_start(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._session is not None and not self._session.status().failure:
+            response.message = f"already recording into {self._session.folder}: call stop first"
+            return response
+        if self._session is not None:
+            self._stop()
+        try:
+            response.message = self._start()
+            response.success = True
+        except (BagWriteError, parameters.ParameterError) as error:
+            response.message = self._last_failure = str(error)
+            self.get_logger().error(str(error))
+        return response
+
+    def _on_stop(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._session is None:
+            response.message = self._last_failure or "not recording: call start first"
+            return response
+        response.success, response.message = self._stop()
+        return response
+
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        if self._session is None:
+            response.message = "not recording: call start first"
+            return response
+        self._session.paused = request.data
+        response.success = True
+        response.message = "paused" if request.data else "recording again"
+        return response
+
+    def _on_mark(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._session is None:
+            response.message = "not recording: call start first"
+            return response
+        self._marks += 1
+        label = self._parameter("mark_label") or f"mark {self._marks}"
+        name = f"{self.get_namespace().rstrip('/')}/{MARK_TOPIC}"
+        definition = find_definition("std_msgs/msg/String")
+        spec = TopicSpec(
+            name, definition.name, definition.text, definition.type_hash, (OfferedQos(),)
+        )
+        now = self._now()
+        paused, self._session.paused = self._session.paused, False
+        response.success = self._session.put(spec, now, now, serialize_message(String(data=label)))
+        self._session.paused = paused
+        response.message = label
+        return response
+
+    def _health(self) -> Health:
+        values: dict[str, object] = {
+            "topics": len(self._subscriptions_by_topic),
+            "not_recorded": "; ".join(f"{k}: {v}" for k, v in self._refused.items()),
+        }
+        if self._session is None:
+            if self._last_failure:
+                return Health("error", self._last_failure, {**values, "state": "failed"})
+            return Health("ok", "not recording", {**values, "state": "idle"})
+        status = self._session.status()
+        values |= {
+            "state": "paused" if status.paused else "recording",
+            "bag": status.folder,
+            "messages": status.messages,
+            "bytes": status.bytes,
+            "files": status.files,
+            "dropped": status.dropped,
+            "queued_bytes": status.queued_bytes,
+        }
+        if status.failure:
+            return Health("error", status.failure, {**values, "state": "failed"})
+        if status.dropped:
+            lost = f"{status.dropped} messages dropped: the disk is too slow for what is recorded"
+            return Health("warning", lost, values)
+        return Health("ok", f"{values['state']} into {status.folder}", values)
+
+
+def offered_qos(endpoints: list[TopicEndpointInfo]) -> tuple[OfferedQos, ...]:
+    """Return what the publishers of a topic offer, each profile once."""
+    found = {
+        OfferedQos(
+            reliability=info.qos_profile.reliability.name.lower(),
+            durability=info.qos_profile.durability.name.lower(),
+            history=info.qos_profile.history.name.lower(),
+            depth=info.qos_profile.depth,
+        )
+        for info in endpoints
+    }
+    return tuple(sorted(found, key=repr))
+
+
+def _profile(type_name: str, offered: tuple[OfferedQos, ...]) -> QoSProfile:
+    """Return the strictest profile that every publisher still matches."""
+    is_image = type_name == IMAGE_TYPE
+    reliable = not is_image and all(q.reliability == "reliable" for q in offered)
+    latched = bool(offered) and all(q.durability == "transient_local" for q in offered)
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=IMAGE_DEPTH if is_image else DEPTH,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run_node(Recorder))
