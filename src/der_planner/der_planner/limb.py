@@ -40,6 +40,15 @@ class Segment:
         rest_curvature: signed curvature at zero differential pressure [1/m], positive toward +y.
         cubic_stiffness: k3 in moment = EI (κ − κ̄) + k3 (κ − κ̄)³ [N·m⁴]; 0 is a linear segment.
         material_damping: Kelvin-Voigt time τ in moment = EI (κ + τ κ̇) [s].
+        gain_asymmetry: relative gain of the left over the mean of both chambers [-].
+        pressure_stiffening: relative growth of the stiffness per |differential pressure| [1/Pa].
+        friction_moment: saturation of a Dahl friction element [N·m].
+        friction_curvature: change of curvature over which friction turns round [1/m].
+        creep_stiffness: of a Maxwell element beside EI [N·m²].
+        creep_time: relaxation time of it [s].
+
+    The last six are what `der_planner.actuation` turns into pressures; the rod and the PCC model are
+    driven by the effective pressure that remains. All zero: effective and differential are the same.
     """
 
     length: float
@@ -52,6 +61,12 @@ class Segment:
     rest_curvature: float = 0.0
     cubic_stiffness: float = 0.0
     material_damping: float = 0.0
+    gain_asymmetry: float = 0.0
+    pressure_stiffening: float = 0.0
+    friction_moment: float = 0.0
+    friction_curvature: float = 0.0
+    creep_stiffness: float = 0.0
+    creep_time: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -65,6 +80,7 @@ class Pneumatics:
         time_constant: first-order lag from command to chamber [s].
         delay: dead time from command to the first change in the chamber [s].
         minimum_supply: least absolute supply pressure that the board needs [Pa].
+        vent_time_constant: lag while |differential pressure| falls [s]; 0 = as `time_constant`.
     """
 
     pressure_limit: float
@@ -73,6 +89,7 @@ class Pneumatics:
     time_constant: float
     delay: float = 0.0
     minimum_supply: float = 0.0
+    vent_time_constant: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -101,6 +118,8 @@ class Limb:
         gravity: acceleration in `limb_base` [m/s²]; the limb lies on its plane by default.
         calibrated: what the numbers were identified on.
         provenance: free text by key: source, date, bag, residuals.
+        pcc_segments: (M,) what the same data say of the PCC model, where that differs; empty: as
+            `segments`.
     """
 
     name: str
@@ -110,13 +129,21 @@ class Limb:
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     calibrated: CalibratedRange = field(default_factory=CalibratedRange)
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    pcc_segments: tuple[Segment, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.segments:
             raise LimbError(f"limb '{self.name}' has no segments: give at least one")
-        for index, segment in enumerate(self.segments):
-            _check_numbers(segment, f"segments[{index}]", may_be_zero=_MAY_BE_ZERO, signed=_SIGNED)
-        _check_numbers(self.pneumatics, "pneumatics", may_be_zero={"delay", "minimum_supply"})
+        for key in ("segments", "pcc_segments"):
+            for index, segment in enumerate(getattr(self, key)):
+                where = f"{key}[{index}]"
+                _check_numbers(segment, where, may_be_zero=_MAY_BE_ZERO, signed=_SIGNED)
+                _check_memory(segment, where)
+        if self.pcc_segments and len(self.pcc_segments) != len(self.segments):
+            raise LimbError(
+                f"pcc_segments has {len(self.pcc_segments)} entries, segments {len(self.segments)}"
+            )
+        _check_numbers(self.pneumatics, "pneumatics", may_be_zero=_PNEUMATICS_MAY_BE_ZERO)
         if not (math.isfinite(self.connector_length) and self.connector_length >= 0):
             raise LimbError(f"connector_length must be 0 or more m, got {self.connector_length}")
         if len(self.gravity) != 3 or not all(math.isfinite(value) for value in self.gravity):
@@ -137,6 +164,14 @@ class Limb:
     def static_gain(self) -> NDArray[np.float64]:
         """(M,) bend angle per differential pressure of a linear segment, G L / EI [rad/Pa]."""
         return np.array([s.moment_gain * s.length / s.bending_stiffness for s in self.segments])
+
+    def for_model(self, model: str) -> Limb:
+        """Return the limb as a model sees it: "der" as it is, "pcc" with its own segments if any."""
+        if model not in ("der", "pcc"):
+            raise LimbError(f"model must be 'der' or 'pcc', got {model!r}")
+        if model == "der" or not self.pcc_segments:
+            return self
+        return dataclasses.replace(self, segments=self.pcc_segments, pcc_segments=())
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> Limb:
@@ -176,16 +211,11 @@ class Limb:
         if version != SCHEMA_VERSION:
             raise LimbError(f"schema_version is {version!r}: this program reads {SCHEMA_VERSION}")
         _refuse_unknown(content, {"schema_version", *_field_names(cls)}, "")
-        segments = content.get("segments")
-        if not isinstance(segments, Sequence) or isinstance(segments, str):
-            raise LimbError("segments must be a list with one entry a segment")
         calibrated = content.get("calibrated") or {}
         return cls(
             name=str(content.get("name", "limb")),
-            segments=tuple(
-                _from_mapping(Segment, item, f"segments[{index}]")
-                for index, item in enumerate(segments)
-            ),
+            segments=_segments(content.get("segments"), "segments"),
+            pcc_segments=_segments(content.get("pcc_segments") or [], "pcc_segments"),
             pneumatics=_from_mapping(Pneumatics, content.get("pneumatics"), "pneumatics"),
             connector_length=_number(content.get("connector_length", 0.0), "connector_length"),
             gravity=_triple(content.get("gravity", (0.0, 0.0, 0.0))),
@@ -200,6 +230,7 @@ class Limb:
         body: dict[str, Any] = {"schema_version": SCHEMA_VERSION, **dataclasses.asdict(self)}
         body["gravity"] = list(self.gravity)
         body["segments"] = list(body["segments"])
+        body["pcc_segments"] = list(body["pcc_segments"])
         body["calibrated"] = {key: list(value) for key, value in body["calibrated"].items()}
         body["provenance"] = dict(self.provenance)
         text = yaml.safe_dump(body, sort_keys=False, allow_unicode=True)
@@ -211,11 +242,41 @@ _UNITS = """\
 # length, connector_length [m]; bending_stiffness EI, torsional_stiffness GJ [N m^2];
 # axial_stiffness EA [N]; mass_per_length [kg/m]; damping [1/s]; moment_gain [N m/Pa];
 # rest_curvature [1/m]; cubic_stiffness [N m^4]; material_damping [s]; pressure_limit [Pa];
-# slew_limit, fill_rate [Pa/s]; time_constant, delay [s]; minimum_supply [Pa, absolute];
+# gain_asymmetry [-]; pressure_stiffening [1/Pa]; friction_moment [N m]; friction_curvature [1/m];
+# creep_stiffness [N m^2]; creep_time [s];
+# slew_limit, fill_rate [Pa/s]; time_constant, vent_time_constant, delay [s];
+# minimum_supply [Pa, absolute];
 # gravity [m/s^2]; calibrated.differential_pressure [Pa]; calibrated.bend_angle [rad].
 """
-_SIGNED = {"rest_curvature", "cubic_stiffness"}
-_MAY_BE_ZERO = {"damping", "material_damping"}
+_SIGNED = {"rest_curvature", "cubic_stiffness", "gain_asymmetry", "pressure_stiffening"}
+_MAY_BE_ZERO = {
+    "damping",
+    "material_damping",
+    "friction_moment",
+    "friction_curvature",
+    "creep_stiffness",
+    "creep_time",
+}
+_PNEUMATICS_MAY_BE_ZERO = {"delay", "minimum_supply", "vent_time_constant"}
+
+
+def _check_memory(segment: Segment, where: str) -> None:
+    for strength, scale in (
+        ("friction_moment", "friction_curvature"),
+        ("creep_stiffness", "creep_time"),
+    ):
+        if getattr(segment, strength) > 0 and getattr(segment, scale) == 0:
+            raise LimbError(f"{where}.{scale} must be positive where {strength} is")
+    if not abs(segment.gain_asymmetry) < 1:
+        raise LimbError(f"{where}.gain_asymmetry must be within ±1, got {segment.gain_asymmetry}")
+
+
+def _segments(content: object, key: str) -> tuple[Segment, ...]:
+    if not isinstance(content, Sequence) or isinstance(content, str):
+        raise LimbError(f"{key} must be a list with one entry a segment")
+    return tuple(
+        _from_mapping(Segment, item, f"{key}[{index}]") for index, item in enumerate(content)
+    )
 
 
 def _field_names(kind: Any) -> set[str]:

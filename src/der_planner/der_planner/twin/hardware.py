@@ -27,9 +27,13 @@ RANGES: dict[str, tuple[float, float]] = {
     "rest_angle": (-3.0, 3.0),  # [deg] each segment
     "loop_first": (0.06, 0.12),  # friction loop width over a span of 60°, first segment
     "loop_second": (0.02, 0.06),  # second segment
-    "yield_angle": (8.0, 16.0),  # [deg] of bend over which friction turns round
-    "creep": (0.02, 0.05),  # slow share of the stiffness
-    "creep_time": (15.0, 60.0),  # [s]
+    "yield_angle": (6.0, 14.0),  # [deg] of bend over which friction turns round
+    "friction_exponent": (1.2, 2.0),  # sharpness of the knee of the friction
+    "friction_share": (0.55, 0.85),  # share of the friction's decay that reversal switches off
+    "slow_creep": (0.01, 0.03),  # slow share of the stiffness
+    "slow_creep_time": (30.0, 90.0),  # [s]
+    "creep": (0.01, 0.03),  # middle share of the stiffness
+    "creep_time": (3.0, 9.0),  # [s]
     "fast_creep": (0.15, 0.35),  # fast share of the stiffness
     "fast_creep_time": (0.02, 0.05),  # [s]
     "wander": (0.1, 0.3),  # [deg] standard deviation of the rest angle within a run
@@ -60,7 +64,8 @@ class SegmentHardware:
         rest_curvature: at atmosphere [1/m].
         friction_moment: saturation of the friction between silicone and fibre [N·m].
         friction_curvature: change of curvature over which the friction turns round [1/m].
-        creep_stiffness, creep_time: Maxwell branches, fast and slow [N·m²], [s].
+        friction_exponent, friction_share: n and β of its Bouc-Wen law.
+        creep_stiffness, creep_time: Maxwell branches, fast, middle and slow [N·m²], [s].
         wander, wander_time: standard deviation [1/m] and correlation time [s] of the rest curvature.
     """
 
@@ -73,8 +78,10 @@ class SegmentHardware:
     rest_curvature: float
     friction_moment: float
     friction_curvature: float
-    creep_stiffness: tuple[float, float]
-    creep_time: tuple[float, float]
+    friction_exponent: float
+    friction_share: float
+    creep_stiffness: tuple[float, float, float]
+    creep_time: tuple[float, float, float]
     wander: float
     wander_time: float
 
@@ -130,8 +137,14 @@ def draw(seed: int) -> Hardware:
                 rest_curvature=float(np.deg2rad(of("rest_angle"))) / length,
                 friction_moment=0.5 * loop * LOOP_SPAN / length * stiffness,
                 friction_curvature=float(np.deg2rad(of("yield_angle"))) / length,
-                creep_stiffness=(stiffness * of("fast_creep"), stiffness * of("creep")),
-                creep_time=(of("fast_creep_time"), of("creep_time")),
+                friction_exponent=of("friction_exponent"),
+                friction_share=of("friction_share"),
+                creep_stiffness=(
+                    stiffness * of("fast_creep"),
+                    stiffness * of("creep"),
+                    stiffness * of("slow_creep"),
+                ),
+                creep_time=(of("fast_creep_time"), of("creep_time"), of("slow_creep_time")),
                 wander=float(np.deg2rad(of("wander"))) / length,
                 wander_time=of("wander_time"),
             )

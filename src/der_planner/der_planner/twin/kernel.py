@@ -74,27 +74,33 @@ class Material(NamedTuple):
     active: Array  # [N·m] moment of the chambers
     friction_moment: Array  # [N·m]
     friction_curvature: Array  # [1/m]
-    creep_stiffness: Array  # (2, K) [N·m²]
-    creep_time: Array  # (2, K) [s]
+    friction_exponent: Array
+    friction_share: Array
+    creep_stiffness: Array  # (3, K) [N·m²]
+    creep_time: Array  # (3, K) [s]
     curvature: Array  # state: κ at the last step [1/m]
     friction: Array  # state: z in −1 … 1
-    creep: Array  # state: q (2, K) [1/m]
+    creep: Array  # state: q (3, K) [1/m]
 
 
 @njit(cache=True)
 def bending_law(material: Material, kappa: Array, couple: Array, dt: float) -> None:
     """Write the planar bending moment of each vertex (K,) [N·m] and advance what it remembers.
 
-    Friction is a Dahl element, dz = (dκ/κ_f)(1 − z sgn dκ), and creep a Maxwell element,
-    q̇ = κ̇ − q/τ; both are integrated exactly for a constant rate, so any step size is stable.
+    Friction is a Bouc-Wen element, κ_f dz = (1 − |z|ⁿ (β sgn(z dκ) + 1 − β)) dκ, kept within ±1, and
+    creep a Maxwell element, q̇ = κ̇ − q/τ, integrated exactly for a constant rate, so that any rate of
+    bending is stable.
     """
     for k in range(kappa.shape[0]):
         curvature = kappa[k] / material.flexible_share[k]
         change = curvature - material.curvature[k]
         material.curvature[k] = curvature
-        sign = 1.0 if change >= 0.0 else -1.0
-        turn = np.exp(-abs(change) / material.friction_curvature[k])
-        material.friction[k] = sign + (material.friction[k] - sign) * turn
+        z = material.friction[k]
+        share = material.friction_share[k]
+        loading = share if z * change >= 0.0 else -share
+        decay = abs(z) ** material.friction_exponent[k] * (loading + 1.0 - share)
+        z += change / material.friction_curvature[k] * (1.0 - decay)
+        material.friction[k] = min(1.0, max(-1.0, z))
         strain = curvature - material.rest[k]
         moment = (
             material.stiffness[k] * strain
@@ -102,7 +108,7 @@ def bending_law(material: Material, kappa: Array, couple: Array, dt: float) -> N
             + material.friction_moment[k] * material.friction[k]
             - material.active[k]
         )
-        for branch in range(2):
+        for branch in range(3):
             rate = dt / material.creep_time[branch, k]
             keep = np.exp(-rate)
             material.creep[branch, k] = (

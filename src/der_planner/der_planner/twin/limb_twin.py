@@ -286,11 +286,13 @@ class LimbTwin:
             active=np.zeros(count),
             friction_moment=column("friction_moment"),
             friction_curvature=column("friction_curvature"),
+            friction_exponent=column("friction_exponent"),
+            friction_share=column("friction_share"),
             creep_stiffness=np.ascontiguousarray(column("creep_stiffness").T),
             creep_time=np.ascontiguousarray(column("creep_time").T),
             curvature=np.zeros(count),
             friction=np.zeros(count),
-            creep=np.zeros((2, count)),
+            creep=np.zeros((3, count)),
         )
 
     def _collect(self) -> None:

@@ -1,0 +1,147 @@
+"""Between the pressure in the chambers and the pressure that a memoryless, linear limb feels.
+
+A segment that was calibrated has chambers of unequal gain, grows stiffer with pressure, rubs and
+creeps. Along a motion whose bend is known, all of that is a known pressure, so that the planners may
+stay with a linear rod driven by an *effective* pressure w and convert at the end:
+
+    w (1 + s |u|) = u (1 + a sgn u) − (F z + C q) / G
+    θ_f dz = (1 − z sgn dθ) dθ          Dahl friction, −1 < z < 1
+    q̇ = κ̇ − q / τ                       Maxwell creep
+
+with u the differential pressure [Pa], θ the bend angle, κ = θ / L. All memory starts at zero: a limb
+that has rested.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from der_planner.limb import Limb, Segment
+
+Array = NDArray[np.float64]
+
+
+def differential_pressure(
+    limb: Limb, time: ArrayLike, effective: ArrayLike, bend_angle: ArrayLike
+) -> Array:
+    """Return the differential pressures that make a limb feel these effective ones.
+
+    Args:
+        limb: calibrated limb.
+        time: (K,) rising [s].
+        effective: (K, M) what the linear model wants [Pa].
+        bend_angle: (K, M) bend along the motion [rad].
+
+    Returns:
+        (K, M) [Pa].
+
+    Raises:
+        ValueError: shapes do not fit, or the stiffening makes a pressure unreachable.
+    """
+    times, wanted, angles = _check(limb, time, effective, bend_angle)
+    result = np.empty_like(wanted)
+    for index, segment in enumerate(limb.segments):
+        load = wanted[:, index] + memory_pressure(segment, times, angles[:, index])
+        # w (1 + s|u|) = u (1 + a sgn u) − m  is linear in u on either side of zero.
+        side = np.sign(load)
+        slope = 1.0 + segment.gain_asymmetry * side
+        slope = slope - segment.pressure_stiffening * wanted[:, index] * side
+        if not np.all(slope > 0.1):
+            raise ValueError(
+                f"segment {index} is too stiff for an effective pressure of "
+                f"{np.abs(wanted[:, index]).max():.0f} Pa: check its pressure_stiffening"
+            )
+        result[:, index] = load / slope
+    return result
+
+
+def effective_pressure(
+    limb: Limb, time: ArrayLike, differential: ArrayLike, bend_angle: ArrayLike
+) -> Array:
+    """Return the (K, M) effective pressures [Pa] of measured ones; the inverse of the above."""
+    times, measured, angles = _check(limb, time, differential, bend_angle)
+    result = np.empty_like(measured)
+    for index, segment in enumerate(limb.segments):
+        u = measured[:, index]
+        driven = u * (1.0 + segment.gain_asymmetry * np.sign(u))
+        driven = driven - memory_pressure(segment, times, angles[:, index])
+        result[:, index] = driven / (1.0 + segment.pressure_stiffening * np.abs(u))
+    return result
+
+
+def memory_pressure(segment: Segment, time: Array, bend_angle: Array) -> Array:
+    """Return the (K,) pressure that friction and creep take along a bend history (K,) [Pa]."""
+    total = np.zeros_like(time)
+    if segment.friction_moment > 0:
+        turn = segment.friction_curvature * segment.length
+        total += segment.friction_moment * dahl(bend_angle, turn)
+    if segment.creep_stiffness > 0:
+        strain = maxwell(time, bend_angle / segment.length, segment.creep_time)
+        total += segment.creep_stiffness * strain
+    pressure: Array = total / segment.moment_gain
+    return pressure
+
+
+@njit(cache=True)
+def dahl(angle: Array, turn: float) -> Array:
+    """Return z (K,) of a Dahl element along an angle (K,) [rad], exact for straight pieces."""
+    z = np.zeros(angle.shape[0])
+    for k in range(1, angle.shape[0]):
+        change = angle[k] - angle[k - 1]
+        sign = 1.0 if change >= 0.0 else -1.0
+        z[k] = sign + (z[k - 1] - sign) * np.exp(-abs(change) / turn)
+    return z
+
+
+@njit(cache=True)
+def maxwell(time: Array, strain: Array, relaxation: float) -> Array:
+    """Return the strain (K,) of the spring of a Maxwell element, exact for straight pieces."""
+    q = np.zeros(strain.shape[0])
+    for k in range(1, strain.shape[0]):
+        rate = (time[k] - time[k - 1]) / relaxation
+        keep = np.exp(-rate)
+        q[k] = q[k - 1] * keep + (strain[k] - strain[k - 1]) * (1.0 - keep) / rate
+    return q
+
+
+def lead(
+    limb: Limb, time: ArrayLike, differential: ArrayLike, largest_step: float = 0.02
+) -> Array:
+    """Return the commands (K, M) that put these pressures (K, M) into the chambers in time [Pa].
+
+    The inverse of a dead time and a first-order lag, with one time constant while |pressure| rises and
+    another while it falls.
+    """
+    times = np.asarray(time, dtype=float)
+    wanted = np.asarray(differential, dtype=float)
+    air = limb.pneumatics
+    vent = air.vent_time_constant or air.time_constant
+    result = np.empty_like(wanted)
+    half = 0.5 * largest_step
+    for index in range(wanted.shape[1]):
+        column = wanted[:, index]
+        ahead = times + air.delay
+        value = np.interp(ahead, times, column)
+        slope = np.interp(ahead + half, times, column) - np.interp(ahead - half, times, column)
+        slope /= largest_step
+        lag = np.where(value * slope >= 0, air.time_constant, vent)
+        result[:, index] = value + lag * slope
+    limit = air.pressure_limit
+    return np.clip(result, -limit, limit)
+
+
+def _check(
+    limb: Limb, time: ArrayLike, pressure: ArrayLike, bend_angle: ArrayLike
+) -> tuple[Array, Array, Array]:
+    times = np.asarray(time, dtype=float)
+    pressures = np.asarray(pressure, dtype=float)
+    angles = np.asarray(bend_angle, dtype=float)
+    expected = (times.size, limb.segment_count)
+    if times.ndim != 1 or pressures.shape != expected or angles.shape != expected:
+        raise ValueError(
+            f"expected time (K,), pressures and bend angles (K, {limb.segment_count}); got "
+            f"{times.shape}, {pressures.shape}, {angles.shape}"
+        )
+    return times, pressures, angles
