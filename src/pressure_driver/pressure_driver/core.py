@@ -28,6 +28,9 @@ from pressure_driver.schedule import Counters, Schedule, ScheduleLimits, Setpoin
 STANDARD_ATMOSPHERE = 101_325.0
 """[Pa] on the wire until the room's has been measured; only vent commands are sent before."""
 
+IDENTITY_RETRY = 1.0
+"""[s] after which a board that has not introduced itself is asked again."""
+
 
 @dataclass(frozen=True)
 class CoreSettings:
@@ -81,9 +84,10 @@ class DriverCore:
         settings: CoreSettings,
         steady: Callable[[], float] = time.monotonic,
         notify: Callable[[], None] = lambda: None,
-        log: Callable[[str, bool], None] = lambda text, warning: None,
+        log: Callable[[str, bool], None] = lambda *_: None,
     ) -> None:
         self.protocol = protocol
+        protocol.assumed_atmosphere = settings.atmosphere or STANDARD_ATMOSPHERE
         self.settings = settings
         self.identity: BoardIdentity | None = None
         self._steady = steady
@@ -98,6 +102,7 @@ class DriverCore:
         self._awaiting_echo: deque[tuple[int | None, float]] = deque(maxlen=64)
         self._round_trip = float("nan")
         self._pending_number: int | None = None
+        self._asked_at = 0.0
         self.last_text = ""
 
     # ------------------------------------------------------------------ from any thread
@@ -177,6 +182,7 @@ class DriverCore:
             self._monitor.forget()
             self._awaiting_echo.clear()
             self._machine.link_fault = ""
+            self._forget_identity()
             return self.protocol.start() + self._vent_bytes()
 
     def tick(self, instant: int) -> bytes:
@@ -188,7 +194,7 @@ class DriverCore:
             self._last_tick = instant
             action = self._machine.tick(instant, now)
             if action.dump:
-                return self._vent_bytes()
+                return self._ask_identity(now) + self._vent_bytes()
             data, self._pending_number = self.protocol.setpoint(
                 action.differential, self._wire_atmosphere(), self.settings.command_validity
             )
@@ -222,6 +228,38 @@ class DriverCore:
         with self._lock:
             return self._vent_bytes()
 
+    def _forget_identity(self) -> None:
+        self.identity = None
+        self._asked_at = self._steady()
+        if self.protocol.introduces_itself:
+            self._machine.board_obstacle = "the board has not introduced itself yet"
+
+    def _ask_identity(self, now: float) -> bytes:
+        """Return the greeting again while it has not been answered; a board may boot slowly."""
+        if self.identity is not None or not self.protocol.introduces_itself:
+            return b""
+        if now - self._asked_at < IDENTITY_RETRY:
+            return b""
+        self._asked_at = now
+        return self.protocol.start()
+
+    def _check_identity(self, identity: BoardIdentity) -> None:
+        """Refuse to arm a board that is not the one which the parameters describe."""
+        self.identity = identity
+        limit = self.settings.schedule.pressure_limit
+        problem = ""
+        if identity.chamber_count != self.protocol.chamber_count:
+            problem = (
+                f"the board has {identity.chamber_count} chambers, the driver expects "
+                f"{self.protocol.chamber_count}: set the parameter 'segment_count'"
+            )
+        elif identity.largest_pressure < limit:
+            problem = (
+                f"the board reaches {identity.largest_pressure:.0f} Pa, less than 'pressure_limit' "
+                f"({limit:.0f} Pa): lower the parameter"
+            )
+        self._machine.board_obstacle = problem
+
     def _wire_atmosphere(self) -> float:
         return self._monitor.atmosphere if self._monitor.rest_known() else STANDARD_ATMOSPHERE
 
@@ -241,7 +279,7 @@ class DriverCore:
             if event.fatal:
                 self._machine.fail(f"board reports: {event.text}")
         elif isinstance(event, BoardIdentity):
-            self.identity = event
+            self._check_identity(event)
         elif isinstance(event, BoardText):
             self.last_text = event.text
             self._log(f"board: {event.text}", False)

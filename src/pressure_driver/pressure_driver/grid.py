@@ -1,9 +1,9 @@
 """The absolute time grid of the driver's ticks.
 
-Ticks fall on whole multiples of the period of the wall clock that stamps messages (ROS time), not at
-a period after the last tick, so they cannot drift against the stamps. Waiting is done on the steady
-clock; how far the two clocks are apart is taken anew at every tick, so that a clock that is slewed
-or stepped (NTP) moves the grid by itself.
+Ticks fall on whole multiples of the period of the wall clock that stamps messages (ROS time), not
+at a period after the last tick, so they cannot drift against the stamps. Waiting is done on the
+steady clock; how far the two clocks are apart is taken anew at every tick, so that a clock that is
+slewed or stepped (NTP) moves the grid by itself.
 """
 
 from __future__ import annotations

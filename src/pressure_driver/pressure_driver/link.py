@@ -216,9 +216,8 @@ class SerialLink:
         if self._device is None and time.monotonic() >= self._retry_at:
             self._reopen()
         delay = max(self.grid.delay(time.time_ns()), 0.0)
-        watched: list[object] = [self._wake_read]
-        if self._device is not None:
-            watched.append(self._device)
+        port = -1 if self._device is None else self._device.fileno()
+        watched = [self._wake_read] if port < 0 else [self._wake_read, port]
         readable, _, _ = select.select(watched, [], [], delay)
         instant = self.grid.take(time.time_ns(), time.monotonic_ns())
         if instant is not None:
@@ -229,7 +228,7 @@ class SerialLink:
             if self._urgent:
                 self._urgent = False
                 self._write(self._client.farewell())
-        if self._device is not None and self._device in readable:
+        if port in readable and self._device is not None:
             self._read()
 
     def _read(self) -> None:

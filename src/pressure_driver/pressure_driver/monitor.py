@@ -87,7 +87,7 @@ class Monitor:
     @property
     def gauge(self) -> NDArray[np.float64]:
         """(2M,) [Pa] measured pressures above those at rest."""
-        return self.chamber_pressure - self.rest_pressure
+        return np.subtract(self.chamber_pressure, self.rest_pressure)
 
     def telemetry_age(self, now: float) -> float:
         """Return the age [s] of the newest chamber pressures; NaN before the first."""

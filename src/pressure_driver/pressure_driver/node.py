@@ -7,6 +7,10 @@ import math
 import time
 from collections import deque
 
+from rclpy.node import Node
+from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import Trigger
+
 from der_msgs.msg import PressureSetpoint, PressureState
 from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
@@ -16,19 +20,16 @@ from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
 from pressure_driver.core import DriverCore, Snapshot
 from pressure_driver.grid import TickGrid
 from pressure_driver.link import SerialLink
-from pressure_driver.parameters import read_parameters
+from pressure_driver.node_parameters import read_parameters
 from pressure_driver.protocols import host_protocol
 from pressure_driver.safety import Mode
 from pressure_driver.schedule import Setpoint, Verdict
-from rclpy.node import Node
-from std_msgs.msg import Float64MultiArray
-from std_srvs.srv import Trigger
 
 PASCAL_PER_HECTOPASCAL = 100.0
 
 
 class PressureDriver(Node):
-    """Plays `pressure_setpoint` on the board, publishes `pressure_state`, serves `arm` and `vent`."""
+    """Plays `pressure_setpoint`, publishes `pressure_state`, serves `arm` and `vent`."""
 
     def __init__(self) -> None:
         super().__init__("pressure_driver", namespace=topics.NAMESPACE)

@@ -80,6 +80,8 @@ class SafetyMachine:
         """Why the mode is FAULT, worst first."""
         self.link_fault: str = "the serial port is not open"
         """What is wrong with the line; empty while it works."""
+        self.board_obstacle: str = ""
+        """What is wrong with the board itself; empty if nothing is."""
         self.transitions = 0
         self._zero = (0.0,) * schedule.limits.segment_count
         self.differential = self._zero
@@ -116,6 +118,8 @@ class SafetyMachine:
         monitor = self.monitor
         if self.link_fault:
             return [self.link_fault]
+        if self.board_obstacle:
+            return [self.board_obstacle]
         found = monitor.telemetry_faults(now)
         if found:
             return found

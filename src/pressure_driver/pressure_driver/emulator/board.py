@@ -52,6 +52,8 @@ class EmulatedBoard:
         self._sequence = 0
         self._target = np.full(count, pneumatics.atmosphere)
         self._vented = True
+        self._expired = False
+        self._unsaid = b""
         self.atmosphere = 0.0
         """[Pa] what the board takes for the room's pressure, measured when it boots."""
         self.boot()
@@ -59,6 +61,7 @@ class EmulatedBoard:
     def boot(self) -> bytes:
         """Restart: vent, measure the room, greet."""
         self._vent()
+        self._expired = False
         self._sequence = 0
         self.atmosphere = float(np.mean(self.pneumatics.pressure + self._offset))
         return self.protocol.boot(self.atmosphere)
@@ -107,6 +110,8 @@ class EmulatedBoard:
                         command.kind == "vent",
                     )
                 )
+        if self.faults.mute:
+            answer = b""
         return received, self.faults.damage(answer, self._generator)
 
     def _stamp_of(self, place: int) -> int:
@@ -127,8 +132,10 @@ class EmulatedBoard:
             self._sequence = command.sequence
         if command.kind == "vent":
             self._vent()
+            self._expired = False
         elif command.kind == "setpoint" and command.pressure is not None:
             self._regulate(np.asarray(command.pressure))
+            self._expired = False
             if command.valid_for is not None:
                 self._valid_until = self._time + command.valid_for
         return self.protocol.reply(command, self.reading())
@@ -165,6 +172,8 @@ class EmulatedBoard:
         self._time += duration
         if self._valid_until is not None and self._time > self._valid_until:
             self._vent()
+            self._expired = True
+            self._unsaid += self.protocol.expired()
         return self.pneumatics.step(duration)
 
     def reading(self) -> BoardReading:
@@ -178,10 +187,12 @@ class EmulatedBoard:
             supply_pressure=self.pneumatics.supply_pressure,
             last_sequence=self._sequence,
             vented=self._vented,
+            expired=self._expired,
         )
 
     def telemetry(self) -> bytes:
         """Return the bytes of one report; nothing while muted."""
+        report, self._unsaid = self._unsaid + self.protocol.telemetry(self.reading()), b""
         if self.faults.mute:
             return b""
-        return self.faults.damage(self.protocol.telemetry(self.reading()), self._generator)
+        return self.faults.damage(report, self._generator)

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from collections import deque
 
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
 from der_msgs.msg import ChamberPressures
 from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
@@ -16,9 +20,6 @@ from pressure_driver.emulator.pneumatics import Pneumatics
 from pressure_driver.emulator.port import EmulatedPort
 from pressure_driver.emulator.runner import BoardRunner
 from pressure_driver.protocols import NAMES, board_protocol
-from rcl_interfaces.msg import SetParametersResult
-from rclpy.node import Node
-from rclpy.parameter import Parameter
 
 
 class BoardEmulator(Node):

@@ -41,8 +41,8 @@ class BoardRunner:
         self,
         board: EmulatedBoard,
         port: EmulatedPort,
-        on_air: Callable[[int, NDArray[np.float64]], None] = lambda stamp, pressure: None,
-        on_command: Callable[[ReceivedCommand], None] = lambda command: None,
+        on_air: Callable[[int, NDArray[np.float64]], None] = lambda *_: None,
+        on_command: Callable[[ReceivedCommand], None] = lambda *_: None,
         real_time_priority: int = 0,
         reset_on_open: bool = True,
     ) -> None:

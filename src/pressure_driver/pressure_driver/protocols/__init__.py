@@ -3,10 +3,20 @@
 from __future__ import annotations
 
 from pressure_driver.protocols.base import BoardProtocol, HostProtocol
+from pressure_driver.protocols.ctrlp import CtrlpBoard, CtrlpHost
 from pressure_driver.protocols.ezloop import EzloopBoard, EzloopHost
+from pressure_driver.protocols.native import NativeBoard, NativeHost
 
-HOSTS: dict[str, type[HostProtocol]] = {"ezloop": EzloopHost}
-BOARDS: dict[str, type[BoardProtocol]] = {"ezloop": EzloopBoard}
+HOSTS: dict[str, type[HostProtocol]] = {
+    "ezloop": EzloopHost,
+    "ctrlp": CtrlpHost,
+    "native": NativeHost,
+}
+BOARDS: dict[str, type[BoardProtocol]] = {
+    "ezloop": EzloopBoard,
+    "ctrlp": CtrlpBoard,
+    "native": NativeBoard,
+}
 NAMES = tuple(HOSTS)
 """The protocols that can be chosen."""
 

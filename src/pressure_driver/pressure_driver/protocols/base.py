@@ -78,6 +78,10 @@ class HostProtocol(ABC):
     """What the protocol cannot protect from; shown in the diagnostics."""
     reports_supply: ClassVar[bool] = False
     has_watchdog: ClassVar[bool] = False
+    introduces_itself: ClassVar[bool] = False
+    """Whether the board answers `start` with a `BoardIdentity`."""
+    assumed_atmosphere: float = 101_325.0
+    """[Pa] added to the reports of boards that only know gauge pressures."""
 
     def __init__(self, chamber_count: int = 4) -> None:
         if chamber_count < 2 or chamber_count % 2:
@@ -148,6 +152,8 @@ class BoardReading:
     supply_pressure: float
     last_sequence: int = 0
     vented: bool = True
+    expired: bool = False
+    """The board has vented since no setpoint came in time."""
 
 
 class BoardProtocol(ABC):
@@ -176,4 +182,8 @@ class BoardProtocol(ABC):
 
     def reply(self, command: BoardCommand, reading: BoardReading) -> bytes:  # noqa: ARG002
         """Return what the board answers to a command at once."""
+        return b""
+
+    def expired(self) -> bytes:
+        """Return what the board says when it has vented since no setpoint came in time."""
         return b""

@@ -1,19 +1,19 @@
-"""The lab's four-chamber board: ASCII lines at 115200 baud, absolute pressures in hPa.
+r"""The lab's four-chamber board: ASCII lines at 115200 baud, absolute pressures in hPa.
 
 To the board, up to 20 times a second::
 
-    <1013.25,1088.25,1013.25,1013.25>\\n
+    <1013.25,1088.25,1013.25,1013.25>\n
 
 The board takes each pair as a difference: it vents the smaller of the two and holds its own
-atmosphere plus the difference in the other. A command with a value above 1250 hPa is ignored whole.
-From the board at 20 Hz::
+atmosphere plus the difference in the other. A command with a value above 1250 hPa is ignored
+whole. From the board at 20 Hz::
 
     [MPR]: 1013.31 1013.02 1014.55 1013.90     chambers, hPa absolute
     [RPR]: 1401.22                             reservoir, hPa absolute
     [VAL]: 0.00 0.31 0.00 0.12                 inlet valves, 0 … 1
 
-and free text while it boots (about 12 s after the port has opened, since opening resets it). There
-is no checksum, no echo and no watchdog: it holds the last pressures for ever.
+and free text while it boots (some seconds after the port has opened, since opening resets it).
+There is no checksum, no echo and no watchdog: it holds the last pressures for ever.
 """
 
 from __future__ import annotations
@@ -120,19 +120,16 @@ class EzloopHost(HostProtocol):
             damaged = "[" in line or "]" in line or not any(c.isalpha() for c in line)
             return None if damaged else BoardText(line)
         values = _numbers(rest.strip(), None)
-        if values is None:
+        expected = 1 if tag == "[RPR]" else self.chamber_count
+        low, high = (0.0, 1.0) if tag == "[VAL]" else PLAUSIBLE_PRESSURE
+        if values is None or len(values) != expected or not all(low <= v <= high for v in values):
             return None
-        low, high = PLAUSIBLE_PRESSURE
         if tag == "[VAL]":
-            if len(values) != self.chamber_count or not all(0.0 <= v <= 1.0 for v in values):
-                return None
             return Telemetry(valve_opening=tuple(values))
-        if not all(low <= value <= high for value in values):
-            return None
         pascals = tuple(value * PASCAL_PER_HECTOPASCAL for value in values)
         if tag == "[RPR]":
-            return Telemetry(supply_pressure=pascals[0]) if len(values) == 1 else None
-        return Telemetry(chamber_pressure=pascals) if len(values) == self.chamber_count else None
+            return Telemetry(supply_pressure=pascals[0])
+        return Telemetry(chamber_pressure=pascals)
 
     def reset(self) -> None:
         """Forget a half-received line."""

@@ -1,0 +1,124 @@
+"""Consistent-overhead byte stuffing (Cheshire and Baker 1999) and CRC-16 for binary frames."""
+
+from __future__ import annotations
+
+POLYNOMIAL = 0x1021
+INITIAL = 0xFFFF
+FULL_BLOCK = 254
+"""Bytes without a zero that one length byte can announce; a full block implies no zero."""
+
+
+def _table() -> tuple[int, ...]:
+    entries = []
+    for byte in range(256):
+        value = byte << 8
+        for _ in range(8):
+            value = (value << 1) ^ (POLYNOMIAL if value & 0x8000 else 0)
+        entries.append(value & 0xFFFF)
+    return tuple(entries)
+
+
+_TABLE = _table()
+
+
+def crc16(data: bytes) -> int:
+    """Return CRC-16/CCITT-FALSE: polynomial 0x1021, start 0xFFFF, nothing reflected or inverted.
+
+    Check value: ``crc16(b"123456789") == 0x29B1``.
+    """
+    value = INITIAL
+    for byte in data:
+        value = (value << 8 & 0xFFFF) ^ _TABLE[value >> 8 ^ byte]
+    return value
+
+
+def stuff(data: bytes) -> bytes:
+    """Return ``data`` coded without zero bytes; on the wire one zero byte ends it."""
+    out = bytearray()
+    pieces = data.split(b"\0")
+    for number, piece in enumerate(pieces):
+        last = number == len(pieces) - 1
+        rest = piece
+        while len(rest) >= FULL_BLOCK:
+            out.append(FULL_BLOCK + 1)
+            out += rest[:FULL_BLOCK]
+            rest = rest[FULL_BLOCK:]
+        # A last piece that ended with a full block needs no empty block behind it.
+        if rest or not last or not piece:
+            out.append(len(rest) + 1)
+            out += rest
+    return bytes(out)
+
+
+def unstuff(coded: bytes) -> bytes | None:
+    """Return the data of a coded frame (without its ending zero), or None if it is damaged."""
+    if not coded or 0 in coded:
+        return None
+    out = bytearray()
+    place = 0
+    while place < len(coded):
+        length = coded[place]
+        end = place + length
+        if end > len(coded):
+            return None
+        out += coded[place + 1 : end]
+        place = end
+        if length != FULL_BLOCK + 1 and place < len(coded):
+            out.append(0)
+    return bytes(out)
+
+
+class FrameSplitter:
+    """Cuts a byte stream at zero bytes and checks each frame.
+
+    Args:
+        longest: coded bytes; longer frames are dropped as garbage.
+    """
+
+    def __init__(self, longest: int = 256) -> None:
+        self._longest = longest
+        self._buffer = bytearray()
+        self._position = 0
+        self._overlong = False
+        self.rejected = 0
+
+    def feed(self, data: bytes) -> list[tuple[int, bytes]]:
+        """Return (place of the first byte, payload without CRC) of every sound frame."""
+        frames: list[tuple[int, bytes]] = []
+        self._buffer += data
+        while (end := self._buffer.find(0)) >= 0:
+            coded = bytes(self._buffer[:end])
+            start = self._position
+            del self._buffer[: end + 1]
+            self._position += end + 1
+            payload = None if self._overlong else self._open(coded)
+            self._overlong = False
+            if payload is not None:
+                frames.append((start, payload))
+            elif coded:
+                self.rejected += 1
+        if len(self._buffer) > self._longest:
+            self._position += len(self._buffer)
+            self._buffer.clear()
+            self._overlong = True
+        return frames
+
+    def _open(self, coded: bytes) -> bytes | None:
+        if len(coded) > self._longest:
+            return None
+        data = unstuff(coded)
+        if data is None or len(data) < 3:
+            return None
+        payload, check = data[:-2], data[-2:]
+        return payload if crc16(payload).to_bytes(2, "little") == check else None
+
+    def reset(self) -> None:
+        """Forget a half-received frame."""
+        self._position += len(self._buffer)
+        self._buffer.clear()
+        self._overlong = False
+
+
+def seal(payload: bytes) -> bytes:
+    """Return the wire bytes of a payload: CRC appended (low byte first), stuffed, ended by zero."""
+    return stuff(payload + crc16(payload).to_bytes(2, "little")) + b"\0"

@@ -1,0 +1,311 @@
+"""Our own protocol for new firmware: binary frames with a checksum and a watchdog on the board.
+
+The specification, for authors of firmware and with test vectors, is a page of the package's README.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+from pressure_driver.protocols.base import (
+    BoardCommand,
+    BoardIdentity,
+    BoardProtocol,
+    BoardReading,
+    BoardReport,
+    Echo,
+    Event,
+    HostProtocol,
+    Telemetry,
+)
+from pressure_driver.protocols.framing import FrameSplitter, seal
+
+VERSION = 1
+HEADER = struct.Struct("<BBH")
+HELLO_BODY = struct.Struct("<BiiIB")
+SETPOINT_HEAD = struct.Struct("<H")
+STATUS_HEAD = struct.Struct("<IHBII")
+LARGEST_GAUGE = 1_000_000
+"""[Pa] A frame with more is refused."""
+LONGEST_VALIDITY = 60_000
+"""[ms] A setpoint may stay valid at most this long."""
+
+
+class FrameType(IntEnum):
+    """Second byte of every frame; the top bit is set in what the board sends."""
+
+    HELLO = 0x01
+    SETPOINT = 0x02
+    VENT = 0x03
+    IDENTITY = 0x81
+    STATUS = 0x82
+    FAULT = 0x83
+
+
+class StatusFlag(IntEnum):
+    """Bits of a STATUS frame."""
+
+    VENTED = 1
+    EXPIRED = 2
+    SUPPLY_KNOWN = 4
+    VALVES_KNOWN = 8
+
+
+class FaultCode(IntEnum):
+    """First byte of a FAULT frame's body."""
+
+    EXPIRED = 1
+    OVER_PRESSURE = 2
+    SENSOR = 3
+    SUPPLY = 4
+    REFUSED = 5
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame whose checksum and version are right."""
+
+    type: FrameType
+    sequence: int
+    body: bytes
+
+
+def encode(kind: FrameType, sequence: int, body: bytes = b"") -> bytes:
+    """Return the wire bytes of a frame."""
+    return seal(HEADER.pack(VERSION, kind, sequence & 0xFFFF) + body)
+
+
+class _Frames:
+    """Splits a stream into frames of this version and known type."""
+
+    def __init__(self) -> None:
+        self._splitter = FrameSplitter()
+        self._unknown = 0
+
+    @property
+    def rejected(self) -> int:
+        return self._splitter.rejected + self._unknown
+
+    def feed(self, data: bytes) -> list[tuple[int, Frame]]:
+        frames = []
+        for place, payload in self._splitter.feed(data):
+            if len(payload) < HEADER.size:
+                self._unknown += 1
+                continue
+            version, kind, sequence = HEADER.unpack_from(payload)
+            if version != VERSION or kind not in set(FrameType):
+                self._unknown += 1
+                continue
+            frames.append((place, Frame(FrameType(kind), sequence, payload[HEADER.size :])))
+        return frames
+
+    def refuse(self) -> None:
+        self._unknown += 1
+
+    def reset(self) -> None:
+        self._splitter.reset()
+
+
+class NativeHost(HostProtocol):
+    """The driver's end of ``native``."""
+
+    name = "native"
+    reports_supply = True
+    has_watchdog = True
+    introduces_itself = True
+
+    def __init__(self, chamber_count: int = 4) -> None:
+        super().__init__(chamber_count)
+        if chamber_count > 32:
+            raise ValueError(f"a native frame carries at most 32 chambers, got {chamber_count}")
+        self._frames = _Frames()
+        self._sequence = 0
+
+    def _next(self) -> int:
+        self._sequence = (self._sequence + 1) & 0xFFFF
+        return self._sequence
+
+    def start(self) -> bytes:
+        """A zero byte, which ends whatever was half-sent, and HELLO."""
+        return b"\0" + encode(FrameType.HELLO, self._next())
+
+    def setpoint(
+        self,
+        differential: Sequence[float],
+        atmosphere: float,  # noqa: ARG002 - the wire carries gauge pressures
+        valid_for: float,
+    ) -> tuple[bytes, int | None]:
+        """Encode one gauge pressure a chamber, and how long they hold.
+
+        Raises:
+            ValueError: wrong number of segments, or a value that the frame cannot carry.
+        """
+        if 2 * len(differential) != self.chamber_count:
+            raise ValueError(
+                f"expected {self.chamber_count // 2} differences, got {len(differential)}"
+            )
+        milliseconds = round(valid_for * 1000.0)
+        if not 0 < milliseconds <= LONGEST_VALIDITY:
+            raise ValueError(f"a setpoint cannot stay valid for {valid_for} s")
+        body = SETPOINT_HEAD.pack(milliseconds)
+        for difference in differential:
+            if not abs(difference) <= LARGEST_GAUGE:
+                raise ValueError(f"a difference of {difference} Pa does not fit a native frame")
+            body += struct.pack("<ii", round(max(difference, 0.0)), round(max(-difference, 0.0)))
+        sequence = self._next()
+        return encode(FrameType.SETPOINT, sequence, body), sequence
+
+    def vent(self, atmosphere: float) -> tuple[bytes, int | None]:  # noqa: ARG002
+        """Encode VENT, which holds until the next SETPOINT."""
+        sequence = self._next()
+        return encode(FrameType.VENT, sequence), sequence
+
+    def decode(self, data: bytes) -> list[Event]:
+        """Return what complete and sound frames say."""
+        events: list[Event] = []
+        for _, frame in self._frames.feed(data):
+            found = self._interpret(frame)
+            if not found:
+                self._frames.refuse()
+            events += found
+        self.rejected = self._frames.rejected
+        return events
+
+    def _interpret(self, frame: Frame) -> list[Event]:
+        if frame.type is FrameType.IDENTITY:
+            return self._identity(frame.body)
+        if frame.type is FrameType.STATUS:
+            return self._status(frame.body)
+        if frame.type is FrameType.FAULT and frame.body and frame.body[0] in set(FaultCode):
+            code = FaultCode(frame.body[0])
+            text = frame.body[1:].decode("ascii", "replace")
+            name = code.name.lower().replace("_", "-")
+            return [BoardReport(f"{name}: {text}", fatal=code is not FaultCode.REFUSED)]
+        return []
+
+    def _identity(self, body: bytes) -> list[Event]:
+        if len(body) < HELLO_BODY.size:
+            return []
+        count, low, high, _, length = HELLO_BODY.unpack_from(body)
+        text = body[HELLO_BODY.size :]
+        if len(text) != length or low > high:
+            return []
+        return [BoardIdentity(count, float(low), float(high), text.decode("ascii", "replace"))]
+
+    def _status(self, body: bytes) -> list[Event]:
+        count = self.chamber_count
+        if len(body) != STATUS_HEAD.size + 5 * count:
+            return []
+        _, echo, flags, atmosphere, supply = STATUS_HEAD.unpack_from(body)
+        gauges = struct.unpack_from(f"<{count}i", body, STATUS_HEAD.size)
+        valves = body[STATUS_HEAD.size + 4 * count :]
+        if max(map(abs, gauges)) > LARGEST_GAUGE or atmosphere > LARGEST_GAUGE:
+            return []
+        telemetry = Telemetry(
+            chamber_pressure=tuple(float(atmosphere + gauge) for gauge in gauges),
+            valve_opening=(
+                tuple(value / 255.0 for value in valves)
+                if flags & StatusFlag.VALVES_KNOWN
+                else None
+            ),
+            supply_pressure=float(supply) if flags & StatusFlag.SUPPLY_KNOWN else None,
+        )
+        return [telemetry, Echo(echo)]
+
+    def reset(self) -> None:
+        """Forget a half-received frame."""
+        self._frames.reset()
+
+
+class NativeBoard(BoardProtocol):
+    """The firmware's end of ``native``: a reference for authors of firmware."""
+
+    gauge = True
+
+    def __init__(
+        self, chamber_count: int = 4, largest_pressure: int = 30_000, firmware: str = "emulator 1"
+    ) -> None:
+        super().__init__(chamber_count)
+        self._frames = _Frames()
+        self._largest = largest_pressure
+        self._firmware = firmware.encode("ascii")
+        self._sequence = 0
+
+    def decode(self, data: bytes) -> list[BoardCommand]:
+        """Return HELLO, SETPOINT and VENT; a setpoint out of range comes back as ``refused``."""
+        commands = []
+        for place, frame in self._frames.feed(data):
+            command = self._interpret(place, frame)
+            if command is None:
+                self._frames.refuse()
+            else:
+                commands.append(command)
+        self.rejected = self._frames.rejected
+        return commands
+
+    def _interpret(self, place: int, frame: Frame) -> BoardCommand | None:
+        number, body = frame.sequence, frame.body
+        if frame.type in (FrameType.HELLO, FrameType.VENT):
+            kind = "hello" if frame.type is FrameType.HELLO else "vent"
+            return None if body else BoardCommand(kind, place, sequence=number)
+        if frame.type is not FrameType.SETPOINT:
+            return None
+        if len(body) != SETPOINT_HEAD.size + 4 * self.chamber_count:
+            return BoardCommand("refused", place, sequence=number, text="wrong length")
+        (milliseconds,) = SETPOINT_HEAD.unpack_from(body)
+        values = struct.unpack_from(f"<{self.chamber_count}i", body, SETPOINT_HEAD.size)
+        if not 0 < milliseconds <= LONGEST_VALIDITY:
+            return BoardCommand("refused", place, sequence=number, text="valid-for out of range")
+        if min(values) < 0 or max(values) > self._largest:
+            return BoardCommand("refused", place, sequence=number, text="pressure out of range")
+        return BoardCommand(
+            "setpoint",
+            place,
+            pressure=tuple(float(value) for value in values),
+            valid_for=milliseconds / 1000.0,
+            sequence=number,
+        )
+
+    def _next(self) -> int:
+        self._sequence = (self._sequence + 1) & 0xFFFF
+        return self._sequence
+
+    def telemetry(self, reading: BoardReading) -> bytes:
+        """One STATUS frame."""
+        flags = StatusFlag.SUPPLY_KNOWN | StatusFlag.VALVES_KNOWN
+        flags |= StatusFlag.VENTED if reading.vented else 0
+        flags |= StatusFlag.EXPIRED if reading.expired else 0
+        atmosphere = round(reading.atmosphere)
+        body = STATUS_HEAD.pack(
+            round(reading.time * 1000.0) & 0xFFFFFFFF,
+            reading.last_sequence,
+            flags,
+            atmosphere,
+            round(reading.supply_pressure),
+        )
+        for pressure in reading.chamber_pressure:
+            body += struct.pack("<i", round(pressure) - atmosphere)
+        body += bytes(round(255 * min(max(v, 0.0), 1.0)) for v in reading.valve_opening)
+        return encode(FrameType.STATUS, self._next(), body)
+
+    def reply(self, command: BoardCommand, reading: BoardReading) -> bytes:
+        """IDENTITY to HELLO, FAULT to what was refused, STATUS to everything else."""
+        if command.kind == "hello":
+            body = HELLO_BODY.pack(
+                self.chamber_count, 0, self._largest, round(reading.atmosphere), len(self._firmware)
+            )
+            return encode(FrameType.IDENTITY, self._next(), body + self._firmware)
+        if command.kind == "refused":
+            return self.fault(FaultCode.REFUSED, command.text)
+        return self.telemetry(reading)
+
+    def fault(self, code: int, text: str) -> bytes:
+        """One FAULT frame."""
+        return encode(FrameType.FAULT, self._next(), bytes([code]) + text.encode("ascii"))
+
+    def expired(self) -> bytes:
+        """What the board says when it has vented since no setpoint came in time."""
+        return self.fault(FaultCode.EXPIRED, "no setpoint in time, vented")
