@@ -153,12 +153,20 @@ def _get(options: argparse.Namespace) -> str | None:
 
 
 def parameter_value(text: str) -> ParameterValue:
-    """Return a parameter's value of the type that the text has in YAML; else it is a string."""
+    """Return a parameter's value of the type that the text has in YAML; else it is a string.
+
+    Raises:
+        CommandError: an integer does not fit into 64 bit.
+    """
     try:
-        if isinstance(yaml.safe_load(text), (bool, int, float, str, list)):
-            return get_parameter_value(text)
+        value = yaml.safe_load(text)
     except yaml.YAMLError:
-        pass
+        value = None
+    integers = value if isinstance(value, list) else [value]
+    if any(isinstance(item, int) and not -(2**63) <= item < 2**63 for item in integers):
+        raise CommandError(f"{text} does not fit into an integer parameter (64 bit)")
+    if isinstance(value, (bool, int, float, str, list)):
+        return get_parameter_value(text)
     return ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=text)
 
 

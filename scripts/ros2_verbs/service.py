@@ -8,7 +8,8 @@ import time
 import yaml
 
 from ros2_verbs.cli import CommandError, add_verb, add_verbs
-from ros2_verbs.messages import Filler, interface
+from ros2_verbs.filling import Filler
+from ros2_verbs.messages import interface
 from ros2_verbs.session import Session, add_session_arguments, is_hidden
 
 

@@ -19,9 +19,11 @@ from rclpy.validate_full_topic_name import validate_full_topic_name
 from ros2_verbs.cli import CommandError
 
 HIDDEN_PREFIX = "_"
-_AT_LEAST, _AT_MOST = 1.0, 4.0
+_AT_LEAST, _AT_MOST = 3.3, 6.0
+"""How long discovery lasts [s]. Fast DDS repeats its announcements every 3 s, and the answer to the
+first ones of a new participant may stay away: a shorter look misses nodes now and then."""
 _QUIET, _QUIET_WHEN_FOUND = 0.5, 0.2
-"""How long discovery lasts [s], and for how long nothing new must have come."""
+"""For how long nothing new must have come [s]."""
 
 
 def add_session_arguments(parser: argparse.ArgumentParser) -> None:

@@ -11,7 +11,8 @@ import yaml
 from rclpy.duration import Duration
 
 from ros2_verbs.cli import CommandError, add_verb
-from ros2_verbs.messages import Filler, interface
+from ros2_verbs.filling import Filler
+from ros2_verbs.messages import interface
 from ros2_verbs.qos import add_qos_arguments, given_qos, preset
 from ros2_verbs.session import Session
 
