@@ -176,7 +176,7 @@ class PlanarBackend:
         gradient = np.zeros(self.size)
         u = np.zeros(len(self.mesh.gain))
         planar_kernel.assemble(
-            x, np.zeros(self.size), 0.0, u, gradient, self.band, self.edge, self.turn, self.torque,
+            x, np.zeros(self.size), 0.0, u, False, gradient, self.band, self.edge, self.turn, self.torque,
             *self.rod,
         )  # fmt: skip
         return self._full(gradient), self._full_matrix(band_to_dense(self.band))

@@ -58,13 +58,14 @@ def energy(x, edge, turn, rest, axial, bend, rest_kappa, cubic, viscous, first, 
 
 @kernel
 def assemble(
-    x, v, rate, u, g, s, edge, turn, torque,
+    x, v, rate, u, convex, g, s, edge, turn, torque,
     rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain,
 ):  # fmt: skip
     """Elastic, viscous and actuating terms of the residual and its symmetric derivative.
 
     g (2n,) becomes ∇E + viscous force − B(q)Λu; s (2n, 6) its derivative by x with v = rate·(x − x_n),
-    of which the unsymmetric part is left out or symmetrised (`unsymmetric` adds what is missing).
+    of which the unsymmetric part is left out or symmetrised (`unsymmetric` adds what is missing). With
+    `convex` the negative geometric terms are left out too: a safer direction far from the solution.
     edge (n-1, 3), turn (n,), torque (n, 2) are work space: t and 1/|e|; κ; moment and its derivative.
     """
     n = turn.shape[0]
@@ -110,6 +111,9 @@ def assemble(
         # t tᵀ, n̂ n̂ᵀ (in nx, ny scaled by 1/|e|), t n̂ᵀ + n̂ tᵀ
         side = tension / il + curving
         cross = follower - bending * il
+        if convex:
+            side = max(tension, 0.0) / il + curving
+            cross = 0.0
         hxx = along * tx * tx + side * nx * nx + 2.0 * cross * tx * nx
         hxy = along * tx * ty + side * nx * ny + cross * (tx * ny + ty * nx)
         hyy = along * ty * ty + side * ny * ny + 2.0 * cross * ty * ny
@@ -252,12 +256,14 @@ def newton(
     size = x.shape[0]
     residual = work[0]
     v = work[1]
-    largest = 0.25 * rest.min()
+    largest = 2.0 * rest.min()
+    careful = 0.1 * rest.min()
     update = np.inf
+    convex = False
     for iteration in range(limit):
         for k in range(size):
             v[k] = (x[k] - x_n[k]) * rate
-        assemble(x, v, rate, u, residual, s, edge, turn, torque,
+        assemble(x, v, rate, u, convex, residual, s, edge, turn, torque,
                  rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain)  # fmt: skip
         for k in range(size):
             residual[k] += mass[k] * rate * (v[k] - v_n[k]) + damping[k] * v[k] - load[k]
@@ -272,11 +278,26 @@ def newton(
         if not update < 1e6:
             return -iteration - 1, update
         scale = 1.0 if update < largest else largest / update
+        convex = rate > 0.0 and update > careful
         for k in range(size):
             x[k] -= scale * residual[k]
         if update < tolerance:
             return iteration + 1, update
     return -limit, update
+
+
+@kernel
+def predict(x, x_n, v_n, acceleration, h, fixed, rest):
+    """Fill x with a guess of the step's end: the last acceleration goes on, unless it leads far."""
+    far = 0.5 * rest.min()
+    for d in range(x.shape[0]):
+        move = h * (v_n[d] + h * acceleration[d])
+        x[d] = x_n[d] + move
+        if not abs(move) < far:
+            x[:] = x_n
+            return
+    for d in fixed:
+        x[d] = x_n[d]
 
 
 @kernel
@@ -312,14 +333,17 @@ def simulate(
     for k in range(intervals):
         for step in range(steps):
             u = pressures[k, step]
-            for d in range(size):
-                x[d] = x_n[d] + h * (v_n[d] + h * acceleration[d])
-            for d in fixed:
-                x[d] = x_n[d]
+            predict(x, x_n, v_n, acceleration, h, fixed, rest)
             iterations, update = newton(
                 x, x_n, v_n, rate, u, tolerance, limit, work, s, edge, turn, torque,
                 mass, damping, load, fixed,
                 rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain)  # fmt: skip
+            if iterations < 0:  # the guess may have been at fault: once more from rest
+                x[:] = x_n
+                iterations, update = newton(
+                    x, x_n, v_n, rate, u, tolerance, limit, work, s, edge, turn, torque,
+                    mass, damping, load, fixed,
+                    rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain)  # fmt: skip
             index = k * steps + step
             if iterations < 0:
                 q[k + 1] = x_n
@@ -356,7 +380,7 @@ def linearise(
     v = work[1]
     for k in range(size):
         v[k] = (x[k] - x_n[k]) * rate
-    assemble(x, v, rate, u, work[0], s, edge, turn, torque,
+    assemble(x, v, rate, u, False, work[0], s, edge, turn, torque,
              rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain)  # fmt: skip
     for k in range(size):
         s[k, 0] += rate * (mass[k] * rate + damping[k])
