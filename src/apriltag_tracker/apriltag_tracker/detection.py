@@ -1,0 +1,269 @@
+"""Find AprilTags (36h11) in a grey image: OpenCV finds them, our own line fits place their corners."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from apriltag_tracker import edges, family
+
+SMALLEST_TAG = 12.0
+"""Shortest side that is looked for [px]; a cell is 1.5 px then."""
+
+_FROM_OPENCV = (1, 0, 3, 2)
+"""OpenCV's corners run clockwise from what is the printed tag's lower right."""
+
+
+@dataclass(frozen=True)
+class Tag:
+    """One tag in one image.
+
+    Attributes:
+        id: within the family.
+        corners: (4, 2) px, counter-clockwise from the printed lower left.
+        covariance: (8, 8) px² of the corners x0 y0 x1 …, from the scatter of the edge points.
+        line_residual: RMS distance of the edge points from the four lines [px].
+        edge_share: share of the border's profiles that took part, of the worst side.
+        contrast: white minus black at the border [grey levels].
+        found_by: `full`, `tracked` or `region`.
+    """
+
+    id: int
+    corners: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    line_residual: float
+    edge_share: float
+    contrast: float
+    found_by: str = "full"
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """Where the diagonals cross, (2,) px: the image of the printed tag's centre."""
+        a, b, c, d = self.corners
+        along, across = c - a, d - b
+        determinant = along[0] * across[1] - along[1] * across[0]
+        gap = b - a
+        share = (gap[0] * across[1] - gap[1] * across[0]) / determinant
+        result: NDArray[np.float64] = a + share * along
+        return result
+
+    @property
+    def pixel_size(self) -> float:
+        """Mean length of the sides [px]."""
+        return float(np.mean(np.hypot(*(np.roll(self.corners, -1, axis=0) - self.corners).T)))
+
+
+def corner_covariance(
+    corners: NDArray[np.float64], stats: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Propagate the variances of four lines to the corners they meet in.
+
+    Args:
+        corners: (4, 2) px.
+        stats: (4, 6) per side, from `edges.refine_quads`.
+
+    Returns:
+        (8, 8) px². A line that moves by δ along its normal n moves a corner, where it meets a line
+        of direction t, by t δ / (t·n).
+    """
+    spread = np.zeros((8, 8))
+    for side in range(4):
+        start, end = side, (side + 1) % 4
+        direction = np.array([math.cos(stats[side, 0]), math.sin(stats[side, 0])])
+        normal = np.array([-direction[1], direction[0]])
+        moves = np.zeros((8, 2))
+        half = 0.5 * math.hypot(*(corners[end] - corners[start]))
+        for corner, other, lever in ((start, (side + 3) % 4, -half), (end, end, half)):
+            along = np.array([math.cos(stats[other, 0]), math.sin(stats[other, 0])])
+            gain = along / (along @ normal)
+            moves[2 * corner : 2 * corner + 2, 0] = gain
+            moves[2 * corner : 2 * corner + 2, 1] = gain * lever
+        spread += moves @ np.diag(stats[side, 1:3]) @ moves.T
+    return spread
+
+
+def refine(
+    gray: NDArray[np.uint8], quads: NDArray[np.float64], search: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Refine corners (n, 4, 2) px; returns corners, side statistics (n, 4, 6) and success (n,)."""
+    corners = np.empty_like(quads)
+    stats = np.zeros((len(quads), 4, edges.EDGE_VALUES))
+    found = np.zeros(len(quads), dtype=np.bool_)
+    edges.refine_quads(gray, quads, search, corners, stats, found)
+    return corners, stats, found
+
+
+def make_tag(
+    tag: int, corners: NDArray[np.float64], stats: NDArray[np.float64], found_by: str
+) -> Tag:
+    """Put one refined tag together."""
+    return Tag(
+        id=tag,
+        corners=corners,
+        covariance=corner_covariance(corners, stats),
+        line_residual=float(np.sqrt(np.mean(stats[:, 3] ** 2))),
+        edge_share=float(np.min(stats[:, 4])),
+        contrast=float(np.median(stats[:, 5])),
+        found_by=found_by,
+    )
+
+
+def grey(image: Any) -> NDArray[np.uint8]:
+    """Check an image and return it as contiguous grey.
+
+    Raises:
+        ValueError: not an array of uint8 with one or three channels.
+    """
+    if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim not in {2, 3}:
+        what = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image)
+        raise ValueError(
+            f"image: uint8 array (rows, columns) or (rows, columns, 3) expected, not {what}"
+        )
+    if image.ndim == 3:
+        image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    return np.ascontiguousarray(image)
+
+
+class Detector:
+    """Finds all tags of an image.
+
+    Args:
+        smallest: shortest side of a tag to look for [px].
+        correct_bits: wrong cells of a code that are forgiven; three at most keeps false tags away.
+        largest_residual: RMS residual of the border's lines above which a candidate is dropped [px].
+    """
+
+    def __init__(
+        self, smallest: float = SMALLEST_TAG, correct_bits: int = 2, largest_residual: float = 0.6
+    ) -> None:
+        if smallest < 8.0:
+            raise ValueError(f"smallest tag of {smallest} px: 8 px or more can be read")
+        self.smallest = smallest
+        self.correct_bits = correct_bits
+        self.largest_residual = largest_residual
+        check_orientation()
+
+    @functools.cached_property
+    def _codes(self) -> NDArray[np.uint8]:
+        return family.codes()
+
+    def warm_up(self) -> None:
+        """Load or compile everything a first image would wait for."""
+        canvas = np.full((96, 96), 255, dtype=np.uint8)
+        cells = np.kron(family.printed_cells(0, margin=0), np.ones((5, 5))).astype(np.uint8)
+        canvas[28:68, 28:68] = cells * 255
+        if [tag.id for tag in self.detect(canvas)] != [0]:
+            raise family.FamilyError("a perfect picture of tag 0 is not detected")
+
+    def detect(self, gray: NDArray[np.uint8]) -> list[Tag]:
+        """Find tags in a grey image (rows, columns) of uint8; duplicates are returned as they are.
+
+        Raises:
+            ValueError: not such an image.
+        """
+        image = grey(gray)
+        ids, quads = find_quads(image, self.smallest)
+        return self.confirm(image, ids, quads, search=3.0, found_by="full")
+
+    def confirm(
+        self,
+        image: NDArray[np.uint8],
+        ids: NDArray[np.int64],
+        quads: NDArray[np.float64],
+        search: float,
+        found_by: str,
+    ) -> list[Tag]:
+        """Refine candidates and keep those whose border is straight and whose code is right.
+
+        Args:
+            image: grey image.
+            ids: (n,) the tag each candidate should be.
+            quads: (n, 4, 2) px, from the printed lower left counter-clockwise.
+            search: how far a side may be from where the candidate says [px].
+            found_by: noted in the tags.
+        """
+        if len(ids) == 0:
+            return []
+        corners, stats, found = refine(image, quads, search)
+        distance = np.empty(len(ids), dtype=np.int64)
+        edges.hamming_of_quads(image, corners, self._codes[ids], found, distance)
+        tags = []
+        for i, tag in enumerate(ids):
+            if not found[i] or distance[i] > self.correct_bits:
+                continue
+            if not _counter_clockwise(corners[i]):
+                continue
+            result = make_tag(int(tag), corners[i], stats[i], found_by)
+            if result.line_residual <= self.largest_residual:
+                tags.append(result)
+        return tags
+
+
+def _counter_clockwise(corners: NDArray[np.float64]) -> bool:
+    """Tell whether corners run as printed; y points down in the image. A mirror image does not."""
+    a, b, c, d = corners
+    diagonal, other = c - a, d - b
+    return bool(diagonal[0] * other[1] - diagonal[1] * other[0] < 0.0)
+
+
+def find_quads(
+    image: NDArray[np.uint8], smallest: float
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Let OpenCV find tags; returns ids (n,) and corners (n, 4, 2) px, printed lower left first."""
+    detector = _opencv_detector(max(image.shape), smallest)
+    found, ids, _ = detector.detectMarkers(image)
+    if ids is None or len(ids) == 0:
+        return np.empty(0, dtype=np.int64), np.empty((0, 4, 2))
+    quads = np.array([np.asarray(quad, dtype=np.float64).reshape(4, 2) for quad in found])
+    return np.asarray(ids, dtype=np.int64).ravel(), np.ascontiguousarray(quads[:, _FROM_OPENCV])
+
+
+@functools.lru_cache(maxsize=32)
+def _opencv_detector(extent: int, smallest: float) -> Any:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
+    parameters.minMarkerPerimeterRate = 0.8 * 4.0 * smallest / extent
+    parameters.maxMarkerPerimeterRate = 4.0
+    parameters.adaptiveThreshWinSizeMin = 13
+    parameters.adaptiveThreshWinSizeMax = 13
+    parameters.adaptiveThreshWinSizeStep = 10
+    parameters.minCornerDistanceRate = 0.05
+    parameters.minDistanceToBorder = 2
+    parameters.perspectiveRemovePixelPerCell = 4
+    parameters.errorCorrectionRate = 0.5
+    return cv2.aruco.ArucoDetector(family.dictionary(), parameters)
+
+
+@functools.cache
+def check_orientation() -> None:
+    """Detect one known tag and check id, corner order, rotation and pixel convention.
+
+    Raises:
+        family.FamilyError: this OpenCV answers otherwise than this package expects.
+    """
+    family.check_code_of_tag_0()
+    scale, left, top = 5, 30, 20
+    canvas = np.full((100, 110), 255, dtype=np.uint8)
+    cells = np.kron(family.printed_cells(0, margin=0), np.ones((scale, scale))).astype(np.uint8)
+    canvas[top : top + 8 * scale, left : left + 8 * scale] = cells * 255
+    ids, quads = find_quads(canvas, 20.0)
+    right, bottom = left + 8 * scale, top + 8 * scale
+    expected = np.array([[left, bottom], [right, bottom], [right, top], [left, top]]) - 0.5
+    if list(ids) != [0] or np.abs(quads[0] - expected).max() > 2.0:
+        raise family.FamilyError(
+            f"OpenCV {cv2.__version__} finds ids {list(ids)} with corners {quads.tolist()} in a picture "
+            f"of tag 0 with corners {expected.tolist()}: its conventions changed; "
+            "install opencv-python-headless 4.14 or 5.0"
+        )
+    corners, _, found = refine(canvas, quads, 3.0)
+    if not found[0] or np.abs(corners[0] - expected).max() > 0.05:
+        raise family.FamilyError(
+            f"the line fit places the corners of a perfect tag at {corners[0].tolist()}, not at "
+            f"{expected.tolist()}"
+        )

@@ -1,0 +1,323 @@
+"""Corners of tags from the edges of their black border, to a few hundredths of a pixel.
+
+Along each side, profiles are taken across the border. Where the border crosses from black to white is the
+centroid of the profile's slope: with bilinear samples this is a sum of intensities, so it does not depend
+on where the edge lies between pixels, and a symmetric blur does not move it. A line goes through the
+crossings of a side, outliers are taken out, and neighbouring lines are intersected. A second and third
+pass start from the corners of the one before.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+MAX_SAMPLES = 96
+EDGE_VALUES = 6
+"""Per side: angle, offset variance, angle variance, residual RMS, used fraction, contrast."""
+
+_PROFILE = 17
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def sample(image: NDArray[np.uint8], x: float, y: float) -> float:
+    """Return the bilinear intensity, clamped at the image's border."""
+    height, width = image.shape
+    x = min(max(x, 0.0), width - 1.001)
+    y = min(max(y, 0.0), height - 1.001)
+    column, row = int(x), int(y)
+    a, b = x - column, y - row
+    top = image[row, column] * (1.0 - a) + image[row, column + 1] * a
+    low = image[row + 1, column] * (1.0 - a) + image[row + 1, column + 1] * a
+    return float(top * (1.0 - b) + low * b)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _crossing(profile: NDArray[np.float64], window: float, coarse: bool) -> tuple[float, float]:
+    """Return offset of the edge from the middle of a profile [px] and its contrast."""
+    count = profile.shape[0]
+    step = 2.0 * window / (count - 1)
+    if coarse:
+        # Squared slopes: pulled less by the cells further in, though a little toward pixel centres.
+        weight, moment, contrast = 0.0, 0.0, 0.0
+        for k in range(count - 1):
+            slope = profile[k + 1] - profile[k]
+            if slope > 0.0:
+                weight += slope * slope
+                moment += slope * slope * (-window + (k + 0.5) * step)
+                contrast += slope
+        return (moment / weight if weight > 0.0 else 0.0), contrast
+    low = 0.5 * (profile[0] + profile[1])
+    high = 0.5 * (profile[count - 1] + profile[count - 2])
+    contrast = high - low
+    if contrast <= 1.0:
+        return 0.0, contrast
+    # Black area of the profile; the trapezoid rule from the first to the last sample.
+    area = 0.0
+    for k in range(count):
+        share = (high - profile[k]) / contrast
+        area += share * (0.5 if k in {0, count - 1} else 1.0)
+    return area * step - window, contrast
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _fit_side(
+    image: NDArray[np.uint8],
+    ax: float,
+    ay: float,
+    bx: float,
+    by: float,
+    turn: float,
+    window: float,
+    coarse: bool,
+    line: NDArray[np.float64],
+    stats: NDArray[np.float64],
+) -> bool:
+    """Fit the line of one side; `line` becomes (middle x, y, direction x, y)."""
+    length = math.hypot(bx - ax, by - ay)
+    if length < 4.0:
+        return False
+    tx, ty = (bx - ax) / length, (by - ay) / length
+    nx, ny = turn * ty, -turn * tx
+    inset = min(max(1.5, 0.08 * length), 0.25 * length)
+    count = min(max(int(length - 2.0 * inset), 6), MAX_SAMPLES)
+    spacing = (length - 2.0 * inset) / (count - 1)
+    along = np.empty(count)
+    across = np.empty(count)
+    contrasts = np.empty(count)
+    profile = np.empty(_PROFILE)
+    for i in range(count):
+        along[i] = inset + i * spacing - 0.5 * length
+        px = 0.5 * (ax + bx) + along[i] * tx
+        py = 0.5 * (ay + by) + along[i] * ty
+        for k in range(_PROFILE):
+            offset = -window + 2.0 * window * k / (_PROFILE - 1)
+            profile[k] = sample(image, px + offset * nx, py + offset * ny)
+        across[i], contrasts[i] = _crossing(profile, window, coarse)
+    typical = np.median(contrasts)
+    if typical < 8.0:
+        return False
+    weights = np.empty(count)
+    for i in range(count):
+        usable = contrasts[i] > 0.6 * typical and abs(across[i]) < 0.95 * window
+        weights[i] = 1.0 if usable else 0.0
+    middle, slope, mean_along, spread, rms, used = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for _ in range(3):
+        sw = sx = sy = sxx = sxy = 0.0
+        for i in range(count):
+            w = weights[i]
+            sw += w
+            sx += w * along[i]
+            sy += w * across[i]
+            sxx += w * along[i] * along[i]
+            sxy += w * along[i] * across[i]
+        if sw < 5.0:
+            return False
+        mean_along = sx / sw
+        spread = sxx - sx * mean_along
+        if spread < 1e-6:
+            return False
+        slope = (sxy - sy * mean_along) / spread
+        middle = sy / sw - slope * mean_along
+        total = 0.0
+        for i in range(count):
+            total += weights[i] * (across[i] - middle - slope * along[i]) ** 2
+        rms = math.sqrt(total / max(sw - 2.0, 1.0))
+        used = sw / count
+        gate = max(3.0 * rms, 0.05)
+        for i in range(count):
+            if abs(across[i] - middle - slope * along[i]) > gate:
+                weights[i] = 0.0
+    line[0] = 0.5 * (ax + bx) + middle * nx
+    line[1] = 0.5 * (ay + by) + middle * ny
+    dx, dy = tx + slope * nx, ty + slope * ny
+    norm = math.hypot(dx, dy)
+    line[2], line[3] = dx / norm, dy / norm
+    # Neighbouring profiles share pixels, which makes about two of them worth one.
+    variance = 2.0 * max(rms, 0.004) ** 2
+    stats[0] = math.atan2(dy, dx)
+    stats[1] = variance / (used * count) + variance * mean_along**2 / spread
+    stats[2] = variance / spread
+    stats[3] = rms
+    stats[4] = used
+    stats[5] = typical
+    return True
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _refine_once(
+    image: NDArray[np.uint8],
+    corners: NDArray[np.float64],
+    window: float,
+    coarse: bool,
+    stats: NDArray[np.float64],
+) -> bool:
+    area = 0.0
+    for i in range(4):
+        j = (i + 1) % 4
+        area += corners[i, 0] * corners[j, 1] - corners[j, 0] * corners[i, 1]
+    turn = 1.0 if area > 0.0 else -1.0
+    lines = np.empty((4, 4))
+    for i in range(4):
+        j = (i + 1) % 4
+        if not _fit_side(
+            image,
+            corners[i, 0],
+            corners[i, 1],
+            corners[j, 0],
+            corners[j, 1],
+            turn,
+            window,
+            coarse,
+            lines[i],
+            stats[i],
+        ):
+            return False
+    for i in range(4):
+        before = lines[(i + 3) % 4]
+        after = lines[i]
+        determinant = before[2] * after[3] - before[3] * after[2]
+        if abs(determinant) < 0.2:
+            return False
+        gx, gy = after[0] - before[0], after[1] - before[1]
+        reach = (gx * after[3] - gy * after[2]) / determinant
+        corners[i, 0] = before[0] + reach * before[2]
+        corners[i, 1] = before[1] + reach * before[3]
+    return True
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def refine_quads(
+    image: NDArray[np.uint8],
+    quads: NDArray[np.float64],
+    search: float,
+    corners: NDArray[np.float64],
+    stats: NDArray[np.float64],
+    found: NDArray[np.bool_],
+) -> None:
+    """Refine the corners of black quadrilaterals on white.
+
+    Args:
+        image: grey image.
+        quads: (n, 4, 2) px, corners to start from, in either sense of rotation.
+        search: largest distance of a side from where it starts [px]; cut to the width of a cell.
+        corners: (n, 4, 2) px, output.
+        stats: (n, 4, 6), output per side: direction [rad], variance of its offset in the middle [px²],
+            variance of its direction [rad²], RMS residual [px], share of profiles used, contrast.
+        found: (n,), output: whether all four sides were there.
+    """
+    for i in range(quads.shape[0]):
+        shortest = 1e9
+        for k in range(4):
+            j = (k + 1) % 4
+            side = math.hypot(quads[i, j, 0] - quads[i, k, 0], quads[i, j, 1] - quads[i, k, 1])
+            shortest = min(shortest, side)
+            corners[i, k, 0] = quads[i, k, 0]
+            corners[i, k, 1] = quads[i, k, 1]
+        cell = shortest / 8.0
+        wide = min(max(search, 1.0), 0.9 * cell + 0.4)
+        fine = min(max(0.55 * cell, 1.1), 2.5)
+        found[i] = _refine_once(image, corners[i], wide, True, stats[i])
+        for _ in range(2):
+            if found[i]:
+                found[i] = _refine_once(image, corners[i], fine, False, stats[i])
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def read_bits(
+    image: NDArray[np.uint8], corners: NDArray[np.float64], bits: NDArray[np.uint8]
+) -> float:
+    """Read the 6 x 6 cells of one tag whose corners are known.
+
+    Args:
+        image: grey image.
+        corners: (4, 2) px, lower left first, counter-clockwise as printed.
+        bits: (6, 6) output, upper row of the printed tag first, 1 is white.
+
+    Returns:
+        Distance of the cell nearest to the threshold from it, over the contrast; 0.5 is a clean tag.
+    """
+    h = _square_to_quad(corners)
+    values = np.empty((8, 8))
+    for row in range(8):
+        for column in range(8):
+            u = (column + 0.5) / 8.0
+            v = 1.0 - (row + 0.5) / 8.0
+            w = h[6] * u + h[7] * v + 1.0
+            x = (h[0] * u + h[1] * v + h[2]) / w
+            y = (h[3] * u + h[4] * v + h[5]) / w
+            values[row, column] = sample(image, x, y)
+    black = 0.0
+    for k in range(8):
+        black += values[0, k] + values[7, k] + values[k, 0] + values[k, 7]
+    black /= 32.0
+    white = 0.0
+    for row in range(1, 7):
+        for column in range(1, 7):
+            white = max(white, values[row, column])
+    middle = 0.5 * (black + white)
+    contrast = white - black
+    margin = 0.5
+    if contrast <= 8.0:
+        return 0.0
+    for row in range(6):
+        for column in range(6):
+            value = values[row + 1, column + 1]
+            bits[row, column] = 1 if value > middle else 0
+            margin = min(margin, abs(value - middle) / contrast)
+    for k in range(8):
+        for value in (values[0, k], values[7, k], values[k, 0], values[k, 7]):
+            if value > middle:
+                return 0.0
+    return margin
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _square_to_quad(c: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the projective map of the unit square onto a quadrilateral (Heckbert 1989)."""
+    dx1, dx2 = c[1, 0] - c[2, 0], c[3, 0] - c[2, 0]
+    dy1, dy2 = c[1, 1] - c[2, 1], c[3, 1] - c[2, 1]
+    sx = c[0, 0] - c[1, 0] + c[2, 0] - c[3, 0]
+    sy = c[0, 1] - c[1, 1] + c[2, 1] - c[3, 1]
+    determinant = dx1 * dy2 - dx2 * dy1
+    g = (sx * dy2 - dx2 * sy) / determinant
+    h = (dx1 * sy - sx * dy1) / determinant
+    out = np.empty(8)
+    out[0] = c[1, 0] - c[0, 0] + g * c[1, 0]
+    out[1] = c[3, 0] - c[0, 0] + h * c[3, 0]
+    out[2] = c[0, 0]
+    out[3] = c[1, 1] - c[0, 1] + g * c[1, 1]
+    out[4] = c[3, 1] - c[0, 1] + h * c[3, 1]
+    out[5] = c[0, 1]
+    out[6] = g
+    out[7] = h
+    return out
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def hamming(bits: NDArray[np.uint8], code: NDArray[np.uint8]) -> int:
+    """Count the cells in which two codes differ."""
+    count = 0
+    for row in range(bits.shape[0]):
+        for column in range(bits.shape[1]):
+            count += bits[row, column] != code[row, column]
+    return count
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def hamming_of_quads(
+    image: NDArray[np.uint8],
+    corners: NDArray[np.float64],
+    codes: NDArray[np.uint8],
+    found: NDArray[np.bool_],
+    distance: NDArray[np.int64],
+) -> None:
+    """Compare what quadrilaterals (n, 4, 2) show with the codes (n, 6, 6) expected of them."""
+    bits = np.zeros((6, 6), dtype=np.uint8)
+    for i in range(corners.shape[0]):
+        distance[i] = 36
+        if found[i] and read_bits(image, corners[i], bits) > 0.0:
+            distance[i] = hamming(bits, codes[i])

@@ -1,0 +1,471 @@
+"""The node `apriltag_tracker`: images in, tags and the limb's state out."""
+
+from __future__ import annotations
+
+import array
+import collections
+import math
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+from ament_index_python.packages import get_package_share_directory
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point, Pose2D
+from numpy.typing import NDArray
+from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo, Image
+from visualization_msgs.msg import Marker, MarkerArray
+
+from apriltag_tracker.camera import CameraError, Intrinsics
+from apriltag_tracker.detection import Detector
+from apriltag_tracker.encodings import to_grey
+from apriltag_tracker.overlay import draw_observation
+from apriltag_tracker.pipeline import (
+    LimbObservation,
+    LimbTracker,
+    PlacedTag,
+    TrackerOptions,
+    Uncertainty,
+)
+from apriltag_tracker.sources import Grabbed, SourceError, open_source
+from apriltag_tracker.tag_map import TagMap
+from apriltag_tracker.tracking import TrackingOptions
+from der_msgs.msg import LimbState, TagDetection, TagDetectionArray
+from limb_interfaces import qos, stamps, topics
+from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
+from limb_interfaces.parameters import declare
+from limb_interfaces.runner import run_node
+
+ANNOTATED_IMAGE = "camera/image_annotated"
+_MARKER_PERIOD = 0.1
+_SILENCE = 2.0
+_WINDOW = 300
+
+
+class TrackerNode(Node):
+    """Follows the limb in images of a topic, a camera, a video file or a folder."""
+
+    def __init__(self) -> None:
+        super().__init__("apriltag_tracker", namespace=topics.NAMESPACE)
+        share = Path(get_package_share_directory("apriltag_tracker")) / "config"
+        tag_map = declare(
+            self, "tag_map", str(share / "tags.yaml"), "YAML file: where the tags are"
+        )
+        calibration = declare(
+            self, "calibration_file", "", "camera_info YAML; empty: from the camera_info topic"
+        )
+        source = str(
+            declare(
+                self,
+                "source",
+                "topic",
+                "where images come from: topic, /dev/videoN, a video file, or a folder of images",
+            )
+        )
+        rate = float(
+            declare(
+                self,
+                "source_rate",
+                30.0,
+                "images a second from a folder or device",
+                at_least=0.1,
+                at_most=500.0,
+            )
+        )
+        threads = int(declare(self, "threads", 1, "threads of OpenCV", at_least=1, at_most=64))
+        cv2.setNumThreads(threads)
+        self._map = TagMap.from_yaml(str(tag_map))
+        self._options = self._declare_options()
+        self._detector = Detector(
+            float(
+                declare(
+                    self,
+                    "smallest_tag",
+                    14.0,
+                    "shortest side of a tag in px",
+                    at_least=8.0,
+                    at_most=500.0,
+                )
+            ),
+            int(
+                declare(
+                    self,
+                    "correct_bits",
+                    2,
+                    "wrong bits of a code that are forgiven",
+                    at_least=0,
+                    at_most=3,
+                )
+            ),
+        )
+        self._warm_up()
+        self._tracker: LimbTracker | None = None
+        self._calibration_problem = ""
+        self._started = time.monotonic()
+        self._last_image = -math.inf
+        self._received = self._processed = self._failed = self._invalid = self._bridged = 0
+        self._out_of_order = 0
+        self._last_stamp = -1
+        self._image_problem = ""
+        self._observation: LimbObservation | None = None
+        self._latency: collections.deque[float] = collections.deque(maxlen=_WINDOW)
+        self._work: collections.deque[float] = collections.deque(maxlen=_WINDOW)
+        self._arrivals: collections.deque[float] = collections.deque(maxlen=_WINDOW)
+        self._last_markers = 0.0
+        self._make_topics()
+        if calibration:
+            self._use(Intrinsics.from_yaml(str(calibration)))
+        self._source_name = source
+        self._source = None
+        if source == "topic":
+            self._subscribe(needs_info=not calibration)
+        else:
+            if not calibration:
+                raise CameraError(
+                    f"source '{source}' brings no camera_info: set the parameter calibration_file "
+                    "(scripts/calibrate_camera.py writes one)"
+                )
+            self._source = open_source(source, rate)
+            self._source_timer = self.create_timer(0.002, self._poll_source)
+        self._diagnostics = DiagnosticsPublisher(self, self._health, source)
+
+    def close(self) -> None:
+        """Release the camera or file."""
+        if self._source is not None:
+            self._source.close()
+
+    # Set-up
+
+    def _declare_options(self) -> TrackerOptions:
+        def number(name: str, default: float, description: str, at_most: float) -> float:
+            return float(
+                declare(self, name, float(default), description, at_least=0.0, at_most=at_most)
+            )
+
+        return TrackerOptions(
+            bridge_frames=int(
+                declare(
+                    self,
+                    "bridge_frames",
+                    TrackerOptions.bridge_frames,
+                    "frames without limb tags that are bridged and marked",
+                    at_least=0,
+                    at_most=30,
+                )
+            ),
+            reject_beyond=number(
+                "reject_beyond",
+                TrackerOptions.reject_beyond,
+                "distance in m from the other tags' shape at which a tag is left out",
+                0.1,
+            ),
+            uncertainty=Uncertainty(
+                survey=number(
+                    "survey_sigma", Uncertainty.survey, "of fixed tags' positions, m", 0.1
+                ),
+                height=number("height_sigma", Uncertainty.height, "of limb tags' heights, m", 0.1),
+                mounting=number(
+                    "mounting_sigma", Uncertainty.mounting, "of limb tags on the limb, m", 0.1
+                ),
+                mounting_angle=number(
+                    "mounting_angle_sigma",
+                    Uncertainty.mounting_angle,
+                    "of limb tags' directions, rad",
+                    1.0,
+                ),
+            ),
+            tracking=TrackingOptions(
+                full_search_period=number(
+                    "full_search_period",
+                    TrackingOptions.full_search_period,
+                    "s between searches of the whole image; 0 searches every image in full",
+                    60.0,
+                )
+            ),
+        )
+
+    def _warm_up(self) -> None:
+        """Compile or load every kernel and check OpenCV's conventions before the first image."""
+        self._detector.warm_up()
+
+    def _make_topics(self) -> None:
+        self._tags = self.create_publisher(TagDetectionArray, topics.TAGS, qos.STATES)
+        self._states = self.create_publisher(LimbState, topics.LIMB_STATE, qos.STATES)
+        self._markers = self.create_publisher(MarkerArray, topics.SHAPE_MARKERS, qos.STATES)
+        self._annotated = self.create_publisher(Image, ANNOTATED_IMAGE, qos.SENSOR_DATA)
+
+    def _subscribe(self, needs_info: bool) -> None:
+        # A best-effort subscriber hears best-effort and reliable publishers alike.
+        self.create_subscription(Image, topics.IMAGE, self._on_image, qos.IMAGES)
+        if needs_info:
+            # Two, since a latched publisher and a volatile one need different subscribers: the one
+            # that asks for the kept message is not matched with a camera that keeps none.
+            self.create_subscription(CameraInfo, topics.CAMERA_INFO, self._on_info, qos.LATCHED)
+            self.create_subscription(CameraInfo, topics.CAMERA_INFO, self._on_info, qos.IMAGES)
+
+    # Input
+
+    def _on_info(self, message: CameraInfo) -> None:
+        try:
+            intrinsics = Intrinsics.create(
+                message.width, message.height, message.k, message.d, message.distortion_model
+            )
+        except CameraError as error:
+            self._calibration_problem = str(error)
+            return
+        self._use(intrinsics)
+
+    def _use(self, intrinsics: Intrinsics) -> None:
+        """Take a calibration; one that is like the present one changes nothing."""
+        self._calibration_problem = ""
+        now = self._tracker.intrinsics if self._tracker is not None else None
+        if (
+            now is not None
+            and (now.width, now.height) == (intrinsics.width, intrinsics.height)
+            and np.array_equal(now.matrix, intrinsics.matrix)
+            and np.array_equal(now.distortion, intrinsics.distortion)
+        ):
+            return
+        self._tracker = LimbTracker(self._map, intrinsics, self._options, self._detector)
+
+    def _on_image(self, message: Image) -> None:
+        try:
+            gray = to_grey(
+                message.data,
+                message.height,
+                message.width,
+                message.step,
+                message.encoding,
+                bool(message.is_bigendian),
+            )
+        except ValueError as error:
+            self._count_arrival()
+            self._fail(message.header.stamp, str(error))
+            return
+        self._take(gray, message.header.stamp)
+
+    def _poll_source(self) -> None:
+        assert self._source is not None
+        try:
+            grabbed: Grabbed | None = self._source.read()
+        except SourceError as error:
+            self._image_problem = str(error)
+            return
+        if grabbed is not None:
+            self._take(grabbed.gray, stamps.stamp_from_nanoseconds(grabbed.stamp))
+
+    def _count_arrival(self) -> None:
+        self._received += 1
+        self._last_image = time.monotonic()
+        self._arrivals.append(self._last_image)
+
+    def _take(self, gray: NDArray[np.uint8], stamp: Time) -> None:
+        """Process one image and publish what it says under its own stamp."""
+        started = time.perf_counter()
+        self._count_arrival()
+        if stamps.nanoseconds(stamp) == self._last_stamp:
+            # The same picture again says nothing new.
+            self._out_of_order += 1
+            return
+        self._last_stamp = stamps.nanoseconds(stamp)
+        if self._tracker is None:
+            self._fail(stamp, self._calibration_problem or "no camera_info has come yet")
+            return
+        try:
+            observation = self._tracker.observe(gray, stamps.seconds(stamp))
+        except (ValueError, ArithmeticError, cv2.error) as error:
+            self._fail(stamp, str(error))
+            return
+        self._image_problem = ""
+        self._observation = observation
+        self._processed += 1
+        self._invalid += observation.estimate is None
+        self._bridged += observation.bridged
+        self._publish(observation, gray, stamp)
+        self._work.append(time.perf_counter() - started)
+
+    def _fail(self, stamp: Time, problem: str) -> None:
+        """Say at once that this image gives no state, and why."""
+        self._failed += 1
+        self._image_problem = problem
+        self._states.publish(self._state(LimbObservation((), None, problem), stamp))
+
+    # Output
+
+    def _publish(self, observation: LimbObservation, gray: NDArray[np.uint8], stamp: Time) -> None:
+        state = self._state(observation, stamp)
+        self._states.publish(state)
+        self._latency.append(state.latency)
+        array_message = TagDetectionArray(
+            detections=[_tag_message(placed) for placed in observation.tags]
+        )
+        array_message.header.stamp = stamp
+        array_message.header.frame_id = topics.BASE_FRAME
+        self._tags.publish(array_message)
+        now = time.monotonic()
+        if (
+            now - self._last_markers >= _MARKER_PERIOD
+            and self._markers.get_subscription_count() > 0
+            and observation.estimate is not None
+        ):
+            self._last_markers = now
+            self._markers.publish(_markers(state))
+        if self._annotated.get_subscription_count() > 0 and self._tracker is not None:
+            picture = draw_observation(gray, observation, self._tracker)
+            message = Image(
+                height=picture.shape[0],
+                width=picture.shape[1],
+                encoding="bgr8",
+                step=3 * picture.shape[1],
+                data=array.array("B", picture.tobytes()),
+            )
+            message.header.stamp = stamp
+            self._annotated.publish(message)
+
+    def _state(self, observation: LimbObservation, stamp: Time) -> LimbState:
+        message = LimbState(reason=observation.reason)
+        message.header.stamp = stamp
+        message.header.frame_id = topics.BASE_FRAME
+        count = len(self._map.segment_lengths)
+        estimate = observation.estimate
+        if estimate is None:
+            nan = math.nan
+            message.tip = Point(x=nan, y=nan, z=nan)
+            message.tip_covariance = message.tip_systematic = [nan] * 4
+            message.bend_angle = message.bend_angle_sigma = message.curvature = [nan] * count
+            message.elongation = message.residual = nan
+        else:
+            message.valid = True
+            message.tip = Point(x=float(estimate.tip[0]), y=float(estimate.tip[1]), z=0.0)
+            message.tip_covariance = estimate.tip_covariance.ravel()
+            message.tip_systematic = estimate.tip_systematic.ravel()
+            message.bend_angle = estimate.bend_angle.tolist()
+            message.bend_angle_sigma = estimate.bend_angle_sigma.tolist()
+            message.curvature = estimate.curvature.tolist()
+            message.elongation = estimate.elongation
+            message.residual = estimate.residual
+            message.curve = [Point(x=x, y=y) for x, y in estimate.curve.tolist()]
+            message.tags_used = len(estimate.tags_used)
+        now = self.get_clock().now().nanoseconds
+        message.latency = (now - stamps.nanoseconds(stamp)) / stamps.NANOSECONDS
+        return message
+
+    # Diagnostics
+
+    def _health(self) -> Health:
+        silent = time.monotonic() - max(self._last_image, self._started)
+        values = self._values()
+        if self._received == 0 or silent > _SILENCE:
+            return self._no_images(silent, values)
+        if self._tracker is None:
+            problem = self._calibration_problem or (
+                f"images come but no {topics.CAMERA_INFO}: publish it, or set the parameter "
+                "calibration_file (scripts/calibrate_camera.py writes one)"
+            )
+            return Health("error", problem, values)
+        if self._image_problem:
+            return Health("error", self._image_problem, values)
+        observation = self._observation
+        if observation is None or observation.estimate is None:
+            reason = observation.reason if observation is not None else "no image was processed"
+            return Health("error", reason, values)
+        world = self._tracker.world
+        if world.excluded:
+            named = ", ".join(f"{tag} ({gap:.1f} px)" for tag, gap in world.excluded.items())
+            return Health("warning", f"fixed tags that do not fit the others: {named}", values)
+        if observation.reason:
+            return Health("warning", observation.reason, values)
+        return Health("ok", "tracking", values)
+
+    def _no_images(self, silent: float, values: dict[str, object]) -> Health:
+        if self._source is not None:
+            problem = self._image_problem or f"no image from {self._source_name} for {silent:.0f} s"
+            return Health("error", problem, values)
+        topic = self.resolve_topic_name(topics.IMAGE)
+        publishers = self.count_publishers(topic)
+        if self._received == 0 and silent <= _SILENCE:
+            return Health("stale", f"waiting for images on {topic}", values)
+        if publishers == 0:
+            cure = "nobody publishes it: start the camera, or remap the topic"
+        else:
+            cure = (
+                f"{publishers} publisher(s), but no image arrives: large images are lost with Fast DDS's "
+                "default shared memory; set FASTRTPS_DEFAULT_PROFILES_FILE to "
+                "apriltag_tracker/config/fastdds_large_images.xml in every process"
+            )
+        level = "stale" if self._received == 0 else "error"
+        return Health(level, f"no image on {topic} for {silent:.0f} s: {cure}", values)
+
+    def _values(self) -> dict[str, object]:
+        values: dict[str, object] = {
+            "images_received": self._received,
+            "images_processed": self._processed,
+            "images_failed": self._failed,
+            "repeated_stamps": self._out_of_order,
+            "states_invalid": self._invalid,
+            "states_bridged": self._bridged,
+        }
+        if len(self._arrivals) > 1 and self._arrivals[-1] > self._arrivals[0]:
+            rate = (len(self._arrivals) - 1) / (self._arrivals[-1] - self._arrivals[0])
+            values["rate_hz"] = f"{rate:.1f}"
+        for name, kept in (("latency", self._latency), ("processing", self._work)):
+            if kept:
+                values[f"{name}_ms_median"] = f"{1e3 * float(np.median(kept)):.2f}"
+                values[f"{name}_ms_p99"] = f"{1e3 * float(np.percentile(kept, 99)):.2f}"
+        if self._tracker is not None:
+            counts, world = self._tracker.tracker.counts, self._tracker.world
+            values.update(
+                tags_tracked=counts.tracked,
+                tags_by_region=counts.by_region,
+                tags_by_full_search=counts.by_full,
+                full_searches=counts.full_searches,
+                duplicates_rejected=counts.duplicates,
+                unknown_tags=dict(counts.unknown),
+                tags_misplaced=self._tracker.misplaced,
+                world_residual_px=f"{world.residual:.3f}",
+                camera_bumps=world.bumps,
+            )
+        return values
+
+
+def _tag_message(placed: PlacedTag) -> TagDetection:
+    tag = placed.tag
+    message = TagDetection(
+        id=tag.id,
+        corners=tag.corners.ravel(),
+        on_limb=placed.on_limb,
+        pose_valid=placed.pose is not None,
+        pixel_size=tag.pixel_size,
+        line_residual=tag.line_residual,
+    )
+    if placed.pose is not None:
+        x, y, yaw = placed.pose.tolist()
+        message.pose = Pose2D(x=x, y=y, theta=yaw)
+    return message
+
+
+def _markers(state: LimbState) -> MarkerArray:
+    """Draw the measured limb and its tip for RViz and Foxglove."""
+    line = Marker(ns="measured", id=0, type=Marker.LINE_STRIP, points=list(state.curve))
+    tip = Marker(ns="measured", id=1, type=Marker.SPHERE)
+    for marker in (line, tip):
+        marker.header = state.header
+        marker.color.g = marker.color.b = 0.7
+        marker.color.a = 1.0
+        marker.pose.orientation.w = 1.0
+    line.scale.x = 0.004
+    tip.pose.position = state.tip
+    tip.scale.x = tip.scale.y = tip.scale.z = 0.01
+    return MarkerArray(markers=[line, tip])
+
+
+def main() -> int:
+    """Run the node."""
+    return run_node(TrackerNode)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

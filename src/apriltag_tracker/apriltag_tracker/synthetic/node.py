@@ -1,0 +1,191 @@
+"""The node `synthetic_camera`: renders one image for every shape of the limb's twin."""
+
+from __future__ import annotations
+
+import array
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+from ament_index_python.packages import get_package_share_directory
+from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo, Image
+
+from apriltag_tracker.synthetic.camera import (
+    CameraModel,
+    Errors,
+    Optics,
+    Shape,
+    SyntheticCamera,
+)
+from apriltag_tracker.synthetic.shapes import constant_curvature
+from apriltag_tracker.tag_map import TagMap
+from der_msgs.msg import LimbShape
+from limb_interfaces import qos, stamps, topics
+from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
+from limb_interfaces.parameters import declare
+from limb_interfaces.runner import run_node
+
+FRAME = "camera_optical_frame"
+_INFO_PERIOD = 0.5
+
+
+class SyntheticCameraNode(Node):
+    """Subscribes to the twin's shape, publishes images with the shape's stamp, and camera_info."""
+
+    def __init__(self) -> None:
+        super().__init__("synthetic_camera", namespace=topics.NAMESPACE)
+        cv2.setNumThreads(1)
+        share = Path(get_package_share_directory("apriltag_tracker")) / "config"
+        tag_map = declare(
+            self, "tag_map", str(share / "tags.yaml"), "YAML file: where the tags are"
+        )
+        camera = declare(
+            self,
+            "camera_file",
+            str(share / "synthetic_camera.yaml"),
+            "YAML file: lens and place of the rendered camera",
+        )
+        seed = declare(self, "seed", 0, "of noise, floor and set-up errors", at_least=0)
+        optics = Optics(
+            noise=self._number("noise", Optics.noise, "noise of a pixel, grey levels", 30.0),
+            blur=self._number(
+                "blur", Optics.blur, "blur of the lens, standard deviation in px", 4.0
+            ),
+            exposure=self._number("exposure", Optics.exposure, "exposure time in s", 0.1),
+            light_fall=self._number(
+                "light_fall", Optics.light_fall, "difference of the light over its mean", 1.0
+            ),
+        )
+        errors = Errors(
+            survey=self._number(
+                "survey_error", 0.0, "how far fixed tags are from the tag map, in m", 0.01
+            ),
+            mounting=self._number(
+                "mounting_error", 0.0, "how far limb tags are from the tag map, in m", 0.01
+            ),
+            mounting_angle=self._number(
+                "mounting_angle_error", 0.0, "how far limb tags are turned, in rad", 0.3
+            ),
+        )
+        tags = TagMap.from_yaml(str(tag_map))
+        self._camera = SyntheticCamera(
+            CameraModel.from_yaml(str(camera)), tags, optics, errors, int(seed)
+        )
+        self._compile(tags)
+        self._before: tuple[int, Shape] | None = None
+        self._frames = 0
+        self._refused = 0
+        self._last_shape = time.monotonic()
+        self._busy = 0.0
+        self._image = self._image_message()
+        self._info = self._info_message()
+        self._images = self.create_publisher(Image, topics.IMAGE, qos.SENSOR_DATA)
+        self._infos = self.create_publisher(CameraInfo, topics.CAMERA_INFO, qos.LATCHED)
+        self._last_info = 0.0
+        self.create_subscription(LimbShape, topics.TWIN_SHAPE, self._on_shape, qos.IMAGES)
+        self._diagnostics = DiagnosticsPublisher(self, self._health, "rendered")
+        self._publish_info()
+
+    def _number(self, name: str, default: float, description: str, at_most: float) -> float:
+        return float(
+            declare(self, name, float(default), description, at_least=0.0, at_most=at_most)
+        )
+
+    def _compile(self, tags: TagMap) -> None:
+        """Draw once, so that no frame of a run waits for a compiler."""
+        straight = constant_curvature(tags.segment_lengths, [0.0] * len(tags.segment_lengths))
+        self._camera.frame(straight)
+
+    def _image_message(self) -> Image:
+        size = self._camera.model.intrinsics
+        message = Image(height=size.height, width=size.width, encoding="mono8", step=size.width)
+        message.header.frame_id = FRAME
+        return message
+
+    def _info_message(self) -> CameraInfo:
+        size = self._camera.model.intrinsics
+        message = CameraInfo(
+            height=size.height,
+            width=size.width,
+            distortion_model="plumb_bob",
+            d=size.distortion[:5].tolist(),
+            k=size.matrix.ravel().tolist(),
+            r=np.eye(3).ravel().tolist(),
+            p=np.hstack([size.matrix, np.zeros((3, 1))]).ravel().tolist(),
+        )
+        message.header.frame_id = FRAME
+        return message
+
+    def _publish_info(self) -> None:
+        self._last_info = time.monotonic()
+        self._infos.publish(self._info)
+
+    def _on_shape(self, message: LimbShape) -> None:
+        started = time.perf_counter()
+        self._last_shape = time.monotonic()
+        count = len(message.points)
+        if count < 2 or not count == len(message.arc_length) == len(message.heading):
+            self._refused += 1
+            return
+        points = np.array([(point.x, point.y) for point in message.points])
+        shape = Shape(np.array(message.arc_length), points, np.array(message.heading))
+        if not (np.isfinite(points).all() and np.all(np.diff(shape.arc_length) > 0.0)):
+            self._refused += 1
+            return
+        stamp = stamps.nanoseconds(message.header.stamp)
+        frame = self._camera.frame(shape, self._velocity(stamp, shape))
+        self._before = (stamp, shape)
+        self._image.header.stamp = message.header.stamp
+        # rclpy copies an array.array in one piece; other sequences go through element by element.
+        self._image.data = array.array("B", frame.image.tobytes())
+        self._images.publish(self._image)
+        if time.monotonic() - self._last_info > _INFO_PERIOD:
+            self._info.header.stamp = message.header.stamp
+            self._publish_info()
+        self._frames += 1
+        self._busy += time.perf_counter() - started
+
+    def _velocity(self, stamp: int, shape: Shape) -> Shape | None:
+        """Return how fast the limb moves, from this shape and the one before."""
+        if self._before is None:
+            return None
+        earlier, before = self._before
+        elapsed = (stamp - earlier) / stamps.NANOSECONDS
+        if not 0.0 < elapsed < 0.5 or len(before.heading) != len(shape.heading):
+            return None
+        return Shape(
+            shape.arc_length,
+            (shape.points - before.points) / elapsed,
+            (shape.heading - before.heading) / elapsed,
+        )
+
+    def _health(self) -> Health:
+        silent = time.monotonic() - self._last_shape
+        values = {
+            "frames": self._frames,
+            "refused_shapes": self._refused,
+            "render_ms": f"{1e3 * self._busy / max(self._frames, 1):.2f}",
+        }
+        if self._frames == 0:
+            return Health("stale", f"waiting for shapes on {topics.TWIN_SHAPE}", values)
+        if silent > 1.0:
+            return Health(
+                "warning",
+                f"no shape on {topics.TWIN_SHAPE} for {silent:.0f} s: is limb_twin running?",
+                values,
+            )
+        if self._refused:
+            return Health("warning", f"{self._refused} malformed shapes were left out", values)
+        return Health("ok", "rendering", values)
+
+
+def main() -> int:
+    """Run the node."""
+    return run_node(SyntheticCameraNode)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,180 @@
+"""The tag map: which tag sits where on the limb and around it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from apriltag_tracker import family
+
+SCHEMA_VERSION = 1
+
+UNIT_CORNERS = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+"""Corners of a tag of size 1 in its own frame: lower left, lower right, upper right, upper left."""
+
+
+class TagMapError(ValueError):
+    """The tag map is incomplete or impossible; the message names file, key and remedy."""
+
+
+@dataclass(frozen=True)
+class LimbTag:
+    """A tag on the limb.
+
+    Attributes:
+        id: within the family.
+        arc_length: of its centre from the clamp along the centreline [m].
+        height: above the base plane [m].
+        size: edge of the black border [m].
+        offset: mounting offset of the centre along and across the limb [m, m] and of its direction
+            [rad], against where `arc_length` says it is.
+    """
+
+    id: int
+    arc_length: float
+    height: float
+    size: float
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class WorldTag:
+    """A fixed tag: position of its centre in `limb_base` [m], yaw [rad] and border size [m]."""
+
+    id: int
+    position: tuple[float, float, float]
+    yaw: float
+    size: float
+
+    def corners(self) -> NDArray[np.float64]:
+        """Return the corners in `limb_base`, (4, 3) m, lower left first, counter-clockwise."""
+        cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
+        turned = UNIT_CORNERS @ np.array([[cosine, sine], [-sine, cosine]]) * self.size
+        corners = np.empty((4, 3))
+        corners[:, :2] = turned + np.array(self.position[:2])
+        corners[:, 2] = self.position[2]
+        return corners
+
+
+@dataclass(frozen=True)
+class TagMap:
+    """All tags of a set-up and the lengths of the limb's segments [m]."""
+
+    segment_lengths: tuple[float, ...]
+    limb: tuple[LimbTag, ...]
+    world: tuple[WorldTag, ...]
+
+    def __post_init__(self) -> None:
+        ids = [tag.id for tag in self.limb] + [tag.id for tag in self.world]
+        twice = sorted({tag for tag in ids if ids.count(tag) > 1})
+        if twice:
+            raise TagMapError(
+                f"tag ids {twice} occur twice in the tag map: every tag needs its own id"
+            )
+
+    @property
+    def length(self) -> float:
+        """Arc length of the tip at rest [m]."""
+        return sum(self.segment_lengths)
+
+    def limb_tag(self, tag: int) -> LimbTag | None:
+        """Return the limb tag with this id, or None."""
+        return next((entry for entry in self.limb if entry.id == tag), None)
+
+    def world_tag(self, tag: int) -> WorldTag | None:
+        """Return the world tag with this id, or None."""
+        return next((entry for entry in self.world if entry.id == tag), None)
+
+    @classmethod
+    def from_yaml(cls, path: str | Path) -> TagMap:
+        """Read a tag map.
+
+        Raises:
+            TagMapError: the file is missing, is no YAML, or a key is missing or impossible.
+        """
+        path = Path(path)
+        try:
+            data = yaml.safe_load(path.read_text())
+        except OSError as error:
+            raise TagMapError(f"cannot read the tag map {path}: {error.strerror}") from error
+        except yaml.YAMLError as error:
+            raise TagMapError(f"the tag map {path} is not YAML: {error}") from error
+        try:
+            return cls.from_dict(data)
+        except TagMapError as error:
+            raise TagMapError(f"{path}: {error}") from error
+
+    @classmethod
+    def from_dict(cls, data: Any) -> TagMap:
+        """Build a tag map from the content of its file; raises `TagMapError`."""
+        if not isinstance(data, dict) or data.get("schema") != SCHEMA_VERSION:
+            raise TagMapError(f"'schema: {SCHEMA_VERSION}' expected at the top of a tag map")
+        if data.get("family") != family.FAMILY:
+            raise TagMapError(f"family '{data.get('family')}': only {family.FAMILY} is supported")
+        limb = _section(data, "limb")
+        world = _section(data, "world")
+        lengths = tuple(_floats(limb.get("segment_lengths"), None, "limb.segment_lengths"))
+        if not lengths or min(lengths) <= 0.0:
+            raise TagMapError("limb.segment_lengths: a list of positive lengths in m expected")
+        total = sum(lengths)
+        limb_tags = tuple(_limb_tag(entry, total) for entry in limb.get("tags") or [])
+        if not limb_tags:
+            raise TagMapError("limb.tags is empty: at least one tag must be on the limb")
+        return cls(
+            lengths, limb_tags, tuple(_world_tag(entry) for entry in world.get("tags") or [])
+        )
+
+
+def _section(data: dict[str, Any], name: str) -> dict[str, Any]:
+    section = data.get(name)
+    if not isinstance(section, dict):
+        raise TagMapError(f"section '{name}' is missing")
+    return section
+
+
+def _floats(value: Any, count: int | None, name: str) -> list[float]:
+    if not isinstance(value, list) or (count is not None and len(value) != count):
+        raise TagMapError(f"{name}: a list of {count or 'some'} numbers expected, not {value!r}")
+    return [_number(entry, name) for entry in value]
+
+
+def _number(value: Any, name: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise TagMapError(f"{name}: a finite number expected, not {value!r}")
+    return float(value)
+
+
+def _common(entry: Any, where: str) -> tuple[int, float, str]:
+    if not isinstance(entry, dict):
+        raise TagMapError(f"{where}: an entry 'id: …, size: …' expected, not {entry!r}")
+    tag = entry.get("id")
+    if not isinstance(tag, int) or not 0 <= tag < family.TAG_COUNT:
+        raise TagMapError(f"{where}: id {tag!r} is not one of 0 to {family.TAG_COUNT - 1}")
+    name = f"{where} {tag}"
+    size = _number(entry.get("size"), f"{name}: size")
+    if size <= 0.0:
+        raise TagMapError(f"{name}: size {size} m must be positive")
+    return tag, size, name
+
+
+def _limb_tag(entry: Any, total: float) -> LimbTag:
+    tag, size, name = _common(entry, "limb tag")
+    arc_length = _number(entry.get("arc_length"), f"{name}: arc_length")
+    if not 0.0 <= arc_length <= total:
+        raise TagMapError(f"{name}: arc_length {arc_length} m is not on the limb (0 to {total} m)")
+    offset = _floats(entry.get("offset", [0.0, 0.0, 0.0]), 3, f"{name}: offset")
+    height = _number(entry.get("height"), f"{name}: height")
+    return LimbTag(tag, arc_length, height, size, (offset[0], offset[1], offset[2]))
+
+
+def _world_tag(entry: Any) -> WorldTag:
+    tag, size, name = _common(entry, "world tag")
+    position = _floats(entry.get("position"), 3, f"{name}: position")
+    yaw = _number(entry.get("yaw", 0.0), f"{name}: yaw")
+    return WorldTag(tag, (position[0], position[1], position[2]), yaw, size)
