@@ -1,1 +1,60 @@
-"""From bags to errors, tables and figures."""
+"""Evaluation: from bags, or arrays of a run without one, to errors, tables and figures.
+
+run = load_run("bags/same_direction_der_1")     # or RunSeries.from_arrays(…)
+result = evaluate_run(run)                      # evaluate_bag does both
+print(format_table(summarise([result])))
+write_results([result], folder)                 # folder/results.json
+plot_tip([run], folder)
+"""
+
+from der_planner.evaluation.extract import load_run
+from der_planner.evaluation.figures import plot_error, plot_pressures, plot_tip
+from der_planner.evaluation.metrics import (
+    RunResult,
+    Settings,
+    error_series,
+    evaluate_bag,
+    evaluate_run,
+    split_error,
+)
+from der_planner.evaluation.results import read_results, results_document, write_results
+from der_planner.evaluation.series import Description, EvaluationError, RunSeries, Stream
+from der_planner.evaluation.statistics import Comparison, Summary, compare, summarise
+from der_planner.evaluation.table import (
+    csv_table,
+    format_comparison,
+    format_table,
+    latex_table,
+    markdown_table,
+)
+from der_planner.recording.reader import BagError
+
+__all__ = [
+    "BagError",
+    "Comparison",
+    "Description",
+    "EvaluationError",
+    "RunResult",
+    "RunSeries",
+    "Settings",
+    "Stream",
+    "Summary",
+    "compare",
+    "csv_table",
+    "error_series",
+    "evaluate_bag",
+    "evaluate_run",
+    "format_comparison",
+    "format_table",
+    "latex_table",
+    "load_run",
+    "markdown_table",
+    "plot_error",
+    "plot_pressures",
+    "plot_tip",
+    "read_results",
+    "results_document",
+    "split_error",
+    "summarise",
+    "write_results",
+]

@@ -10,9 +10,6 @@ import time
 from functools import partial
 from pathlib import Path
 
-from limb_interfaces import parameters, topics
-from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
-from limb_interfaces.runner import run_node
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
@@ -25,6 +22,9 @@ from der_planner.recording.definitions import DefinitionError, find_definition
 from der_planner.recording.layout import RUN_KEY, OfferedQos, TopicSpec
 from der_planner.recording.session import RecordingSession
 from der_planner.recording.writer import COMPRESSIONS, BagWriteError, BagWriter
+from limb_interfaces import parameters, topics
+from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
+from limb_interfaces.runner import run_node
 
 IMAGE_TYPE = "sensor_msgs/msg/Image"
 MARK_TOPIC = "recorder/mark"
@@ -92,12 +92,15 @@ class Recorder(Node):
         declare("flush_interval", 1.0, "time between flushes [s]", at_least=0.05, at_most=60.0)
         declare("queue_size", 256 << 20, "bytes that may wait for the disk", at_least=1 << 20)
         declare(
-            "minimum_free", 64 << 20, "stop below so many free bytes on the disk; 0: never", at_least=0
+            "minimum_free",
+            64 << 20,
+            "stop below so many free bytes on the disk; 0: never",
+            at_least=0,
         )
         self._wanted = self._pattern("topics")
         self._unwanted = self._pattern("exclude")
 
-    def _parameter(self, name: str):  # noqa: ANN202 - whatever type was declared
+    def _parameter(self, name: str):
         return self.get_parameter(name).value
 
     def _pattern(self, name: str) -> re.Pattern[str] | None:
@@ -124,8 +127,10 @@ class Recorder(Node):
             present = self._subscriptions_by_topic.get(name)
             if present is None:
                 self._subscribe(name, types[0], qos)
-            elif qos and qos != present[1] and _profile(types[0], qos) != _profile(
-                types[0], present[1]
+            elif (
+                qos
+                and qos != present[1]
+                and _profile(types[0], qos) != _profile(types[0], present[1])
             ):
                 self._unsubscribe(name)
                 self._subscribe(name, types[0], qos)
@@ -176,7 +181,7 @@ class Recorder(Node):
         if present is not None:
             self.destroy_subscription(present[0])
 
-    def _receiver(self, name: str):  # noqa: ANN202 - a callback of two arguments
+    def _receiver(self, name: str):
         def receive(data: bytes, info: dict[str, int]) -> None:
             arrived = self._now()
             sent = info.get("source_timestamp", 0) or arrived

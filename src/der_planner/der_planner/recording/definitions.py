@@ -18,8 +18,7 @@ from pathlib import Path
 
 SEPARATOR = "=" * 80
 _PRIMITIVES = frozenset(
-    "bool byte char float32 float64 int8 uint8 int16 uint16 int32 uint32 int64 uint64 string "
-    "wstring".split()
+    ["bool", "byte", "char", "float32", "float64", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64", "string", "wstring"]
 )
 _FIELD = re.compile(r"^\s*([A-Za-z][A-Za-z0-9_/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+[A-Za-z]")
 _PARTS = 3
@@ -50,9 +49,7 @@ def installed_prefixes() -> tuple[Path, ...]:
     return tuple(Path(part) for part in value.split(os.pathsep) if part)
 
 
-def find_definition(
-    type_name: str, prefixes: Sequence[Path] | None = None
-) -> MessageDefinition:
+def find_definition(type_name: str, prefixes: Sequence[Path] | None = None) -> MessageDefinition:
     """Collect the definition of a message type from the installed share folders.
 
     Args:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import struct
 import zlib
 from collections.abc import Callable
@@ -108,8 +109,8 @@ class FileScan:
 
     def count_message(self, message: Message) -> None:
         """Take one message into the statistics."""
-        self.first = message.log_time if not self.message_count else min(
-            self.first, message.log_time
+        self.first = (
+            message.log_time if not self.message_count else min(self.first, message.log_time)
         )
         self.last = max(self.last, message.log_time)
         self.channel_counts[message.channel_id] = self.channel_counts.get(message.channel_id, 0) + 1
@@ -242,6 +243,24 @@ def finish_file(path: Path, progress: Callable[[float], None] | None = None) -> 
         file.flush()
         os.fsync(file.fileno())
     return scan
+
+
+def copy_finished(path: Path, copy: Path) -> Path:
+    """Copy the whole records of an unfinished file and its new index; the original stays as it is.
+
+    Raises:
+        RecoverError: it holds no whole message.
+        OSError: no space for the copy.
+    """
+    scan = scan_file(path)
+    if not scan.message_count:
+        raise RecoverError(f"{path} holds no whole message")
+    shutil.copyfile(path, copy)
+    with copy.open("r+b") as file:
+        file.truncate(scan.data_end)
+        file.seek(scan.data_end)
+        file.write(_ending(scan))
+    return copy
 
 
 def _ending(scan: FileScan) -> bytes:
@@ -398,7 +417,9 @@ def _summary(scans: list[FileScan]) -> BagSummary:
         for topic, count in scan.counts.items():
             counts[topic] = counts.get(topic, 0) + count
         custom.update(scan.run_data())
-    files = [FileSummary(scan.path.name, scan.message_count, scan.first, scan.last) for scan in scans]
+    files = [
+        FileSummary(scan.path.name, scan.message_count, scan.first, scan.last) for scan in scans
+    ]
     return BagSummary(files, list(topics.values()), counts, custom)
 
 

@@ -272,9 +272,9 @@ class BagWriter:
         self._sink = None
 
     def _write_metadata(self) -> None:
-        BagSummary(
-            self._files, list(self._topics.values()), self._counts, self.custom_data
-        ).write(self.folder)
+        BagSummary(self._files, list(self._topics.values()), self._counts, self.custom_data).write(
+            self.folder
+        )
 
     @contextlib.contextmanager
     def _guarded(self):  # type: ignore[no-untyped-def]
