@@ -26,6 +26,14 @@ class CommandError(RuntimeError):
     """The command cannot be done; the message is what the real tool says."""
 
 
+class Terminated(BaseException):
+    """The process was sent SIGTERM."""
+
+
+def _terminate(*_: object) -> None:
+    raise Terminated
+
+
 def add_verbs(parser: argparse.ArgumentParser, command: str) -> argparse._SubParsersAction:
     """Return the place where a command adds its verbs."""
     parser.set_defaults(help_of=parser)
@@ -81,6 +89,7 @@ def main(arguments: Sequence[str]) -> str | int | None:
     if isinstance(sys.stdout, io.TextIOWrapper):
         # A reader at the other end of a pipe sees each message when it comes.
         sys.stdout.reconfigure(line_buffering=True)
+    signal.signal(signal.SIGTERM, _terminate)
     try:
         result: str | int | None = options.main(options)
     except KeyboardInterrupt:
@@ -89,10 +98,8 @@ def main(arguments: Sequence[str]) -> str | int | None:
         # The reader of a pipe has gone (`| head -1`). What is still buffered must go nowhere.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         result = 128 + signal.SIGPIPE
+    except Terminated:
+        result = int(signal.SIGTERM)
     except RuntimeError as error:
         result = str(error)
-    except Exception as error:
-        if type(error).__name__ != "ExternalShutdownException":
-            raise
-        result = int(signal.SIGTERM)
     return result

@@ -66,8 +66,8 @@ def _info(options: argparse.Namespace) -> str | None:
         wanted = absolute(options.node_name)
         if not session.find_node(wanted, include_hidden=options.include_hidden):
             return f"Unable to find node '{options.node_name}'"
-        # The endpoints of a node come a moment after its name.
-        session.discover()
+        # The endpoints of a node come a moment after its name: until there are no more.
+        session.discover(lambda: True)
         same = sum(full_name(*item) == wanted for item in session.nodes())
         if same > 1:
             print(

@@ -81,8 +81,7 @@ def _call(options: argparse.Namespace) -> None:
         client = session.node.create_client(kind, options.service_name)
         if not client.wait_for_service(timeout_sec=0.2):
             print("waiting for service to become available...")
-            while not client.wait_for_service(timeout_sec=0.2):
-                session.check()
+            client.wait_for_service()
         while True:
             started = time.monotonic()
             print(f"requester: making request: {request!r}\n")

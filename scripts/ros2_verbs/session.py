@@ -11,9 +11,9 @@ from types import TracebackType
 from typing import Any
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.parameter import Parameter
+from rclpy.signals import SignalHandlerOptions
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
 from ros2_verbs.cli import CommandError
@@ -62,7 +62,9 @@ class Session:
 
     def __init__(self, options: argparse.Namespace, name: str = "") -> None:
         self._spin_time: float | None = getattr(options, "spin_time", None)
-        rclpy.init(args=[])
+        # SIGINT and SIGTERM are Python's exceptions here; a context that a signal handler shuts
+        # down under a waiting command ends in one of several errors.
+        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
         simulated = getattr(options, "use_sim_time", False)
         self.node = rclpy.create_node(
             name or f"{HIDDEN_PREFIX}ros2cli_{os.getpid()}",
@@ -84,15 +86,6 @@ class Session:
         with contextlib.suppress(Exception):
             rclpy.try_shutdown()
 
-    def check(self) -> None:
-        """Raise if a signal has ended the session.
-
-        Raises:
-            ExternalShutdownException: after SIGTERM.
-        """
-        if not rclpy.ok():
-            raise ExternalShutdownException
-
     def discover(self, enough: Callable[[], Any] = lambda: False) -> None:
         """Wait until the graph is known: for the spin time if given, else until it is quiet.
 
@@ -102,7 +95,6 @@ class Session:
         start = changed = time.monotonic()
         seen = None
         while True:
-            self.check()
             picture = (self.nodes(), self.topics(), self.services())
             now = time.monotonic()
             if picture != seen:
@@ -175,7 +167,6 @@ class Session:
         """
         future = client.call_async(request)
         while not future.done():
-            self.check()
             rclpy.spin_once(self.node, timeout_sec=0.1)
         if future.result() is None:
             raise CommandError(f"Exception while calling service: {future.exception()!r}")

@@ -163,5 +163,4 @@ def _echo(options: argparse.Namespace) -> None:
             kind, topic, printer, profile, event_callbacks=events, raw=options.raw
         )
         while not printer.done:
-            session.check()
             rclpy.spin_once(session.node, timeout_sec=0.2)

@@ -98,7 +98,6 @@ def _hz(options: argparse.Namespace) -> None:
         if kind is None:
             print(f"WARNING: topic [{options.topic_name}] does not appear to be published yet")
         while kind is None:
-            session.check()
             time.sleep(0.1)
             kind = topic_type(session, topic)
         clock = session.node.get_clock()
@@ -114,7 +113,6 @@ def _hz(options: argparse.Namespace) -> None:
             kind, topic, count, qos_profile_sensor_data, raw=options.filter is None
         )
         while True:
-            session.check()
             rclpy.spin_once(session.node, timeout_sec=0.2)
             if text := meter.report():
                 print(text)

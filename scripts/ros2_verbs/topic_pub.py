@@ -92,12 +92,11 @@ def add_arguments(verbs: argparse._SubParsersAction) -> None:
     add_qos_arguments(parser, "publish", "default")
 
 
-def _wait(session: Session, publisher: Any, wanted: int, at_most: float | None) -> None:
+def _wait(publisher: Any, wanted: int, at_most: float | None) -> None:
     """Wait for subscriptions; says so once a second."""
     started = time.monotonic()
     said = 0
     while publisher.get_subscription_count() < wanted:
-        session.check()
         waited = time.monotonic() - started
         if waited >= said:
             print(f"Waiting for at least {wanted} matching subscription(s)...")
@@ -131,7 +130,7 @@ def _pub(options: argparse.Namespace) -> None:
     with Session(options, name=options.node_name) as session:
         node = session.node
         publisher = node.create_publisher(kind, options.topic_name, profile)
-        _wait(session, publisher, wanted, options.max_wait_time_secs)
+        _wait(publisher, wanted, options.max_wait_time_secs)
         filler = Filler(kind(), values)
         print("publisher: beginning loop")
         count = 0
@@ -149,7 +148,6 @@ def _pub(options: argparse.Namespace) -> None:
         publish()
         timer = node.create_timer(1.0 / options.rate, publish)
         while times == 0 or count < times:
-            session.check()
             rclpy.spin_once(node, timeout_sec=0.2)
         node.destroy_timer(timer)
         time.sleep(options.keep_alive)
