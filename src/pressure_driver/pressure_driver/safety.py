@@ -228,9 +228,9 @@ class SafetyMachine:
         monitor = self.monitor
         found = monitor.overpressure_faults() + monitor.following_faults(now)
         if self.mode in LIVE:
-            if self.link_fault:
-                found.append(self.link_fault)
-            found += monitor.telemetry_faults(now) + monitor.supply_faults(now)
+            # Without a port there is no telemetry either: one cause, one reason.
+            silent = [self.link_fault] if self.link_fault else monitor.telemetry_faults(now)
+            found += silent + monitor.supply_faults(now)
         if found and self.mode is not Mode.FAULT:
             self._fault(found)
 

@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import NamedTuple
 
 NANOSECONDS = 1_000_000_000
 
@@ -24,8 +25,7 @@ class Verdict(Enum):
     REFUSED = "refused"
 
 
-@dataclass(frozen=True)
-class Setpoint:
+class Setpoint(NamedTuple):
     """Differential pressures and the instant at which they take effect."""
 
     stamp: int
@@ -36,8 +36,7 @@ class Setpoint:
     index: int = 0
 
 
-@dataclass(frozen=True)
-class Sample:
+class Sample(NamedTuple):
     """What the schedule asks for at one tick."""
 
     setpoint: Setpoint
@@ -130,7 +129,8 @@ class Schedule:
         if verdict is Verdict.ACCEPTED:
             self.counters.accepted += 1
             return verdict
-        self.reason = reason
+        plan = f" of '{setpoint.plan_id}'" if setpoint.plan_id else ""
+        self.reason = f"setpoint {setpoint.index}{plan}: {reason}"
         if verdict is Verdict.LATE:
             self.counters.late += 1
         elif verdict is Verdict.DUPLICATE:
@@ -146,23 +146,18 @@ class Schedule:
         return Verdict.REFUSED
 
     def _judge(self, setpoint: Setpoint, now: int, held: Sequence[float]) -> tuple[Verdict, str]:
-        label = f"setpoint {setpoint.index}" + (
-            f" of '{setpoint.plan_id}'" if setpoint.plan_id else ""
-        )
         if problem := self._value_problem(setpoint):
-            return Verdict.REFUSED, f"{label}: {problem}"
+            return Verdict.REFUSED, problem
         if setpoint.stamp == 0:
             # "Now" is the next tick, whatever the grid has already done.
             stamp = max(self._tick_of(now), self._last_tick + self.period)
             setpoint = Setpoint(stamp, setpoint.differential, setpoint.plan_id, setpoint.index)
         ahead = (setpoint.stamp - now) / NANOSECONDS
         if ahead > self.limits.horizon:
-            return Verdict.REFUSED, (
-                f"{label}: {ahead:.2f} s ahead, the limit is {self.limits.horizon:g} s"
-            )
+            return Verdict.REFUSED, (f"{ahead:.2f} s ahead, the limit is {self.limits.horizon:g} s")
         if self._tick_of(setpoint.stamp) <= self._last_tick:
-            return Verdict.LATE, f"{label}: came {-ahead * 1000:.1f} ms after its stamp"
-        return self._insert(setpoint, label, held)
+            return Verdict.LATE, f"came {-ahead * 1000:.1f} ms after its stamp"
+        return self._insert(setpoint, held)
 
     def _value_problem(self, setpoint: Setpoint) -> str:
         values = setpoint.differential
@@ -175,30 +170,36 @@ class Schedule:
             return f"asks for {worst:.0f} Pa, the limit is ±{self.limits.pressure_limit:.0f} Pa"
         return ""
 
-    def _insert(self, setpoint: Setpoint, label: str, held: Sequence[float]) -> tuple[Verdict, str]:
-        place = bisect.bisect_left(self._waiting, setpoint.stamp, key=lambda s: s.stamp)
+    def _insert(self, setpoint: Setpoint, held: Sequence[float]) -> tuple[Verdict, str]:
+        place = self._place(setpoint.stamp)
         same_stamp = place < len(self._waiting) and self._waiting[place].stamp == setpoint.stamp
         replaces = not self._belongs(setpoint)
         if not replaces:
             if same_stamp:
-                return Verdict.DUPLICATE, f"{label}: another one has the same stamp"
+                return Verdict.DUPLICATE, "another one has the same stamp"
             current = self._current
             if current is not None and current.stamp == setpoint.stamp:
-                return Verdict.DUPLICATE, f"{label}: already executed"
+                return Verdict.DUPLICATE, "already executed"
         if setpoint.plan_id in self._replaced:
-            return Verdict.REFUSED, f"{label}: this plan has been replaced by a newer one"
+            return Verdict.REFUSED, "this plan has been replaced by a newer one"
         if len(self._waiting) >= self.limits.capacity and not replaces:
-            return Verdict.REFUSED, f"{label}: {len(self._waiting)} setpoints are waiting already"
+            return Verdict.REFUSED, f"{len(self._waiting)} setpoints are waiting already"
         before = self._waiting[place - 1] if place else None
         after = None if replaces or place >= len(self._waiting) else self._waiting[place]
         if problem := self._slew_problem(before, setpoint, held) or (
             self._slew_problem(setpoint, after, held) if after else ""
         ):
-            return Verdict.REFUSED, f"{label}: {problem}"
+            return Verdict.REFUSED, problem
         if replaces:
             self._replace_from(place)
         self._waiting.insert(place, setpoint)
         return Verdict.ACCEPTED, ""
+
+    def _place(self, stamp: int) -> int:
+        """Return where a stamp belongs among those that wait; mostly at the end."""
+        if not self._waiting or self._waiting[-1].stamp < stamp:
+            return len(self._waiting)
+        return bisect.bisect_left(self._waiting, stamp, key=lambda item: item.stamp)
 
     def _replace_from(self, place: int) -> None:
         """Drop what an older plan had from this place on, and let it say no more."""
@@ -242,7 +243,9 @@ class Schedule:
             What to command, or None before the first setpoint.
         """
         self._last_tick = max(self._last_tick, tick)
-        due = bisect.bisect_right(self._waiting, tick, key=lambda s: s.stamp)
+        due = 0
+        while due < len(self._waiting) and self._waiting[due].stamp <= tick:
+            due += 1
         if due:
             self._current = self._waiting[due - 1]
             del self._waiting[:due]

@@ -1,0 +1,123 @@
+"""A driver and an emulated board in simulated time, without ports, threads or ROS."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pressure_driver.core import CoreSettings, DriverCore
+from pressure_driver.emulator.board import EmulatedBoard
+from pressure_driver.emulator.faults import Faults
+from pressure_driver.emulator.pneumatics import Pneumatics
+from pressure_driver.protocols import board_protocol, host_protocol
+from pressure_driver.safety import Mode
+from pressure_driver.schedule import Setpoint, Verdict
+
+PERIOD = 50_000_000
+START = 1_700_000_000_000_000_000
+
+
+class Simulation:
+    """Ticks, line and air, one period at a time.
+
+    Attributes worth a look: ``core``, ``board``, ``air`` (true gauge pressures), ``sent`` (bytes of
+    every tick), ``received`` (commands as the board saw them), ``plugged``.
+    """
+
+    def __init__(self, protocol="ezloop", seed=0, **settings):
+        self.time = 0
+        self.settings = replace(CoreSettings(), **settings)
+        self.core = DriverCore(host_protocol(protocol), self.settings, steady=lambda: self.steady)
+        self.board = EmulatedBoard(board_protocol(protocol), Pneumatics(2, seed), seed)
+        self.plugged = True
+        self.sent = []
+        self.received = []
+        self.modes = []
+        self._receive(self.core.opening())
+
+    @property
+    def steady(self):
+        return self.time / 1e9
+
+    @property
+    def wall(self):
+        return START + self.time
+
+    @property
+    def mode(self):
+        return self.core.snapshot().mode
+
+    @property
+    def faults(self):
+        return self.core.snapshot().faults
+
+    @property
+    def gauge(self):
+        return self.board.pneumatics.pressure - self.board.pneumatics.atmosphere
+
+    def _receive(self, data):
+        if data and self.plugged:
+            commands, answer = self.board.receive(data, self.wall)
+            self.received += commands
+            if answer:
+                self.core.received(answer)
+
+    def tick(self):
+        """Advance by one period."""
+        self.time += PERIOD
+        data = self.core.tick(self.wall)
+        self.sent.append(data)
+        self._receive(data)
+        self.core.sent(self.wall)
+        self.board.step(PERIOD / 1e9)
+        report = self.board.telemetry()
+        if report and self.plugged:
+            self.core.received(report)
+        self.modes.append(self.mode)
+
+    def run(self, seconds):
+        for _ in range(round(seconds * 1e9 / PERIOD)):
+            self.tick()
+
+    def run_until(self, condition, limit=30.0):
+        """Tick until the condition holds; return the seconds it took."""
+        begin = self.steady
+        while not condition():
+            assert self.steady - begin < limit, (self.mode, self.faults, self.gauge)
+            self.tick()
+        return self.steady - begin
+
+    def have(self, *faults):
+        self.board.set_faults(Faults.parse(faults, 4))
+
+    def arm(self):
+        """Wait until the driver may be armed, and arm it."""
+        self.run_until(lambda: not self.core.obstacles())
+        assert self.core.arm() == (True, "armed")
+
+    def offer(self, differential, ahead=0.2, plan_id="plan", index=0):
+        """Offer a setpoint whose stamp lies on the grid, ``ahead`` seconds from now."""
+        stamp = self.wall + round(ahead * 1e9 / PERIOD) * PERIOD
+        return self.core.offer(Setpoint(stamp, tuple(differential), plan_id, index), self.wall)
+
+    def stream(
+        self, seconds, shape=lambda t: (8_000.0 * np.sin(t) ** 2, -4_000.0 * np.sin(t) ** 2)
+    ):
+        """Play a smooth motion, offering each setpoint 0.2 s ahead."""
+        for index in range(round(seconds * 1e9 / PERIOD)):
+            verdict = self.offer(shape(index * PERIOD / 1e9), index=index)
+            if self.mode is not Mode.FAULT:
+                assert verdict is Verdict.ACCEPTED, self.core.last_refusal
+            self.tick()
+
+    def track(self, seconds=3.0):
+        """Arm and play for a while, which leaves the limb pressurised."""
+        self.arm()
+        self.stream(seconds, lambda t: (min(4_000.0 * t, 9_000.0), -min(2_000.0 * t, 5_000.0)))
+        assert self.mode is Mode.TRACKING
+
+
+@pytest.fixture
+def simulate():
+    """Return `Simulation`, to be called with a protocol, a seed and settings."""
+    return Simulation

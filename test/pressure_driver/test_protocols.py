@@ -1,0 +1,329 @@
+"""Both ends of every board protocol: bytes, splits, garbage, limits, and a million random bytes."""
+
+import re
+
+import numpy as np
+import pytest
+
+from pressure_driver.protocols import NAMES, board_protocol, host_protocol
+from pressure_driver.protocols.base import (
+    BoardIdentity,
+    BoardReading,
+    BoardReport,
+    BoardText,
+    Echo,
+    Telemetry,
+)
+from pressure_driver.protocols.native import FaultCode, FrameType, NativeBoard, encode
+
+ATMOSPHERE = 101_812.0
+READING = BoardReading(
+    time=12.345,
+    chamber_pressure=(101_900.0, 109_322.0, 101_850.0, 101_840.0),
+    atmosphere=ATMOSPHERE,
+    valve_opening=(0.0, 0.25, 1.0, 0.5),
+    supply_pressure=140_020.0,
+    last_sequence=77,
+)
+
+
+def in_chunks(stream, generator, largest=40):
+    place = 0
+    while place < len(stream):
+        size = int(generator.integers(1, largest))
+        yield stream[place : place + size]
+        place += size
+
+
+def decode_all(decoder, stream, generator=None):
+    if generator is None:
+        return decoder.decode(stream)
+    return [event for chunk in in_chunks(stream, generator) for event in decoder.decode(chunk)]
+
+
+def reporting_board(name):
+    board = board_protocol(name)
+    board.boot(ATMOSPHERE)
+    board.decode(host_protocol(name).start())
+    return board
+
+
+# ------------------------------------------------------------------------------ exact bytes
+
+
+def test_ezloop_bytes():
+    host = host_protocol("ezloop")
+    assert host.setpoint([7500.0, -20.0], 101_325.0, 0.25) == (
+        b"<1088.25,1013.25,1013.25,1013.45>\n",
+        None,
+    )
+    assert host.vent(101_325.0)[0] == b"<1013.25,1013.25,1013.25,1013.25>\n"
+    assert board_protocol("ezloop").telemetry(READING) == (
+        b"[MPR]: 1019.00 1093.22 1018.50 1018.40\r\n"
+        b"[RPR]: 1400.20\r\n[VAL]: 0.00 0.25 1.00 0.50\r\n"
+    )
+
+
+def test_ctrlp_bytes():
+    host = host_protocol("ctrlp")
+    assert host.setpoint([7500.0, -20.0], 0.0, 0.25)[0] == (b"SET;0.050;7.500;0.000;0.000;0.020\n")
+    assert host.vent(0.0)[0] == b"SET;0.000;0.000;0.000;0.000;0.000\n"
+    assert reporting_board("ctrlp").telemetry(READING) == b"12345\t1\t0.088\t7.510\t0.038\t0.028\n"
+
+
+def test_a_pair_near_the_boards_limit_is_sent_lower_with_the_same_difference():
+    board = board_protocol("ezloop")
+    for difference in (24_000.0, -24_000.0, 30_000.0):
+        data, _ = host_protocol("ezloop").setpoint([difference, 0.0], 102_900.0, 0.25)
+        (command,) = board.decode(data)
+        assert max(command.pressure) <= 125_000.0
+        assert command.pressure[0] - command.pressure[1] == pytest.approx(difference, abs=1.0)
+
+
+def test_the_ezloop_board_ignores_a_command_above_its_limit_whole():
+    board = board_protocol("ezloop")
+    assert board.decode(b"<1013.00,1250.01,1013.00,1013.00>\n") == []
+    assert board.rejected == 1
+    assert len(board.decode(b"<1013.00,1250.00,1013.00,1013.00>\n")) == 1
+
+
+# --------------------------------------------------------------------------- both directions
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("split", [False, True])
+def test_commands_arrive_as_they_were_meant(name, split):
+    generator = np.random.default_rng(3) if split else None
+    host, board = host_protocol(name), board_protocol(name)
+    wanted = np.random.default_rng(4).uniform(-24_000.0, 24_000.0, (60, 2))
+    stream = host.start() + b"".join(host.setpoint(u, ATMOSPHERE, 0.25)[0] for u in wanted)
+    commands = [c for c in decode_all(board, stream, generator) if c.kind == "setpoint"]
+    assert len(commands) == len(wanted)
+    for command, difference in zip(commands, wanted, strict=True):
+        pressure = np.array(command.pressure)
+        assert pressure[0::2] - pressure[1::2] == pytest.approx(difference, abs=1.1)
+        assert command.valid_for in (None, 0.25)
+    places = [c.first_byte for c in commands]
+    assert places == sorted(set(places))
+    first = host_protocol(name).setpoint([1.0, 1.0], ATMOSPHERE, 0.25)[0][:1]
+    if name != "native":
+        assert all(stream[place : place + 1] == first for place in places)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("split", [False, True])
+def test_telemetry_arrives_as_it_was_measured(name, split):
+    generator = np.random.default_rng(5) if split else None
+    host, board = host_protocol(name), reporting_board(name)
+    host.assumed_atmosphere = ATMOSPHERE
+    garbage = b"\x00noise\xff" + (b"\0" if name == "native" else b"\n")
+    events = decode_all(host, garbage + board.telemetry(READING), generator)
+    merged = {}
+    for event in events:
+        if isinstance(event, Telemetry):
+            merged.update({k: v for k, v in vars(event).items() if v is not None})
+    assert merged["chamber_pressure"] == pytest.approx(READING.chamber_pressure, abs=1.1)
+    assert host.rejected >= 1
+    if host.reports_supply:
+        assert merged["supply_pressure"] == pytest.approx(READING.supply_pressure, abs=1.0)
+        assert merged["valve_opening"] == pytest.approx(READING.valve_opening, abs=0.005)
+
+
+def test_echoes():
+    host, board = host_protocol("native"), board_protocol("native")
+    data, number = host.setpoint([1000.0, 0.0], ATMOSPHERE, 0.25)
+    (command,) = board.decode(data)
+    reading = BoardReading(**{**vars(READING), "last_sequence": command.sequence})
+    assert Echo(number) in host.decode(board.reply(command, reading))
+    host, board = host_protocol("ctrlp"), board_protocol("ctrlp")
+    (command,) = board.decode(host.setpoint([1000.0, 0.0], ATMOSPHERE, 0.25)[0])
+    assert host.decode(board.reply(command, READING)) == [Echo(None)]
+    (command,) = board.decode(b"JUMP;3\n")
+    assert host.decode(board.reply(command, READING)) == [
+        BoardReport("a command was not understood", fatal=False)
+    ]
+
+
+def test_native_identity_faults_and_refusals():
+    host, board = host_protocol("native"), NativeBoard(4, 30_000, "lab 2.1")
+    (hello,) = board.decode(host.start())
+    assert host.decode(board.reply(hello, READING)) == [BoardIdentity(4, 0.0, 30_000.0, "lab 2.1")]
+    (command,) = board.decode(host.setpoint([31_000.0, 0.0], 0.0, 0.25)[0])
+    assert command.kind == "refused"
+    (report,) = host.decode(board.reply(command, READING))
+    assert not report.fatal
+    assert "pressure out of range" in report.text
+    (report,) = host.decode(board.fault(FaultCode.OVER_PRESSURE, "chamber 2"))
+    assert report.fatal
+    assert report.text == "over-pressure: chamber 2"
+
+
+def test_native_sequence_numbers_wrap():
+    host, board = host_protocol("native"), board_protocol("native")
+    numbers = []
+    for _ in range(65_540):
+        data, number = host.vent(0.0)
+        numbers.append(number)
+    (command,) = board.decode(data)
+    assert command.sequence == numbers[-1] == (numbers[0] + 65_539) % 65_536
+
+
+@pytest.mark.parametrize(
+    "body",
+    [b"", b"\x00\x00" + bytes(16), b"\xfa\x00" + bytes(12), b"\xfa\x00" + b"\xff" * 16],
+    ids=["empty", "valid for nothing", "three chambers", "negative"],
+)
+def test_native_board_refuses_malformed_setpoints(body):
+    (command,) = board_protocol("native").decode(encode(FrameType.SETPOINT, 5, body))
+    assert command.kind == "refused"
+    assert command.sequence == 5
+
+
+def test_frames_of_another_version_or_type_are_rejected():
+    from pressure_driver.protocols.framing import seal
+
+    host = host_protocol("native")
+    assert host.decode(seal(bytes([2, FrameType.STATUS, 0, 0]))) == []
+    assert host.decode(seal(bytes([1, 0x44, 0, 0]))) == []
+    assert host.rejected == 2
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("bad", [[1.0], [1.0, 2.0, 3.0], [float("nan"), 0.0], [1e9, 0.0]])
+def test_what_the_wire_cannot_carry_is_an_error(name, bad):
+    with pytest.raises(ValueError, match=r"difference|nan"):
+        host_protocol(name).setpoint(bad, ATMOSPHERE, 0.25)
+
+
+def test_unknown_protocols_are_named():
+    with pytest.raises(ValueError, match="ezloop, ctrlp, native"):
+        host_protocol("modbus")
+    with pytest.raises(ValueError, match="even"):
+        host_protocol("ezloop", 3)
+
+
+# ---------------------------------------------------------------------------------- fuzzing
+
+MILLION = 1_000_000
+
+
+def random_bytes(seed):
+    """Half of it plain random, half drawn from the protocols' own alphabet."""
+    generator = np.random.default_rng(seed)
+    plain = generator.integers(0, 256, MILLION // 2, dtype=np.uint8)
+    alphabet = np.frombuffer(b"[MPRVAL]: 0123456789.-\t\r\n<>,;_SETON\0\x01\x02", dtype=np.uint8)
+    return plain.tobytes() + generator.choice(alphabet, MILLION // 2).tobytes()
+
+
+def mutated(sound, seed):
+    """Bit flips, lost and doubled bytes in a stream of a million sound bytes."""
+    generator = np.random.default_rng(seed)
+    stream = np.frombuffer(sound * (MILLION // len(sound) + 1), dtype=np.uint8)[:MILLION].copy()
+    hit = generator.random(len(stream)) < 0.01
+    stream[hit] ^= (1 << generator.integers(0, 8, hit.sum())).astype(np.uint8)
+    copies = np.ones(len(stream), dtype=int)
+    copies[generator.random(len(stream)) < 0.002] = 0
+    copies[generator.random(len(stream)) < 0.002] = 2
+    return np.repeat(stream, copies).tobytes()
+
+
+def board_stream(name):
+    """What a board says in a while, with changing numbers."""
+    board = reporting_board(name)
+    generator = np.random.default_rng(6)
+    stream = b""
+    for step in range(200):
+        pressure = ATMOSPHERE + generator.uniform(-100.0, 24_000.0, 4)
+        reading = BoardReading(
+            step * 0.05, tuple(pressure), ATMOSPHERE, (0.0, 0.1, 0.2, 1.0), 1.4e5
+        )
+        stream += board.telemetry(reading)
+    return stream
+
+
+def host_stream(name):
+    host = host_protocol(name)
+    generator = np.random.default_rng(7)
+    return b"".join(
+        host.setpoint(generator.uniform(-24e3, 24e3, 2), ATMOSPHERE, 0.25)[0] for _ in range(300)
+    )
+
+
+NUMBER = rb"-?[0-9]{1,6}(?:\.[0-9]{1,6})?"
+
+
+def reference_telemetry(name, stream):
+    """Chamber pressures in hPa or kPa by a regular expression over the whole stream."""
+    found = []
+    for raw in stream.split(b"\n"):
+        line = raw.strip()
+        if name == "ezloop":
+            match = re.fullmatch(rb"\[MPR\]:\s*(" + NUMBER + rb"(?:\s+" + NUMBER + rb"){3})", line)
+            values = [float(v) for v in match[1].split()] if match else []
+            ok = all(300.0 <= v <= 4000.0 for v in values)
+        else:
+            match = re.fullmatch(rb"[0-9]{1,10}\t1((?:\t-?[0-9]{1,4}(?:\.[0-9]{1,6})?){4})", line)
+            values = [float(v) for v in match[1].split()] if match else []
+            ok = all(abs(v) <= 500.0 for v in values)
+        if values and ok and len(raw) <= 512:
+            found.append(values)
+    return found
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("kind", ["random", "mutated"])
+def test_a_million_bytes_into_the_hosts_decoder(name, kind):
+    sound = board_stream(name)
+    stream = random_bytes(8) if kind == "random" else mutated(sound, 9)
+    host = host_protocol(name)
+    events = decode_all(host, stream, np.random.default_rng(10))
+    pressures = [
+        e.chamber_pressure for e in events if isinstance(e, Telemetry) and e.chamber_pressure
+    ]
+    if name == "native":
+        truth = {
+            e.chamber_pressure
+            for e in host_protocol(name).decode(sound)
+            if isinstance(e, Telemetry)
+        }
+        assert set(pressures) <= truth
+        assert not [e for e in events if isinstance(e, BoardText | BoardIdentity | BoardReport)]
+    else:
+        scale, base = (100.0, 0.0) if name == "ezloop" else (1000.0, host.assumed_atmosphere)
+        expected = [[base + v * scale for v in row] for row in reference_telemetry(name, stream)]
+        assert np.allclose(pressures, expected) if expected else not pressures
+    assert host.rejected > 1000
+    assert (len(pressures) > 1000) == (kind == "mutated")
+    # After all that, a sound report is read at once.
+    end = decode_all(host, b"\n\0" + board_stream(name)[: len(sound) // 10])
+    assert any(isinstance(e, Telemetry) and e.chamber_pressure for e in end)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("kind", ["random", "mutated"])
+def test_a_million_bytes_into_the_boards_decoder(name, kind):
+    sound = host_stream(name)
+    stream = random_bytes(11) if kind == "random" else mutated(sound, 12)
+    board = board_protocol(name)
+    commands = decode_all(board, stream, np.random.default_rng(13))
+    setpoints = [c.pressure for c in commands if c.kind == "setpoint"]
+    if name == "native":
+        truth = {c.pressure for c in board_protocol(name).decode(sound)}
+        assert set(setpoints) <= truth
+    else:
+        pattern = {
+            "ezloop": rb"<(" + NUMBER + rb"(?:," + NUMBER + rb"){3})>",
+            "ctrlp": rb"^\s*SET;" + NUMBER + rb"((?:;" + NUMBER + rb"){4})\s*$",
+        }[name]
+        text = stream if name == "ezloop" else stream.upper()
+        rows = [
+            [float(v) for v in match.strip(b";").replace(b";", b",").split(b",")]
+            for match in re.findall(pattern, text, re.MULTILINE)
+        ]
+        scale = 100.0 if name == "ezloop" else 1000.0
+        expected = [
+            [v * scale for v in row] for row in rows if name != "ezloop" or max(row) <= 1250
+        ]
+        assert np.allclose(setpoints, expected) if expected else not setpoints
+    assert (len(setpoints) > 1000) == (kind == "mutated")
+    assert board.rejected > 100

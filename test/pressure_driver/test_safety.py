@@ -1,0 +1,482 @@
+"""Every transition of the state machine, every refusal and every fault, in simulated time."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pressure_driver.core import CoreSettings
+from pressure_driver.monitor import MonitorLimits
+from pressure_driver.protocols import NAMES
+from pressure_driver.protocols.base import BoardReport
+from pressure_driver.safety import Mode, SafetyLimits
+from pressure_driver.schedule import ScheduleLimits, Setpoint, Verdict
+
+VENTED = 500.0
+"""[Pa] gauge that counts as vented."""
+
+
+def vented(sim):
+    return bool(np.all(sim.gauge < VENTED))
+
+
+def is_vent(sim, data):
+    """Tell whether the bytes of a tick ask the board to open every chamber."""
+    from pressure_driver.protocols import board_protocol
+
+    commands = [
+        c
+        for c in board_protocol(sim.core.protocol.name).decode(data)
+        if c.kind in ("setpoint", "vent")
+    ]
+    return bool(commands) and all(
+        c.kind == "vent"
+        or (
+            np.ptp(np.reshape(c.pressure, (-1, 2)), axis=1).max() == 0.0
+            and (sim.core.protocol.name != "ctrlp" or max(c.pressure) == 0.0)
+        )
+        for c in commands
+    )
+
+
+# ------------------------------------------------------------------------------ transitions
+
+
+@pytest.mark.parametrize("protocol", NAMES)
+def test_a_whole_life(simulate, protocol):
+    sim = simulate(protocol)
+    assert sim.mode is Mode.DISARMED
+    sim.arm()
+    assert sim.mode is Mode.ARMED
+    sim.stream(4.0)
+    # The stream has ended 0.2 s before its last stamp.
+    sim.run_until(lambda: sim.mode is not Mode.TRACKING)
+    sim.run_until(lambda: sim.mode is not Mode.HOLDING)
+    sim.run_until(lambda: sim.mode is not Mode.VENTING)
+    sim.run_until(lambda: vented(sim), 10.0)
+    order = [m for k, m in enumerate(sim.modes) if k == 0 or m is not sim.modes[k - 1]]
+    assert order == [
+        Mode.DISARMED, Mode.ARMED, Mode.TRACKING, Mode.HOLDING, Mode.VENTING, Mode.ARMED,
+    ]  # fmt: skip
+    counters = sim.core.snapshot().counters
+    assert counters.accepted == counters.executed == 80
+    assert counters.late == counters.refused == counters.duplicate == 0
+    assert sim.core.vent()[0]
+    sim.run_until(lambda: sim.mode is Mode.DISARMED, 10.0)
+    assert is_vent(sim, sim.sent[-1])
+
+
+@pytest.mark.parametrize("protocol", NAMES)
+def test_each_setpoint_is_on_the_wire_at_its_stamp(simulate, protocol):
+    sim = simulate(protocol)
+    sim.arm()
+    wanted = {}
+    for index in range(100):
+        u = (6_000.0 * np.sin(0.03 * index) ** 2 + 100.0, -40.0 * index - 50.0)
+        wanted[sim.wall + 4 * 50_000_000] = u
+        sim.offer(u, index=index)
+        sim.tick()
+    sim.run(0.2)
+    got = {c.stamp: np.array(c.pressure) for c in sim.received}
+    for stamp, u in wanted.items():
+        pressure = got[stamp]
+        assert pressure[0::2] - pressure[1::2] == pytest.approx(u, abs=1.1)
+
+
+def test_holding_goes_on_with_the_next_setpoint(simulate):
+    sim = simulate()
+    sim.track()
+    sim.run_until(lambda: sim.mode is Mode.HOLDING)
+    held = sim.core.snapshot().commanded_differential
+    assert sim.offer(held, plan_id="next") is Verdict.ACCEPTED
+    sim.run_until(lambda: sim.mode is Mode.TRACKING, 0.3)
+    assert sim.core.snapshot().setpoint.plan_id == "next"
+
+
+def test_holding_keeps_the_last_pressures_for_the_hold_time(simulate):
+    sim = simulate(safety=SafetyLimits(setpoint_timeout=0.2, hold_time=1.0))
+    sim.track()
+    last = None
+    silence = 0
+    while sim.mode in (Mode.TRACKING, Mode.HOLDING):
+        snapshot = sim.core.snapshot()
+        if snapshot.setpoint.stamp == last:
+            silence += 1
+            assert snapshot.commanded_differential == snapshot.setpoint.differential
+        last = snapshot.setpoint.stamp
+        sim.tick()
+    assert silence * 0.05 == pytest.approx(1.2, abs=0.06)
+
+
+def test_the_ramp_down_is_as_fast_as_it_says_and_keeps_the_shape(simulate):
+    sim = simulate(safety=SafetyLimits(vent_rate=8_000.0))
+    sim.track()
+    sim.run_until(lambda: sim.mode is Mode.VENTING)
+    commanded = [sim.core.snapshot().commanded_differential]
+    while sim.mode is Mode.VENTING:
+        sim.tick()
+        commanded.append(sim.core.snapshot().commanded_differential)
+    commanded = np.array(commanded)
+    largest = np.abs(commanded).max(axis=1)
+    assert np.diff(largest)[:-1] == pytest.approx(-400.0)
+    assert commanded[-1].tolist() == [0.0, 0.0]
+    ratio = commanded[:-1, 1] / commanded[:-1, 0]
+    assert ratio == pytest.approx(ratio[0])
+
+
+def test_venting_on_the_ramp_goes_on_with_the_next_setpoint(simulate):
+    sim = simulate()
+    sim.track()
+    sim.run_until(lambda: sim.mode is Mode.VENTING)
+    assert sim.offer((3_000.0, -1_000.0), plan_id="next") is Verdict.ACCEPTED
+    sim.run_until(lambda: sim.mode is Mode.TRACKING, 0.3)
+
+
+@pytest.mark.parametrize("protocol", NAMES)
+@pytest.mark.parametrize("mode", [Mode.ARMED, Mode.TRACKING, Mode.HOLDING, Mode.VENTING])
+def test_vent_works_in_every_live_state_and_is_latched(simulate, protocol, mode):
+    sim = simulate(protocol)
+    if mode is Mode.ARMED:
+        sim.arm()
+    else:
+        sim.track()
+        sim.run_until(lambda: sim.mode is mode)
+    assert sim.core.vent()[0]
+    assert sim.mode is Mode.VENTING
+    assert sim.offer((1_000.0, 0.0)) is Verdict.REFUSED
+    if mode is not Mode.ARMED:
+        assert "not vented yet" in sim.core.arm()[1]
+    sim.tick()
+    assert is_vent(sim, sim.sent[-1])
+    sim.run_until(lambda: sim.mode is Mode.DISARMED, 6.0)
+    assert vented(sim)
+    assert sim.offer((1_000.0, 0.0)) is Verdict.REFUSED
+    assert "arm first" in sim.core.last_refusal
+    sim.arm()
+
+
+def test_vent_while_disarmed_or_in_fault_vents_and_changes_nothing(simulate):
+    sim = simulate()
+    assert sim.core.vent()[0]
+    assert sim.mode is Mode.DISARMED
+    sim.track()
+    sim.core.lost("pulled")
+    sim.tick()
+    assert sim.mode is Mode.FAULT
+    assert sim.core.vent()[0]
+    assert sim.mode is Mode.FAULT
+    assert sim.faults == ("pulled",)
+
+
+def test_a_vent_that_does_not_empty_the_chambers_is_a_fault(simulate):
+    sim = simulate(safety=SafetyLimits(vent_timeout=1.0))
+    sim.track()
+    sim.have("stick:0")
+    sim.core.vent()
+    sim.run_until(lambda: sim.mode is Mode.FAULT, 5.0)
+    assert "not vented" in sim.faults[0]
+
+
+def test_arming_twice_is_no_harm(simulate):
+    sim = simulate()
+    sim.track(1.0)
+    success, text = sim.core.arm()
+    assert success
+    assert "already armed" in text
+    assert sim.mode is Mode.TRACKING
+
+
+def test_arming_waits_for_telemetry_rest_and_empty_chambers(simulate):
+    sim = simulate()
+    assert "telemetry" in sim.core.arm()[1]
+    sim.tick()
+    assert "rest pressures" in sim.core.arm()[1]
+    sim.arm()
+    sim.stream(3.0)
+    sim.core.lost("pulled")
+    sim.tick()
+    assert sim.core.arm() == (False, "not armed: pulled")
+    sim.core.opening()
+    sim.tick()
+    success, text = sim.core.arm()
+    assert not success
+    assert "not vented yet" in text
+    sim.run_until(lambda: sim.core.arm()[0], 6.0)
+    assert sim.faults == ()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_rest_pressures_are_the_sensors_own(simulate, seed):
+    sim = simulate(seed=seed)
+    sim.arm()
+    reading = sim.board.pneumatics.pressure + sim.board._offset
+    assert sim.core._monitor.rest_pressure == pytest.approx(reading, abs=8.0)
+
+
+def test_rest_pressures_are_not_taken_from_chambers_under_pressure(simulate):
+    sim = simulate()
+    # The board still holds what an earlier program told it, and does not listen yet.
+    sim.board.receive(b"<1013.00,1013.00,1113.00,1013.00>\n", sim.wall)
+    sim.board.step(3.0)
+    sim.have("deaf")
+    sim.run(3.0)
+    assert not sim.core.arm()[0]
+    sim.have()
+    sim.run_until(lambda: sim.core.arm()[0], 8.0)
+    assert sim.core.atmosphere == pytest.approx(sim.board.pneumatics.atmosphere, abs=250.0)
+
+
+def test_a_given_atmosphere_is_used_as_it_is(simulate):
+    sim = simulate(atmosphere=101_000.0)
+    sim.run(1.0)
+    assert sim.core.atmosphere == 101_000.0
+
+
+def test_untimed_commands(simulate):
+    sim = simulate()
+    sim.arm()
+    assert sim.core.offer(Setpoint(0, (2_000.0, -500.0)), sim.wall) is Verdict.ACCEPTED
+    sim.tick()
+    assert sim.mode is Mode.TRACKING
+    pressure = np.array(sim.received[-1].pressure)
+    assert pressure[0::2] - pressure[1::2] == pytest.approx([2_000.0, -500.0])
+
+
+# --------------------------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize("protocol", NAMES)
+@pytest.mark.parametrize(
+    ("differential", "ahead", "reason"),
+    [
+        ((float("nan"), 0.0), 0.2, "not finite"),
+        ((1_000.0,), 0.2, "expected 2"),
+        ((24_500.0, 0.0), 0.2, "limit"),
+        ((15_000.0, 0.0), 0.2, "Pa/s"),
+        ((1_000.0, 0.0), 11.0, "ahead"),
+        ((1_000.0, 0.0), -0.1, "after its stamp"),
+    ],
+)
+def test_what_is_refused_never_reaches_the_wire(simulate, protocol, differential, ahead, reason):
+    sim = simulate(protocol)
+    sim.arm()
+    sim.tick()
+    before = len(sim.sent)
+    assert sim.offer(differential, ahead) in (Verdict.REFUSED, Verdict.LATE)
+    assert reason in sim.core.last_refusal
+    sim.run(1.0)
+    assert sim.mode is Mode.ARMED
+    assert all(is_vent(sim, data) for data in sim.sent[before:])
+
+
+def test_nothing_but_vent_is_sent_until_armed(simulate):
+    sim = simulate()
+    for index in range(40):
+        assert sim.offer((1_000.0, 0.0), index=index) is Verdict.REFUSED
+        sim.tick()
+    assert all(is_vent(sim, data) for data in sim.sent)
+    assert sim.core.snapshot().counters.refused == 40
+
+
+# ------------------------------------------------------------------------------------ faults
+
+FAULTS = {
+    "telemetry stops": ("mute", "no telemetry", 0.6),
+    "valve sticks": ("stick:0", "chamber 0 does not follow", 6.0),
+    "leak": ("leak:0:30", "chamber 0 does not follow", 6.0),
+    "supply low": ("supply:105000", "supply too low", 0.8),
+    "supply high": ("supply:300000", "supply too high", 0.8),
+    "valve stays open": ("runaway:1", "over-pressure|chamber 1 does not follow", 6.0),
+    "board is deaf": ("deaf", "does not follow|expired", 6.0),
+}
+
+
+def push(sim, seconds, pulsation=1.2):
+    """Swing segment 0, and offer setpoints for as long as the driver takes them."""
+    for index in range(round(seconds / 0.05)):
+        first = 9_000.0 * np.cos(pulsation * index * 0.05)
+        sim.offer((first, -5_000.0), plan_id="push", index=index)
+        sim.tick()
+        if sim.mode is Mode.FAULT:
+            return
+
+
+@pytest.mark.parametrize("protocol", NAMES)
+@pytest.mark.parametrize("name", FAULTS)
+def test_every_fault_ends_vented(simulate, protocol, name):
+    fault, reason, limit = FAULTS[name]
+    if "supply" in name and protocol == "ctrlp":
+        pytest.skip("this board does not tell its supply, which its diagnostics say")
+    sim = simulate(protocol)
+    sim.track()
+    sim.have(fault)
+    begin = sim.steady
+    # A leak shows while a chamber is to be kept full.
+    push(sim, limit, pulsation=0.0 if name == "leak" else 1.2)
+    assert sim.mode is Mode.FAULT, "not noticed"
+    assert sim.steady - begin <= limit
+    assert any(part in " ".join(sim.faults) for part in reason.split("|")), sim.faults
+    sim.tick()
+    assert is_vent(sim, sim.sent[-1])
+    assert sim.offer((0.0, 0.0)) is Verdict.REFUSED
+    sim.run(1.0)
+    assert all(is_vent(sim, data) for data in sim.sent[-19:])
+    assert sim.mode is Mode.FAULT
+    # Chambers that still obey are empty within four seconds; the broken ones once they work again.
+    if name in ("telemetry stops", "supply low", "supply high"):
+        sim.run_until(lambda: vented(sim), 3.0)
+    sim.have()
+    sim.run_until(lambda: vented(sim), 8.0)
+    assert sim.mode is Mode.FAULT, "must stay until armed"
+    sim.run_until(lambda: sim.core.arm()[0], 5.0)
+    assert sim.mode is Mode.ARMED
+
+
+def test_over_pressure_needs_two_readings_in_a_row(simulate):
+    sim = simulate()
+    sim.arm()
+    sim.core.received(b"[MPR]: 1400.00 1013.00 1013.00 1013.00\n")
+    sim.tick()
+    assert sim.mode is Mode.ARMED
+    sim.core.received(b"[MPR]: 1400.00 1013.00 1013.00 1013.00\n" * 2)
+    sim.tick()
+    assert sim.mode is Mode.FAULT
+    assert "over-pressure: chamber 0" in sim.faults[0]
+
+
+@pytest.mark.parametrize("protocol", NAMES)
+def test_over_pressure_is_noticed_while_disarmed(simulate, protocol):
+    sim = simulate(protocol)
+    sim.run(1.5)
+    sim.have("runaway:2")
+    sim.run_until(lambda: sim.mode is Mode.FAULT, 8.0)
+
+
+@pytest.mark.parametrize("protocol", NAMES)
+def test_an_unplug_vents_after_the_reconnect_and_wants_arming(simulate, protocol):
+    sim = simulate(protocol)
+    sim.track()
+    sim.plugged = False
+    sim.core.lost("serial link lost: pulled")
+    push(sim, 1.0)
+    assert sim.mode is Mode.FAULT
+    assert sim.faults == ("serial link lost: pulled",)
+    sim.plugged = True
+    greeting = sim.core.opening()
+    assert is_vent(sim, greeting)
+    sim._receive(greeting)
+    sim.run_until(lambda: vented(sim), 6.0)
+    assert sim.mode is Mode.FAULT
+    sim.run_until(lambda: sim.core.arm()[0], 5.0)
+
+
+def test_the_native_board_vents_by_itself_when_the_driver_dies(simulate):
+    sim = simulate("native", command_validity=0.25)
+    sim.track()
+    assert sim.gauge.max() > 4_000.0
+    begin = sim.board._time
+    while not vented(sim):
+        sim.board.step(0.05)
+        assert sim.board._time - begin < 4.5
+    # What it says about it is a fault for a driver that is back.
+    sim.core.received(sim.board.telemetry())
+    assert sim.mode is Mode.FAULT
+    assert "expired" in sim.faults[0]
+
+
+@pytest.mark.parametrize("protocol", ["ezloop", "ctrlp"])
+def test_boards_without_a_watchdog_keep_the_pressure_which_the_diagnostics_say(simulate, protocol):
+    sim = simulate(protocol)
+    sim.track()
+    sim.board.step(5.0)
+    assert sim.gauge.max() > 4_000.0
+    assert any("no watchdog" in text for text in sim.core.protocol.weaknesses)
+
+
+def test_a_board_with_other_chambers_or_less_range_cannot_be_armed(simulate):
+    from pressure_driver.protocols.native import NativeBoard
+
+    sim = simulate("native")
+    sim.board.protocol = NativeBoard(4, largest_pressure=20_000)
+    sim.run(1.5)
+    sim._receive(sim.core.opening())
+    sim.run(1.5)
+    success, text = sim.core.arm()
+    assert not success
+    assert "reaches 20000 Pa" in text
+    sim.core._check_identity(replace(sim.core.identity, chamber_count=6, largest_pressure=3e4))
+    assert "6 chambers" in sim.core.arm()[1]
+
+
+def test_a_slow_native_board_is_asked_again(simulate):
+    sim = simulate("native")
+    sim.have("deaf")
+    sim._receive(sim.core.opening())
+    sim.run(0.5)
+    assert "introduced" in sim.core.arm()[1]
+    sim.have()
+    sim.run_until(lambda: sim.core.arm()[0], 3.0)
+    assert sim.core.identity.firmware == "emulator 1"
+
+
+def test_a_report_of_the_board_is_a_fault(simulate):
+    sim = simulate("native")
+    sim.arm()
+    sim.core._take(BoardReport("sensor: channel 3", fatal=True), sim.steady)
+    assert sim.mode is Mode.FAULT
+    sim.tick()
+    assert is_vent(sim, sim.sent[-1])
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("protocol", NAMES)
+def test_no_false_alarm_on_full_steps_and_fast_swings(simulate, protocol, seed):
+    """Steps over the whole range and a 3 s swing, on limbs whose valves differ."""
+    limits = ScheduleLimits(slew_limit=1e6)
+    sim = simulate(protocol, seed=seed, schedule=limits)
+    sim.arm()
+    step = 20_000.0
+    sim.stream(16.0, lambda t: (step if t % 8.0 < 4.0 else -step, -step if t % 6.0 < 3.0 else 0.0))
+    amplitude = 18_000.0
+    swing = 2.0 * np.pi / 3.0
+    sim.run_until(lambda: sim.mode is Mode.ARMED)
+    sim.stream(9.0, lambda t: (amplitude * np.sin(swing * t), -amplitude * np.sin(swing * t)))
+    assert sim.faults == ()
+
+
+def test_corrupt_lines_do_not_end_a_run(simulate):
+    """Two bytes in a thousand damaged on a line without a checksum."""
+    sim = simulate("ezloop")
+    sim.arm()
+    sim.have("corrupt:0.002")
+    sim.stream(30.0)
+    assert sim.mode is Mode.TRACKING
+    assert sim.core.protocol.rejected > 10
+
+
+def test_the_round_trip_is_measured_where_there_are_echoes(simulate):
+    for protocol in ("ctrlp", "native"):
+        sim = simulate(protocol)
+        sim.run(2.0)
+        assert np.isfinite(sim.core.snapshot().round_trip)
+    sim = simulate("ezloop")
+    sim.run(2.0)
+    assert np.isnan(sim.core.snapshot().round_trip)
+
+
+def test_the_monitor_bounds_are_those_of_the_settings(simulate):
+    settings = CoreSettings()
+    assert settings.monitor.over_pressure > settings.schedule.pressure_limit
+    sim = simulate(monitor=MonitorLimits(follow_time=0.5))
+    sim.track()
+    sim.have("stick:0")
+    begin = sim.steady
+    push(sim, 3.0)
+    assert sim.mode is Mode.FAULT
+    quick = sim.steady - begin
+    sim = simulate()
+    sim.track()
+    sim.have("stick:0")
+    begin = sim.steady
+    push(sim, 6.0)
+    assert sim.steady - begin > quick + 1.0

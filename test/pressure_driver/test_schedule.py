@@ -1,0 +1,240 @@
+"""Timed setpoints: when they take effect, and what is refused."""
+
+import numpy as np
+import pytest
+
+from pressure_driver.grid import TickGrid
+from pressure_driver.schedule import Schedule, ScheduleLimits, Setpoint, Verdict
+
+PERIOD = 50_000_000
+NOW = 1_700_000_000 * 1_000_000_000
+ZERO = (0.0, 0.0)
+
+
+def setpoint(steps, value=1000.0, plan_id="a", index=0, offset=0):
+    return Setpoint(NOW + steps * PERIOD + offset, (value, -value), plan_id, index)
+
+
+def offer(schedule, item, now=NOW):
+    return schedule.offer(item, now, ZERO)
+
+
+def test_a_setpoint_waits_for_its_stamp_and_is_then_held():
+    schedule = Schedule(ScheduleLimits())
+    assert offer(schedule, setpoint(3)) is Verdict.ACCEPTED
+    assert [schedule.sample(NOW + k * PERIOD) for k in (1, 2)] == [None, None]
+    first = schedule.sample(NOW + 3 * PERIOD)
+    assert first.fresh
+    assert first.differential == (1000.0, -1000.0)
+    held = schedule.sample(NOW + 4 * PERIOD)
+    assert not held.fresh
+    assert held.differential == first.differential
+    assert schedule.counters.executed == 1
+
+
+def test_order_of_arrival_does_not_matter():
+    schedule = Schedule(ScheduleLimits())
+    for k in (5, 3, 4):
+        assert offer(schedule, setpoint(k, 1000.0 + k, index=k)) is Verdict.ACCEPTED
+    values = [schedule.sample(NOW + k * PERIOD).differential[0] for k in (3, 4, 5)]
+    assert values == [1003.0, 1004.0, 1005.0]
+
+
+def test_a_stamp_between_ticks_takes_effect_at_the_next_one():
+    schedule = Schedule(ScheduleLimits())
+    offer(schedule, setpoint(2, offset=1))
+    assert schedule.sample(NOW + 2 * PERIOD) is None
+    assert schedule.sample(NOW + 3 * PERIOD).fresh
+
+
+def test_two_setpoints_within_one_tick_leave_the_later_one():
+    schedule = Schedule(ScheduleLimits())
+    offer(schedule, setpoint(2, 1000.0, offset=-2 * 10**7))
+    offer(schedule, setpoint(2, 2000.0, index=1))
+    assert schedule.sample(NOW + 2 * PERIOD).differential[0] == 2000.0
+    assert schedule.counters.superseded == 1
+
+
+def test_linear_interpolation_moves_between_stamps():
+    schedule = Schedule(ScheduleLimits(), interpolate=True)
+    offer(schedule, setpoint(2, 0.0))
+    offer(schedule, setpoint(6, 4000.0, index=1))
+    samples = [schedule.sample(NOW + k * PERIOD) for k in range(2, 8)]
+    assert [s.differential[0] for s in samples] == [0.0, 1000.0, 2000.0, 3000.0, 4000.0, 4000.0]
+    assert [s.fresh for s in samples] == [True] * 5 + [False]
+
+
+def test_stamp_zero_is_the_next_tick():
+    schedule = Schedule(ScheduleLimits())
+    schedule.sample(NOW)
+    item = Setpoint(0, (500.0, 0.0))
+    assert offer(schedule, item, NOW + 10**6) is Verdict.ACCEPTED
+    assert schedule.sample(NOW + PERIOD).differential == (500.0, 0.0)
+    # Even if the next tick has been taken while the message was under way.
+    schedule.sample(NOW + 2 * PERIOD)
+    assert offer(schedule, item, NOW + PERIOD) is Verdict.ACCEPTED
+    assert schedule.sample(NOW + 3 * PERIOD).fresh
+
+
+def test_late_ones_are_counted_and_refused():
+    schedule = Schedule(ScheduleLimits())
+    schedule.sample(NOW + 4 * PERIOD)
+    assert offer(schedule, setpoint(4), NOW + 4 * PERIOD) is Verdict.LATE
+    assert offer(schedule, setpoint(3, offset=1), NOW + 4 * PERIOD) is Verdict.LATE
+    assert offer(schedule, setpoint(5), NOW + 4 * PERIOD) is Verdict.ACCEPTED
+    assert schedule.counters.late == 2
+    assert "after its stamp" in schedule.reason
+
+
+def test_duplicates_are_counted_and_refused():
+    schedule = Schedule(ScheduleLimits())
+    offer(schedule, setpoint(1, 1000.0))
+    assert offer(schedule, setpoint(1, 2000.0)) is Verdict.DUPLICATE
+    assert schedule.sample(NOW + PERIOD).differential[0] == 1000.0
+    assert schedule.counters.duplicate == 1
+
+
+def test_a_new_plan_replaces_the_old_from_its_first_stamp_on():
+    schedule = Schedule(ScheduleLimits())
+    for k in range(1, 9):
+        offer(schedule, setpoint(k, 100.0 * k, index=k))
+    for k in range(5, 8):
+        assert offer(schedule, setpoint(k, 500.0 + k, "b", k)) is Verdict.ACCEPTED
+    assert schedule.counters.superseded == 4
+    assert offer(schedule, setpoint(9, 900.0, "a", 9)) is Verdict.REFUSED
+    assert "replaced" in schedule.reason
+    plans = [schedule.sample(NOW + k * PERIOD).setpoint.plan_id for k in range(1, 10)]
+    assert plans == ["a"] * 4 + ["b"] * 5
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        ((float("nan"), 0.0), "not finite"),
+        ((float("inf"), 0.0), "not finite"),
+        ((1000.0,), "expected 2"),
+        ((1.0, 2.0, 3.0), "expected 2"),
+        ((), "expected 2"),
+        ((24_000.1, 0.0), "limit is ±24000 Pa"),
+        ((0.0, -24_000.1), "limit is ±24000 Pa"),
+        ((10_000.1, 0.0), "Pa/s"),
+    ],
+)
+def test_refused_with_the_reason(values, reason):
+    schedule = Schedule(ScheduleLimits())
+    item = Setpoint(NOW + PERIOD, values, "plan-7", 3)
+    assert offer(schedule, item) is Verdict.REFUSED
+    assert reason in schedule.reason
+    assert "setpoint 3 of 'plan-7'" in schedule.reason
+    assert schedule.waiting == 0
+    assert schedule.sample(NOW + PERIOD) is None
+
+
+def test_too_far_ahead_is_refused():
+    schedule = Schedule(ScheduleLimits(horizon=1.0))
+    assert offer(schedule, setpoint(20)) is Verdict.ACCEPTED
+    assert offer(schedule, setpoint(21, index=1)) is Verdict.REFUSED
+    assert "1.05 s ahead" in schedule.reason
+
+
+def test_slew_is_taken_between_neighbours_in_time():
+    limits = ScheduleLimits(slew_limit=10_000.0)
+    schedule = Schedule(limits)
+    assert offer(schedule, setpoint(1, 500.0)) is Verdict.ACCEPTED
+    assert offer(schedule, setpoint(11, 5500.0)) is Verdict.ACCEPTED
+    # Fits behind its predecessor, but the way to the next would be too steep.
+    assert offer(schedule, setpoint(6, 2900.0)) is Verdict.REFUSED
+    assert offer(schedule, setpoint(6, 3000.0)) is Verdict.ACCEPTED
+    assert schedule.sample(NOW + PERIOD).fresh
+    # What is held counts, not how long it has been held.
+    fresh = Schedule(limits)
+    fresh.offer(setpoint(1, 500.0), NOW, ZERO)
+    fresh.sample(NOW + PERIOD)
+    late = setpoint(101, 5000.0)
+    assert fresh.offer(late, NOW + 99 * PERIOD, (500.0, -500.0)) is Verdict.REFUSED
+
+
+def test_the_buffer_is_bounded():
+    schedule = Schedule(ScheduleLimits(capacity=10))
+    verdicts = [offer(schedule, setpoint(k, 1.0 * k, index=k)) for k in range(1, 13)]
+    assert verdicts == [Verdict.ACCEPTED] * 10 + [Verdict.REFUSED] * 2
+
+
+# ------------------------------------------------------------------------------------- grid
+
+
+def test_ticks_fall_on_the_grid_and_never_before_it():
+    grid = TickGrid(PERIOD)
+    wall = NOW + 12_345_678
+    grid.take(wall, 0)
+    for _ in range(1000):
+        wall += round(grid.delay(wall) * 1e9) + 7_000
+        instant = grid.take(wall, wall - NOW)
+        assert instant is not None
+        assert instant % PERIOD == 0
+        assert 0 <= wall - instant < 20_000
+        assert grid.take(wall, wall - NOW) is None
+    assert grid.missed == 0
+
+
+def test_a_late_wake_skips_what_is_over_and_counts_it():
+    grid = TickGrid(PERIOD)
+    grid.take(NOW, 0)
+    assert grid.take(NOW + PERIOD, PERIOD) == NOW + PERIOD
+    late = 5 * PERIOD + 10**6
+    assert grid.take(NOW + late, late) == NOW + 5 * PERIOD
+    assert grid.missed == 3
+    assert grid.clock_steps == 0
+
+
+@pytest.mark.parametrize("step", [-3600, -1, 1, 3600])
+def test_a_stepped_wall_clock_moves_the_grid_and_does_not_stop_it(step):
+    grid = TickGrid(PERIOD)
+    steady = 0
+    grid.take(NOW, steady)
+    for _ in range(10):
+        steady += PERIOD
+        assert grid.take(NOW + steady, steady) is not None
+    moved = NOW + step * 1_000_000_000
+    ticks = []
+    for _ in range(40):
+        assert grid.delay(moved + steady) <= PERIOD / 1e9
+        steady += PERIOD
+        ticks.append(grid.take(moved + steady, steady))
+    assert sum(t is not None for t in ticks) >= 39
+    assert all(t == moved + (11 + k) * PERIOD for k, t in enumerate(ticks) if t is not None)
+    assert grid.clock_steps == 1
+
+
+@pytest.mark.slow
+def test_a_day_of_setpoints_without_drift():
+    """24 h at 20 Hz on clocks that drift by 80 ppm, are slewed, and wake the thread late."""
+    generator = np.random.default_rng(14)
+    grid = TickGrid(PERIOD)
+    schedule = Schedule(ScheduleLimits())
+    count = 24 * 3600 * 20
+    lateness = generator.exponential(60_000.0, count + 10).astype(np.int64)
+    drift = 80e-6 * np.sin(np.linspace(0.0, 9.0, count + 10))
+    drift_by_tick = (drift * PERIOD).astype(np.int64)
+    values = (3000.0 * np.sin(np.arange(count) * 0.01)).tolist()
+    wall, steady = NOW + 17, 0
+    grid.take(wall, steady)
+    executed = 0
+    for k in range(count):
+        stamp = NOW + (k + 4) * PERIOD
+        schedule.offer(Setpoint(stamp, (values[k], 0.0), "day", k), wall, ZERO)
+        wait = round(grid.delay(wall) * 1e9) + int(lateness[k])
+        wall += wait
+        steady += wait + int(drift_by_tick[k])
+        instant = grid.take(wall, steady)
+        sample = schedule.sample(instant)
+        if sample is not None:
+            assert sample.fresh
+            assert sample.setpoint.stamp == instant
+            assert sample.setpoint.index == executed
+            executed += 1
+    assert schedule.counters.accepted == count
+    assert executed == schedule.counters.executed == count - 3
+    assert grid.missed == grid.clock_steps == 0
+    assert schedule.counters.late == schedule.counters.refused == schedule.counters.superseded == 0
+    assert wall - (NOW + count * PERIOD) < 2_000_000
