@@ -176,12 +176,8 @@ def acceleration(
 def simulate(
     q: Vector,
     v: Vector,
-    chamber: Vector,
-    command: Vector,
-    period: float,
-    substeps: int,
-    time_constant: float,
-    fill_rate: float,
+    pressures: Vector,
+    step: float,
     gain: Vector,
     lengths: Vector,
     connector: float,
@@ -194,54 +190,41 @@ def simulate(
     cubic: Vector,
     rest: Vector,
     material_damping: Vector,
-) -> tuple[Vector, Vector, Vector]:
-    """Roll the model forward under held commands with the classical Runge-Kutta method.
+) -> tuple[Vector, Vector]:
+    """Roll the model forward with the classical Runge-Kutta method.
 
     Args:
-        q, v, chamber: state at the first command: angles, rates, differential pressures felt (n,).
-        command: (K, n) differential pressures [Pa], each held for ``period`` [s].
-        substeps: Runge-Kutta steps a period.
-        time_constant, fill_rate: of the chambers [s], [Pa/s]; the rate limits the lag.
+        q, v: angles [rad] and rates [rad/s] at the beginning, (n,).
+        pressures: (K, S, n) [Pa], constant over each of the S steps of an interval.
+        step: of the integrator [s].
+        gain: (n,) moment per pressure [N·m/Pa]; the others as in `acceleration`.
 
     Returns:
-        Angles (K, n), rates (K, n) and chamber pressures (K, n) at the start of each command.
+        Angles and rates (K + 1, n) at the interval boundaries.
     """
-    count, n = command.shape
-    angles = np.zeros((count, n))
-    rates = np.zeros((count, n))
-    pressures = np.zeros((count, n))
-    h = period / substeps
-    decay = np.exp(-h / time_constant)
-    half_decay = np.exp(-0.5 * h / time_constant)
-    q = q.copy()
-    v = v.copy()
-    p0 = chamber.copy()
+    count, substeps, n = pressures.shape
+    angles = np.zeros((count + 1, n))
+    rates = np.zeros((count + 1, n))
+    angles[0] = q
+    rates[0] = v
+    slopes = np.zeros((4, n))
     for k in range(count):
-        angles[k] = q
-        rates[k] = v
-        pressures[k] = p0
-        for _ in range(substeps):
-            gap = p0 - command[k]
-            largest = fill_rate * h
-            p1 = p0 + np.clip(gap * (decay - 1.0), -largest, largest)
-            pm = p0 + np.clip(gap * (half_decay - 1.0), -0.5 * largest, 0.5 * largest)
-            parts = np.zeros((4, n))
-            q_stage = q
-            v_stage = v
-            q_total = np.zeros(n)
-            v_total = np.zeros(n)
+        for s in range(substeps):
+            torque = gain * pressures[k, s]
+            q_stage, v_stage = q, v
+            q_total, v_total = np.zeros(n), np.zeros(n)
             for stage in range(4):
-                pressure = p0 if stage == 0 else (p1 if stage == 3 else pm)
-                parts[stage] = acceleration(
-                    q_stage, v_stage, gain * pressure, lengths, connector, masses, damping,
-                    gravity, fractions, weights, stiffness, cubic, rest, material_damping,
+                slopes[stage] = acceleration(
+                    q_stage, v_stage, torque, lengths, connector, masses, damping, gravity,
+                    fractions, weights, stiffness, cubic, rest, material_damping,
                 )  # fmt: skip
                 share = 2.0 if stage in (1, 2) else 1.0
                 q_total += share * v_stage
-                v_total += share * parts[stage]
-                ahead = h if stage == 2 else 0.5 * h
-                q_stage, v_stage = q + ahead * v_stage, v + ahead * parts[stage]
-            q = q + h / 6.0 * q_total
-            v = v + h / 6.0 * v_total
-            p0 = p1
-    return angles, rates, pressures
+                v_total += share * slopes[stage]
+                ahead = step if stage == 2 else 0.5 * step
+                q_stage, v_stage = q + ahead * v_stage, v + ahead * slopes[stage]
+            q = q + step / 6.0 * q_total
+            v = v + step / 6.0 * v_total
+        angles[k + 1] = q
+        rates[k + 1] = v
+    return angles, rates

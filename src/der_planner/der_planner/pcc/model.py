@@ -25,7 +25,6 @@ MassModel = Literal["distributed", "lumped"]
 
 QUADRATURE_POINTS = 8
 """Gauss-Legendre points a segment: exact to rounding for bends below 180 degrees."""
-SUBSTEP = 0.005
 
 
 class Pcc:
@@ -166,56 +165,42 @@ class Pcc:
 
     def simulate(
         self,
-        command: ArrayLike,
-        period: float,
+        pressures: ArrayLike,
+        step: float,
         angles: ArrayLike | None = None,
         rates: ArrayLike | None = None,
-        chamber: ArrayLike | None = None,
-        time_constant: float | None = None,
-        substep: float = SUBSTEP,
-    ) -> tuple[Vector, Vector, Vector]:
-        """Roll the model forward under held commands, with the chambers' lag.
+    ) -> tuple[Vector, Vector]:
+        """Roll the model forward from rest, or from a given state.
 
         Args:
-            command: (K, n) differential pressures [Pa], each held for ``period`` [s].
-            angles, rates, chamber: state at the first command; at rest and vented if None.
-            time_constant: of the chambers [s]; the limb file's if None, tiny for none.
-            substep: of the integrator [s].
+            pressures: (K, S, n) effective differential pressures [Pa], constant over each step.
+            step: of the Runge-Kutta integrator [s]; an interval lasts S steps.
+            angles, rates: (n,) at the beginning [rad], [rad/s]; at rest if None.
 
         Returns:
-            Angles [rad], rates [rad/s] and chamber pressures [Pa], each (K, n), at the start of
-            each command.
+            Angles [rad] and rates [rad/s], each (K + 1, n), at the interval boundaries.
+
+        Raises:
+            ValueError: wrong shapes.
         """
-        lag = self.limb.pneumatics.time_constant if time_constant is None else time_constant
-        zero = np.zeros(self.segment_count)
-        result: tuple[Vector, Vector, Vector] = kernels.simulate(
+        inputs = np.ascontiguousarray(pressures, dtype=float)
+        if inputs.ndim != 3 or inputs.shape[2] != self.segment_count:
+            raise ValueError(f"pressures must be (K, S, {self.segment_count}), got {inputs.shape}")
+        result: tuple[Vector, Vector] = kernels.simulate(
             self._check("angles", self.rest if angles is None else angles),
-            self._check("rates", zero if rates is None else rates),
-            self._check("chamber", zero if chamber is None else chamber),
-            np.ascontiguousarray(command, dtype=float),
-            period,
-            max(1, round(period / substep)),
-            max(lag, 1e-9),
-            self.limb.pneumatics.fill_rate,
+            self._check("rates", np.zeros(self.segment_count) if rates is None else rates),
+            inputs,
+            step,
             self.gain,
-            **self._parameters(),
+            *self._parameters(),
         )
         return result
 
-    def _parameters(self) -> dict[str, Any]:
-        return {
-            "lengths": self.lengths,
-            "connector": self.connector,
-            "masses": self.masses,
-            "damping": self.damping,
-            "gravity": self.gravity,
-            "fractions": self.fractions,
-            "weights": self.weights,
-            "stiffness": self.stiffness,
-            "cubic": self.cubic,
-            "rest": self.rest,
-            "material_damping": self.material_damping,
-        }
+    def _parameters(self) -> tuple[Any, ...]:
+        return (
+            self.lengths, self.connector, self.masses, self.damping, self.gravity, self.fractions,
+            self.weights, self.stiffness, self.cubic, self.rest, self.material_damping,
+        )  # fmt: skip
 
 
 def _arc(angle: Vector) -> NDArray[np.complex128]:

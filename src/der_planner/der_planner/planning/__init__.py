@@ -1,1 +1,26 @@
-"""From a motion to timed pressures."""
+"""From a motion to timed pressures: motions, inverse kinematics, planners, plans.
+
+`plan(limb, motion)` is the way in; `Motion.named` and `Motion.from_tip_path` make motions.
+"""
+
+from der_planner.planning.errors import PlanningError, UnreachableError
+from der_planner.planning.models import METHODS
+from der_planner.planning.motions import CONTROL_PERIOD, NAMES, Motion, Reference
+from der_planner.planning.paths import PathLimits
+from der_planner.planning.planner import DEFAULT_METHOD, choose_method, plan
+from der_planner.planning.result import Plan
+
+__all__ = [
+    "CONTROL_PERIOD",
+    "DEFAULT_METHOD",
+    "METHODS",
+    "NAMES",
+    "Motion",
+    "PathLimits",
+    "Plan",
+    "PlanningError",
+    "Reference",
+    "UnreachableError",
+    "choose_method",
+    "plan",
+]

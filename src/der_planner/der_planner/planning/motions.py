@@ -1,0 +1,299 @@
+"""Motions: what the tip should do, as bend angles first and tip positions after them.
+
+Every motion becomes a `Reference`: smooth bend angles q̄(t) of constant-curvature arcs, which begin and
+end at rest in the straight pose, and the tip r̄(t) of these arcs. The reference belongs to no model:
+all planners get the same r̄(t) and find their own configuration for it, so that their errors compare.
+
+Named motions of the paper, with s(t) = ½ (1 − cos 2πt/T), amplitude A and period T:
+
+- ``asynchronous``: segment j follows A s(t − j T/4);
+- ``same_direction``: all segments follow A s(t);
+- ``opposite_direction``: segment j follows (−1)ʲ A s(t).
+
+The first quarter of a period is faded in by a quintic, and a closing quarter after the last cycle
+brings the limb back to rest by a quintic that meets angle, rate and acceleration: the driver can vent
+without a jump. A motion of two cycles of 20 s thus lasts 45 s.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import BSpline, make_interp_spline
+
+from der_planner.limb import Limb
+from der_planner.planning import paths, shapes
+from der_planner.planning.errors import PlanningError
+from der_planner.planning.inverse import follow
+from der_planner.planning.kinematics import ArcKinematics
+
+Vector = NDArray[np.float64]
+
+CONTROL_PERIOD = 0.05
+"""Setpoints are 50 ms apart [s]."""
+JOINT_MOTIONS = ("asynchronous", "same_direction", "opposite_direction")
+NAMES = (*JOINT_MOTIONS, *shapes.NAMES)
+DEFAULT_AMPLITUDE = math.pi / 4
+DEFAULT_PERIOD = 20.0
+DEFAULT_CYCLES = 2
+LONGEST = 3600.0
+_GRID = 0.01
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A motion made concrete for one limb.
+
+    Attributes:
+        time: (K,) instants of the setpoints, 50 ms apart, from 0 [s].
+        tip: (K, 2) r̄ [m].
+        bend_angles: (K, M) q̄ of constant-curvature arcs [rad].
+        spline: q̄(t), twice continuously differentiable; `sample` reads it.
+    """
+
+    time: Vector
+    tip: Vector
+    bend_angles: Vector
+    spline: BSpline
+
+    @property
+    def duration(self) -> float:
+        """Instant of the last setpoint [s]."""
+        return float(self.time[-1])
+
+    def sample(self, time: ArrayLike) -> tuple[Vector, Vector, Vector]:
+        """Return q̄, its rate and acceleration (…, M) at instants, held at rest outside the motion."""
+        return sample_spline(self.spline, time)
+
+
+def sample_spline(spline: BSpline, time: ArrayLike) -> tuple[Vector, Vector, Vector]:
+    """Return value, rate and acceleration of a spline; beyond its ends it rests."""
+    instants = np.asarray(time, dtype=float)
+    first, last = spline.t[spline.k], spline.t[-spline.k - 1]
+    inside = ((instants >= first) & (instants <= last))[..., None]
+    clipped = np.clip(instants, first, last)
+    value: Vector = spline(clipped)
+    return value, np.where(inside, spline(clipped, 1), 0.0), np.where(inside, spline(clipped, 2), 0.0)
+
+
+def resting_spline(time: ArrayLike, values: ArrayLike) -> BSpline:
+    """Return the quintic spline through (K, M) values that starts and ends at rest."""
+    samples = np.asarray(values, dtype=float)
+    rest = np.zeros(samples.shape[1:])
+    ends = [(1, rest), (2, rest)]
+    return make_interp_spline(np.asarray(time), samples, k=5, bc_type=(ends, ends))
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What the tip should do: a named motion, or a path of the tip.
+
+    Use `Motion.named`, `Motion.from_tip_path` or `Motion.from_csv`.
+
+    Attributes:
+        name: one of `NAMES`, or the name given to a path.
+        amplitude: largest bend of a segment; scales the shapes; 0 for a path [rad].
+        period: of one cycle; 0 for a path [s].
+        cycles: number of them; 1 for a path.
+        path: the tip path of shapes and paths.
+        branch: of the arcs at the first point of a path, see `inverse.BRANCHES`; empty: least pressure.
+    """
+
+    name: str
+    amplitude: float = 0.0
+    period: float = 0.0
+    cycles: int = 1
+    path: paths.TipPath | None = None
+    branch: str = ""
+
+    @classmethod
+    def named(
+        cls,
+        name: str,
+        amplitude: float = DEFAULT_AMPLITUDE,
+        period: float = DEFAULT_PERIOD,
+        cycles: int = DEFAULT_CYCLES,
+        branch: str = "",
+    ) -> Motion:
+        """Return one of the motions in `NAMES`.
+
+        Args:
+            name: of the motion.
+            amplitude: largest bend of a segment [rad]; a shape is drawn around the tip of a limb bent by
+                1.2 times of it, and grows in proportion.
+            period: of one cycle [s].
+            cycles: how many.
+            branch: for shapes, which way to reach the first point.
+
+        Raises:
+            PlanningError: unknown name, or a number that is out of range.
+        """
+        if name not in NAMES:
+            raise PlanningError(f"motion '{name}' is unknown: choose {', '.join(NAMES)}")
+        for what, value, unit in (("amplitude", amplitude, "rad"), ("period", period, "s")):
+            if not (math.isfinite(value) and value > 0):
+                raise PlanningError(f"{what} must be positive and finite in {unit}, got {value}")
+        if amplitude > math.pi:
+            raise PlanningError(
+                f"amplitude is {amplitude:.4g} rad ({math.degrees(amplitude):.0f} degrees): "
+                "a segment bends by 3.14 rad at most; is it in radians?"
+            )
+        if cycles != int(cycles) or cycles < 1:
+            raise PlanningError(f"cycles must be a whole number of 1 or more, got {cycles}")
+        if period < 4 * CONTROL_PERIOD:
+            raise PlanningError(f"period is {period} s: the shortest is {4 * CONTROL_PERIOD} s")
+        if period * cycles > LONGEST:
+            raise PlanningError(
+                f"{cycles} cycles of {period} s are longer than {LONGEST:.0f} s: plan fewer"
+            )
+        return cls(name, float(amplitude), float(period), int(cycles), branch=branch)
+
+    @classmethod
+    def from_tip_path(
+        cls,
+        time: ArrayLike | None,
+        tip: ArrayLike,
+        name: str = "path",
+        branch: str = "",
+        limits: paths.PathLimits | None = None,
+    ) -> Motion:
+        """Return a motion along a path of the tip.
+
+        The limb first goes from rest to the first point and at the end back, over times of their own.
+
+        Args:
+            time: (P,) increasing instants [s]; None: the path gets its timing from the limits.
+            tip: (P, 2) points in `limb_base` [m].
+            name: for tables.
+            branch: which way to reach the first point; empty: the one with the least pressure.
+            limits: speed and acceleration for a path without times.
+
+        Raises:
+            PlanningError: wrong shapes, not finite, not increasing, too few points.
+        """
+        return cls(name, path=paths.TipPath.build(time, tip, limits), branch=branch)
+
+    @classmethod
+    def from_csv(
+        cls, path: str | Path, branch: str = "", limits: paths.PathLimits | None = None
+    ) -> Motion:
+        """Return a motion along the path in a CSV file with columns x, y [m] and, if timed, time [s].
+
+        Raises:
+            PlanningError: the file cannot be read; the message names line and column.
+        """
+        time, tip = paths.read_csv(path)
+        return cls.from_tip_path(time, tip, name=Path(path).stem, branch=branch, limits=limits)
+
+    def reference(self, limb: Limb) -> Reference:
+        """Return q̄(t) and r̄(t) for a limb.
+
+        Raises:
+            UnreachableError: a point of a tip path is out of reach.
+            PlanningError: the path cannot be followed.
+        """
+        if self.name in JOINT_MOTIONS and self.path is None:
+            time, angles = self._joint_motion(limb.segment_count)
+        else:
+            time, angles = self._tip_motion(limb)
+        spline = resting_spline(time, angles)
+        count = round(time[-1] / CONTROL_PERIOD) + 1
+        instants = np.arange(count) * CONTROL_PERIOD
+        sampled = sample_spline(spline, instants)[0]
+        return Reference(instants, ArcKinematics(limb).tip(sampled), sampled, spline)
+
+    def _joint_motion(self, segments: int) -> tuple[Vector, Vector]:
+        total = self.cycles * self.period
+        time = _fine_grid(total)
+        place = np.arange(segments)
+        lag = place * self.period / 4 if self.name == "asynchronous" else 0.0 * place
+        sign = (-1.0) ** place if self.name == "opposite_direction" else 1.0 + 0.0 * place
+        phase = 2 * np.pi * (time[:, None] - lag) / self.period
+        wave = 0.5 * self.amplitude * sign * (1 - np.cos(phase))
+        angles = wave * smooth_step(time / (self.period / 4))[:, None]
+        rate = 2 * np.pi / self.period
+        last = phase[-1]
+        state = (
+            angles[-1],
+            0.5 * self.amplitude * sign * rate * np.sin(last),
+            0.5 * self.amplitude * sign * rate**2 * np.cos(last),
+        )
+        closing = _fine_grid(_on_grid(self.period / 4))
+        back = quintic(closing, *state, 0 * state[0], 0 * state[0], 0 * state[0])
+        return np.append(time, total + closing[1:]), np.concatenate([angles, back[1:]])
+
+    def _tip_motion(self, limb: Limb) -> tuple[Vector, Vector]:
+        kinematics = ArcKinematics(limb)
+        path = self.path
+        if path is None:
+            path = shapes.draw(self.name, kinematics, self.amplitude, self.period, self.cycles)
+        time, tip = path.resample(_GRID * 2)
+        angles = follow(limb, kinematics, time, tip, self.branch)
+        inner = make_interp_spline(time, angles, k=5)
+        ends = [(inner(t), inner(t, 1), inner(t, 2)) for t in (time[0], time[-1])]
+        zero = np.zeros(limb.segment_count)
+        lead = _travel_time(limb, ends[0])
+        tail = _travel_time(limb, ends[1])
+        approach = quintic(_fine_grid(lead), zero, zero, zero, *ends[0])
+        back = quintic(_fine_grid(tail), *ends[1], zero, zero, zero)
+        between = _fine_grid(_on_grid(time[-1] - time[0]))
+        middle = inner(np.minimum(time[0] + between, time[-1]))
+        return (
+            np.concatenate(
+                [
+                    _fine_grid(lead),
+                    lead + between[1:],
+                    lead + between[-1] + _fine_grid(tail)[1:],
+                ]
+            ),
+            np.concatenate([approach, middle[1:], back[1:]]),
+        )
+
+
+def smooth_step(x: ArrayLike) -> Vector:
+    """Return the quintic that goes from 0 to 1 with zero rate and acceleration at both ends."""
+    t = np.clip(np.asarray(x, dtype=float), 0.0, 1.0)
+    step: Vector = t**3 * (10 + t * (6 * t - 15))
+    return step
+
+
+def quintic(
+    time: Vector, x0: Vector, v0: Vector, a0: Vector, x1: Vector, v1: Vector, a1: Vector
+) -> Vector:
+    """Return (K, M) samples of the quintic between two states over the span of ``time`` (K,)."""
+    span = float(time[-1])
+    t = (time / span)[:, None]
+    start = (x0, span * v0, span**2 * a0)
+    end = (x1, span * v1, span**2 * a1)
+    difference = end[0] - start[0] - start[1] - 0.5 * start[2]
+    slope = end[1] - start[1] - start[2]
+    bow = end[2] - start[2]
+    c3 = 10 * difference - 4 * slope + 0.5 * bow
+    c4 = -15 * difference + 7 * slope - bow
+    c5 = 6 * difference - 3 * slope + 0.5 * bow
+    result: Vector = start[0] + t * (start[1] + t * (0.5 * start[2] + t * (c3 + t * (c4 + t * c5))))
+    return result
+
+
+def _on_grid(span: float) -> float:
+    """Return a span rounded up to whole control periods."""
+    return math.ceil(span / CONTROL_PERIOD - 1e-9) * CONTROL_PERIOD
+
+
+def _fine_grid(span: float) -> Vector:
+    """Return evenly spaced instants from 0 to span, about 10 ms apart."""
+    return np.linspace(0.0, span, max(2, round(span / _GRID) + 1))
+
+
+def _travel_time(limb: Limb, state: tuple[Vector, Vector, Vector]) -> float:
+    """Return how long the limb takes between rest and a state, at half of its slew limit [s]."""
+    fastest = 0.5 * limb.pneumatics.slew_limit * limb.static_gain
+    angle, rate, acceleration = (np.abs(part) for part in state)
+    by_angle = np.max(1.875 * angle / fastest)
+    by_rate = np.max(np.sqrt(angle * 0) + 2 * rate / fastest)
+    by_acceleration = np.max(np.sqrt(acceleration / fastest))
+    return _on_grid(max(1.0, by_angle, by_rate, by_acceleration))

@@ -1,0 +1,210 @@
+"""Paths of the tip: read, checked, timed within stated limits, and resampled."""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import PchipInterpolator, make_interp_spline
+
+from der_planner.planning.errors import PlanningError
+
+Vector = NDArray[np.float64]
+
+LONGEST = 3600.0
+
+
+@dataclass(frozen=True)
+class PathLimits:
+    """How fast the tip may go along a path that comes without times.
+
+    Attributes:
+        speed: [m/s].
+        acceleration: along and across the path [m/s²].
+    """
+
+    speed: float = 0.03
+    acceleration: float = 0.05
+
+
+@dataclass(frozen=True)
+class TipPath:
+    """A timed path of the tip.
+
+    Attributes:
+        time: (P,) increasing, from 0 [s].
+        tip: (P, 2) [m].
+        exact: take straight lines between the points (polygons) instead of a smooth curve.
+    """
+
+    time: Vector
+    tip: Vector
+    exact: bool = False
+
+    @classmethod
+    def build(
+        cls, time: ArrayLike | None, tip: ArrayLike, limits: PathLimits | None = None
+    ) -> TipPath:
+        """Check a path, and time it if it has no times.
+
+        Raises:
+            PlanningError: what was expected and what came.
+        """
+        points = np.asarray(tip, dtype=float)
+        if points.ndim != 2 or points.shape[1] != 2 or len(points) < 2:
+            raise PlanningError(
+                f"a tip path needs two or more points as (P, 2) numbers in m, got shape {points.shape}"
+            )
+        if not np.all(np.isfinite(points)):
+            row = int(np.argmax(~np.isfinite(points).all(axis=1)))
+            raise PlanningError(f"point {row} of the tip path is not finite: {points[row]}")
+        if time is None:
+            return time_path(points, limits or PathLimits())
+        instants = np.asarray(time, dtype=float)
+        if instants.shape != (len(points),):
+            raise PlanningError(
+                f"a tip path of {len(points)} points needs as many times, got shape {instants.shape}"
+            )
+        steps = np.diff(instants)
+        if not np.all(np.isfinite(instants)) or np.any(steps <= 0):
+            row = int(np.argmax(~(steps > 0))) + 1
+            raise PlanningError(
+                f"times of a tip path must increase: point {row} is at {instants[row]} s, "
+                f"the one before at {instants[row - 1]} s"
+            )
+        if instants[-1] - instants[0] > LONGEST:
+            raise PlanningError(
+                f"the tip path lasts {instants[-1] - instants[0]:.0f} s, the longest is {LONGEST:.0f} s"
+            )
+        return cls(instants - instants[0], points)
+
+    @property
+    def duration(self) -> float:
+        """From the first to the last point [s]."""
+        return float(self.time[-1])
+
+    def resample(self, step: float) -> tuple[Vector, Vector]:
+        """Return instants about ``step`` apart and the points (K, 2) there."""
+        instants = np.linspace(0.0, self.duration, max(8, round(self.duration / step) + 1))
+        if self.exact or len(self.time) < 4:
+            points = np.column_stack([np.interp(instants, self.time, axis) for axis in self.tip.T])
+        else:
+            points = make_interp_spline(self.time, self.tip, k=3)(instants)
+        return instants, points
+
+
+def time_path(points: Vector, limits: PathLimits) -> TipPath:
+    """Time a path: rest at both ends, no faster than the limits along and across it.
+
+    The curve is a spline over its chord length; the speed profile is the largest that keeps the
+    centripetal acceleration v²/r and the acceleration along the path below the limit, found by a
+    forward and a backward pass over the curve.
+
+    Raises:
+        PlanningError: limits that are not positive, or a path of no length.
+    """
+    if not (limits.speed > 0 and limits.acceleration > 0):
+        raise PlanningError(f"speed and acceleration limits must be positive, got {limits}")
+    chords = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    kept = np.concatenate([[True], chords > 1e-9])
+    points = points[kept]
+    chord = np.concatenate([[0.0], np.cumsum(chords[chords > 1e-9])])
+    if len(points) < 2:
+        raise PlanningError("all points of the tip path coincide: it has no length")
+    spline = make_interp_spline(chord, points, k=min(3, len(points) - 1))
+    count = int(np.clip(chord[-1] / 2e-4, 200, 20000))
+    s = np.linspace(0.0, chord[-1], count)
+    curve = spline(s)
+    first, second = spline(s, 1), spline(s, 2)
+    stretch = np.linalg.norm(first, axis=1)
+    cross = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
+    bend = cross / np.maximum(stretch, 1e-9) ** 3
+    speed = np.minimum(limits.speed, np.sqrt(limits.acceleration / np.maximum(bend, 1e-9)))
+    steps = np.linalg.norm(np.diff(curve, axis=0), axis=1)
+    speed[0] = speed[-1] = 0.0
+    for k in range(count - 1):
+        reach = math.sqrt(speed[k] ** 2 + 2 * limits.acceleration * steps[k])
+        speed[k + 1] = min(speed[k + 1], reach)
+    for k in range(count - 2, -1, -1):
+        reach = math.sqrt(speed[k + 1] ** 2 + 2 * limits.acceleration * steps[k])
+        speed[k] = min(speed[k], reach)
+    durations = 2 * steps / np.maximum(speed[1:] + speed[:-1], 1e-9)
+    time = np.concatenate([[0.0], np.cumsum(durations)])
+    if time[-1] > LONGEST:
+        raise PlanningError(
+            f"at {limits.speed} m/s the tip path lasts {time[-1]:.0f} s, the longest is {LONGEST:.0f} s"
+        )
+    grid = np.linspace(0.0, time[-1], max(20, round(time[-1] / 0.02) + 1))
+    along = PchipInterpolator(time, s)(grid)
+    along = _smoothed(along, window=max(1, round(0.2 / (grid[1] - grid[0]))))
+    return TipPath(grid, spline(along))
+
+
+def polygon(corners: Vector, period: float) -> TipPath:
+    """Return the timed path along straight lines that rests at every corner.
+
+    Each side takes a share of the period in proportion to its length, with a quintic from rest to rest.
+    """
+    lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    shares = lengths / lengths.sum() * period
+    times, points = [np.zeros(1)], [corners[:1]]
+    start = 0.0
+    for corner, following, share in zip(corners[:-1], corners[1:], shares, strict=True):
+        local = np.linspace(0.0, 1.0, max(10, round(share / 0.02)) + 1)[1:]
+        step = local**3 * (10 + local * (6 * local - 15))
+        times.append(start + share * local)
+        points.append(corner + step[:, None] * (following - corner))
+        start += share
+    return TipPath(np.concatenate(times), np.concatenate(points), exact=True)
+
+
+def _smoothed(values: Vector, window: int) -> Vector:
+    """Return a running mean over 2 window + 1 samples; the ends stay where they are."""
+    padded = np.concatenate([np.full(window, values[0]), values, np.full(window, values[-1])])
+    total = np.concatenate([[0.0], np.cumsum(padded)])
+    width = 2 * window + 1
+    mean: Vector = (total[width:] - total[:-width]) / width
+    mean[0], mean[-1] = values[0], values[-1]
+    return mean
+
+
+def read_csv(path: str | Path) -> tuple[Vector | None, Vector]:
+    """Read a tip path: a header with x and y [m], and time [s] if the path is timed.
+
+    Raises:
+        PlanningError: no such file, no such column, not a number; the message names line and column.
+    """
+    try:
+        with Path(path).open(newline="") as stream:
+            reader = csv.DictReader(stream, skipinitialspace=True)
+            columns = [name.strip().lower() for name in reader.fieldnames or []]
+            missing = [name for name in ("x", "y") if name not in columns]
+            if missing:
+                raise PlanningError(
+                    f"{path} has no column '{missing[0]}': the first line must name x, y "
+                    f"and, for a timed path, time; it names {columns or 'nothing'}"
+                )
+            wanted = ["time", "x", "y"] if "time" in columns else ["x", "y"]
+            rows = []
+            for row in reader:
+                named = {(key or "").strip().lower(): value for key, value in row.items()}
+                rows.append([_number(named[name], name, path, reader.line_num) for name in wanted])
+    except OSError as error:
+        raise PlanningError(f"cannot read tip path {path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise PlanningError(f"cannot read tip path {path}: it is not text ({error})") from error
+    table = np.array(rows, dtype=float).reshape(-1, len(wanted))
+    return (table[:, 0] if len(wanted) == 3 else None), table[:, -2:]
+
+
+def _number(text: object, column: str, path: str | Path, line: int) -> float:
+    try:
+        return float(str(text))
+    except ValueError:
+        raise PlanningError(
+            f"{path}, line {line}: column '{column}' is not a number: {text!r}"
+        ) from None

@@ -1,0 +1,157 @@
+"""`plan`: from a limb and a motion to timed pressures."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import BSpline
+
+from der_planner import actuation
+from der_planner.limb import Limb
+from der_planner.planning import models, pneumatics
+from der_planner.planning.errors import PlanningError
+from der_planner.planning.models import METHODS, PlanningModel
+from der_planner.planning.motions import CONTROL_PERIOD, Motion, Reference, sample_spline
+from der_planner.planning.result import Plan
+from der_planner.planning.rod_model import NODES
+
+Vector = NDArray[np.float64]
+
+DEFAULT_METHOD = {"der": "projected", "pcc": "paper"}
+SUBSTEPS = 5
+"""Integrator steps a control period: 10 ms."""
+_FINE = 5
+"""Points of the feedforward's grid a control period."""
+
+
+def plan(
+    limb: Limb,
+    motion: Motion,
+    model: str = "der",
+    method: str = "",
+    *,
+    nodes: int = NODES,
+    initial: ArrayLike | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Plan:
+    """Plan the chamber pressures for a motion.
+
+    Args:
+        limb: the robot.
+        motion: what the tip should do.
+        model: ``der`` (discrete elastic rod) or ``pcc`` (constant curvature).
+        method: ``paper``, ``projected`` or ``optimal`` for the rod, ``paper`` for PCC; empty takes the
+            model's default.
+        nodes: of the rod.
+        initial: (M,) differential pressure in force when the plan begins [Pa]; vented if None.
+        progress: called with the share that is done, 0 … 1.
+
+    Returns:
+        The plan; its `warnings` say where limits cut the wanted pressures.
+
+    Raises:
+        PlanningError: unknown model or method.
+        UnreachableError: a point is out of reach or needs more pressure than allowed.
+    """
+    begin = clock.perf_counter()
+    method = choose_method(model, method)
+    report = progress or (lambda share: None)
+    physics = models.build(limb, model, nodes)
+    reference = motion.reference(limb)
+    report(0.1)
+    spline = physics.configuration(reference)
+    report(0.3)
+    wanted = feedforward(physics, spline, reference, "projected" if method == "optimal" else method)
+    commands, cut = pneumatics.within_limits(wanted, limb.pneumatics, CONTROL_PERIOD, initial)
+    report(0.6)
+    bend = sample_spline(spline, reference.time)[0]
+    tip = predict(physics, spline, commands, initial)
+    report(1.0)
+    return Plan(
+        time=reference.time,
+        differential_pressure=commands,
+        tip_reference=reference.tip,
+        tip_predicted=tip,
+        bend_angles=bend,
+        motion=motion.name,
+        model=model,
+        method=method,
+        amplitude=motion.amplitude,
+        period=motion.period,
+        cycles=motion.cycles,
+        limb=physics.limb,
+        solve_time=clock.perf_counter() - begin,
+        warnings=tuple(_warnings(physics.limb, wanted, bend, cut)),
+    )
+
+
+def choose_method(model: str, method: str) -> str:
+    """Return the method, or the model's default for an empty one.
+
+    Raises:
+        PlanningError: unknown model, or a method that it has not.
+    """
+    if model not in METHODS:
+        raise PlanningError(f"model '{model}' is unknown: choose {' or '.join(METHODS)}")
+    chosen = method or DEFAULT_METHOD[model]
+    if chosen not in METHODS[model]:
+        raise PlanningError(
+            f"the model '{model}' has no method '{method}': choose {', '.join(METHODS[model])}"
+        )
+    return chosen
+
+
+def feedforward(
+    physics: PlanningModel, spline: BSpline, reference: Reference, method: str
+) -> Vector:
+    """Return the commands (K, M) [Pa] that a balance of forces asks for, before any limit."""
+    ahead = CONTROL_PERIOD + physics.limb.pneumatics.delay
+    count = int(np.ceil((reference.duration + ahead) / CONTROL_PERIOD * _FINE)) + 1
+    fine = np.arange(count) * (CONTROL_PERIOD / _FINE)
+    fine[-1] = reference.duration + ahead
+    q, v, a = sample_spline(spline, fine)
+    effective = physics.pressures(method, q, v, a)
+    return pneumatics.commands(physics.limb, fine, effective, q, CONTROL_PERIOD)
+
+
+def predict(
+    physics: PlanningModel, spline: BSpline, commands: Vector, initial: ArrayLike | None = None
+) -> Vector:
+    """Return the tip (K, 2) [m] that the model expects under commands, with the chambers' lag."""
+    air = physics.limb.pneumatics
+    chambers = pneumatics.chamber_pressures(air, commands, CONTROL_PERIOD, SUBSTEPS, initial)
+    return physics.simulate(effective_pressures(physics.limb, spline, chambers), CONTROL_PERIOD)
+
+
+def effective_pressures(limb: Limb, spline: BSpline, chambers: Vector) -> Vector:
+    """Return what the linear model feels, (K, S, M) [Pa], of chamber pressures along a known bend."""
+    count, substeps, inputs = chambers.shape
+    middle = (np.arange(count * substeps) + 0.5) * (CONTROL_PERIOD / substeps)
+    bend = sample_spline(spline, middle)[0]
+    flat = chambers.reshape(-1, inputs)
+    return actuation.effective_pressure(limb, middle, flat, bend).reshape(chambers.shape)
+
+
+def _warnings(limb: Limb, wanted: Vector, bend: Vector, cut: float) -> list[str]:
+    said = []
+    air = limb.pneumatics
+    if cut > 1.0:
+        largest = float(np.abs(wanted).max())
+        fastest = float(np.abs(np.diff(wanted, axis=0)).max(initial=0.0)) / CONTROL_PERIOD
+        said.append(
+            f"limits cut the wanted pressures by up to {cut:.0f} Pa: the motion wants {largest:.0f} Pa "
+            f"and {fastest:.0f} Pa/s, allowed are {air.pressure_limit:.0f} Pa and "
+            f"{air.slew_limit:.0f} Pa/s; a longer period or a smaller amplitude keeps them"
+        )
+    seen = np.array(limb.calibrated.bend_angle)
+    if seen.size == limb.segment_count and np.any(np.abs(bend).max(axis=0) > seen * 1.05):
+        j = int(np.argmax(np.abs(bend).max(axis=0) - seen))
+        said.append(
+            f"segment {j} bends by {np.degrees(np.abs(bend[:, j]).max()):.0f} degrees, its calibration "
+            f"covered {np.degrees(seen[j]):.0f}"
+        )
+    return said
+
