@@ -21,7 +21,7 @@ class StepFactors(NamedTuple):
         viscous: (steps or 0, n, b+1) viscous matrix times rate.
         inputs: (steps, n, M) B(q)Λ.
         inertia: (n,) M·rate² + D·rate. momentum: (n,) M·rate; both zero where fixed.
-        rate: 1/h. extrapolate: 1 for backward Euler, 2 for the midpoint rule.
+        rate: 1/h. extrapolate: (P,) factors e of the stages.
     """
 
     factors: Array
@@ -30,7 +30,7 @@ class StepFactors(NamedTuple):
     inertia: Array
     momentum: Array
     rate: float
-    extrapolate: float
+    extrapolate: Array
 
 
 @dataclass(frozen=True)
@@ -43,12 +43,14 @@ class Linearisation:
 
     Attributes:
         intervals: K. steps: S, integrator steps in an interval.
+        stages: of one integrator step.
         outputs: (P,) indices into q.
         state_indices: indices into q of the free degrees of freedom, for `start` arguments.
     """
 
     intervals: int
     steps: int
+    stages: int
     outputs: NDArray[np.int64]
     state_indices: NDArray[np.int64]
     _stored: StepFactors
@@ -86,10 +88,12 @@ class Linearisation:
             by_step: keep one row for each step, (K, S, M), instead of (K, M).
         """
         weight = array(weights, (self.intervals + 1, len(self.outputs)), "weights")
-        gradient = np.empty((self.intervals, self.steps, self.input_count))
+        gradient = np.empty((self.intervals, self.steps * self.stages, self.input_count))
         start = np.empty((2, self._stored.inertia.shape[0]))
         sensitivity_kernel.adjoint(weight, *self._stored, self._output_rows, gradient, start)
-        return gradient if by_step else gradient.sum(axis=1)
+        if not by_step:
+            return gradient.sum(axis=1)
+        return gradient.reshape(self.intervals, self.steps, self.stages, -1).sum(axis=2)
 
     def sensitivity(self, pulse: ArrayLike | None = None) -> Array:
         """Return ∂output/∂input (K+1, P, K, M) [m/Pa], zero where the input comes later.
@@ -106,7 +110,7 @@ class Linearisation:
             shape = array(pulse, (rows, self.input_count), "pulse")
         out = np.zeros((self.intervals + 1, len(self.outputs), self.intervals, self.input_count))
         sensitivity_kernel.sensitivity(
-            shape, self.intervals, 16, *self._stored, self._output_rows, out
+            np.repeat(shape, self.stages, axis=0), self.intervals, 16, *self._stored, self._output_rows, out
         )
         return out
 
@@ -114,26 +118,27 @@ class Linearisation:
         given = np.asarray(pressures, dtype=np.float64)
         if given.ndim == 2:
             held = array(given, (self.intervals, self.input_count), "pressures")
-            return np.ascontiguousarray(np.repeat(held[:, None, :], self.steps, axis=1))
-        return array(given, (self.intervals, self.steps, self.input_count), "pressures")
+            return np.repeat(held[:, None, :], self.steps * self.stages, axis=1)
+        by_step = array(given, (self.intervals, self.steps, self.input_count), "pressures")
+        return np.repeat(by_step, self.stages, axis=1)
 
 
 def step_matrices(stored: StepFactors, rows: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Return A (2F, 2F) and B (2F, M) of the first stored step on the unknowns `rows`."""
+    """Return A (2F, 2F) and B (2F, M) of all stored stages under one input, on the unknowns `rows`."""
     size = stored.inertia.shape[0]
     count = len(rows)
-    inputs = stored.inputs.shape[2]
-    columns = 2 * count + inputs
+    columns = 2 * count + stored.inputs.shape[2]
     dq = np.zeros((size, columns))
     dv = np.zeros((size, columns))
-    y = np.zeros((size, columns))
     dq[rows, np.arange(count)] = 1.0
     dv[rows, np.arange(count, 2 * count)] = 1.0
-    y[:, 2 * count :] = stored.inputs[0]
-    viscous = stored.viscous[0] if len(stored.viscous) else np.empty((0, 1))
-    sensitivity_kernel.advance(
-        dq, dv, y, stored.factors[0], viscous, stored.inertia, stored.momentum, stored.rate,
-        stored.extrapolate,
-    )  # fmt: skip
+    for stage in range(len(stored.factors)):
+        y = np.zeros((size, columns))
+        y[:, 2 * count :] = stored.inputs[stage]
+        viscous = stored.viscous[stage] if len(stored.viscous) else np.empty((0, 1))
+        sensitivity_kernel.advance(
+            dq, dv, y, stored.factors[stage], viscous, stored.inertia, stored.momentum, stored.rate,
+            float(stored.extrapolate[stage]),
+        )  # fmt: skip
     both = np.concatenate([dq[rows], dv[rows]])
     return both[:, : 2 * count], both[:, 2 * count :]

@@ -106,7 +106,7 @@ class PlanarBackend:
         state: RodState,
         pressures: Array,
         h: float,
-        extrapolate: float,
+        extrapolate: Array,
         load: Array,
         tolerance: float,
         limit: int,

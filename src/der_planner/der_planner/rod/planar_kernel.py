@@ -309,9 +309,9 @@ def simulate(
 ):  # fmt: skip
     """Run K intervals of S steps from q[0], v[0] into q, v (K+1, 2n).
 
-    Each step solves backward Euler over h and goes on to x_n + extrapolate·(x − x_n): 1 is backward
-    Euler, 2 with h = dt/2 the implicit midpoint rule. pressures is (K, S, M). factors (K·S, 2n, 11),
-    viscous_bands (K·S or 0, 2n, 6) and inputs (K·S, 2n, M) receive the linearisation unless empty.
+    Each step solves backward Euler over h and goes on to x_n + e (x − x_n) with e = extrapolate[step
+    modulo its length] (P,). pressures is (K, S, M). factors (K·S, 2n, 11), viscous_bands (K·S or 0, 2n, 6)
+    and inputs (K·S, 2n, M) receive the linearisation unless empty.
 
     Returns (steps done, Newton iterations, last update, iterations of the failed step or 0).
     """
@@ -357,11 +357,12 @@ def simulate(
                 factor_general(factors[index])
                 if viscous_bands.shape[0] > 0:
                     viscous_bands[index] = band
+            e = extrapolate[index % extrapolate.shape[0]]
             for d in range(size):
                 velocity = (x[d] - x_n[d]) * rate
                 acceleration[d] = (velocity - v_n[d]) * rate
-                x_n[d] += extrapolate * (x[d] - x_n[d])
-                v_n[d] += extrapolate * (velocity - v_n[d])
+                x_n[d] += e * (x[d] - x_n[d])
+                v_n[d] += e * (velocity - v_n[d])
         q[k + 1] = x_n
         v[k + 1] = v_n
     return intervals * steps, total, 0.0, 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Literal
 
@@ -17,7 +18,7 @@ from der_planner.rod.spatial import SpatialBackend
 from der_planner.rod.state import Array, RodState, Trajectory, positions_of
 from der_planner.rod.statics import even_bend, find_equilibrium
 
-Method = Literal["midpoint", "backward_euler"]
+Method = Literal["sdirk2", "midpoint", "backward_euler"]
 Plane = Literal["xy", "xz"]
 
 
@@ -157,7 +158,7 @@ class Rod:
         state: RodState,
         u: ArrayLike,
         dt: float,
-        method: Method = "midpoint",
+        method: Method = "sdirk2",
         *,
         forces: ArrayLike | None = None,
         halvings: int = 0,
@@ -165,6 +166,13 @@ class Rod:
         """Advance by dt [s] under constant pressures u (M,) [Pa] and point forces (N, 3) [N].
 
         Args:
+            state: where the step begins.
+            u: held over the step.
+            dt: length of the step.
+            method: "sdirk2" (two stages, second order, damps what the step cannot resolve), "midpoint"
+                (second order, one solve, keeps energy, unstable when a step turns an edge far while
+                stretching is undamped) or "backward_euler" (first order, robust).
+            forces: on the nodes.
             halvings: how often a step that does not converge may be cut in two.
 
         Raises:
@@ -188,7 +196,7 @@ class Rod:
         dt: float,
         *,
         substeps: int = 1,
-        method: Method = "midpoint",
+        method: Method = "sdirk2",
         forces: ArrayLike | None = None,
         linearise: bool = False,
         outputs: Sequence[int] | None = None,
@@ -200,7 +208,7 @@ class Rod:
             pressures: (K, M) held over each interval, or (K, substeps, M) one for each step [Pa].
             dt: length of an interval [s].
             substeps: S, integrator steps in an interval.
-            method: integrator.
+            method: as in `step`.
             forces: (N, 3) constant point forces [N].
             linearise: also keep the exact linearisation of every step: `Trajectory.linearisation` has
                 `.tangent(pressure change) -> output change`, `.adjoint(output weight) -> gradient` and
@@ -226,7 +234,7 @@ class Rod:
         if linearise and run.factors is not None:
             wanted = self._output_indices(outputs)
             linearisation = Linearisation(
-                intervals, substeps, wanted, self.free, run.factors,
+                intervals, substeps, len(_STAGES[method][1]), wanted, self.free, run.factors,
                 self._backend.rows(wanted), self._backend.free_rows,
             )  # fmt: skip
         time = dt * np.arange(intervals + 1)
@@ -287,7 +295,7 @@ class Rod:
         state: RodState,
         u: ArrayLike,
         dt: float,
-        method: Method = "midpoint",
+        method: Method = "sdirk2",
         *,
         forces: ArrayLike | None = None,
     ) -> tuple[Array, Array]:
@@ -328,17 +336,19 @@ class Rod:
         load: Array,
         linearise: bool = False,
     ) -> Run:
-        require(method in _EXTRAPOLATE, "method", f"one of {sorted(_EXTRAPOLATE)}", method)
-        extrapolate = _EXTRAPOLATE[method]
+        require(method in _STAGES, "method", f"one of {sorted(_STAGES)}", method)
+        fraction, extrapolate = _STAGES[method]
+        if len(extrapolate) > 1:
+            pressures = np.repeat(pressures, len(extrapolate), axis=1)
         run = self._backend.simulate(
-            state, pressures, dt / extrapolate, extrapolate, load, self._tolerance, 30, linearise
+            state, pressures, dt * fraction, extrapolate, load, self._tolerance, 30, linearise
         )
         if run.failed_iterations:
             raise ConvergenceError(
-                f"step {run.steps} of {dt:g} s ({method}) did not converge in "
+                f"step {run.steps // len(extrapolate)} of {dt:g} s ({method}) did not converge in "
                 f"{run.failed_iterations} Newton iterations (last update {run.update:.3g}): "
                 "take a shorter step",
-                step=run.steps, residual=run.update, iterations=run.failed_iterations,
+                step=run.steps // len(extrapolate), residual=run.update, iterations=run.failed_iterations,
                 state=run.final,
             )  # fmt: skip
         return run
@@ -377,7 +387,15 @@ class Rod:
         return wanted
 
 
-_EXTRAPOLATE = {"midpoint": 2.0, "backward_euler": 1.0}
+# Each method is a chain of backward Euler solves over fraction·dt from (q, v), after each of which the
+# state goes on to (q, v) + e ((q', v') − (q, v)). e = 2 is the implicit midpoint rule; γ = 1 − 1/√2 with
+# e = (1 − γ)/γ, then 1, is Alexander's two-stage SDIRK: second order and L-stable.
+_GAMMA = 1.0 - math.sqrt(0.5)
+_STAGES = {
+    "backward_euler": (1.0, np.array([1.0])),
+    "midpoint": (0.5, np.array([2.0])),
+    "sdirk2": (_GAMMA, np.array([(1.0 - _GAMMA) / _GAMMA, 1.0])),
+}
 
 
 def _interleave(of_nodes: Array, of_edges: Array) -> Array:

@@ -1,8 +1,8 @@
 """Compiled sweeps over the stored linearisation of a simulation, for any half-bandwidth.
 
 One step is J y = (M·rate² + D·rate + V) δq + M·rate δv + B δu, then δq' = δq + e (y − δq) and
-δv' = δv + e (rate (y − δq) − δv): e = 1 for backward Euler, 2 for the midpoint rule. `inertia` and
-`momentum` hold the two diagonals (zero where fixed), V is the viscous band, J is stored factored.
+δv' = δv + e (rate (y − δq) − δv), e = extrapolate[step modulo its length] (P,). `inertia` and `momentum`
+hold the two diagonals (zero where fixed), V is the viscous band, J is stored factored.
 """
 
 from __future__ import annotations
@@ -63,7 +63,8 @@ def tangent(change, start, factors, viscous, inputs, inertia, momentum, rate, ex
                     total += inputs[s, i, m] * change[k, step, m]
                 y[i, 0] = total
             band = viscous[s] if viscous.shape[0] > 0 else viscous[:0].reshape(0, 1)
-            advance(dq, dv, y, factors[s], band, inertia, momentum, rate, extrapolate)
+            advance(dq, dv, y, factors[s], band, inertia, momentum, rate,
+                    extrapolate[s % extrapolate.shape[0]])  # fmt: skip
         for p in range(outputs.shape[0]):
             out[k + 1, p] = dq[outputs[p], 0]
 
@@ -83,8 +84,9 @@ def adjoint(
             lq[outputs[p]] += weight[k + 1, p]
         for step in range(steps - 1, -1, -1):
             s = k * steps + step
+            e = extrapolate[s % extrapolate.shape[0]]
             for i in range(size):
-                y[i] = extrapolate * (lq[i] + rate * lv[i])
+                y[i] = e * (lq[i] + rate * lv[i])
             solve_transposed(factors[s], y)
             for m in range(count):
                 total = 0.0
@@ -92,8 +94,8 @@ def adjoint(
                     total += inputs[s, i, m] * y[i]
                 gradient[k, step, m] = total
             for i in range(size):
-                lq[i] = (1.0 - extrapolate) * lq[i] - extrapolate * rate * lv[i] + inertia[i] * y[i]
-                lv[i] = (1.0 - extrapolate) * lv[i] + momentum[i] * y[i]
+                lq[i] = (1.0 - e) * lq[i] - e * rate * lv[i] + inertia[i] * y[i]
+                lv[i] = (1.0 - e) * lv[i] + momentum[i] * y[i]
             if viscous.shape[0] > 0:
                 for i in range(size):
                     for j in range(min(viscous.shape[2], size - i)):
@@ -136,7 +138,8 @@ def sensitivity(
                             for i in range(size):
                                 y[i, (j - begin) * count + m] = inputs[s, i, m] * size_of_pulse
                 band = viscous[s] if viscous.shape[0] > 0 else viscous[:0].reshape(0, 1)
-                advance(dq, dv, y, factors[s], band, inertia, momentum, rate, extrapolate)
+                advance(dq, dv, y, factors[s], band, inertia, momentum, rate,
+                        extrapolate[s % extrapolate.shape[0]])  # fmt: skip
             for p in range(outputs.shape[0]):
                 for c in range(columns):
                     out[k + 1, p, begin + c // count, c % count] = dq[outputs[p], c]
