@@ -139,9 +139,7 @@ class Pcc:
         J, H = np.zeros(q.size, dtype=complex), np.zeros((q.size, q.size), dtype=complex)
         for j, mass in enumerate(self.masses):
             for sigma, weight in zip(self.fractions, self.weights, strict=True):
-                point = kernels.point_derivatives(
-                    q, self.lengths, self.connector, j, sigma, J, H
-                )
+                point = kernels.point_derivatives(q, self.lengths, self.connector, j, sigma, J, H)
                 height = point.real * self.gravity[0] + point.imag * self.gravity[1]
                 potential -= mass * weight * height
         return float(0.5 * v @ M @ v + elastic + potential)
@@ -155,7 +153,9 @@ class Pcc:
         Returns:
             (K, n) differential pressures [Pa].
         """
-        q, v, a = (np.atleast_2d(np.asarray(x, dtype=float)) for x in (angles, rates, accelerations))
+        q, v, a = (
+            np.atleast_2d(np.asarray(x, dtype=float)) for x in (angles, rates, accelerations)
+        )
         torque = self.elastic_torque(q) + self.stiffness * self.material_damping * v
         for k in range(len(q)):
             M, C, D, weight = self._inertia(q[k], v[k])

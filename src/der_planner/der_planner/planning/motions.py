@@ -77,7 +77,11 @@ def sample_spline(spline: BSpline, time: ArrayLike) -> tuple[Vector, Vector, Vec
     inside = ((instants >= first) & (instants <= last))[..., None]
     clipped = np.clip(instants, first, last)
     value: Vector = spline(clipped)
-    return value, np.where(inside, spline(clipped, 1), 0.0), np.where(inside, spline(clipped, 2), 0.0)
+    return (
+        value,
+        np.where(inside, spline(clipped, 1), 0.0),
+        np.where(inside, spline(clipped, 2), 0.0),
+    )
 
 
 def resting_spline(time: ArrayLike, values: ArrayLike) -> BSpline:

@@ -83,6 +83,7 @@ def plan(
         period=motion.period,
         cycles=motion.cycles,
         limb=physics.limb,
+        kinematics=physics.kinematics,
         solve_time=clock.perf_counter() - begin,
         warnings=tuple(_warnings(physics.limb, wanted, bend, cut)),
     )
@@ -154,4 +155,3 @@ def _warnings(limb: Limb, wanted: Vector, bend: Vector, cut: float) -> list[str]
             f"covered {np.degrees(seen[j]):.0f}"
         )
     return said
-

@@ -42,7 +42,11 @@ def commands(limb: Limb, time: Vector, effective: Vector, bend: Vector, period: 
 
 
 def chamber_pressures(
-    air: Pneumatics, command: ArrayLike, period: float, substeps: int, initial: ArrayLike | None = None
+    air: Pneumatics,
+    command: ArrayLike,
+    period: float,
+    substeps: int,
+    initial: ArrayLike | None = None,
 ) -> Vector:
     """Return the differential pressures in the chambers (K, S, M) [Pa], in the middle of each substep.
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.limb import Limb
+from der_planner.planning.kinematics import Kinematics
 
 Vector = NDArray[np.float64]
 
@@ -25,6 +26,7 @@ class Plan:
         motion, model, method: what was asked for.
         amplitude, period, cycles: of the motion; 0, 0 and 1 for a path.
         limb: the robot it was made for.
+        kinematics: of the model, for drawing.
         solve_time: wall time of the planning [s].
         warnings: sentences: limits that cut the wanted pressures, ranges that were left.
         details: numbers of the method: iterations, cost, Newton steps.
@@ -42,9 +44,14 @@ class Plan:
     period: float
     cycles: int
     limb: Limb
+    kinematics: Kinematics
     solve_time: float
     warnings: tuple[str, ...] = ()
     details: dict[str, float] = field(default_factory=dict)
+
+    def curve(self, index: int) -> Vector:
+        """Return the centreline (P, 2) [m] of the reference configuration at a setpoint."""
+        return self.kinematics.curve(self.bend_angles[index])
 
     @property
     def error(self) -> Vector:
