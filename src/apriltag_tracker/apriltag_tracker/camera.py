@@ -184,17 +184,6 @@ class CameraPose:
         result: NDArray[np.float64] = origin[:2] + scale[:, None] * directions[:, :2]
         return result
 
-    def plane_jacobian(self, rays: NDArray[np.float64], height: float) -> NDArray[np.float64]:
-        """Return the derivative of `onto_plane` by the normalised coordinates, (n, 2, 2) m."""
-        directions = rays @ self.rotation[:2] + self.rotation[2]
-        gap = height - self.position[2]
-        jacobian = np.empty((len(rays), 2, 2))
-        for axis in range(2):
-            slope = self.rotation[axis]
-            numerator = slope[:2] * directions[:, 2:3] - directions[:, :2] * slope[2]
-            jacobian[:, :, axis] = gap * numerator / directions[:, 2:3] ** 2
-        return jacobian
-
 
 def project(
     intrinsics: Intrinsics, pose: CameraPose, points: NDArray[np.float64]

@@ -30,7 +30,7 @@ class Tag:
         covariance: (8, 8) px² of the corners x0 y0 x1 …, from the scatter of the edge points.
         line_residual: RMS distance of the edge points from the four lines [px].
         edge_share: share of the border's profiles that took part, of the worst side.
-        contrast: white minus black at the border [grey levels].
+        contrast: white minus black at the weakest side of the border [grey levels].
         found_by: `full`, `tracked` or `region`.
     """
 
@@ -56,36 +56,8 @@ class Tag:
     @property
     def pixel_size(self) -> float:
         """Mean length of the sides [px]."""
-        return float(np.mean(np.hypot(*(np.roll(self.corners, -1, axis=0) - self.corners).T)))
-
-
-def corner_covariance(
-    corners: NDArray[np.float64], stats: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Propagate the variances of four lines to the corners they meet in.
-
-    Args:
-        corners: (4, 2) px.
-        stats: (4, 6) per side, from `edges.refine_quads`.
-
-    Returns:
-        (8, 8) px². A line that moves by δ along its normal n moves a corner, where it meets a line
-        of direction t, by t δ / (t·n).
-    """
-    spread = np.zeros((8, 8))
-    for side in range(4):
-        start, end = side, (side + 1) % 4
-        direction = np.array([math.cos(stats[side, 0]), math.sin(stats[side, 0])])
-        normal = np.array([-direction[1], direction[0]])
-        moves = np.zeros((8, 2))
-        half = 0.5 * math.hypot(*(corners[end] - corners[start]))
-        for corner, other, lever in ((start, (side + 3) % 4, -half), (end, end, half)):
-            along = np.array([math.cos(stats[other, 0]), math.sin(stats[other, 0])])
-            gain = along / (along @ normal)
-            moves[2 * corner : 2 * corner + 2, 0] = gain
-            moves[2 * corner : 2 * corner + 2, 1] = gain * lever
-        spread += moves @ np.diag(stats[side, 1:3]) @ moves.T
-    return spread
+        a, b, c, d = self.corners.tolist()
+        return (math.dist(a, b) + math.dist(b, c) + math.dist(c, d) + math.dist(d, a)) / 4.0
 
 
 def refine(
@@ -97,21 +69,6 @@ def refine(
     found = np.zeros(len(quads), dtype=np.bool_)
     edges.refine_quads(gray, quads, search, corners, stats, found)
     return corners, stats, found
-
-
-def make_tag(
-    tag: int, corners: NDArray[np.float64], stats: NDArray[np.float64], found_by: str
-) -> Tag:
-    """Put one refined tag together."""
-    return Tag(
-        id=tag,
-        corners=corners,
-        covariance=corner_covariance(corners, stats),
-        line_residual=float(np.sqrt(np.mean(stats[:, 3] ** 2))),
-        edge_share=float(np.min(stats[:, 4])),
-        contrast=float(np.median(stats[:, 5])),
-        found_by=found_by,
-    )
 
 
 def grey(image: Any) -> NDArray[np.uint8]:
@@ -193,16 +150,23 @@ class Detector:
         corners, stats, found = refine(image, quads, search)
         distance = np.empty(len(ids), dtype=np.int64)
         edges.hamming_of_quads(image, corners, self._codes[ids], found, distance)
-        tags = []
-        for i, tag in enumerate(ids):
-            if not found[i] or distance[i] > self.correct_bits:
-                continue
-            if not _counter_clockwise(corners[i]):
-                continue
-            result = make_tag(int(tag), corners[i], stats[i], found_by)
-            if result.line_residual <= self.largest_residual:
-                tags.append(result)
-        return tags
+        residuals = np.sqrt(np.mean(stats[:, :, 3] ** 2, axis=1))
+        good = found & (distance <= self.correct_bits) & (residuals <= self.largest_residual)
+        kept = [i for i in np.flatnonzero(good) if _counter_clockwise(corners[i])]
+        spread = np.empty((len(kept), 8, 8))
+        edges.corner_covariances(corners[kept], stats[kept], spread)
+        return [
+            Tag(
+                id=int(ids[i]),
+                corners=corners[i],
+                covariance=spread[k],
+                line_residual=float(residuals[i]),
+                edge_share=float(stats[i, :, 4].min()),
+                contrast=float(stats[i, :, 5].min()),
+                found_by=found_by,
+            )
+            for k, i in enumerate(kept)
+        ]
 
 
 def _counter_clockwise(corners: NDArray[np.float64]) -> bool:

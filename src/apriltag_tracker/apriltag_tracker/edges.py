@@ -19,47 +19,50 @@ MAX_SAMPLES = 96
 EDGE_VALUES = 6
 """Per side: angle, offset variance, angle variance, residual RMS, used fraction, contrast."""
 
-_PROFILE = 17
+_PROFILE = 9
+_FURTHER_PASSES = 3
+_SETTLED = 0.05
+"""A pass that moves no corner further than this is the last one [px]."""
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def sample(image: NDArray[np.uint8], x: float, y: float) -> float:
-    """Return the bilinear intensity, clamped at the image's border."""
-    height, width = image.shape
-    x = min(max(x, 0.0), width - 1.001)
-    y = min(max(y, 0.0), height - 1.001)
-    column, row = int(x), int(y)
+    """Return the bilinear intensity at a point well inside of the image."""
+    column, row = np.uintp(x), np.uintp(y)
     a, b = x - column, y - row
-    top = image[row, column] * (1.0 - a) + image[row, column + 1] * a
-    low = image[row + 1, column] * (1.0 - a) + image[row + 1, column + 1] * a
+    one = np.uintp(1)
+    top = image[row, column] * (1.0 - a) + image[row, column + one] * a
+    low = image[row + one, column] * (1.0 - a) + image[row + one, column + one] * a
     return float(top * (1.0 - b) + low * b)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _inside(image: NDArray[np.uint8], x: float, y: float) -> bool:
+    return bool(0.0 <= x < image.shape[1] - 1.001 and 0.0 <= y < image.shape[0] - 1.001)
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def _crossing(profile: NDArray[np.float64], window: float, coarse: bool) -> tuple[float, float]:
     """Return offset of the edge from the middle of a profile [px] and its contrast."""
-    count = profile.shape[0]
-    step = 2.0 * window / (count - 1)
+    step = 2.0 * window / (_PROFILE - 1)
     if coarse:
         # Squared slopes: pulled less by the cells further in, though a little toward pixel centres.
         weight, moment, contrast = 0.0, 0.0, 0.0
-        for k in range(count - 1):
+        for k in range(_PROFILE - 1):
             slope = profile[k + 1] - profile[k]
             if slope > 0.0:
                 weight += slope * slope
                 moment += slope * slope * (-window + (k + 0.5) * step)
                 contrast += slope
         return (moment / weight if weight > 0.0 else 0.0), contrast
-    low = 0.5 * (profile[0] + profile[1])
-    high = 0.5 * (profile[count - 1] + profile[count - 2])
+    low, high = profile[0], profile[_PROFILE - 1]
     contrast = high - low
     if contrast <= 1.0:
         return 0.0, contrast
-    # Black area of the profile; the trapezoid rule from the first to the last sample.
-    area = 0.0
-    for k in range(count):
-        share = (high - profile[k]) / contrast
-        area += share * (0.5 if k in {0, count - 1} else 1.0)
+    # Black area of the profile by the trapezoid rule; the ends are black and white by definition.
+    area = 0.5
+    for k in range(1, _PROFILE - 1):
+        area += (high - profile[k]) / contrast
     return area * step - window, contrast
 
 
@@ -89,13 +92,20 @@ def _fit_side(
     across = np.empty(count)
     contrasts = np.empty(count)
     profile = np.empty(_PROFILE)
+    step_x = 2.0 * window / (_PROFILE - 1) * nx
+    step_y = 2.0 * window / (_PROFILE - 1) * ny
     for i in range(count):
         along[i] = inset + i * spacing - 0.5 * length
         px = 0.5 * (ax + bx) + along[i] * tx
         py = 0.5 * (ay + by) + along[i] * ty
+        x, y = px - window * nx, py - window * ny
+        if not (_inside(image, x, y) and _inside(image, px + window * nx, py + window * ny)):
+            across[i], contrasts[i] = 0.0, 0.0
+            continue
         for k in range(_PROFILE):
-            offset = -window + 2.0 * window * k / (_PROFILE - 1)
-            profile[k] = sample(image, px + offset * nx, py + offset * ny)
+            profile[k] = sample(image, x, y)
+            x += step_x
+            y += step_y
         across[i], contrasts[i] = _crossing(profile, window, coarse)
     typical = np.median(contrasts)
     if typical < 8.0:
@@ -221,9 +231,13 @@ def refine_quads(
         wide = min(max(search, 1.0), 0.9 * cell + 0.4)
         fine = min(max(0.55 * cell, 1.1), 2.5)
         found[i] = _refine_once(image, corners[i], wide, True, stats[i])
-        for _ in range(2):
-            if found[i]:
-                found[i] = _refine_once(image, corners[i], fine, False, stats[i])
+        for _ in range(_FURTHER_PASSES):
+            if not found[i]:
+                break
+            before = corners[i].copy()
+            found[i] = _refine_once(image, corners[i], fine, False, stats[i])
+            if np.abs(corners[i] - before).max() < _SETTLED:
+                break
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -249,6 +263,8 @@ def read_bits(
             w = h[6] * u + h[7] * v + 1.0
             x = (h[0] * u + h[1] * v + h[2]) / w
             y = (h[3] * u + h[4] * v + h[5]) / w
+            if not _inside(image, x, y):
+                return 0.0
             values[row, column] = sample(image, x, y)
     black = 0.0
     for k in range(8):
@@ -321,3 +337,43 @@ def hamming_of_quads(
         distance[i] = 36
         if found[i] and read_bits(image, corners[i], bits) > 0.0:
             distance[i] = hamming(bits, codes[i])
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def corner_covariances(
+    corners: NDArray[np.float64], stats: NDArray[np.float64], spread: NDArray[np.float64]
+) -> None:
+    """Propagate the variances of four lines to the corners they meet in.
+
+    A line of normal n that moves by δ moves a corner, where it meets a line of direction t, by
+    t δ / (t·n).
+
+    Args:
+        corners: (n, 4, 2) px.
+        stats: (n, 4, 6) per side, from `refine_quads`.
+        spread: (n, 8, 8) px², output.
+    """
+    moves = np.empty((4, 2))
+    for i in range(corners.shape[0]):
+        spread[i] = 0.0
+        for side in range(4):
+            end = (side + 1) % 4
+            half = 0.5 * math.hypot(
+                corners[i, end, 0] - corners[i, side, 0], corners[i, end, 1] - corners[i, side, 1]
+            )
+            angle = stats[i, side, 0]
+            for place in range(2):
+                other = (side + 3) % 4 if place == 0 else end
+                tx, ty = math.cos(stats[i, other, 0]), math.sin(stats[i, other, 0])
+                across = -tx * math.sin(angle) + ty * math.cos(angle)
+                lever = -half if place == 0 else half
+                moves[2 * place, 0], moves[2 * place, 1] = tx / across, tx / across * lever
+                moves[2 * place + 1, 0], moves[2 * place + 1, 1] = ty / across, ty / across * lever
+            for a in range(4):
+                row = (2 * side + a) % 8
+                for b in range(4):
+                    column = (2 * side + b) % 8
+                    spread[i, row, column] += (
+                        moves[a, 0] * moves[b, 0] * stats[i, side, 1]
+                        + moves[a, 1] * moves[b, 1] * stats[i, side, 2]
+                    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from apriltag_tracker.camera import CameraPose, Intrinsics
 from apriltag_tracker.detection import Detector, Tag
-from apriltag_tracker.plane import centreline_pose, height_slope, locate
+from apriltag_tracker.plane import centreline_pose, locate
 from apriltag_tracker.shape import LimbEstimate, PlanarTag, ShapeFitter, ShapePrior
 from apriltag_tracker.tag_map import TagMap
 from apriltag_tracker.tracking import TagTracker, TrackingOptions
@@ -102,8 +103,12 @@ class LimbTracker:
         self.tags = tags
         self.intrinsics = intrinsics
         self.options = options or TrackerOptions()
-        wanted = [tag.id for tag in (*tags.limb, *tags.world)]
-        self.tracker = TagTracker(wanted, detector, self.options.tracking)
+        self._limb_tags = {tag.id: tag for tag in tags.limb}
+        self._flat = {tag.id: (tag.height, tag.size) for tag in tags.limb}
+        self._flat.update({tag.id: (tag.position[2], tag.size) for tag in tags.world})
+        self._world_positions = np.array([tag.position[:2] for tag in tags.world]).reshape(-1, 2)
+        self._world_size = max((tag.size for tag in tags.world), default=1.0)
+        self.tracker = TagTracker(self._flat, detector, self.options.tracking)
         self.world = WorldPose(tags, intrinsics)
         uncertainty = self.options.uncertainty
         self.fitter = ShapeFitter(
@@ -152,46 +157,57 @@ class LimbTracker:
     def _place(
         self, found: Sequence[Tag], pose: CameraPose | None
     ) -> tuple[tuple[PlacedTag, ...], list[PlanarTag], NDArray[np.float64]]:
-        placed: list[PlacedTag] = []
-        planar: list[PlanarTag] = []
-        common: list[NDArray[np.float64]] = []
-        for tag in found:
-            entry = self.tags.limb_tag(tag.id)
-            world = self.tags.world_tag(tag.id)
-            on_limb = entry is not None
-            if pose is None or (entry is None and world is None):
-                placed.append(PlacedTag(tag, on_limb, None))
-                continue
-            height = entry.height if entry is not None else world.position[2] if world else 0.0
-            size = entry.size if entry is not None else world.size if world else 0.0
-            place, covariance, misfit = locate(tag, height, size, self.intrinsics, pose)
-            placed.append(PlacedTag(tag, on_limb, place))
-            if entry is None or misfit > self.options.largest_misfit * size:
-                continue
-            centre = centreline_pose(place, entry)
-            planar.append(PlanarTag(tag.id, entry.arc_length, centre, covariance))
-            common.append(self._common_errors(place, height, pose))
-        stacked = np.array(common) if common else np.empty((0, 3, 0))
-        return tuple(placed), planar, stacked
+        """Place all tags on their planes; those of the limb also with their shared errors."""
+        if pose is None or not found:
+            placed = tuple(PlacedTag(tag, tag.id in self._limb_tags, None) for tag in found)
+            return placed, [], np.empty((0, 3, 0))
+        flat = np.array([self._flat[tag.id] for tag in found])
+        places, spreads, misfits = locate(
+            np.array([tag.corners for tag in found]),
+            np.array([tag.covariance for tag in found]),
+            flat[:, 0],
+            flat[:, 1],
+            self.intrinsics,
+            pose,
+        )
+        used = [
+            i
+            for i, tag in enumerate(found)
+            if tag.id in self._limb_tags and misfits[i] <= self.options.largest_misfit * flat[i, 1]
+        ]
+        planar = []
+        for i in used:
+            entry = self._limb_tags[found[i].id]
+            centre = centreline_pose(places[i], entry)
+            planar.append(PlanarTag(entry.id, entry.arc_length, centre, spreads[i]))
+        common = self._common_errors(places[used], flat[used, 0], pose)
+        everywhere = tuple(
+            PlacedTag(tag, tag.id in self._limb_tags, place)
+            for tag, place in zip(found, places, strict=True)
+        )
+        return everywhere, planar, common
 
     def _common_errors(
-        self, place: NDArray[np.float64], height: float, pose: CameraPose
+        self, places: NDArray[np.float64], heights: NDArray[np.float64], pose: CameraPose
     ) -> NDArray[np.float64]:
-        """Return how one tag moves with errors that all tags share, (3, 4): survey x, y, turn; height.
+        """Return how tags move with errors that all of them share, (n, 3, 4).
 
-        The survey's errors average over the fixed tags; its turn is seen from their middle.
+        These are the survey's shift in x and y and its turn, which average over the fixed tags, and
+        the height, which moves a tag away from the point below the camera.
         """
         uncertainty = self.options.uncertainty
-        positions = np.array([tag.position[:2] for tag in self.tags.world])
-        middle = positions.mean(axis=0)
-        spread = np.sqrt(np.sum((positions - middle) ** 2)) or 1.0
-        shift = uncertainty.survey / np.sqrt(len(positions))
-        turn = uncertainty.survey / spread
-        arm = place[:2] - middle
-        moves = np.zeros((3, 4))
-        moves[0, 0] = moves[1, 1] = shift
-        moves[:, 2] = turn * np.array([-arm[1], arm[0], 1.0])
-        moves[:, 3] = uncertainty.height * height_slope(place, height, pose)
+        shift = uncertainty.survey / math.sqrt(len(self._world_positions))
+        middle = self._world_positions.mean(axis=0)
+        spread = math.sqrt(float(np.sum((self._world_positions - middle) ** 2)))
+        # One fixed tag alone says where the base turns to by its own corners only.
+        turn = uncertainty.survey / max(spread, self._world_size)
+        arm = places[:, :2] - middle
+        origin = pose.position
+        moves = np.zeros((len(places), 3, 4))
+        moves[:, 0, 0] = moves[:, 1, 1] = shift
+        moves[:, 0, 2], moves[:, 1, 2], moves[:, 2, 2] = -turn * arm[:, 1], turn * arm[:, 0], turn
+        outward = (places[:, :2] - origin[:2]) / (heights - origin[2])[:, None]
+        moves[:, :2, 3] = uncertainty.height * outward
         return moves
 
     def _remark(self, estimate: LimbEstimate) -> str:

@@ -1,78 +1,142 @@
-"""From corners in the image to poses of tags on their plane."""
+"""From corners in the image to poses of tags on their plane, with the noise carried along."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from apriltag_tracker.camera import CameraPose, Intrinsics
-from apriltag_tracker.detection import Tag
-from apriltag_tracker.tag_map import UNIT_CORNERS, LimbTag
+from apriltag_tracker.lens import undistort_pixels
+from apriltag_tracker.tag_map import LimbTag
 
 
+@njit(cache=True)  # type: ignore[untyped-decorator]
 def planar_pose(
     corners: NDArray[np.float64], size: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Fit a square of known size to four points of a plane.
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Fit a square of known size to four points of a plane (Kabsch 1976, in the plane).
 
     Args:
         corners: (4, 2) m, from the printed lower left counter-clockwise.
         size: edge of the square [m].
 
     Returns:
-        x, y [m], yaw [rad], and the derivative (3, 8) of these by the corners x0 y0 x1 …
+        x, y [m] and yaw [rad]; the derivative (3, 8) of these by the corners x0 y0 x1 …; and the RMS
+        distance of the corners from the square [m].
     """
-    centre = corners.mean(axis=0)
-    shape = UNIT_CORNERS * size
-    centred = corners - centre
-    # Least squares over rotations in the plane (Kabsch): the angle of one complex sum.
-    cosine = float(np.sum(shape * centred))
-    sine = float(np.sum(shape[:, 0] * centred[:, 1] - shape[:, 1] * centred[:, 0]))
+    x = (corners[0, 0] + corners[1, 0] + corners[2, 0] + corners[3, 0]) / 4.0
+    y = (corners[0, 1] + corners[1, 1] + corners[2, 1] + corners[3, 1]) / 4.0
+    half = 0.5 * size
+    cosine, sine = 0.0, 0.0
+    for k in range(4):
+        u = half if k in {1, 2} else -half
+        v = half if k in {2, 3} else -half
+        cosine += u * (corners[k, 0] - x) + v * (corners[k, 1] - y)
+        sine += u * (corners[k, 1] - y) - v * (corners[k, 0] - x)
     squared = cosine * cosine + sine * sine
+    norm = math.sqrt(squared)
     jacobian = np.zeros((3, 8))
-    jacobian[0, 0::2] = 0.25
-    jacobian[1, 1::2] = 0.25
-    # The centroid of the shape is zero, so the mean of the corners does not enter the angle.
-    jacobian[2, 0::2] = (-cosine * shape[:, 1] - sine * shape[:, 0]) / squared
-    jacobian[2, 1::2] = (cosine * shape[:, 0] - sine * shape[:, 1]) / squared
-    return np.array([centre[0], centre[1], np.arctan2(sine, cosine)]), jacobian
+    misfit = 0.0
+    for k in range(4):
+        u = half if k in {1, 2} else -half
+        v = half if k in {2, 3} else -half
+        jacobian[0, 2 * k] = 0.25
+        jacobian[1, 2 * k + 1] = 0.25
+        # The square's own centre is zero, so the mean of the corners does not enter the angle.
+        jacobian[2, 2 * k] = (-cosine * v - sine * u) / squared
+        jacobian[2, 2 * k + 1] = (cosine * u - sine * v) / squared
+        gap_x = corners[k, 0] - x - (cosine * u - sine * v) / norm
+        gap_y = corners[k, 1] - y - (sine * u + cosine * v) / norm
+        misfit += gap_x * gap_x + gap_y * gap_y
+    return np.array([x, y, math.atan2(sine, cosine)]), jacobian, math.sqrt(misfit / 4.0)
 
 
-def square_misfit(corners: NDArray[np.float64], size: float) -> float:
-    """Return the RMS distance of four points of a plane from a square of known size [m]."""
-    pose, _ = planar_pose(corners, size)
-    cosine, sine = np.cos(pose[2]), np.sin(pose[2])
-    placed = UNIT_CORNERS @ np.array([[cosine, sine], [-sine, cosine]]) * size + pose[:2]
-    return float(np.sqrt(np.mean(np.sum((placed - corners) ** 2, axis=1))))
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _locate(
+    corners: NDArray[np.float64],
+    covariances: NDArray[np.float64],
+    heights: NDArray[np.float64],
+    sizes: NDArray[np.float64],
+    matrix: NDArray[np.float64],
+    distortion: NDArray[np.float64],
+    rotation: NDArray[np.float64],
+    origin: NDArray[np.float64],
+    places: NDArray[np.float64],
+    spreads: NDArray[np.float64],
+    misfits: NDArray[np.float64],
+) -> None:
+    on_plane = np.empty((4, 2))
+    for i in range(corners.shape[0]):
+        rays = undistort_pixels(corners[i], matrix, distortion)
+        slopes = np.zeros((8, 8))
+        gap = heights[i] - origin[2]
+        for k in range(4):
+            direction = rays[k, 0] * rotation[0] + rays[k, 1] * rotation[1] + rotation[2]
+            for row in range(2):
+                on_plane[k, row] = origin[row] + gap * direction[row] / direction[2]
+                for axis in range(2):
+                    # The lens bends little across a tag: the focal length is the slope of the rays.
+                    change = rotation[axis, row] * direction[2]
+                    change -= direction[row] * rotation[axis, 2]
+                    slopes[2 * k + row, 2 * k + axis] = (
+                        gap * change / direction[2] ** 2 / matrix[axis, axis]
+                    )
+        place, by_corners, misfit = planar_pose(on_plane, sizes[i])
+        gain = by_corners @ slopes
+        places[i] = place
+        spreads[i] = gain @ covariances[i] @ gain.T
+        misfits[i] = misfit
 
 
 def locate(
-    tag: Tag, height: float, size: float, intrinsics: Intrinsics, pose: CameraPose
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Place a tag that lies flat at a known height.
+    corners: NDArray[np.float64],
+    covariances: NDArray[np.float64],
+    heights: NDArray[np.float64],
+    sizes: NDArray[np.float64],
+    intrinsics: Intrinsics,
+    pose: CameraPose,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Place tags that lie flat at known heights.
+
+    Args:
+        corners: (n, 4, 2) px.
+        covariances: (n, 8, 8) px² of the corners.
+        heights: (n,) m above the base plane.
+        sizes: (n,) m, edges of the black borders.
+        intrinsics: of the camera.
+        pose: of the camera.
 
     Returns:
-        x, y [m], yaw [rad]; their (3, 3) covariance from the noise of the corners; and the misfit of
-        the corners to a square of the tag's size [m].
+        Poses (n, 3) x, y [m], yaw [rad]; their (n, 3, 3) covariance from the noise of the corners;
+        and the RMS misfit (n,) of the corners to a square of the tag's size [m].
     """
-    rays = intrinsics.rays(tag.corners)
-    on_plane = pose.onto_plane(rays, height)
-    place, by_corners = planar_pose(on_plane, size)
-    # Pixels to rays: the lens bends little across a tag, so the focal length is the slope.
-    by_rays = pose.plane_jacobian(rays, height)
-    slopes = np.zeros((8, 8))
-    scale = np.diag(1.0 / np.diag(intrinsics.matrix)[:2])
-    for k in range(4):
-        slopes[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = by_rays[k] @ scale
-    gain = by_corners @ slopes
-    return place, gain @ tag.covariance @ gain.T, square_misfit(on_plane, size)
+    count = len(corners)
+    places, spreads = np.empty((count, 3)), np.empty((count, 3, 3))
+    misfits = np.empty(count)
+    _locate(
+        np.ascontiguousarray(corners),
+        covariances,
+        heights,
+        sizes,
+        intrinsics.matrix,
+        intrinsics.distortion,
+        np.ascontiguousarray(pose.rotation),
+        pose.position,
+        places,
+        spreads,
+        misfits,
+    )
+    return places, spreads, misfits
 
 
 def centreline_pose(place: NDArray[np.float64], tag: LimbTag) -> NDArray[np.float64]:
     """Take the mounting offset off a tag's pose: the centreline's pose at its arc length, (3,)."""
     along, across, turn = tag.offset
     heading = place[2] - turn
-    cosine, sine = np.cos(heading), np.sin(heading)
+    cosine, sine = math.cos(heading), math.sin(heading)
     return np.array(
         [
             place[0] - cosine * along + sine * across,
@@ -80,12 +144,3 @@ def centreline_pose(place: NDArray[np.float64], tag: LimbTag) -> NDArray[np.floa
             heading,
         ]
     )
-
-
-def height_slope(
-    place: NDArray[np.float64], height: float, pose: CameraPose
-) -> NDArray[np.float64]:
-    """Return how a tag's pose moves with an error of its height, (3,) m/m: radially from the camera."""
-    origin = pose.position
-    shift = (place[:2] - origin[:2]) / (height - origin[2])
-    return np.array([shift[0], shift[1], 0.0])
