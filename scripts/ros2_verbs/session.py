@@ -19,9 +19,10 @@ from rclpy.validate_full_topic_name import validate_full_topic_name
 from ros2_verbs.cli import CommandError
 
 HIDDEN_PREFIX = "_"
-_AT_LEAST, _AT_MOST = 3.3, 6.0
-"""How long discovery lasts [s]. Fast DDS repeats its announcements every 3 s, and the answer to the
-first ones of a new participant may stay away: a shorter look misses nodes now and then."""
+_AT_LEAST, _AT_MOST = 1.5, 6.0
+"""How long discovery lasts [s]. The answer to the first announcements of a new participant may stay
+away; it then sees the others when these announce themselves again: the nodes of this workspace
+every 0.5 s, by the profile in FASTRTPS_DEFAULT_PROFILES_FILE, but others every 3 s."""
 _QUIET, _QUIET_WHEN_FOUND = 0.5, 0.2
 """For how long nothing new must have come [s]."""
 
@@ -32,7 +33,8 @@ def add_session_arguments(parser: argparse.ArgumentParser) -> None:
         "--spin-time",
         type=float,
         metavar="SPIN_TIME",
-        help="Spin time in seconds to wait for discovery (default: until nothing new appears)",
+        help="Spin time in seconds to wait for discovery (default: until nothing new appears, at "
+        "least 1.5; nodes from outside of this workspace may need 4)",
     )
     parser.add_argument(
         "-s", "--use-sim-time", action="store_true", help="Enable ROS simulation time"

@@ -21,17 +21,19 @@ COMMAND = ROOT / "scripts" / "ros2"
 sys.path.insert(0, str(ROOT / "scripts"))
 DOMAIN = int(os.environ.get("TEST_DOMAIN_ID", 21 + os.getpid() % 80))
 TIMEOUT = 120.0
+# Where the real tool is installed, the stand-in is tested all the same.
+ENVIRONMENT = {**os.environ, "ROS_DOMAIN_ID": str(DOMAIN), "DER_LIMB_ROS2_HANDED_OVER": "1"}
 
 
-def ros2(*arguments: str, timeout: float = TIMEOUT, **environment: str):
+def ros2(*arguments: str, **environment: str):
     """Run the command to its end; returns exit code, stdout and stderr."""
     return subprocess.run(
         [COMMAND, *arguments],
         capture_output=True,
         text=True,
-        timeout=timeout,
+        timeout=TIMEOUT,
         check=False,
-        env={**os.environ, "ROS_DOMAIN_ID": str(DOMAIN), **environment},
+        env={**ENVIRONMENT, **environment},
     )
 
 
@@ -41,7 +43,7 @@ def start(*arguments: str) -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env={**os.environ, "ROS_DOMAIN_ID": str(DOMAIN)},
+        env=ENVIRONMENT,
     )
 
 
@@ -467,7 +469,7 @@ def test_run_becomes_the_executable(prefix: Path):
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
-        env={**os.environ, "AMENT_PREFIX_PATH": str(prefix)},
+        env={**ENVIRONMENT, "AMENT_PREFIX_PATH": str(prefix)},
     )
     try:
         # The same process, so that signals to it reach the node.
@@ -491,7 +493,10 @@ def test_run_names_executables_that_exist_twice(prefix: Path):
 
 
 @pytest.mark.parametrize("works", [True, False])
-def test_hands_over_to_a_real_tool_that_works(tmp_path: Path, works: bool):
+def test_hands_over_to_a_real_tool_that_works(
+    tmp_path: Path, works: bool, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.delitem(ENVIRONMENT, "DER_LIMB_ROS2_HANDED_OVER")
     real = tmp_path / "ros2"
     real.write_text(f'#!/bin/sh\necho "real $* $DER_LIMB_WORKSPACE"\nexit {0 if works else 1}\n')
     real.chmod(0o755)
@@ -506,7 +511,11 @@ def test_hands_over_to_a_real_tool_that_works(tmp_path: Path, works: bool):
 def test_enters_the_workspace_by_itself(tmp_path: Path):
     outside = SimpleNamespace(
         python=Path(sys.base_prefix) / "bin" / f"python3.{sys.version_info.minor}",
-        environment={"PATH": "/usr/bin:/bin", "HOME": str(tmp_path)},
+        environment={
+            "PATH": "/usr/bin:/bin",
+            "HOME": str(tmp_path),
+            "DER_LIMB_ROS2_HANDED_OVER": "1",
+        },
     )
     result = subprocess.run(
         [outside.python, COMMAND, "service", "call", "/s", "der_msgs/srv/Nothing"],
