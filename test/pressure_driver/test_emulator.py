@@ -1,0 +1,221 @@
+"""The emulated board: its air against what a real limb does, its faults, its port."""
+
+import contextlib
+import os
+import select
+
+import numpy as np
+import pytest
+
+from pressure_driver.emulator.board import EmulatedBoard
+from pressure_driver.emulator.faults import FaultError, Faults
+from pressure_driver.emulator.pneumatics import Pneumatics
+from pressure_driver.emulator.port import EmulatedPort
+from pressure_driver.protocols import board_protocol, host_protocol
+
+SEEDS = range(8)
+
+
+def trace(air, command, seconds, dt=0.01):
+    air.command(air.atmosphere + np.asarray(command))
+    return np.array([air.step(dt) - air.atmosphere for _ in range(round(seconds / dt))])
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_filling_is_a_ramp_and_lifts_the_neighbour_for_a_second(seed):
+    air = Pneumatics(2, seed)
+    gauge = trace(air, [7000.0, 0.0, 0.0, 0.0], 5.0)
+    rate = np.diff(gauge[:, 0]) / 0.01
+    middle = (gauge[1:, 0] > 700.0) & (gauge[1:, 0] < 5000.0)
+    assert 8000.0 < rate[middle].mean() < 10_000.0
+    assert gauge[-1, 0] == pytest.approx(7000.0, abs=15.0)
+    assert 0.12 < gauge[:, 1].max() / 7000.0 < 0.26
+    lifted = gauge[:, 1] > 0.05 * 7000.0
+    assert 0.8 < lifted.sum() * 0.01 < 2.0
+    assert np.all(np.abs(gauge[:, 2:]) < 1e-9)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_venting_takes_its_time_and_ends(seed):
+    air = Pneumatics(2, seed)
+    trace(air, [0.0, 0.0, 7000.0, 0.0], 4.0)
+    gauge = trace(air, [0.0] * 4, 8.0)[:, 2] / 7000.0
+    duration = 0.01 * (np.argmax(gauge < 0.1) - np.argmax(gauge < 0.9))
+    assert duration == pytest.approx(2.5, rel=0.15)
+    assert abs(gauge[-1]) < 0.005
+    assert np.all(np.diff(gauge[gauge > 0.02]) <= 1e-9)
+
+
+def test_the_real_limb_fills_and_vents_like_that(shared_data):
+    """The same figures, taken from the log of a real step."""
+    log = np.genfromtxt(shared_data / "real_limb" / "B_steps1.csv", delimiter=",", names=True)
+    gauge = (log["p0"] - log["p0"][:5].mean()) * 100.0
+    neighbour = (log["p1"] - log["p1"][:5].mean()) * 100.0
+    filling = (log["t"] > 10.7) & (log["t"] < 11.3)
+    assert np.polyfit(log["t"][filling], gauge[filling], 1)[0] == pytest.approx(9000.0, rel=0.1)
+    venting = log["t"] > 27.8
+    share = gauge[venting] / gauge[venting][0]
+    t = log["t"][venting]
+    assert t[np.argmax(share < 0.1)] - t[np.argmax(share < 0.9)] == pytest.approx(2.5, rel=0.1)
+    assert 0.2 < neighbour.max() / gauge.max() < 0.28
+
+
+def test_seeds_repeat_and_differ():
+    runs = [trace(Pneumatics(2, seed), [9000.0, 0.0, 0.0, 5000.0], 1.0) for seed in (3, 3, 4)]
+    assert np.array_equal(runs[0], runs[1])
+    assert np.abs(runs[0] - runs[2]).max() > 50.0
+    assert Pneumatics(2, 3).atmosphere != Pneumatics(2, 4).atmosphere
+
+
+def test_the_step_size_does_not_matter():
+    ends = []
+    for count in (1, 20, 150):
+        air = Pneumatics(2, 1)
+        air.command(air.atmosphere + np.array([9000.0, 0.0, 0.0, 4000.0]))
+        for _ in range(count):
+            air.step(0.6 / count)
+        ends.append(air.pressure)
+    assert ends[0] == pytest.approx(ends[1], abs=40.0)
+    assert ends[1] == pytest.approx(ends[2], abs=40.0)
+
+
+def test_pressures_stay_between_atmosphere_and_supply():
+    air = Pneumatics(2, 2)
+    generator = np.random.default_rng(15)
+    for _ in range(60):
+        air.command(air.atmosphere + generator.uniform(-1e4, 1e5, 4))
+        gauge = air.step(0.4) - air.atmosphere
+        assert gauge.max() < 1.3 * (air.supply_pressure - air.atmosphere)
+        assert gauge.min() > -1500.0
+
+
+@pytest.mark.parametrize("bad", [[1e5] * 3, [1e5, 1e5, 1e5, float("nan")]])
+def test_bad_commands_are_errors(bad):
+    with pytest.raises(ValueError, match="pressures"):
+        Pneumatics(2).command(bad)
+    with pytest.raises(ValueError, match="duration"):
+        Pneumatics(2).step(-1.0)
+    with pytest.raises(ValueError, match="segment_count"):
+        Pneumatics(0)
+
+
+# ------------------------------------------------------------------------------------ board
+
+
+def test_a_command_is_stamped_with_its_first_byte():
+    board = EmulatedBoard(board_protocol("ezloop"), Pneumatics(2), 0)
+    first, second = b"<1013.00,1014.00,1015.00,1016.00>\n", b"<1013.00,1013.00,1013.00,1013.00>\n"
+    pieces = [(b"junk" + first[:3], 100), (first[3:20], 200), (first[20:] + second[:1], 300)]
+    received = [c for data, stamp in pieces for c in board.receive(data, stamp)[0]]
+    received += board.receive(second[1:], 400)[0]
+    assert [c.stamp for c in received] == [100, 300]
+    assert received[0].pressure == pytest.approx((101300.0, 101400.0, 101500.0, 101600.0))
+
+
+@pytest.mark.parametrize("protocol", ["ezloop", "ctrlp", "native"])
+def test_the_board_reaches_what_it_is_told(protocol):
+    board = EmulatedBoard(board_protocol(protocol), Pneumatics(2, 5), 5)
+    host = host_protocol(protocol)
+    data, _ = host.setpoint([8000.0, -3000.0], board.atmosphere, 9.0)
+    (command,), _ = board.receive(data, 0)
+    wire = np.array(command.pressure)
+    assert wire[0::2] - wire[1::2] == pytest.approx([8000.0, -3000.0], abs=1.1)
+    board.step(5.0)
+    gauge = board.pneumatics.pressure - board.pneumatics.atmosphere
+    # The ezloop board regulates raw sensors, which differ by up to 200 Pa.
+    assert gauge == pytest.approx([8000.0, 0.0, 0.0, 3000.0], abs=130.0)
+
+
+@pytest.mark.parametrize(
+    "text", ["jam", "stick", "stick:4", "stick:0.5", "stick:-1", "drop:1.5", "mute:1", "leak:a"]
+)
+def test_fault_texts_that_are_not_understood(text):
+    with pytest.raises(FaultError, match="fault"):
+        Faults.parse([text], 4)
+
+
+def test_fault_texts():
+    faults = Faults.parse(
+        ["drop:0.1", " stick:1", "leak:2", "leak:0:5", "mute", "supply:1e5", "unplug:2"], 4
+    )
+    assert (faults.drop, faults.stuck, faults.leaks) == (0.1, (1,), {2: 3.0, 0: 5.0})
+    assert faults.mute
+    assert faults.unplugged
+    assert (faults.supply, faults.replug_after) == (1e5, 2.0)
+    assert Faults.parse([""], 4) == Faults()
+
+
+def test_dropped_and_corrupted_bytes_come_in_the_stated_share():
+    board = EmulatedBoard(board_protocol("ezloop"), Pneumatics(2), 0)
+    board.set_faults(Faults.parse(["drop:0.3"], 4))
+    data = host_protocol("ezloop").vent(101_325.0)[0]
+    got = sum(len(board.receive(data, 0)[0]) for _ in range(2000))
+    assert got / 2000 == pytest.approx(0.7, abs=0.04)
+    faults = Faults.parse(["corrupt:0.05"], 4)
+    clean = bytes(20_000)
+    damaged = np.frombuffer(faults.damage(clean, np.random.default_rng(1)), dtype=np.uint8)
+    assert np.mean(damaged != 0) == pytest.approx(0.05, abs=0.01)
+    assert np.all(np.bitwise_count(damaged) <= 1)
+
+
+# ------------------------------------------------------------------------------------- port
+
+
+def open_host(port):
+    return os.open(port.link, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+
+
+def test_the_port_paces_bytes_both_ways(tmp_path):
+    port = EmulatedPort(str(tmp_path / "board"), 9600)
+    host = open_host(port)
+    byte = round(1e10 / 9600)
+    try:
+        port.read(0)
+        os.write(host, b"x" * 96)
+        now = 1000
+        assert select.select(port.watched(), [], [], 10.0)[0]
+        port.read(now)
+        assert port.arrived(now + 96 * byte - 1000) == []
+        assert port.arrived(now + 96 * byte) == [(now, b"x" * 96)]
+        port.pump(now)
+        port.send(b"y" * 50)
+        got = b""
+        for step in range(1, 60):
+            port.pump(now + step * byte)
+            with contextlib.suppress(BlockingIOError):
+                got += os.read(host, 100)
+            assert len(got) <= step
+        while len(got) < 50 and select.select([host], [], [], 10.0)[0]:
+            got += os.read(host, 100)
+        assert got == b"y" * 50
+    finally:
+        os.close(host)
+        port.close()
+
+
+def test_the_port_disappears_and_comes_back_under_the_same_name(tmp_path):
+    port = EmulatedPort(str(tmp_path / "board"), 0)
+    host = open_host(port)
+    port.unplug()
+    assert not port.link.exists()
+    with pytest.raises(OSError, match=r"\[Errno 5\]"):
+        os.write(host, b"x")
+    os.close(host)
+    port.plug()
+    host = open_host(port)
+    try:
+        assert port.read(0)
+        port.send(b"hello")
+        port.pump(1)
+        assert os.read(host, 100) == b"hello"
+    finally:
+        os.close(host)
+        port.close()
+    assert not port.link.is_symlink()
+
+
+def test_the_port_does_not_overwrite_a_file(tmp_path):
+    (tmp_path / "board").write_text("precious")
+    with pytest.raises(FileExistsError, match="port_link"):
+        EmulatedPort(str(tmp_path / "board"), 0)
+    assert (tmp_path / "board").read_text() == "precious"

@@ -1,0 +1,213 @@
+"""The port's thread on a real pseudo-terminal, with an emulated board at the other end."""
+
+import os
+import re
+import select
+import threading
+import time
+
+import pytest
+
+from pressure_driver.core import CoreSettings, DriverCore
+from pressure_driver.emulator.board import EmulatedBoard
+from pressure_driver.emulator.faults import Faults
+from pressure_driver.emulator.pneumatics import Pneumatics
+from pressure_driver.emulator.port import EmulatedPort
+from pressure_driver.emulator.runner import BoardRunner
+from pressure_driver.grid import TickGrid
+from pressure_driver.link import PortError, SerialLink, open_port
+from pressure_driver.monitor import MonitorLimits
+from pressure_driver.protocols import board_protocol, host_protocol
+from pressure_driver.safety import Mode
+from pressure_driver.schedule import Setpoint, Verdict
+
+PERIOD = 50_000_000
+
+
+def wait_for(condition, limit=20.0):
+    deadline = time.monotonic() + limit
+    while not condition():
+        assert time.monotonic() < deadline, "waited too long"
+        time.sleep(0.005)
+
+
+class Rig:
+    """A driver without ROS and a board, connected by a pseudo-terminal."""
+
+    def __init__(self, folder, protocol="ezloop"):
+        self.commands = []
+        self.port = EmulatedPort(str(folder / "board"), 115_200)
+        self.board = EmulatedBoard(board_protocol(protocol), Pneumatics(2, 1), 1)
+        self.runner = BoardRunner(self.board, self.port, on_command=self.commands.append)
+        self.runner.start()
+        settings = CoreSettings(monitor=MonitorLimits(rest_time=0.15))
+        self.core = DriverCore(host_protocol(protocol), settings)
+        self.link = SerialLink(str(self.port.link), 115_200, TickGrid(PERIOD), self.core)
+        self.link.start()
+
+    def arm(self):
+        wait_for(lambda: self.core.arm()[0])
+
+    def play(self, count):
+        """Offer setpoints 0.2 s ahead in real time; return stamp -> difference."""
+        start = (time.time_ns() // PERIOD + 6) * PERIOD
+        wanted = {}
+        for index in range(count):
+            stamp = start + index * PERIOD
+            while time.time_ns() < stamp - 200_000_000:
+                time.sleep(0.002)
+            value = 300.0 * (index + 1)
+            if self.core.offer(Setpoint(stamp, (value, 0.0), "p", index), time.time_ns()) is (
+                Verdict.ACCEPTED
+            ):
+                wanted[stamp] = value
+        return wanted
+
+    def have(self, *texts):
+        self.runner.set_faults(Faults.parse(texts, 4))
+
+    @property
+    def mode(self):
+        return self.core.snapshot().mode
+
+    def pressurised(self):
+        return max(self.board.pneumatics.pressure) > self.board.pneumatics.atmosphere + 1000.0
+
+    def close(self):
+        self.link.close()
+        self.runner.close()
+
+
+@pytest.fixture
+def rig(tmp_path):
+    running = Rig(tmp_path)
+    yield running
+    running.close()
+
+
+def differences(commands):
+    return [round(c.pressure[0] - c.pressure[1], 1) for c in commands]
+
+
+def test_setpoints_arrive_in_order_not_before_their_stamps(rig):
+    rig.arm()
+    wanted = rig.play(20)
+    assert len(wanted) >= 15
+    wait_for(lambda: rig.mode is Mode.HOLDING)
+    first_seen = {}
+    for command, value in zip(rig.commands, differences(rig.commands), strict=True):
+        first_seen.setdefault(value, command.stamp)
+    order = [first_seen[v] for v in wanted.values() if v in first_seen]
+    assert order == sorted(order)
+    assert len(order) + rig.core.snapshot().counters.superseded == len(wanted)
+    for stamp, value in wanted.items():
+        if value in first_seen:
+            assert first_seen[value] >= stamp
+
+
+def test_closing_puts_vent_on_the_wire(rig):
+    rig.arm()
+    rig.play(10)
+    wait_for(rig.pressurised)
+    assert rig.link.close()
+    wait_for(lambda: differences(rig.commands)[-3:] == [0.0] * 3)
+    wait_for(lambda: not rig.pressurised())
+    wait_for(lambda: not rig.port.host_present)
+
+
+def test_an_urgent_vent_does_not_wait_for_the_tick(rig):
+    rig.arm()
+    rig.play(10)
+    rig.core.vent()
+    rig.link.urge()
+    wait_for(lambda: differences(rig.commands)[-1] == 0.0)
+    assert rig.mode in (Mode.VENTING, Mode.DISARMED)
+
+
+def test_an_unplug_faults_and_the_return_vents(rig):
+    rig.arm()
+    rig.play(5)
+    rig.have("unplug:0.5")
+    wait_for(lambda: rig.mode is Mode.FAULT)
+    assert "serial link lost" in rig.core.snapshot().faults[0]
+    wait_for(lambda: rig.link.reconnects == 1)
+    count = len(rig.commands)
+    wait_for(lambda: len(rig.commands) > count + 5)
+    assert set(differences(rig.commands[count:])) == {0.0}
+    assert rig.mode is Mode.FAULT
+    rig.have()
+    rig.arm()
+
+
+def test_an_exception_in_the_thread_vents_and_is_reported(rig):
+    rig.arm()
+    rig.play(10)
+    wait_for(rig.pressurised)
+    rig.core.sent = lambda _: 1 / 0
+    wait_for(lambda: rig.link.error is not None)
+    assert isinstance(rig.link.error, ZeroDivisionError)
+    wait_for(lambda: differences(rig.commands)[-3:] == [0.0] * 3)
+
+
+def test_a_board_that_takes_no_bytes_does_not_stop_the_ticks(tmp_path):
+    """The other end is open but never read: the thread must not hang in a write."""
+    master, slave = os.openpty()
+    try:
+        core = DriverCore(host_protocol("ezloop"), CoreSettings())
+        link = SerialLink(os.ttyname(slave), 115_200, TickGrid(1_000_000), core)
+        link.start()
+        wait_for(lambda: link.bytes_sent > 3000, 30.0)
+        wait_for(lambda: "takes no bytes" in core._machine.link_fault, 30.0)
+        assert link.close()
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+def test_a_missing_port_is_named_with_the_remedy(tmp_path):
+    missing = str(tmp_path / "ttyNOWHERE")
+    with pytest.raises(PortError, match=f"no serial device {re.escape(missing)}.*ports that exist"):
+        open_port(missing, 115_200)
+
+
+def test_a_port_in_use_is_named_with_the_remedy(rig):
+    with pytest.raises(PortError, match=r"in use by another program.*fuser"):
+        open_port(str(rig.port.link), 115_200)
+
+
+def test_a_file_is_no_port(tmp_path):
+    path = tmp_path / "file"
+    path.write_text("text")
+    with pytest.raises(PortError, match="cannot open serial port"):
+        open_port(str(path), 115_200)
+
+
+def test_the_port_is_free_again_after_closing(rig):
+    assert rig.link.close()
+    open_port(str(rig.port.link), 115_200).close()
+
+
+def test_only_the_thread_touches_the_port(rig):
+    users = set()
+    device = rig.link._device
+    original = device.write
+    device.write = lambda data: (users.add(threading.current_thread().name), original(data))[1]
+    rig.arm()
+    rig.play(5)
+    rig.link.urge()
+    rig.link.close()
+    assert users == {"serial link"}
+
+
+def test_a_pty_of_the_system_is_a_port():
+    """Without an emulator: raw bytes at the other end of a pseudo-terminal."""
+    master, slave = os.openpty()
+    try:
+        device = open_port(os.ttyname(slave), 115_200)
+        device.write(b"<1013.00>\n")
+        assert select.select([master], [], [], 5.0)[0]
+        assert os.read(master, 100) == b"<1013.00>\n"
+        device.close()
+    finally:
+        os.close(master)
+        os.close(slave)
