@@ -1,7 +1,7 @@
 """The camera: calibration, pose from fixed tags, and rays onto planes above the base.
 
-Pixels have the centre of the first pixel at (0, 0). A camera pose maps points of `limb_base` into the
-camera's optical frame (x right, y down, z forward).
+Pixels have the centre of the first pixel at (0, 0). A camera pose maps points of `limb_base` into
+the camera's optical frame (x right, y down, z forward).
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ class Intrinsics:
         k = np.asarray(matrix, dtype=np.float64).reshape(-1)
         if model and model not in PINHOLE_MODELS:
             raise CameraError(
-                f"distortion model '{model}': {' and '.join(PINHOLE_MODELS)} are known; calibrate again "
-                "with scripts/calibrate_camera.py"
+                f"distortion model '{model}': {' and '.join(PINHOLE_MODELS)} are known; calibrate "
+                "again with scripts/calibrate_camera.py"
             )
         if width <= 0 or height <= 0:
             raise CameraError(f"camera_info says {width} x {height} px: the size must be positive")
@@ -234,6 +234,7 @@ def solve_pose(
     pose = CameraPose(cv2.Rodrigues(rotation)[0], np.asarray(translation).reshape(3))
     if pose.position[2] <= float(np.max(points[:, 2])):
         raise CameraError(
-            "the fixed tags are seen from below: the image is mirrored, or positions in the tag map are"
+            "the fixed tags are seen from below: the image is mirrored, or positions in "
+            "the tag map are"
         )
     return pose, project(intrinsics, pose, points) - pixels

@@ -1,4 +1,4 @@
-"""Find AprilTags (36h11) in a grey image: OpenCV finds them, our own line fits place their corners."""
+"""Find AprilTags (36h11) in a grey image: OpenCV finds them, line fits place their corners."""
 
 from __future__ import annotations
 
@@ -93,7 +93,8 @@ class Detector:
     Args:
         smallest: shortest side of a tag to look for [px].
         correct_bits: wrong cells of a code that are forgiven; three at most keeps false tags away.
-        largest_residual: RMS residual of the border's lines above which a candidate is dropped [px].
+        largest_residual: RMS residual of the border's lines above which a candidate is dropped
+            [px].
     """
 
     def __init__(
@@ -221,8 +222,8 @@ def check_orientation() -> None:
     expected = np.array([[left, bottom], [right, bottom], [right, top], [left, top]]) - 0.5
     if list(ids) != [0] or np.abs(quads[0] - expected).max() > 2.0:
         raise family.FamilyError(
-            f"OpenCV {cv2.__version__} finds ids {list(ids)} with corners {quads.tolist()} in a picture "
-            f"of tag 0 with corners {expected.tolist()}: its conventions changed; "
+            f"OpenCV {cv2.__version__} finds ids {list(ids)} with corners {quads.tolist()} in a "
+            f"picture of tag 0 with corners {expected.tolist()}: its conventions changed; "
             "install opencv-python-headless 4.14 or 5.0"
         )
     corners, _, found = refine(canvas, quads, 3.0)

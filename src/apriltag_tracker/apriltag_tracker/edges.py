@@ -1,10 +1,10 @@
 """Corners of tags from the edges of their black border, to a few hundredths of a pixel.
 
-Along each side, profiles are taken across the border. Where the border crosses from black to white is the
-centroid of the profile's slope: with bilinear samples this is a sum of intensities, so it does not depend
-on where the edge lies between pixels, and a symmetric blur does not move it. A line goes through the
-crossings of a side, outliers are taken out, and neighbouring lines are intersected. A second and third
-pass start from the corners of the one before.
+Along each side, profiles are taken across the border. Where the border crosses from black to white
+is the centroid of the profile's slope: with bilinear samples this is a sum of intensities, so it
+does not depend on where the edge lies between pixels, and a symmetric blur does not move it. A line
+goes through the crossings of a side, outliers are taken out, and neighbouring lines are
+intersected. A second and third pass start from the corners of the one before.
 """
 
 from __future__ import annotations
@@ -67,57 +67,20 @@ def _crossing(profile: NDArray[np.float64], window: float, coarse: bool) -> tupl
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def _fit_side(
-    image: NDArray[np.uint8],
-    ax: float,
-    ay: float,
-    bx: float,
-    by: float,
-    turn: float,
-    window: float,
-    coarse: bool,
-    line: NDArray[np.float64],
-    stats: NDArray[np.float64],
+def _fit_line(
+    along: NDArray[np.float64],
+    across: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    result: NDArray[np.float64],
 ) -> bool:
-    """Fit the line of one side; `line` becomes (middle x, y, direction x, y)."""
-    length = math.hypot(bx - ax, by - ay)
-    if length < 4.0:
-        return False
-    tx, ty = (bx - ax) / length, (by - ay) / length
-    nx, ny = turn * ty, -turn * tx
-    inset = min(max(1.5, 0.08 * length), 0.25 * length)
-    count = min(max(int(length - 2.0 * inset), 6), MAX_SAMPLES)
-    spacing = (length - 2.0 * inset) / (count - 1)
-    along = np.empty(count)
-    across = np.empty(count)
-    contrasts = np.empty(count)
-    profile = np.empty(_PROFILE)
-    step_x = 2.0 * window / (_PROFILE - 1) * nx
-    step_y = 2.0 * window / (_PROFILE - 1) * ny
-    for i in range(count):
-        along[i] = inset + i * spacing - 0.5 * length
-        px = 0.5 * (ax + bx) + along[i] * tx
-        py = 0.5 * (ay + by) + along[i] * ty
-        x, y = px - window * nx, py - window * ny
-        if not (_inside(image, x, y) and _inside(image, px + window * nx, py + window * ny)):
-            across[i], contrasts[i] = 0.0, 0.0
-            continue
-        for k in range(_PROFILE):
-            profile[k] = sample(image, x, y)
-            x += step_x
-            y += step_y
-        across[i], contrasts[i] = _crossing(profile, window, coarse)
-    typical = np.median(contrasts)
-    if typical < 8.0:
-        return False
-    weights = np.empty(count)
-    for i in range(count):
-        usable = contrasts[i] > 0.6 * typical and abs(across[i]) < 0.95 * window
-        weights[i] = 1.0 if usable else 0.0
-    middle, slope, mean_along, spread, rms, used = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    """Fit across = middle + slope along, three times, leaving out what is far off.
+
+    The weights (0 or 1) are changed; the result is middle, slope, mean and spread of `along`, RMS
+    residual and number of points used.
+    """
     for _ in range(3):
         sw = sx = sy = sxx = sxy = 0.0
-        for i in range(count):
+        for i in range(along.shape[0]):
             w = weights[i]
             sw += w
             sx += w * along[i]
@@ -126,33 +89,77 @@ def _fit_side(
             sxy += w * along[i] * across[i]
         if sw < 5.0:
             return False
-        mean_along = sx / sw
-        spread = sxx - sx * mean_along
+        mean = sx / sw
+        spread = sxx - sx * mean
         if spread < 1e-6:
             return False
-        slope = (sxy - sy * mean_along) / spread
-        middle = sy / sw - slope * mean_along
+        slope = (sxy - sy * mean) / spread
+        middle = sy / sw - slope * mean
         total = 0.0
-        for i in range(count):
+        for i in range(along.shape[0]):
             total += weights[i] * (across[i] - middle - slope * along[i]) ** 2
         rms = math.sqrt(total / max(sw - 2.0, 1.0))
-        used = sw / count
         gate = max(3.0 * rms, 0.05)
-        for i in range(count):
+        for i in range(along.shape[0]):
             if abs(across[i] - middle - slope * along[i]) > gate:
                 weights[i] = 0.0
-    line[0] = 0.5 * (ax + bx) + middle * nx
-    line[1] = 0.5 * (ay + by) + middle * ny
+        result[0], result[1], result[2] = middle, slope, mean
+        result[3], result[4], result[5] = spread, rms, sw
+    return True
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _fit_side(
+    image: NDArray[np.uint8],
+    start: NDArray[np.float64],
+    end: NDArray[np.float64],
+    turn: float,
+    window: float,
+    coarse: bool,
+    line: NDArray[np.float64],
+    stats: NDArray[np.float64],
+) -> bool:
+    """Fit the line of one side; `line` becomes (middle x, y, direction x, y)."""
+    length = math.hypot(end[0] - start[0], end[1] - start[1])
+    if length < 4.0:
+        return False
+    tx, ty = (end[0] - start[0]) / length, (end[1] - start[1]) / length
+    nx, ny = turn * ty, -turn * tx
+    middle_x, middle_y = 0.5 * (start[0] + end[0]), 0.5 * (start[1] + end[1])
+    inset = min(max(1.5, 0.08 * length), 0.25 * length)
+    count = min(max(int(length - 2.0 * inset), 6), MAX_SAMPLES)
+    spacing = (length - 2.0 * inset) / (count - 1)
+    along, across, contrasts = np.empty(count), np.zeros(count), np.zeros(count)
+    profile = np.empty(_PROFILE)
+    step = 2.0 * window / (_PROFILE - 1)
+    for i in range(count):
+        along[i] = inset + i * spacing - 0.5 * length
+        px, py = middle_x + along[i] * tx, middle_y + along[i] * ty
+        x, y = px - window * nx, py - window * ny
+        if not (_inside(image, x, y) and _inside(image, px + window * nx, py + window * ny)):
+            continue
+        for k in range(_PROFILE):
+            profile[k] = sample(image, x + k * step * nx, y + k * step * ny)
+        across[i], contrasts[i] = _crossing(profile, window, coarse)
+    typical = np.median(contrasts)
+    if typical < 8.0:
+        return False
+    usable = (contrasts > 0.6 * typical) & (np.abs(across) < 0.95 * window)
+    fit = np.empty(6)
+    if not _fit_line(along, across, usable.astype(np.float64), fit):
+        return False
+    middle, slope, mean, spread, rms, used = fit
+    line[0], line[1] = middle_x + middle * nx, middle_y + middle * ny
     dx, dy = tx + slope * nx, ty + slope * ny
     norm = math.hypot(dx, dy)
     line[2], line[3] = dx / norm, dy / norm
     # Neighbouring profiles share pixels, which makes about two of them worth one.
     variance = 2.0 * max(rms, 0.004) ** 2
     stats[0] = math.atan2(dy, dx)
-    stats[1] = variance / (used * count) + variance * mean_along**2 / spread
+    stats[1] = variance / used + variance * mean**2 / spread
     stats[2] = variance / spread
     stats[3] = rms
-    stats[4] = used
+    stats[4] = used / count
     stats[5] = typical
     return True
 
@@ -173,18 +180,7 @@ def _refine_once(
     lines = np.empty((4, 4))
     for i in range(4):
         j = (i + 1) % 4
-        if not _fit_side(
-            image,
-            corners[i, 0],
-            corners[i, 1],
-            corners[j, 0],
-            corners[j, 1],
-            turn,
-            window,
-            coarse,
-            lines[i],
-            stats[i],
-        ):
+        if not _fit_side(image, corners[i], corners[j], turn, window, coarse, lines[i], stats[i]):
             return False
     for i in range(4):
         before = lines[(i + 3) % 4]
@@ -215,8 +211,9 @@ def refine_quads(
         quads: (n, 4, 2) px, corners to start from, in either sense of rotation.
         search: largest distance of a side from where it starts [px]; cut to the width of a cell.
         corners: (n, 4, 2) px, output.
-        stats: (n, 4, 6), output per side: direction [rad], variance of its offset in the middle [px²],
-            variance of its direction [rad²], RMS residual [px], share of profiles used, contrast.
+        stats: (n, 4, 6), output per side: direction [rad], variance of its offset in the middle
+            [px²], variance of its direction [rad²], RMS residual [px], share of profiles used,
+            contrast.
         found: (n,), output: whether all four sides were there.
     """
     for i in range(quads.shape[0]):
@@ -252,7 +249,8 @@ def read_bits(
         bits: (6, 6) output, upper row of the printed tag first, 1 is white.
 
     Returns:
-        Distance of the cell nearest to the threshold from it, over the contrast; 0.5 is a clean tag.
+        Distance of the cell nearest to the threshold from it, over the contrast; 0.5 is a clean
+        tag.
     """
     h = _square_to_quad(corners)
     values = np.empty((8, 8))

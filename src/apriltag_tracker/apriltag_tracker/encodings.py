@@ -42,8 +42,8 @@ def to_grey(
     raw = np.frombuffer(data, dtype=np.uint8)
     if height <= 0 or width <= 0 or step < width * width_bytes or raw.size < step * height:
         raise ImageError(
-            f"image of {width} x {height} px in {encoding} with {step} bytes a row has {raw.size} bytes: "
-            f"{width * width_bytes} bytes a row or more expected"
+            f"image of {width} x {height} px in {encoding} with {step} bytes a row has {raw.size} "
+            f"bytes: {width * width_bytes} bytes a row or more expected"
         )
     rows = raw[: step * height].reshape(height, step)[:, : width * width_bytes]
     if encoding in {"mono8", "8UC1"}:

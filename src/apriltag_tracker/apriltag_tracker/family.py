@@ -76,6 +76,7 @@ def check_code_of_tag_0() -> None:
     value = int("".join(str(bit) for bit in bits), 2)
     if value != _CODE_OF_TAG_0:
         raise FamilyError(
-            f"tag 0 of OpenCV {cv2.__version__} reads {value:#x} and not {_CODE_OF_TAG_0:#x}: its dictionary "
-            "is turned in another way than this package knows; install opencv-python-headless 4.14 or 5.0"
+            f"tag 0 of OpenCV {cv2.__version__} reads {value:#x} and not {_CODE_OF_TAG_0:#x}: its "
+            "dictionary is turned in another way than this package knows; install "
+            "opencv-python-headless 4.14 or 5.0"
         )

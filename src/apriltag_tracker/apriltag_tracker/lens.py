@@ -1,8 +1,8 @@
 """Lens distortion of Brown and Conrady with the rational terms, both ways, compiled.
 
 Coefficients are ordered as OpenCV and `sensor_msgs/CameraInfo` order them: k1 k2 p1 p2 k3 k4 k5 k6.
-Normalised coordinates are x/z, y/z in the camera's optical frame; pixels have the centre of the first
-pixel at (0, 0).
+Normalised coordinates are x/z, y/z in the camera's optical frame; pixels have the centre of the
+first pixel at (0, 0).
 """
 
 from __future__ import annotations

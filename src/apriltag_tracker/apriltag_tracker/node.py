@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import array
-import collections
 import math
 import sys
 import time
@@ -22,6 +21,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from apriltag_tracker.camera import CameraError, Intrinsics
 from apriltag_tracker.detection import Detector
 from apriltag_tracker.encodings import to_grey
+from apriltag_tracker.monitor import NO_CALIBRATION, Monitor
 from apriltag_tracker.overlay import draw_observation
 from apriltag_tracker.pipeline import (
     LimbObservation,
@@ -41,8 +41,6 @@ from limb_interfaces.runner import run_node
 
 ANNOTATED_IMAGE = "camera/image_annotated"
 _MARKER_PERIOD = 0.1
-_SILENCE = 2.0
-_WINDOW = 300
 
 
 class TrackerNode(Node):
@@ -103,18 +101,12 @@ class TrackerNode(Node):
         )
         self._warm_up()
         self._tracker: LimbTracker | None = None
-        self._calibration_problem = ""
-        self._started = time.monotonic()
-        self._last_image = -math.inf
-        self._received = self._processed = self._failed = self._invalid = self._bridged = 0
-        self._out_of_order = 0
         self._last_stamp = -1
-        self._image_problem = ""
-        self._observation: LimbObservation | None = None
-        self._latency: collections.deque[float] = collections.deque(maxlen=_WINDOW)
-        self._work: collections.deque[float] = collections.deque(maxlen=_WINDOW)
-        self._arrivals: collections.deque[float] = collections.deque(maxlen=_WINDOW)
         self._last_markers = 0.0
+        self._image_topic = self.resolve_topic_name(topics.IMAGE)
+        self._monitor = Monitor(
+            self._image_topic if source == "topic" else source, is_topic=source == "topic"
+        )
         self._make_topics()
         if calibration:
             self._use(Intrinsics.from_yaml(str(calibration)))
@@ -214,13 +206,13 @@ class TrackerNode(Node):
                 message.width, message.height, message.k, message.d, message.distortion_model
             )
         except CameraError as error:
-            self._calibration_problem = str(error)
+            self._monitor.calibration_problem = str(error)
             return
         self._use(intrinsics)
 
     def _use(self, intrinsics: Intrinsics) -> None:
         """Take a calibration; one that is like the present one changes nothing."""
-        self._calibration_problem = ""
+        self._monitor.calibration_problem = ""
         now = self._tracker.intrinsics if self._tracker is not None else None
         if (
             now is not None
@@ -242,7 +234,7 @@ class TrackerNode(Node):
                 bool(message.is_bigendian),
             )
         except ValueError as error:
-            self._count_arrival()
+            self._monitor.arrived()
             self._fail(message.header.stamp, str(error))
             return
         self._take(gray, message.header.stamp)
@@ -252,53 +244,42 @@ class TrackerNode(Node):
         try:
             grabbed: Grabbed | None = self._source.read()
         except SourceError as error:
-            self._image_problem = str(error)
+            self._monitor.image_problem = str(error)
             return
         if grabbed is not None:
             self._take(grabbed.gray, stamps.stamp_from_nanoseconds(grabbed.stamp))
 
-    def _count_arrival(self) -> None:
-        self._received += 1
-        self._last_image = time.monotonic()
-        self._arrivals.append(self._last_image)
-
     def _take(self, gray: NDArray[np.uint8], stamp: Time) -> None:
         """Process one image and publish what it says under its own stamp."""
         started = time.perf_counter()
-        self._count_arrival()
+        self._monitor.arrived()
         if stamps.nanoseconds(stamp) == self._last_stamp:
             # The same picture again says nothing new.
-            self._out_of_order += 1
+            self._monitor.repeated += 1
             return
         self._last_stamp = stamps.nanoseconds(stamp)
         if self._tracker is None:
-            self._fail(stamp, self._calibration_problem or "no camera_info has come yet")
+            self._fail(stamp, self._monitor.calibration_problem or NO_CALIBRATION)
             return
         try:
             observation = self._tracker.observe(gray, stamps.seconds(stamp))
         except (ValueError, ArithmeticError, cv2.error) as error:
             self._fail(stamp, str(error))
             return
-        self._image_problem = ""
-        self._observation = observation
-        self._processed += 1
-        self._invalid += observation.estimate is None
-        self._bridged += observation.bridged
-        self._publish(observation, gray, stamp)
-        self._work.append(time.perf_counter() - started)
+        latency = self._publish(observation, gray, stamp)
+        self._monitor.observed(observation, latency, time.perf_counter() - started)
 
     def _fail(self, stamp: Time, problem: str) -> None:
         """Say at once that this image gives no state, and why."""
-        self._failed += 1
-        self._image_problem = problem
+        self._monitor.failed_with(problem)
         self._states.publish(self._state(LimbObservation((), None, problem), stamp))
 
     # Output
 
-    def _publish(self, observation: LimbObservation, gray: NDArray[np.uint8], stamp: Time) -> None:
+    def _publish(self, observation: LimbObservation, gray: NDArray[np.uint8], stamp: Time) -> float:
+        """Publish everything; returns the latency of the state [s]."""
         state = self._state(observation, stamp)
         self._states.publish(state)
-        self._latency.append(state.latency)
         array_message = TagDetectionArray(
             detections=[_tag_message(placed) for placed in observation.tags]
         )
@@ -324,6 +305,7 @@ class TrackerNode(Node):
             )
             message.header.stamp = stamp
             self._annotated.publish(message)
+        return float(state.latency)
 
     def _state(self, observation: LimbObservation, stamp: Time) -> LimbState:
         message = LimbState(reason=observation.reason)
@@ -353,82 +335,10 @@ class TrackerNode(Node):
         message.latency = (now - stamps.nanoseconds(stamp)) / stamps.NANOSECONDS
         return message
 
-    # Diagnostics
-
     def _health(self) -> Health:
-        silent = time.monotonic() - max(self._last_image, self._started)
-        values = self._values()
-        if self._received == 0 or silent > _SILENCE:
-            return self._no_images(silent, values)
-        if self._tracker is None:
-            problem = self._calibration_problem or (
-                f"images come but no {topics.CAMERA_INFO}: publish it, or set the parameter "
-                "calibration_file (scripts/calibrate_camera.py writes one)"
-            )
-            return Health("error", problem, values)
-        if self._image_problem:
-            return Health("error", self._image_problem, values)
-        observation = self._observation
-        if observation is None or observation.estimate is None:
-            reason = observation.reason if observation is not None else "no image was processed"
-            return Health("error", reason, values)
-        world = self._tracker.world
-        if world.excluded:
-            named = ", ".join(f"{tag} ({gap:.1f} px)" for tag, gap in world.excluded.items())
-            return Health("warning", f"fixed tags that do not fit the others: {named}", values)
-        if observation.reason:
-            return Health("warning", observation.reason, values)
-        return Health("ok", "tracking", values)
-
-    def _no_images(self, silent: float, values: dict[str, object]) -> Health:
-        if self._source is not None:
-            problem = self._image_problem or f"no image from {self._source_name} for {silent:.0f} s"
-            return Health("error", problem, values)
-        topic = self.resolve_topic_name(topics.IMAGE)
-        publishers = self.count_publishers(topic)
-        if self._received == 0 and silent <= _SILENCE:
-            return Health("stale", f"waiting for images on {topic}", values)
-        if publishers == 0:
-            cure = "nobody publishes it: start the camera, or remap the topic"
-        else:
-            cure = (
-                f"{publishers} publisher(s), but no image arrives: large images are lost with Fast DDS's "
-                "default shared memory; set FASTRTPS_DEFAULT_PROFILES_FILE to "
-                "apriltag_tracker/config/fastdds_large_images.xml in every process"
-            )
-        level = "stale" if self._received == 0 else "error"
-        return Health(level, f"no image on {topic} for {silent:.0f} s: {cure}", values)
-
-    def _values(self) -> dict[str, object]:
-        values: dict[str, object] = {
-            "images_received": self._received,
-            "images_processed": self._processed,
-            "images_failed": self._failed,
-            "repeated_stamps": self._out_of_order,
-            "states_invalid": self._invalid,
-            "states_bridged": self._bridged,
-        }
-        if len(self._arrivals) > 1 and self._arrivals[-1] > self._arrivals[0]:
-            rate = (len(self._arrivals) - 1) / (self._arrivals[-1] - self._arrivals[0])
-            values["rate_hz"] = f"{rate:.1f}"
-        for name, kept in (("latency", self._latency), ("processing", self._work)):
-            if kept:
-                values[f"{name}_ms_median"] = f"{1e3 * float(np.median(kept)):.2f}"
-                values[f"{name}_ms_p99"] = f"{1e3 * float(np.percentile(kept, 99)):.2f}"
-        if self._tracker is not None:
-            counts, world = self._tracker.tracker.counts, self._tracker.world
-            values.update(
-                tags_tracked=counts.tracked,
-                tags_by_region=counts.by_region,
-                tags_by_full_search=counts.by_full,
-                full_searches=counts.full_searches,
-                duplicates_rejected=counts.duplicates,
-                unknown_tags=dict(counts.unknown),
-                tags_misplaced=self._tracker.misplaced,
-                world_residual_px=f"{world.residual:.3f}",
-                camera_bumps=world.bumps,
-            )
-        return values
+        publishers = self.count_publishers(self._image_topic) if self._source is None else 0
+        report = self._monitor.report(self._tracker, publishers)
+        return Health(report.level, report.message, report.values)
 
 
 def _tag_message(placed: PlacedTag) -> TagDetection:

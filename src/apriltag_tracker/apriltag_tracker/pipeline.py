@@ -42,8 +42,8 @@ class TrackerOptions:
     Attributes:
         bridge_frames: frames without a tip that are bridged from the motion before.
         reject_beyond: distance from the other tags' shape at which a tag is on the wrong place [m].
-        largest_misfit: RMS distance of a tag's corners from a square of its size [m, as a share of the
-            size] above which it is not at the height it should be at.
+        largest_misfit: RMS distance of a tag's corners from a square of its size [m, as a share of
+            the size] above which it is not at the height it should be at.
         uncertainty: what averaging does not remove.
         prior: how the limb may differ from ideal.
         tracking: when to search how.
@@ -59,7 +59,7 @@ class TrackerOptions:
 
 @dataclass(frozen=True)
 class PlacedTag:
-    """A tag with its planar pose: x, y [m], yaw [rad] in `limb_base`; None without a camera pose."""
+    """A tag with its planar pose x, y [m], yaw [rad]; None without a camera pose."""
 
     tag: Tag
     on_limb: bool

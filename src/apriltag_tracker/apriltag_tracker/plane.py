@@ -24,8 +24,8 @@ def planar_pose(
         size: edge of the square [m].
 
     Returns:
-        x, y [m] and yaw [rad]; the derivative (3, 8) of these by the corners x0 y0 x1 …; and the RMS
-        distance of the corners from the square [m].
+        x, y [m] and yaw [rad]; the derivative (3, 8) of these by the corners x0 y0 x1 …; and the
+        RMS distance of the corners from the square [m].
     """
     x = (corners[0, 0] + corners[1, 0] + corners[2, 0] + corners[3, 0]) / 4.0
     y = (corners[0, 1] + corners[1, 1] + corners[2, 1] + corners[3, 1]) / 4.0

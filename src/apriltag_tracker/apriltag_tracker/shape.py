@@ -2,12 +2,13 @@
 
 The limb's heading is θ(s) = θ0 + ∫κ ds with one constant curvature a segment and smooth corrections
 (Legendre polynomials of the segment's coordinate) that a prior keeps small. Positions follow from
-integrating the tangent, stretched by one elongation. All unknowns come from one weighted least-squares
-fit of the tags' positions and headings (maximum a posteriori, Gauss-Newton).
+integrating the tangent, stretched by one elongation. All unknowns come from one weighted least-
+squares fit of the tags' positions and headings (maximum a posteriori, Gauss-Newton).
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -108,9 +109,7 @@ class _Curve:
         self.size = 4 + self.segments * (1 + degrees)
         nodes, weights = np.polynomial.legendre.leggauss(4)
         edges = np.unique(
-            np.concatenate(
-                [np.linspace(a, b, grid + 1) for a, b in zip(ends, ends[1:], strict=False)]
-            )
+            np.concatenate([np.linspace(a, b, grid + 1) for a, b in itertools.pairwise(ends)])
         )
         self._edges = edges
         self._nodes = nodes
@@ -135,7 +134,7 @@ class _Curve:
         return basis
 
     def quadrature(self, s: Sequence[float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return Gauss points of the whole limb and weights (n, points) that integrate up to each s."""
+        """Return Gauss points of the limb and weights (n, points) that integrate up to each s."""
         edges = np.unique(np.concatenate([self._edges, np.clip(s, 0.0, self.ends[-1])]))
         middle, half = 0.5 * (edges[1:] + edges[:-1]), 0.5 * np.diff(edges)
         points = (middle[:, None] + half[:, None] * self._nodes).ravel()

@@ -1,7 +1,7 @@
 """Images from elsewhere than a topic: a V4L2 device, a video file, a folder of pictures.
 
-A device is read by its own thread, so that a frame is stamped when it arrives and only the newest one
-waits. Files are played at a steady rate by the clock.
+A device is read by its own thread, so that a frame is stamped when it arrives and only the newest
+one waits. Files are played at a steady rate by the clock.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Source(Protocol):
     """Something that gives images."""
 
     def read(self) -> Grabbed | None:
-        """Return the next image, None while there is none; raises `SourceError` when it has ended."""
+        """Return the next image, None while there is none; `SourceError` after the last."""
 
     def close(self) -> None:
         """Release it."""

@@ -71,12 +71,16 @@ class TagMap:
     world: tuple[WorldTag, ...]
 
     def __post_init__(self) -> None:
-        ids = [tag.id for tag in self.limb] + [tag.id for tag in self.world]
-        twice = sorted({tag for tag in ids if ids.count(tag) > 1})
+        twice = sorted({tag for tag in self.ids if self.ids.count(tag) > 1})
         if twice:
             raise TagMapError(
                 f"tag ids {twice} occur twice in the tag map: every tag needs its own id"
             )
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """Ids of all tags, those of the limb first."""
+        return tuple(tag.id for tag in self.limb) + tuple(tag.id for tag in self.world)
 
     @property
     def length(self) -> float:

@@ -1,9 +1,10 @@
 """Tags from frame to frame: short searches where tags are expected, full searches now and then.
 
-A tag that was seen is looked for at its predicted corners by the line fit itself, and its code is read
-there, which costs tens of microseconds. What is not found like that is looked for in enlarged regions
-around the prediction, put together into one mosaic for one call of the detector, and once more with the
-mosaic sharpened and enlarged. A full search runs once a second, and when tags are missing.
+A tag that was seen is looked for at its predicted corners by the line fit itself, and its code is
+read there, which costs tens of microseconds. What is not found like that is looked for in enlarged
+regions around the prediction, put together into one mosaic for one call of the detector, and once
+more with the mosaic sharpened and enlarged. A full search runs once a second, and when tags are
+missing.
 """
 
 from __future__ import annotations
@@ -145,7 +146,7 @@ class TagTracker:
         lost: Sequence[int],
         predicted: dict[int, NDArray[np.float64]],
     ) -> list[Tag]:
-        """Search around the predictions of lost tags, as they are and then sharpened and enlarged."""
+        """Search around the predictions of lost tags; again sharpened and enlarged."""
         boxes = [box for tag in lost if (box := self._region(image, predicted[tag])) is not None]
         if not boxes:
             return []

@@ -127,7 +127,7 @@ class WorldPose:
         if per_tag.max() > 4.0 * self._misfit:
             self.pose = None
             self.problem = (
-                f"the fixed tags {ids} do not fit together (residual {per_tag.max():.1f} px): survey their "
+                f"the fixed tags {ids} do not fit together ({per_tag.max():.1f} px): survey their "
                 "positions again or calibrate the camera"
             )
             return

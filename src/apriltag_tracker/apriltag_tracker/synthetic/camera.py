@@ -71,7 +71,7 @@ class Shape:
     heading: NDArray[np.float64]
 
     def at(self, arc_length: float) -> NDArray[np.float64]:
-        """Return x, y, heading at an arc length by cubic interpolation, continued as a line beyond."""
+        """Return x, y, heading at an arc length (cubic), continued as a line beyond."""
         s = self.arc_length
         k = int(np.clip(np.searchsorted(s, arc_length) - 1, 0, len(s) - 2))
         step = s[k + 1] - s[k]
@@ -178,9 +178,7 @@ class SyntheticCamera:
         size = model.intrinsics
         self._rays = ray_map(size.width, size.height, size.matrix, size.distortion)
         self._table = render.cumulative_table()
-        self._cells = {
-            tag.id: family.printed_cells(tag.id, MARGIN_CELLS) for tag in (*tags.limb, *tags.world)
-        }
+        self._cells = {tag: family.printed_cells(tag, MARGIN_CELLS) for tag in tags.ids}
         self._light = self._make_light()
         self._noise = self._make_noise()
         self._mounting = self._draw_mounting()
@@ -197,8 +195,8 @@ class SyntheticCamera:
 
         Args:
             shape: the limb at mid-exposure; None leaves it out.
-            velocity: the shape one second later at the present velocity minus the shape itself, in the
-                same arrays; blurs what moves.
+            velocity: the shape one second later at the present velocity minus the shape itself, in
+                the same arrays; blurs what moves.
             covers: polygons (px) that hide what is below them, drawn last.
         """
         rows, columns = self._background.shape
@@ -262,7 +260,7 @@ class SyntheticCamera:
     def _draw_tag(
         self, image: NDArray[np.uint8], tag_id: int, placements: NDArray[np.float64]
     ) -> NDArray[np.float64] | None:
-        """Draw a tag; returns its corners at the last instant, None if it is outside of the picture."""
+        """Draw a tag; returns its corners at the last instant, None if it is out of sight."""
         first, last = self._corners(placements[0]), self._corners(placements[-1])
         both = np.concatenate([first, last])
         middle = both.mean(axis=0)

@@ -1,8 +1,8 @@
-"""Images of tags, computed in closed form: no texture is sampled, so corners are where they should be.
+"""Images of tags in closed form: no texture is sampled, so corners are where they should be.
 
-A pixel sees the printed pattern through a Gaussian, the lens's blur together with the pixel's own area.
-Seen from the tag, this is a product of two error functions per cell, exact for a tag that is not
-foreshortened much. Each pixel's ray comes from the exact inverse of the lens distortion.
+A pixel sees the printed pattern through a Gaussian, the lens's blur together with the pixel's own
+area. Seen from the tag, this is a product of two error functions per cell, exact for a tag that is
+not foreshortened much. Each pixel's ray comes from the exact inverse of the lens distortion.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def draw_tag(
         noise: (n,) grey levels, added to the tag's pixels from `noise_start` on.
         noise_start: place in the noise.
         box: first row, end row, first column, end column.
-        maps: (k, 3, 3) from rays to cells (column to the right, row downward), one for each instant of
-            the exposure, averaged.
+        maps: (k, 3, 3) from rays to cells (column to the right, row downward), one for each instant
+            of the exposure, averaged.
         spread: (2,) standard deviation of blur and pixel in cells, along columns and rows.
         cells: (n, n) printed cells with their margin, 1 is white.
         black: grey level of black cells in nominal light.
@@ -84,10 +84,10 @@ def draw_tag(
                 w = m[2, 0] * x + m[2, 1] * y + m[2, 2]
                 u = (m[0, 0] * x + m[0, 1] * y + m[0, 2]) / w
                 v = (m[1, 0] * x + m[1, 1] * y + m[1, 2]) / w
-                u0 = max(int(math.floor(u - reach_u)), 0)
-                u1 = min(int(math.floor(u + reach_u)), count - 1)
-                v0 = max(int(math.floor(v - reach_v)), 0)
-                v1 = min(int(math.floor(v + reach_v)), count - 1)
+                u0 = max(math.floor(u - reach_u), 0)
+                u1 = min(math.floor(u + reach_u), count - 1)
+                v0 = max(math.floor(v - reach_v), 0)
+                v1 = min(math.floor(v + reach_v), count - 1)
                 if u0 > u1 or v0 > v1:
                     continue
                 last = _cumulative((u0 - u) / spread[0], table)
