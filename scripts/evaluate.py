@@ -37,10 +37,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="bag folders or files")
     parser.add_argument("--out", type=Path, help="write results.json and the figures here")
-    parser.add_argument("--skip", type=float, default=0.0, metavar="S", help="leave out the first")
+    parser.add_argument("--window", choices=("plan", "cycles"), default="plan", help="what counts")
     parser.add_argument("--remove-lag", action="store_true", help="shift by the estimated lag")
     options = parser.parse_args()
-    settings = Settings(skip=options.skip, remove_lag=options.remove_lag)
+    settings = Settings(window=options.window, remove_lag=options.remove_lag)
     runs: list[RunSeries] = []
     results = []
     failed = 0

@@ -7,16 +7,10 @@ write_results([result], folder)                 # folder/results.json
 plot_tip([run], folder)
 """
 
+from der_planner.evaluation.alignment import Settings, Split, error_series, split_error
 from der_planner.evaluation.extract import load_run
 from der_planner.evaluation.figures import plot_error, plot_pressures, plot_tip
-from der_planner.evaluation.metrics import (
-    RunResult,
-    Settings,
-    error_series,
-    evaluate_bag,
-    evaluate_run,
-    split_error,
-)
+from der_planner.evaluation.metrics import RunResult, evaluate_bag, evaluate_run
 from der_planner.evaluation.results import read_results, results_document, write_results
 from der_planner.evaluation.series import Description, EvaluationError, RunSeries, Stream
 from der_planner.evaluation.statistics import Comparison, Summary, compare, summarise
@@ -37,6 +31,7 @@ __all__ = [
     "RunResult",
     "RunSeries",
     "Settings",
+    "Split",
     "Stream",
     "Summary",
     "compare",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,8 +12,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from der_planner.evaluation import style
-from der_planner.evaluation.metrics import error_series
-from der_planner.evaluation.series import RunSeries, Stream
+from der_planner.evaluation.alignment import error_series
+from der_planner.evaluation.series import Array, RunSeries, Stream
 from der_planner.evaluation.table import CASE
 
 FORMATS = ("png", "pdf")
@@ -63,7 +64,7 @@ def _draw_tip_row(row: Sequence[Axes], motion: str, runs: Sequence[RunSeries]) -
     plane, over_x, over_y = row
     for index, run in enumerate(runs):
         model = run.description.model
-        look = {
+        look: dict[str, Any] = {
             "color": style.colour(model, index),
             "alpha": 0.9 if len(runs) <= 4 else 0.5,
             "lw": 1.0,
@@ -75,7 +76,7 @@ def _draw_tip_row(row: Sequence[Axes], motion: str, runs: Sequence[RunSeries]) -
         over_x.plot(time, tip[:, 0], **look)
         over_y.plot(time, tip[:, 1], **look)
     reference = runs[0].reference
-    black = {"color": style.REFERENCE, "lw": 0.9, "ls": ":"}
+    black: dict[str, Any] = {"color": style.REFERENCE, "lw": 0.9, "ls": ":"}
     value = reference.value * CM
     plane.plot(value[:, 0], value[:, 1], label="reference", **black)
     over_x.plot(reference.time, value[:, 0], **black)
@@ -129,9 +130,7 @@ def _by_model(runs: Sequence[RunSeries]) -> dict[str, list[RunSeries]]:
     return found
 
 
-def mean_error(
-    runs: Sequence[RunSeries], rate: float = 20.0
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def mean_error(runs: Sequence[RunSeries], rate: float = 20.0) -> tuple[Array, Array, Array]:
     """Return time, mean and standard deviation of |r − r̄| over runs on a common grid [s, m, m].
 
     A gap in one run does not count there: at each instant the mean is over the runs that have a

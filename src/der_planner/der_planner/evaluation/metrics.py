@@ -2,8 +2,8 @@
 
 With r̄ the tip reference of the plan, interpolated linearly at the stamp of each image (the plan's
 setpoints are 50 ms apart, which costs under 0.01 mm), r the measured tip, and the window from the
-first to the last setpoint of the plan, ramp-in included: E is the mean over the valid images of
-|r − r̄|, its components the means of |x − x̄| and |y − ȳ|. Times come from stamps; nothing is shifted.
+first to the last setpoint of the plan: E is the mean over the valid images of |r − r̄|, its
+components the means of |x − x̄| and |y − ȳ|.
 """
 
 from __future__ import annotations
@@ -15,42 +15,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
+from der_planner.evaluation.alignment import Settings, error_series, split_error, window
 from der_planner.evaluation.extract import load_run
 from der_planner.evaluation.selfcheck import check_board, check_tracker, interpolate
-from der_planner.evaluation.series import Array, EvaluationError, RunSeries, Stream
+from der_planner.evaluation.series import Array, RunSeries
 
-LARGEST_LAG = 1.0
 GAP = 0.5
+"""Longest time without a valid image [s] that leaves a run fit for comparison."""
 LEAST_VALID = 0.9
-
-
-@dataclass(frozen=True)
-class Split:
-    """The measured tip as a late, scaled and shifted copy of the reference, and what is left.
-
-    r(t) ≈ g r̄(t − τ) + b per axis, fitted by least squares over the window; τ is common.
-
-    Attributes:
-        lag: τ [s], positive when the limb is late.
-        gain_x, gain_y: g.
-        bias_x, bias_y: mean of r − r̄ over the window after the lag is taken out [m].
-        rms: of |r − r̄| [m].
-        rms_without_lag: after the lag is taken out.
-        rms_without_bias: after the mean is taken out, too.
-        rms_without_gain: after the gains are fitted, too: neither lag, bias nor gain explains it.
-    """
-
-    lag: float
-    gain_x: float
-    gain_y: float
-    bias_x: float
-    bias_y: float
-    rms: float
-    rms_without_lag: float
-    rms_without_bias: float
-    rms_without_gain: float
+"""Least share of valid images of such a run."""
+REFERENCE_POINTS = 25
 
 
 @dataclass(frozen=True)
@@ -59,7 +34,8 @@ class RunResult:
 
     ``valid_fraction`` is the share of the images in the window whose limb state is valid;
     ``dropped_frames`` is estimated from the gaps between stamps. ``problems`` says in words what
-    makes the run unfit for a comparison. ``checks`` holds figures of the instruments (`selfcheck`).
+    makes the run unfit for a comparison; ``reference_points_m`` is r̄ at 25 evenly spaced instants
+    of the window. ``checks`` holds figures of the instruments (`selfcheck`).
     """
 
     motion: str
@@ -94,12 +70,13 @@ class RunResult:
     pressure_rms_error_pa: tuple[float, ...] = ()
     removed_lag_s: float = 0.0
     problems: tuple[str, ...] = ()
+    reference_points_m: tuple[tuple[float, float], ...] = ()
     checks: Mapping[str, float] = field(default_factory=dict)
     extra: Mapping[str, Any] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Return what ``results.json`` holds; NaN becomes None, which JSON can say."""
-        return {key: _json_value(value) for key, value in dataclasses.asdict(self).items()}
+        return {key: json_value(value) for key, value in dataclasses.asdict(self).items()}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> RunResult:
@@ -112,11 +89,12 @@ class RunResult:
         return cls(**given)
 
 
-def _json_value(value: Any) -> Any:
+def json_value(value: Any) -> Any:
+    """Return a value as JSON can say it: tuples as lists, NaN and infinity as None."""
     if isinstance(value, dict):
-        return {key: _json_value(entry) for key, entry in value.items()}
+        return {key: json_value(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_json_value(entry) for entry in value]
+        return [json_value(entry) for entry in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
@@ -124,19 +102,6 @@ def _python_value(value: Any) -> Any:
     if isinstance(value, list):
         return tuple(_python_value(entry) for entry in value)
     return float("nan") if value is None else value
-
-
-@dataclass(frozen=True)
-class Settings:
-    """How a run is evaluated.
-
-    Attributes:
-        skip: leave out so many seconds after the first setpoint, e.g. a ramp-in.
-        remove_lag: shift the measured tip by the estimated lag before E; the result says by how much.
-    """
-
-    skip: float = 0.0
-    remove_lag: bool = False
 
 
 def evaluate_bag(path: str | Path, settings: Settings | None = None) -> RunResult:
@@ -147,51 +112,6 @@ def evaluate_bag(path: str | Path, settings: Settings | None = None) -> RunResul
         BagError: it cannot be read.
     """
     return evaluate_run(load_run(path), settings)
-
-
-@dataclass(frozen=True)
-class ErrorSeries:
-    """Error over time of one run: time (F,) [s], error (F, 2) measured minus reference [m]."""
-
-    time: Array
-    error: Array
-    measured: Array
-    reference: Array
-
-    @property
-    def distance(self) -> Array:
-        """|r − r̄| (F,) [m]."""
-        return np.asarray(np.linalg.norm(self.error, axis=1))
-
-
-def error_series(run: RunSeries, settings: Settings | None = None) -> ErrorSeries:
-    """Return the error at every valid image of the window.
-
-    Raises:
-        EvaluationError: there is no valid image in the window.
-    """
-    settings = settings or Settings()
-    lag = split_error(run, settings).lag if settings.remove_lag else 0.0
-    first, last = _window(run, settings)
-    time = run.tip.time - lag
-    inside = (time >= first) & (time <= last) & np.isfinite(run.tip.value).all(axis=1)
-    if not inside.any():
-        raise EvaluationError(
-            f"{run.description.title}: no valid limb state between the first and the last setpoint"
-        )
-    reference = interpolate(run.reference, time[inside])
-    measured = run.tip.value[inside]
-    return ErrorSeries(time[inside], measured - reference, measured, reference)
-
-
-def _window(run: RunSeries, settings: Settings) -> tuple[float, float]:
-    first = float(run.reference.time[0]) + settings.skip
-    last = float(run.reference.time[-1])
-    if first >= last:
-        raise EvaluationError(
-            f"{run.description.title}: skipping {settings.skip} s leaves nothing of {last:.1f} s"
-        )
-    return first, last
 
 
 def evaluate_run(run: RunSeries, settings: Settings | None = None) -> RunResult:
@@ -206,7 +126,7 @@ def evaluate_run(run: RunSeries, settings: Settings | None = None) -> RunResult:
     """
     settings = settings or Settings()
     series = error_series(run, settings)
-    first, last = _window(run, settings)
+    first, last = window(run, settings)
     in_window = (run.tip.time >= first) & (run.tip.time <= last)
     frames = int(in_window.sum())
     dropped, longest = _gaps(run.tip.time[in_window], series.time, first, last)
@@ -246,6 +166,7 @@ def evaluate_run(run: RunSeries, settings: Settings | None = None) -> RunResult:
         pressure_rms_error_pa=_pressure_errors(run, first, last),
         removed_lag_s=split.lag if settings.remove_lag else 0.0,
         problems=_problems(run, valid, longest),
+        reference_points_m=_reference_points(run, first, last),
         checks=_checks(run, first, last),
         extra=dict(about.extra),
     )
@@ -259,6 +180,12 @@ def _gaps(stamps: Array, valid: Array, first: float, last: float) -> tuple[int, 
         dropped = int(np.sum(np.maximum(0, np.rint(steps / np.median(steps)) - 1)))
     edges = np.concatenate([[first], valid, [last]])
     return dropped, float(np.diff(edges).max())
+
+
+def _reference_points(run: RunSeries, first: float, last: float) -> tuple[tuple[float, float], ...]:
+    """Return r̄ at evenly spaced instants of the window: enough to tell two references apart."""
+    points = interpolate(run.reference, np.linspace(first, last, REFERENCE_POINTS))
+    return tuple((round(float(x), 6), round(float(y), 6)) for x, y in points)
 
 
 def _predicted_error(run: RunSeries) -> float:
@@ -314,80 +241,3 @@ def _checks(run: RunSeries, first: float, last: float) -> dict[str, float]:
             "board_value_error_pa": board.value_error,
         }
     return figures
-
-
-def split_error(run: RunSeries, settings: Settings | None = None) -> Split:
-    """Fit lag, gain and bias of the measured against the reference tip.
-
-    The lag minimises the squared distance of r(t) and r̄(t − τ) after the mean difference is taken
-    out, |τ| up to 1 s; a reference that stands still has none, and gets 0.
-
-    Args:
-        run: with at least a few valid images.
-        settings: window.
-
-    Raises:
-        EvaluationError: there is no valid image in the window.
-    """
-    first, last = _window(run, settings or Settings())
-    # The same samples for every lag, so that residuals compare.
-    margin = min(LARGEST_LAG, 0.1 * (last - first))
-    valid = np.isfinite(run.tip.value).all(axis=1)
-    inside = valid & (run.tip.time >= first + margin) & (run.tip.time <= last - margin)
-    if inside.sum() < 3:
-        inside = valid & (run.tip.time >= first) & (run.tip.time <= last)
-    if not inside.any():
-        raise EvaluationError(
-            f"{run.description.title}: no valid limb state between the first and the last setpoint"
-        )
-    time, measured = run.tip.time[inside], run.tip.value[inside]
-    lag = _best_lag(run.reference, time, measured, margin)
-    present = interpolate(run.reference, time)
-    late = interpolate(run.reference, time - lag)
-    offset = (measured - late).mean(axis=0)
-    gains, fitted = _fit_gains(late, measured)
-    return Split(
-        lag=lag,
-        gain_x=float(gains[0]),
-        gain_y=float(gains[1]),
-        bias_x=float(offset[0]),
-        bias_y=float(offset[1]),
-        rms=_rms(measured - present),
-        rms_without_lag=_rms(measured - late),
-        rms_without_bias=_rms(measured - late - offset),
-        rms_without_gain=_rms(measured - fitted),
-    )
-
-
-def _rms(difference: Array) -> float:
-    return float(np.sqrt(np.mean(np.sum(difference**2, axis=1))))
-
-
-def _best_lag(reference: Stream, time: Array, measured: Array, margin: float) -> float:
-    def cost(lag: float) -> float:
-        difference = measured - interpolate(reference, time - lag)
-        return _rms(difference - difference.mean(axis=0))
-
-    if np.ptp(reference.value, axis=0).max() < 1e-6:
-        return 0.0
-    grid = np.linspace(-margin, margin, 41)
-    best = grid[int(np.argmin([cost(lag) for lag in grid]))]
-    step = grid[1] - grid[0]
-    found = minimize_scalar(
-        cost,
-        bounds=(max(-margin, best - step), min(margin, best + step)),
-        method="bounded",
-        options={"xatol": 1e-5},
-    )
-    return float(found.x)
-
-
-def _fit_gains(reference: Array, measured: Array) -> tuple[Array, Array]:
-    gains, fitted = np.ones(2), np.empty_like(measured)
-    for axis in range(2):
-        centred = reference[:, axis] - reference[:, axis].mean()
-        power = float(centred @ centred)
-        if power > 1e-12 * len(centred):
-            gains[axis] = float(centred @ measured[:, axis]) / power
-        fitted[:, axis] = measured[:, axis].mean() + gains[axis] * centred
-    return gains, fitted

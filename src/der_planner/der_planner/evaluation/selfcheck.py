@@ -59,7 +59,8 @@ def check_tracker(
     Args:
         tip: (F, 2) tracked, NaN where invalid.
         truth: (T, 2) simulated.
-        first, last: window [s].
+        first: start of the window [s].
+        last: its end [s].
 
     Returns:
         None where the bag has no ground truth in the window.
@@ -92,8 +93,8 @@ def check_board(log: BoardLog | None) -> BoardCheck | None:
     """Match every setpoint with the command that carried it.
 
     The command nearest in time is the setpoint's own if its value is the setpoint's within the
-    wire's rounding. A setpoint without such a command is looked for among the later ones that belong
-    to no other setpoint, up to `LATEST` after its stamp.
+    wire's rounding. A setpoint without such a command is looked for among the later ones that
+    belong to no other setpoint, up to `LATEST` after its stamp.
     """
     if log is None or not len(log.setpoint_time):
         return None

@@ -1,7 +1,7 @@
 """What was measured and asked for in one run, as arrays: the input of every metric.
 
-A bag becomes a `RunSeries` in `extract`; runs without a bag (offline ones, logs of other tools) build
-it from their arrays with `RunSeries.from_arrays`.
+A bag becomes a `RunSeries` in `extract`; runs without a bag (offline ones, logs of other tools)
+build it from their arrays with `RunSeries.from_arrays`.
 """
 
 from __future__ import annotations
@@ -138,7 +138,8 @@ class RunSeries:
             tip_reference: (K, 2) [m].
             tip_predicted: (K, 2) [m].
             pressure_time: (P,) [s].
-            commanded, measured: (P, M) differential pressures [Pa].
+            commanded: (P, M) differential pressures [Pa].
+            measured: (P, M) differential pressures [Pa].
 
         Raises:
             EvaluationError: shapes do not fit or times do not rise; the message says which.
@@ -151,7 +152,7 @@ class RunSeries:
             if tip_predicted is not None
             else Stream(_empty(0), _empty(0, 2))
         )
-        pressures = {}
+        pressures = {name: Stream(_empty(0), _empty(0, 0)) for name in ("commanded", "measured")}
         if pressure_time is not None:
             ticks = _times(pressure_time, "pressure_time", description)
             for name, value in (("commanded", commanded), ("measured", measured)):
@@ -163,7 +164,8 @@ class RunSeries:
             reference=Stream(setpoints, reference),
             predicted=predicted,
             tip=Stream(clock, _rows(tip, len(clock), "tip", description)),
-            **pressures,
+            commanded=pressures["commanded"],
+            measured=pressures["measured"],
         )
 
 
@@ -171,7 +173,7 @@ def _times(value: ArrayLike, name: str, description: Description) -> Array:
     array = np.asarray(value, dtype=float)
     if array.ndim != 1 or len(array) < 2 or not np.all(np.diff(array) > 0):
         raise EvaluationError(
-            f"{description.title}: {name} must be at least two rising times, got shape {array.shape}"
+            f"{description.title}: {name} must be two or more rising times, got shape {array.shape}"
         )
     return array
 

@@ -11,12 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from der_planner.evaluation.metrics import RunResult, _json_value
+from der_planner.evaluation.metrics import RunResult, json_value
 from der_planner.evaluation.series import Array
 
 RESAMPLES = 10_000
 CONFIDENCE = 0.95
 SEED = 20260
+SAME_REFERENCE = 1e-4
+"""References nearer than that [m] are the same."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class Summary:
 
     def to_dict(self) -> dict[str, Any]:
         """Return what ``results.json`` holds."""
-        return {key: _json_value(value) for key, value in asdict(self).items()}
+        return {key: json_value(value) for key, value in asdict(self).items()}
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,7 @@ class Comparison:
 
     def to_dict(self) -> dict[str, Any]:
         """Return what ``results.json`` holds."""
-        return {key: _json_value(value) for key, value in asdict(self).items()}
+        return {key: json_value(value) for key, value in asdict(self).items()}
 
 
 Key = tuple[str, str, str]
@@ -97,25 +99,30 @@ def summarise(results: Sequence[RunResult]) -> list[Summary]:
     """
     rows = []
     for (motion, model, method), runs in group(results).items():
-        errors = np.array([[r.mean_error_m, r.mean_error_x_m, r.mean_error_y_m] for r in runs])
-        mean = errors.mean(axis=0)
-        deviation = errors.std(axis=0, ddof=1) if len(runs) > 1 else np.full(3, np.nan)
-        problems = [f"trial {run.trial}: {text}" for run in runs for text in run.problems]
-        rows.append(
-            Summary(
-                motion,
-                model,
-                method,
-                len(runs),
-                *(float(value) for value in mean),
-                *(float(value) for value in deviation),
-                max_error_m=max(run.max_error_m for run in runs),
-                valid_fraction=float(np.mean([run.valid_fraction for run in runs])),
-                predicted_error_m=float(np.mean([run.predicted_error_m for run in runs])),
-                problems=tuple(problems),
-            )
-        )
+        rows.append(_summary(motion, model, method, runs))
     return rows
+
+
+def _summary(motion: str, model: str, method: str, runs: Sequence[RunResult]) -> Summary:
+    errors = np.array([[r.mean_error_m, r.mean_error_x_m, r.mean_error_y_m] for r in runs])
+    mean = errors.mean(axis=0)
+    deviation = errors.std(axis=0, ddof=1) if len(runs) > 1 else np.full(3, np.nan)
+    return Summary(
+        motion=motion,
+        model=model,
+        method=method,
+        trials=len(runs),
+        mean_error_m=float(mean[0]),
+        mean_error_x_m=float(mean[1]),
+        mean_error_y_m=float(mean[2]),
+        std_error_m=float(deviation[0]),
+        std_error_x_m=float(deviation[1]),
+        std_error_y_m=float(deviation[2]),
+        max_error_m=max(run.max_error_m for run in runs),
+        valid_fraction=float(np.mean([run.valid_fraction for run in runs])),
+        predicted_error_m=float(np.mean([run.predicted_error_m for run in runs])),
+        problems=tuple(f"trial {run.trial}: {text}" for run in runs for text in run.problems),
+    )
 
 
 @dataclass
@@ -159,24 +166,20 @@ def why_not_comparable(results: Sequence[RunResult]) -> str:
     for run in results:
         if run.problems:
             return f"{run.bag or run.motion} (trial {run.trial}): {'; '.join(run.problems)}"
-    for name, unit in (
-        ("amplitude_rad", "rad"),
-        ("period_s", "s"),
-        ("cycles", ""),
-        ("removed_lag_s", "s"),
-    ):
+    for name, unit in (("amplitude_rad", " rad"), ("period_s", " s"), ("cycles", "")):
         values = sorted({round(getattr(run, name), 6) for run in results})
-        if len(values) > 1 and name != "removed_lag_s":
-            listed = ", ".join(f"{value:g} {unit}".strip() for value in values)
-            return f"different {name.rsplit('_', 1)[0] if unit else name}: {listed}"
+        if len(values) > 1:
+            listed = ", ".join(f"{value:g}{unit}" for value in values)
+            return f"different {name.split('_')[0]}: {listed}"
     if len({bool(run.removed_lag_s) for run in results}) > 1:
         return "the lag was removed from some runs only"
     windows = {(round(run.window_s[0], 3), round(run.window_s[1], 3)) for run in results}
     if len(windows) > 1:
         return f"different windows: {', '.join(f'{a:g} to {b:g} s' for a, b in sorted(windows))}"
-    paths = {run.extra.get("reference_digest") for run in results} - {None}
-    if len(paths) > 1:
-        return "the tip references differ by more than 0.1 mm"
+    paths = [np.array(run.reference_points_m) for run in results if run.reference_points_m]
+    apart = max((float(np.abs(path - paths[0]).max()) for path in paths[1:]), default=0.0)
+    if apart > SAME_REFERENCE:
+        return f"the tip references are up to {apart * 1000:.1f} mm apart"
     return ""
 
 

@@ -1,1 +1,1 @@
-"""Recording: MCAP bags in rosbag2's layout, their reader and their repair. Nothing here needs ROS."""
+"""Recording: MCAP bags in rosbag2's layout, their reader and their repair; nothing needs ROS."""

@@ -18,7 +18,10 @@ from pathlib import Path
 
 SEPARATOR = "=" * 80
 _PRIMITIVES = frozenset(
-    ["bool", "byte", "char", "float32", "float64", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64", "string", "wstring"]
+    (
+        *("bool", "byte", "char", "float32", "float64", "string", "wstring"),
+        *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
+    )
 )
 _FIELD = re.compile(r"^\s*([A-Za-z][A-Za-z0-9_/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+[A-Za-z]")
 _PARTS = 3

@@ -20,13 +20,8 @@ from rosbags.rosbag2 import Reader, ReaderError
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
 from der_planner.recording.layout import METADATA_FILE, RUN_KEY
-from der_planner.recording.recover import (
-    RecoverError,
-    bag_files,
-    copy_finished,
-    parse_run,
-    scan_file,
-)
+from der_planner.recording.recover import copy_finished
+from der_planner.recording.scan import RecoverError, bag_files, parse_run, scan_file
 
 
 class BagError(ValueError):
@@ -157,12 +152,12 @@ class BagReader:
     @property
     def start(self) -> int:
         """Log time of the first message [ns]."""
-        return min(reader.start_time for reader in self._readers)
+        return int(min(reader.start_time for reader in self._readers))
 
     @property
     def end(self) -> int:
         """Log time of the last message [ns]."""
-        return max(reader.end_time - 1 for reader in self._readers)
+        return int(max(reader.end_time - 1 for reader in self._readers))
 
     def run(self) -> dict[str, Any]:
         """Return what the recorder was told of the run; empty for bags of other recorders."""
@@ -187,7 +182,8 @@ class BagReader:
 
         Args:
             topics: names; every topic if None.
-            start, stop: log times [ns], start included, stop not.
+            start: first log time [ns].
+            stop: log time before which to stop [ns].
         """
         for reader in self._readers:
             wanted = [c for c in reader.connections if topics is None or c.topic in topics]

@@ -1,16 +1,16 @@
 """Write a bag: raw CDR in MCAP files with embedded definitions, safe at every flush.
 
-rosbag2's own writer keeps a chunk open until it is full; here every `flush` ends the chunk and hands
-it to the operating system, so a killed process leaves whole chunks and `recover` only has to add the
-index. A write that fails (full disk, removed folder) truncates the file to its last whole chunk and
-finishes it there.
+rosbag2's own writer keeps a chunk open until it is full; here every `flush` ends the chunk and
+hands it to the operating system, so a killed process leaves whole chunks and `recover` only has to
+add the index. A write that fails (full disk, removed folder) truncates the file to its last
+whole chunk and finishes it there.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO
 
@@ -24,6 +24,7 @@ from der_planner.recording.layout import (
     file_name,
 )
 from der_planner.recording.recover import finish_file
+from der_planner.recording.scan import scan_file
 
 COMPRESSIONS = {
     "none": CompressionType.NONE,
@@ -224,7 +225,7 @@ class BagWriter:
         name = file_name(self.folder, len(self._files))
         self._sink = _Sink(self.folder / name)
         self._writer = Writer(
-            self._sink,  # type: ignore[arg-type] - has the three methods that the writer calls
+            self._sink,  # has the three methods that the writer calls
             chunk_size=self._chunk_size,
             compression=self._compression,
         )
@@ -277,7 +278,7 @@ class BagWriter:
         )
 
     @contextlib.contextmanager
-    def _guarded(self):  # type: ignore[no-untyped-def]
+    def _guarded(self) -> Iterator[None]:
         """Turn a refused write into a finished bag and a BagWriteError."""
         try:
             yield
@@ -332,8 +333,6 @@ class BagWriter:
 
 
 def _counts_of_finished(folder: Path, names: list[str]) -> dict[str, int]:
-    from der_planner.recording.recover import scan_file  # noqa: PLC0415 - only after a failure
-
     total: dict[str, int] = {}
     for name in names:
         for topic, count in scan_file(folder / name).counts.items():
