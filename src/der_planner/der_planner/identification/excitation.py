@@ -1,4 +1,4 @@
-"""The pressures of a calibration run."""
+"""The pressures of a calibration run: stairs, slow waves, steps and a band-limited sweep."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ Array = NDArray[np.float64]
 
 PERIOD = 0.05
 """Of setpoints [s]."""
+SETTLED = 0.6
+"""Share of a stair after which air and limb rest."""
 
 
 @dataclass(frozen=True)
@@ -20,18 +22,29 @@ class Excitation:
     Attributes:
         time: (K,) [s].
         differential_pressure: (K, M) [Pa].
-        stairs: (S, 2) first and last instant of each stair's rest [s].
+        parts: (name, first instant, last instant) of each part [s].
     """
 
     time: Array
     differential_pressure: Array
-    stairs: Array
+    parts: tuple[tuple[str, float, float], ...]
+
+    @property
+    def duration(self) -> float:
+        """Length of the run [s]."""
+        return float(self.time[-1] + PERIOD)
 
 
-def staircase(
-    amplitude: float, segment_count: int = 2, levels: int = 3, hold: float = 4.0
-) -> Excitation:
-    """Return a slow staircase both ways on each input alone, on all together and alternating.
+def directions(segment_count: int) -> list[Array]:
+    """Return each input alone, all together and alternating, as (M,) signs."""
+    result = [*np.eye(segment_count)]
+    if segment_count > 1:
+        result += [np.ones(segment_count), (-1.0) ** np.arange(segment_count)]
+    return result
+
+
+def staircase(amplitude: float, segment_count: int = 2, levels: int = 2, hold: float = 3.0) -> Array:
+    """Return a staircase (K, M) [Pa] both ways along each of `directions`.
 
     Args:
         amplitude: largest |differential pressure| [Pa].
@@ -39,16 +52,82 @@ def staircase(
         levels: stairs from zero to the amplitude.
         hold: duration of a stair [s].
     """
-    up = np.arange(0, levels + 1) / levels
-    cycle = np.concatenate([up, up[-2::-1], -up[1:], -up[-2::-1]])
-    directions = [*np.eye(segment_count)]
-    if segment_count > 1:
-        directions += [np.ones(segment_count), (-1.0) ** np.arange(segment_count)]
-    heights = amplitude * np.concatenate([np.outer(cycle, direction) for direction in directions])
-    per_stair = round(hold / PERIOD)
-    pressure = np.repeat(heights, per_stair, axis=0)
-    time = np.arange(len(pressure)) * PERIOD
-    ends = (np.arange(len(heights)) + 1) * hold
-    # The end of a stair, when neither air nor limb moves any more.
-    stairs = np.stack([ends - 0.2 * hold, ends - 0.5 * PERIOD], axis=1)
-    return Excitation(time, pressure, stairs)
+    up = np.arange(1, levels + 1) / levels
+    down = up[-2::-1]
+    cycle = np.concatenate([up, down, [0.0], -up, -down, [0.0]])
+    heights = np.concatenate([np.outer(cycle, way) for way in directions(segment_count)])
+    return np.repeat(amplitude * heights, round(hold / PERIOD), axis=0)
+
+
+def waves(amplitude: float, segment_count: int = 2, duration: float = 64.0) -> Array:
+    """Return slow waves (K, M) [Pa]: different periods, first one-sided, then both ways.
+
+    Loops of several widths tell friction from creep and from stiffening.
+    """
+    t = np.arange(round(duration / PERIOD)) * PERIOD
+    columns = []
+    for index in range(segment_count):
+        period = duration / (3 + index)
+        wave = np.sin(2 * np.pi * t / period - 0.5 * np.pi) + 1.0
+        offset = np.clip((t - 0.4 * duration) / (0.2 * duration), 0.0, 1.0)
+        columns.append((-1.0) ** index * 0.5 * amplitude * (wave - offset * (1 + 0.5 * offset)))
+    return _fade(np.stack(columns, axis=1), 2.0)
+
+
+def steps(amplitude: float, segment_count: int = 2, hold: float = 4.0) -> Array:
+    """Return one step up and down of each input in turn (K, M) [Pa], for air and ring-down."""
+    count = round(hold / PERIOD)
+    blocks = []
+    for index in range(segment_count):
+        for height in (amplitude, 0.0):
+            block = np.zeros((count, segment_count))
+            block[:, index] = height
+            blocks.append(block)
+    return np.concatenate(blocks)
+
+
+def sweep(
+    amplitude: float, segment_count: int = 2, duration: float = 16.0, band: tuple[float, float] = (0.1, 1.2)
+) -> Array:
+    """Return a sweep (K, M) [Pa] through a band of frequencies [Hz], its inputs out of step."""
+    t = np.arange(round(duration / PERIOD)) * PERIOD
+    low, high = band
+    phase = 2 * np.pi * low * duration / np.log(high / low) * ((high / low) ** (t / duration) - 1)
+    columns = [np.sin(phase * (1 + 0.15 * index)) for index in range(segment_count)]
+    return _fade(amplitude * np.stack(columns, axis=1), 1.0)
+
+
+def calibration_run(amplitude: float, segment_count: int = 2) -> Excitation:
+    """Return the whole run, about three minutes for two segments.
+
+    Args:
+        amplitude: largest |differential pressure| [Pa].
+        segment_count: M.
+    """
+    pause = np.zeros((round(2.0 / PERIOD), segment_count))
+    named = (
+        ("rest", pause),
+        ("waves", waves(amplitude, segment_count)),
+        ("rest", pause),
+        ("staircase", staircase(amplitude, segment_count)),
+        ("steps", steps(0.4 * amplitude, segment_count)),
+        ("sweep", sweep(0.25 * amplitude, segment_count)),
+        ("rest", pause),
+    )
+    ends = np.cumsum([len(block) for _, block in named])
+    parts = tuple(
+        (name, (end - len(block)) * PERIOD, (end - 1) * PERIOD)
+        for (name, block), end in zip(named, ends, strict=True)
+    )
+    pressure = np.concatenate([block for _, block in named])
+    return Excitation(np.arange(len(pressure)) * PERIOD, pressure, parts)
+
+
+def _fade(wave: Array, duration: float) -> Array:
+    count = round(duration / PERIOD)
+    ramp = 0.5 - 0.5 * np.cos(np.pi * np.arange(count) / count)
+    shape = np.ones(len(wave))
+    shape[:count] *= ramp
+    shape[-count:] *= ramp[::-1]
+    faded: Array = wave * shape[:, None]
+    return faded

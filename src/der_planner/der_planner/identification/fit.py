@@ -1,0 +1,293 @@
+"""From a log to a limb: air, lengths, statics, then everything at once on the rod's dynamics."""
+
+from __future__ import annotations
+
+import datetime
+import time as clock
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from der_planner.identification.air import AirFit, fit_air
+from der_planner.identification.geometry import GeometryFit, fit_geometry, with_lengths
+from der_planner.identification.log import CalibrationLog, LogError
+from der_planner.identification.parameters import (
+    GROUPS,
+    TERMS,
+    column,
+    start_values,
+    to_limb,
+    without,
+)
+from der_planner.identification.prediction import NODES, RodPrediction
+from der_planner.identification.prepare import PERIOD, Prepared, prepare
+from der_planner.identification.report import FitReport, Unknown
+from der_planner.identification.statics import static_gain
+from der_planner.limb import CalibratedRange, Limb
+
+Array = NDArray[np.float64]
+
+ANGLE_ERROR = np.deg2rad(0.3)
+"""Error of a predicted bend angle that is taken for granted [rad]; the residual replaces it."""
+CORRELATION = 20.0
+"""Rows over which an error of the model stays the same (1 s)."""
+STRONG = 0.9
+"""|correlation| above which two unknowns are said to be told only together."""
+UNTOLD = 0.8
+"""Share of its prior spread that must be left of an unknown that the data say nothing about."""
+
+
+def fit(
+    limb: Limb,
+    log: CalibrationLog,
+    *,
+    terms: Iterable[str] = GROUPS,
+    geometry: bool = True,
+    nodes: int = NODES,
+) -> tuple[Limb, FitReport]:
+    """Identify a limb from a calibration run.
+
+    Args:
+        limb: geometry, masses, limits and first guesses; mass and axial stiffness are kept.
+        log: of a calibration run, or of any run that excites every input.
+        terms: model terms to fit beside gain and rest angle, of `GROUPS`.
+        geometry: fit the segment lengths to the tips as well.
+        nodes: of the rod in the fit.
+
+    Returns:
+        The identified limb, with provenance and calibrated ranges, and what the data say of it.
+
+    Raises:
+        LogError: the log cannot tell the limb; the message names what is missing.
+    """
+    begin = clock.perf_counter()
+    groups = frozenset(terms)
+    if not groups <= set(GROUPS):
+        raise LogError(f"unknown model term {sorted(groups - set(GROUPS))}: choose {GROUPS}")
+    prepared = prepare(log, limb)
+    warnings = list(prepared.warnings)
+    air = _try_air(prepared, warnings)
+    lengths = fit_geometry(limb, prepared.log) if geometry else None
+    if lengths is not None:
+        limb = with_lengths(limb, lengths.lengths)
+    offset = np.zeros(limb.segment_count) if air is None else air.offset
+    problem = _Problem(limb, prepared, offset, groups, nodes)
+    values, jacobian = problem.solve()
+    unknowns, correlation = problem.uncertainties(values, jacobian)
+    remaining = problem.remaining(values)
+    found = _finish(limb, to_limb(limb, values), air, prepared, remaining)
+    report = FitReport(
+        source=log.source,
+        unknowns=unknowns,
+        correlation=correlation,
+        strongly_correlated=_pairs(unknowns, correlation),
+        untold=tuple(u.name for u in unknowns if u.untold),
+        air=air,
+        geometry=lengths,
+        residual=np.sqrt(np.nanmean(remaining**2, axis=0)),
+        largest=np.nanmax(np.abs(remaining), axis=0),
+        span=np.ptp(prepared.bend[prepared.usable], axis=0),
+        duration=float(prepared.log.time[-1] - prepared.log.time[0]),
+        rows=int(prepared.usable.sum()),
+        evaluations=problem.evaluations,
+        fit_time=clock.perf_counter() - begin,
+        warnings=tuple(warnings),
+    )
+    return found, report
+
+
+class _Problem:
+    """Nonlinear least squares of the bend angles with priors, on the rod's exact derivatives."""
+
+    def __init__(
+        self, limb: Limb, prepared: Prepared, offset: Array, groups: frozenset[str], nodes: int
+    ) -> None:
+        self._groups = groups
+        self._prepared = prepared
+        self._wanted = [
+            (segment, index)
+            for segment in range(limb.segment_count)
+            for index, term in enumerate(TERMS)
+            if term.group == "linear" or term.group in groups
+        ]
+        self._scale = np.array([TERMS[index].scale for _, index in self._wanted])
+        self._spread = np.array([TERMS[index].spread for _, index in self._wanted])
+        self._known = np.isfinite(self._spread)
+        self._prediction = RodPrediction(
+            limb, prepared.log.time, prepared.pressure - offset, prepared.bend, nodes
+        )
+        self._start = self._start_values(limb, prepared, offset)
+        self._weight = 1.0 / (ANGLE_ERROR * np.sqrt(CORRELATION))
+        self._cache: tuple[bytes, Array, Array] | None = None
+        self.evaluations = 0
+
+    def solve(self) -> tuple[Array, Array]:
+        """Return the unknowns (M, T) and the Jacobian of the weighted residual."""
+        low = np.array([TERMS[index].low for _, index in self._wanted]) / self._scale
+        high = np.array([TERMS[index].high for _, index in self._wanted]) / self._scale
+        start = np.array([self._start[place] for place in self._wanted]) / self._scale
+        margin = 1e-6 * (high - low)
+        solution = least_squares(
+            self._residual,
+            np.clip(start, low + margin, high - margin),
+            jac=self._jacobian,
+            bounds=(low, high),
+            loss="soft_l1",
+            f_scale=3.0 / np.sqrt(CORRELATION),
+            xtol=1e-4,
+            ftol=1e-5,
+            max_nfev=25,
+        )
+        values = self._values(solution.x)
+        return values, self._jacobian(solution.x)
+
+    def remaining(self, values: Array) -> Array:
+        """Return measured less predicted bend angles (K, M) [rad], NaN where nothing was measured."""
+        return self._prepared.log.bend_angles - self._prediction.angles(values)
+
+    def uncertainties(self, values: Array, jacobian: Array) -> tuple[tuple[Unknown, ...], Array]:
+        """Return the unknowns with standard deviations, and their correlation (P, P)."""
+        remaining = self.remaining(values)
+        error = float(np.sqrt(np.nanmean(remaining**2)))
+        # Neighbouring errors are alike: as many independent ones as the residual's memory leaves.
+        factor = (error / ANGLE_ERROR) ** 2 * correlation_length(remaining) / CORRELATION
+        data = jacobian[: -int(self._known.sum()) or None]
+        information = data.T @ data / max(factor, 1e-6)
+        prior = np.where(self._known, self._scale / self._spread, 0.0)
+        covariance = np.linalg.pinv(information + np.diag(prior**2))
+        deviation = np.sqrt(np.diag(covariance))
+        correlation = covariance / np.outer(deviation, deviation)
+        unknowns = []
+        for place, (segment, index) in enumerate(self._wanted):
+            term = TERMS[index]
+            sigma = float(deviation[place] * term.scale)
+            unknowns.append(
+                Unknown(
+                    name=f"{term.name}[{segment}]",
+                    unit=term.unit,
+                    value=float(values[segment, index]),
+                    deviation=sigma,
+                    untold=bool(sigma > UNTOLD * term.spread),
+                    at_bound=bool(
+                        min(values[segment, index] - term.low, term.high - values[segment, index])
+                        < 1e-3 * (term.high - term.low)
+                    ),
+                )
+            )
+        return tuple(unknowns), correlation
+
+    def _start_values(self, limb: Limb, prepared: Prepared, offset: Array) -> Array:
+        rows = prepared.usable
+        gains, rests = static_gain((prepared.pressure - offset)[rows], prepared.bend[rows])
+        values = without(start_values(limb), self._groups)
+        values[:, column("gain")] = np.clip(gains, 1.1 * TERMS[0].low, 0.9 * TERMS[0].high)
+        values[:, column("rest_angle")] = np.clip(rests, -0.5, 0.5)
+        return values
+
+    def _values(self, x: Array) -> Array:
+        values = self._start.copy()
+        for place, scaled in zip(self._wanted, x * self._scale, strict=True):
+            values[place] = scaled
+        return values
+
+    def _evaluate(self, x: Array) -> tuple[Array, Array]:
+        key = x.tobytes()
+        if self._cache is None or self._cache[0] != key:
+            angles, derivatives = self._prediction.derivatives(self._values(x), self._wanted)
+            self._cache = (key, angles, derivatives)
+            self.evaluations += 1
+        return self._cache[1], self._cache[2]
+
+    def _residual(self, x: Array) -> Array:
+        angles, _ = self._evaluate(x)
+        rows = self._prepared.usable
+        data = self._weight * (angles - self._prepared.log.bend_angles)[rows]
+        prior = ((x - self._start_scaled()) * self._scale / self._spread)[self._known]
+        return np.concatenate([data.ravel(), prior])
+
+    def _jacobian(self, x: Array) -> Array:
+        _, derivatives = self._evaluate(x)
+        rows = self._prepared.usable
+        data = self._weight * derivatives[rows].reshape(-1, len(x)) * self._scale
+        prior = np.diag(self._scale / self._spread)[self._known]
+        return np.concatenate([data, prior])
+
+    def _start_scaled(self) -> Array:
+        return np.array([self._start[place] for place in self._wanted]) / self._scale
+
+
+def correlation_length(remaining: Array, longest: int = 200) -> float:
+    """Return over how many rows the errors (K, M) of a prediction stay alike, 1 or more.
+
+    One plus twice the sum of the autocorrelation up to its first zero, the larger of the columns.
+    """
+    lengths = [1.0]
+    for error in remaining.T:
+        known = error[np.isfinite(error)]
+        known = known - known.mean()
+        power = float(known @ known)
+        if power == 0 or known.size < 2:
+            continue
+        total = 1.0
+        for lag in range(1, min(longest, known.size - 1)):
+            value = float(known[lag:] @ known[:-lag]) / power
+            if value <= 0:
+                break
+            total += 2.0 * value
+        lengths.append(total)
+    return max(lengths)
+
+
+def _try_air(prepared: Prepared, warnings: list[str]) -> AirFit | None:
+    try:
+        return fit_air(prepared.log, PERIOD)
+    except LogError as error:
+        warnings.append(f"the chambers' lag keeps its old value: {error}")
+        return None
+
+
+def _pairs(unknowns: tuple[Unknown, ...], correlation: Array) -> tuple[tuple[str, str, float], ...]:
+    count = len(unknowns)
+    return tuple(
+        (unknowns[i].name, unknowns[j].name, float(correlation[i, j]))
+        for i in range(count)
+        for j in range(i)
+        if abs(correlation[i, j]) > STRONG
+    )
+
+
+def _finish(
+    prior: Limb, found: Limb, air: AirFit | None, prepared: Prepared, remaining: Array
+) -> Limb:
+    pneumatics = prior.pneumatics
+    if air is not None:
+        pneumatics = replace(
+            pneumatics,
+            time_constant=air.fill_lag,
+            vent_time_constant=air.vent_lag,
+            delay=air.delay,
+            fill_rate=air.fill_rate if np.isfinite(air.fill_rate) else pneumatics.fill_rate,
+        )
+    rows = prepared.usable
+    error = np.degrees(np.sqrt(np.nanmean(remaining**2, axis=0)))
+    return replace(
+        found,
+        pneumatics=pneumatics,
+        calibrated=CalibratedRange(
+            tuple(float(v) for v in np.abs(prepared.pressure[rows]).max(axis=0)),
+            tuple(float(v) for v in np.abs(prepared.bend[rows]).max(axis=0)),
+        ),
+        provenance={
+            "source": prepared.log.source,
+            "date": datetime.datetime.now(datetime.timezone.utc).date().isoformat(),
+            "fitted_by": "der_planner.identification",
+            "residual_deg": [round(float(v), 3) for v in error],
+            "prior": prior.name,
+        },
+    )
+
+
+__all__ = ["AirFit", "FitReport", "GeometryFit", "fit"]

@@ -1,0 +1,129 @@
+"""The unknowns of a fit: names, units, scales, bounds, what is known before, and their place in a limb."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from der_planner.limb import Limb, Segment
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Term:
+    """One unknown of a segment, in units in which it can be told from angles and pressures.
+
+    Attributes:
+        name: as reports print it.
+        unit: of its value.
+        scale: a typical value; the solver works in multiples of it.
+        low, high: bounds.
+        spread: standard deviation of what is known before any data; infinite for nothing.
+        group: the model term that it belongs to; `linear` is always fitted.
+    """
+
+    name: str
+    unit: str
+    scale: float
+    low: float
+    high: float
+    spread: float
+    group: str
+
+
+TERMS = (
+    Term("gain", "rad/Pa", 5e-5, 5e-6, 5e-4, math.inf, "linear"),
+    Term("rest_angle", "rad", 0.02, -0.6, 0.6, math.inf, "linear"),
+    Term("gain_asymmetry", "-", 0.03, -0.4, 0.4, 0.1, "asymmetry"),
+    Term("pressure_stiffening", "1/Pa", 3e-6, -2e-5, 3e-5, 1e-5, "stiffening"),
+    Term("friction_pressure", "Pa", 300.0, 0.0, 4000.0, 800.0, "friction"),
+    Term("friction_angle", "rad", 0.1, 0.02, 0.8, 0.1, "friction"),
+    Term("creep_pressure", "Pa/rad", 500.0, 0.0, 5000.0, 1000.0, "creep"),
+    Term("creep_time", "s", 15.0, 3.0, 120.0, 15.0, "creep"),
+    Term("log_stiffness", "-", 0.2, -1.2, 1.2, 0.3, "dynamics"),
+    Term("log_damping", "-", 0.5, -3.0, 3.0, 1.0, "dynamics"),
+)
+"""Unknowns of each segment. The last two are relative to the prior's, as natural logarithms."""
+
+GROUPS = ("asymmetry", "stiffening", "friction", "creep", "dynamics")
+"""Model terms that may be left out, in the order in which they are explained."""
+_INDEX = {term.name: index for index, term in enumerate(TERMS)}
+
+
+def start_values(limb: Limb) -> Array:
+    """Return the (M, T) values of a limb, with plausible memory where it has none."""
+    rows = []
+    for segment in limb.segments:
+        gain = segment.moment_gain
+        rows.append(
+            [
+                gain * segment.length / segment.bending_stiffness,
+                segment.rest_curvature * segment.length,
+                segment.gain_asymmetry,
+                segment.pressure_stiffening,
+                segment.friction_moment / gain or 200.0,
+                segment.friction_curvature * segment.length or 0.1,
+                segment.creep_stiffness / (gain * segment.length) or 400.0,
+                segment.creep_time or 15.0,
+                0.0,
+                0.0,
+            ]
+        )
+    values = np.array(rows)
+    low, high = (np.array([getattr(term, name) for term in TERMS]) for name in ("low", "high"))
+    clipped: Array = np.clip(values, low, high)
+    return clipped
+
+
+def to_limb(prior: Limb, values: Array) -> Limb:
+    """Return the prior with the unknowns (M, T) put in place."""
+    segments = [
+        _segment(segment, dict(zip(_INDEX, row, strict=True)))
+        for segment, row in zip(prior.segments, values, strict=True)
+    ]
+    return replace(prior, segments=tuple(segments))
+
+
+def _segment(prior: Segment, value: dict[str, float]) -> Segment:
+    stiffness = prior.bending_stiffness * math.exp(value["log_stiffness"])
+    gain = value["gain"] * stiffness / prior.length
+    friction, creep = value["friction_pressure"] * gain, value["creep_pressure"] * gain
+    return replace(
+        prior,
+        bending_stiffness=float(stiffness),
+        moment_gain=float(gain),
+        damping=float(prior.damping * math.exp(value["log_damping"])),
+        rest_curvature=float(value["rest_angle"] / prior.length),
+        gain_asymmetry=float(value["gain_asymmetry"]),
+        pressure_stiffening=float(value["pressure_stiffening"]),
+        cubic_stiffness=0.0,
+        friction_moment=float(friction),
+        friction_curvature=float(value["friction_angle"] / prior.length) if friction else 0.0,
+        creep_stiffness=float(creep * prior.length),
+        creep_time=float(value["creep_time"]) if creep else 0.0,
+    )
+
+
+def column(name: str) -> int:
+    """Return the place of a term in `TERMS`."""
+    return _INDEX[name]
+
+
+def without(values: Array, groups: frozenset[str]) -> Array:
+    """Return the values with the terms outside ``groups`` switched off."""
+    result = values.copy()
+    for name, group in (
+        ("gain_asymmetry", "asymmetry"),
+        ("pressure_stiffening", "stiffening"),
+        ("friction_pressure", "friction"),
+        ("creep_pressure", "creep"),
+        ("log_stiffness", "dynamics"),
+        ("log_damping", "dynamics"),
+    ):
+        if group not in groups:
+            result[:, column(name)] = 0.0
+    return result

@@ -1,0 +1,180 @@
+"""The rod's bend angles along a log, and their exact derivatives by every unknown."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from der_planner.actuation import dahl, effective_pressure, maxwell
+from der_planner.identification.parameters import TERMS, column, to_limb
+from der_planner.limb import Limb
+from der_planner.rod import Rod, Trajectory
+
+Array = NDArray[np.float64]
+
+NODES = 13
+"""Of the rod in a fit: its statics do not depend on it, its first two frequencies by 2 %."""
+SUBSTEPS = 2
+
+
+class RodPrediction:
+    """Predicts bend angles along measured pressures, with friction and creep along measured bends.
+
+    Args:
+        prior: geometry, masses and everything that is not an unknown.
+        time: (K,) regular [s].
+        pressure: (K, M) measured differential pressures [Pa], without gaps.
+        bend_angle: (K, M) smoothed measured bend angles [rad], without gaps: what the memory saw.
+        nodes: of the rod.
+    """
+
+    def __init__(
+        self, prior: Limb, time: Array, pressure: Array, bend_angle: Array, nodes: int = NODES
+    ) -> None:
+        self._prior, self._time, self._nodes = prior, time, nodes
+        self._pressure, self._bend = pressure, bend_angle
+        self._period = float(time[1] - time[0])
+
+    def angles(self, values: Array) -> Array:
+        """Return predicted bend angles (K, M) [rad] for the unknowns (M, T)."""
+        rod, trajectory = self._simulate(to_limb(self._prior, values))
+        return bend_of(rod, trajectory.q)
+
+    def tip(self, limb: Limb) -> Array:
+        """Return predicted tips (K, 2) [m] of a limb."""
+        _, trajectory = self._simulate(limb)
+        tip: Array = trajectory.tip[:, :2]
+        return tip
+
+    def derivatives(self, values: Array, wanted: list[tuple[int, int]]) -> tuple[Array, Array]:
+        """Return angles (K, M) and their derivatives (K, M, P) by P unknowns.
+
+        Args:
+            values: (M, T) unknowns.
+            wanted: (segment, term) of each of the P unknowns.
+
+        What enters through the effective pressure goes through the rod's exact tangent; stiffness and
+        damping, which change the rod itself, are differences of two simulations.
+        """
+        rod, trajectory = self._simulate(to_limb(self._prior, values), linearise=True)
+        angles = bend_of(rod, trajectory.q)
+        start = _start_derivatives(rod, self.effective(values)[0])
+        result = np.empty((*angles.shape, len(wanted)))
+        for place, (segment, term) in enumerate(wanted):
+            if TERMS[term].group == "dynamics":
+                result[:, :, place] = self._difference(values, segment, term, angles)
+                continue
+            change = np.zeros_like(angles)
+            change[:, segment] = self._pressure_derivative(values, segment, term)
+            shift = start[:, segment] * change[0, segment]
+            result[:, :, place] = _bend_tangent(rod, trajectory, _mid(change), shift)
+        return angles, result
+
+    def effective(self, values: Array) -> Array:
+        """Return the effective pressures (K, M) [Pa] of the unknowns (M, T)."""
+        limb = to_limb(self._prior, values)
+        return effective_pressure(limb, self._time, self._pressure, self._bend)
+
+    def _simulate(self, limb: Limb, linearise: bool = False) -> tuple[Rod, Trajectory]:
+        rod = Rod.from_limb(limb, self._nodes)
+        effective = effective_pressure(limb, self._time, self._pressure, self._bend)
+        trajectory = rod.simulate(
+            rod.equilibrium(effective[0]),
+            _mid(effective),
+            self._period,
+            substeps=SUBSTEPS,
+            linearise=linearise,
+            outputs=_outputs(rod) if linearise else None,
+        )
+        return rod, trajectory
+
+    def _difference(self, values: Array, segment: int, term: int, angles: Array) -> Array:
+        step = 0.02
+        moved = values.copy()
+        moved[segment, term] += step
+        changed: Array = (self.angles(moved) - angles) / step
+        return changed
+
+    def _pressure_derivative(self, values: Array, segment: int, term: int) -> Array:
+        """Return ∂(equivalent effective pressure)/∂unknown (K,) of one segment."""
+        name, row = TERMS[term].name, values[segment]
+        u = self._pressure[:, segment]
+        bend = self._bend[:, segment]
+        stiffer = 1.0 + row[column("pressure_stiffening")] * np.abs(u)
+        if name in ("gain", "rest_angle"):
+            # A rest angle is a constant moment; a larger gain scales the moment.
+            effective = self.effective(values)[:, segment]
+            numerator = effective if name == "gain" else np.ones_like(u)
+            return np.asarray(numerator / row[column("gain")])
+        if name == "gain_asymmetry":
+            return np.asarray(np.abs(u) / stiffer)
+        if name == "pressure_stiffening":
+            return np.asarray(-self.effective(values)[:, segment] * np.abs(u) / stiffer)
+        if name == "friction_pressure":
+            return np.asarray(-dahl(bend, row[column("friction_angle")]) / stiffer)
+        if name == "creep_pressure":
+            return np.asarray(-maxwell(self._time, bend, row[column("creep_time")]) / stiffer)
+        step = 0.01 * row[term]
+        if name == "friction_angle":
+            change = dahl(bend, row[term] + step) - dahl(bend, row[term] - step)
+            strength = row[column("friction_pressure")]
+        else:
+            change = maxwell(self._time, bend, row[term] + step)
+            change = change - maxwell(self._time, bend, row[term] - step)
+            strength = row[column("creep_pressure")]
+        return np.asarray(-strength * change / (2.0 * step) / stiffer)
+
+
+def bend_of(rod: Rod, q: Array) -> Array:
+    """Return bend angles (K, M) [rad] as tags see them: heading after each segment less before it."""
+    headings = [_heading(q, a, b) for a, b in _edges(rod)]
+    absolute = np.unwrap(np.stack(headings, axis=1), axis=0)
+    relative: Array = np.diff(absolute, axis=1, prepend=0.0)
+    return relative
+
+
+def _mid(values: Array) -> Array:
+    middle: Array = 0.5 * (values[1:] + values[:-1])
+    return middle
+
+
+def _edges(rod: Rod) -> list[tuple[int, int]]:
+    """Return the nodes of the edge that carries the tag at the end of each segment."""
+    last = len(rod.rest_lengths)
+    ends = [min(first + count - 1, last - 1) for first, count in rod.segments]
+    return [(end, end + 1) for end in ends]
+
+
+def _outputs(rod: Rod) -> list[int]:
+    return [4 * node + axis for edge in _edges(rod) for node in edge for axis in (0, 1)]
+
+
+def _heading(q: Array, first: int, second: int) -> Array:
+    dx = q[:, 4 * second] - q[:, 4 * first]
+    dy = q[:, 4 * second + 1] - q[:, 4 * first + 1]
+    heading: Array = np.arctan2(dy, dx)
+    return heading
+
+
+def _start_derivatives(rod: Rod, pressure: Array) -> Array:
+    """Return the change (F, M) of the resting state's free coordinates per pressure [m/Pa]."""
+    base = rod.equilibrium(pressure).q
+    columns = []
+    for index in range(len(pressure)):
+        moved = pressure.copy()
+        moved[index] += 10.0
+        columns.append((rod.equilibrium(moved).q - base)[rod.free] / 10.0)
+    return np.stack(columns, axis=1)
+
+
+def _bend_tangent(rod: Rod, trajectory: Trajectory, change: Array, start: Array) -> Array:
+    assert trajectory.linearisation is not None
+    moved = trajectory.linearisation.tangent(change, (start, np.zeros_like(start)))
+    columns = []
+    for place, (a, b) in enumerate(_edges(rod)):
+        x1, y1, x2, y2 = moved[:, 4 * place : 4 * place + 4].T
+        dx = trajectory.q[:, 4 * b] - trajectory.q[:, 4 * a]
+        dy = trajectory.q[:, 4 * b + 1] - trajectory.q[:, 4 * a + 1]
+        columns.append((dx * (y2 - y1) - dy * (x2 - x1)) / (dx * dx + dy * dy))
+    relative: Array = np.diff(np.stack(columns, axis=1), axis=1, prepend=0.0)
+    return relative

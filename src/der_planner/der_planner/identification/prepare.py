@@ -1,0 +1,179 @@
+"""From a log as recorded to rows on a regular grid that a fit can use, and what is wrong with them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import savgol_filter
+
+from der_planner.identification.log import CalibrationLog, LogError
+from der_planner.limb import Limb
+
+Array = NDArray[np.float64]
+
+PERIOD = 0.05
+"""Of the grid [s]."""
+SMOOTHING = 11
+"""Rows of the filter through which friction sees the measured bend (0.5 s)."""
+LONGEST_GAP = 1.0
+"""Gap in the tags that is bridged by a straight line [s]; longer ones are not fitted to."""
+LEAST_EXCITATION = 1000.0
+"""Standard deviation of an input below which nothing can be told of it [Pa]."""
+LEAST_VALID = 0.5
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A log on a regular grid.
+
+    Attributes:
+        log: on the grid, NaN where nothing was measured.
+        pressure: (K, M) measured, or commanded where there is no measurement, without gaps [Pa].
+        bend: (K, M) smoothed bend angles without gaps [rad].
+        usable: (K,) rows to fit to.
+        warnings: sentences for the report.
+    """
+
+    log: CalibrationLog
+    pressure: Array
+    bend: Array
+    usable: NDArray[np.bool_]
+    warnings: tuple[str, ...]
+
+
+def prepare(log: CalibrationLog, limb: Limb, period: float = PERIOD) -> Prepared:
+    """Resample and check a log.
+
+    Raises:
+        LogError: another number of segments, an input without excitation, too few tags, or pressures
+            that contradict the commands (a wrong column map).
+    """
+    if log.segment_count != limb.segment_count:
+        raise LogError(
+            f"the log has {log.segment_count} segments, the limb '{limb.name}' {limb.segment_count}: "
+            "this limb file belongs to another limb"
+        )
+    grid = log.resampled(period, LONGEST_GAP)
+    warnings: list[str] = []
+    valid = np.all(np.isfinite(grid.bend_angles), axis=1)
+    if valid.mean() < LEAST_VALID:
+        raise LogError(
+            f"the tags were seen in {100 * valid.mean():.0f} % of the log only, "
+            f"{100 * LEAST_VALID:.0f} % are needed: check light, focus and the tag map"
+        )
+    if valid.mean() < 0.98:
+        warnings.append(f"tags lost in {100 * (1 - valid.mean()):.1f} % of the log")
+    pressure = _pressures(grid, limb, warnings)
+    _check_excitation(pressure)
+    _check_saturation(pressure, limb, warnings)
+    bend = np.stack([_bridge(column) for column in grid.bend_angles.T], axis=1)
+    _check_match(pressure, bend, warnings)
+    count = min(SMOOTHING, len(bend) - (len(bend) + 1) % 2)
+    bend = np.asarray(savgol_filter(bend, count, 2, axis=0))
+    return Prepared(grid, pressure, bend, valid, tuple(warnings))
+
+
+def _pressures(log: CalibrationLog, limb: Limb, warnings: list[str]) -> Array:
+    measured = log.measured_differential
+    known = np.isfinite(measured)
+    for index in range(measured.shape[1]):
+        share = known[:, index].mean()
+        if share < 0.5:
+            raise LogError(
+                f"pressure {index} was measured in {100 * share:.0f} % of the log only: the fit needs "
+                "the board's telemetry"
+            )
+    pressure = np.stack([_bridge(column) for column in measured.T], axis=1)
+    largest = np.nanmax(np.abs(pressure))
+    if largest > 20.0 * limb.pneumatics.pressure_limit or largest < 100.0:
+        raise LogError(
+            f"the largest measured differential pressure is {largest:.3g} Pa, the limb's limit "
+            f"{limb.pneumatics.pressure_limit:.0f} Pa: check the units of the log"
+        )
+    for index, (command, column) in enumerate(
+        zip(log.commanded_differential.T, measured.T, strict=True)
+    ):
+        both = np.isfinite(command) & np.isfinite(column)
+        if both.sum() < 10 or np.std(command[both]) < LEAST_EXCITATION:
+            continue
+        agreement = _correlation(command[both], column[both])
+        if agreement < 0.3:
+            raise LogError(
+                f"measured pressure {index} does not follow its command (correlation "
+                f"{agreement:.2f}): check the column map and the tubes"
+            )
+        if agreement < 0.8:
+            warnings.append(f"measured pressure {index} follows its command loosely ({agreement:.2f})")
+    return pressure
+
+
+def _check_excitation(pressure: Array) -> None:
+    spread = np.std(pressure, axis=0)
+    for index, value in enumerate(spread):
+        if value < LEAST_EXCITATION:
+            raise LogError(
+                f"input {index} was not excited (standard deviation {value:.0f} Pa, "
+                f"{LEAST_EXCITATION:.0f} Pa needed): nothing can be told of segment {index}; "
+                "run the calibration motion"
+            )
+    if pressure.shape[1] > 1:
+        together = np.corrcoef(pressure.T)
+        for i in range(len(together)):
+            for j in range(i):
+                if abs(together[i, j]) > 0.98:
+                    raise LogError(
+                        f"inputs {j} and {i} always move together: a coupling between the segments "
+                        "cannot be told from their own gains; excite each input alone as well"
+                    )
+
+
+def _check_saturation(pressure: Array, limb: Limb, warnings: list[str]) -> None:
+    limit = limb.pneumatics.pressure_limit
+    for index, column in enumerate(pressure.T):
+        share = float(np.mean(np.abs(column) > 0.98 * limit))
+        if share > 0.5:
+            raise LogError(
+                f"input {index} is saturated in {100 * share:.0f} % of the log: lower the amplitude"
+            )
+        if share > 0.02:
+            warnings.append(f"input {index} is at its limit in {100 * share:.0f} % of the log")
+
+
+def _check_match(pressure: Array, bend: Array, warnings: list[str]) -> None:
+    """Each segment must follow its own pressure, not its neighbour's, and with the right sign."""
+    count = pressure.shape[1]
+    design = np.concatenate([pressure, np.ones((len(pressure), 1))], axis=1)
+    solution = np.linalg.lstsq(design, bend, rcond=None)[0][:count]
+    for index in range(count):
+        own = solution[index, index]
+        others = np.abs(np.delete(solution[:, index], index))
+        if others.size and others.max() > 1.5 * abs(own):
+            raise LogError(
+                f"segment {index} bends with input {int(np.argmax(np.abs(solution[:, index])))}, not "
+                f"with input {index}: columns or tubes are swapped"
+            )
+        if own < 0:
+            raise LogError(
+                f"segment {index} bends the wrong way: positive differential pressure must bend "
+                "toward +y; swap the two chambers or the sign in the column map"
+            )
+        if others.size and others.max() > 0.2 * own:
+            warnings.append(
+                f"segment {index} answers to another segment's pressure with "
+                f"{100 * others.max() / own:.0f} % of its own gain"
+            )
+
+
+def _correlation(a: Array, b: Array) -> float:
+    if np.std(a) == 0 or np.std(b) == 0:
+        return 0.0
+    return float(np.corrcoef(a, b)[0, 1])
+
+
+def _bridge(column: Array) -> Array:
+    known = np.isfinite(column)
+    index = np.arange(len(column))
+    bridged: Array = np.interp(index, index[known], column[known])
+    return bridged

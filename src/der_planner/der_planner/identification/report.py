@@ -1,0 +1,145 @@
+"""What a fit says of itself: values, uncertainties, what cannot be told apart, residuals."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from der_planner.identification.air import AirFit
+from der_planner.identification.geometry import GeometryFit
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """One identified number.
+
+    Attributes:
+        name: with the segment in brackets.
+        unit: of the value.
+        value: identified.
+        deviation: standard deviation.
+        untold: the data say next to nothing of it; the prior's value was kept.
+        at_bound: the value sits at a bound of its range.
+    """
+
+    name: str
+    unit: str
+    value: float
+    deviation: float
+    untold: bool = False
+    at_bound: bool = False
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """What a fit found, and how well.
+
+    Attributes:
+        source: of the log.
+        unknowns: (P,) with standard deviations.
+        correlation: (P, P) of the unknowns.
+        strongly_correlated: pairs that the data tell only together.
+        untold: names of unknowns that kept their prior value.
+        air: fit of the chambers; None if the log has no smooth commands.
+        geometry: fit of the lengths; None if the log has no tips.
+        residual, largest: (M,) root mean square and largest bend angle error [rad].
+        span: (M,) range of the measured bend angles [rad].
+        duration: of the log [s].
+        rows: used by the fit.
+        evaluations: of model and derivatives.
+        fit_time: [s].
+        warnings: sentences.
+    """
+
+    source: str
+    unknowns: tuple[Unknown, ...]
+    correlation: Array
+    strongly_correlated: tuple[tuple[str, str, float], ...]
+    untold: tuple[str, ...]
+    air: AirFit | None
+    geometry: GeometryFit | None
+    residual: Array
+    largest: Array
+    span: Array
+    duration: float
+    rows: int
+    evaluations: int
+    fit_time: float
+    warnings: tuple[str, ...] = ()
+
+    def value(self, name: str) -> Unknown:
+        """Return the unknown of this name, e.g. ``gain[0]``.
+
+        Raises:
+            KeyError: it was not fitted.
+        """
+        for unknown in self.unknowns:
+            if unknown.name == name:
+                return unknown
+        raise KeyError(name)
+
+    def text(self) -> str:
+        """Return the report as text for people."""
+        lines = [
+            f"Calibration from {self.source or 'a log'}: {self.duration:.0f} s, {self.rows} rows, "
+            f"fitted in {self.fit_time:.1f} s ({self.evaluations} evaluations)",
+            "",
+            f"{'unknown':26s} {'value':>12s} {'std':>10s}  unit",
+        ]
+        for item in self.unknowns:
+            value, deviation, unit = _readable(item)
+            note = "  kept from the prior: the data do not tell" if item.untold else ""
+            note += "  at its bound" if item.at_bound else ""
+            lines.append(f"{item.name:26s} {value:12.4g} {deviation:10.2g}  {unit}{note}")
+        lines.append("")
+        for index, (error, largest, span) in enumerate(
+            zip(self.residual, self.largest, self.span, strict=True)
+        ):
+            lines.append(
+                f"segment {index}: bend angle error rms {math.degrees(error):.2f}°, "
+                f"max {math.degrees(largest):.2f}°, {100 * error / max(span, 1e-9):.2f} % of its range"
+            )
+        lines += self._air_lines() + self._geometry_lines()
+        for first, second, value in self.strongly_correlated:
+            lines.append(f"told only together: {first} and {second} (correlation {value:+.2f})")
+        lines += [f"warning: {warning}" for warning in self.warnings]
+        return "\n".join(lines)
+
+    def _air_lines(self) -> list[str]:
+        if self.air is None:
+            return []
+        air = self.air
+        return [
+            f"air: lag {air.fill_lag:.3f} s filling, {air.vent_lag:.3f} s venting, dead time "
+            f"{air.delay:.3f} s, fill rate {air.fill_rate:.0f} Pa/s, residual {air.residual:.0f} Pa"
+        ]
+
+    def _geometry_lines(self) -> list[str]:
+        if self.geometry is None:
+            return []
+        geometry = self.geometry
+        lengths = ", ".join(
+            f"{1e3 * length:.1f} ± {1e3 * deviation:.1f}"
+            for length, deviation in zip(geometry.lengths, geometry.uncertainty, strict=True)
+        )
+        return [
+            f"lengths: {lengths} mm; tips within {1e3 * geometry.residual:.2f} mm of arcs at the "
+            f"measured angles (with the prior's lengths {1e3 * geometry.residual_before:.2f} mm)"
+        ]
+
+
+def _readable(item: Unknown) -> tuple[float, float, str]:
+    """Return value, deviation and unit as people read them: degrees and hPa."""
+    factor, unit = {
+        "rad/Pa": (math.degrees(1.0) * 100.0, "deg/hPa"),
+        "rad": (math.degrees(1.0), "deg"),
+        "1/Pa": (1e6, "% per 10 kPa"),
+        "Pa": (0.01, "hPa"),
+        "Pa/rad": (0.01 * math.radians(45.0), "hPa at 45 deg"),
+    }.get(item.unit, (1.0, item.unit))
+    return item.value * factor, item.deviation * factor, unit
