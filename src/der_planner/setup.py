@@ -27,6 +27,7 @@ setup(
         "rosbags",
         "matplotlib",
         "pyelastica",
+        "piqp",
     ],
     extras_require={"test": ["pytest"]},
     zip_safe=False,

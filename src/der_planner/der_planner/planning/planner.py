@@ -15,8 +15,9 @@ from der_planner.planning import models, pneumatics
 from der_planner.planning.errors import PlanningError
 from der_planner.planning.models import METHODS, PlanningModel
 from der_planner.planning.motions import CONTROL_PERIOD, Motion, Reference, sample_spline
+from der_planner.planning.optimal import Optimiser
 from der_planner.planning.result import Plan
-from der_planner.planning.rod_model import NODES
+from der_planner.planning.rod_model import NODES, RodModel
 
 Vector = NDArray[np.float64]
 
@@ -64,11 +65,19 @@ def plan(
     report(0.1)
     spline = physics.configuration(reference)
     report(0.3)
-    wanted = feedforward(physics, spline, reference, "projected" if method == "optimal" else method)
-    commands, cut = pneumatics.within_limits(wanted, limb.pneumatics, CONTROL_PERIOD, initial)
-    report(0.6)
+    details: dict[str, float] = {}
+    optimal = method == "optimal"
+    wanted = feedforward(physics, spline, reference, "projected" if optimal else method)
+    report(0.4)
+    if optimal and isinstance(physics, RodModel):
+        solver = Optimiser(physics, spline, reference.tip, wanted, SUBSTEPS, initial)
+        outcome = solver.run(lambda share: report(0.4 + 0.6 * share))
+        commands, tip, cut = outcome.commands, outcome.tip, 0.0
+        details = {"steps": outcome.steps, "limited_windows": outcome.limited}
+    else:
+        commands, cut = pneumatics.within_limits(wanted, limb.pneumatics, CONTROL_PERIOD, initial)
+        tip = predict(physics, spline, commands, initial)
     bend = sample_spline(spline, reference.time)[0]
-    tip = predict(physics, spline, commands, initial)
     report(1.0)
     return Plan(
         time=reference.time,
@@ -86,6 +95,7 @@ def plan(
         kinematics=physics.kinematics,
         solve_time=clock.perf_counter() - begin,
         warnings=tuple(_warnings(physics.limb, wanted, bend, cut)),
+        details=details,
     )
 
 

@@ -1,0 +1,301 @@
+"""Optimal pressures: Gauss-Newton on the rod's own discrete dynamics, window after window.
+
+Unknown are the commands u (K, M) themselves. Minimised is, over the setpoints k,
+
+    Σ |tip_k(u) − r̄_k|² + λ Σ |D²(u − u⁰)_k|² + μ Σ |(u − u⁰)_k|²
+
+with u⁰ the `projected` commands (the warm start, smooth and nearly right), D² the second difference,
+|u_k| within the pressure limit and |u_k − u_{k−1}| within the slew limit. The model is everything the
+limb file knows: hold, dead time and lag of the chambers, unequal chambers, friction and creep, the rod.
+
+tip(u) comes from the rod's integrator, its derivative from the exact linearisation of that integrator.
+A response dies out in seconds, so that a long motion is solved as a row of overlapping windows: each
+starts from the rod's state at the end of what the last one settled, and its tail, which does not yet
+know what follows, is solved again by the next. Cost grows with the first power of the motion's length.
+Where no limit is in the way the step is one Cholesky factorisation, else the quadratic programme is
+handed to `der_planner.planning.quadratic`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import BSpline
+from scipy.linalg import cho_factor, cho_solve
+
+from der_planner import actuation
+from der_planner.limb import Limb
+from der_planner.planning import pneumatics
+from der_planner.planning.motions import CONTROL_PERIOD, sample_spline
+from der_planner.planning.quadratic import Band, solve_limited
+from der_planner.planning.rod_model import RodModel
+from der_planner.rod import ConvergenceError, RodState
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the optimisation weighs and when it is content.
+
+    Attributes:
+        smoothness: √λ, tip error that a unit second difference is worth [m/Pa].
+        nearness: √μ, tip error that a unit deviation from the warm start is worth [m/Pa].
+        window: setpoints that are solved together.
+        settled: setpoints of a window that are kept; the rest is solved again.
+        iterations: Gauss-Newton steps a window at most.
+        tolerance: root mean square tip error below which a window is done, and change of it below which
+            another step is not worth its time [m].
+    """
+
+    smoothness: float = 2e-7
+    nearness: float = 1e-8
+    window: int = 160
+    settled: int = 120
+    iterations: int = 4
+    tolerance: float = 5e-6
+
+
+class Actuation:
+    """From commands to the effective pressures of the rod along a known bend, and back by gradient.
+
+    Args:
+        limb: calibrated limb.
+        spline: bend angles of the motion, for friction and creep.
+        count: K commands.
+        substeps: integrator steps a command.
+        initial: (M,) command and chamber pressure before the first one [Pa].
+    """
+
+    def __init__(
+        self, limb: Limb, spline: BSpline, count: int, substeps: int, initial: Vector
+    ) -> None:
+        self.air = limb.pneumatics
+        self.substeps = substeps
+        self.initial = initial
+        middle = (np.arange(count * substeps) + 0.5) * (CONTROL_PERIOD / substeps)
+        bend = sample_spline(spline, middle)[0]
+        self._memory = np.column_stack(
+            [
+                actuation.memory_pressure(segment, middle, bend[:, j])
+                for j, segment in enumerate(limb.segments)
+            ]
+        ).reshape(count, substeps, -1)
+        self._asymmetry = np.array([s.gain_asymmetry for s in limb.segments])
+        self._stiffening = np.array([s.pressure_stiffening for s in limb.segments])
+
+    def effective(self, command: Vector, first: int) -> tuple[Vector, Vector]:
+        """Return effective pressures (W, S, M) [Pa] from setpoint ``first`` on, and dw/dp (W, M).
+
+        Args:
+            command: (first + W, M) commands from the beginning [Pa].
+            first: of the window.
+        """
+        chambers = pneumatics.chamber_pressures(
+            self.air, command, CONTROL_PERIOD, self.substeps, self.initial
+        )[first:]
+        memory = self._memory[first : len(command)]
+        side = np.sign(chambers)
+        stiffer = 1 + self._stiffening * np.abs(chambers)
+        effective = (chambers * (1 + self._asymmetry * side) - memory) / stiffer
+        slope = (1 + self._asymmetry * side - self._stiffening * side * effective) / stiffer
+        return effective, slope.mean(axis=1)
+
+    def pulse(self, inputs: int) -> Vector:
+        """Return the chamber pressure (R, M) in the steps after a setpoint is raised by one Pascal."""
+        air, size = self.air, self.substeps
+        mean = 0.5 * (air.time_constant + (air.vent_time_constant or air.time_constant))
+        reach = int(np.ceil((air.delay + 12 * mean) / CONTROL_PERIOD)) + 1
+        command = np.zeros((reach, 1))
+        command[0] = 1.0
+        even = type(air)(air.pressure_limit, air.slew_limit, air.fill_rate, mean, air.delay)
+        response = pneumatics.chamber_pressures(even, command, CONTROL_PERIOD, size)
+        return np.tile(response.reshape(-1, 1), (1, inputs))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the optimisation found.
+
+    Attributes:
+        commands: (K, M) [Pa].
+        tip: (K, 2) of the model under them [m].
+        steps: Gauss-Newton steps of all windows.
+        limited: windows in which a limit was in the way.
+    """
+
+    commands: Vector
+    tip: Vector
+    steps: int
+    limited: int
+
+
+class Optimiser:
+    """Solves window after window; see the module.
+
+    Args:
+        model: the rod.
+        spline: bend angles along the motion.
+        tip: (K, 2) r̄ [m].
+        warm: (K, M) commands of `projected`, before limits [Pa].
+        substeps: integrator steps a command.
+        initial: (M,) command before the first one [Pa].
+        settings: weights and sizes.
+    """
+
+    def __init__(
+        self,
+        model: RodModel,
+        spline: BSpline,
+        tip: Vector,
+        warm: Vector,
+        substeps: int,
+        initial: ArrayLike | None = None,
+        settings: Settings | None = None,
+    ) -> None:
+        self.model = model
+        self.settings = settings or Settings()
+        self.target = np.concatenate([tip[1:], tip[-1:]])
+        self.warm = warm
+        count, inputs = warm.shape
+        self.before = np.zeros(inputs) if initial is None else np.array(initial, dtype=float)
+        self.actuation = Actuation(model.limb, spline, count, substeps, self.before)
+        self._pulse = self.actuation.pulse(inputs)
+
+    def run(self, progress: Callable[[float], None] = lambda _share: None) -> Outcome:
+        """Solve all windows from the resting rod."""
+        air = self.model.limb.pneumatics
+        count = len(self.warm)
+        command, _ = pneumatics.within_limits(self.warm, air, CONTROL_PERIOD, self.before)
+        state = self.model.rest if not self.before.any() else self.model.rod.equilibrium(self.before)
+        tip = np.empty((count, 2))
+        first, steps, limited = 0, 0, 0
+        while first < count:
+            last = min(first + self.settings.window, count)
+            if count - last < self.settings.window - self.settings.settled:
+                last = count
+            keep = last if last == count else first + self.settings.settled
+            used, met = self.improve(command, state, first, last)
+            steps, limited = steps + used, limited + met
+            effective, _ = self.actuation.effective(command[:keep], first)
+            motion = self.model.rod.simulate(
+                state, effective, CONTROL_PERIOD, substeps=self.actuation.substeps
+            )
+            tip[first:keep] = motion.tip[:-1, :2]
+            state, first = motion.final, keep
+            progress(first / count)
+        return Outcome(command, tip, steps, limited)
+
+    def improve(
+        self, command: Vector, state: RodState, first: int, last: int
+    ) -> tuple[int, bool]:
+        """Improve ``command[first:last]`` in place; return the steps and whether a limit was met."""
+        settings = self.settings
+        met, damping = False, 0.0
+        jacobian: Vector | None = None
+        cost, misses = self._evaluate(command, state, first, last)
+        for step in range(settings.iterations):
+            rms = _rms(misses)
+            if rms < settings.tolerance:
+                return step, met
+            if jacobian is None:
+                jacobian = self._jacobian(command, state, first, last)
+            change, limited = self._step(command, misses, jacobian, first, last, damping)
+            met = met or limited
+            trial = command[:last].copy()
+            trial[first:] += change
+            try:
+                new_cost, new_misses = self._evaluate(trial, state, first, last)
+            except ConvergenceError:
+                new_cost = np.inf
+            if new_cost > cost:
+                damping = max(10 * damping, 1e-7)
+                continue
+            command[:last] = trial
+            cost, misses, jacobian = new_cost, new_misses, None
+            if rms - _rms(misses) < max(settings.tolerance / 5, 0.02 * rms):
+                return step + 1, met
+        return settings.iterations, met
+
+    def _evaluate(
+        self, command: Vector, state: RodState, first: int, last: int
+    ) -> tuple[float, Vector]:
+        """Return the cost and the misses (W, 2) [m] of a window."""
+        effective, _ = self.actuation.effective(command[:last], first)
+        motion = self.model.rod.simulate(
+            state, effective, CONTROL_PERIOD, substeps=self.actuation.substeps
+        )
+        misses = motion.tip[1:, :2] - self.target[first:last]
+        return float((misses**2).sum()) + self._roughness(command, first, last), misses
+
+    def _jacobian(self, command: Vector, state: RodState, first: int, last: int) -> Vector:
+        """Return ∂tip/∂command (W, 2, W, M) [m/Pa] of a window."""
+        effective, slope = self.actuation.effective(command[:last], first)
+        motion = self.model.rod.simulate(
+            state, effective, CONTROL_PERIOD, substeps=self.actuation.substeps, linearise=True
+        )
+        if motion.linearisation is None:
+            raise AssertionError("a linearised motion has a linearisation")
+        sensitivity = motion.linearisation.sensitivity(self._pulse)
+        jacobian: Vector = sensitivity[1:, :2] * slope
+        return jacobian
+
+    def _deviation(self, command: Vector, first: int, last: int) -> Vector:
+        """Return u − u⁰ (W + 2, M) from two setpoints before the window on."""
+        deviation = np.zeros((last - first + 2, command.shape[1]))
+        begin = max(0, first - 2)
+        deviation[2 - (first - begin) :] = command[begin:last] - self.warm[begin:last]
+        return deviation
+
+    def _roughness(self, command: Vector, first: int, last: int) -> float:
+        deviation = self._deviation(command, first, last)
+        bends = np.diff(deviation, 2, axis=0)
+        smooth, near = self.settings.smoothness, self.settings.nearness
+        return float(smooth**2 * (bends**2).sum() + near**2 * (deviation[2:] ** 2).sum())
+
+    def _step(
+        self,
+        command: Vector,
+        misses: Vector,
+        jacobian: Vector,
+        first: int,
+        last: int,
+        damping: float,
+    ) -> tuple[Vector, bool]:
+        """Return the change of the commands (W, M) and whether a limit shaped it."""
+        size, inputs = last - first, command.shape[1]
+        J = jacobian.reshape(2 * size, size * inputs)
+        second = _second_difference(size)
+        weight = self.settings.smoothness**2 * second.T @ second
+        weight[np.diag_indices(size)] += self.settings.nearness**2
+        H = J.T @ J + np.kron(weight, np.eye(inputs))
+        H[np.diag_indices(len(H))] += damping**2
+        deviation = self._deviation(command, first, last)
+        rough = self.settings.smoothness**2 * second.T @ np.diff(deviation, 2, axis=0)
+        gradient = J.T @ misses.ravel() + rough.ravel()
+        gradient += self.settings.nearness**2 * deviation[2:].ravel()
+        change = -cho_solve(cho_factor(H, lower=True), gradient).reshape(size, inputs)
+        band = self._band(command, first, last)
+        if band.contains(change):
+            return change, False
+        return solve_limited(H, gradient, band), True
+
+    def _band(self, command: Vector, first: int, last: int) -> Band:
+        air = self.model.limb.pneumatics
+        before = command[first - 1] if first else self.before
+        return Band(command[first:last], before, air.pressure_limit, air.slew_limit * CONTROL_PERIOD)
+
+
+def _rms(misses: Vector) -> float:
+    return float(np.sqrt(np.mean((misses**2).sum(axis=1))))
+
+
+def _second_difference(size: int) -> Vector:
+    """Return the matrix (size, size) of second differences with two known values before the first."""
+    matrix = np.eye(size)
+    matrix[np.arange(1, size), np.arange(size - 1)] = -2.0
+    matrix[np.arange(2, size), np.arange(size - 2)] = 1.0
+    return matrix

@@ -1,0 +1,93 @@
+"""Quadratic programmes over a band of commands: pressure limit and slew limit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import piqp
+from numpy.typing import NDArray
+
+from der_planner.planning.errors import PlanningError
+
+Vector = NDArray[np.float64]
+
+_PRESSURE = 1e3
+"""The solver works in kPa …"""
+_LENGTH = 1e-3
+"""… and mm, so that its tolerances mean something."""
+
+
+@dataclass(frozen=True)
+class Band:
+    """What a change of commands must keep.
+
+    Attributes:
+        command: (W, M) commands that are changed; they keep the limits themselves [Pa].
+        before: (M,) command before the first one [Pa].
+        limit: largest |command| [Pa].
+        step: largest change from one command to the next [Pa].
+    """
+
+    command: Vector
+    before: Vector
+    limit: float
+    step: float
+
+    def contains(self, change: Vector) -> bool:
+        """Tell whether the changed commands (W, M) keep the limits."""
+        command = self.command + change
+        steps = np.diff(np.vstack([self.before, command]), axis=0)
+        return bool(np.abs(command).max() <= self.limit and np.abs(steps).max() <= self.step)
+
+    def cut(self, change: Vector) -> Vector:
+        """Return the change (W, M) with rounding errors of a solver cut off, setpoint by setpoint."""
+        result = np.empty_like(change)
+        last = self.before
+        for k in range(len(change)):
+            command = np.clip(self.command[k] + change[k], last - self.step, last + self.step)
+            last = np.clip(command, -self.limit, self.limit)
+            result[k] = last - self.command[k]
+        return result
+
+
+def solve_limited(H: Vector, gradient: Vector, band: Band) -> Vector:
+    """Return the change δ (W, M) that minimises ½ δᵀHδ + gradientᵀδ within the band [Pa].
+
+    Args:
+        H: (W·M, W·M) positive definite [m²/Pa²].
+        gradient: (W·M,) [m²/Pa].
+        band: limits.
+
+    Raises:
+        PlanningError: the solver gave up, with its status.
+    """
+    size, inputs = band.command.shape
+    total = size * inputs
+    difference = np.eye(total) - np.eye(total, k=-inputs)
+    steps = np.diff(np.vstack([band.before, band.command]), axis=0).ravel() / _PRESSURE
+    room, limit = band.step / _PRESSURE, band.limit / _PRESSURE
+    present = band.command.ravel() / _PRESSURE
+    scale = (_PRESSURE / _LENGTH) ** 2
+    solver = piqp.DenseSolver()
+    solver.settings.eps_abs = 1e-6
+    solver.settings.eps_rel = 1e-8
+    solver.setup(
+        np.asfortranarray(H * scale),
+        gradient * scale / _PRESSURE,
+        None,
+        None,
+        np.asfortranarray(difference),
+        -room - steps,
+        room - steps,
+        -limit - present,
+        limit - present,
+    )
+    status = solver.solve()
+    if status != piqp.PIQP_SOLVED:
+        raise PlanningError(
+            f"the quadratic programme of {size} setpoints was not solved ({status}): "
+            "use the method projected, or a longer period"
+        )
+    change = np.asarray(solver.result.x).reshape(size, inputs) * _PRESSURE
+    return band.cut(change)
