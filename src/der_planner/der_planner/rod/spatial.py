@@ -1,3 +1,185 @@
+"""A rod in space: between the public layout (4N-1,) and the spatial kernels (4n-1,)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from der_planner.rod import spatial_kernel, spatial_step_kernel
+from der_planner.rod.mesh import Mesh
+from der_planner.rod.planar import Run, band_to_dense
+from der_planner.rod.state import Array, RodState
+
+
 class SpatialBackend:
-    def __init__(self, mesh):
-        raise NotImplementedError
+    """Kernels and arrays of a rod in space. A ghost edge is a node and an edge before the rod's own."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self.mesh = mesh
+        self.ghost = int(mesh.ghost)
+        self.offset = 4 * self.ghost
+        size = 4 * mesh.nodes - 1
+        self.index = np.arange(size)
+        held = set(mesh.clamped.tolist())
+        self.fixed = np.array([*range(self.offset), *(d + self.offset for d in sorted(held))], dtype=np.int64)
+        self.free = np.array([d for d in range(size) if d not in held], dtype=np.int64)
+        self.free_rows = self.free + self.offset
+        self.mass = self._extended(mesh.node_mass, mesh.edge_inertia)
+        self.damping = self._extended(mesh.node_damping, mesh.edge_inertia * mesh.edge_damping)
+        one, rows = np.zeros(self.ghost), np.zeros((self.ghost, 2))
+        first = [first + self.ghost for first, _ in mesh.segments]
+        last = [first + count - 2 + self.ghost for first, count in mesh.segments]
+        self.rod = (
+            np.concatenate([mesh.rest[: self.ghost], mesh.rest]),
+            np.concatenate([one, mesh.axial]),
+            np.concatenate([one, mesh.bend]),
+            np.concatenate([one, mesh.twist]),
+            np.concatenate([one, mesh.cubic]),
+            np.concatenate([one, mesh.viscous]),
+            np.concatenate([rows, mesh.rest_kappa]),
+            np.concatenate([one, mesh.rest_twist]),
+            np.array(first, dtype=np.int64),
+            np.array(last, dtype=np.int64),
+            mesh.gain,
+        )
+        n = mesh.nodes + self.ghost
+        self.size = 4 * n - 1
+        self.work = np.zeros((2, self.size))
+        self.band = np.zeros((self.size, 11))
+        self.frame = np.zeros((n - 1, 16))
+        self.own = np.zeros((n - 1, 4, 5))
+        self.link = np.zeros((n, 4, 4))
+        self.local = np.zeros((12, 8))
+        self.twists = np.zeros(n)
+
+    def _extended(self, of_nodes: Array, of_edges: Array) -> Array:
+        result = np.zeros(4 * self.mesh.nodes - 1)
+        for axis in range(3):
+            result[axis::4] = of_nodes
+        result[3::4] = of_edges
+        return np.concatenate([np.zeros(self.offset), result])
+
+    def extend(self, q: Array) -> Array:
+        """Return the kernels' coordinates of q, with the ghost node."""
+        if not self.ghost:
+            return q.copy()
+        return np.concatenate([[q[0] - self.mesh.rest[0], q[1], q[2], 0.0], q])
+
+    def extend_rate(self, v: Array) -> Array:
+        """Return a velocity or force (4N-1,) in the kernels' coordinates."""
+        return np.concatenate([np.zeros(self.offset), v])
+
+    def reference(self, state: RodState) -> tuple[Array, Array, Array]:
+        """Return tangents, directors (n-1, 3) and reference twists (n,) of a state, for the kernels."""
+        x = state.q
+        nodes = np.stack([x[0::4], x[1::4], x[2::4]], axis=1)
+        edges = np.diff(nodes, axis=0)
+        tangents = edges / np.linalg.norm(edges, axis=1)[:, None]
+        if not self.ghost:
+            return tangents, state.directors.copy(), state.reference_twist.copy()
+        return (
+            np.concatenate([[[1.0, 0.0, 0.0]], tangents]),
+            np.concatenate([[[0.0, 1.0, 0.0]], state.directors]),
+            np.concatenate([[0.0], state.reference_twist]),
+        )
+
+    def carry_frames(self, base: RodState, q: Array, v: Array) -> RodState:
+        """Return a state at q whose frames are those of `base`, transported."""
+        tangents, directors, twists = self.reference(base)
+        spatial_step_kernel.carry(
+            self.extend(q), twists, tangents, directors, self.twists, self.frame
+        )
+        return self._state(q, v, directors, twists)
+
+    def _state(self, q: Array, v: Array, directors: Array, twists: Array) -> RodState:
+        return RodState(q, v, directors[self.ghost :].copy(), twists[self.ghost :].copy())
+
+    def simulate(
+        self,
+        state: RodState,
+        pressures: Array,
+        h: float,
+        extrapolate: Array,
+        load: Array,
+        tolerance: float,
+        limit: int,
+        linearise: bool,
+    ) -> Run:
+        """Run the kernel `simulate`; load is (4N-1,)."""
+        if linearise:
+            raise ValueError("a rod in space keeps no linearisation of a motion: use linearise_step")
+        intervals, steps, _ = pressures.shape
+        x = np.empty((intervals + 1, self.size))
+        rate = np.empty((intervals + 1, self.size))
+        x[0] = self.extend(state.q)
+        rate[0] = self.extend_rate(state.v)
+        tangents, directors, twists = self.reference(state)
+        done, iterations, update, failed = spatial_step_kernel.simulate(
+            x, rate, pressures, h, extrapolate, tolerance, limit, tangents, directors, twists,
+            self.mass, self.damping, self.extend_rate(load), self.fixed, *self.rod,
+        )  # fmt: skip
+        q = x[:, self.offset :].copy()
+        v = rate[:, self.offset :].copy()
+        at = done // steps + 1 if failed else intervals
+        final = self._state(q[at].copy(), v[at].copy(), directors, twists)
+        return Run(q, v, final, done, iterations, update, failed, None)
+
+    def rows(self, indices: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the kernel's rows of indices into q; -1 for indices out of range."""
+        inside = (indices >= 0) & (indices < 4 * self.mesh.nodes - 1)
+        return np.where(inside, indices + self.offset, -1)
+
+    def solve_static(
+        self, start: RodState, u: Array, load: Array, tolerance: float, limit: int
+    ) -> tuple[RodState, int, float]:
+        """Solve the balance of forces from `start`; iterations are negative without convergence."""
+        x = self.extend(start.q)
+        tangents, directors, twists = self.reference(start)
+        iterations, update = spatial_step_kernel.newton(
+            x, x.copy(), np.zeros(self.size), 0.0, u, tolerance, limit, tangents, directors, twists,
+            self.twists, self.work, self.band, self.frame, self.own, self.link, self.local,
+            self.mass, self.damping, self.extend_rate(load), self.fixed, *self.rod,
+        )  # fmt: skip
+        if iterations < 0:
+            return start, iterations, update
+        q = x[self.offset :].copy()
+        return self.carry_frames(start, q, np.zeros_like(q)), iterations, update
+
+    def _place(self, state: RodState) -> Array:
+        """Fill the work space with the frames of a state; return its kernel coordinates."""
+        x = self.extend(state.q)
+        tangents, directors, twists = self.reference(state)
+        spatial_kernel.frames(x, tangents, directors, self.frame)
+        spatial_kernel.reference_twists(self.frame, twists, self.twists)
+        return x
+
+    def energy(self, state: RodState) -> float:
+        """Return the elastic energy."""
+        x = self._place(state)
+        return float(spatial_kernel.energy(x, self.frame, self.twists, self.local, *self.rod))
+
+    def _assemble(self, state: RodState, v: Array) -> Array:
+        x = self._place(state)
+        gradient = np.zeros(self.size)
+        spatial_kernel.assemble(
+            x, v, 0.0, np.zeros(len(self.mesh.gain)), False, gradient, self.band, self.frame,
+            self.twists, self.own, self.link, self.local, *self.rod,
+        )  # fmt: skip
+        return gradient[self.offset :]
+
+    def gradient_and_hessian(self, state: RodState) -> tuple[Array, Array]:
+        """Return ∇E (4N-1,) and ∇²E (4N-1, 4N-1) at a state, its frames re-based there."""
+        gradient = self._assemble(state, np.zeros(self.size))
+        return gradient, band_to_dense(self.band)[self.offset :, self.offset :]
+
+    def viscous_force(self, state: RodState) -> Array:
+        """Return the Kelvin-Voigt force (4N-1,) at a state."""
+        moving = self._assemble(state, self.extend_rate(state.v))
+        return self._assemble(state, np.zeros(self.size)) - moving
+
+    def input_matrix(self, state: RodState) -> Array:
+        """Return B(q)Λ (4N-1, M)."""
+        self._place(state)
+        columns = np.zeros((self.size, len(self.mesh.gain)))
+        spatial_kernel.input_columns(self.frame, *self.rod[-3:], columns)
+        return columns[self.offset :]

@@ -1,0 +1,146 @@
+"""Compiled time steps of a rod in space; see `spatial_kernel` for the symbols and the rod's arrays."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from der_planner.rod.band_kernel import hold_fixed, solve_10
+from der_planner.rod.compile import kernel
+from der_planner.rod.spatial_kernel import D1, T, assemble, frames, reference_twists
+
+
+@kernel
+def newton(
+    x, x_n, v_n, rate, u, tolerance, limit, tangents, directors, twists_n, twists,
+    work, s, frame, own, link, local, mass, damping, load, fixed,
+    rest, axial, bend, twist, cubic, viscous, rest_kappa, rest_twist, first, last, gain,
+):  # fmt: skip
+    """Solve M·rate·((x − x_n)·rate − v_n) + D·rate·(x − x_n) = F(x) for x, from the guess in x.
+
+    rate = 0 is statics. tangents, directors (n-1, 3) and twists_n (n,) are the reference frames at x_n.
+    Returns (iterations, size of the last update); iterations is negative without convergence. The
+    update is a length: an angle counts with a tenth of the rod's length.
+    """
+    size = x.shape[0]
+    residual = work[0]
+    v = work[1]
+    shortest = rest.min()
+    lever = 0.1 * rest.sum()
+    largest, careful = 2.0 * shortest, 0.1 * shortest
+    update = np.inf
+    convex = False
+    for iteration in range(limit):
+        for k in range(size):
+            v[k] = (x[k] - x_n[k]) * rate
+        frames(x, tangents, directors, frame)
+        reference_twists(frame, twists_n, twists)
+        assemble(x, v, rate, u, convex, residual, s, frame, twists, own, link, local,
+                 rest, axial, bend, twist, cubic, viscous, rest_kappa, rest_twist,
+                 first, last, gain)  # fmt: skip
+        for k in range(size):
+            residual[k] += mass[k] * rate * (v[k] - v_n[k]) + damping[k] * v[k] - load[k]
+            s[k, 0] += rate * (mass[k] * rate + damping[k])
+        hold_fixed(s, residual, fixed)
+        solve_10(s, residual)
+        update = 0.0
+        turn = 0.0
+        for k in range(size):
+            # written so that NaN counts as too large
+            change = abs(residual[k])
+            if k % 4 == 3:
+                if not change <= turn:
+                    turn = change
+            elif not change <= update:
+                update = change
+        if not max(update, turn) < 1e6:
+            return -iteration - 1, update
+        scale = min(1.0, largest / max(update, largest), 0.7 / max(turn, 0.7))
+        convex = rate > 0.0 and update > careful
+        update = max(update, lever * turn)
+        for k in range(size):
+            x[k] -= scale * residual[k]
+        if update < tolerance:
+            return iteration + 1, update
+    return -limit, update
+
+
+@kernel
+def carry(x, twists_n, tangents, directors, twists, frame):
+    """Move the reference frames to x: tangents, directors and twists_n are replaced."""
+    frames(x, tangents, directors, frame)
+    reference_twists(frame, twists_n, twists)
+    for j in range(frame.shape[0]):
+        for k in range(3):
+            tangents[j, k] = frame[j, T + k]
+            directors[j, k] = frame[j, D1 + k]
+        twists_n[j] = twists[j]
+
+
+@kernel
+def simulate(
+    q, v, pressures, h, extrapolate, tolerance, limit, tangents, directors, twists_n,
+    mass, damping, load, fixed,
+    rest, axial, bend, twist, cubic, viscous, rest_kappa, rest_twist, first, last, gain,
+):  # fmt: skip
+    """Run K intervals of S steps from q[0], v[0] into q, v (K+1, 4n-1); as `planar_kernel.simulate`.
+
+    The reference frames are replaced by those of the last state.
+    Returns (steps done, Newton iterations, last update, iterations of the failed step or 0).
+    """
+    intervals, steps, _ = pressures.shape
+    size = q.shape[1]
+    n = (size + 1) // 4
+    work = np.zeros((2, size))
+    s = np.zeros((size, 11))
+    frame = np.zeros((n - 1, 16))
+    own = np.zeros((n - 1, 4, 5))
+    link = np.zeros((n, 4, 4))
+    local = np.zeros((12, 8))
+    twists = np.zeros(n)
+    x = q[0].copy()
+    x_n = q[0].copy()
+    v_n = v[0].copy()
+    acceleration = np.zeros(size)
+    rate = 1.0 / h
+    total = 0
+    far = 0.5 * rest.min()
+    for k in range(intervals):
+        for step in range(steps):
+            u = pressures[k, step]
+            quiet = True
+            for d in range(size):
+                move = h * (v_n[d] + h * acceleration[d])
+                x[d] = x_n[d] + move
+                quiet = quiet and abs(move) < (0.5 if d % 4 == 3 else far)
+            if not quiet:
+                x[:] = x_n
+            for d in fixed:
+                x[d] = x_n[d]
+            iterations = -1
+            update = np.inf
+            for attempt in range(2):
+                if attempt == 1:  # the guess may have been at fault: once more from rest
+                    x[:] = x_n
+                iterations, update = newton(
+                    x, x_n, v_n, rate, u, tolerance, limit, tangents, directors, twists_n, twists,
+                    work, s, frame, own, link, local, mass, damping, load, fixed,
+                    rest, axial, bend, twist, cubic, viscous, rest_kappa, rest_twist,
+                    first, last, gain)  # fmt: skip
+                if iterations > 0:
+                    break
+            index = k * steps + step
+            if iterations < 0:
+                q[k + 1] = x_n
+                v[k + 1] = v_n
+                return index, total - iterations, update, -iterations
+            total += iterations
+            e = extrapolate[index % extrapolate.shape[0]]
+            for d in range(size):
+                velocity = (x[d] - x_n[d]) * rate
+                acceleration[d] = (velocity - v_n[d]) * rate
+                x_n[d] += e * (x[d] - x_n[d])
+                v_n[d] += e * (velocity - v_n[d])
+            carry(x_n, twists_n, tangents, directors, twists, frame)
+        q[k + 1] = x_n
+        v[k + 1] = v_n
+    return intervals * steps, total, 0.0, 0
