@@ -14,6 +14,9 @@ from der_planner.evaluation.selfcheck import interpolate
 from der_planner.evaluation.series import Array, EvaluationError, RunSeries, Stream
 
 LARGEST_LAG = 1.0
+"""Bound of the estimated lag [s]."""
+STANDSTILL = 1e-6
+"""A reference that moves less [m] stands still."""
 WINDOWS = ("plan", "cycles")
 
 
@@ -121,8 +124,8 @@ def window(run: RunSeries, settings: Settings) -> tuple[float, float]:
 def split_error(run: RunSeries, settings: Settings | None = None) -> Split:
     """Fit lag, gain and bias of the measured against the reference tip.
 
-    The lag minimises the squared distance of r(t) and r̄(t − τ) after the mean difference is taken
-    out, |τ| up to 1 s; a reference that stands still has none, and gets 0.
+    The lag minimises what gains and mean leave of the squared distance of r(t) and r̄(t − τ), |τ| up
+    to 1 s and a tenth of the window; a reference that stands still has none, and gets 0.
 
     Args:
         run: with at least a few valid images.
@@ -167,10 +170,10 @@ def _rms(difference: Array) -> float:
 
 def _best_lag(reference: Stream, time: Array, measured: Array, margin: float) -> float:
     def cost(lag: float) -> float:
-        difference = measured - interpolate(reference, time - lag)
-        return _rms(difference - difference.mean(axis=0))
+        _, fitted = _fit_gains(interpolate(reference, time - lag), measured)
+        return _rms(measured - fitted)
 
-    if np.ptp(reference.value, axis=0).max() < 1e-6:
+    if np.ptp(reference.value, axis=0).max() < STANDSTILL:
         return 0.0
     grid = np.linspace(-margin, margin, 41)
     best = grid[int(np.argmin([cost(lag) for lag in grid]))]

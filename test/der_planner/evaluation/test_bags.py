@@ -1,0 +1,136 @@
+"""Runs read from bags: ours, rosbags' own, split and killed ones."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from runs import FRAMES, TIMES, BagOfRun, reference
+
+from der_planner.evaluation import EvaluationError, evaluate_bag, evaluate_run, load_run
+from der_planner.recording.layout import RUN_KEY
+from der_planner.recording.writer import BagWriter
+
+OFFSET = np.array([0.003, -0.004])
+
+
+def write_run(bag: BagOfRun, first_setpoint: float = 0.0) -> None:
+    """Write a run in which the tip is off by 5 mm, in the order of time."""
+    bag.plan(stamp=first_setpoint)
+    events = [(TIMES[i], "setpoint", i) for i in range(len(TIMES))]
+    events += [(t, "state", t) for t in FRAMES]
+    for when, kind, what in sorted(events, key=lambda event: event[0]):
+        if kind == "setpoint":
+            value = 3000.0 * np.array([np.sin(when), np.cos(when)])
+            bag.setpoint(what, value)
+            bag.pressure(when, value, value + np.array([100.0, -50.0]))
+            bag.command(when + 0.004, value, what)
+        else:
+            bag.state(when, reference(when)[0] + OFFSET)
+            bag.state(
+                when, reference(when)[0] + OFFSET - [0.0003, 0.0], topic="/limb/twin/ground_truth"
+            )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("bags") / "run"
+    run = json.dumps({"trial": 2, "seed": 7, "commit": "abc"})
+    bag = BagOfRun(path, run=run)
+    write_run(bag)
+    bag.bag.close()
+    return path
+
+
+def test_run_of_a_bag(folder: Path):
+    result = evaluate_bag(folder)
+    assert result.mean_error_m == pytest.approx(0.005, abs=3e-5)
+    assert (result.motion, result.model, result.method) == ("same_direction", "der", "paper")
+    assert (result.trial, result.seed, result.limb) == (2, 7, "test limb")
+    assert result.extra == {"commit": "abc"}
+    assert result.bag == str(folder)
+    assert result.problems == ()
+    assert result.pressure_rms_error_pa == pytest.approx((100.0, 50.0))
+    assert result.checks["tracker_rms_m"] == pytest.approx(0.0003, rel=1e-3)
+    assert result.checks["board_lost"] == 0
+    assert result.checks["board_received"] == len(TIMES)
+    assert result.checks["board_lateness_p99_s"] == pytest.approx(0.004, abs=1e-6)
+    assert result.checks["board_value_error_pa"] <= 100.0
+
+
+def test_times_come_from_the_setpoints_not_from_arrival_or_plan(tmp_path: Path):
+    bag = BagOfRun(tmp_path / "run")
+    write_run(bag, first_setpoint=-3.0)  # the plan's own stamp is off by 3 s
+    bag.bag.close()
+    assert evaluate_bag(tmp_path / "run").mean_error_m == pytest.approx(0.005, abs=3e-5)
+
+
+def test_split_bag_evaluates_the_same(folder: Path, tmp_path: Path):
+    writer = BagWriter(tmp_path / "run", {RUN_KEY: "{}"}, split_seconds=2.0)
+    bag = BagOfRun(tmp_path / "run", writer)
+    write_run(bag)
+    writer.close()
+    assert writer.file_count >= 4
+    whole, split = evaluate_bag(folder), evaluate_bag(tmp_path / "run")
+    assert split.mean_error_m == whole.mean_error_m
+    assert split.frames == whole.frames
+    assert split.checks == whole.checks
+
+
+@pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_bag_in_rosbags_own_layout_evaluates_the_same(folder: Path, tmp_path: Path, storage):
+    from rosbags.rosbag2 import Reader
+
+    copy = tmp_path / "copy"
+    with Reader(folder) as source, Writer(copy, version=9, storage_plugin=storage) as target:
+        made = {
+            c.id: target.add_connection(c.topic, c.msgtype, msgdef=c.msgdef.data, rihs01=c.digest)
+            for c in source.connections
+        }
+        for connection, when, data in source.messages(source.connections):
+            target.write(made[connection.id], when, data)
+    one, two = evaluate_bag(folder).to_dict(), evaluate_bag(copy).to_dict()
+    for key in ("bag", "trial", "seed", "extra"):
+        one.pop(key)
+        two.pop(key)
+    assert one == two
+
+
+def test_interrupted_run_says_so(tmp_path: Path):
+    bag = BagOfRun(tmp_path / "run")
+    bag.plan()
+    for index in range(40):
+        bag.setpoint(index, [0.0, 0.0])
+    for when in FRAMES[FRAMES < 2.0]:
+        bag.state(when, reference(when)[0])
+    bag.pressure(1.5, [0, 0], [0, 0], mode=5, faults=["serial line lost"])
+    bag.bag.close()
+    result = evaluate_run(load_run(tmp_path / "run"))
+    assert any("serial line lost" in text for text in result.problems)
+    assert any("not played" in text for text in result.problems)
+
+
+def test_bag_without_plan_or_states_is_refused(tmp_path: Path):
+    bag = BagOfRun(tmp_path / "no_plan")
+    bag.state(0.0, (0.2, 0.0))
+    bag.bag.close()
+    with pytest.raises(EvaluationError, match=r"no_plan: holds no der_msgs/msg/PressurePlan"):
+        evaluate_bag(tmp_path / "no_plan")
+    bag = BagOfRun(tmp_path / "no_state")
+    bag.plan()
+    bag.setpoint(0, [0.0, 0.0])
+    bag.bag.close()
+    with pytest.raises(EvaluationError, match="did the tracker run"):
+        evaluate_bag(tmp_path / "no_state")
+
+
+def test_the_plan_that_was_played_is_chosen(tmp_path: Path):
+    bag = BagOfRun(tmp_path / "run")
+    bag.plan(plan_id="rejected", model="pcc", stamp=-5.0)
+    write_run(bag)
+    bag.bag.close()
+    assert load_run(tmp_path / "run").description.model == "der"
+    assert load_run(tmp_path / "run", plan_id="rejected").description.model == "pcc"
+    with pytest.raises(EvaluationError, match="only p, rejected"):
+        load_run(tmp_path / "run", plan_id="none")
