@@ -74,6 +74,11 @@ class PolylineKinematics:
         """Return the nodes (..., N, 2) [m] for bend angles (..., M) [rad]."""
         return _points(self._edges(bend_angles))
 
+    def edge_normals(self, bend_angles: ArrayLike) -> Vector:
+        """Return the left normals of the edges (..., N-1, 2), unit vectors."""
+        normal = 1j * np.exp(1j * (np.asarray(bend_angles, dtype=float) @ self.turning.T))
+        return np.stack([normal.real, normal.imag], axis=-1)
+
     def tangents(self, bend_angles: ArrayLike) -> Vector:
         """Return S = ∂nodes/∂bend angles (..., M, N, 2) [m/rad]."""
         edges = self._edges(bend_angles)

@@ -24,7 +24,7 @@ Vector = NDArray[np.float64]
 DEFAULT_METHOD = {"der": "projected", "pcc": "paper"}
 SUBSTEPS = 5
 """Integrator steps a control period: 10 ms."""
-_FINE = 5
+_FINE = 2
 """Points of the feedforward's grid a control period."""
 
 

@@ -33,8 +33,8 @@ class RodModel:
         self.rod = Rod.from_limb(limb, nodes)
         self.kinematics = PolylineKinematics(self.rod.rest_lengths, list(self.rod.segments))
         self.rest = self.rod.equilibrium(np.zeros(limb.segment_count))
-        self._x = np.arange(nodes) * 4
-        self._free = self.rod.free
+        first = [first for first, _ in self.rod.segments]
+        self._moment_gain = self.rod.input_gain * self.rod.rest_lengths[first]
 
     def configuration(self, reference: Reference) -> BSpline:
         """Return the rod's bend angles (M,) [rad] as a spline of time that follows r̄(t).
@@ -67,60 +67,74 @@ class RodModel:
         tip: Vector = motion.tip[:-1, :2]
         return tip
 
-    def _needed_force(self, angles: Vector, rates: Vector, accelerations: Vector) -> Vector:
-        """Return M q̈ + D q̇ − F_int − F_ext (K, 4N−1) that the couples must supply [N]."""
-        position, velocity, acceleration = self.kinematics.motion(angles, rates, accelerations)
-        size = self.rod.mass_diagonal.size
-        force = np.tile(-self.rod.external_force, (len(angles), 1))
-        straight = self.rod.straight_state().q
-        for k in range(len(angles)):
-            q, v, a = straight.copy(), np.zeros(size), np.zeros(size)
-            for axis in range(2):
-                rows = self._x + axis
-                q[rows] = position[k, :, axis]
-                v[rows] = velocity[k, :, axis]
-                a[rows] = acceleration[k, :, axis]
-            force[k] += self.rod.mass_diagonal * a + self.rod.damping_diagonal * v
-            force[k] -= self.rod.internal_force(q)
-        return force
-
-    def projected_pressures(self, angles: Vector, rates: Vector, accelerations: Vector) -> Vector:
+    def projected_pressures(self, q: Vector, v: Vector, a: Vector) -> Vector:
         """Return (K, M) pressures [Pa] from Sᵀ (M q̈ + D q̇ − F_int − F_ext) = Sᵀ B Λ u.
 
         Args:
-            angles, rates, accelerations: (K, M) of evenly bent segments [rad], [rad/s], [rad/s²].
+            q: (K, M) bend angles of evenly bent segments [rad].
+            v: their rates [rad/s].
+            a: their accelerations [rad/s²].
         """
-        force = self._needed_force(angles, rates, accelerations)
-        tangents = self.kinematics.tangents(angles)
-        planar = np.stack([force[:, self._x], force[:, self._x + 1]], axis=-1)
-        load = np.einsum("kmna,kna->km", tangents, planar)
-        # A couple on an edge works on that edge's turning: Sᵀ B Λ is diagonal, gain times edge length.
-        lever = [first + 0 for first, _ in self.rod.segments]
-        gain = self.rod.input_gain * self.rod.rest_lengths[lever]
-        pressures: Vector = load / gain
-        return pressures + self._material_damping(rates) / gain
+        force = self._needed_force(q, v, a)
+        load = np.einsum("kmna,kna->km", self.kinematics.tangents(q), force)
+        # A couple on an edge works on that edge's turning: Sᵀ B Λ = diag(Λ times edge length).
+        pressures: Vector = load / self._moment_gain
+        return pressures
 
-    def paper_pressures(self, angles: Vector, rates: Vector, accelerations: Vector) -> Vector:
+    def paper_pressures(self, q: Vector, v: Vector, a: Vector) -> Vector:
         """Return (K, M) pressures [Pa] from (B Λ)† (M q̈ + D q̇ − F_int − F_ext) on the free rows.
 
         Args:
-            angles, rates, accelerations: (K, M) of evenly bent segments [rad], [rad/s], [rad/s²].
+            q: (K, M) bend angles of evenly bent segments [rad].
+            v: their rates [rad/s].
+            a: their accelerations [rad/s²].
         """
-        force = self._needed_force(angles, rates, accelerations)
-        positions = self.kinematics.nodes(angles)
-        lever = [first for first, _ in self.rod.segments]
-        gain = self.rod.input_gain * self.rod.rest_lengths[lever]
-        pressures = self._material_damping(rates) / gain
-        straight = self.rod.straight_state().q
-        for k in range(len(force)):
-            q = straight.copy()
-            q[self._x], q[self._x + 1] = positions[k, :, 0], positions[k, :, 1]
-            matrix = self.rod.input_matrix(q)[self._free]
-            pressures[k] += np.linalg.lstsq(matrix, force[k, self._free], rcond=None)[0]
+        force = self._needed_force(q, v, a)[:, 1:].reshape(len(q), -1)
+        inputs = self._input_matrix(q)
+        pressures: Vector = np.einsum("kmf,kf->km", np.linalg.pinv(inputs), force)
         return pressures
 
-    def _material_damping(self, rates: Vector) -> Vector:
-        """Return EI τ θ̇ / L (K, M), the moment of the Kelvin-Voigt term [N·m]."""
-        moments = [s.bending_stiffness * s.material_damping / s.length for s in self.limb.segments]
-        damping: Vector = np.array(moments) * rates
-        return damping
+    def _needed_force(self, q: Vector, v: Vector, a: Vector) -> Vector:
+        """Return M q̈ + D q̇ − F_int − F_ext (K, N, 2) of evenly bent configurations [N].
+
+        Edges keep their rest length, so that F_int is that of the nodes' bending moments alone: with
+        c_e = ∂E/∂ψ_e, the node behind edge e feels +c_e n̂/ē and the node ahead −c_e n̂/ē.
+        """
+        _, velocity, acceleration = self.kinematics.motion(q, v, a)
+        mesh = self.rod.mesh
+        couple = self._edge_couples(q, v)
+        normal = self.kinematics.edge_normals(q) / mesh.rest[:, None]
+        pair = couple[..., None] * normal
+        force = mesh.node_mass[:, None] * (acceleration - mesh.gravity[:2])
+        force += mesh.node_damping[:, None] * velocity
+        force[:, 1:] += pair
+        force[:, :-1] -= pair
+        return force
+
+    def _edge_couples(self, q: Vector, v: Vector) -> Vector:
+        """Return c_e = ∂E/∂ψ_e (K, N−1) [N·m] with the Kelvin-Voigt moment, from κ = 2 tan(θ/2)."""
+        mesh = self.rod.mesh
+        # Node i turns by ψ_i − ψ_{i−1}; node 0 against the clamp.
+        share = np.diff(self.kinematics.turning, axis=0, prepend=0.0)
+        turn, rate = q @ share.T, v @ share.T
+        kappa = 2 * np.tan(turn / 2)
+        growth = 1 + kappa**2 / 4
+        excess = kappa - mesh.rest_kappa[:-1, 0]
+        moment = (mesh.bend[:-1] + mesh.cubic[:-1] * excess**2) * excess
+        moment = (moment + mesh.viscous[:-1] * growth * rate) * growth
+        ahead = np.concatenate([moment[:, 1:], np.zeros((len(q), 1))], axis=1)
+        couples: Vector = moment - ahead
+        return couples
+
+    def _input_matrix(self, q: Vector) -> Vector:
+        """Return B Λ (K, 2(N−1), M) [N/Pa] on the free rows, those of nodes 1 … N−1."""
+        rest = self.rod.rest_lengths
+        normal = self.kinematics.edge_normals(q)
+        matrix = np.zeros((len(q), len(rest) + 1, 2, self.limb.segment_count))
+        for j, (first, count) in enumerate(self.rod.segments):
+            for edge, sign in ((first, -1.0), (first + count - 2, 1.0)):
+                # A couple about z on an edge: −n̂/|ē| times itself behind, +n̂/|ē| ahead.
+                pair = sign * self._moment_gain[j] * normal[:, edge] / rest[edge]
+                matrix[:, edge, :, j] -= pair
+                matrix[:, edge + 1, :, j] += pair
+        return matrix[:, 1:].reshape(len(q), -1, self.limb.segment_count)
