@@ -51,15 +51,19 @@ class ShapePrior:
             curvature [1/m].
         tag_position: what a tag's position may be off besides noise, e.g. by its mounting [m].
         tag_heading: the same of its heading [rad].
+        arc_position: how far a real limb's points are from arcs of constant curvature [m].
+        arc_heading: the same of its heading [rad].
     """
 
-    base_position: float = 0.001
-    base_heading: float = 0.02
+    base_position: float = 0.0005
+    base_heading: float = 0.005
     elongation: float = 0.05
     curvature: float = 30.0
-    corrections: tuple[float, ...] = (3.0, 3.0, 1.5)
+    corrections: tuple[float, ...] = (3.0, 3.0, 1.5, 1.0)
     tag_position: float = 5e-5
     tag_heading: float = 3e-3
+    arc_position: float = 5e-4
+    arc_heading: float = 5e-3
 
 
 @dataclass(frozen=True)
@@ -73,7 +77,7 @@ class LimbEstimate:
         tip_heading: [rad].
         bend_angle: (M,) rad, by constant curvature.
         bend_angle_sigma: (M,) rad.
-        curvature: (M,) 1/m.
+        curvature: (M,) 1/m, of the parts of each segment that bend.
         elongation: length over length at rest.
         residual: RMS distance of the tags from the constant-curvature shape [m].
         curve: (n, 2) m, base to tip.
@@ -98,31 +102,50 @@ class LimbEstimate:
 class _Curve:
     """A family of curves: heading linear in the parameters, evaluated at fixed arc lengths.
 
-    Parameters are x0, y0, θ0, elongation − 1, one curvature a segment, then the corrections.
+    Parameters are x0, y0, θ0, elongation − 1, one curvature a segment, then the corrections. Stiff
+    stretches keep their heading.
     """
 
-    def __init__(self, lengths: Sequence[float], degrees: int, grid: int = 20) -> None:
+    def __init__(
+        self,
+        lengths: Sequence[float],
+        degrees: int,
+        stiff: Sequence[tuple[float, float]] = (),
+        grid: int = 20,
+    ) -> None:
         ends = np.concatenate([[0.0], np.cumsum(lengths)])
         self.ends = ends
         self.segments = len(lengths)
         self.degrees = degrees
         self.size = 4 + self.segments * (1 + degrees)
         nodes, weights = np.polynomial.legendre.leggauss(4)
+        self._stiff = tuple(stiff)
+        self.active = np.diff(self._bending_length(ends))
         edges = np.unique(
-            np.concatenate([np.linspace(a, b, grid + 1) for a, b in itertools.pairwise(ends)])
+            np.concatenate(
+                [np.linspace(a, b, grid + 1) for a, b in itertools.pairwise(ends)]
+                + [np.array(stretch) for stretch in self._stiff]
+            )
         )
         self._edges = edges
         self._nodes = nodes
         self._weights = weights
 
+    def _bending_length(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how much of the limb up to each arc length can bend [m]."""
+        result = np.clip(s, 0.0, self.ends[-1])
+        for start, end in self._stiff:
+            result = result - (np.clip(s, start, end) - start)
+        return result
+
     def heading_basis(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return dθ/dp at arc lengths (n,), (n, size)."""
         basis = np.zeros((len(s), self.size))
         basis[:, 2] = 1.0
+        bending, starts = self._bending_length(s), self._bending_length(self.ends)
         for j in range(self.segments):
-            start, end = self.ends[j], self.ends[j + 1]
-            half = 0.5 * (end - start)
-            local = np.clip((s - start) / half - 1.0, -1.0, 1.0)
+            half = 0.5 * self.active[j]
+            local = np.clip((bending - starts[j]) / half - 1.0, -1.0, 1.0)
             basis[:, 4 + j] = half * (local + 1.0)
             for degree in range(1, self.degrees + 1):
                 column = 4 + self.segments + j * self.degrees + degree - 1
@@ -211,12 +234,11 @@ class ShapeFitter:
         mounting_angle: float = 5e-3,
         curve_points: int = 41,
     ) -> None:
-        self._map = tags
         self.prior = prior or ShapePrior()
         self.reject_beyond = reject_beyond
         self._mounting = np.array([mounting, mounting, mounting_angle])
-        self._smooth = _Curve(tags.segment_lengths, len(self.prior.corrections))
-        self._constant = _Curve(tags.segment_lengths, 0)
+        self._smooth = _Curve(tags.segment_lengths, len(self.prior.corrections), tags.stiff)
+        self._constant = _Curve(tags.segment_lengths, 0, tags.stiff)
         self._outline = _Evaluation(
             self._smooth, np.linspace(0.0, tags.length, curve_points).tolist()
         )
@@ -293,7 +315,13 @@ class ShapeFitter:
         """Find the most probable parameters and the gain (size, n, 3) from measurements to them."""
         evaluation = self._evaluation(curve, tags)
         measured = np.array([tag.pose for tag in tags])
-        extra = np.array([self.prior.tag_position] * 2 + [self.prior.tag_heading]) ** 2
+        prior = self.prior
+        slack = (
+            (prior.tag_position, prior.tag_heading)
+            if curve.degrees
+            else (prior.arc_position, prior.arc_heading)
+        )
+        extra = np.array([slack[0], slack[0], slack[1]]) ** 2
         whiten = np.array(
             [np.linalg.inv(np.linalg.cholesky(tag.covariance + np.diag(extra))) for tag in tags]
         )
@@ -343,9 +371,9 @@ class ShapeFitter:
         systematic += undetermined @ undetermined.T
         arcs = self._solve(self._constant, tags, fit.parameters)
         bends = arcs.parameters[4 : 4 + self._constant.segments]
-        lengths = np.array(self._map.segment_lengths)
+        bending = self._constant.active
         bend_gain = arcs.gain[4:]
-        variance = np.zeros(len(lengths))
+        variance = np.zeros(self._constant.segments)
         for i, tag in enumerate(tags):
             spread = tag.covariance + np.diag(self._mounting**2)
             variance += np.einsum("pj,jk,pk->p", bend_gain[:, i], spread, bend_gain[:, i])
@@ -355,8 +383,8 @@ class ShapeFitter:
             tip_covariance=noise,
             tip_systematic=systematic,
             tip_heading=float(curve[-1, 2]),
-            bend_angle=bends * lengths,
-            bend_angle_sigma=np.sqrt(variance) * lengths,
+            bend_angle=bends * bending,
+            bend_angle_sigma=np.sqrt(variance) * bending,
             curvature=bends,
             elongation=1.0 + float(fit.parameters[3]),
             residual=float(np.sqrt(np.mean(np.sum(arcs.residuals[:, :2] ** 2, axis=1)))),

@@ -64,11 +64,19 @@ class WorldTag:
 
 @dataclass(frozen=True)
 class TagMap:
-    """All tags of a set-up and the lengths of the limb's segments [m]."""
+    """All tags of a set-up.
+
+    Attributes:
+        segment_lengths: of the limb [m].
+        limb: tags on it.
+        world: fixed tags.
+        stiff: stretches of the limb that cannot bend, from and to in arc length [m].
+    """
 
     segment_lengths: tuple[float, ...]
     limb: tuple[LimbTag, ...]
     world: tuple[WorldTag, ...]
+    stiff: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
         twice = sorted({tag for tag in self.ids if self.ids.count(tag) > 1})
@@ -130,9 +138,8 @@ class TagMap:
         limb_tags = tuple(_limb_tag(entry, total) for entry in limb.get("tags") or [])
         if not limb_tags:
             raise TagMapError("limb.tags is empty: at least one tag must be on the limb")
-        return cls(
-            lengths, limb_tags, tuple(_world_tag(entry) for entry in world.get("tags") or [])
-        )
+        world_tags = tuple(_world_tag(entry) for entry in world.get("tags") or [])
+        return cls(lengths, limb_tags, world_tags, _stiff(limb.get("stiff") or [], lengths))
 
 
 def _section(data: dict[str, Any], name: str) -> dict[str, Any]:
@@ -152,6 +159,24 @@ def _number(value: Any, name: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise TagMapError(f"{name}: a finite number expected, not {value!r}")
     return float(value)
+
+
+def _stiff(value: Any, lengths: tuple[float, ...]) -> tuple[tuple[float, float], ...]:
+    result: list[tuple[float, float]] = []
+    for entry in value if isinstance(value, list) else [value]:
+        start, end = _floats(entry, 2, "limb.stiff")
+        if not (result[-1][1] if result else 0.0) <= start < end <= sum(lengths) + 1e-9:
+            raise TagMapError(f"limb.stiff: {entry} is out of order or not on the limb")
+        result.append((start, end))
+    begin = 0.0
+    for length in lengths:
+        covered = sum(
+            max(0.0, min(end, begin + length) - max(start, begin)) for start, end in result
+        )
+        if covered > 0.5 * length:
+            raise TagMapError("limb.stiff covers more than half of a segment: nothing could bend")
+        begin += length
+    return tuple(result)
 
 
 def _common(entry: Any, where: str) -> tuple[int, float, str]:
