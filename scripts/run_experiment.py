@@ -23,18 +23,20 @@ from orchestrator.errors import GraphError, NodeError  # noqa: E402
 from orchestrator.experiment import run  # noqa: E402
 from orchestrator.options import OptionError, parse  # noqa: E402
 
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
 
 def _interrupt_once(number: int, _frame: FrameType | None) -> None:
     # A second signal must not cut the venting short.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    for each in SIGNALS:
+        signal.signal(each, signal.SIG_IGN)
     raise KeyboardInterrupt(signal.Signals(number).name)
 
 
 def main() -> int:
     """Run the command line; 0 when every trial was played, 1 after an error, 2 for bad options."""
-    signal.signal(signal.SIGINT, _interrupt_once)
-    signal.signal(signal.SIGTERM, _interrupt_once)
+    for each in SIGNALS:
+        signal.signal(each, _interrupt_once)
     try:
         run(parse(sys.argv[1:]))
     except OptionError as error:

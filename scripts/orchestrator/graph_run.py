@@ -117,6 +117,7 @@ class GraphTrial:
         self._progress = progress
         self._logs = options.out / "logs" / trial.name
         self._processes: dict[str, NodeProcess] = {}
+        self._driver_spec: NodeSpec | None = None
 
     def play(self) -> GraphRun:
         """Start the graph, play the motion and stop everything, whatever happens on the way.
@@ -146,16 +147,20 @@ class GraphTrial:
         client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES)
 
     def _start(self, client: GraphClient, port: str) -> None:
+        begin = time.monotonic()
         specs = node_specs(self._trial, self._options, self._limb, port, self._metadata)
         self._progress.say(f"  starting {', '.join(spec.executable for spec in specs)}")
         remap = self._options.hardware.remap if self._options.hardware else None
         for spec in specs:
             process = NodeProcess(spec.package, spec.executable, spec.parameters, self._logs, remap)
             self._processes[spec.executable] = process
+            if spec.executable == "pressure_driver":
+                self._driver_spec = spec
             client.watch(self._processes.values())
             if spec.executable == "board_emulator":
                 client.wait_for(lambda: os.path.exists(port), 60.0, "the emulated board's port")
         client.wait_ready(self._processes, READY_TIMEOUT)
+        self._progress.say(f"  ready after {time.monotonic() - begin:.1f} s")
 
     def _play_motion(self, client: GraphClient) -> GraphRun:
         bag = Path(client.call("recorder/start"))
@@ -224,6 +229,7 @@ class GraphTrial:
 
     def _vent(self, client: GraphClient) -> None:
         client.call("pressure_driver/vent")
+        client.newest.pop(topics.PRESSURE_STATE, None)
 
         def vented() -> bool:
             state = client.newest.get(topics.PRESSURE_STATE)
@@ -232,18 +238,41 @@ class GraphTrial:
 
         client.wait_for(vented, 15.0, "the chambers to vent")
 
+    def _vent_whatever_happened(self, client: GraphClient) -> None:
+        """Vent after an error; a dead driver is started again, since boards have no watchdog."""
+        driver = self._processes.get("pressure_driver")
+        if driver is None or self._driver_spec is None:
+            return
+        self._progress.say("  venting the limb")
+        client.watch(())
+        try:
+            if not driver.alive:
+                spec = self._driver_spec
+                client.diagnostics.pop(spec.executable, None)
+                driver = NodeProcess(
+                    spec.package,
+                    spec.executable,
+                    spec.parameters,
+                    self._logs,
+                    name="pressure_driver_restarted",
+                )
+                self._processes["pressure_driver"] = driver
+                client.watch([driver])
+                client.wait_ready([spec.executable], 20.0)
+            self._vent(client)
+        except (GraphError, NodeError) as error:
+            self._progress.say(
+                f"  WARNING: the limb may still be under pressure ({error}); close its air supply"
+            )
+        client.watch(())
+
     @contextlib.contextmanager
     def _everything_stops(self, client: GraphClient) -> Iterator[None]:
         """Stop every node at the end; after an error or an interrupt, vent first."""
         try:
             yield
         except BaseException:
-            client.watch(())
-            driver = self._processes.get("pressure_driver")
-            if driver is not None and driver.alive:
-                self._progress.say("  venting the limb")
-                with contextlib.suppress(GraphError, NodeError):
-                    client.call("pressure_driver/vent", timeout=3.0)
+            self._vent_whatever_happened(client)
             self._stop_all()
             raise
         client.watch(())

@@ -1,0 +1,192 @@
+"""The main command from the outside: a whole run, and what is left when a node of it is killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+TWIN_NODES = {
+    "board_emulator",
+    "pressure_driver",
+    "limb_twin",
+    "synthetic_camera",
+    "apriltag_tracker",
+    "planner",
+    "recorder",
+}
+pytestmark = pytest.mark.graph
+
+
+class Experiment:
+    """A run_experiment.py in a process and a ROS domain of its own."""
+
+    def __init__(self, folder: Path, *arguments: str) -> None:
+        self.out = folder / "out"
+        self.marker = f"TEST_EXPERIMENT={folder}"
+        domain = str(21 + os.getpid() % 80)
+        name, value = self.marker.split("=", 1)
+        self._process = subprocess.Popen(
+            [
+                sys.executable,
+                ROOT / "scripts" / "run_experiment.py",
+                "--no-calibration",
+                "--period",
+                "3",
+                "--cycles",
+                "1",
+                "--out",
+                self.out,
+                *arguments,
+            ],
+            env={**os.environ, "ROS_DOMAIN_ID": domain, name: value},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self.output = ""
+        self.errors = ""
+
+    def finish(self, timeout: float = 200.0) -> int:
+        self.output, self.errors = self._process.communicate(timeout=timeout)
+        return self._process.returncode
+
+    def signal(self, number: int) -> None:
+        self._process.send_signal(number)
+
+    def wait_for_line(self, text: str) -> None:
+        """Wait until the run says something on stderr."""
+        for line in self._process.stderr:
+            self.errors += line
+            if text in line:
+                return
+        raise AssertionError(f"never said {text!r}:\n{self.errors}")
+
+    def processes(self) -> dict[str, int]:
+        """Return the process ids of this run's nodes by the name of their executable."""
+        found = {}
+        for folder in Path("/proc").iterdir():
+            if not folder.name.isdigit():
+                continue
+            try:
+                if self.marker.encode() not in (folder / "environ").read_bytes().split(b"\0"):
+                    continue
+                words = (folder / "cmdline").read_bytes().split(b"\0")
+            except OSError:
+                continue
+            for word in words:
+                name = Path(word.decode(errors="replace")).name
+                if name in TWIN_NODES:
+                    found[name] = int(folder.name)
+        return found
+
+    def close(self) -> None:
+        if self._process.poll() is None:
+            self._process.send_signal(signal.SIGTERM)
+            self._process.communicate(timeout=60)
+
+
+@pytest.fixture
+def experiment(tmp_path: Path) -> Iterator:
+    running = []
+
+    def start(*arguments: str) -> Experiment:
+        running.append(Experiment(tmp_path, *arguments))
+        return running[-1]
+
+    yield start
+    for each in running:
+        each.close()
+
+
+def last_board_command(bag: Path) -> np.ndarray:
+    """Return the differential pressures [Pa] that the board was told last, as the bag has it."""
+    from der_planner.recording.reader import BagReader
+
+    last = None
+    with BagReader(bag) as reader:
+        for _, _, message in reader.messages(["/limb/twin/board_commands"]):
+            last = message
+    assert last is not None, f"{bag} holds no command that the board received"
+    pressure = np.array(last.pressure)
+    return pressure[0::2] - pressure[1::2]
+
+
+def test_a_run_of_both_models_ends_in_a_table_and_leaves_nothing_behind(experiment):
+    run = experiment("--models", "der", "pcc")
+    assert run.finish() == 0, run.errors
+    document = json.loads((run.out / "results.json").read_text())
+    assert [entry["model"] for entry in document["runs"]] == ["der", "pcc"]
+    for entry in document["runs"]:
+        assert entry["valid_fraction"] > 0.9
+        assert 0.0 < entry["mean_error_m"] <= entry["max_error_m"] < 0.1
+        assert entry["checks"]["tracker_rms_m"] < 1e-3
+        assert entry["checks"]["board_lost"] == 0
+        assert entry["checks"]["board_out_of_order"] == 0
+        np.testing.assert_allclose(last_board_command(Path(entry["bag"])), 0.0, atol=1.0)
+    for name in ("tip.png", "error.png", "pressures.png"):
+        assert (run.out / name).stat().st_size > 5000
+    assert "same direction" in run.output
+    assert run.processes() == {}
+
+    again = experiment("--models", "der", "pcc")
+    begin = time.monotonic()
+    assert again.finish() == 0, again.errors
+    assert "0 of 2 trials to play" in again.errors
+    assert time.monotonic() - begin < 60
+
+
+@pytest.mark.parametrize("victim", ["apriltag_tracker", "pressure_driver"])
+def test_a_killed_node_is_named_and_the_limb_vents(experiment, victim: str):
+    run = experiment("--models", "der", "--period", "30")
+    run.wait_for_line("planned in")
+    nodes = run.processes()
+    assert set(nodes) == TWIN_NODES
+    os.kill(nodes[victim], signal.SIGKILL)
+    assert run.finish() == 1
+    assert f"node '{victim}' died (killed by SIGKILL)" in run.errors
+    assert "may still be under pressure" not in run.errors
+    assert run.processes() == {}
+    bag = run.out / "bags" / "same_direction_der_paper_trial1"
+    assert (bag / "metadata.yaml").exists()
+    np.testing.assert_allclose(last_board_command(bag), 0.0, atol=1.0)
+
+
+def test_an_interrupted_run_vents_closes_the_bag_and_can_go_on(experiment):
+    run = experiment("--models", "der", "--period", "30")
+    run.wait_for_line("planned in")
+    run.signal(signal.SIGINT)
+    assert run.finish() == 130
+    assert "the same --out goes on" in run.errors
+    assert run.processes() == {}
+    bag = run.out / "bags" / "same_direction_der_paper_trial1"
+    assert (bag / "metadata.yaml").exists()
+    np.testing.assert_allclose(last_board_command(bag), 0.0, atol=1.0)
+    assert not (run.out / "trials").exists()
+
+
+def test_a_malformed_limb_file_is_refused_before_anything_starts(experiment, tmp_path: Path):
+    limb = tmp_path / "limb.yaml"
+    text = (ROOT / "src/der_planner/der_planner/data/default_limb.yaml").read_text()
+    limb.write_text(text.replace("bending_stiffness: 0.0175", "bending_stiffness: -1.0", 1))
+    run = experiment("--limb", str(limb))
+    assert run.finish() == 2
+    assert "segments[0].bending_stiffness must be positive" in run.errors
+    assert not run.out.exists()
+
+
+def test_two_graphs_do_not_mix(experiment, graph):
+    graph.start("pressure_driver", "board_emulator", port_link=str(graph.folder / "board"))
+    graph.client.wait_ready(["board_emulator"], 60.0)
+    run = experiment("--models", "der")
+    assert run.finish() == 1
+    assert "another graph is running in this ROS domain (node 'board_emulator')" in run.errors
