@@ -30,11 +30,21 @@ class BagError(ValueError):
 
 @dataclass(frozen=True)
 class RecordedTopic:
-    """One topic of a bag."""
+    """One topic of a bag.
+
+    Attributes:
+        name: as recorded.
+        type_name: ``package/msg/Name``.
+        message_count: in the whole bag.
+        reliable: every publisher was; true where the bag does not say.
+        latched: every publisher kept its last messages for late subscribers.
+    """
 
     name: str
     type_name: str
     message_count: int
+    reliable: bool = True
+    latched: bool = False
 
 
 @dataclass(frozen=True)
@@ -146,7 +156,15 @@ class BagReader:
                 name, count = connection.topic, connection.msgcount
                 if name in found:
                     count += found[name].message_count
-                found[name] = RecordedTopic(name, connection.msgtype, count)
+                profiles = getattr(connection.ext, "offered_qos_profiles", [])
+                found[name] = RecordedTopic(
+                    name,
+                    connection.msgtype,
+                    count,
+                    reliable=all(p.reliability.name != "BEST_EFFORT" for p in profiles),
+                    latched=bool(profiles)
+                    and all(p.durability.name == "TRANSIENT_LOCAL" for p in profiles),
+                )
         return found
 
     @property
