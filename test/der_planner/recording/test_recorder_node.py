@@ -1,0 +1,213 @@
+"""The recorder as a process on a graph."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from bags import read_texts
+
+from der_planner.recording.reader import BagReader
+from der_planner.recording.recover import recover_bag
+
+pytestmark = pytest.mark.graph
+SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"
+
+
+class Talker:
+    """Publishers of Strings and of an image, and what they sent."""
+
+    def __init__(self, graph) -> None:
+        from std_msgs.msg import String
+
+        from limb_interfaces import qos
+
+        self.graph, self.qos, self.kind = graph, qos, String
+        self.sent: list[str] = []
+        self.publishers = {}
+
+    def topic(self, name: str, profile=None):
+        self.publishers[name] = self.graph.client.node.create_publisher(
+            self.kind, name, profile or self.qos.STATES
+        )
+
+    def say(self, name: str, text: str) -> None:
+        self.publishers[name].publish(self.kind(data=text))
+        self.sent.append(text)
+
+    def heard(self, *names: str) -> None:
+        """Wait until the recorder listens to the topics."""
+        for name in names:
+            self.graph.client.wait_for(
+                lambda name=name: self.publishers[name].get_subscription_count() > 0,
+                30.0,
+                f"a subscription of {name}",
+            )
+
+
+def start(graph, **parameters):
+    process = graph.start("der_planner", "recorder", **parameters)
+    graph.client.watch([process])
+    graph.client.wait_ready(["recorder"], 60.0)
+    return process
+
+
+def value(graph, key: str) -> str:
+    return graph.client.diagnostic_values("recorder").get(key, "")
+
+
+def test_records_the_graph_between_start_and_stop(graph, tmp_path: Path):
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
+    from sensor_msgs.msg import Image
+    from std_srvs.srv import SetBool
+
+    talker = Talker(graph)
+    talker.topic("latched", talker.qos.LATCHED)
+    talker.topic("fast", QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT))
+    image = graph.client.node.create_publisher(Image, "camera/image_raw", talker.qos.SENSOR_DATA)
+    talker.say("latched", "the plan")
+    folder = tmp_path / "run"
+    process = start(graph, output=str(folder), metadata='{"motion": "circle", "trial": 3}')
+    talker.heard("latched", "fast")
+
+    talker.publishers["fast"].publish(talker.kind(data="before the start"))
+    assert graph.client.call("recorder/start") == str(folder)
+    for index in range(20):
+        talker.say("fast", f"fast {index}")
+        image.publish(Image(data=b"123"))
+        graph.client.spin(0.01)
+
+    talker.topic("late")  # appears while recording
+    talker.heard("late")
+    talker.say("late", "late one")
+    graph.client.wait_for(lambda: int(value(graph, "messages") or 0) >= 22, 30.0, "messages")
+
+    pause = graph.client.node.create_client(SetBool, "recorder/pause")
+    graph.client.wait_for(pause.service_is_ready, 10.0, "pause")
+    future = pause.call_async(SetBool.Request(data=True))
+    graph.client.wait_for(future.done, 10.0, "pause")
+    talker.publishers["late"].publish(talker.kind(data="in the pause"))
+    graph.client.spin(0.3)
+    assert graph.client.call("recorder/mark") == "mark 1"
+    future = pause.call_async(SetBool.Request(data=False))
+    graph.client.wait_for(future.done, 10.0, "going on")
+    talker.say("late", "after the pause")
+    graph.client.spin(0.3)
+    assert graph.client.call("recorder/stop") == str(folder)
+
+    texts = read_texts(folder)
+    assert texts[0] == "the plan"
+    assert [t for t in texts if t.startswith("fast")] == [f"fast {i}" for i in range(20)]
+    assert [t for t in texts if "late" in t or "pause" in t] == ["late one", "after the pause"]
+    assert "mark 1" in texts
+    assert "before the start" not in texts
+    with BagReader(folder) as bag:
+        assert bag.run() == {"motion": "circle", "trial": 3}
+        assert "/limb/camera/image_raw" not in bag.topics
+        assert "/diagnostics" in bag.topics
+        assert bag.topics["/limb/latched"].latched
+        assert not bag.topics["/limb/fast"].reliable
+    assert process.stop() == 0
+
+
+def test_second_start_into_the_same_folder_is_refused(graph, tmp_path: Path):
+    from orchestrator.errors import GraphError
+
+    start(graph, output=str(tmp_path / "run"))
+    graph.client.call("recorder/start")
+    with pytest.raises(GraphError, match="already recording"):
+        graph.client.call("recorder/start")
+    graph.client.call("recorder/stop")
+    with pytest.raises(GraphError, match="not empty: name another"):
+        graph.client.call("recorder/start")
+    with pytest.raises(GraphError, match=r"not empty|not recording"):
+        graph.client.call("recorder/stop")
+
+
+def test_sigterm_closes_and_sigkill_loses_at_most_a_second(graph, tmp_path: Path):
+    talker = Talker(graph)
+    talker.topic("talk")
+    for name in ("term", "kill"):
+        folder = tmp_path / name
+        process = start(graph, output=str(folder), autostart=True, flush_interval=1.0)
+        talker.heard("talk")
+        said: list[tuple[float, str]] = []
+        begin = time.monotonic()
+        while time.monotonic() - begin < 2.5:
+            text = f"{name} {len(said)}"
+            talker.publishers["talk"].publish(talker.kind(data=text))
+            said.append((time.monotonic(), text))
+            graph.client.spin(0.02)
+        graph.client.watch([])
+        if name == "term":
+            graph.client.spin(0.2)
+            assert process.stop() == 0
+            assert [t for t in read_texts(folder) if t.startswith("term")] == [t for _, t in said]
+            continue
+        killed = time.monotonic()
+        process.signal(signal.SIGKILL)
+        process.stop()
+        recover_bag(folder)
+        kept = [text for text in read_texts(folder) if text.startswith("kill")]
+        # A second between flushes, and what a busy machine adds.
+        old = [text for when, text in said if when < killed - 1.8]
+        assert kept[: len(old)] == old
+        assert old
+
+
+def test_removed_folder_is_reported_and_node_lives_on(graph, tmp_path: Path):
+    talker = Talker(graph)
+    talker.topic("talk")
+    process = start(graph, output=str(tmp_path / "run"), autostart=True, topics="/limb/talk")
+    talker.heard("talk")
+    talker.say("talk", "kept")
+    graph.client.wait_for(lambda: int(value(graph, "messages") or 0) > 0, 30.0, "a message")
+    shutil.rmtree(tmp_path / "run")
+    graph.client.wait_for(lambda: value(graph, "state") == "failed", 30.0, "the failure")
+    assert "was removed" in graph.client.diagnostics["recorder"].message
+    assert process.alive
+    assert "kept" in read_texts(tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"topics": "(["}, "parameter 'topics' is '(['"),
+        ({"compression": "rar"}, "parameter 'compression'"),
+        ({"metadata": "{broken", "autostart": True}, "parameter 'metadata' is no JSON"),
+    ],
+)
+def test_bad_parameters_end_the_node_by_name(graph, parameters, message):
+    process = graph.start("der_planner", "recorder", **parameters)
+    graph.client.wait_for(lambda: not process.alive, 60.0, "the end of the node")
+    assert process.exit_code == 1
+    assert message in process.log.read_text()
+
+
+def test_replay_publishes_the_recorded_bytes(graph, tmp_path: Path):
+    talker = Talker(graph)
+    talker.topic("talk")
+    start(graph, output=str(tmp_path / "run"), topics="/limb/talk")
+    talker.heard("talk")
+    graph.client.call("recorder/start")
+    for index in range(10):
+        talker.say("talk", f"word {index}")
+        graph.client.spin(0.02)
+    graph.client.spin(0.3)
+    graph.client.call("recorder/stop")
+
+    heard: list[str] = []
+    graph.client.subscribe(
+        talker.kind, "again", talker.qos.STATES, lambda message: heard.append(message.data)
+    )
+    command = [sys.executable, str(SCRIPTS / "replay_bag.py"), str(tmp_path / "run")]
+    command += ["--rate", "0", "--remap", "/limb/talk=/limb/again", "--wait", "30"]
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(graph.domain_id)}
+    with subprocess.Popen(command, env=environment) as replay:
+        graph.client.wait_for(lambda: len(heard) == 10, 60.0, "the replay")
+        assert replay.wait(30.0) == 0
+    assert heard == [f"word {index}" for index in range(10)]
