@@ -42,6 +42,7 @@ class PressureDriver(Node):
         self._options = options
         protocol = host_protocol(options.protocol, 2 * options.core.schedule.segment_count)
         self._ticks: deque[Snapshot] = deque(maxlen=100)
+        self._log_lines: deque[tuple[str, bool]] = deque(maxlen=1000)
         self._guard = self.create_guard_condition(self._publish_ticks)
         self._core = DriverCore(
             protocol, options.core, notify=self._on_tick, log=self._log_from_thread
@@ -113,6 +114,7 @@ class PressureDriver(Node):
         self._guard.trigger()
 
     def _publish_ticks(self) -> None:
+        self._write_log()
         while self._ticks:
             self._state_publisher.publish(self._state_message(self._ticks.popleft()))
 
@@ -187,13 +189,25 @@ class PressureDriver(Node):
             self.fatal_error = f"the serial thread ended: {type(error).__name__}: {error}"
 
     def _log_from_thread(self, text: str, warning: bool) -> None:
-        logger = self.get_logger()
-        (logger.warning if warning else logger.info)(text)
+        """Leave the writing to the executor: the port's thread has a clock to keep."""
+        self._log_lines.append((text, warning))
+        self._guard.trigger()
+
+    def _write_log(self) -> None:
+        while self._log_lines:
+            text, warning = self._log_lines.popleft()
+            # Two calls in two lines: rclpy remembers one severity for each place in the code.
+            if warning:
+                self.get_logger().warning(text)
+            else:
+                self.get_logger().info(text)
 
     def close(self) -> None:
         """Vent the board and release the port."""
         self._core.vent()
-        if not self._link.close():
+        ended = self._link.close()
+        self._publish_ticks()
+        if not ended:
             raise RuntimeError(f"the thread of {self._link.port} did not end; check the valves")
         self.get_logger().info("vented and closed")
 

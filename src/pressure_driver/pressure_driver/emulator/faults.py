@@ -8,18 +8,19 @@ from dataclasses import dataclass, field
 import numpy as np
 
 WORDS = {
-    "drop": "drop:SHARE      lose this share of the chunks that come from the host",
-    "corrupt": "corrupt:SHARE   flip a bit in this share of all bytes, both ways",
-    "delay": "delay:SECONDS   hold back telemetry by this time",
-    "mute": "mute            send no telemetry",
-    "deaf": "deaf            ignore every command",
-    "stick": "stick:CHAMBER   its valves stop moving",
-    "leak": "leak:CHAMBER[:RATE]  a hole drains it at RATE [1/s], 3 if not given",
-    "runaway": "runaway:CHAMBER its inlet valve stays open",
-    "supply": "supply:PASCAL   absolute pressure of the reservoir",
-    "unplug": "unplug[:SECONDS]  the port disappears, and comes back after SECONDS",
+    "drop": "drop:SHARE (of the chunks that come from the host are lost)",
+    "corrupt": "corrupt:SHARE (of all bytes, both ways, get a bit flipped)",
+    "delay": "delay:SECONDS (telemetry is held back)",
+    "mute": "mute (no telemetry)",
+    "deaf": "deaf (every command is ignored)",
+    "stick": "stick:CHAMBER (its valves stop moving)",
+    "leak": "leak:CHAMBER[:RATE] (a hole drains it at RATE 1/s, 3 if not given)",
+    "runaway": "runaway:CHAMBER (its inlet valve stays open)",
+    "supply": "supply:PASCAL (absolute pressure of the reservoir)",
+    "unplug": "unplug[:SECONDS] (the port disappears, and comes back after SECONDS)",
 }
 """Word and usage of every fault."""
+USAGE = ", ".join(WORDS.values())
 
 
 class FaultError(ValueError):
@@ -65,7 +66,7 @@ class Faults:
         low, high = wanted.get(word, (1, 1))
         well_formed = low <= len(numbers) <= high and all(number >= 0.0 for number in numbers)
         if word not in WORDS or not well_formed:
-            raise FaultError(f"fault '{text}' is not one of:\n  " + "\n  ".join(WORDS.values()))
+            raise FaultError(f"fault '{text}' is not one of: {USAGE}")
         if word in ("stick", "leak", "runaway") and not (
             numbers[0].is_integer() and numbers[0] < chamber_count
         ):
