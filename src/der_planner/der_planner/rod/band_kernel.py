@@ -16,10 +16,10 @@ from der_planner.rod.state import Array
 def solve_5(s: Array, r: Array) -> float:
     """Factor s (n, 6) into LDLᵀ in place, solve into r (n,); return the smallest pivot."""
     n = r.shape[0]
-    smallest = np.inf
+    least = np.inf
     for j in range(n - 5):
         pivot = s[j, 0]
-        smallest = min(smallest, pivot)
+        least = min(least, pivot)
         inverse = 1.0 / pivot
         rj = r[j]
         for i in range(1, 6):
@@ -30,7 +30,7 @@ def solve_5(s: Array, r: Array) -> float:
         s[j, 0] = inverse
     for j in range(n - 5, n):
         pivot = s[j, 0]
-        smallest = min(smallest, pivot)
+        least = min(least, pivot)
         inverse = 1.0 / pivot
         for i in range(1, n - j):
             factor = s[j, i] * inverse
@@ -48,17 +48,17 @@ def solve_5(s: Array, r: Array) -> float:
         for i in range(1, 6):
             total -= s[j, i] * r[j + i]
         r[j] = total * s[j, 0]
-    return smallest
+    return least
 
 
 @kernel
 def solve_10(s: Array, r: Array) -> float:
     """As `solve_5` for s (n, 11)."""
     n = r.shape[0]
-    smallest = np.inf
+    least = np.inf
     for j in range(n - 10):
         pivot = s[j, 0]
-        smallest = min(smallest, pivot)
+        least = min(least, pivot)
         inverse = 1.0 / pivot
         rj = r[j]
         for i in range(1, 11):
@@ -69,7 +69,7 @@ def solve_10(s: Array, r: Array) -> float:
         s[j, 0] = inverse
     for j in range(n - 10, n):
         pivot = s[j, 0]
-        smallest = min(smallest, pivot)
+        least = min(least, pivot)
         inverse = 1.0 / pivot
         for i in range(1, n - j):
             factor = s[j, i] * inverse
@@ -87,7 +87,23 @@ def solve_10(s: Array, r: Array) -> float:
         for i in range(1, 11):
             total -= s[j, i] * r[j + i]
         r[j] = total * s[j, 0]
-    return smallest
+    return least
+
+
+@kernel
+def put(source: Array, target: Array) -> None:
+    """Copy a vector (numba compiles a loop far faster than a slice assignment)."""
+    for k in range(source.shape[0]):
+        target[k] = source[k]
+
+
+@kernel
+def smallest(values: Array) -> float:
+    """Return the least of the values."""
+    result = np.inf
+    for value in values:
+        result = min(result, value)
+    return result
 
 
 @kernel

@@ -78,11 +78,19 @@ class PlanarBackend:
         )
         n = nodes + self.ghost
         self.size = 2 * n
-        self.work = np.zeros((3, self.size))
-        self.band = np.zeros((self.size, 6))
-        self.edge = np.zeros((n - 1, 3))
-        self.turn = np.zeros(n)
-        self.torque = np.zeros((n, 2))
+
+    def work_space(self) -> tuple[Array, ...]:
+        """Return new work arrays: work, s, band, edge, turn, torque, parts."""
+        n = self.size // 2
+        return (
+            np.zeros((6, self.size)),
+            np.zeros((self.size, 6)),
+            np.zeros((self.size, 6)),
+            np.zeros((n - 1, 3)),
+            np.zeros(n),
+            np.zeros((n, 2)),
+            np.zeros((2, 6)),
+        )
 
     def extend(self, q: Array) -> Array:
         """Return the kernels' coordinates of q, with the ghost node."""
@@ -125,7 +133,7 @@ class PlanarBackend:
         rate[0] = self.extend_rate(state.v)
         done, iterations, update, failed = planar_kernel.simulate(
             x, rate, pressures, h, extrapolate, tolerance, limit, factors, bands, columns,
-            self.mass, self.damping, self.extend_rate(load), self.fixed, *self.rod,
+            *self.work_space(), self.mass, self.damping, self.extend_rate(load), self.fixed, *self.rod,
         )  # fmt: skip
         q = self.restore(x, state.q)
         v = self.restore(rate, state.v)
@@ -153,9 +161,10 @@ class PlanarBackend:
     ) -> tuple[RodState, int, float]:
         """Solve the balance of forces from `start`; iterations are negative without convergence."""
         x = self.extend(start.q)
+        work, s, _, edge, turn, torque, _ = self.work_space()
         iterations, update = planar_kernel.newton(
-            x, x.copy(), np.zeros(self.size), 0.0, u, tolerance, limit, self.work, self.band,
-            self.edge, self.turn, self.torque, self.mass, self.damping, self.extend_rate(load),
+            x, x.copy(), np.zeros(self.size), 0.0, u, tolerance, limit, work, s,
+            edge, turn, torque, self.mass, self.damping, self.extend_rate(load),
             self.fixed, *self.rod,
         )  # fmt: skip
         q = self.restore(x, start.q)
@@ -167,35 +176,38 @@ class PlanarBackend:
 
     def energy(self, state: RodState) -> float:
         """Return the elastic energy."""
-        x = self.extend(state.q)
-        return float(planar_kernel.energy(x, self.edge, self.turn, *self.rod))
+        _, _, _, edge, turn, _, _ = self.work_space()
+        return float(planar_kernel.energy(self.extend(state.q), edge, turn, *self.rod))
 
     def gradient_and_hessian(self, state: RodState) -> tuple[Array, Array]:
         """Return ∇E (4N-1,) and ∇²E (4N-1, 4N-1); entries off the plane are zero."""
         x = self.extend(state.q)
         gradient = np.zeros(self.size)
         u = np.zeros(len(self.mesh.gain))
+        _, s, _, edge, turn, torque, _ = self.work_space()
         planar_kernel.assemble(
-            x, np.zeros(self.size), 0.0, u, False, gradient, self.band, self.edge, self.turn, self.torque,
-            *self.rod,
-        )  # fmt: skip
-        return self._full(gradient), self._full_matrix(band_to_dense(self.band))
+            x, np.zeros(self.size), 0.0, u, False, gradient, s, edge, turn, torque, *self.rod
+        )
+        return self._full(gradient), self._full_matrix(band_to_dense(s))
 
     def input_matrix(self, state: RodState) -> Array:
         """Return B(q)Λ (4N-1, M)."""
         columns = np.zeros((self.size, len(self.mesh.gain)))
-        planar_kernel.edges_and_turns(self.extend(state.q), self.edge, self.turn)
-        planar_kernel.input_columns(self.edge, *self.rod[-3:], columns)
+        _, _, _, edge, turn, _, _ = self.work_space()
+        planar_kernel.edges_and_turns(self.extend(state.q), edge, turn)
+        planar_kernel.input_columns(edge, *self.rod[-3:], columns)
         return self._full(columns)
 
     def viscous_force(self, state: RodState) -> Array:
         """Return the Kelvin-Voigt force (4N-1,) at a state."""
         x, v = self.extend(state.q), self.extend_rate(state.v)
         a = np.zeros((self.size, 11))
-        band = np.zeros((self.size, 6))
+        _, _, band, edge, turn, _, parts = self.work_space()
         u = np.zeros(len(self.mesh.gain))
-        planar_kernel.edges_and_turns(x, self.edge, self.turn)
-        planar_kernel.unsymmetric(v, 1.0, u, a, band, self.edge, self.turn, self.rod[5], *self.rod[-3:])
+        planar_kernel.edges_and_turns(x, edge, turn)
+        planar_kernel.unsymmetric(
+            v, 1.0, u, a, band, edge, turn, parts, self.rod[5], *self.rod[-3:]
+        )
         return self._full(-band_to_dense(band) @ v)
 
     def _full(self, planar: Array) -> Array:

@@ -14,6 +14,8 @@ from der_planner.rod.band_kernel import (
     factor_general,
     hold_fixed,
     hold_fixed_general,
+    put,
+    smallest,
     solve_5,
 )
 from der_planner.rod.compile import kernel
@@ -171,7 +173,7 @@ def turning_rate(v, edge, i):
 
 
 @kernel
-def unsymmetric(v, rate, u, a, damping, edge, turn, viscous, first, last, gain):
+def unsymmetric(v, rate, u, a, damping, edge, turn, parts, viscous, first, last, gain):
     """Complete a (2n, 11) to the exact derivative; fill damping (2n, 6) with the viscous matrix·rate.
 
     Missing in `assemble` are −(Λu/|e|) n̂ tᵀ of a couple that keeps its force while its edge stretches,
@@ -189,8 +191,7 @@ def unsymmetric(v, rate, u, a, damping, edge, turn, viscous, first, last, gain):
                 for column in range(4):
                     along = (tx if column % 2 == 0 else ty) * (-1.0 if column < 2 else 1.0)
                     a[2 * j + row, 5 + column - row] -= force * normal * along
-    gradient = np.empty(6)
-    change = np.empty(6)
+    gradient, change = parts[0], parts[1]
     for i in range(1, n - 1):
         if viscous[i] == 0.0:
             continue
@@ -250,16 +251,16 @@ def newton(
 ):  # fmt: skip
     """Solve M·rate·((x − x_n)·rate − v_n) + D·rate·(x − x_n) = F(x) for x, from the guess in x.
 
-    rate = 0 is statics. work (3, 2n) holds the residual, the velocity and the last converged guess.
+    rate = 0 is statics. work (6, 2n): the first two rows are used.
     Returns (iterations, size of the last update); iterations is negative without convergence.
     """
     size = x.shape[0]
     residual = work[0]
     v = work[1]
-    largest = 2.0 * rest.min()
-    careful = 0.1 * rest.min()
+    largest = 2.0 * smallest(rest)
+    careful = 0.1 * smallest(rest)
     update = np.inf
-    convex = False
+    convex = rate < 0.0
     for iteration in range(limit):
         for k in range(size):
             v[k] = (x[k] - x_n[k]) * rate
@@ -289,12 +290,12 @@ def newton(
 @kernel
 def predict(x, x_n, v_n, acceleration, h, fixed, rest):
     """Fill x with a guess of the step's end: the last acceleration goes on, unless it leads far."""
-    far = 0.5 * rest.min()
+    far = 0.5 * smallest(rest)
     for d in range(x.shape[0]):
         move = h * (v_n[d] + h * acceleration[d])
         x[d] = x_n[d] + move
         if not abs(move) < far:
-            x[:] = x_n
+            put(x_n, x)
             return
     for d in fixed:
         x[d] = x_n[d]
@@ -303,7 +304,7 @@ def predict(x, x_n, v_n, acceleration, h, fixed, rest):
 @kernel
 def simulate(
     q, v, pressures, h, extrapolate, tolerance, limit,
-    factors, viscous_bands, inputs,
+    factors, viscous_bands, inputs, work, s, band, edge, turn, torque, parts,
     mass, damping, load, fixed,
     rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain,
 ):  # fmt: skip
@@ -311,66 +312,62 @@ def simulate(
 
     Each step solves backward Euler over h and goes on to x_n + e (x − x_n) with e = extrapolate[step
     modulo its length] (P,). pressures is (K, S, M). factors (K·S, 2n, 11), viscous_bands (K·S or 0, 2n, 6)
-    and inputs (K·S, 2n, M) receive the linearisation unless empty.
+    and inputs (K·S, 2n, M) receive the linearisation unless empty. Work space: work (6, 2n), s and band
+    (2n, 6), edge (n-1, 3), turn (n,), torque (n, 2), parts (2, 6).
 
     Returns (steps done, Newton iterations, last update, iterations of the failed step or 0).
     """
     intervals, steps, _ = pressures.shape
     size = q.shape[1]
-    n = size // 2
-    work = np.zeros((3, size))
-    s = np.zeros((size, 6))
-    edge = np.zeros((n - 1, 3))
-    turn = np.zeros(n)
-    torque = np.zeros((n, 2))
-    x = q[0].copy()
-    x_n = q[0].copy()
-    v_n = v[0].copy()
-    acceleration = np.zeros(size)
-    band = np.zeros((size, 6))
+    x, x_n, v_n, acceleration = work[2], work[3], work[4], work[5]
+    put(q[0], x_n)
+    put(v[0], v_n)
+    acceleration[:] = 0.0
     rate = 1.0 / h
     total = 0
     for k in range(intervals):
         for step in range(steps):
             u = pressures[k, step]
             predict(x, x_n, v_n, acceleration, h, fixed, rest)
-            iterations, update = newton(
-                x, x_n, v_n, rate, u, tolerance, limit, work, s, edge, turn, torque,
-                mass, damping, load, fixed,
-                rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain)  # fmt: skip
-            if iterations < 0:  # the guess may have been at fault: once more from rest
-                x[:] = x_n
+            iterations = -1
+            update = np.inf
+            for attempt in range(2):
+                if attempt == 1:  # the guess may have been at fault: once more from rest
+                    put(x_n, x)
                 iterations, update = newton(
                     x, x_n, v_n, rate, u, tolerance, limit, work, s, edge, turn, torque,
                     mass, damping, load, fixed,
                     rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain)  # fmt: skip
+                if iterations > 0:
+                    break
             index = k * steps + step
             if iterations < 0:
-                q[k + 1] = x_n
-                v[k + 1] = v_n
+                put(x_n, q[k + 1])
+                put(v_n, v[k + 1])
                 return index, total - iterations, update, -iterations
             total += iterations
             if factors.shape[0] > 0:
                 linearise(x, x_n, rate, u, factors[index], inputs[index], band, work, s, edge, turn,
-                          torque, mass, damping, fixed,
+                          torque, parts, mass, damping, fixed,
                           rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain)  # fmt: skip
                 factor_general(factors[index])
                 if viscous_bands.shape[0] > 0:
-                    viscous_bands[index] = band
+                    for d in range(size):
+                        put(band[d], viscous_bands[index, d])
             e = extrapolate[index % extrapolate.shape[0]]
             for d in range(size):
                 velocity = (x[d] - x_n[d]) * rate
                 acceleration[d] = (velocity - v_n[d]) * rate
                 x_n[d] += e * (x[d] - x_n[d])
                 v_n[d] += e * (velocity - v_n[d])
-        q[k + 1] = x_n
-        v[k + 1] = v_n
+        put(x_n, q[k + 1])
+        put(v_n, v[k + 1])
     return intervals * steps, total, 0.0, 0
 
 
 @kernel
 def linearise(
-    x, x_n, rate, u, a, columns, band, work, s, edge, turn, torque, mass, damping, fixed,
+    x, x_n, rate, u, a, columns, band, work, s, edge, turn, torque, parts, mass, damping, fixed,
     rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain,
 ):  # fmt: skip
     """Fill a (2n, 11) with the exact derivative of the step's residual at x, columns with B(q)Λ.
@@ -381,12 +378,12 @@ def linearise(
     v = work[1]
     for k in range(size):
         v[k] = (x[k] - x_n[k]) * rate
-    assemble(x, v, rate, u, False, work[0], s, edge, turn, torque,
+    assemble(x, v, rate, u, rate < 0.0, work[0], s, edge, turn, torque,
              rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain)  # fmt: skip
     for k in range(size):
         s[k, 0] += rate * (mass[k] * rate + damping[k])
     expand(s, a)
-    unsymmetric(v, rate, u, a, band, edge, turn, viscous, first, last, gain)
+    unsymmetric(v, rate, u, a, band, edge, turn, parts, viscous, first, last, gain)
     hold_fixed_general(a, fixed)
     hold_fixed(band, work[0], fixed)
     for d in fixed:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from der_planner.rod.band_kernel import solve_columns, solve_transposed
+from der_planner.rod.band_kernel import put, solve_columns, solve_transposed
 from der_planner.rod.compile import kernel
 
 
@@ -104,8 +104,8 @@ def adjoint(
                             lq[i] += viscous[s, i, j] * y[i + j]
     for p in range(outputs.shape[0]):
         lq[outputs[p]] += weight[0, p]
-    start[0] = lq
-    start[1] = lv
+    put(lq, start[0])
+    put(lv, start[1])
 
 
 @kernel

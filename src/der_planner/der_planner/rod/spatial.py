@@ -44,13 +44,21 @@ class SpatialBackend:
         )
         n = mesh.nodes + self.ghost
         self.size = 4 * n - 1
-        self.work = np.zeros((2, self.size))
-        self.band = np.zeros((self.size, 11))
-        self.frame = np.zeros((n - 1, 16))
-        self.own = np.zeros((n - 1, 4, 5))
-        self.link = np.zeros((n, 4, 4))
-        self.local = np.zeros((12, 8))
-        self.twists = np.zeros(n)
+        self.lever = 0.1 * float(mesh.rest.sum())
+
+    def work_space(self) -> tuple[Array, ...]:
+        """Return new work arrays: twists, work, s, frame, own, link, local, vectors."""
+        n = (self.size + 1) // 4
+        return (
+            np.zeros(n),
+            np.zeros((6, self.size)),
+            np.zeros((self.size, 11)),
+            np.zeros((n - 1, 16)),
+            np.zeros((n - 1, 4, 5)),
+            np.zeros((n, 4, 4)),
+            np.zeros((12, 8)),
+            np.zeros((10, 3)),
+        )
 
     def _extended(self, of_nodes: Array, of_edges: Array) -> Array:
         result = np.zeros(4 * self.mesh.nodes - 1)
@@ -86,9 +94,8 @@ class SpatialBackend:
     def carry_frames(self, base: RodState, q: Array, v: Array) -> RodState:
         """Return a state at q whose frames are those of `base`, transported."""
         tangents, directors, twists = self.reference(base)
-        spatial_step_kernel.carry(
-            self.extend(q), twists, tangents, directors, self.twists, self.frame
-        )
+        space = self.work_space()
+        spatial_step_kernel.carry(self.extend(q), twists, tangents, directors, space[0], space[3])
         return self._state(q, v, directors, twists)
 
     def _state(self, q: Array, v: Array, directors: Array, twists: Array) -> RodState:
@@ -115,8 +122,8 @@ class SpatialBackend:
         rate[0] = self.extend_rate(state.v)
         tangents, directors, twists = self.reference(state)
         done, iterations, update, failed = spatial_step_kernel.simulate(
-            x, rate, pressures, h, extrapolate, tolerance, limit, tangents, directors, twists,
-            self.mass, self.damping, self.extend_rate(load), self.fixed, *self.rod,
+            x, rate, pressures, h, extrapolate, tolerance, self.lever, limit, tangents, directors,
+            twists, *self.work_space(), self.mass, self.damping, self.extend_rate(load), self.fixed, *self.rod,
         )  # fmt: skip
         q = x[:, self.offset :].copy()
         v = rate[:, self.offset :].copy()
@@ -136,50 +143,51 @@ class SpatialBackend:
         x = self.extend(start.q)
         tangents, directors, twists = self.reference(start)
         iterations, update = spatial_step_kernel.newton(
-            x, x.copy(), np.zeros(self.size), 0.0, u, tolerance, limit, tangents, directors, twists,
-            self.twists, self.work, self.band, self.frame, self.own, self.link, self.local,
-            self.mass, self.damping, self.extend_rate(load), self.fixed, *self.rod,
+            x, x.copy(), np.zeros(self.size), 0.0, u, tolerance, self.lever, limit, tangents,
+            directors, twists, *self.work_space(), self.mass, self.damping, self.extend_rate(load), self.fixed, *self.rod,
         )  # fmt: skip
         if iterations < 0:
             return start, iterations, update
         q = x[self.offset :].copy()
         return self.carry_frames(start, q, np.zeros_like(q)), iterations, update
 
-    def _place(self, state: RodState) -> Array:
-        """Fill the work space with the frames of a state; return its kernel coordinates."""
+    def _place(self, state: RodState) -> tuple[Array, tuple[Array, ...]]:
+        """Return the kernel coordinates of a state and a work space with its frames and twists."""
         x = self.extend(state.q)
         tangents, directors, twists = self.reference(state)
-        spatial_kernel.frames(x, tangents, directors, self.frame)
-        spatial_kernel.reference_twists(self.frame, twists, self.twists)
-        return x
+        space = self.work_space()
+        spatial_kernel.frames(x, tangents, directors, space[3])
+        spatial_kernel.reference_twists(space[3], twists, space[0])
+        return x, space
 
     def energy(self, state: RodState) -> float:
         """Return the elastic energy."""
-        x = self._place(state)
-        return float(spatial_kernel.energy(x, self.frame, self.twists, self.local, *self.rod))
+        x, (twists, _, _, frame, _, _, local, _) = self._place(state)
+        return float(spatial_kernel.energy(x, frame, twists, local, *self.rod))
 
-    def _assemble(self, state: RodState, v: Array) -> Array:
-        x = self._place(state)
+    def _assemble(self, state: RodState, v: Array) -> tuple[Array, Array]:
+        x, (twists, _, s, frame, own, link, local, vectors) = self._place(state)
         gradient = np.zeros(self.size)
         spatial_kernel.assemble(
-            x, v, 0.0, np.zeros(len(self.mesh.gain)), False, gradient, self.band, self.frame,
-            self.twists, self.own, self.link, self.local, *self.rod,
+            x, v, 0.0, np.zeros(len(self.mesh.gain)), False, gradient, s, frame, twists, own, link,
+            local, vectors, *self.rod,
         )  # fmt: skip
-        return gradient[self.offset :]
+        return gradient[self.offset :], s
 
     def gradient_and_hessian(self, state: RodState) -> tuple[Array, Array]:
         """Return ∇E (4N-1,) and ∇²E (4N-1, 4N-1) at a state, its frames re-based there."""
-        gradient = self._assemble(state, np.zeros(self.size))
-        return gradient, band_to_dense(self.band)[self.offset :, self.offset :]
+        gradient, band = self._assemble(state, np.zeros(self.size))
+        return gradient, band_to_dense(band)[self.offset :, self.offset :]
 
     def viscous_force(self, state: RodState) -> Array:
         """Return the Kelvin-Voigt force (4N-1,) at a state."""
-        moving = self._assemble(state, self.extend_rate(state.v))
-        return self._assemble(state, np.zeros(self.size)) - moving
+        moving, _ = self._assemble(state, self.extend_rate(state.v))
+        still, _ = self._assemble(state, np.zeros(self.size))
+        return still - moving
 
     def input_matrix(self, state: RodState) -> Array:
         """Return B(q)Λ (4N-1, M)."""
-        self._place(state)
+        _, space = self._place(state)
         columns = np.zeros((self.size, len(self.mesh.gain)))
-        spatial_kernel.input_columns(self.frame, *self.rod[-3:], columns)
+        spatial_kernel.input_columns(space[3], *self.rod[-3:], columns)
         return columns[self.offset :]

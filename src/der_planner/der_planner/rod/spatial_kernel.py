@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from der_planner.rod.band_kernel import hold_fixed, solve_10
 from der_planner.rod.compile import kernel
 
 # A rod's arrays, in the order in which every kernel takes them after its own arguments:
@@ -77,7 +76,7 @@ def reference_twists(frame, before, twists):
             twists[i] = 0.0
             continue
         angle = np.arctan2(sine, cosine)
-        twists[i] = angle + 2.0 * np.pi * np.round((old - angle) / (2.0 * np.pi))
+        twists[i] = angle + 2.0 * np.pi * np.floor((old - angle) / (2.0 * np.pi) + 0.5)
 
 
 @kernel
@@ -128,16 +127,13 @@ def node_strains(i, frame, twists, x, strain, gradient):
 
 
 @kernel
-def add_curvature_hessian(i, c1, c2, c3, frame, strain, h):
+def add_curvature_hessian(i, c1, c2, c3, frame, strain, vectors, h):
     """Add c1 ∇²κ1 + c2 ∇²κ2 + c3 ∇²τ, symmetric, to h (8, 8), whose lower triangle is filled.
 
     With a = c1 m2 − c2 m1 on each edge, c1 κ1 + c2 κ2 = ½ κb·(a_e + a_f): one formula does both.
     """
-    t = np.empty((2, 3))
-    a = np.empty((2, 3))
-    b = np.empty((2, 3))
-    q = np.empty(3)
-    s = np.empty(3)
+    t, a, b, p = vectors[0:2], vectors[2:4], vectors[4:6], vectors[6:8]
+    q, s = vectors[8], vectors[9]
     chi = strain[3]
     over = 1.0 / chi
     value = 0.0
@@ -152,8 +148,7 @@ def add_curvature_hessian(i, c1, c2, c3, frame, strain, h):
         s[k] = over * (a[0, k] + a[1, k])
         value += 0.5 * kb[k] * (a[0, k] + a[1, k])
     inverse = (frame[i - 1, 3], frame[i, 3])
-    p = np.empty((2, 3))  # t_f × ã and −t_e × ã
-    for side in range(2):
+    for side in range(2):  # p is t_f × ã and −t_e × ã
         other = 1 - side
         sign = 1.0 if side == 0 else -1.0
         p[side, 0] = sign * (t[other, 1] * s[2] - t[other, 2] * s[1])
@@ -217,7 +212,7 @@ def add_curvature_hessian(i, c1, c2, c3, frame, strain, h):
 
 @kernel
 def assemble(
-    x, v, rate, u, convex, g, s, frame, twists, own, link, local,
+    x, v, rate, u, convex, g, s, frame, twists, own, link, local, vectors,
     rest, axial, bend, twist, cubic, viscous, rest_kappa, rest_twist, first, last, gain,
 ):  # fmt: skip
     """Elastic, viscous and actuating terms of the residual and its symmetric derivative.
@@ -225,7 +220,7 @@ def assemble(
     g (4n-1,) becomes ∇E + viscous force − B(q)Λu; s (4n-1, 11) the symmetric derivative by x, the viscous
     part with v = rate·(x − x_n). frame and twists are those of x. Work space: own (n-1, 4, 5) gradient (last
     column) and Hessian of each edge's (e, φ); link (n, 4, 4) coupling of a node's two edges, rows of the
-    second; local (12, 8).
+    second; local (12, 8); vectors (10, 3).
     """
     edges = frame.shape[0]
     stretch(frame, u, convex, own, rest, axial, first, last, gain)
@@ -253,7 +248,7 @@ def assemble(
             g2 += gr * d2
             for c in range(8):
                 local[r, c] = g1 * gradient[0, c] + g2 * gradient[1, c] + g3 * gradient[2, c]
-        add_curvature_hessian(i, c1, c2, c3, frame, strain, local)
+        add_curvature_hessian(i, c1, c2, c3, frame, strain, vectors, local)
         for r in range(4):
             own[i - 1, r, 4] += c1 * gradient[0, r] + c2 * gradient[1, r] + c3 * gradient[2, r]
             own[i, r, 4] += c1 * gradient[0, 4 + r] + c2 * gradient[1, 4 + r] + c3 * gradient[2, 4 + r]

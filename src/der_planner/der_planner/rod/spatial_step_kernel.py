@@ -4,37 +4,36 @@ from __future__ import annotations
 
 import numpy as np
 
-from der_planner.rod.band_kernel import hold_fixed, solve_10
+from der_planner.rod.band_kernel import hold_fixed, put, smallest, solve_10
 from der_planner.rod.compile import kernel
 from der_planner.rod.spatial_kernel import D1, T, assemble, frames, reference_twists
 
 
 @kernel
 def newton(
-    x, x_n, v_n, rate, u, tolerance, limit, tangents, directors, twists_n, twists,
-    work, s, frame, own, link, local, mass, damping, load, fixed,
+    x, x_n, v_n, rate, u, tolerance, lever, limit, tangents, directors, twists_n, twists,
+    work, s, frame, own, link, local, vectors, mass, damping, load, fixed,
     rest, axial, bend, twist, cubic, viscous, rest_kappa, rest_twist, first, last, gain,
 ):  # fmt: skip
     """Solve M·rate·((x − x_n)·rate − v_n) + D·rate·(x − x_n) = F(x) for x, from the guess in x.
 
     rate = 0 is statics. tangents, directors (n-1, 3) and twists_n (n,) are the reference frames at x_n.
     Returns (iterations, size of the last update); iterations is negative without convergence. The
-    update is a length: an angle counts with a tenth of the rod's length.
+    update is a length: an angle counts times lever [m].
     """
     size = x.shape[0]
     residual = work[0]
     v = work[1]
-    shortest = rest.min()
-    lever = 0.1 * rest.sum()
+    shortest = smallest(rest)
     largest, careful = 2.0 * shortest, 0.1 * shortest
     update = np.inf
-    convex = False
+    convex = rate < 0.0
     for iteration in range(limit):
         for k in range(size):
             v[k] = (x[k] - x_n[k]) * rate
         frames(x, tangents, directors, frame)
         reference_twists(frame, twists_n, twists)
-        assemble(x, v, rate, u, convex, residual, s, frame, twists, own, link, local,
+        assemble(x, v, rate, u, convex, residual, s, frame, twists, own, link, local, vectors,
                  rest, axial, bend, twist, cubic, viscous, rest_kappa, rest_twist,
                  first, last, gain)  # fmt: skip
         for k in range(size):
@@ -78,7 +77,8 @@ def carry(x, twists_n, tangents, directors, twists, frame):
 
 @kernel
 def simulate(
-    q, v, pressures, h, extrapolate, tolerance, limit, tangents, directors, twists_n,
+    q, v, pressures, h, extrapolate, tolerance, lever, limit, tangents, directors, twists_n,
+    twists, work, s, frame, own, link, local, vectors,
     mass, damping, load, fixed,
     rest, axial, bend, twist, cubic, viscous, rest_kappa, rest_twist, first, last, gain,
 ):  # fmt: skip
@@ -89,21 +89,13 @@ def simulate(
     """
     intervals, steps, _ = pressures.shape
     size = q.shape[1]
-    n = (size + 1) // 4
-    work = np.zeros((2, size))
-    s = np.zeros((size, 11))
-    frame = np.zeros((n - 1, 16))
-    own = np.zeros((n - 1, 4, 5))
-    link = np.zeros((n, 4, 4))
-    local = np.zeros((12, 8))
-    twists = np.zeros(n)
-    x = q[0].copy()
-    x_n = q[0].copy()
-    v_n = v[0].copy()
-    acceleration = np.zeros(size)
+    x, x_n, v_n, acceleration = work[2], work[3], work[4], work[5]
+    put(q[0], x_n)
+    put(v[0], v_n)
+    acceleration[:] = 0.0
     rate = 1.0 / h
     total = 0
-    far = 0.5 * rest.min()
+    far = 0.5 * smallest(rest)
     for k in range(intervals):
         for step in range(steps):
             u = pressures[k, step]
@@ -113,25 +105,25 @@ def simulate(
                 x[d] = x_n[d] + move
                 quiet = quiet and abs(move) < (0.5 if d % 4 == 3 else far)
             if not quiet:
-                x[:] = x_n
+                put(x_n, x)
             for d in fixed:
                 x[d] = x_n[d]
             iterations = -1
             update = np.inf
             for attempt in range(2):
                 if attempt == 1:  # the guess may have been at fault: once more from rest
-                    x[:] = x_n
+                    put(x_n, x)
                 iterations, update = newton(
-                    x, x_n, v_n, rate, u, tolerance, limit, tangents, directors, twists_n, twists,
-                    work, s, frame, own, link, local, mass, damping, load, fixed,
+                    x, x_n, v_n, rate, u, tolerance, lever, limit, tangents, directors, twists_n, twists,
+                    work, s, frame, own, link, local, vectors, mass, damping, load, fixed,
                     rest, axial, bend, twist, cubic, viscous, rest_kappa, rest_twist,
                     first, last, gain)  # fmt: skip
                 if iterations > 0:
                     break
             index = k * steps + step
             if iterations < 0:
-                q[k + 1] = x_n
-                v[k + 1] = v_n
+                put(x_n, q[k + 1])
+                put(v_n, v[k + 1])
                 return index, total - iterations, update, -iterations
             total += iterations
             e = extrapolate[index % extrapolate.shape[0]]
@@ -141,6 +133,6 @@ def simulate(
                 x_n[d] += e * (x[d] - x_n[d])
                 v_n[d] += e * (velocity - v_n[d])
             carry(x_n, twists_n, tangents, directors, twists, frame)
-        q[k + 1] = x_n
-        v[k + 1] = v_n
+        put(x_n, q[k + 1])
+        put(v_n, v[k + 1])
     return intervals * steps, total, 0.0, 0
