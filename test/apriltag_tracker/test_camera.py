@@ -1,0 +1,136 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from apriltag_tracker.camera import (
+    CameraError,
+    CameraPose,
+    Intrinsics,
+    project,
+    solve_pose,
+)
+
+MATRIX = [1250.0, 0.0, 642.3, 0.0, 1240.0, 357.1, 0.0, 0.0, 1.0]
+PLUMB_BOB = [-0.11, 0.06, 0.0006, -0.0004, 0.01]
+RATIONAL = [0.2, -0.1, 0.0006, -0.0004, 0.01, 0.3, -0.05, 0.002]
+
+
+def intrinsics(distortion) -> Intrinsics:
+    return Intrinsics.create(1280, 720, MATRIX, distortion)
+
+
+@pytest.mark.parametrize("distortion", [[], PLUMB_BOB, RATIONAL])
+def test_pixels_agree_with_opencv(distortion):
+    lens = intrinsics(distortion)
+    points = np.random.default_rng(1).uniform(-0.5, 0.5, (50, 2))
+    expected, _ = cv2.projectPoints(
+        np.column_stack([points, np.ones(50)]),
+        np.zeros(3),
+        np.zeros(3),
+        lens.matrix,
+        lens.distortion,
+    )
+    assert np.allclose(lens.pixels(points), expected.reshape(-1, 2), atol=1e-9)
+
+
+@pytest.mark.parametrize("distortion", [[], PLUMB_BOB, RATIONAL])
+def test_rays_undo_the_lens(distortion):
+    lens = intrinsics(distortion)
+    pixels = np.random.default_rng(2).uniform([0, 0], [1280, 720], (200, 2))
+    assert np.allclose(lens.pixels(lens.rays(pixels)), pixels, atol=1e-8)
+
+
+def test_plane_and_projection_are_inverse():
+    lens = intrinsics(PLUMB_BOB)
+    pose = CameraPose.looking_down((0.1, 0.02, 0.6), -1.5, (0.1, -0.08))
+    points = np.random.default_rng(3).uniform(-0.2, 0.2, (40, 2))
+    for height in (0.0, 0.03):
+        pixels = project(lens, pose, np.column_stack([points, np.full(40, height)]))
+        assert np.allclose(pose.onto_plane(lens.rays(pixels), height), points, atol=1e-10)
+
+
+def test_camera_that_looks_down_is_where_it_was_put():
+    pose = CameraPose.looking_down((0.1, 0.02, 0.6), 0.7)
+    assert np.allclose(pose.position, (0.1, 0.02, 0.6))
+    assert np.linalg.det(pose.rotation) == pytest.approx(1.0)
+    right = pose.rotation.T @ (1.0, 0.0, 0.0)
+    assert np.allclose(right, (np.cos(0.7), np.sin(0.7), 0.0))
+
+
+def square(size: float = 0.3) -> np.ndarray:
+    grid = np.linspace(-size, size, 4)
+    x, y = np.meshgrid(grid, grid)
+    return np.column_stack([x.ravel(), y.ravel(), np.zeros(16)])
+
+
+def test_pose_is_recovered_from_fixed_points():
+    lens = intrinsics(PLUMB_BOB)
+    pose = CameraPose.looking_down((0.1, 0.02, 0.8), -1.5, (0.15, -0.1))
+    pixels = project(lens, pose, square())
+    found, residuals = solve_pose(lens, square(), pixels)
+    assert np.allclose(found.rotation, pose.rotation, atol=1e-7)
+    assert np.allclose(found.position, pose.position, atol=1e-7)
+    assert np.abs(residuals).max() < 1e-5
+
+
+def test_pose_with_noise_is_as_good_as_its_residuals_say():
+    lens = intrinsics(PLUMB_BOB)
+    pose = CameraPose.looking_down((0.1, 0.02, 0.8), -1.5, (0.15, -0.1))
+    noise = np.random.default_rng(4).normal(0.0, 0.1, (16, 2))
+    found, residuals = solve_pose(lens, square(), project(lens, pose, square()) + noise, pose)
+    assert np.sqrt(np.mean(residuals**2)) < 0.1
+    assert np.linalg.norm(found.position - pose.position) < 1e-3
+
+
+def test_a_mirrored_map_is_refused():
+    lens = intrinsics([])
+    pose = CameraPose.looking_down((0.0, 0.0, 0.8), 0.3)
+    pixels = project(lens, pose, square())
+    mirrored = square() * (1.0, -1.0, 1.0)
+    with pytest.raises(CameraError, match=r"from below|no camera pose"):
+        solve_pose(lens, mirrored, pixels)
+
+
+def test_three_points_are_too_few():
+    with pytest.raises(CameraError, match="four"):
+        solve_pose(intrinsics([]), square()[:3], np.zeros((3, 2)))
+
+
+@pytest.mark.parametrize("distortion", [PLUMB_BOB, RATIONAL])
+def test_calibration_survives_its_file(tmp_path, distortion):
+    lens = intrinsics(distortion)
+    lens.to_yaml(tmp_path / "camera.yaml")
+    again = Intrinsics.from_yaml(tmp_path / "camera.yaml")
+    assert np.array_equal(again.matrix, lens.matrix)
+    assert np.array_equal(again.distortion, lens.distortion)
+    assert (again.width, again.height) == (1280, 720)
+
+
+def test_an_uncalibrated_camera_names_the_remedy():
+    with pytest.raises(CameraError, match="calibrate_camera"):
+        Intrinsics.create(1280, 720, [0.0] * 9, [])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((0, 720, MATRIX, []), "1280|0 x 720"),
+        ((1280, 720, MATRIX, [0.0] * 12), "12 distortion"),
+        ((1280, 720, MATRIX, [], "equidistant"), "equidistant"),
+        ((1280, 720, [np.nan] * 9, []), "not calibrated"),
+    ],
+)
+def test_impossible_calibrations_are_refused(arguments, message):
+    with pytest.raises(CameraError, match=message):
+        Intrinsics.create(*arguments)
+
+
+@pytest.mark.parametrize("text", ["", "a: 1", "[1, 2", "image_width: x"])
+def test_files_that_are_no_calibration_are_named(tmp_path, text):
+    path = tmp_path / "camera.yaml"
+    path.write_text(text)
+    with pytest.raises(CameraError, match=r"camera\.yaml"):
+        Intrinsics.from_yaml(path)
+    with pytest.raises(CameraError, match="nowhere"):
+        Intrinsics.from_yaml(tmp_path / "nowhere.yaml")

@@ -1,0 +1,149 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from apriltag_tracker import family
+from apriltag_tracker.camera import CameraError
+from apriltag_tracker.synthetic.camera import (
+    CameraModel,
+    Errors,
+    Optics,
+    Shape,
+    SyntheticCamera,
+)
+from apriltag_tracker.synthetic.shapes import constant_curvature
+
+CLEAN = Optics(noise=0.0, light_fall=0.0)
+
+
+def brute_force(model, tag, shape, optics, rows, columns, oversampling=6, reach=4):
+    """Sample the printed tag at many points a pixel and blur it: slow, and nothing in common."""
+    fine = oversampling
+    first_row, first_column = rows.start - reach, columns.start - reach
+    count_rows = (rows.stop - rows.start + 2 * reach) * fine
+    count_columns = (columns.stop - columns.start + 2 * reach) * fine
+    y = first_row - 0.5 + (np.arange(count_rows) + 0.5) / fine
+    x = first_column - 0.5 + (np.arange(count_columns) + 0.5) / fine
+    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    plane = model.pose.onto_plane(model.intrinsics.rays(grid), tag.height)
+    place = shape.at(tag.arc_length)
+    cosine, sine = np.cos(place[2]), np.sin(place[2])
+    local = (plane - place[:2]) @ np.array([[cosine, -sine], [sine, cosine]])
+    cells = family.printed_cells(tag.id, 1)
+    column = np.floor(local[:, 0] / tag.size * 8 + 5).astype(int)
+    row = np.floor(5 - local[:, 1] / tag.size * 8).astype(int)
+    inside = (column >= 0) & (column < 10) & (row >= 0) & (row < 10)
+    level = np.where(cells[row.clip(0, 9), column.clip(0, 9)] > 0, optics.white, optics.black)
+    picture = np.where(inside, level, 52.0).reshape(count_rows, count_columns)
+    picture = cv2.GaussianBlur(picture, (0, 0), optics.blur * fine)
+    small = picture.reshape(count_rows // fine, fine, count_columns // fine, fine).mean(axis=(1, 3))
+    return small[reach:-reach, reach:-reach]
+
+
+@pytest.mark.parametrize("blur", [0.5, 1.2])
+def test_pixels_agree_with_brute_force_sampling(model, tags, blur):
+    optics = Optics(noise=0.0, light_fall=0.0, blur=blur)
+    camera = SyntheticCamera(model, tags, optics)
+    shape = constant_curvature(tags.segment_lengths, [0.5, 0.4])
+    frame = camera.frame(shape)
+    tag = tags.limb[2]
+    low = np.floor(frame.corners[tag.id].min(axis=0)).astype(int) - 1
+    high = np.ceil(frame.corners[tag.id].max(axis=0)).astype(int) + 2
+    rows, columns = slice(low[1], high[1]), slice(low[0], high[0])
+    expected = brute_force(model, tag, shape, optics, rows, columns)
+    # The tag's own square: outside of it the limb's body is drawn in another way.
+    mask = np.zeros(frame.image.shape, dtype=np.uint8)
+    cv2.fillConvexPoly(mask, np.round(frame.corners[tag.id]).astype(np.int32), 1)
+    inside = mask[rows, columns] > 0
+    gap = (frame.image[rows, columns] - expected)[inside]
+    assert np.abs(gap).max() < 6.0
+    assert np.sqrt(np.mean(gap**2)) < 1.2
+    assert abs(gap.mean()) < 0.3
+
+
+def test_pictures_repeat_with_their_seed(model, tags):
+    shape = constant_curvature(tags.segment_lengths, [0.2, 0.1])
+    first, second, other = (SyntheticCamera(model, tags, seed=seed) for seed in (5, 5, 6))
+    picture = first.frame(shape).image
+    assert np.array_equal(picture, second.frame(shape).image)
+    assert not np.array_equal(picture, other.frame(shape).image)
+    assert not np.array_equal(picture, first.frame(shape).image)
+
+
+def test_noise_has_its_size_everywhere(model, tags):
+    camera = SyntheticCamera(model, tags, Optics(noise=4.0, light_fall=0.0), seed=1)
+    shape = constant_curvature(tags.segment_lengths, [0.2, 0.1])
+    frames = np.stack([camera.frame(shape).image.astype(float) for _ in range(24)])
+    spread = frames.std(axis=0)
+    assert np.median(spread) == pytest.approx(4.0, rel=0.1)
+    corners = camera.frame(shape).corners[2]
+    x, y = np.round(corners.mean(axis=0)).astype(int)
+    assert np.median(spread[y - 8 : y + 8, x - 8 : x + 8]) == pytest.approx(4.0, rel=0.15)
+
+
+def test_motion_blur_is_the_mean_of_sharp_pictures(model, tags):
+    shape = constant_curvature(tags.segment_lengths, [0.3, 0.3])
+    still = np.zeros_like(shape.heading)
+    motion = np.tile([0.0, 0.6], (len(still), 1))
+    optics = Optics(noise=0.0, exposure=0.01)
+    blurred = SyntheticCamera(model, tags, optics).frame(shape, Shape(shape.arc_length, motion, still))
+    camera = SyntheticCamera(model, tags, Optics(noise=0.0, exposure=0.0))
+    sharp = []
+    for share in np.linspace(-0.5, 0.5, 41):
+        moved = Shape(shape.arc_length, shape.points + share * 0.01 * motion, shape.heading)
+        sharp.append(camera.frame(moved).image.astype(float))
+    mean = np.mean(sharp, axis=0)
+    corners = blurred.corners[3]
+    mask = np.zeros(mean.shape, dtype=np.uint8)
+    middle = corners.mean(axis=0)
+    cv2.fillConvexPoly(mask, np.round(middle + 0.7 * (corners - middle)).astype(np.int32), 1)
+    gap = (blurred.image - mean)[mask > 0]
+    still_gap = (camera.frame(shape).image - mean)[mask > 0]
+    assert np.sqrt(np.mean(gap**2)) < 0.25 * np.sqrt(np.mean(still_gap**2))
+
+
+def test_set_up_errors_are_drawn_only_when_asked_for(model, tags):
+    shape = constant_curvature(tags.segment_lengths, [0.0, 0.0])
+    perfect = SyntheticCamera(model, tags, CLEAN, seed=1).frame(shape).corners
+    same = SyntheticCamera(model, tags, CLEAN, seed=2).frame(shape).corners
+    wrong = SyntheticCamera(model, tags, CLEAN, Errors(survey=1e-3, mounting=1e-3), seed=2)
+    moved = wrong.frame(shape).corners
+    assert all(np.array_equal(perfect[tag], same[tag]) for tag in perfect)
+    shifts = [np.abs(perfect[tag] - moved[tag]).max() for tag in perfect]
+    assert min(shifts) > 0.01
+    assert max(shifts) < 15.0
+
+
+def test_covers_hide_what_is_below(camera, tags):
+    shape = constant_curvature(tags.segment_lengths, [0.0, 0.0])
+    corners = camera.frame(shape).corners[2]
+    low, high = corners.min(axis=0) - 5, corners.max(axis=0) + 5
+    cover = [low, (high[0], low[1]), high, (low[0], high[1])]
+    image = camera.frame(shape, covers=[cover]).image
+    x, y = np.round(corners.mean(axis=0)).astype(int)
+    assert np.ptp(image[y - 10 : y + 10, x - 10 : x + 10].astype(int)) == 0
+
+
+def test_shapes_are_interpolated_and_continued(tags):
+    shape = constant_curvature(tags.segment_lengths, [0.6, -0.4], points=9)
+    exact = constant_curvature(tags.segment_lengths, [0.6, -0.4], points=1001)
+    for arc_length in (0.03, 0.13, 0.2, 0.244):
+        k = int(np.argmin(np.abs(exact.arc_length - arc_length)))
+        s = exact.arc_length[k]
+        place = shape.at(s)
+        assert np.allclose(place[:2], exact.points[k], atol=3e-6)
+        assert place[2] == pytest.approx(exact.heading[k], abs=1e-9)
+    beyond = shape.at(0.254)
+    end, angle = exact.points[-1], exact.heading[-1]
+    assert np.allclose(beyond[:2], end + 0.01 * np.array([np.cos(angle), np.sin(angle)]))
+
+
+def test_a_wrong_camera_file_is_named(tmp_path):
+    path = tmp_path / "camera.yaml"
+    path.write_text("schema: 1\nwidth: 10\n")
+    with pytest.raises(CameraError, match=r"camera\.yaml"):
+        CameraModel.from_yaml(path)
+    path.write_text("schema: 7\n")
+    with pytest.raises(CameraError, match="schema"):
+        CameraModel.from_yaml(path)
