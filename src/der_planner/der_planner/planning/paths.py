@@ -16,6 +16,8 @@ from der_planner.planning.errors import PlanningError
 Vector = NDArray[np.float64]
 
 LONGEST = 3600.0
+_SOFTNESS = 0.2
+"""Half width of the mean that rounds the corners of a speed profile [s]."""
 
 
 @dataclass(frozen=True)
@@ -139,9 +141,9 @@ def time_path(points: Vector, limits: PathLimits) -> TipPath:
             f"at {limits.speed} m/s the tip path lasts {time[-1]:.0f} s, the longest is {LONGEST:.0f} s"
         )
     grid = np.linspace(0.0, time[-1], max(20, round(time[-1] / 0.02) + 1))
-    along = PchipInterpolator(time, s)(grid)
-    along = _smoothed(along, window=max(1, round(0.2 / (grid[1] - grid[0]))))
-    return TipPath(grid, spline(along))
+    step = float(grid[1])
+    along = _smoothed(PchipInterpolator(time, s)(grid), window=max(1, round(_SOFTNESS / step)))
+    return TipPath(np.arange(len(along)) * step, spline(along))
 
 
 def polygon(corners: Vector, period: float) -> TipPath:
@@ -163,12 +165,11 @@ def polygon(corners: Vector, period: float) -> TipPath:
 
 
 def _smoothed(values: Vector, window: int) -> Vector:
-    """Return a running mean over 2 window + 1 samples; the ends stay where they are."""
-    padded = np.concatenate([np.full(window, values[0]), values, np.full(window, values[-1])])
-    total = np.concatenate([[0.0], np.cumsum(padded)])
+    """Return a running mean over 2 window + 1 samples, longer by as much: from rest to rest."""
     width = 2 * window + 1
+    padded = np.concatenate([np.full(width - 1, values[0]), values, np.full(width - 1, values[-1])])
+    total = np.concatenate([[0.0], np.cumsum(padded)])
     mean: Vector = (total[width:] - total[:-width]) / width
-    mean[0], mean[-1] = values[0], values[-1]
     return mean
 
 

@@ -1,0 +1,181 @@
+"""The PCC model against definitions: energies, finite differences, limits that are known."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from der_planner.limb import Limb
+from der_planner.pcc import Pcc
+from der_planner.pcc import kernels
+
+SEED = 4
+
+
+def limb_of(count, **changes):
+    base = Limb.default()
+    rng = np.random.default_rng(count)
+    segments = tuple(
+        dataclasses.replace(
+            base.segments[0],
+            length=float(rng.uniform(0.08, 0.15)),
+            mass_per_length=float(rng.uniform(0.5, 1.5)),
+            bending_stiffness=float(rng.uniform(0.01, 0.03)),
+            **changes,
+        )
+        for _ in range(count)
+    )
+    return dataclasses.replace(base, segments=segments, connector_length=0.01)
+
+
+@pytest.fixture(params=[1, 2, 3, 5], ids="{} segments".format)
+def model(request):
+    return Pcc(limb_of(request.param))
+
+
+def configurations(model, count=5, scale=1.2):
+    rng = np.random.default_rng(SEED)
+    return rng.normal(scale=scale, size=(count, 2, model.segment_count))
+
+
+def material_points(model, q, points=4001):
+    """Points of the centreline with mass fractions, straight from the definition of an arc."""
+    s = (np.arange(points) + 0.5) / points
+    heading, start, result, masses = 0.0, 0j, [], []
+    for j, length in enumerate(model.lengths):
+        if j:
+            start += np.exp(1j * heading) * model.connector
+        step = length / points
+        middle = np.exp(1j * (heading + q[j] * s)) * step
+        chain = start + np.cumsum(middle) - middle / 2
+        result.append(chain)
+        masses.append(np.full(points, model.masses[j] / points))
+        start += middle.sum()
+        heading += q[j]
+    return np.concatenate(result), np.concatenate(masses)
+
+
+def test_inertia_is_that_of_the_kinetic_energy(model):
+    for q, v in configurations(model, count=2):
+        h = 1e-5
+        ahead, mass = material_points(model, q + h * v)
+        behind, _ = material_points(model, q - h * v)
+        kinetic = 0.5 * (mass * np.abs((ahead - behind) / (2 * h)) ** 2).sum()
+        inertia, _, _ = model.matrices(q, v)
+        assert 0.5 * v @ inertia @ v == pytest.approx(kinetic, rel=1e-5)
+
+
+def test_rate_of_inertia_is_coriolis_plus_its_transpose(model):
+    for q, v in configurations(model):
+        h = 1e-5
+        ahead, behind = model.matrices(q + h * v, v)[0], model.matrices(q - h * v, v)[0]
+        rate = (ahead - behind) / (2 * h)
+        coriolis = model.matrices(q, v)[1]
+        np.testing.assert_allclose(coriolis + coriolis.T, rate, atol=1e-8 * np.abs(rate).max())
+
+
+def test_coriolis_terms_are_christoffel_symbols(model):
+    n, h = model.segment_count, 1e-5
+    for q, v in configurations(model, count=2):
+        slopes = np.array(
+            [
+                (model.matrices(q + h * e, v)[0] - model.matrices(q - h * e, v)[0]) / (2 * h)
+                for e in np.eye(n)
+            ]
+        )  # slopes[k, i, j] = ∂M_ij/∂q_k
+        symbols = 0.5 * (
+            np.einsum("kij,k->ij", slopes, v)
+            + np.einsum("jik,k->ij", slopes, v)
+            - np.einsum("ijk,k->ij", slopes, v)
+        )
+        coriolis = model.matrices(q, v)[1]
+        np.testing.assert_allclose(coriolis, symbols, atol=1e-8 * np.abs(symbols).max() + 1e-14)
+
+
+def test_inertia_is_symmetric_and_positive_definite(model):
+    for q, v in configurations(model):
+        inertia = model.matrices(q, v)[0]
+        np.testing.assert_allclose(inertia, inertia.T, rtol=1e-12)
+        assert np.linalg.eigvalsh(inertia).min() > 0
+
+
+def test_straight_segment_has_the_inertia_of_a_parabola():
+    model = Pcc(limb_of(1))
+    length, mass = model.lengths[0], model.masses[0]
+    inertia = model.matrices(np.zeros(1), np.zeros(1))[0]
+    assert inertia[0, 0] == pytest.approx(mass * length**2 / 20, rel=1e-12)
+    lumped = Pcc(limb_of(1), mass="lumped").matrices(np.zeros(1), np.zeros(1))[0]
+    assert lumped[0, 0] == pytest.approx(mass * length**2 / 4, rel=1e-12)
+
+
+@pytest.mark.parametrize("order", [0, 1, 2])
+def test_arc_functions_are_smooth_where_series_and_quotient_meet(order):
+    z = kernels.SERIES_BELOW
+    below, above = kernels.arc_moment(z - 1e-12, order), kernels.arc_moment(z + 1e-12, order)
+    assert abs(below - above) < 1e-11
+    eta, weight = np.polynomial.legendre.leggauss(40)
+    eta, weight = (eta + 1) / 2, weight / 2
+    for value in (-7.0, -0.3, -1e-9, 0.0, 1e-300, 0.499, 0.501, 3.0):
+        exact = (weight * eta**order * np.exp(1j * value * eta)).sum()
+        assert abs(kernels.arc_moment(value, order) - exact) < 1e-13
+
+
+def test_tip_and_its_jacobian_agree(model):
+    h = 1e-6
+    for q, _ in configurations(model):
+        columns = [
+            (model.tip(q + h * e) - model.tip(q - h * e)) / (2 * h)
+            for e in np.eye(model.segment_count)
+        ]
+        np.testing.assert_allclose(model.tip_jacobian(q), np.array(columns).T, atol=1e-9)
+        np.testing.assert_allclose(model.curve(q)[-1], model.tip(q), atol=1e-14)
+
+
+def undamped(count):
+    limb = limb_of(count, damping=0.0)
+    return Pcc(dataclasses.replace(limb, gravity=(2.0, -1.0, 0.0)))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_undamped_motion_keeps_its_energy(count):
+    model = undamped(count)
+    q0, v0 = np.linspace(0.5, -0.4, count), np.linspace(1.0, -2.0, count)
+    angles, rates = model.simulate(np.zeros((100, 20, count)), 5e-4, q0, v0)
+    energies = np.array([model.energy(q, v) for q, v in zip(angles, rates, strict=True)])
+    swing = np.ptp([0.5 * v @ model.matrices(q, v)[0] @ v for q, v in zip(angles, rates, strict=True)])
+    assert swing > 1e-4
+    assert np.ptp(energies) < 1e-5 * swing
+
+
+def test_pressures_invert_the_forward_dynamics(model):
+    rng = np.random.default_rng(SEED)
+    q, v, a = rng.normal(size=(3, 6, model.segment_count))
+    pressures = model.pressures(q, v, a)
+    for k in range(len(q)):
+        back = kernels.acceleration(q[k], v[k], model.gain * pressures[k], *model._parameters())
+        np.testing.assert_allclose(back, a[k], rtol=1e-9, atol=1e-9)
+
+
+def test_resting_pressures_are_the_static_ones():
+    limb = Limb.default()
+    model, zero = Pcc(limb), np.zeros((1, 2))
+    q = np.array([[0.4, -0.7]])
+    np.testing.assert_allclose(model.pressures(q, zero, zero) * limb.static_gain, q, rtol=1e-12)
+
+
+def test_a_simulated_limb_settles_where_the_pressure_holds_it():
+    limb = Limb.default()
+    model = Pcc(limb)
+    pressure = np.array([6000.0, -3000.0])
+    angles, _ = model.simulate(np.tile(pressure, (400, 10, 1)), 5e-3)
+    np.testing.assert_allclose(angles[-1], pressure * limb.static_gain, rtol=1e-3)
+
+
+def test_bad_input_is_named():
+    model = Pcc(Limb.default())
+    with pytest.raises(ValueError, match="bend_angles must be 2 finite numbers"):
+        model.matrices([1.0], [0.0, 0.0])
+    with pytest.raises(ValueError, match="'distributed' or 'lumped'"):
+        Pcc(Limb.default(), mass="spread")
+    with pytest.raises(ValueError, match=r"\(K, S, 2\)"):
+        model.simulate(np.zeros((4, 2)), 0.01)

@@ -1,0 +1,133 @@
+"""Inverse kinematics: the inverse of the forward, branches, the singular straight pose, reach."""
+
+import numpy as np
+import pytest
+
+from der_planner.limb import Limb
+from der_planner.planning import inverse
+from der_planner.planning.kinematics import ArcKinematics, PolylineKinematics
+from der_planner.planning.rod_model import RodModel
+from der_planner.rod import Rod
+
+LIMB = Limb.default()
+ARCS = ArcKinematics(LIMB)
+CHAIN = RodModel(LIMB).kinematics
+
+
+def polyline(count):
+    limb = Limb("many", LIMB.segments[:1] * count, LIMB.pneumatics)
+    rod = Rod.from_limb(limb, 10 * count + 1)
+    return PolylineKinematics(rod.rest_lengths, list(rod.segments))
+
+
+@pytest.mark.parametrize("kinematics", [ARCS, CHAIN], ids=["arcs", "rod"])
+def test_jacobian_against_finite_differences(kinematics):
+    rng = np.random.default_rng(1)
+    angles = rng.uniform(-1.5, 1.5, size=(20, 2))
+    h = 1e-6
+    for j in range(2):
+        step = h * np.eye(2)[j]
+        slope = (kinematics.tip(angles + step) - kinematics.tip(angles - step)) / (2 * h)
+        np.testing.assert_allclose(kinematics.tip_jacobians(angles)[..., j], slope, atol=1e-9)
+
+
+def test_the_chain_is_the_rods_evenly_bent_configuration():
+    rod = Rod.from_limb(LIMB, 21)
+    for angles in ([0.9, -0.9], [0.2, 0.7], [0.0, 0.0]):
+        q, tangents = rod.configuration_from_bend_angles(angles)
+        np.testing.assert_allclose(CHAIN.nodes(angles), rod.positions(q)[:, :2], atol=1e-14)
+        S = CHAIN.tangents(angles)
+        np.testing.assert_allclose(S[..., 0].T, tangents[0::4], atol=1e-13)
+        np.testing.assert_allclose(S[..., 1].T, tangents[1::4], atol=1e-13)
+
+
+def test_velocity_and_acceleration_of_the_chain_are_derivatives():
+    rng = np.random.default_rng(2)
+    q, v, a = rng.normal(size=(3, 2))
+    h = 1e-4
+
+    def at(t):
+        return CHAIN.nodes(q + v * t + 0.5 * a * t * t)
+
+    _, velocity, acceleration = CHAIN.motion(q, v, a)
+    np.testing.assert_allclose(velocity, (at(h) - at(-h)) / (2 * h), atol=1e-8)
+    np.testing.assert_allclose(acceleration, (at(h) - 2 * at(0) + at(-h)) / h**2, atol=1e-6)
+
+
+@pytest.mark.parametrize("kinematics", [ARCS, CHAIN], ids=["arcs", "rod"])
+def test_inverse_of_forward_is_the_identity(kinematics):
+    rng = np.random.default_rng(3)
+    angles = rng.uniform(-1.2, 1.2, size=(200, 2))
+    away = np.abs(np.linalg.det(kinematics.tip_jacobians(angles))) > 2e-3
+    angles = angles[away]
+    guess = angles + rng.normal(scale=0.02, size=angles.shape)
+    found, miss = inverse.solve(kinematics, kinematics.tip(angles), guess, prior_weight=0.0)
+    assert miss.max() < 1e-12
+    np.testing.assert_allclose(found, angles, atol=1e-8)
+
+
+def test_both_branches_are_found_and_named():
+    point = ARCS.tip(np.radians([35.0, 20.0]))
+    found = inverse.solutions(LIMB, ARCS, point)
+    assert {item.branch for item in found} == set(inverse.BRANCHES)
+    assert len(found) == 2
+    for item in found:
+        np.testing.assert_allclose(ARCS.tip(item.bend_angles), point, atol=1e-9)
+        assert inverse.branch_of(ARCS, item.bend_angles) == item.branch
+    assert found[0].pressure <= found[1].pressure
+    turns = {item.branch: item.bend_angles[1] for item in found}
+    assert turns["counter_clockwise"] > turns["clockwise"]
+
+
+@pytest.mark.parametrize("branch", inverse.BRANCHES)
+def test_a_path_stays_on_the_branch_it_was_given(branch):
+    turn = np.linspace(0, 2 * np.pi, 50)
+    centre = ARCS.tip(np.radians([35.0, 20.0]))
+    tip = centre + 0.003 * np.column_stack([np.cos(turn), np.sin(turn)])
+    angles = inverse.follow(LIMB, ARCS, turn, tip, branch)
+    assert {inverse.branch_of(ARCS, q) for q in angles} == {branch}
+    np.testing.assert_allclose(ARCS.tip(angles), tip, atol=1e-8)
+    assert np.abs(np.diff(angles, axis=0)).max() < 0.1
+
+
+def test_a_path_through_the_straight_pose_is_smooth():
+    s = np.linspace(0, np.pi, 81)
+    theta = 0.4 * np.sin(s) ** 3
+    for second in (1.0, -1.0):
+        wanted = np.column_stack([theta, second * theta])
+        found, miss = inverse.solve(CHAIN, ARCS.tip(wanted), wanted)
+        assert miss.max() < 1e-6
+        assert np.all(np.isfinite(found))
+        assert np.abs(np.diff(found, 2, axis=0)).max() < 3 * np.abs(np.diff(wanted, 2, axis=0)).max()
+
+
+@pytest.mark.parametrize("count", [3, 4])
+def test_more_than_two_segments_stay_near_the_first_guess(count):
+    kinematics = polyline(count)
+    rng = np.random.default_rng(count)
+    angles = rng.uniform(0.2, 0.6, size=(30, count))
+    guess = angles + rng.normal(scale=0.05, size=angles.shape)
+    found, miss = inverse.solve(kinematics, kinematics.tip(angles), guess)
+    assert miss.max() < 1e-6
+    for q, start in zip(found, guess, strict=True):
+        null = np.linalg.svd(kinematics.tip_jacobians(q))[2][2:]
+        # What the tip leaves open is where the guess was.
+        assert np.abs(null @ (q - start)).max() < 0.02
+
+
+def test_distance_to_reach_agrees_with_a_search():
+    low, high = inverse.angle_limits(LIMB)
+    grid = np.stack(np.meshgrid(*(np.linspace(a, b, 301) for a, b in zip(low, high, strict=True))), -1)
+    tips = ARCS.tip(grid).reshape(-1, 2)
+    for point in ([0.26, 0.10], [0.10, 0.02], [0.0, 0.0]):
+        searched = np.linalg.norm(tips - point, axis=1).min()
+        found = inverse.distance_to_reach(LIMB, ARCS, point, np.array([0.1, 0.1]))
+        assert found <= searched + 1e-9
+        assert found == pytest.approx(searched, abs=1e-3)
+
+
+def test_static_pressure_inverts_the_angle_limits():
+    low, high = inverse.angle_limits(LIMB)
+    np.testing.assert_allclose(
+        inverse.static_pressure(LIMB, [low, high]), [[-24e3] * 2, [24e3] * 2], rtol=1e-9
+    )
