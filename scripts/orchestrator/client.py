@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
 
@@ -21,6 +22,31 @@ from orchestrator.errors import GraphError
 from orchestrator.processes import NodeProcess
 
 READY = (DiagnosticStatus.OK, DiagnosticStatus.WARN)
+
+
+@dataclass(frozen=True)
+class Patience:
+    """How long a node may take to get ready [s], by what it says of itself.
+
+    Attributes:
+        silent: while it says nothing.
+        waiting: while it says that it waits for something, e.g. for its kernels to compile at the
+            first start on a machine.
+        failing: while it says that something is wrong.
+    """
+
+    silent: float = 120.0
+    waiting: float = 90.0
+    failing: float = 25.0
+
+    def of(self, status: DiagnosticStatus | None) -> float:
+        """Return the patience with a node of this status."""
+        if status is None:
+            return self.silent
+        return self.failing if status.level == DiagnosticStatus.ERROR else self.waiting
+
+
+PATIENCE = Patience()
 
 
 class GraphClient:
@@ -131,30 +157,30 @@ class GraphClient:
             self._executor.spin_once(timeout_sec=0.05)
         return value
 
-    def wait_ready(self, names: Iterable[str], timeout: float) -> None:
+    def wait_ready(self, names: Iterable[str], patience: Patience = PATIENCE) -> None:
         """Wait until the diagnostics of all these nodes are ok or warning.
 
         Raises:
             GraphError: names the node that is not ready and what it says.
             NodeError: a watched process has ended.
         """
-        wanted = list(names)
+        unready = {name: time.monotonic() for name in names}
 
-        def missing() -> list[str]:
-            return [
-                name
-                for name in wanted
-                if name not in self.diagnostics or self.diagnostics[name].level not in READY
-            ]
+        def all_ready() -> bool:
+            for name, since in list(unready.items()):
+                status = self.diagnostics.get(name)
+                if status is not None and status.level in READY:
+                    del unready[name]
+                    continue
+                limit = patience.of(status)
+                if time.monotonic() - since > limit:
+                    said = status.message if status is not None else "nothing"
+                    raise GraphError(
+                        f"node '{name}' was not ready within {limit:.0f} s; it says: {said}"
+                    )
+            return not unready
 
-        try:
-            self.wait_for(lambda: not missing(), timeout, "the nodes")
-        except GraphError as error:
-            name = missing()[0]
-            said = self.diagnostics[name].message if name in self.diagnostics else "nothing"
-            raise GraphError(
-                f"node '{name}' was not ready within {timeout:.0f} s; it says: {said}"
-            ) from error
+        self.wait_for(all_ready, patience.silent + 10.0, "the nodes")
 
     def diagnostic_values(self, name: str) -> dict[str, str]:
         """Return the key-value pairs of a node's newest diagnostics, empty before the first."""

@@ -20,8 +20,6 @@ from orchestrator.options import Options, Trial
 from orchestrator.processes import NodeProcess
 from orchestrator.progress import Progress
 
-READY_TIMEOUT = 180.0
-"""Kernels are compiled at the first start on a machine [s]."""
 PLAN_TIMEOUT = 120.0
 VENTED_PRESSURE = 1000.0
 """Differential pressure below which a limb counts as vented [Pa]."""
@@ -127,18 +125,19 @@ class GraphTrial:
             NodeError: a node cannot be started or has died.
         """
         with tempfile.TemporaryDirectory(prefix="der_limb_") as folder, GraphClient() as client:
-            self._refuse_second_graph(client)
-            self._watch_topics(client)
             port = str(Path(folder) / "board")
+            specs = node_specs(self._trial, self._options, self._limb, port, self._metadata)
+            self._refuse_second_graph(client, specs)
+            self._watch_topics(client)
             with self._everything_stops(client):
-                self._start(client, port)
+                self._start(client, specs, port)
                 return self._play_motion(client)
 
-    def _refuse_second_graph(self, client: GraphClient) -> None:
-        others = client.other_nodes()
+    def _refuse_second_graph(self, client: GraphClient, specs: list[NodeSpec]) -> None:
+        others = set(client.other_nodes()) & {spec.executable for spec in specs}
         if others:
             raise GraphError(
-                f"another graph is running in this ROS domain (node '{others[0]}'): stop it, or "
+                f"another graph is running in this ROS domain (node '{min(others)}'): stop it, or "
                 "set ROS_DOMAIN_ID to another number for one of them"
             )
 
@@ -146,9 +145,8 @@ class GraphTrial:
         client.subscribe(PressurePlan, topics.PLAN, qos.LATCHED)
         client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES)
 
-    def _start(self, client: GraphClient, port: str) -> None:
+    def _start(self, client: GraphClient, specs: list[NodeSpec], port: str) -> None:
         begin = time.monotonic()
-        specs = node_specs(self._trial, self._options, self._limb, port, self._metadata)
         self._progress.say(f"  starting {', '.join(spec.executable for spec in specs)}")
         remap = self._options.hardware.remap if self._options.hardware else None
         for spec in specs:
@@ -159,7 +157,7 @@ class GraphTrial:
             client.watch(self._processes.values())
             if spec.executable == "board_emulator":
                 client.wait_for(lambda: os.path.exists(port), 60.0, "the emulated board's port")
-        client.wait_ready(self._processes, READY_TIMEOUT)
+        client.wait_ready(self._processes)
         self._progress.say(f"  ready after {time.monotonic() - begin:.1f} s")
 
     def _play_motion(self, client: GraphClient) -> GraphRun:
@@ -258,7 +256,7 @@ class GraphTrial:
                 )
                 self._processes["pressure_driver"] = driver
                 client.watch([driver])
-                client.wait_ready([spec.executable], 20.0)
+                client.wait_ready([spec.executable])
             self._vent(client)
         except (GraphError, NodeError) as error:
             self._progress.say(

@@ -55,7 +55,7 @@ class Bench:
             "pressure_driver", "board_emulator", port_link=self.link, protocol=protocol
         )
         self.client.watch([self.board])
-        self.client.wait_ready(["board_emulator"], 60.0)
+        self.client.wait_ready(["board_emulator"])
         self.parameters = {"port": self.link, "protocol": protocol, **QUICK, **parameters}
         self.start_driver()
 
@@ -64,7 +64,7 @@ class Bench:
         if ready:
             self.client.watch([self.board, self.driver])
             self.client.diagnostics.pop("pressure_driver", None)
-            self.client.wait_ready(["pressure_driver"], 60.0)
+            self.client.wait_ready(["pressure_driver"])
             self.wait(self.publisher.get_subscription_count, "the driver's subscription")
             self.wait(lambda: self.air, "the air")
 

@@ -52,7 +52,7 @@ class Talker:
 def start(graph, **parameters):
     process = graph.start("der_planner", "recorder", **parameters)
     graph.client.watch([process])
-    graph.client.wait_ready(["recorder"], 60.0)
+    graph.client.wait_ready(["recorder"])
     return process
 
 

@@ -1,0 +1,52 @@
+"""The orchestrator's view of the graph: readiness and death are told with their cause."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+
+pytestmark = pytest.mark.graph
+
+
+def test_a_tracker_without_camera_is_named_with_the_cure(graph):
+    from orchestrator.client import Patience
+    from orchestrator.errors import GraphError
+
+    graph.start("apriltag_tracker", "apriltag_tracker")
+    graph.client.wait_for(lambda: "apriltag_tracker" in graph.client.diagnostics, 60, "its word")
+    with pytest.raises(GraphError, match=r"'apriltag_tracker' was not ready.*start the camera"):
+        graph.client.wait_ready(["apriltag_tracker"], Patience(waiting=1.0, failing=1.0))
+
+
+def test_a_driver_without_its_board_ends_with_the_port_and_the_remedy(graph):
+    from orchestrator.errors import NodeError
+
+    port = str(graph.folder / "no_such_board")
+    driver = graph.start("pressure_driver", "pressure_driver", port=port)
+    graph.client.watch([driver])
+    with pytest.raises(NodeError, match=r"'pressure_driver' died \(exit code 1\)") as caught:
+        graph.client.wait_ready(["pressure_driver"])
+    assert port in str(caught.value)
+
+
+def test_a_waiting_client_notices_a_death_at_once(graph):
+    from orchestrator.errors import NodeError
+
+    board = graph.start("pressure_driver", "board_emulator", port_link=str(graph.folder / "board"))
+    graph.client.watch([board])
+    graph.client.wait_ready(["board_emulator"])
+    board.signal(signal.SIGKILL)
+    with pytest.raises(NodeError, match="killed by SIGKILL"):
+        graph.client.wait_for(lambda: False, 30.0, "what never comes")
+
+
+def test_nodes_end_with_zero_on_both_signals(graph):
+    for number in (signal.SIGINT, signal.SIGTERM):
+        link = str(graph.folder / f"board_{number}")
+        board = graph.start("pressure_driver", "board_emulator", port_link=link)
+        graph.client.diagnostics.clear()
+        graph.client.wait_ready(["board_emulator"])
+        board.signal(number)
+        graph.client.wait_for(lambda board=board: not board.alive, 20.0, "the end of the node")
+        assert board.exit_code == 0
