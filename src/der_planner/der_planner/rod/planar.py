@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.rod import planar_kernel
-from der_planner.rod.linearisation import StepFactors
+from der_planner.rod.linearisation import StepFactors, step_matrices
 from der_planner.rod.mesh import Mesh
 from der_planner.rod.state import Array, RodState
 
@@ -143,6 +143,23 @@ class PlanarBackend:
         if linearise and not failed:
             stored = StepFactors(factors, bands, columns, *self._diagonals(h), 1.0 / h, extrapolate)
         return Run(q, v, final, done, iterations, update, failed, stored)
+
+    def linearise(
+        self,
+        state: RodState,
+        u: Array,
+        h: float,
+        extrapolate: Array,
+        load: Array,
+        tolerance: float,
+        limit: int,
+    ) -> tuple[Run, tuple[Array, Array] | None]:
+        """Return the run and (A, B) of one step; no matrices if a stage failed."""
+        pressures = np.ascontiguousarray(np.broadcast_to(u, (1, len(extrapolate), len(u))))
+        run = self.simulate(state, pressures, h, extrapolate, load, tolerance, limit, True)
+        if run.factors is None:
+            return run, None
+        return run, step_matrices(run.factors, self.free_rows)
 
     def _diagonals(self, h: float) -> tuple[Array, Array]:
         inertia = (self.mass / h + self.damping) / h

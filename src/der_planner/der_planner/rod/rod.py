@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from der_planner.limb import Limb
 from der_planner.rod.errors import ConvergenceError
-from der_planner.rod.linearisation import Linearisation, step_matrices
+from der_planner.rod.linearisation import Linearisation
 from der_planner.rod.mesh import Mesh, array, limb_mesh, positive, require, uniform_mesh
 from der_planner.rod.planar import PlanarBackend, Run
 from der_planner.rod.spatial import SpatialBackend
@@ -302,13 +302,19 @@ class Rod:
         """Return the exact A (2F, 2F), B (2F, M) of δx' = A δx + B δu for one step from `state`.
 
         x = (q[free], v[free]); by the implicit function theorem at the converged step, with the
-        derivative of B(q)u.
+        derivative of B(q)u. In space φ counts from frames transported from those of `state` at the
+        beginning and of the step's result at the end: what `Rod.state(q, like=…)` does.
         """
-        pressures = array(u, (self.segment_count,), "u")[None, None, :]
-        run = self._run(state, pressures, positive(dt, "dt"), method, self._load(forces), True)
-        if run.factors is None:
-            raise AssertionError("a converged run keeps its factors")
-        return step_matrices(run.factors, self._backend.free_rows)
+        pressures = array(u, (self.segment_count,), "u")
+        require(method in _STAGES, "method", f"one of {sorted(_STAGES)}", method)
+        fraction, extrapolate = _STAGES[method]
+        h = positive(dt, "dt") * fraction
+        run, matrices = self._backend.linearise(
+            state, pressures, h, extrapolate, self._load(forces), self._tolerance, _LIMIT
+        )
+        if matrices is None:
+            raise self._failure(run, dt, method)
+        return matrices
 
     def bend_angles(self, state: RodState | ArrayLike) -> Array:
         """Return (…, M) the turning of each segment about +z from its first to its last edge [rad]."""
@@ -341,17 +347,19 @@ class Rod:
         if len(extrapolate) > 1:
             pressures = np.repeat(pressures, len(extrapolate), axis=1)
         run = self._backend.simulate(
-            state, pressures, dt * fraction, extrapolate, load, self._tolerance, 30, linearise
+            state, pressures, dt * fraction, extrapolate, load, self._tolerance, _LIMIT, linearise
         )
         if run.failed_iterations:
-            raise ConvergenceError(
-                f"step {run.steps // len(extrapolate)} of {dt:g} s ({method}) did not converge in "
-                f"{run.failed_iterations} Newton iterations (last update {run.update:.3g}): "
-                "take a shorter step",
-                step=run.steps // len(extrapolate), residual=run.update, iterations=run.failed_iterations,
-                state=run.final,
-            )  # fmt: skip
+            raise self._failure(run, dt, method)
         return run
+
+    def _failure(self, run: Run, dt: float, method: str) -> ConvergenceError:
+        step = run.steps // len(_STAGES[method][1])
+        return ConvergenceError(
+            f"step {step} of {dt:g} s ({method}) did not converge in {run.failed_iterations} Newton "
+            f"iterations (last update {run.update:.3g} m): take a shorter step",
+            step=step, residual=run.update, iterations=run.failed_iterations, state=run.final,
+        )  # fmt: skip
 
     def _load(self, forces: ArrayLike | None) -> Array:
         if forces is None:
@@ -390,6 +398,7 @@ class Rod:
 # Each method is a chain of backward Euler solves over fraction·dt from (q, v), after each of which the
 # state goes on to (q, v) + e ((q', v') − (q, v)). e = 2 is the implicit midpoint rule; γ = 1 − 1/√2 with
 # e = (1 − γ)/γ, then 1, is Alexander's two-stage SDIRK: second order and L-stable.
+_LIMIT = 30  # Newton iterations of a step
 _GAMMA = 1.0 - math.sqrt(0.5)
 _STAGES = {
     "backward_euler": (1.0, np.array([1.0])),

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from der_planner.rod import spatial_kernel, spatial_step_kernel
 from der_planner.rod.mesh import Mesh
 from der_planner.rod.planar import Run, band_to_dense
+from der_planner.rod.spatial_linearisation import Stage, propagate, residual_derivatives
 from der_planner.rod.state import Array, RodState
 
 
@@ -130,6 +131,41 @@ class SpatialBackend:
         at = done // steps + 1 if failed else intervals
         final = self._state(q[at].copy(), v[at].copy(), directors, twists)
         return Run(q, v, final, done, iterations, update, failed, None)
+
+    def linearise(
+        self,
+        state: RodState,
+        u: Array,
+        h: float,
+        extrapolate: Array,
+        load: Array,
+        tolerance: float,
+        limit: int,
+    ) -> tuple[Run, tuple[Array, Array] | None]:
+        """Return the run and (A, B) of one step; no matrices if a stage failed."""
+        count, inputs = len(self.free), len(u)
+        dq = np.zeros((self.size, 2 * count + inputs))
+        dv = np.zeros_like(dq)
+        dq[self.free_rows, np.arange(count)] = 1.0
+        dv[self.free_rows, np.arange(count, 2 * count)] = 1.0
+        once = np.ones(1)
+        for e in extrapolate:
+            run = self.simulate(
+                state, u[None, None, :], h, once, load, tolerance, limit, linearise=False
+            )
+            if run.failed_iterations:
+                return run, None
+            x_n, x = self.extend(state.q), self.extend(run.final.q)
+            stage = Stage(x, x_n, 1.0 / h, u, *self.reference(state))
+            derivatives = residual_derivatives(stage, self.rod, self.work_space())
+            dq, dv = propagate(
+                stage, derivatives, self.mass, self.damping, self.free_rows, e, (dq, dv)
+            )
+            q = state.q + e * (run.final.q - state.q)
+            v = state.v + e * (run.final.v - state.v)
+            state = self.carry_frames(state, q, v)
+        both = np.concatenate([dq[self.free_rows], dv[self.free_rows]])
+        return run, (both[:, : 2 * count], both[:, 2 * count :])
 
     def rows(self, indices: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the kernel's rows of indices into q; -1 for indices out of range."""
