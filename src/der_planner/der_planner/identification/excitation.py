@@ -97,15 +97,16 @@ def sweep(
     return _fade(amplitude * np.stack(columns, axis=1), 1.0)
 
 
-def calibration_run(amplitude: float, segment_count: int = 2) -> Excitation:
+def calibration_run(amplitude: float, segment_count: int = 2, quick: bool = False) -> Excitation:
     """Return the whole run, about three minutes for two segments.
 
     Args:
         amplitude: largest |differential pressure| [Pa].
         segment_count: M.
+        quick: leave out the staircase and the steps: a minute and a half.
     """
     pause = np.zeros((round(2.0 / PERIOD), segment_count))
-    named = (
+    named = [
         ("rest", pause),
         ("waves", waves(amplitude, segment_count)),
         ("rest", pause),
@@ -113,7 +114,9 @@ def calibration_run(amplitude: float, segment_count: int = 2) -> Excitation:
         ("steps", steps(0.4 * amplitude, segment_count)),
         ("sweep", sweep(0.25 * amplitude, segment_count)),
         ("rest", pause),
-    )
+    ]
+    if quick:
+        named = [part for part in named if part[0] not in ("staircase", "steps")]
     ends = np.cumsum([len(block) for _, block in named])
     parts = tuple(
         (name, (end - len(block)) * PERIOD, (end - 1) * PERIOD)

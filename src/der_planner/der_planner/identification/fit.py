@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from der_planner.identification.air import AirFit, fit_air
-from der_planner.identification.geometry import GeometryFit, fit_geometry, with_lengths
+from der_planner.identification.geometry import GeometryFit, fit_geometry, with_geometry
 from der_planner.identification.log import CalibrationLog, LogError
 from der_planner.identification.parameters import (
     GROUPS,
@@ -34,6 +34,8 @@ ANGLE_ERROR = np.deg2rad(0.3)
 """Error of a predicted bend angle that is taken for granted [rad]; the residual replaces it."""
 CORRELATION = 20.0
 """Rows over which an error of the model stays the same (1 s)."""
+MOST_EVALUATIONS = 15
+"""Of model and derivatives; a fit that has not settled by then changes less than its uncertainty."""
 STRONG = 0.9
 """|correlation| above which two unknowns are said to be told only together."""
 UNTOLD = 0.8
@@ -72,7 +74,7 @@ def fit(
     air = _try_air(prepared, warnings)
     lengths = fit_geometry(limb, prepared.log) if geometry else None
     if lengths is not None:
-        limb = with_lengths(limb, lengths.lengths)
+        limb = with_geometry(limb, lengths.lengths, lengths.connector)
     offset = np.zeros(limb.segment_count) if air is None else air.offset
     problem = _Problem(limb, prepared, offset, groups, nodes)
     values, jacobian = problem.solve()
@@ -137,9 +139,9 @@ class _Problem:
             bounds=(low, high),
             loss="soft_l1",
             f_scale=3.0 / np.sqrt(CORRELATION),
-            xtol=1e-4,
-            ftol=1e-5,
-            max_nfev=25,
+            xtol=1e-3,
+            ftol=1e-4,
+            max_nfev=MOST_EVALUATIONS,
         )
         values = self._values(solution.x)
         return values, self._jacobian(solution.x)

@@ -1,4 +1,4 @@
-"""Lengths of the segments from tips and bend angles: where the tags sit on the rod."""
+"""Lengths of segments and connector from tips and bend angles: where the tags sit on the rod."""
 
 from __future__ import annotations
 
@@ -10,17 +10,25 @@ from scipy.optimize import least_squares
 
 from der_planner.identification.log import CalibrationLog
 from der_planner.limb import Limb
-from der_planner.pcc import Pcc
+from der_planner.planning.kinematics import PolylineKinematics
+from der_planner.rod import Rod
 
 Array = NDArray[np.float64]
 
 LENGTH_PRIOR = 0.02
 """Relative standard deviation of a length measured with a ruler."""
+CONNECTOR_RANGE = (1e-3, 3e-2)
+"""Of the connector [m]: the rod needs an edge there."""
+CONNECTOR_PRIOR = 0.01
+"""Standard deviation of what is known of the connector before [m]."""
 TIP_ERROR = 1e-3
-"""Error of arcs at single instants [m]: the limb does not bend quite evenly."""
-
+"""Error of an evenly bent limb at single instants [m]: a real one does not bend quite evenly."""
 CORRELATION = 20.0
 """Rows over which that error stays the same (1 s)."""
+NODES = 21
+"""Of the rod whose chain of edges is fitted, as the planners use it. A polyline bends at its inner
+nodes alone and leaves a straight half edge at both ends of a segment; the fitted connector makes up
+for that."""
 
 
 @dataclass(frozen=True)
@@ -29,52 +37,69 @@ class GeometryFit:
 
     Attributes:
         lengths: (M,) [m].
-        uncertainty: (M,) standard deviations [m].
-        residual_before, residual: root mean square tip error of arcs with the prior's and the fitted
-            lengths [m].
+        connector: between two segments [m]; the prior's for one segment.
+        uncertainty: (M + 1,) standard deviations of lengths and connector [m].
+        residual_before, residual: root mean square distance of the tips from those of an evenly bent
+            rod with the prior's and with the fitted lengths [m].
     """
 
     lengths: Array
+    connector: float
     uncertainty: Array
     residual_before: float
     residual: float
 
 
-def fit_geometry(limb: Limb, log: CalibrationLog) -> GeometryFit | None:
-    """Fit the segment lengths to tips at given bend angles; None where the log has no tips."""
+def fit_geometry(limb: Limb, log: CalibrationLog, nodes: int = NODES) -> GeometryFit | None:
+    """Fit the lengths to tips at given bend angles; None where the log has no tips."""
     rows = np.all(np.isfinite(log.bend_angles), axis=1) & np.all(np.isfinite(log.tip), axis=1)
     if np.count_nonzero(rows) < 20:
         return None
     every = max(1, np.count_nonzero(rows) // 800)
     angles, tip = log.bend_angles[rows][::every], log.tip[rows][::every]
     prior = np.array([segment.length for segment in limb.segments])
+    connector = limb.connector_length or 4e-3
+    several = limb.segment_count > 1
+    spread = np.append(LENGTH_PRIOR * prior, CONNECTOR_PRIOR)
+    start = np.append(prior, np.clip(connector, 1.1 * CONNECTOR_RANGE[0], 0.9 * CONNECTOR_RANGE[1]))
+    low, high = np.append(0.8 * prior, CONNECTOR_RANGE[0]), np.append(1.2 * prior, CONNECTOR_RANGE[1])
     weight = np.sqrt(every / CORRELATION) / TIP_ERROR
+    free = len(start) if several else len(prior)
 
-    def difference(lengths: Array) -> Array:
-        return np.asarray(Pcc(with_lengths(limb, lengths)).tip(angles) - tip)
+    def difference(candidate: Limb) -> Array:
+        rod = Rod.from_limb(candidate, nodes)
+        chain = PolylineKinematics(rod.rest_lengths, list(rod.segments))
+        return chain.tip(angles) - tip
 
-    def residual(relative: Array) -> Array:
-        data = weight * difference(prior * relative).ravel()
-        return np.concatenate([data, (relative - 1.0) / LENGTH_PRIOR])
+    def candidate(x: Array) -> Limb:
+        return with_geometry(limb, x[: len(prior)], float(x[-1]) if several else None)
 
-    solution = least_squares(residual, np.ones(len(prior)), bounds=(0.8, 1.2))
+    def residual(x: Array) -> Array:
+        data = weight * difference(candidate(x)).ravel()
+        return np.concatenate([data, (x - start[:free]) / spread[:free]])
+
+    solution = least_squares(
+        residual, start[:free], bounds=(low[:free], high[:free]), x_scale=spread[:free]
+    )
     covariance = np.linalg.inv(solution.jac.T @ solution.jac)
-    lengths = prior * solution.x
+    found = candidate(solution.x)
     return GeometryFit(
-        lengths=lengths,
-        uncertainty=prior * np.sqrt(np.diag(covariance)),
-        residual_before=_distance(difference(prior)),
-        residual=_distance(difference(lengths)),
+        lengths=np.array([segment.length for segment in found.segments]),
+        connector=found.connector_length,
+        uncertainty=np.sqrt(np.diag(covariance)),
+        residual_before=_distance(difference(limb)),
+        residual=_distance(difference(found)),
     )
 
 
-def with_lengths(limb: Limb, lengths: Array) -> Limb:
-    """Return the limb with these segment lengths (M,) [m]."""
+def with_geometry(limb: Limb, lengths: Array, connector: float | None) -> Limb:
+    """Return the limb with these segment lengths (M,) and this connector [m], None keeps the old."""
     segments = tuple(
         replace(segment, length=float(length))
         for segment, length in zip(limb.segments, lengths, strict=True)
     )
-    return replace(limb, segments=segments)
+    kept = limb.connector_length if connector is None else connector
+    return replace(limb, segments=segments, connector_length=kept)
 
 
 def _distance(difference: Array) -> float:

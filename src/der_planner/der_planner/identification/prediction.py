@@ -14,7 +14,8 @@ Array = NDArray[np.float64]
 
 NODES = 13
 """Of the rod in a fit: its statics do not depend on it, its first two frequencies by 2 %."""
-SUBSTEPS = 2
+SUBSTEPS = 1
+"""Integrator steps of 50 ms: see the convergence on the page of the identification."""
 
 
 class RodPrediction:

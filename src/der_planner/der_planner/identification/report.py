@@ -125,11 +125,12 @@ class FitReport:
         geometry = self.geometry
         lengths = ", ".join(
             f"{1e3 * length:.1f} ± {1e3 * deviation:.1f}"
-            for length, deviation in zip(geometry.lengths, geometry.uncertainty, strict=True)
+            for length, deviation in zip(geometry.lengths, geometry.uncertainty, strict=False)
         )
         return [
-            f"lengths: {lengths} mm; tips within {1e3 * geometry.residual:.2f} mm of arcs at the "
-            f"measured angles (with the prior's lengths {1e3 * geometry.residual_before:.2f} mm)"
+            f"lengths: {lengths} mm, connector {1e3 * geometry.connector:.1f} mm; tips within "
+            f"{1e3 * geometry.residual:.2f} mm of an evenly bent rod at the measured angles (with the "
+            f"prior's lengths {1e3 * geometry.residual_before:.2f} mm)"
         ]
 
 
