@@ -20,7 +20,7 @@ from visualization_msgs.msg import MarkerArray
 from der_msgs.msg import MotionCommand, PressurePlan, PressureSetpoint
 from der_planner.limb import Limb
 from der_planner.nodes.planner_markers import limb_marker, path_markers
-from der_planner.planning import METHODS, Motion, PathLimits, Plan, choose_method, plan
+from der_planner.planning import METHODS, Motion, PathLimits, Plan, Start, choose_method, plan
 from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD
 from der_planner.planning.streaming import GRID, Player, Schedule, first_stamp
 from limb_interfaces import qos, topics
@@ -145,9 +145,17 @@ class PlannerNode(Node):
         """Play the newest plan, again if it was played before."""
         with self._lock:
             newest = self._newest
-        response.success = newest is not None
+        position = self._player.position
+        response.success = newest is not None and position is None
         if newest is None:
             response.message = "no plan yet: publish a command first"
+            return response
+        if position is not None:
+            response.message = f"plan {position[0].plan_id} is being played: call stop first"
+            return response
+        if newest[1].reference.start is not None:
+            response.success = False
+            response.message = f"plan {newest[0]} began in another motion: publish its command again"
             return response
         schedule = self._play(*newest, start=0)
         response.message = f"plan {schedule.plan_id} starts at {schedule.start * 1e-9:.2f} s"
@@ -224,26 +232,42 @@ class PlannerNode(Node):
                 raise Cancelled
             self._progress = share
 
-        progress(0.0)
-        result = plan(
-            self._limb, request.motion, request.model, request.method, nodes=self._nodes,
-            progress=progress,
-        )  # fmt: skip
-        progress(1.0)
+        # A motion that is being played goes on meanwhile; the new one takes over where it then is.
+        allowance = _MARGIN
+        while True:
+            progress(0.0)
+            stamp, start = self._hand_over(request.start, allowance)
+            result = plan(
+                self._limb, request.motion, request.model, request.method, nodes=self._nodes,
+                start=start, progress=progress,
+            )  # fmt: skip
+            progress(1.0)
+            if start is None or stamp - self._lead > self._now():
+                break
+            allowance = 2 * round(result.solve_time * 1e9) + _MARGIN
         for warning in result.warnings:
             self.get_logger().warning(f"plan {request.plan_id}: {warning}")
         with self._lock:
             self._newest = (request.plan_id, result)
         if self._auto_start:
-            self._play(request.plan_id, result, request.start)
+            self._play(request.plan_id, result, stamp if start is not None else request.start)
         else:
             self._publish_plan(Schedule(request.plan_id, result, 0))
             self._set("done", request.plan_id, reason="waits for the service start", progress=1.0)
 
+    def _hand_over(self, wanted: int, allowance: int) -> tuple[int, Start | None]:
+        """Return when a plan of now can take over, and where the limb is then; None: at rest."""
+        stamp = first_stamp(self._now() + allowance, self._lead, wanted)
+        position = self._player.position
+        return stamp, None if position is None else position[0].leave(stamp)
+
     # Streaming -----------------------------------------------------------------------------
 
     def _play(self, plan_id: str, result: Plan, start: int) -> Schedule:
-        earliest = first_stamp(self._now() + _MARGIN, self._lead, start)
+        earliest = first_stamp(self._now() + (_MARGIN if start == 0 else 0), self._lead, start)
+        position = self._player.position
+        if position is not None and result.reference.start is None:
+            earliest = max(earliest, position[0].stamp(position[0].count))
         schedule = Schedule(plan_id, result, earliest)
         self._set("streaming", plan_id, reason="; ".join(result.warnings), progress=0.0)
         self._publish_plan(schedule)

@@ -5,7 +5,7 @@
 
 from der_planner.planning.errors import PlanningError, UnreachableError
 from der_planner.planning.models import METHODS
-from der_planner.planning.motions import CONTROL_PERIOD, NAMES, Motion, Reference
+from der_planner.planning.motions import CONTROL_PERIOD, NAMES, Motion, Reference, Start
 from der_planner.planning.paths import PathLimits
 from der_planner.planning.planner import DEFAULT_METHOD, choose_method, plan
 from der_planner.planning.result import Plan
@@ -20,6 +20,7 @@ __all__ = [
     "Plan",
     "PlanningError",
     "Reference",
+    "Start",
     "UnreachableError",
     "choose_method",
     "plan",

@@ -34,8 +34,11 @@ class PlanningModel(Protocol):
     def pressures(self, method: str, q: Vector, v: Vector, a: Vector) -> Vector:
         """Return effective pressures (K, M) [Pa] for angles, rates and accelerations (K, M)."""
 
-    def simulate(self, pressures: Vector, period: float) -> Vector:
-        """Return the tip (K, 2) [m] at the start of each interval, under (K, S, M) pressures [Pa]."""
+    def simulate(self, pressures: Vector, period: float, spline: BSpline | None = None) -> Vector:
+        """Return the tip (K, 2) [m] at the start of each interval, under (K, S, M) pressures [Pa].
+
+        From rest, or from the beginning of a motion ``spline`` of bend angles.
+        """
 
 
 class ArcModel:
@@ -60,9 +63,10 @@ class ArcModel:
             raise PlanningError(f"the PCC model has no method '{method}': choose paper")
         return self.model.pressures(q, v, a)
 
-    def simulate(self, pressures: Vector, period: float) -> Vector:
-        """Return the tip (K, 2) [m], from rest."""
-        angles, _ = self.model.simulate(pressures, period / pressures.shape[1])
+    def simulate(self, pressures: Vector, period: float, spline: BSpline | None = None) -> Vector:
+        """Return the tip (K, 2) [m] at the start of each interval."""
+        state = (None, None) if spline is None else (spline(0.0), spline(0.0, 1))
+        angles, _ = self.model.simulate(pressures, period / pressures.shape[1], *state)
         return self.model.tip(angles[:-1])
 
 

@@ -45,6 +45,23 @@ _GRID = 0.01
 
 
 @dataclass(frozen=True)
+class Start:
+    """Where another motion is left, to begin a new one there instead of at rest.
+
+    Attributes:
+        bend_angles: (M,) of the arcs [rad].
+        rate: (M,) [rad/s].
+        acceleration: (M,) [rad/s²].
+        pressure: (M,) command in force [Pa].
+    """
+
+    bend_angles: Vector
+    rate: Vector
+    acceleration: Vector
+    pressure: Vector
+
+
+@dataclass(frozen=True)
 class Reference:
     """A motion made concrete for one limb.
 
@@ -53,12 +70,14 @@ class Reference:
         tip: (K, 2) r̄ [m].
         bend_angles: (K, M) q̄ of constant-curvature arcs [rad].
         spline: q̄(t), twice continuously differentiable; `sample` reads it.
+        start: where it begins, if not at rest.
     """
 
     time: Vector
     tip: Vector
     bend_angles: Vector
     spline: BSpline
+    start: Start | None = None
 
     @property
     def duration(self) -> float:
@@ -84,12 +103,13 @@ def sample_spline(spline: BSpline, time: ArrayLike) -> tuple[Vector, Vector, Vec
     )
 
 
-def resting_spline(time: ArrayLike, values: ArrayLike) -> BSpline:
-    """Return the quintic spline through (K, M) values that starts and ends at rest."""
+def resting_spline(time: ArrayLike, values: ArrayLike, start: Start | None = None) -> BSpline:
+    """Return the quintic spline through (K, M) values that ends at rest, and starts so or as given."""
     samples = np.asarray(values, dtype=float)
     rest = np.zeros(samples.shape[1:])
-    ends = [(1, rest), (2, rest)]
-    return make_interp_spline(np.asarray(time), samples, k=5, bc_type=(ends, ends))
+    begin = (rest, rest) if start is None else (start.rate, start.acceleration)
+    ends = ([(1, begin[0]), (2, begin[1])], [(1, rest), (2, rest)])
+    return make_interp_spline(np.asarray(time), samples, k=5, bc_type=ends)
 
 
 @dataclass(frozen=True)
@@ -193,8 +213,12 @@ class Motion:
         time, tip = paths.read_csv(path)
         return cls.from_tip_path(time, tip, name=Path(path).stem, branch=branch, limits=limits)
 
-    def reference(self, limb: Limb) -> Reference:
+    def reference(self, limb: Limb, start: Start | None = None) -> Reference:
         """Return q̄(t) and r̄(t) for a limb.
+
+        Args:
+            limb: the robot.
+            start: where another motion is left: a quintic leads from there to the straight pose first.
 
         Raises:
             UnreachableError: a point of a tip path is out of reach.
@@ -204,11 +228,13 @@ class Motion:
             time, angles = self._joint_motion(limb.segment_count)
         else:
             time, angles = self._tip_motion(limb)
-        spline = resting_spline(time, angles)
+        if start is not None:
+            time, angles = _led_in(limb, start, time, angles)
+        spline = resting_spline(time, angles, start)
         count = round(time[-1] / CONTROL_PERIOD) + 1
         instants = np.arange(count) * CONTROL_PERIOD
         sampled = sample_spline(spline, instants)[0]
-        return Reference(instants, ArcKinematics(limb).tip(sampled), sampled, spline)
+        return Reference(instants, ArcKinematics(limb).tip(sampled), sampled, spline, start)
 
     def _joint_motion(self, segments: int) -> tuple[Vector, Vector]:
         total = self.cycles * self.period
@@ -283,6 +309,17 @@ def quintic(
     return result
 
 
+def _led_in(
+    limb: Limb, start: Start, time: Vector, angles: Vector
+) -> tuple[Vector, Vector]:
+    """Return time and angles with the way from another motion to the straight pose before them."""
+    zero = np.zeros(limb.segment_count)
+    state = (start.bend_angles, start.rate, start.acceleration)
+    lead = _fine_grid(_travel_time(limb, state))
+    way = quintic(lead, *state, zero, zero, zero)
+    return np.append(lead, lead[-1] + time[1:]), np.concatenate([way, angles[1:]])
+
+
 def _on_grid(span: float) -> float:
     """Return a span rounded up to whole control periods."""
     return math.ceil(span / CONTROL_PERIOD - 1e-9) * CONTROL_PERIOD
@@ -298,6 +335,6 @@ def _travel_time(limb: Limb, state: tuple[Vector, Vector, Vector]) -> float:
     fastest = 0.5 * limb.pneumatics.slew_limit * limb.static_gain
     angle, rate, acceleration = (np.abs(part) for part in state)
     by_angle = np.max(1.875 * angle / fastest)
-    by_rate = np.max(np.sqrt(angle * 0) + 2 * rate / fastest)
+    by_rate = np.max(2 * rate / fastest)
     by_acceleration = np.max(np.sqrt(acceleration / fastest))
     return _on_grid(max(1.0, by_angle, by_rate, by_acceleration))

@@ -22,14 +22,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_factor, cho_solve
 
 from der_planner import actuation
 from der_planner.limb import Limb
 from der_planner.planning import pneumatics
-from der_planner.planning.motions import CONTROL_PERIOD, sample_spline
+from der_planner.planning.motions import CONTROL_PERIOD, Reference, sample_spline
 from der_planner.planning.quadratic import Band, solve_limited
 from der_planner.planning.rod_model import RodModel
 from der_planner.rod import ConvergenceError, RodState
@@ -139,10 +139,9 @@ class Optimiser:
     Args:
         model: the rod.
         spline: bend angles along the motion.
-        tip: (K, 2) r̄ [m].
+        reference: r̄, and where the motion starts.
         warm: (K, M) commands of `projected`, before limits [Pa].
         substeps: integrator steps a command.
-        initial: (M,) command before the first one [Pa].
         settings: weights and sizes.
     """
 
@@ -150,27 +149,28 @@ class Optimiser:
         self,
         model: RodModel,
         spline: BSpline,
-        tip: Vector,
+        reference: Reference,
         warm: Vector,
         substeps: int,
-        initial: ArrayLike | None = None,
         settings: Settings | None = None,
     ) -> None:
         self.model = model
         self.settings = settings or Settings()
-        self.target = np.concatenate([tip[1:], tip[-1:]])
+        self.target = np.concatenate([reference.tip[1:], reference.tip[-1:]])
         self.warm = warm
         count, inputs = warm.shape
-        self.before = np.zeros(inputs) if initial is None else np.array(initial, dtype=float)
+        start = reference.start
+        self.before = np.zeros(inputs) if start is None else start.pressure
+        self.start = model.rest if start is None else model.state(spline(0.0), spline(0.0, 1))
         self.actuation = Actuation(model.limb, spline, count, substeps, self.before)
         self._pulse = self.actuation.pulse(inputs)
 
     def run(self, progress: Callable[[float], None] = lambda _share: None) -> Outcome:
-        """Solve all windows from the resting rod."""
+        """Solve all windows, one after the other."""
         air = self.model.limb.pneumatics
         count = len(self.warm)
         command, _ = pneumatics.within_limits(self.warm, air, CONTROL_PERIOD, self.before)
-        state = self.model.rest if not self.before.any() else self.model.rod.equilibrium(self.before)
+        state = self.start
         tip = np.empty((count, 2))
         first, steps, limited = 0, 0, 0
         while first < count:

@@ -6,7 +6,7 @@ import time as clock
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from der_planner import actuation
@@ -14,7 +14,7 @@ from der_planner.limb import Limb
 from der_planner.planning import models, pneumatics
 from der_planner.planning.errors import PlanningError
 from der_planner.planning.models import METHODS, PlanningModel
-from der_planner.planning.motions import CONTROL_PERIOD, Motion, Reference, sample_spline
+from der_planner.planning.motions import CONTROL_PERIOD, Motion, Reference, Start, sample_spline
 from der_planner.planning.optimal import Optimiser
 from der_planner.planning.result import Plan
 from der_planner.planning.rod_model import NODES, RodModel
@@ -35,7 +35,7 @@ def plan(
     method: str = "",
     *,
     nodes: int = NODES,
-    initial: ArrayLike | None = None,
+    start: Start | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Plan:
     """Plan the chamber pressures for a motion.
@@ -47,7 +47,7 @@ def plan(
         method: ``paper``, ``projected`` or ``optimal`` for the rod, ``paper`` for PCC; empty takes the
             model's default.
         nodes: of the rod.
-        initial: (M,) differential pressure in force when the plan begins [Pa]; vented if None.
+        start: where another motion is left; None: at rest, vented.
         progress: called with the share that is done, 0 … 1.
 
     Returns:
@@ -61,7 +61,7 @@ def plan(
     method = choose_method(model, method)
     report = progress or (lambda share: None)
     physics = models.build(limb, model, nodes)
-    reference = motion.reference(limb)
+    reference = motion.reference(limb, start)
     report(0.1)
     spline = physics.configuration(reference)
     report(0.3)
@@ -70,19 +70,20 @@ def plan(
     wanted = feedforward(physics, spline, reference, "projected" if optimal else method)
     report(0.4)
     if optimal and isinstance(physics, RodModel):
-        solver = Optimiser(physics, spline, reference.tip, wanted, SUBSTEPS, initial)
+        solver = Optimiser(physics, spline, reference, wanted, SUBSTEPS)
         outcome = solver.run(lambda share: report(0.4 + 0.6 * share))
         commands, tip, cut = outcome.commands, outcome.tip, 0.0
         details = {"steps": outcome.steps, "limited_windows": outcome.limited}
     else:
-        commands, cut = pneumatics.within_limits(wanted, limb.pneumatics, CONTROL_PERIOD, initial)
-        tip = predict(physics, spline, commands, initial)
+        before = None if start is None else start.pressure
+        commands, cut = pneumatics.within_limits(wanted, limb.pneumatics, CONTROL_PERIOD, before)
+        tip = predict(physics, spline, commands, start)
     bend = sample_spline(spline, reference.time)[0]
     report(1.0)
     return Plan(
         time=reference.time,
         differential_pressure=commands,
-        tip_reference=reference.tip,
+        reference=reference,
         tip_predicted=tip,
         bend_angles=bend,
         motion=motion.name,
@@ -120,7 +121,7 @@ def feedforward(
 ) -> Vector:
     """Return the commands (K, M) [Pa] that a balance of forces asks for, before any limit."""
     ahead = CONTROL_PERIOD + physics.limb.pneumatics.delay
-    count = int(np.ceil((reference.duration + ahead) / CONTROL_PERIOD * _FINE)) + 1
+    count = int(np.ceil((reference.duration + ahead) / CONTROL_PERIOD * _FINE - 1e-6)) + 1
     fine = np.arange(count) * (CONTROL_PERIOD / _FINE)
     fine[-1] = reference.duration + ahead
     q, v, a = sample_spline(spline, fine)
@@ -129,12 +130,14 @@ def feedforward(
 
 
 def predict(
-    physics: PlanningModel, spline: BSpline, commands: Vector, initial: ArrayLike | None = None
+    physics: PlanningModel, spline: BSpline, commands: Vector, start: Start | None = None
 ) -> Vector:
     """Return the tip (K, 2) [m] that the model expects under commands, with the chambers' lag."""
     air = physics.limb.pneumatics
-    chambers = pneumatics.chamber_pressures(air, commands, CONTROL_PERIOD, SUBSTEPS, initial)
-    return physics.simulate(effective_pressures(physics.limb, spline, chambers), CONTROL_PERIOD)
+    before = None if start is None else start.pressure
+    chambers = pneumatics.chamber_pressures(air, commands, CONTROL_PERIOD, SUBSTEPS, before)
+    effective = effective_pressures(physics.limb, spline, chambers)
+    return physics.simulate(effective, CONTROL_PERIOD, None if start is None else spline)
 
 
 def effective_pressures(limb: Limb, spline: BSpline, chambers: Vector) -> Vector:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from der_planner.limb import Limb
 from der_planner.planning.kinematics import Kinematics
+from der_planner.planning.motions import Reference
 
 Vector = NDArray[np.float64]
 
@@ -20,7 +21,7 @@ class Plan:
     Attributes:
         time: (K,) instants of the setpoints since the first [s].
         differential_pressure: (K, M) commands, each held until the next [Pa].
-        tip_reference: (K, 2) r̄ at these instants [m].
+        reference: r̄ and q̄ as functions of time.
         tip_predicted: (K, 2) tip of the model under these commands, with the chambers' lag [m].
         bend_angles: (K, M) of the model's reference configuration [rad].
         motion, model, method: what was asked for.
@@ -34,7 +35,7 @@ class Plan:
 
     time: Vector
     differential_pressure: Vector
-    tip_reference: Vector
+    reference: Reference
     tip_predicted: Vector
     bend_angles: Vector
     motion: str
@@ -48,6 +49,11 @@ class Plan:
     solve_time: float
     warnings: tuple[str, ...] = ()
     details: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def tip_reference(self) -> Vector:
+        """(K, 2) r̄ at the setpoints [m]."""
+        return self.reference.tip
 
     def curve(self, index: int) -> Vector:
         """Return the centreline (P, 2) [m] of the reference configuration at a setpoint."""

@@ -10,7 +10,7 @@ from der_planner.limb import Limb
 from der_planner.planning.inverse import check_reach, solve
 from der_planner.planning.kinematics import PolylineKinematics
 from der_planner.planning.motions import Reference, resting_spline
-from der_planner.rod import Rod
+from der_planner.rod import Rod, RodState
 
 Vector = NDArray[np.float64]
 
@@ -45,10 +45,10 @@ class RodModel:
         time, tip, guess = reference.time, reference.tip, reference.bend_angles
         if self.limb.segment_count == 1:
             # One angle cannot follow two coordinates: the rod bends as the arc does.
-            return resting_spline(time, guess)
+            return resting_spline(time, guess, reference.start)
         angles, distances = solve(self.kinematics, tip, guess, REFERENCE_PRIOR)
         check_reach(self.limb, self.kinematics, time, tip, angles, distances)
-        return resting_spline(time, angles)
+        return resting_spline(time, angles, reference.start)
 
     def pressures(self, method: str, q: Vector, v: Vector, a: Vector) -> Vector:
         """Return effective pressures (K, M) [Pa] by the method ``paper`` or ``projected``."""
@@ -56,14 +56,25 @@ class RodModel:
             return self.paper_pressures(q, v, a)
         return self.projected_pressures(q, v, a)
 
-    def simulate(self, pressures: Vector, period: float) -> Vector:
-        """Return the tip (K, 2) [m] at the start of each interval, from rest.
+    def state(self, angles: Vector, rates: Vector) -> RodState:
+        """Return the rod evenly bent, at bend angles and rates (M,) [rad], [rad/s]."""
+        position, velocity, _ = self.kinematics.motion(angles, rates, np.zeros_like(rates))
+        q = self.rod.straight_state().q
+        v = np.zeros_like(q)
+        for axis in range(2):
+            q[axis::4], v[axis::4] = position[:, axis], velocity[:, axis]
+        return self.rod.state(q, v, like=self.rest)
+
+    def simulate(self, pressures: Vector, period: float, spline: BSpline | None = None) -> Vector:
+        """Return the tip (K, 2) [m] at the start of each interval.
 
         Args:
             pressures: (K, S, M) effective pressures of each integrator step [Pa].
             period: of an interval [s].
+            spline: bend angles of a motion whose beginning is the start; None: from rest.
         """
-        motion = self.rod.simulate(self.rest, pressures, period, substeps=pressures.shape[1])
+        state = self.rest if spline is None else self.state(spline(0.0), spline(0.0, 1))
+        motion = self.rod.simulate(state, pressures, period, substeps=pressures.shape[1])
         tip: Vector = motion.tip[:-1, :2]
         return tip
 

@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from der_planner.planning.motions import Start
 from der_planner.planning.result import Plan
 
 GRID = 50_000_000
@@ -34,6 +35,15 @@ class Schedule:
     def stamp(self, index: int) -> int:
         """Return the stamp of a setpoint [ns]."""
         return self.start + index * GRID
+
+    def leave(self, stamp: int) -> Start | None:
+        """Return where the motion is at an instant [ns]; None before it starts and after it ends."""
+        index = (stamp - self.start) // GRID
+        if not 0 < index < self.count:
+            return None
+        angles, rate, acceleration = self.plan.reference.sample(self.plan.time[index])
+        before = self.plan.differential_pressure[index - 1]
+        return Start(angles, rate, acceleration, before)
 
     @property
     def count(self) -> int:

@@ -1,0 +1,302 @@
+"""Plans: the methods' identities, limits, determinism, hand-over from one motion to the next."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from der_planner.limb import CalibratedRange, Limb
+from der_planner.planning import METHODS, Motion, PlanningError, Start, UnreachableError, plan
+from der_planner.planning import pneumatics
+from der_planner.planning.inverse import static_pressure
+from der_planner.planning.rod_model import RodModel
+
+LIMB = Limb.default()
+CASES = ("asynchronous", "same_direction", "opposite_direction")
+EVERY = [(model, method) for model, methods in METHODS.items() for method in methods]
+
+
+def changed(limb, air=None, segment=None):
+    segments = tuple(
+        dataclasses.replace(s, **{k: v[i] for k, v in (segment or {}).items()})
+        for i, s in enumerate(limb.segments)
+    )
+    return dataclasses.replace(
+        limb, segments=segments, pneumatics=dataclasses.replace(limb.pneumatics, **(air or {}))
+    )
+
+
+UNEVEN = changed(
+    LIMB,
+    {"delay": 0.03, "vent_time_constant": 0.2},
+    {
+        "length": (0.115, 0.129),
+        "bending_stiffness": (0.0175, 0.019),
+        "rest_curvature": (0.2, -0.1),
+        "cubic_stiffness": (4e-6, 0.0),
+        "material_damping": (0.02, 0.01),
+        "moment_gain": (9.1e-6, 8.2e-6),
+        "gain_asymmetry": (0.05, -0.04),
+        "pressure_stiffening": (2e-6, 1e-6),
+        "friction_moment": (4e-3, 0.0),
+        "friction_curvature": (0.3, 0.0),
+        "creep_stiffness": (1e-3, 0.0),
+        "creep_time": (8.0, 0.0),
+    },
+)
+FREE = changed(LIMB, {"slew_limit": 1e6, "pressure_limit": 1e5})
+
+
+@pytest.fixture(scope="module")
+def model():
+    return RodModel(UNEVEN)
+
+
+def full_force(model, k, q, v, a):
+    """M q̈ + D q̇ − F_int − F_ext of the rod itself, in its full layout."""
+    rod = model.rod
+    position, velocity, acceleration = (part[k] for part in model.kinematics.motion(q, v, a))
+    x, xd, xdd = rod.straight_state().q, np.zeros(4 * rod.nodes - 1), np.zeros(4 * rod.nodes - 1)
+    for axis in range(2):
+        x[axis::4], xd[axis::4], xdd[axis::4] = (
+            part[:, axis] for part in (position, velocity, acceleration)
+        )
+    state = rod.state(x, xd)
+    # f(x) holds every force but the couples; velocity damping included.
+    drift, _ = rod.control_affine(state)
+    mass = rod.mass_diagonal[rod.free]
+    return state, mass * (xdd[rod.free] - drift[len(rod.free) :])
+
+
+def test_needed_forces_are_those_of_the_rod(model):
+    rng = np.random.default_rng(1)
+    q, v, a = rng.normal(size=(3, 4, 2))
+    force = model._needed_force(q, v, a)[:, 1:]
+    inputs = model._input_matrix(q)
+    for k in range(4):
+        state, exact = full_force(model, k, q, v, a)
+        np.testing.assert_allclose(force[k].ravel(), exact, atol=1e-9 * np.abs(exact).max())
+        matrix = model.rod.input_matrix(state)[model.rod.free]
+        np.testing.assert_allclose(inputs[k], matrix, atol=1e-15)
+
+
+def test_projected_pressures_leave_no_virtual_work(model):
+    rng = np.random.default_rng(2)
+    q, v, a = rng.normal(size=(3, 4, 2))
+    pressures = model.projected_pressures(q, v, a)
+    for k in range(4):
+        state, needed = full_force(model, k, q, v, a)
+        supplied = model.rod.input_matrix(state)[model.rod.free] @ pressures[k]
+        tangents = model.rod.configuration_from_bend_angles(q[k])[1][model.rod.free]
+        work = tangents.T @ (needed - supplied)
+        assert np.abs(work).max() < 1e-10 * np.abs(tangents.T @ needed).max() + 1e-14
+
+
+def test_paper_pressures_are_the_least_squares_solution(model):
+    rng = np.random.default_rng(3)
+    q, v, a = rng.normal(size=(3, 3, 2))
+    pressures = model.paper_pressures(q, v, a)
+    for k in range(3):
+        state, needed = full_force(model, k, q, v, a)
+        matrix = model.rod.input_matrix(state)[model.rod.free]
+        best = np.linalg.lstsq(matrix, needed, rcond=None)[0]
+        np.testing.assert_allclose(pressures[k], best, rtol=1e-8)
+
+
+@pytest.mark.parametrize("method", ["paper", "projected"])
+def test_at_rest_every_method_is_the_static_inversion(method, model):
+    rng = np.random.default_rng(4)
+    angles = rng.uniform(-1.0, 1.0, size=(5, 2))
+    zero = np.zeros_like(angles)
+    pressures = model.pressures(method, angles, zero, zero)
+    for wanted, pressure in zip(angles, pressures, strict=True):
+        resting = model.rod.equilibrium(pressure)
+        np.testing.assert_allclose(model.rod.bend_angles(resting), wanted, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_paper_becomes_the_static_inversion_as_speed_goes_to_zero(name):
+    model = RodModel(LIMB)
+    gaps = []
+    for period in (10.0, 20.0, 40.0):
+        reference = Motion.named(name, period=period, cycles=1).reference(LIMB)
+        q, v, a = reference.sample(reference.time)
+        moving = model.paper_pressures(q, v, a)
+        resting = model.paper_pressures(q, 0 * v, 0 * a)
+        gaps.append(np.abs(moving - resting).max())
+    # Inertia falls with the square of speed, damping with speed.
+    assert gaps[0] > 1.8 * gaps[1] > 3.2 * gaps[2]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_projected_beats_paper_and_optimal_beats_both(name):
+    errors = {
+        method: plan(FREE, Motion.named(name, period=6.0, cycles=1), "der", method).predicted_error
+        for method in METHODS["der"]
+    }
+    assert errors["projected"] < 0.4 * errors["paper"]
+    assert errors["optimal"] < 0.1 * errors["projected"]
+    assert errors["optimal"] < 1e-5
+
+
+@pytest.mark.parametrize(("model_name", "method"), EVERY)
+def test_a_calibrated_limb_with_every_effect_is_followed(model_name, method):
+    """What the planner assumes of chambers, friction and creep it also inverts."""
+    result = plan(UNEVEN, Motion.named("asynchronous", period=8.0, cycles=1), model_name, method)
+    bound = {"paper": 2.5e-3, "projected": 1.5e-3, "optimal": 2e-4}[method]
+    assert result.predicted_error < bound
+
+
+@pytest.mark.parametrize(("model_name", "method"), EVERY)
+@pytest.mark.parametrize("name", ["same_direction", "star"])
+def test_limits_are_never_violated(model_name, method, name):
+    limb = changed(LIMB, {"slew_limit": 7000.0, "fill_rate": 7000.0, "pressure_limit": 21e3})
+    result = plan(limb, Motion.named(name, period=3.0, cycles=1), model_name, method)
+    steps = np.diff(result.differential_pressure, axis=0, prepend=0.0)
+    assert np.abs(result.differential_pressure).max() <= 21e3 + 1e-6
+    assert np.abs(steps).max() <= 7000.0 * 0.05 + 1e-6
+    assert result.slew_margin > -1e-3
+    if method != "optimal":
+        assert any("limits cut" in warning for warning in result.warnings)
+
+
+def test_optimal_uses_what_the_limits_leave_better_than_cutting():
+    motion = Motion.named("opposite_direction", period=3.0, cycles=1)
+    cut = plan(LIMB, motion, "der", "projected")
+    best = plan(LIMB, motion, "der", "optimal")
+    assert best.predicted_error < 0.25 * cut.predicted_error
+    assert best.details["limited_windows"] > 0
+
+
+@pytest.mark.parametrize(("model_name", "method"), EVERY)
+def test_plans_are_deterministic(model_name, method):
+    motion = Motion.named("asynchronous", period=4.0, cycles=1)
+    first, second = (plan(LIMB, motion, model_name, method) for _ in range(2))
+    np.testing.assert_array_equal(first.differential_pressure, second.differential_pressure)
+    np.testing.assert_array_equal(first.tip_predicted, second.tip_predicted)
+
+
+def test_all_models_get_the_same_reference():
+    motion = Motion.named("opposite_direction", period=4.0, cycles=1)
+    plans = [plan(LIMB, motion, *which) for which in EVERY]
+    for other in plans[1:]:
+        np.testing.assert_array_equal(plans[0].tip_reference, other.tip_reference)
+        np.testing.assert_array_equal(plans[0].time, other.time)
+    assert {(p.model, p.method) for p in plans} == set(EVERY)
+
+
+def test_a_plan_begins_and_ends_vented():
+    result = plan(LIMB, Motion.named("asynchronous", period=6.0, cycles=1), "der", "optimal")
+    assert np.abs(result.differential_pressure[[0, -1]]).max() < 50.0
+
+
+@pytest.mark.parametrize(("model_name", "method"), EVERY)
+def test_a_plan_takes_over_from_a_moving_limb(model_name, method):
+    first = Motion.named("asynchronous", amplitude=0.5, period=8.0, cycles=1)
+    before = plan(LIMB, first, model_name, method)
+    reference = first.reference(LIMB)
+    k = 70
+    angles, rates, accelerations = reference.sample(reference.time[k])
+    start = Start(angles, rates, accelerations, before.differential_pressure[k - 1])
+    motion = Motion.named("same_direction", amplitude=0.4, period=6.0, cycles=1)
+    after = plan(LIMB, motion, model_name, method, start=start)
+    joined = np.vstack([before.differential_pressure[:k], after.differential_pressure])
+    assert np.abs(np.diff(joined, axis=0)).max() <= LIMB.pneumatics.slew_limit * 0.05 + 1e-6
+    np.testing.assert_allclose(after.tip_reference[0], before.tip_reference[k], atol=1e-9)
+    assert after.largest_error < 4e-3
+
+
+def test_three_segments_with_gravity():
+    segment = LIMB.segments[0]
+    limb = dataclasses.replace(LIMB, segments=(segment,) * 3, gravity=(0.3, -0.2, 0.0))
+    motion = Motion.named("same_direction", amplitude=0.4, period=10.0, cycles=1)
+    paper = plan(limb, motion, "der", "projected", nodes=31)
+    best = plan(limb, motion, "der", "optimal", nodes=31)
+    assert best.differential_pressure.shape == (len(best.time), 3)
+    assert best.predicted_error < 0.2 * paper.predicted_error
+    assert plan(limb, motion, "pcc").predicted_error < 2e-3
+
+
+def test_one_segment():
+    limb = dataclasses.replace(LIMB, segments=LIMB.segments[:1])
+    motion = Motion.named("asynchronous", period=6.0, cycles=1)
+    for which in EVERY:
+        result = plan(limb, motion, *which, nodes=12)
+        assert result.differential_pressure.shape == (len(result.time), 1)
+        assert result.predicted_error < 3e-3
+
+
+def test_warnings_name_what_the_calibration_did_not_cover():
+    limb = dataclasses.replace(LIMB, calibrated=CalibratedRange((8e3, 8e3), (0.4, 0.9)))
+    result = plan(limb, Motion.named("same_direction", period=20.0, cycles=1), "der", "projected")
+    assert any("segment 0 bends by 4" in w and "covered 23" in w for w in result.warnings)
+
+
+def test_pcc_uses_its_own_identified_segments():
+    softer = tuple(dataclasses.replace(s, moment_gain=2 * s.moment_gain) for s in LIMB.segments)
+    limb = dataclasses.replace(LIMB, pcc_segments=softer)
+    motion = Motion.named("same_direction", period=20.0, cycles=1)
+    plain, own = plan(LIMB, motion, "pcc"), plan(limb, motion, "pcc")
+    np.testing.assert_allclose(
+        own.differential_pressure, plain.differential_pressure / 2, rtol=1e-6, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize(
+    ("model_name", "method", "message"),
+    [
+        ("fem", "", "model 'fem' is unknown: choose der or pcc"),
+        ("der", "magic", "no method 'magic': choose paper, projected, optimal"),
+        ("pcc", "optimal", "the model 'pcc' has no method 'optimal': choose paper"),
+    ],
+)
+def test_unknown_models_and_methods_are_named(model_name, method, message):
+    with pytest.raises(PlanningError, match=message):
+        plan(LIMB, Motion.named("asynchronous"), model_name, method)
+
+
+@pytest.mark.parametrize("which", EVERY)
+def test_too_large_an_amplitude_is_refused_by_all(which):
+    with pytest.raises(UnreachableError, match="out of reach"):
+        plan(LIMB, Motion.named("same_direction", amplitude=1.7), *which)
+
+
+def test_cancelling_by_progress_ends_the_planning():
+    class Stop(Exception):
+        pass
+
+    def progress(share):
+        if share > 0.3:
+            raise Stop
+
+    with pytest.raises(Stop):
+        plan(LIMB, Motion.named("asynchronous"), "der", "optimal", progress=progress)
+
+
+def test_held_commands_reach_the_chambers_as_the_lag_says():
+    air = changed(LIMB, {"delay": 0.02}).pneumatics
+    command = np.zeros((40, 1))
+    command[4:] = 1000.0
+    chambers = pneumatics.chamber_pressures(air, command, 0.05, 10)
+    time = ((np.arange(400) + 0.5) * 0.005).reshape(40, 10, 1) - 0.2 - 0.02
+    exact = np.where(time > 0, 1000.0 * (1 - np.exp(-time / air.time_constant)), 0.0)
+    np.testing.assert_allclose(chambers, exact, atol=1e-9)
+
+
+def test_commands_invert_hold_lag_and_delay():
+    limb = changed(LIMB, {"delay": 0.03})
+    fine = np.arange(401) * 0.025
+    wanted = np.column_stack([4e3 * (1 - np.cos(fine)), 2e3 * np.sin(0.7 * fine) ** 2])
+    bend = np.zeros_like(wanted)
+    command = pneumatics.commands(limb, fine, wanted, bend, 0.05)
+    chambers = pneumatics.chamber_pressures(limb.pneumatics, command, 0.05, 5)
+    middle = (np.arange(len(command) * 5) + 0.5) * 0.01
+    exact = np.column_stack([np.interp(middle, fine, column) for column in wanted.T])
+    assert np.abs(chambers.reshape(-1, 2) - exact)[50:].max() < 60.0
+
+
+def test_static_pressure_holds_the_angles_of_the_rod():
+    angles = np.array([0.5, -0.6])
+    rod = RodModel(LIMB).rod
+    resting = rod.equilibrium(static_pressure(LIMB, angles))
+    np.testing.assert_allclose(rod.bend_angles(resting), angles, rtol=2e-3)
