@@ -121,7 +121,12 @@ def test_a_partly_covered_side_moves_corners_little(detector, tags, model, cover
     a, b, c, d = corners
     outer = a + 0.3 * (b - a), a + (0.3 + cover) * (b - a)
     away = (a - d) / np.linalg.norm(a - d)
-    polygon = [outer[0] + 6 * away, outer[1] + 6 * away, outer[1] - 1.5 * away, outer[0] - 1.5 * away]
+    polygon = [
+        outer[0] + 6 * away,
+        outer[1] + 6 * away,
+        outer[1] - 1.5 * away,
+        outer[0] - 1.5 * away,
+    ]
     found = {tag.id: tag for tag in detector.detect(camera.frame(shape, covers=[polygon]).image)}
     if 2 in found:  # the code may be lost; a wrong corner may not come
         assert np.abs(found[2].corners - corners).max() < 0.25

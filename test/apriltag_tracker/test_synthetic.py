@@ -87,7 +87,9 @@ def test_motion_blur_is_the_mean_of_sharp_pictures(model, tags):
     still = np.zeros_like(shape.heading)
     motion = np.tile([0.0, 0.6], (len(still), 1))
     optics = Optics(noise=0.0, exposure=0.01)
-    blurred = SyntheticCamera(model, tags, optics).frame(shape, Shape(shape.arc_length, motion, still))
+    blurred = SyntheticCamera(model, tags, optics).frame(
+        shape, Shape(shape.arc_length, motion, still)
+    )
     camera = SyntheticCamera(model, tags, Optics(noise=0.0, exposure=0.0))
     sharp = []
     for share in np.linspace(-0.5, 0.5, 41):

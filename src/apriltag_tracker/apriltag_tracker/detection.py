@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from apriltag_tracker import edges, family
+from apriltag_tracker import decoding, edges, family
 
 SMALLEST_TAG = 12.0
 """Shortest side that is looked for [px]; a cell is 1.5 px then."""
@@ -107,10 +108,6 @@ class Detector:
         self.largest_residual = largest_residual
         check_orientation()
 
-    @functools.cached_property
-    def _codes(self) -> NDArray[np.uint8]:
-        return family.codes()
-
     def warm_up(self) -> None:
         """Load or compile everything a first image would wait for."""
         canvas = np.full((96, 96), 255, dtype=np.uint8)
@@ -125,9 +122,17 @@ class Detector:
         Raises:
             ValueError: not such an image.
         """
-        image = grey(gray)
-        ids, quads = find_quads(image, self.smallest)
-        return self.confirm(image, ids, quads, search=3.0, found_by="full")
+        return self.search(grey(gray), "full")
+
+    def search(self, image: NDArray[np.uint8], found_by: str, scale: int = 1) -> list[Tag]:
+        """Find tags in a grey image that may have been enlarged by a whole number.
+
+        Corners belong to the image as given. Quadrilaterals whose code OpenCV does not read are
+        read again at their refined corners, where many more are readable.
+        """
+        ids, quads, others = find_quads(image, self.smallest * scale)
+        tags = self.confirm(image, ids, quads, 3.0 * scale, found_by)
+        return tags + self._read_again(image, others, tags, found_by)
 
     def confirm(
         self,
@@ -150,9 +155,42 @@ class Detector:
             return []
         corners, stats, found = refine(image, quads, search)
         distance = np.empty(len(ids), dtype=np.int64)
-        edges.hamming_of_quads(image, corners, self._codes[ids], found, distance)
+        decoding.distances(image, corners, decoding.code_table()[0, ids], found, distance)
+        return self._collect(ids, corners, stats, found & (distance <= self.correct_bits), found_by)
+
+    def _read_again(
+        self,
+        image: NDArray[np.uint8],
+        quads: NDArray[np.float64],
+        known: Sequence[Tag],
+        found_by: str,
+    ) -> list[Tag]:
+        """Refine quadrilaterals (n, 4, 2) that OpenCV could not read, and read them."""
+        for tag in known:
+            apart = np.hypot(*(quads.mean(axis=1) - tag.corners.mean(axis=0)).T)
+            quads = quads[apart > 0.5 * tag.pixel_size]
+        if len(quads) == 0:
+            return []
+        corners, stats, found = refine(image, quads, 3.0)
+        ids, turns, distance = (np.zeros(len(quads), dtype=np.int64) for _ in range(3))
+        decoding.identify(image, corners, decoding.code_table(), found, ids, turns, distance)
+        good = found & (distance <= self.correct_bits)
+        for i in np.flatnonzero(good):
+            corners[i] = np.roll(corners[i], -turns[i], axis=0)
+            stats[i] = np.roll(stats[i], -turns[i], axis=0)
+        return self._collect(ids, corners, stats, good, found_by)
+
+    def _collect(
+        self,
+        ids: NDArray[np.int64],
+        corners: NDArray[np.float64],
+        stats: NDArray[np.float64],
+        good: NDArray[np.bool_],
+        found_by: str,
+    ) -> list[Tag]:
+        """Put together those candidates whose border is straight and runs the right way round."""
         residuals = np.sqrt(np.mean(stats[:, :, 3] ** 2, axis=1))
-        good = found & (distance <= self.correct_bits) & (residuals <= self.largest_residual)
+        good = good & (residuals <= self.largest_residual)
         kept = [i for i in np.flatnonzero(good) if _counter_clockwise(corners[i])]
         spread = np.empty((len(kept), 8, 8))
         edges.corner_covariances(corners[kept], stats[kept], spread)
@@ -179,14 +217,27 @@ def _counter_clockwise(corners: NDArray[np.float64]) -> bool:
 
 def find_quads(
     image: NDArray[np.uint8], smallest: float
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Let OpenCV find tags; returns ids (n,) and corners (n, 4, 2) px, printed lower left first."""
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Let OpenCV find tags.
+
+    Returns:
+        ids (n,) and corners (n, 4, 2) px of tags, printed lower left first; and corners (m, 4, 2)
+        of quadrilaterals that it could not read, counter-clockwise as printed.
+    """
     detector = _opencv_detector(max(image.shape), smallest)
-    found, ids, _ = detector.detectMarkers(image)
+    found, ids, others = detector.detectMarkers(image)
+    rest = _quads(others)
     if ids is None or len(ids) == 0:
-        return np.empty(0, dtype=np.int64), np.empty((0, 4, 2))
-    quads = np.array([np.asarray(quad, dtype=np.float64).reshape(4, 2) for quad in found])
-    return np.asarray(ids, dtype=np.int64).ravel(), np.ascontiguousarray(quads[:, _FROM_OPENCV])
+        return np.empty(0, dtype=np.int64), np.empty((0, 4, 2)), rest
+    return np.asarray(ids, dtype=np.int64).ravel(), _quads(found), rest
+
+
+def _quads(found: Sequence[Any]) -> NDArray[np.float64]:
+    """Return OpenCV's quadrilaterals as an array (n, 4, 2) that runs as printed."""
+    if len(found) == 0:
+        return np.empty((0, 4, 2))
+    table = np.array([np.asarray(quad, dtype=np.float64).reshape(4, 2) for quad in found])
+    return np.ascontiguousarray(table[:, _FROM_OPENCV])
 
 
 @functools.lru_cache(maxsize=32)
@@ -199,9 +250,11 @@ def _opencv_detector(extent: int, smallest: float) -> Any:
     parameters.adaptiveThreshWinSizeMax = 13
     parameters.adaptiveThreshWinSizeStep = 10
     parameters.minCornerDistanceRate = 0.05
+    # Else the outline of the white sheet takes the place of the black border inside of it.
+    parameters.minMarkerDistanceRate = 0.02
     parameters.minDistanceToBorder = 2
     parameters.perspectiveRemovePixelPerCell = 4
-    parameters.errorCorrectionRate = 0.5
+    parameters.errorCorrectionRate = 1.0
     return cv2.aruco.ArucoDetector(family.dictionary(), parameters)
 
 
@@ -217,7 +270,7 @@ def check_orientation() -> None:
     canvas = np.full((100, 110), 255, dtype=np.uint8)
     cells = np.kron(family.printed_cells(0, margin=0), np.ones((scale, scale))).astype(np.uint8)
     canvas[top : top + 8 * scale, left : left + 8 * scale] = cells * 255
-    ids, quads = find_quads(canvas, 20.0)
+    ids, quads, _ = find_quads(canvas, 20.0)
     right, bottom = left + 8 * scale, top + 8 * scale
     expected = np.array([[left, bottom], [right, bottom], [right, top], [left, top]]) - 0.5
     if list(ids) != [0] or np.abs(quads[0] - expected).max() > 2.0:

@@ -37,7 +37,8 @@ def sample(image: NDArray[np.uint8], x: float, y: float) -> float:
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def _inside(image: NDArray[np.uint8], x: float, y: float) -> bool:
+def inside(image: NDArray[np.uint8], x: float, y: float) -> bool:
+    """Tell whether a point can be sampled."""
     return bool(0.0 <= x < image.shape[1] - 1.001 and 0.0 <= y < image.shape[0] - 1.001)
 
 
@@ -136,7 +137,7 @@ def _fit_side(
         along[i] = inset + i * spacing - 0.5 * length
         px, py = middle_x + along[i] * tx, middle_y + along[i] * ty
         x, y = px - window * nx, py - window * ny
-        if not (_inside(image, x, y) and _inside(image, px + window * nx, py + window * ny)):
+        if not (inside(image, x, y) and inside(image, px + window * nx, py + window * ny)):
             continue
         for k in range(_PROFILE):
             profile[k] = sample(image, x + k * step * nx, y + k * step * ny)
@@ -235,106 +236,6 @@ def refine_quads(
             found[i] = _refine_once(image, corners[i], fine, False, stats[i])
             if np.abs(corners[i] - before).max() < _SETTLED:
                 break
-
-
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def read_bits(
-    image: NDArray[np.uint8], corners: NDArray[np.float64], bits: NDArray[np.uint8]
-) -> float:
-    """Read the 6 x 6 cells of one tag whose corners are known.
-
-    Args:
-        image: grey image.
-        corners: (4, 2) px, lower left first, counter-clockwise as printed.
-        bits: (6, 6) output, upper row of the printed tag first, 1 is white.
-
-    Returns:
-        Distance of the cell nearest to the threshold from it, over the contrast; 0.5 is a clean
-        tag.
-    """
-    h = _square_to_quad(corners)
-    values = np.empty((8, 8))
-    for row in range(8):
-        for column in range(8):
-            u = (column + 0.5) / 8.0
-            v = 1.0 - (row + 0.5) / 8.0
-            w = h[6] * u + h[7] * v + 1.0
-            x = (h[0] * u + h[1] * v + h[2]) / w
-            y = (h[3] * u + h[4] * v + h[5]) / w
-            if not _inside(image, x, y):
-                return 0.0
-            values[row, column] = sample(image, x, y)
-    black = 0.0
-    for k in range(8):
-        black += values[0, k] + values[7, k] + values[k, 0] + values[k, 7]
-    black /= 32.0
-    white = 0.0
-    for row in range(1, 7):
-        for column in range(1, 7):
-            white = max(white, values[row, column])
-    middle = 0.5 * (black + white)
-    contrast = white - black
-    margin = 0.5
-    if contrast <= 8.0:
-        return 0.0
-    for row in range(6):
-        for column in range(6):
-            value = values[row + 1, column + 1]
-            bits[row, column] = 1 if value > middle else 0
-            margin = min(margin, abs(value - middle) / contrast)
-    for k in range(8):
-        for value in (values[0, k], values[7, k], values[k, 0], values[k, 7]):
-            if value > middle:
-                return 0.0
-    return margin
-
-
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _square_to_quad(c: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the projective map of the unit square onto a quadrilateral (Heckbert 1989)."""
-    dx1, dx2 = c[1, 0] - c[2, 0], c[3, 0] - c[2, 0]
-    dy1, dy2 = c[1, 1] - c[2, 1], c[3, 1] - c[2, 1]
-    sx = c[0, 0] - c[1, 0] + c[2, 0] - c[3, 0]
-    sy = c[0, 1] - c[1, 1] + c[2, 1] - c[3, 1]
-    determinant = dx1 * dy2 - dx2 * dy1
-    g = (sx * dy2 - dx2 * sy) / determinant
-    h = (dx1 * sy - sx * dy1) / determinant
-    out = np.empty(8)
-    out[0] = c[1, 0] - c[0, 0] + g * c[1, 0]
-    out[1] = c[3, 0] - c[0, 0] + h * c[3, 0]
-    out[2] = c[0, 0]
-    out[3] = c[1, 1] - c[0, 1] + g * c[1, 1]
-    out[4] = c[3, 1] - c[0, 1] + h * c[3, 1]
-    out[5] = c[0, 1]
-    out[6] = g
-    out[7] = h
-    return out
-
-
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def hamming(bits: NDArray[np.uint8], code: NDArray[np.uint8]) -> int:
-    """Count the cells in which two codes differ."""
-    count = 0
-    for row in range(bits.shape[0]):
-        for column in range(bits.shape[1]):
-            count += bits[row, column] != code[row, column]
-    return count
-
-
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def hamming_of_quads(
-    image: NDArray[np.uint8],
-    corners: NDArray[np.float64],
-    codes: NDArray[np.uint8],
-    found: NDArray[np.bool_],
-    distance: NDArray[np.int64],
-) -> None:
-    """Compare what quadrilaterals (n, 4, 2) show with the codes (n, 6, 6) expected of them."""
-    bits = np.zeros((6, 6), dtype=np.uint8)
-    for i in range(corners.shape[0]):
-        distance[i] = 36
-        if found[i] and read_bits(image, corners[i], bits) > 0.0:
-            distance[i] = hamming(bits, codes[i])
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from apriltag_tracker.detection import Detector, Tag, find_quads, grey
+from apriltag_tracker.detection import Detector, Tag, grey
 
 _TILE = 16
 """Tiles of the mosaic are padded to a multiple of this [px]."""
@@ -154,13 +154,14 @@ class TagTracker:
         found: list[Tag] = []
         for scale in (1, 2):
             searched = mosaic if scale == 1 else _sharpened(mosaic, scale)
-            ids, quads = find_quads(searched, self._detector.smallest * scale)
-            if len(ids) == 0:
+            seen = self._detector.search(searched, "region", scale)
+            if not seen:
                 continue
-            # Back to the whole image: a mosaic's tile, then the box it came from.
-            quads = (quads + 0.5) / scale - 0.5
+            # Back to the whole image, where the corners are refined in pixels as they came.
+            quads = (np.array([tag.corners for tag in seen]) + 0.5) / scale - 0.5
             quads = _from_mosaic(quads, boxes, corners)
-            found = self._detector.confirm(image, ids, quads, 3.0, "region")
+            ids = np.array([tag.id for tag in seen], dtype=np.int64)
+            found = self._detector.confirm(image, ids, quads, 1.5, "region")
             if {tag.id for tag in found} >= set(lost):
                 break
         return found
