@@ -72,6 +72,19 @@ def test_metadata_says_what_rosbag2_needs(tmp_path: Path):
         assert reader.duration == 3 * SECOND + 1
 
 
+def test_bytes_behind_the_content_are_no_damage_but_missing_ones_are(tmp_path: Path):
+    """As rclpy's serialize_message leaves them after empty sequences of doubles."""
+    bag = BagWriter(tmp_path / "run")
+    bag.add_topic(spec("/talk", TEXT))
+    bag.write("/talk", START, START, string("whole") + bytes(8))
+    bag.write("/talk", START + 1, START, string("cut short")[:-4])
+    with BagReader(bag.close()) as reader:
+        messages = reader.messages()
+        assert next(messages)[2].data == "whole"
+        with pytest.raises(Exception, match="String|string|Truncated|size"):
+            next(messages)
+
+
 @pytest.mark.parametrize("how", ["size", "time"])
 def test_split_repeats_latched_messages(tmp_path: Path, how: str):
     options = {"split_bytes": 20_000} if how == "size" else {"split_seconds": 2.0}

@@ -173,6 +173,7 @@ def _series(found: _Collected, run: dict[str, Any], path: Path, plan_id: str) ->
         board=_board(found, setpoints, origin),
         faults=tuple(dict.fromkeys(faults)),
         finished=played == len(times) - 1 and frames[-1] >= end - 1.0,
+        origin=origin,
     )
 
 

@@ -100,6 +100,7 @@ class RunSeries:
         board: only in bags of the twin.
         faults: reasons that the driver gave during the motion.
         finished: the motion was played to its last setpoint.
+        origin: ROS time of the first setpoint [ns]; 0 for a run without a bag.
     """
 
     description: Description
@@ -113,6 +114,7 @@ class RunSeries:
     board: BoardLog | None = None
     faults: tuple[str, ...] = ()
     finished: bool = True
+    origin: int = 0
 
     @classmethod
     def from_arrays(

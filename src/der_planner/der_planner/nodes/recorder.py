@@ -80,7 +80,11 @@ class Recorder(Node):
         declare("mark_label", "", "text of the next mark", read_only=False)
         declare("autostart", False, "start recording at once")
         declare("topics", ".*", "regular expression that the full topic names must match")
-        declare("exclude", "", "regular expression of full topic names to leave out; empty: none")
+        declare(
+            "exclude",
+            ".*/image_annotated",
+            "regular expression of full topic names to leave out; empty: none",
+        )
         declare(
             "compression",
             "auto",

@@ -17,6 +17,7 @@ from typing import Any
 import yaml
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
 from der_planner.recording.layout import METADATA_FILE, RUN_KEY
@@ -218,8 +219,22 @@ class BagReader:
     ) -> Iterator[tuple[str, int, Any]]:
         """Yield (topic, log time [ns], message) with arrays as numpy arrays; as `raw` otherwise."""
         for message in self.raw(topics, start, stop):
-            content = self._store.deserialize_cdr(message.data, message.type_name)
-            yield message.topic, message.log_time, content
+            yield message.topic, message.log_time, self._deserialize(message)
+
+    def _deserialize(self, message: RawMessage) -> Any:
+        try:
+            return self._store.deserialize_cdr(message.data, message.type_name)
+        except SerdeError:
+            # rclpy's serialize_message reserves space for the alignment of empty sequences and
+            # leaves it behind the content: more bytes than needed are no damage, fewer are.
+            definition = self._store.get_msgdef(message.type_name)
+            little = bool(message.data[1])
+            read = definition.deserialize_cdr_le if little else definition.deserialize_cdr_be
+            body = message.data[4:]
+            content, used = read(body, 0, definition.cls, self._store)
+            if used > len(body):
+                raise
+            return content
 
 
 def _leading_metadata(path: Path) -> dict[str, str]:

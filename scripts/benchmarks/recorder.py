@@ -1,0 +1,196 @@
+"""Recorder and evaluation: what is lost, what it costs, how fast bags are read."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from geometry_msgs.msg import Point
+from rclpy.serialization import serialize_message
+
+from der_msgs.msg import (
+    LimbState,
+    PressurePlan,
+    PressureSetpoint,
+    PressureState,
+    TagDetection,
+    TagDetectionArray,
+)
+from der_planner.evaluation import evaluate_bag
+from der_planner.recording.definitions import find_definition
+from der_planner.recording.layout import OfferedQos, TopicSpec
+from der_planner.recording.reader import BagReader
+from der_planner.recording.recover import recover_bag
+from der_planner.recording.writer import BagWriter
+from limb_interfaces.stamps import stamp_from_nanoseconds
+from orchestrator.processes import NodeProcess
+
+SOURCE = """
+import sys, time
+import numpy as np, rclpy
+from rclpy.node import Node
+from sensor_msgs.msg import Image
+from der_msgs.msg import LimbState, PressureState
+from limb_interfaces import qos, topics
+seconds = float(sys.argv[1])
+rclpy.init(args=[])
+node = Node("source", namespace=topics.NAMESPACE)
+image = node.create_publisher(Image, topics.IMAGE, qos.SENSOR_DATA)
+states = [node.create_publisher(LimbState, f"bench/state_{i}", qos.STATES) for i in range(6)]
+while not (image.get_subscription_count() and all(p.get_subscription_count() for p in states)):
+    time.sleep(0.05)
+time.sleep(1.0)
+pixels = np.random.default_rng(0).integers(0, 255, 1280 * 720, dtype=np.uint8)
+message = Image(height=720, width=1280, encoding="mono8", step=1280, data=pixels.tobytes())
+frames = round(30 * seconds)
+begin = time.monotonic()
+for index in range(frames):
+    message.header.frame_id = f"{index}"
+    image.publish(message)
+    for publisher in states:
+        publisher.publish(LimbState(reason=f"{index}"))
+    time.sleep(max(0.0, begin + (index + 1) / 30 - time.monotonic()))
+print(time.monotonic() - begin, flush=True)
+time.sleep(0.5)
+"""
+
+
+def _recorder(folder: Path, images: bool) -> NodeProcess:
+
+    parameters = {"output": str(folder / "bag"), "autostart": True, "record_images": images}
+    return NodeProcess("der_planner", "recorder", parameters, folder)
+
+
+def _play_source(seconds: float) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-c", SOURCE, str(seconds)], stdout=subprocess.PIPE, text=True
+    )
+
+
+def record_images(seconds: float) -> dict[str, float]:
+    """Record 720p mono8 images and six other topics at 30 Hz; count what is missing."""
+    with tempfile.TemporaryDirectory(dir=os.environ.get("BENCHMARK_FOLDER")) as name:
+        folder = Path(name)
+        process = _recorder(folder, images=True)
+        source = _play_source(seconds)
+        try:
+            time.sleep(2.0)
+            begin, used = time.monotonic(), process.measure_cpu()
+            source.wait(seconds + 60.0)
+            cpu = (process.measure_cpu() - used) / (time.monotonic() - begin)
+        finally:
+            source.kill()
+            process.stop(timeout=30.0)
+        with BagReader(folder / "bag") as bag:
+            counts = {n: t.message_count for n, t in bag.topics.items()}
+        size = sum(path.stat().st_size for path in (folder / "bag").glob("*.mcap"))
+    frames = round(30 * seconds)
+    states = [counts.get(f"/limb/bench/state_{i}", 0) for i in range(6)]
+    return {
+        "recorded_s": seconds,
+        "images_sent": frames,
+        "images_lost": frames - counts.get("/limb/camera/image_raw", 0),
+        "states_sent": 6 * frames,
+        "states_lost": 6 * frames - sum(states),
+        "recorder_cpu_percent_of_a_core": 100 * cpu,
+        "written_MB_per_s": size / 1e6 / seconds,
+    }
+
+
+def kill_and_recover(seconds: float) -> dict[str, float]:
+    """Kill the recorder while it records images; how much time is missing at the end?"""
+    with tempfile.TemporaryDirectory(dir=os.environ.get("BENCHMARK_FOLDER")) as name:
+        folder = Path(name)
+        process = _recorder(folder, images=True)
+        source = _play_source(seconds + 30.0)
+        try:
+            time.sleep(4.0 + seconds)
+            killed = time.time_ns()
+            process.signal(signal.SIGKILL)
+            process.stop()
+        finally:
+            source.kill()
+            source.wait()
+        begin = time.perf_counter()
+        report = recover_bag(folder / "bag")
+        took = time.perf_counter() - begin
+        with BagReader(folder / "bag") as bag:
+            lost = (killed - bag.end) / 1e9
+        size = sum(path.stat().st_size for path in (folder / "bag").glob("*.mcap"))
+    return {
+        "killed_lost_s": lost,
+        "recovered_messages": report.message_count,
+        "recover_s_per_GB": took / (size / 1e9),
+    }
+
+
+def evaluate_long_bag(minutes: float) -> dict[str, float]:
+    """Evaluate a bag of the graph's topics at their rates; time per recorded hour."""
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / "long"
+        _write_run(path, minutes * 60.0)
+        size = sum(file.stat().st_size for file in path.glob("*.mcap"))
+        begin = time.perf_counter()
+        result = evaluate_bag(path)
+        took = time.perf_counter() - begin
+    assert abs(result.mean_error_m - 0.005) < 1e-4
+    return {
+        "evaluated_bag_min": minutes,
+        "evaluated_bag_MB": size / 1e6,
+        "evaluation_s_per_recorded_hour": took * 60.0 / minutes,
+    }
+
+
+def _write_run(path: Path, seconds: float) -> None:
+    """Write a run with every topic that the evaluation reads, and tags that it must skip."""
+    origin = 1_700_000_000_000_000_000
+    bag = BagWriter(path)
+
+    def write(topic: str, message: object, when: float) -> None:
+        kind = f"der_msgs/msg/{type(message).__name__}"
+        if topic not in bag.topics:
+            found = find_definition(kind)
+            bag.add_topic(TopicSpec(topic, kind, found.text, found.type_hash, (OfferedQos(),)))
+        stamp = origin + round(when * 1e9)
+        message.header.stamp = stamp_from_nanoseconds(stamp)  # type: ignore[attr-defined]
+        bag.write(topic, stamp, stamp, serialize_message(message))
+
+    times = np.arange(0.0, seconds, 0.05)
+    tip = np.column_stack([0.2 + 0.02 * np.cos(times), 0.06 * np.sin(times)])
+    plan = PressurePlan(plan_id="p", motion="same_direction", model="der", segment_count=2)
+    plan.time, plan.tip_reference = times.tolist(), tip.ravel().tolist()
+    plan.tip_predicted, plan.differential_pressure = plan.tip_reference, [0.0] * 2 * len(times)
+    write("/limb/plan", plan, 0.0)
+    tags = [TagDetection(id=i) for i in range(12)]
+    curve = [Point() for _ in range(41)]
+    for frame in range(round(30 * seconds)):
+        when = frame / 30
+        x, y = 0.2 + 0.02 * np.cos(when) + 0.003, 0.06 * np.sin(when) - 0.004
+        state = LimbState(valid=True, tip=Point(x=x, y=y), bend_angle=[0.1, 0.1], curve=curve)
+        write("/limb/state", state, when)
+        write("/limb/tags", TagDetectionArray(detections=tags), when)
+        if frame % 3 < 2:
+            values = [1000.0, 1000.0]
+            pressure = PressureState(commanded_differential=values, measured_differential=values)
+            write("/limb/pressure_state", pressure, when)
+            index = min(len(times) - 1, round(when * 20))
+            setpoint = PressureSetpoint(plan_id="p", index=index, differential_pressure=values)
+            write("/limb/pressure_setpoint", setpoint, float(times[index]))
+    bag.close()
+
+
+def run(quick: bool) -> dict[str, float | str]:
+    """Measure; every figure has its unit in its name."""
+    figures: dict[str, float | str] = {}
+    figures |= record_images(8.0 if quick else 60.0)
+    figures |= kill_and_recover(3.0 if quick else 8.0)
+    figures |= evaluate_long_bag(2.0 if quick else 15.0)
+    for name, value in figures.items():
+        print(f"  {name:<36} {value:.4g}" if isinstance(value, float) else f"  {name:<36} {value}")
+    return figures
