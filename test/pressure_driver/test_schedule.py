@@ -76,6 +76,15 @@ def test_stamp_zero_is_the_next_tick():
     assert schedule.sample(NOW + 3 * PERIOD).fresh
 
 
+def test_of_two_untimed_commands_within_a_tick_the_newer_one_counts():
+    schedule = Schedule(ScheduleLimits())
+    schedule.sample(NOW)
+    for value in (500.0, 700.0):
+        assert offer(schedule, Setpoint(0, (value, 0.0)), NOW + 10**6) is Verdict.ACCEPTED
+    assert schedule.sample(NOW + PERIOD).differential == (700.0, 0.0)
+    assert schedule.counters.superseded == 1
+
+
 def test_late_ones_are_counted_and_refused():
     schedule = Schedule(ScheduleLimits())
     schedule.sample(NOW + 4 * PERIOD)

@@ -16,6 +16,7 @@ import select
 import termios
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
@@ -24,6 +25,7 @@ import serial
 from serial.tools import list_ports
 
 from pressure_driver.grid import NANOSECONDS, TickGrid
+from pressure_driver.realtime import prefer_thread
 
 FIRST_RETRY = 0.1
 """[s] after a lost port until it is looked for again."""
@@ -150,6 +152,10 @@ class SerialLink:
         """Whether the thread runs with real-time priority."""
         self.error: Exception | None = None
         """What ended the thread, if it did not end by `close`."""
+        self.lateness: deque[float] = deque(maxlen=1200)
+        """[s] from the instant of each of the last ticks to the thread's waking for it."""
+        self.hand_over: deque[float] = deque(maxlen=1200)
+        """[s] from the instant of each of the last ticks to the end of the write to the port."""
         self._client = client
         self._priority = real_time_priority
         self._log = log
@@ -196,7 +202,7 @@ class SerialLink:
 
     def _run(self) -> None:
         try:
-            self._prefer_this_thread()
+            self.real_time = prefer_thread(self._priority)
             self._opened()
             while not self._stop:
                 self._turn()
@@ -204,12 +210,6 @@ class SerialLink:
             self.error = error
         finally:
             self._say_goodbye()
-
-    def _prefer_this_thread(self) -> None:
-        if self._priority > 0:
-            with contextlib.suppress(OSError, PermissionError):
-                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(self._priority))
-                self.real_time = True
 
     def _turn(self) -> None:
         """Wait for bytes or the tick, and serve what came."""
@@ -219,9 +219,12 @@ class SerialLink:
         port = -1 if self._device is None else self._device.fileno()
         watched = [self._wake_read] if port < 0 else [self._wake_read, port]
         readable, _, _ = select.select(watched, [], [], delay)
-        instant = self.grid.take(time.time_ns(), time.monotonic_ns())
+        wall = time.time_ns()
+        instant = self.grid.take(wall, time.monotonic_ns())
         if instant is not None:
             self._write(self._client.tick(instant))
+            self.lateness.append((wall - instant) / NANOSECONDS)
+            self.hand_over.append((time.time_ns() - instant) / NANOSECONDS)
             self._client.sent(instant)
         if self._wake_read in readable:
             os.read(self._wake_read, 64)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import math
 import time
 from collections import deque
@@ -22,6 +21,7 @@ from pressure_driver.grid import TickGrid
 from pressure_driver.link import SerialLink
 from pressure_driver.node_parameters import read_parameters
 from pressure_driver.protocols import host_protocol
+from pressure_driver.realtime import prepare_process
 from pressure_driver.safety import Mode
 from pressure_driver.schedule import Setpoint, Verdict
 
@@ -71,8 +71,7 @@ class PressureDriver(Node):
         self.get_logger().info(
             f"{protocol.name} board on {self._link.port}: vented, waiting for `arm`"
         )
-        gc.collect()
-        gc.freeze()  # fewer and shorter collections while the port's thread keeps time
+        prepare_process(options.real_time_priority)
 
     # ------------------------------------------------------------------------------ inputs
 
@@ -168,8 +167,20 @@ class PressureDriver(Node):
             "reconnects": self._link.reconnects,
             "real_time_priority": self._link.real_time,
         }
+        values.update(self._punctuality())
         level, text = self._judge(snapshot, obstacles)
         return Health(level, text, values)
+
+    def _punctuality(self) -> dict[str, object]:
+        """Return how late the last minute's ticks began, and were with the operating system."""
+        values: dict[str, object] = {}
+        shares = {"p50": 0.5, "p99": 0.99, "max": 1.0}
+        for name, times in (("wake", self._link.lateness), ("write", self._link.hand_over)):
+            recent = sorted(times)
+            for label, share in shares.items() if recent else ():
+                late = recent[round(share * (len(recent) - 1))]
+                values[f"tick_to_{name}_{label}_ms"] = f"{1000.0 * late:.3f}"
+        return values
 
     def _judge(self, snapshot: Snapshot, obstacles: list[str]) -> tuple[str, str]:
         """Return the level and the sentence of the diagnostics."""

@@ -148,7 +148,8 @@ class Schedule:
     def _judge(self, setpoint: Setpoint, now: int, held: Sequence[float]) -> tuple[Verdict, str]:
         if problem := self._value_problem(setpoint):
             return Verdict.REFUSED, problem
-        if setpoint.stamp == 0:
+        untimed = setpoint.stamp == 0
+        if untimed:
             # "Now" is the next tick, whatever the grid has already done.
             stamp = max(self._tick_of(now), self._last_tick + self.period)
             setpoint = Setpoint(stamp, setpoint.differential, setpoint.plan_id, setpoint.index)
@@ -157,7 +158,7 @@ class Schedule:
             return Verdict.REFUSED, (f"{ahead:.2f} s ahead, the limit is {self.limits.horizon:g} s")
         if self._tick_of(setpoint.stamp) <= self._last_tick:
             return Verdict.LATE, f"came {-ahead * 1000:.1f} ms after its stamp"
-        return self._insert(setpoint, held)
+        return self._insert(setpoint, held, untimed)
 
     def _value_problem(self, setpoint: Setpoint) -> str:
         values = setpoint.differential
@@ -170,28 +171,31 @@ class Schedule:
             return f"asks for {worst:.0f} Pa, the limit is ±{self.limits.pressure_limit:.0f} Pa"
         return ""
 
-    def _insert(self, setpoint: Setpoint, held: Sequence[float]) -> tuple[Verdict, str]:
+    def _insert(
+        self, setpoint: Setpoint, held: Sequence[float], untimed: bool
+    ) -> tuple[Verdict, str]:
+        """Put a setpoint into its place; of two for the same instant, the newest untimed wins."""
         place = self._place(setpoint.stamp)
         same_stamp = place < len(self._waiting) and self._waiting[place].stamp == setpoint.stamp
         replaces = not self._belongs(setpoint)
-        if not replaces:
-            if same_stamp:
-                return Verdict.DUPLICATE, "another one has the same stamp"
-            current = self._current
-            if current is not None and current.stamp == setpoint.stamp:
-                return Verdict.DUPLICATE, "already executed"
+        if same_stamp and not replaces and not untimed:
+            return Verdict.DUPLICATE, "another one has the same stamp"
         if setpoint.plan_id in self._replaced:
             return Verdict.REFUSED, "this plan has been replaced by a newer one"
         if len(self._waiting) >= self.limits.capacity and not replaces:
             return Verdict.REFUSED, f"{len(self._waiting)} setpoints are waiting already"
         before = self._waiting[place - 1] if place else None
-        after = None if replaces or place >= len(self._waiting) else self._waiting[place]
+        following = place + 1 if same_stamp else place
+        after = None if replaces or following >= len(self._waiting) else self._waiting[following]
         if problem := self._slew_problem(before, setpoint, held) or (
             self._slew_problem(setpoint, after, held) if after else ""
         ):
             return Verdict.REFUSED, problem
         if replaces:
             self._replace_from(place)
+        elif same_stamp:
+            del self._waiting[place]
+            self.counters.superseded += 1
         self._waiting.insert(place, setpoint)
         return Verdict.ACCEPTED, ""
 

@@ -20,6 +20,7 @@ from pressure_driver.emulator.pneumatics import Pneumatics
 from pressure_driver.emulator.port import EmulatedPort
 from pressure_driver.emulator.runner import BoardRunner
 from pressure_driver.protocols import NAMES, board_protocol
+from pressure_driver.realtime import prepare_process
 
 
 class BoardEmulator(Node):
@@ -55,6 +56,7 @@ class BoardEmulator(Node):
         self._runner.set_faults(self._parse(self._value("faults")))
         self.add_on_set_parameters_callback(self._on_parameters)
         self._runner.start()
+        prepare_process(self._value("real_time_priority"))
         DiagnosticsPublisher(self, self._report, hardware_id=str(self._port.link))
         self.create_timer(0.2, self._watch)
         self.get_logger().info(f"{self._value('protocol')} board on {self._port.link}")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import select
 import threading
 import time
@@ -16,6 +14,7 @@ from numpy.typing import NDArray
 from pressure_driver.emulator.board import EmulatedBoard, ReceivedCommand
 from pressure_driver.emulator.faults import Faults
 from pressure_driver.emulator.port import EmulatedPort
+from pressure_driver.realtime import prefer_thread
 
 NANOSECONDS = 1_000_000_000
 TELEMETRY_PERIOD = 50_000_000
@@ -75,9 +74,7 @@ class BoardRunner:
         self._requests.append(faults)
 
     def _run(self) -> None:
-        if self._priority > 0:
-            with contextlib.suppress(OSError, PermissionError):
-                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(self._priority))
+        prefer_thread(self._priority)
         try:
             self._loop()
         except Exception as error:
