@@ -41,7 +41,7 @@ def find_equilibrium(solver: StaticSolver, start: RodState, u: Array, load: Arra
     if iterations > 0:
         return state
     state = RodState(start.q, 0.0 * start.v, start.directors, start.reference_twist)
-    reached, part, spent, previous = 0.0, 0.125, -iterations, state
+    reached, part, spent = 0.0, 0.125, -iterations
     index = 0
     while reached < 1.0:
         target = min(1.0, reached + part)
@@ -51,7 +51,7 @@ def find_equilibrium(solver: StaticSolver, start: RodState, u: Array, load: Arra
         )
         spent += abs(iterations)
         if iterations > 0:
-            previous, state = state, trial
+            state = trial
             reached = target
             part *= 2.0 if iterations < 8 else 1.0
             index += 1

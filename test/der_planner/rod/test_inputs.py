@@ -1,0 +1,126 @@
+"""The couples of a segment: Theorem 1, Corollary 1 and the input matrix."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from der_planner.rod import Rod
+
+EI = 0.02
+
+
+def segment_rod(nodes: int = 12, segments=((0, 12),), plane=None) -> Rod:
+    return Rod.uniform(
+        length=0.24, nodes=nodes, EI=EI, EA=1000.0, GJ=0.015, mass_per_length=1.0, clamp="free",
+        segments=segments, moment_gain=np.full(len(segments), 1e-5), plane=plane,
+    )  # fmt: skip
+
+
+def node_forces(force):
+    return np.stack([force[axis::4] for axis in range(3)], axis=1)
+
+
+@pytest.mark.parametrize("turn", [0.02, 0.1, -0.3, 0.6])
+@pytest.mark.parametrize("plane", [None, "xy"])
+def test_bending_forces_of_an_even_bend_are_two_couples(turn, plane):
+    """Theorem 1: nothing inside, and |F| = 4 EI sinθ / (l ē (1 + cosθ)²) at the four end nodes."""
+    rod = segment_rod(plane=plane)
+    q, _ = rod.configuration_from_bend_angles([turn * 10])
+    forces = node_forces(rod.internal_force(q))
+    step = rod.rest_lengths[0]
+    magnitude = 4 * EI * abs(np.sin(turn)) / (step * step * (1 + np.cos(turn)) ** 2)
+    np.testing.assert_allclose(forces[2:-2], 0.0, atol=1e-10 * magnitude)
+    np.testing.assert_allclose(
+        np.linalg.norm(forces[[0, 1, -2, -1]], axis=1), magnitude, rtol=1e-10
+    )
+
+
+def test_input_matrix_is_the_direction_against_bending():
+    """Corollary 1: each segment's unit couples are −F_b/|F_b|, the connector carries nothing."""
+    rod = segment_rod(segments=((0, 6), (6, 6)))
+    q, _ = rod.configuration_from_bend_angles([0.5, 0.8])
+    forces = node_forces(rod.internal_force(q))
+    matrix = rod.input_matrix(q) / rod.input_gain
+    for index, (first, count) in enumerate(rod.segments):
+        column = node_forces(matrix[:, index])
+        inside = slice(first, first + count)
+        ends = [first, first + 1, first + count - 2, first + count - 1]
+        direction = forces[ends] / np.linalg.norm(forces[ends], axis=1)[:, None]
+        np.testing.assert_allclose(column[ends], -direction, atol=1e-9)
+        outside = np.ones(12, dtype=bool)
+        outside[ends] = False
+        np.testing.assert_array_equal(column[outside], 0.0)
+        # a couple: no net force, no net moment of the two together
+        np.testing.assert_allclose(column.sum(axis=0), 0.0, atol=1e-14)
+        moment = np.cross(rod.positions(q)[inside], column[inside]).sum(axis=0)
+        np.testing.assert_allclose(moment, 0.0, atol=1e-14)
+    assert not matrix[3::4].any()
+
+
+def test_couples_balance_an_even_bend_exactly():
+    """The pressure of Theorem 1 holds the even bend: the whole force vanishes, not only a projection."""
+    rod = segment_rod(segments=((0, 6), (6, 6)))
+    angles = np.array([0.5, -0.8])
+    q, _ = rod.configuration_from_bend_angles(angles)
+    turn = angles / 4
+    step = rod.rest_lengths[0]
+    moment = EI / step * 2 * np.tan(turn / 2) * (1 + np.tan(turn / 2) ** 2)
+    pressure = moment / step / rod.input_gain
+    residual = rod.internal_force(q) + rod.input_matrix(q) @ pressure
+    np.testing.assert_allclose(residual, 0.0, atol=1e-10 * np.abs(rod.internal_force(q)).max())
+
+
+@pytest.mark.parametrize("grading", [0.0, 0.05, 0.2])
+def test_uneven_edges_break_the_localisation(grading):
+    """Edges that grow along the rod leave interior forces (M_i − M_{i+1})/ē, first order in the growth."""
+    rod = segment_rod()
+    rest = rod.rest_lengths * np.linspace(1 - grading, 1 + grading, 11)
+    cells = 0.5 * (rest[1:] + rest[:-1])
+    bend = np.zeros(12)
+    bend[1:-1] = EI / cells
+    uneven = Rod(dataclasses.replace(rod.mesh, rest=rest, bend=bend))
+    turn = 0.1
+    q, _ = uneven.configuration_from_bend_angles([turn * 10])
+    forces = node_forces(uneven.internal_force(q))
+    moment = EI / cells * 2 * np.tan(turn / 2) * (1 + np.tan(turn / 2) ** 2)
+    edge_force = -np.diff(np.concatenate([[0.0], moment, [0.0]])) / rest
+    expected = np.abs(edge_force[1:-1]).max()
+    tangents = np.diff(uneven.positions(q), axis=0) / rest[:, None]
+    normals = np.stack([-tangents[:, 1], tangents[:, 0], 0 * rest], axis=1)
+    by_edge = edge_force[:, None] * normals
+    predicted = np.concatenate([np.zeros((1, 3)), by_edge]) - np.concatenate([by_edge, np.zeros((1, 3))])
+    np.testing.assert_allclose(forces, -predicted, atol=1e-9)
+    share = expected / np.abs(edge_force).max()  # what an inner edge carries of an end edge's couple
+    assert share == pytest.approx(2 * grading / 10, rel=0.5)
+    assert (np.abs(forces[2:-2]).max() > 1e-6) == (grading > 0)
+
+
+def test_pressure_bends_as_the_continuum_does():
+    """The couples span N_j − 2 edges; the gain makes up for it: bend angle = G u L / EI for small u."""
+    for count in (5, 9, 20):
+        rod = segment_rod(nodes=count, segments=((0, count),), plane="xy")
+        clamped = Rod(dataclasses.replace(rod.mesh, clamped=np.arange(7)), "xy")
+        pressure = 100.0
+        angle = clamped.bend_angles(clamped.equilibrium([pressure]))
+        assert angle[0] == pytest.approx(1e-5 * pressure * 0.24 / EI, rel=1e-4)
+
+
+def test_control_affine_form_is_the_equation_of_motion():
+    rod = Rod.uniform(
+        length=0.24, nodes=12, EI=EI, EA=1000.0, GJ=0.015, mass_per_length=1.0, damping=0.7,
+        segments=[(0, 6), (6, 6)], moment_gain=[1e-5, 1e-5], gravity=(0, 0, -9.81),
+        material_damping=0.01,
+    )  # fmt: skip
+    state = rod.straight_state()
+    for _ in range(3):
+        state = rod.step(state, [4e3, -6e3], 0.01)
+    u = np.array([2e3, 5e3])
+    drift, gain = rod.control_affine(state)
+    # a very short step moves by f + g u
+    dt = 1e-7
+    after = rod.step(state, u, dt, "backward_euler")
+    free = rod.free
+    change = np.concatenate([after.q[free] - state.q[free], after.v[free] - state.v[free]]) / dt
+    predicted = drift + gain @ u
+    np.testing.assert_allclose(change, predicted, atol=2e-3 * np.abs(predicted).max())
+    assert not gain[: len(free)].any()

@@ -1,0 +1,194 @@
+"""Equilibria against what is known of elastic rods."""
+
+import numpy as np
+import pytest
+from der_planner.rod import ConvergenceError, Rod
+from scipy.integrate import solve_bvp
+
+RADIUS = 0.015
+AREA = np.pi * RADIUS**2
+INERTIA = np.pi * RADIUS**4 / 4
+YOUNG = 1.5e6
+LENGTH = 0.25
+WEIGHT = 1240 * AREA * 9.81
+
+
+def cantilever(nodes: int, clamp: str = "ghost", plane="xz", axial: float = 1.0) -> Rod:
+    return Rod.uniform(
+        length=LENGTH, nodes=nodes, EI=YOUNG * INERTIA, EA=axial * YOUNG * AREA,
+        GJ=YOUNG / 3 * 2 * INERTIA, mass_per_length=1240 * AREA, clamp=clamp,
+        gravity=(0, 0, -9.81), plane=plane,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def elastica() -> np.ndarray:
+    """Tip (x, z) of the inextensible cantilever under its weight, by collocation."""
+
+    def slope(s, y):
+        bending = WEIGHT * (LENGTH - s) * np.cos(y[0]) / (YOUNG * INERTIA)
+        return np.array([y[1], bending, np.cos(y[0]), np.sin(y[0])])
+
+    def ends(a, b):
+        return np.array([a[0], b[1], a[2], a[3]])
+
+    solution = solve_bvp(slope, ends, np.linspace(0, LENGTH, 50), np.zeros((4, 50)), tol=1e-10)
+    assert solution.success
+    return solution.y[2:, -1]
+
+
+def test_elastica_under_gravity(elastica):
+    assert elastica[1] == pytest.approx(-66.38e-3, abs=5e-6)
+    errors = []
+    for nodes in (11, 21, 41, 81):
+        rod = cantilever(nodes, axial=1e4)
+        tip = rod.tip(rod.equilibrium([]))[[0, 2]]
+        errors.append(np.linalg.norm(tip - elastica))
+    assert errors[1] < 0.005 * abs(elastica[1])
+    order = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert order.min() > 1.8
+
+
+@pytest.mark.parametrize("plane", ["xz", None])
+def test_the_two_clamps_have_the_known_tips(plane):
+    for clamp, tip in (("ghost", -66.54e-3), ("inside", -60.37e-3)):
+        rod = cantilever(21, clamp, plane)
+        assert rod.tip(rod.equilibrium([]))[2] == pytest.approx(tip, abs=5e-6)
+
+
+@pytest.mark.parametrize("plane", ["xy", None])
+@pytest.mark.parametrize("turns", [1.0, 2.0])
+def test_an_end_moment_rolls_the_rod_to_a_circle(plane, turns):
+    nodes = 41
+    rod = Rod.uniform(
+        length=0.25, nodes=nodes, EI=0.02, EA=1000.0, GJ=0.02, mass_per_length=1.0,
+        segments=[(0, nodes)], moment_gain=[1.0], plane=plane,
+    )  # fmt: skip
+    step = rod.rest_lengths[0]
+    turn = 2 * np.pi * turns / (nodes - 2)
+    moment = 0.02 / step * 2 * np.tan(turn / 2) * (1 + np.tan(turn / 2) ** 2)
+    state = rod.equilibrium([moment / step / rod.input_gain[0]])
+    assert rod.bend_angles(state)[0] == pytest.approx(2 * np.pi * turns, abs=1e-9)
+    # the turning nodes lie on a circle of the polygon's radius
+    inner = state.positions[1:-1]
+    centre = inner[: int((nodes - 2) / turns)].mean(axis=0) if turns == 1 else None
+    radius = step / (2 * np.sin(turn / 2))
+    if centre is not None:
+        np.testing.assert_allclose(np.linalg.norm(inner - centre, axis=1), radius, rtol=1e-9)
+    # and the continuum's angle G u L / EI differs by the second order in the turning of a node
+    continuum = moment * (nodes - 2) * step / 0.02
+    assert continuum == pytest.approx(2 * np.pi * turns, rel=turn**2)
+
+
+def test_a_rod_curved_and_twisted_at_rest_is_a_helix():
+    curvature, twist, length = 10.0, 15.0, 0.5
+    error = []
+    for nodes in (41, 81):
+        state = None
+        for part in np.linspace(0.1, 1.0, 10):
+            rod = Rod.uniform(
+                length=length, nodes=nodes, EI=0.02, EA=1000.0, GJ=0.02, mass_per_length=1.0,
+                rest_curvature=(0.0, part * curvature), rest_twist=part * twist,
+            )  # fmt: skip
+            state = rod.equilibrium([], start=state)
+        assert rod.energy(state) < 1e-20
+        error.append(np.abs(state.positions - helix(curvature, twist, length, nodes)).max())
+    assert error[0] < 0.01 * length
+    assert np.log2(error[0] / error[1]) > 1.8
+
+
+def helix(curvature, torsion, length, nodes):
+    """Points of the helix that starts at the origin along x and curves toward z (Frenet)."""
+    s = np.linspace(0, length, nodes)[:, None]
+    rate = np.hypot(curvature, torsion)
+    tangent, normal = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
+    axis = (torsion * tangent + curvature * np.cross(tangent, normal)) / rate
+    along = axis * (axis @ tangent)
+    across = tangent - along
+    aside = np.cross(axis, tangent)
+    return along * s + across * np.sin(rate * s) / rate + aside * (1 - np.cos(rate * s)) / rate
+
+
+def ring(nodes: int, twist: float):
+    """A closed ring of `nodes` nodes with a total twist, and its rod (two more nodes overlap)."""
+    count = nodes + 2
+    length = 1.0 + 1.0 / nodes
+    held = [*range(7), *range(4 * count - 8, 4 * count - 1)]
+    rod = Rod.uniform(
+        length=length, nodes=count, EI=0.02, EA=2e5, GJ=0.016, mass_per_length=1.0,
+        clamp="inside", fixed=held, segments=[(0, count)], moment_gain=[1.0],
+    )  # fmt: skip
+    state = rod.straight_state()
+    for part in np.linspace(0.02, 1.0, 50):
+        q, _ = rod.configuration_from_bend_angles([part * 2 * np.pi])
+        state = rod.state(q, like=state)
+    for part in np.linspace(0.05, 1.0, 20):
+        q = state.q.copy()
+        q[3::4] = np.linspace(0.0, part * twist, count - 1)
+        state = rod.state(q, like=state)
+    return rod, state
+
+
+@pytest.mark.parametrize("nodes", [24, 48])
+def test_a_twisted_ring_becomes_unstable_at_michells_twist(nodes):
+    """Michell (1889), Zajac (1962): a ring loses stability at a twist of 2π √3 EI/GJ."""
+    critical = 2 * np.pi * np.sqrt(3) * 0.02 / 0.016
+
+    def softest(part):
+        rod, state = ring(nodes, part * critical)
+        force = rod.internal_force(state)[rod.free]
+        np.testing.assert_allclose(force, 0.0, atol=1e-7)  # the plane ring stays an equilibrium
+        stiffness = rod.stiffness(state)[np.ix_(rod.free, rod.free)]
+        values = np.linalg.eigvalsh(stiffness)
+        # turning the ring about the held edge and its cross-sections back costs an isotropic rod nothing
+        neutral = np.argmin(np.abs(values))
+        assert abs(values[neutral]) < 1e-6
+        return np.delete(values, neutral)[0]
+
+    stable, unstable = 0.9, 1.1
+    assert softest(stable) > 0 > softest(unstable)
+    while unstable - stable > 1e-4:
+        middle = 0.5 * (stable + unstable)
+        stable, unstable = (middle, unstable) if softest(middle) > 0 else (stable, middle)
+    assert stable == pytest.approx(1.0, abs=8.0 / nodes**2)
+
+
+def test_point_forces_deflect_a_cantilever_as_beam_theory_says():
+    rod = Rod.uniform(length=0.25, nodes=41, EI=0.02, EA=1e5, GJ=0.02, mass_per_length=1.0)
+    force = np.zeros((41, 3))
+    force[-1] = [0.0, 0.01, -0.02]
+    state = rod.equilibrium([], forces=force)
+    expected = force[-1] * 0.25**3 / (3 * 0.02)
+    np.testing.assert_allclose(rod.tip(state)[1:], expected[1:], rtol=5e-3)
+
+
+def test_a_torque_free_twist_is_shared_evenly():
+    """A rod twisted at rest by τ̄ L turns its free end by that angle, to half an edge at each end."""
+    rod = Rod.uniform(
+        length=0.25, nodes=26, EI=0.02, EA=1e5, GJ=0.02, mass_per_length=1.0, rest_twist=3.0
+    )
+    angles = rod.equilibrium([]).angles
+    np.testing.assert_allclose(angles, 3.0 * (np.arange(25) + 0.5) * 0.01, atol=1e-9)
+
+
+def test_load_stepping_reaches_what_newton_alone_does_not():
+    rod = cantilever(21)
+    heavy = np.zeros((21, 3))
+    heavy[:, 2] = -40 * rod.mass_diagonal[0::4]
+    heavy[-1, 0] = -3.0
+    state = rod.equilibrium([], forces=heavy)
+    balance = rod.internal_force(state) + rod.external_force
+    for axis in range(3):
+        balance[axis::4] += heavy[:, axis]
+    np.testing.assert_allclose(balance[rod.free], 0.0, atol=1e-8)
+
+
+def test_no_equilibrium_raises_with_the_step_and_the_last_state():
+    rod = Rod.uniform(length=0.25, nodes=11, EI=0.02, EA=10.0, GJ=0.02, mass_per_length=1.0)
+    # beyond this the rod is pulled apart or pushed through itself: no stable answer near
+    force = np.zeros((11, 3))
+    force[-1, 0] = -1e6
+    with pytest.raises(ConvergenceError, match="no equilibrium beyond") as caught:
+        rod.equilibrium([], forces=force)
+    assert caught.value.iterations > 0
+    assert np.isfinite(caught.value.state.q).all()
