@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from apriltag_tracker.detection import Detector
 from apriltag_tracker.synthetic.camera import CameraModel, Optics, Shape, SyntheticCamera
 from apriltag_tracker.synthetic.shapes import constant_curvature

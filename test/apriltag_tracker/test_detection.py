@@ -3,6 +3,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+
 from apriltag_tracker import detection, family
 from apriltag_tracker.camera import CameraPose, Intrinsics
 from apriltag_tracker.detection import Detector
@@ -118,7 +119,7 @@ def test_a_partly_covered_side_moves_corners_little(detector, tags, model, cover
     camera = SyntheticCamera(model, tags, Optics(), seed=1)
     shape = constant_curvature(tags.segment_lengths, [0.4, 0.2])
     corners = camera.frame(shape).corners[2]
-    a, b, c, d = corners
+    a, b, _, d = corners
     outer = a + 0.3 * (b - a), a + (0.3 + cover) * (b - a)
     away = (a - d) / np.linalg.norm(a - d)
     polygon = [

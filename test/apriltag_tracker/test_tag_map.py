@@ -5,6 +5,7 @@ import copy
 import numpy as np
 import pytest
 import yaml
+
 from apriltag_tracker.tag_map import TagMap, TagMapError, WorldTag
 
 

@@ -118,9 +118,9 @@ def locate(
     misfits = np.empty(count)
     _locate(
         np.ascontiguousarray(corners),
-        covariances,
-        heights,
-        sizes,
+        np.ascontiguousarray(covariances),
+        np.ascontiguousarray(heights),
+        np.ascontiguousarray(sizes),
         intrinsics.matrix,
         intrinsics.distortion,
         np.ascontiguousarray(pose.rotation),

@@ -57,9 +57,9 @@ class ShapePrior:
 
     base_position: float = 0.0005
     base_heading: float = 0.005
-    elongation: float = 0.05
-    curvature: float = 30.0
-    corrections: tuple[float, ...] = (3.0, 3.0, 1.5, 1.0)
+    elongation: float = 0.03
+    curvature: float = 12.0
+    corrections: tuple[float, ...] = (2.0, 1.5, 1.0, 0.7)
     tag_position: float = 5e-5
     tag_heading: float = 3e-3
     arc_position: float = 5e-4
@@ -213,6 +213,15 @@ class _Fit:
     left_open: NDArray[np.float64]
 
 
+def _furthest(fit: _Fit) -> float:
+    """Return the largest distance of a tag from the fit [m]."""
+    return float(np.hypot(fit.residuals[:, 0], fit.residuals[:, 1]).max())
+
+
+_HOPELESS = 5.0
+"""Residual over the distance of rejection above which nothing can be said."""
+
+
 class ShapeFitter:
     """Fits the limb to its tags.
 
@@ -262,40 +271,57 @@ class ShapeFitter:
         Returns:
             The estimate, or None if no tag, or no consistent set of tags, was left.
         """
-        kept = list(tags)
-        rejected: dict[int, float] = {}
+        kept, rejected, arcs = self._consistent(list(tags))
+        if arcs is None:
+            return None
+        fit = self._solve(self._smooth, kept, self._last)
+        self._last = fit.parameters
+        order = [i for i, tag in enumerate(tags) if tag.id not in rejected]
+        shared = None if common is None else common[order]
+        return self._estimate(fit, arcs, kept, rejected, shared)
+
+    def _consistent(
+        self, tags: list[PlanarTag]
+    ) -> tuple[list[PlanarTag], dict[int, float], _Fit | None]:
+        """Leave out tags that are far from the arcs through all others.
+
+        Arcs are stiff enough to show a tag on the wrong place, which the smooth fit would follow.
+
+        Returns:
+            The tags that are left; those left out with their distance; and the fit of arcs to what
+            is left, None if that is less than half or still contradicts itself.
+        """
+        kept, rejected = list(tags), {}
         while kept:
-            fit = self._solve(self._smooth, kept, self._last)
-            distances = np.hypot(fit.residuals[:, 0], fit.residuals[:, 1])
-            if len(kept) == 1 or float(distances.max()) < 0.3 * self.reject_beyond:
+            arcs = self._solve(self._constant, kept, self._last)
+            furthest = _furthest(arcs)
+            if furthest < 0.5 * self.reject_beyond or len(kept) < 3:
                 break
-            outside, distance = self._worst(kept)
-            if distance < self.reject_beyond:
+            outside, distance, rest = self._odd_one_out(kept)
+            if distance < self.reject_beyond or rest > 0.5 * furthest:
                 break
             rejected[kept[outside].id] = distance
             del kept[outside]
-            if len(kept) < max(2, (len(tags) + 1) // 2):
-                return None
-        if not kept or (len(kept) == 1 and rejected):
-            return None
-        self._last = fit.parameters
-        order = [next(i for i, tag in enumerate(tags) if tag.id == k.id) for k in kept]
-        shared = None if common is None else common[order]
-        return self._estimate(fit, kept, rejected, shared)
+        if len(kept) <= len(tags) // 2 or furthest > _HOPELESS * self.reject_beyond:
+            return kept, rejected, None
+        return kept, rejected, arcs
 
-    def _worst(self, tags: Sequence[PlanarTag]) -> tuple[int, float]:
-        """Return which tag is furthest from where all the others say it is, and how far [m]."""
-        gaps = []
-        for i, tag in enumerate(tags):
-            others = [other for other in tags if other is not tag]
-            fit = self._solve(self._smooth, others, self._last)
-            place, _ = _Evaluation(self._smooth, [tag.arc_length]).places(fit.parameters)
-            gap = float(np.hypot(*(place[0, :2] - tag.pose[:2])))
-            rest = float(np.hypot(fit.residuals[:, 0], fit.residuals[:, 1]).max())
-            gaps.append((rest, -gap, i))
-        # The wrong tag is the one without which the others agree.
-        _, gap, outside = min(gaps)
-        return outside, -gap
+    def _odd_one_out(self, tags: Sequence[PlanarTag]) -> tuple[int, float, float]:
+        """Find the tag without which the others agree best.
+
+        Returns:
+            Its index, its distance from the arcs through the others, and the largest residual of
+            these others [m].
+        """
+        fits = [
+            self._solve(self._constant, [*tags[:i], *tags[i + 1 :]], self._last)
+            for i in range(len(tags))
+        ]
+        rest = [_furthest(fit) for fit in fits]
+        outside = int(np.argmin(rest))
+        tag = tags[outside]
+        place, _ = self._evaluation(self._constant, [tag]).places(fits[outside].parameters)
+        return outside, float(np.hypot(*(place[0, :2] - tag.pose[:2]))), rest[outside]
 
     def _evaluation(self, curve: _Curve, tags: Sequence[PlanarTag]) -> _Evaluation:
         key = (curve.size, tuple(tag.arc_length for tag in tags))
@@ -352,6 +378,7 @@ class ShapeFitter:
     def _estimate(
         self,
         fit: _Fit,
+        arcs: _Fit,
         tags: Sequence[PlanarTag],
         rejected: dict[int, float],
         common: NDArray[np.float64] | None,
@@ -369,7 +396,8 @@ class ShapeFitter:
         # What the tags do not determine, the prior leaves open.
         undetermined = slopes[-1, :2] @ fit.left_open
         systematic += undetermined @ undetermined.T
-        arcs = self._solve(self._constant, tags, fit.parameters)
+        # A tip that may be far to the side is also nearer: the second order of a long arc.
+        systematic += (np.sum(undetermined**2) / self._smooth.ends[-1]) ** 2 * np.eye(2)
         bends = arcs.parameters[4 : 4 + self._constant.segments]
         bending = self._constant.active
         bend_gain = arcs.gain[4:]

@@ -41,15 +41,16 @@ class TrackingOptions:
         missing_search_period: s between full searches while a tag of the map is missing.
         search: how far the sides of a tag may be from their prediction [px].
         keep_frames: frames for which a lost tag is still looked for where it was.
-        region_growth: half the size of a search region over the size of the tag.
+        region_growth: half the side of a search region over half the diagonal of the tag; it grows
+            by a fifth with every frame in which the tag was not found.
         largest_jump: distance from the prediction at which a tag cannot be the same [tag sizes].
     """
 
     full_search_period: float = 1.0
-    missing_search_period: float = 0.2
+    missing_search_period: float = 0.1
     search: float = 3.0
     keep_frames: int = 8
-    region_growth: float = 1.1
+    region_growth: float = 1.6
     largest_jump: float = 1.5
 
 
@@ -147,7 +148,9 @@ class TagTracker:
         predicted: dict[int, NDArray[np.float64]],
     ) -> list[Tag]:
         """Search around the predictions of lost tags; again sharpened and enlarged."""
-        boxes = [box for tag in lost if (box := self._region(image, predicted[tag])) is not None]
+        boxes = [
+            box for tag in lost if (box := self._region(image, tag, predicted[tag])) is not None
+        ]
         if not boxes:
             return []
         mosaic, corners = _mosaic(image, boxes)
@@ -167,11 +170,11 @@ class TagTracker:
         return found
 
     def _region(
-        self, image: NDArray[np.uint8], corners: NDArray[np.float64]
+        self, image: NDArray[np.uint8], tag: int, corners: NDArray[np.float64]
     ) -> tuple[int, int, int, int] | None:
         middle = corners.mean(axis=0)
-        reach = self.options.region_growth * float(np.abs(corners - middle).max()) + 8.0
-        reach *= 1.6
+        growth = self.options.region_growth * (1.0 + 0.2 * self._tracks[tag].missed)
+        reach = growth * float(np.hypot(*(corners - middle).T).max()) + 8.0
         rows, columns = image.shape
         low = np.floor(middle - reach).astype(int)
         high = np.ceil(middle + reach).astype(int)

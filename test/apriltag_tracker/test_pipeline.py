@@ -1,0 +1,138 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from apriltag_tracker.camera import Intrinsics
+from apriltag_tracker.pipeline import LimbTracker, TrackerOptions, Uncertainty
+from apriltag_tracker.synthetic.camera import Errors, Optics, SyntheticCamera
+
+PERIOD = 1.0 / 30.0
+
+
+@pytest.fixture
+def straight_tags(tags):
+    """Without stiff stretches: the swing's arcs bend everywhere."""
+    return dataclasses.replace(tags, stiff=())
+
+
+def run(tracker, camera, swing, frames, start=0, covers=()):
+    errors, observations = [], []
+    for k in range(start, start + frames):
+        time = k * PERIOD
+        frame = camera.frame(swing.shape(time), swing.velocity(time), covers)
+        observation = tracker.observe(frame.image, time)
+        observations.append(observation)
+        if observation.estimate is not None:
+            errors.append(observation.estimate.tip - swing.shape(time).points[-1])
+    return np.array(errors), observations
+
+
+def test_the_tip_is_within_a_tenth_of_a_millimetre(straight_tags, model, camera, swing):
+    tracker = LimbTracker(straight_tags, model.intrinsics)
+    errors, observations = run(tracker, camera, swing, 45)
+    assert len(errors) == 45
+    assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) < 1e-4
+    assert all(observation.reason == "" for observation in observations)
+    normalised = [
+        error @ np.linalg.solve(each.estimate.tip_covariance, error)
+        for error, each in zip(errors, observations, strict=True)
+    ]
+    # Two degrees of freedom: the mean is 2 where the covariance is honest.
+    assert 0.3 < np.mean(normalised) < 8.0
+
+
+def test_set_up_errors_stay_within_the_systematic_part(straight_tags, model, swing):
+    uncertainty = Uncertainty(survey=5e-4, height=0.0, mounting=4e-4, mounting_angle=5e-3)
+    options = TrackerOptions(uncertainty=uncertainty, reject_beyond=0.01)
+    normalised = []
+    for seed in range(12):
+        errors = Errors(survey=5e-4, mounting=4e-4, mounting_angle=5e-3)
+        camera = SyntheticCamera(model, straight_tags, Optics(), errors, seed=seed)
+        tracker = LimbTracker(straight_tags, model.intrinsics, options)
+        error, observations = run(tracker, camera, swing, 2, start=20)
+        spread = observations[-1].estimate.tip_systematic
+        normalised.append(error[-1] @ np.linalg.solve(spread, error[-1]))
+    assert 0.4 < np.mean(normalised) < 5.0
+
+
+def test_gaps_are_bridged_marked_and_then_given_up(straight_tags, model, camera, swing):
+    tracker = LimbTracker(straight_tags, model.intrinsics, TrackerOptions(bridge_frames=3))
+    run(tracker, camera, swing, 20)
+    known = tracker.observe(camera.frame(swing.shape(20 * PERIOD)).image, 20 * PERIOD)
+    spread = np.trace(known.estimate.tip_covariance)
+    for k in range(21, 24):
+        observation = tracker.observe(camera.frame(None).image, k * PERIOD)
+        assert observation.bridged
+        assert observation.reason.startswith(f"bridged {k - 20} frame")
+        error = observation.estimate.tip - swing.shape(k * PERIOD).points[-1]
+        assert np.hypot(*error) < 0.01
+        assert np.trace(observation.estimate.tip_covariance) > spread
+        spread = np.trace(observation.estimate.tip_covariance)
+    for k in range(24, 30):
+        observation = tracker.observe(camera.frame(None).image, k * PERIOD)
+        assert observation.estimate is None
+        assert "no limb tag" in observation.reason
+    errors, observations = run(tracker, camera, swing, 6, start=30)
+    assert (
+        len(errors) >= 3
+    )  # found again by the next full search, a tenth of a second later at most
+    assert not observations[-1].bridged
+
+
+def test_a_covered_lens_is_not_valid(straight_tags, model, camera, swing):
+    tracker = LimbTracker(straight_tags, model.intrinsics, TrackerOptions(bridge_frames=0))
+    run(tracker, camera, swing, 3)
+    black = np.zeros((model.intrinsics.height, model.intrinsics.width), np.uint8)
+    observation = tracker.observe(black, 3 * PERIOD)
+    assert observation.estimate is None
+    assert observation.tags == ()
+
+
+def test_without_fixed_tags_nothing_is_placed(straight_tags, model, swing):
+    bare = dataclasses.replace(straight_tags, world=())
+    camera = SyntheticCamera(model, bare)
+    tracker = LimbTracker(straight_tags, model.intrinsics)
+    observation = tracker.observe(camera.frame(swing.shape(0.0)).image, 0.0)
+    assert observation.estimate is None
+    assert "no fixed tag" in observation.reason
+    assert len(observation.tags) == len(bare.limb)
+    assert all(placed.pose is None for placed in observation.tags)
+
+
+def test_a_tag_at_another_height_is_not_used(straight_tags, model, swing):
+    lower = dataclasses.replace(straight_tags.limb[3], height=-0.09)
+    limb = (*straight_tags.limb[:3], lower, straight_tags.limb[4])
+    camera = SyntheticCamera(model, dataclasses.replace(straight_tags, limb=limb))
+    tracker = LimbTracker(straight_tags, model.intrinsics)
+    observation = tracker.observe(camera.frame(swing.shape(0.3)).image, 0.0)
+    assert 3 not in observation.estimate.tags_used
+    error = observation.estimate.tip - swing.shape(0.3).points[-1]
+    assert np.hypot(*error) < 1e-3
+
+
+def test_a_tag_glued_to_the_wrong_place_is_named(straight_tags, model, swing):
+    wrong = dataclasses.replace(straight_tags.limb[1], arc_length=0.085)
+    limb = (straight_tags.limb[0], wrong, *straight_tags.limb[2:])
+    camera = SyntheticCamera(model, dataclasses.replace(straight_tags, limb=limb))
+    tracker = LimbTracker(straight_tags, model.intrinsics)
+    observation = tracker.observe(camera.frame(swing.shape(0.3)).image, 0.0)
+    assert "wrong place, left out: 1" in observation.reason
+    assert tracker.misplaced == 1
+
+
+def test_another_resolution_is_refused(straight_tags, model):
+    tracker = LimbTracker(straight_tags, model.intrinsics)
+    with pytest.raises(ValueError, match="640 x 480"):
+        tracker.observe(np.zeros((480, 640), np.uint8), 0.0)
+
+
+def test_a_wrong_calibration_shows_in_the_residual(straight_tags, model, camera, swing):
+    matrix = model.intrinsics.matrix.copy()
+    matrix[0, 0] *= 1.05
+    wrong = Intrinsics.create(1280, 720, matrix, model.intrinsics.distortion)
+    tracker = LimbTracker(straight_tags, wrong)
+    tracker.observe(camera.frame(swing.shape(0.0)).image, 0.0)
+    assert tracker.world.pose is None or tracker.world.residual > 0.5 or tracker.world.excluded

@@ -1,0 +1,173 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from apriltag_tracker.shape import (
+    PlanarTag,
+    ShapeFitter,
+    ShapePrior,
+    _Curve,
+    _Evaluation,
+    wrap,
+)
+from apriltag_tracker.synthetic.camera import Shape
+from apriltag_tracker.synthetic.shapes import constant_curvature
+
+NOISE = np.diag([2e-5, 2e-5, 1e-3]) ** 2
+
+
+@pytest.fixture
+def plain(tags):
+    """The default tags on a limb without stiff stretches, on which arcs are exact."""
+    return dataclasses.replace(tags, stiff=())
+
+
+def seen(tags, shape: Shape, random=None) -> list[PlanarTag]:
+    result = []
+    for tag in tags.limb:
+        pose = shape.at(tag.arc_length)
+        if random is not None:
+            pose = pose + random.multivariate_normal(np.zeros(3), NOISE)
+        result.append(PlanarTag(tag.id, tag.arc_length, pose, NOISE))
+    return result
+
+
+@pytest.mark.parametrize(
+    ("bends", "elongation"),
+    [((0.0, 0.0), 1.0), ((0.87, 0.87), 1.0), ((0.87, -0.87), 1.02), ((-1.2, 0.3), 0.98)],
+)
+def test_arcs_are_recovered(plain, bends, elongation):
+    shape = constant_curvature(plain.segment_lengths, bends, elongation, points=2001)
+    estimate = ShapeFitter(plain).fit(seen(plain, shape))
+    assert np.allclose(estimate.tip, shape.points[-1], atol=2e-6)
+    assert np.allclose(estimate.bend_angle, bends, atol=2e-3)
+    assert estimate.elongation == pytest.approx(elongation, abs=1e-4)
+    assert estimate.residual < 1e-4
+    assert estimate.tip_heading == pytest.approx(sum(bends), abs=1e-3)
+    assert np.allclose(estimate.curve[0], 0.0, atol=1e-5)
+    assert estimate.rejected == {}
+
+
+def test_derivatives_agree_with_finite_differences(tags):
+    curve = _Curve(tags.segment_lengths, 3, tags.stiff)
+    evaluation = _Evaluation(curve, [0.01, 0.122, 0.2, 0.244])
+    random = np.random.default_rng(0)
+    parameters = random.normal(0.0, 1.0, curve.size) * 0.3
+    parameters[3] = 0.02
+    _, jacobian = evaluation.places(parameters)
+    for k in range(curve.size):
+        step = np.zeros(curve.size)
+        step[k] = 1e-6
+        after, _ = evaluation.places(parameters + step)
+        before, _ = evaluation.places(parameters - step)
+        assert np.allclose(jacobian[:, :, k], (after - before) / 2e-6, atol=1e-8)
+
+
+def test_stiff_stretches_keep_their_heading(tags):
+    curve = _Curve(tags.segment_lengths, 2, ((0.0, 0.004), (0.1175, 0.1265), (0.24, 0.244)))
+    parameters = np.random.default_rng(1).normal(0.0, 2.0, curve.size)
+    heading = curve.heading_basis(np.array([0.0, 0.004, 0.1175, 0.1265, 0.24, 0.244])) @ parameters
+    assert heading[0] == pytest.approx(heading[1])
+    assert heading[2] == pytest.approx(heading[3])
+    assert heading[4] == pytest.approx(heading[5])
+    assert curve.active == pytest.approx([0.1135, 0.1135])
+
+
+def test_stiff_ends_are_extrapolated_straight(tags):
+    """The limb bends between its fittings only; the tag before the tip does not mislead the fit."""
+    fine = np.linspace(0.0, tags.length, 2441)
+    curvature = np.full_like(fine, 6.0)
+    for start, end in tags.stiff:
+        curvature[(fine >= start) & (fine < end)] = 0.0
+    heading = np.concatenate([[0.0], np.cumsum(curvature[:-1] * np.diff(fine))])
+    middle = 0.5 * (heading[1:] + heading[:-1])
+    steps = np.diff(fine)[:, None] * np.stack([np.cos(middle), np.sin(middle)], axis=1)
+    shape = Shape(fine, np.vstack([np.zeros(2), np.cumsum(steps, axis=0)]), heading)
+    with_stiff = ShapeFitter(tags).fit(seen(tags, shape))
+    without = ShapeFitter(dataclasses.replace(tags, stiff=())).fit(seen(tags, shape))
+    assert np.hypot(*(with_stiff.tip - shape.points[-1])) < 1e-5
+    assert abs(with_stiff.tip_heading - heading[-1]) < 1e-3
+    assert abs(without.tip_heading - heading[-1]) > 5e-3
+
+
+def test_repeatability_is_what_repetition_shows(plain):
+    random = np.random.default_rng(2)
+    shape = constant_curvature(plain.segment_lengths, [0.7, -0.3])
+    fitter = ShapeFitter(plain)
+    estimates = [fitter.fit(seen(plain, shape, random)) for _ in range(150)]
+    tips = np.array([estimate.tip for estimate in estimates])
+    said = np.mean([estimate.tip_covariance for estimate in estimates], axis=0)
+    assert np.allclose(np.sqrt(np.diag(said)), tips.std(axis=0), rtol=0.25)
+    assert np.linalg.norm(tips.mean(axis=0) - shape.points[-1]) < 1e-5
+
+
+def test_mounting_errors_are_in_the_systematic_part(plain):
+    random = np.random.default_rng(3)
+    shape = constant_curvature(plain.segment_lengths, [0.4, 0.3])
+    fitter = ShapeFitter(plain, mounting=3e-4, mounting_angle=4e-3)
+    perfect = fitter.fit(seen(plain, shape))
+    tips = []
+    for _ in range(150):
+        moved = [
+            dataclasses.replace(tag, pose=tag.pose + random.normal(0.0, [3e-4, 3e-4, 4e-3]))
+            for tag in seen(plain, shape)
+        ]
+        tips.append(fitter.fit(moved).tip)
+    spread = np.sqrt(np.trace(np.cov(np.array(tips).T)))
+    said = np.sqrt(np.trace(perfect.tip_systematic))
+    assert said == pytest.approx(spread, rel=0.3)
+
+
+def test_without_the_last_tags_the_tip_is_left_open(plain):
+    shape = constant_curvature(plain.segment_lengths, [0.4, 0.3])
+    fitter = ShapeFitter(plain)
+    every = fitter.fit(seen(plain, shape))
+    few = fitter.fit(seen(plain, shape)[:3])
+    assert np.trace(few.tip_systematic) > 50.0 * np.trace(every.tip_systematic)
+    error = few.tip - shape.points[-1]
+    assert error @ np.linalg.solve(few.tip_systematic + few.tip_covariance, error) < 9.0
+    assert few.tags_used == (0, 1, 2)
+
+
+def test_errors_shared_by_all_tags_move_the_tip(plain):
+    shape = constant_curvature(plain.segment_lengths, [0.4, 0.3])
+    fitter = ShapeFitter(plain, ShapePrior(base_position=1.0, base_heading=1.0))
+    common = np.zeros((5, 3, 1))
+    common[:, 0, 0] = 1e-3
+    alone = fitter.fit(seen(plain, shape))
+    shared = fitter.fit(seen(plain, shape), common)
+    added = shared.tip_systematic - alone.tip_systematic
+    assert np.sqrt(added[0, 0]) == pytest.approx(1e-3, rel=0.02)
+    assert abs(added[1, 1]) < 1e-10
+
+
+@pytest.mark.parametrize("wrong", [0, 1, 2, 3, 4])
+@pytest.mark.parametrize("shift", [(0.008, 0.0), (0.0, -0.02)])
+def test_a_tag_on_the_wrong_place_is_left_out(tags, wrong, shift):
+    shape = constant_curvature(tags.segment_lengths, [0.5, -0.2])
+    placed = seen(tags, shape)
+    pose = placed[wrong].pose + np.array([*shift, 0.0])
+    placed[wrong] = dataclasses.replace(placed[wrong], pose=pose)
+    estimate = ShapeFitter(tags).fit(placed)
+    assert list(estimate.rejected) == [wrong]
+    assert estimate.rejected[wrong] == pytest.approx(np.hypot(*shift), rel=0.4)
+    if wrong < 3:
+        assert np.hypot(*(estimate.tip - shape.points[-1])) < 5e-4
+
+
+def test_tags_that_contradict_each_other_give_nothing(tags):
+    shape = constant_curvature(tags.segment_lengths, [0.0, 0.0])
+    random = np.random.default_rng(5)
+    placed = [
+        dataclasses.replace(tag, pose=tag.pose + random.normal(0.0, [0.1, 0.1, 1.0]))
+        for tag in seen(tags, shape)
+    ]
+    assert ShapeFitter(tags).fit(placed) is None
+    assert ShapeFitter(tags).fit([]) is None
+
+
+def test_angles_are_wrapped():
+    assert np.allclose(wrap(np.array([0.1, 2 * np.pi + 0.1, -2 * np.pi + 0.1])), 0.1)
