@@ -3,6 +3,7 @@
 
 python3 scripts/evaluate.py out/bags/*
 python3 scripts/evaluate.py out/bags/* --report report
+python3 scripts/evaluate.py out/bags/same_direction_der_1 --video film.mp4
 """
 
 from __future__ import annotations
@@ -18,49 +19,84 @@ workspace.enter()
 from der_planner.evaluation import (  # noqa: E402
     BagError,
     EvaluationError,
-    RunSeries,
     Settings,
     compare,
-    evaluate_run,
+    evaluate_bags,
     format_table,
-    load_run,
-    plot_error,
-    plot_pressures,
-    plot_tip,
     summarise,
+    write_report,
     write_results,
 )
+from der_planner.evaluation.alignment import WINDOWS  # noqa: E402
+from der_planner.evaluation.overlay import write_video  # noqa: E402
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="bag folders or files")
+    parser.add_argument(
+        "--report",
+        type=Path,
+        metavar="DIR",
+        help="write report.html, results.json, table.{md,csv,tex} and the figures (PDF, PNG)",
+    )
+    parser.add_argument("--results", type=Path, metavar="DIR", help="write results.json only")
+    parser.add_argument("--video", type=Path, metavar="FILE", help="overlay film of the first bag")
+    parser.add_argument(
+        "--window",
+        choices=WINDOWS,
+        default="plan",
+        help="plan: every setpoint; cycles: without fade-in and closing move (default: plan)",
+    )
+    parser.add_argument(
+        "--remove-lag",
+        action="store_true",
+        help="estimate a constant lag of each run and take it out before computing E",
+    )
+    parser.add_argument("--workers", type=int, default=0, help="processes (default: all cores)")
+    return parser.parse_args()
+
+
+def _show(done: int, total: int, path: Path) -> None:
+    if sys.stderr.isatty() or done == total:
+        print(f"\r  {done} of {total} bags read, {path.name}", end="", file=sys.stderr, flush=True)
+    if done == total:
+        print(file=sys.stderr)
+
+
+def _show_step(text: str) -> None:
+    print(f"  {text}", file=sys.stderr, flush=True)
 
 
 def main() -> int:
     """Run the command line; 0 when every bag was evaluated, 1 otherwise."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="bag folders or files")
-    parser.add_argument("--out", type=Path, help="write results.json and the figures here")
-    parser.add_argument("--window", choices=("plan", "cycles"), default="plan", help="what counts")
-    parser.add_argument("--remove-lag", action="store_true", help="shift by the estimated lag")
-    options = parser.parse_args()
+    options = _arguments()
     settings = Settings(window=options.window, remove_lag=options.remove_lag)
-    runs: list[RunSeries] = []
-    results = []
-    failed = 0
-    for path in options.bags:
-        try:
-            run = load_run(path)
-            results.append(evaluate_run(run, settings))
-            runs.append(run)
-        except (BagError, EvaluationError) as error:
-            print(f"error: {error}", file=sys.stderr)
-            failed += 1
+    found = evaluate_bags(options.bags, settings, workers=options.workers, progress=_show)
+    for entry in found:
+        if entry.error:
+            print(f"error: {entry.error}", file=sys.stderr)
+    runs = [entry.run for entry in found if entry.run is not None]
+    results = [entry.result for entry in found if entry.result is not None]
     if not results:
         return 1
     print(format_table(summarise(results), compare(results)))
-    if options.out is not None:
-        print(write_results(results, options.out))
-        for plot in (plot_tip, plot_error, plot_pressures):
-            for file in plot(runs, options.out):
-                print(file)
-    return 1 if failed else 0
+    for result in results:
+        if result.removed_lag_s:
+            print(f"{result.bag}: a lag of {result.removed_lag_s * 1000:.0f} ms was taken out")
+    try:
+        if options.results is not None:
+            print(write_results(results, options.results))
+        if options.report is not None:
+            print(write_report(runs, results, options.report, progress=_show_step).page)
+        if options.video is not None:
+            print(write_video(runs[0], options.video))
+    except (BagError, EvaluationError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0 if len(results) == len(options.bags) else 1
 
 
 if __name__ == "__main__":

@@ -1,16 +1,21 @@
 """Evaluation: from bags, or arrays of a run without one, to errors, tables and figures.
 
-run = load_run("bags/same_direction_der_1")     # or RunSeries.from_arrays(…)
-result = evaluate_run(run)                      # evaluate_bag does both
-print(format_table(summarise([result])))
-write_results([result], folder)                 # folder/results.json
-plot_tip([run], folder)
+Example::
+
+    run = load_run("bags/same_direction_der_1")  # or RunSeries.from_arrays(…)
+    result = evaluate_run(run)  # evaluate_bag does both
+    print(format_table(summarise([result])))
+    write_results([result], folder)  # folder/results.json
+    plot_tip([run], folder)
+    write_report([run], [result], folder)  # page, tables, every figure
 """
 
 from der_planner.evaluation.alignment import Settings, Split, error_series, split_error
+from der_planner.evaluation.batch import Evaluated, evaluate_bags
 from der_planner.evaluation.extract import load_run
 from der_planner.evaluation.figures import plot_error, plot_pressures, plot_tip
 from der_planner.evaluation.metrics import RunResult, evaluate_bag, evaluate_run
+from der_planner.evaluation.report import Report, write_report
 from der_planner.evaluation.results import read_results, results_document, write_results
 from der_planner.evaluation.series import Description, EvaluationError, RunSeries, Stream
 from der_planner.evaluation.statistics import Comparison, Summary, compare, summarise
@@ -27,7 +32,9 @@ __all__ = [
     "BagError",
     "Comparison",
     "Description",
+    "Evaluated",
     "EvaluationError",
+    "Report",
     "RunResult",
     "RunSeries",
     "Settings",
@@ -38,6 +45,7 @@ __all__ = [
     "csv_table",
     "error_series",
     "evaluate_bag",
+    "evaluate_bags",
     "evaluate_run",
     "format_comparison",
     "format_table",
@@ -51,5 +59,6 @@ __all__ = [
     "results_document",
     "split_error",
     "summarise",
+    "write_report",
     "write_results",
 ]

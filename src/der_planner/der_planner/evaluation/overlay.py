@@ -18,12 +18,12 @@ from der_planner.evaluation.snapshots import (
     IMAGE_TYPE,
     Projection,
     Snapshot,
-    _points,
-    _stamp_of,
-    _topics,
+    curve_points,
     fit_projection,
     gray,
+    stamp_of,
     take_snapshots,
+    topics_of,
 )
 from der_planner.evaluation.table import CASE
 from der_planner.recording.reader import BagReader
@@ -36,8 +36,8 @@ def plot_shapes(
 ) -> list[Path]:
     """Draw reference, DER and PCC limb at five instants, over the camera's frames where recorded.
 
-    A row per motion. The first trial of each model is drawn; frames come from the first run that has
-    them. The reference limb is the shape that the planner published.
+    A row per motion. The first trial of each model is drawn; frames come from the first run that
+    has them. The reference limb is the shape that the planner published.
 
     Args:
         runs: any; those without a bag are left out.
@@ -51,7 +51,7 @@ def plot_shapes(
     if not motions:
         return []
     with style.paper_style():
-        figure = new_figure(style.PAGE, 1.7 * len(motions))
+        figure = new_figure(style.PAGE, 0.4 + 1.6 * len(motions))
         axes = figure.subplots(len(motions), INSTANTS, squeeze=False)
         for row, (motion, members) in zip(axes, motions.items(), strict=True):
             _draw_row(row, members)
@@ -72,7 +72,7 @@ def _draw_row(row: Sequence[Axes], runs: Sequence[RunSeries]) -> None:
     chosen = list(first.values())
     last = min(float(run.reference.time[-1]) for run in chosen)
     times = np.linspace(0.1, 0.9, INSTANTS) * last
-    shots = {run.description.model: take_snapshots(run, times) for run in chosen}
+    shots = {run.description.model: take_snapshots(run, times.tolist()) for run in chosen}
     background = next(
         (run for run in chosen if shots[run.description.model][0].frame is not None), None
     )
@@ -83,6 +83,22 @@ def _draw_row(row: Sequence[Axes], runs: Sequence[RunSeries]) -> None:
             under = shots[background.description.model][index].frame
         _draw_shot(axis, {model: shot[index] for model, shot in shots.items()}, under, project)
         axis.set_title(f"{times[index]:.1f} s")
+    _zoom(row)
+
+
+def _zoom(row: Sequence[Axes]) -> None:
+    """Show the same part of the plane in every picture: where the limbs are, and some margin."""
+    drawn = [line.get_xydata() for axis in row for line in axis.get_lines()]
+    if not drawn:
+        return
+    points = np.vstack(drawn)
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = 0.12 * float((high - low).max())
+    for axis in row:
+        axis.set_xlim(low[0] - margin, high[0] + margin)
+        upside_down = axis.yaxis_inverted()
+        axis.set_ylim(low[1] - margin, high[1] + margin)
+        axis.yaxis.set_inverted(upside_down)
 
 
 def _draw_shot(
@@ -98,13 +114,14 @@ def _draw_shot(
     planned = next((shot.planned for shot in shots.values() if len(shot.planned)), None)
     if planned is not None:
         line = place(planned)
-        axis.plot(line[:, 0], line[:, 1], color="white" if frame is not None else "none", lw=2.4)
-        axis.plot(line[:, 0], line[:, 1], color=style.REFERENCE, ls=":", label="planned")
+        if frame is not None:
+            axis.plot(line[:, 0], line[:, 1], color="white", lw=1.8)
+        axis.plot(line[:, 0], line[:, 1], color=style.REFERENCE, ls=":", lw=1.0, label="planned")
     for index, (model, shot) in enumerate(shots.items()):
         if len(shot.measured):
             line = place(shot.measured)
             look, dash = style.colour(model, index), style.DASHES.get(model, "-.")
-            axis.plot(line[:, 0], line[:, 1], color=look, ls=dash, label=f"{model.upper()}")
+            axis.plot(line[:, 0], line[:, 1], color=look, ls=dash, lw=1.0, label=model.upper())
     axis.set_aspect("equal")
     axis.set(xticks=[], yticks=[])
     for side in axis.spines.values():
@@ -128,20 +145,20 @@ def write_video(
     if project is None:
         raise EvaluationError(f"{run.description.bag}: no camera calibration or too few limb tags")
     with BagReader(run.description.bag) as bag:
-        images, states = _topics(bag, IMAGE_TYPE)[:1], _topics(bag, STATE_TYPE)[:1]
+        images, states = topics_of(bag, IMAGE_TYPE)[:1], topics_of(bag, STATE_TYPE)[:1]
         if not images:
             raise EvaluationError(
                 f"{run.description.bag}: holds no images; record them with record_images:=true"
             )
         curves = {
-            _stamp_of(message): _points(message.curve)
+            stamp_of(message): curve_points(message.curve)
             for _, _, message in bag.messages(states)
             if message.valid
         }
         film: cv2.VideoWriter | None = None
         for _, _, message in bag.messages(images):
             frame = gray(message)
-            stamp = _stamp_of(message)
+            stamp = stamp_of(message)
             if frame is None or stamp is None:
                 continue
             if film is None:

@@ -1,8 +1,9 @@
 """The limb at chosen instants of a recorded run: camera frame, measured and planned shape.
 
-The projection from the limb's plane to the image is fitted to the tags in the bag itself: the tracker
-recorded where each limb tag is in pixels and in `limb_base`, and the camera's calibration is in the
-bag, so no file of the rig is needed. What lies in the plane of the limb tags projects exactly.
+The projection from the limb's plane to the image is fitted to the tags in the bag itself: the
+tracker recorded where each limb tag is in pixels and in `limb_base`, and the camera's calibration
+is in the bag, so no file of the rig is needed. What lies in the plane of the limb tags projects
+exactly.
 """
 
 from __future__ import annotations
@@ -88,7 +89,8 @@ def take_snapshots(run: RunSeries, times: Sequence[float]) -> list[Snapshot]:
         return [_snapshot(bag, run.origin, time) for time in times]
 
 
-def _topics(bag: BagReader, type_name: str) -> list[str]:
+def topics_of(bag: BagReader, type_name: str) -> list[str]:
+    """Return the topics of a type that come from the rig, neither simulated truth nor drawings."""
     return [
         topic.name
         for topic in bag.topics.values()
@@ -100,11 +102,11 @@ def _topics(bag: BagReader, type_name: str) -> list[str]:
 def _snapshot(bag: BagReader, origin: int, time: float) -> Snapshot:
     when = origin + round(time * NANOSECONDS)
     window = (when - round(MARGIN * NANOSECONDS), when + round(MARGIN * NANOSECONDS))
-    states, images = _topics(bag, STATE_TYPE)[:1], _topics(bag, IMAGE_TYPE)[:1]
-    markers = _topics(bag, MARKERS_TYPE)[:1]
+    states, images = topics_of(bag, STATE_TYPE)[:1], topics_of(bag, IMAGE_TYPE)[:1]
+    markers = topics_of(bag, MARKERS_TYPE)[:1]
     nearest: dict[str, tuple[int, Any]] = {}
     for topic, _, message in bag.messages([*states, *images, *markers], *window):
-        stamp = _stamp_of(message)
+        stamp = stamp_of(message)
         if stamp is None:
             continue
         away = abs(stamp - when)
@@ -117,12 +119,14 @@ def _snapshot(bag: BagReader, origin: int, time: float) -> Snapshot:
     return Snapshot(
         time=time,
         frame=gray(image) if image is not None else None,
-        measured=_points(state.curve) if state is not None and state.valid else np.empty((0, 2)),
+        measured=curve_points(state.curve)
+        if state is not None and state.valid
+        else np.empty((0, 2)),
         planned=_limb_of(marker),
     )
 
 
-def _stamp_of(message: Any) -> int | None:
+def stamp_of(message: Any) -> int | None:
     """Return the stamp of a message [ns]; of the limb's line for markers."""
     if hasattr(message, "markers"):
         lines = [marker for marker in message.markers if marker.ns == LIMB_MARKER]
@@ -135,10 +139,13 @@ def _stamp_of(message: Any) -> int | None:
 def _limb_of(message: Any) -> Array:
     if message is None:
         return np.empty((0, 2))
-    return _points(next(marker.points for marker in message.markers if marker.ns == LIMB_MARKER))
+    return curve_points(
+        next(marker.points for marker in message.markers if marker.ns == LIMB_MARKER)
+    )
 
 
-def _points(points: Sequence[Any]) -> Array:
+def curve_points(points: Sequence[Any]) -> Array:
+    """Return messages' points as (N, 2)."""
     return np.array([[point.x, point.y] for point in points]).reshape(-1, 2)
 
 
@@ -166,7 +173,7 @@ def fit_projection(run: RunSeries, seconds: float = 60.0) -> Projection | None:
         None where the bag lacks the camera's calibration or has too few tags.
     """
     with BagReader(run.description.bag) as bag:
-        cameras, tags = _topics(bag, CAMERA_TYPE)[:1], _topics(bag, TAGS_TYPE)[:1]
+        cameras, tags = topics_of(bag, CAMERA_TYPE)[:1], topics_of(bag, TAGS_TYPE)[:1]
         info: Any = None
         pixels: list[list[float]] = []
         plane: list[list[float]] = []

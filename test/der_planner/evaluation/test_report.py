@@ -1,0 +1,248 @@
+"""The page, the figures over camera frames and the film, from bags with images."""
+
+import csv
+import json
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from bags import spec
+from rosbags.typesys import get_types_from_msg
+from runs import FRAMES, TIMES, BagOfRun, reference, series
+
+from der_planner.evaluation import (
+    EvaluationError,
+    compare,
+    evaluate_bags,
+    evaluate_run,
+    load_run,
+    write_report,
+)
+from der_planner.evaluation.overlay import plot_shapes, write_video
+from der_planner.evaluation.snapshots import fit_projection, gray, take_snapshots
+from der_planner.recording.definitions import find_definition
+
+CAMERA = np.array([[300.0, 0.0, 158.0], [0.0, 305.0, 121.0], [0.0, 0.0, 1.0]])
+DISTORTION = np.array([-0.12, 0.03, 0.001, -0.0005, 0.0])
+ROTATION = np.array([0.05, 3.08, 0.1])
+POSITION = np.array([0.1, 0.02, 0.55])
+HEIGHT = 0.03
+
+
+def pixels(points: np.ndarray) -> np.ndarray:
+    """Project points (N, 2) [m] of the plane of the tags with OpenCV's camera model."""
+    lifted = np.column_stack([points, np.full(len(points), HEIGHT)])
+    return cv2.projectPoints(lifted, ROTATION, POSITION, CAMERA, DISTORTION)[0][:, 0, :]
+
+
+class FilmedRun(BagOfRun):
+    """A run with camera, tags and the planner's limb."""
+
+    def __init__(self, folder: Path, **options) -> None:
+        super().__init__(folder, **options)
+        for name in (
+            "der_msgs/msg/TagDetectionArray",
+            "visualization_msgs/msg/MarkerArray",
+            "sensor_msgs/msg/CameraInfo",
+        ):
+            found = get_types_from_msg(find_definition(name).text, name)
+            self.types.register({k: v for k, v in found.items() if k not in self.types.types})
+        self.kinds = self.types.types
+
+    def put(self, topic: str, name: str, seconds: float, message) -> None:
+        self.bag.add_topic(spec(topic, name))
+        data = bytes(self.types.serialize_cdr(message, name))
+        self.bag.write(topic, self.stamp(seconds + 0.03), self.stamp(seconds), data)
+
+    def frame(self, seconds: float, shade: int) -> None:
+        data = np.full((240, 320), shade, dtype=np.uint8)
+        self.put(
+            "/limb/camera/image_raw",
+            "sensor_msgs/msg/Image",
+            seconds,
+            self.kinds["sensor_msgs/msg/Image"](
+                header=self.header(seconds),
+                height=240,
+                width=320,
+                encoding="mono8",
+                is_bigendian=0,
+                step=320,
+                data=data.ravel(),
+            ),
+        )
+
+    def calibration(self) -> None:
+        region = self.kinds["sensor_msgs/msg/RegionOfInterest"](
+            x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+        )
+        self.put(
+            "/limb/camera/camera_info",
+            "sensor_msgs/msg/CameraInfo",
+            0.0,
+            self.kinds["sensor_msgs/msg/CameraInfo"](
+                header=self.header(0.0),
+                height=240,
+                width=320,
+                distortion_model="plumb_bob",
+                d=DISTORTION,
+                k=CAMERA.ravel(),
+                r=np.eye(3).ravel(),
+                p=np.zeros(12),
+                binning_x=0,
+                binning_y=0,
+                roi=region,
+            ),
+        )
+
+    def tags(self, seconds: float, centres: np.ndarray) -> None:
+        square = 0.01 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+        detections = [
+            self.kinds["der_msgs/msg/TagDetection"](
+                id=i,
+                corners=pixels(centre + square).ravel(),
+                on_limb=True,
+                pose_valid=True,
+                pose=self.kinds["geometry_msgs/msg/Pose2D"](x=centre[0], y=centre[1], theta=0.0),
+                pixel_size=20.0,
+                line_residual=0.0,
+            )
+            for i, centre in enumerate(centres)
+        ]
+        name = "der_msgs/msg/TagDetectionArray"
+        message = self.kinds[name](header=self.header(seconds), detections=detections)
+        self.put("/limb/tags", name, seconds, message)
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("filmed") / "run"
+    run = FilmedRun(path, run=json.dumps({"trial": 1, "seed": 1, "commit": "c0ffee"}))
+    run.plan()
+    run.calibration()
+    random = np.random.default_rng(2)
+    for index, when in enumerate(FRAMES[FRAMES >= 0]):
+        run.state(when, reference(when)[0] + np.array([0.0, 0.002]))
+        if index % 10 == 0:
+            run.frame(when, shade=index % 250)
+            run.tags(when, random.uniform([0.0, -0.1], [0.24, 0.1], (5, 2)))
+    for index in range(len(TIMES)):
+        run.setpoint(index, [0.0, 0.0])
+    run.bag.close()
+    return path
+
+
+def test_projection_is_found_from_the_tags_alone(bag: Path):
+    project = fit_projection(load_run(bag))
+    points = np.random.default_rng(3).uniform([0.0, -0.1], [0.24, 0.1], (50, 2))
+    assert project.residual < 0.02
+    assert np.abs(project(points) - pixels(points)).max() < 0.05
+    assert project(np.empty((0, 2))).shape == (0, 2)
+
+
+def test_snapshot_is_the_nearest_frame(bag: Path):
+    frames = FRAMES[FRAMES >= 0]
+    asked = float(frames[40]) + 0.02
+    (shot,) = take_snapshots(load_run(bag), [asked])
+    assert shot.frame.shape == (240, 320)
+    assert np.all(shot.frame == 40)
+    assert shot.planned.shape == (0, 2)
+
+
+def test_colour_images_become_gray():
+    class Message:
+        encoding, height, width, step = "bgr8", 2, 2, 8
+        data = bytes([255, 0, 0, 0, 255, 0, 9, 9] * 2)
+
+    blue, green = gray(Message)[0]
+    assert blue < green
+    Message.encoding = "bayer_rggb8"
+    assert gray(Message) is None
+
+
+class Links(HTMLParser):
+    """Collects what a page would load, and checks that tags are balanced."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.sources: list[str] = []
+        self.open: list[str] = []
+        self.text: list[str] = []
+
+    def handle_starttag(self, tag, attributes):
+        self.sources += [v for k, v in attributes if k in ("src", "href", "srcset") and v]
+        if tag not in ("meta", "img", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def test_report_is_one_page_with_everything_in_it(bag: Path, tmp_path: Path):
+    run = load_run(bag)
+    other = series(reference(FRAMES) + np.array([0.0, 0.01]), model="pcc", trial=1, seed=1)
+    results = [evaluate_run(run), evaluate_run(other)]
+    report = write_report([run, other], results, tmp_path, title="Errors <of a lab>")
+    names = {path.name for path in report.files}
+    assert names >= {"results.json", "table.md", "table.csv", "table.tex", "report.html"}
+    assert names >= {f"{n}.{e}" for n in ("tip", "error", "shapes") for e in ("png", "pdf")}
+    page = Links()
+    text = report.page.read_text()
+    page.feed(text)
+    assert page.open == []
+    assert page.sources
+    assert all(source.startswith("data:image/png;base64,") for source in page.sources)
+    assert "url(" not in text
+    assert "Errors <of a lab>" in page.text
+    assert "c0ffee" in "".join(page.text)
+    (found,) = compare(results)
+    assert f"{found.difference_m * 100:.2f} cm less error" in "".join(page.text)
+    with (tmp_path / "table.csv").open() as file:
+        rows = {row["model"]: float(row["mean_error_m"]) for row in csv.DictReader(file)}
+    assert rows["der"] == pytest.approx(0.002, abs=5e-5)
+    assert rows["pcc"] == pytest.approx(0.01, abs=5e-5)
+
+
+def test_film_has_every_frame(bag: Path, tmp_path: Path):
+    path = write_video(load_run(bag), tmp_path / "film.mp4")
+    film = cv2.VideoCapture(str(path))
+    count = 0
+    while film.read()[0]:
+        count += 1
+    assert count == len(FRAMES[FRAMES >= 0][::10])
+
+
+def test_bag_without_images_has_shapes_but_no_film(tmp_path: Path):
+    run = BagOfRun(tmp_path / "plain")
+    run.plan()
+    for when in FRAMES:
+        run.state(when, reference(when)[0])
+    run.setpoint(0, [0.0, 0.0])
+    run.setpoint(len(TIMES) - 1, [0.0, 0.0])
+    run.bag.close()
+    loaded = load_run(tmp_path / "plain")
+    assert fit_projection(loaded) is None
+    assert len(plot_shapes([loaded], tmp_path)) == 2
+    with pytest.raises(EvaluationError, match="no camera calibration"):
+        write_video(loaded, tmp_path / "film.mp4")
+    assert plot_shapes([series(reference(FRAMES))], tmp_path) == []
+
+
+def test_bags_in_parallel_keep_their_order_and_their_errors(bag: Path, tmp_path: Path):
+    missing = tmp_path / "missing"
+    seen = []
+    found = evaluate_bags(
+        [bag, missing, bag],
+        workers=2,
+        progress=lambda done, total, path: seen.append((done, total)),
+    )
+    assert [entry.path for entry in found] == [bag, missing, bag]
+    assert f"no bag at {missing}" in found[1].error
+    assert found[0].result == found[2].result
+    assert seen == [(1, 3), (2, 3), (3, 3)]
+    alone = evaluate_bags([bag], workers=1)
+    assert alone[0].result == found[0].result
