@@ -214,9 +214,10 @@ class PlannerNode(Node):
     def _warm_up(self) -> None:
         """Compile every kernel before the node says that it is ready."""
         try:
-            for model in METHODS:
-                quick = Motion.named("asynchronous", amplitude=0.1, period=2.0, cycles=1)
-                plan(self._limb, quick, model, self._choose_method(model, ""), nodes=self._nodes)
+            quick = Motion.named("asynchronous", amplitude=0.1, period=2.0, cycles=1)
+            for model, methods in METHODS.items():
+                for method in methods:
+                    plan(self._limb, quick, model, method, nodes=self._nodes)
         except Exception as error:
             self.get_logger().error(f"the limb cannot be planned for: {error}")
             self._set("error", reason=str(error))

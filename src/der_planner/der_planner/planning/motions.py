@@ -46,7 +46,7 @@ _GRID = 0.01
 
 @dataclass(frozen=True)
 class Start:
-    """Where another motion is left, to begin a new one there instead of at rest.
+    """Where a motion begins, if not straight and at rest: where another one is left, for instance.
 
     Attributes:
         bend_angles: (M,) of the arcs [rad].
@@ -218,7 +218,8 @@ class Motion:
 
         Args:
             limb: the robot.
-            start: where another motion is left: a quintic leads from there to the straight pose first.
+            start: where the limb is if not straight at rest: a quintic leads from there to the
+                straight pose first.
 
         Raises:
             UnreachableError: a point of a tip path is out of reach.

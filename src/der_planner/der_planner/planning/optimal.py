@@ -49,14 +49,16 @@ class Settings:
         iterations: Gauss-Newton steps a window at most.
         tolerance: root mean square tip error below which a window is done, and change of it below which
             another step is not worth its time [m].
+        reuse: share of the error that a step must take away for its linearisation to be used again.
     """
 
     smoothness: float = 2e-7
     nearness: float = 1e-8
-    window: int = 160
-    settled: int = 120
-    iterations: int = 4
-    tolerance: float = 5e-6
+    window: int = 100
+    settled: int = 75
+    iterations: int = 6
+    tolerance: float = 1e-5
+    reuse: float = 0.7
 
 
 class Actuation:
@@ -114,6 +116,27 @@ class Actuation:
         even = type(air)(air.pressure_limit, air.slew_limit, air.fill_rate, mean, air.delay)
         response = pneumatics.chamber_pressures(even, command, CONTROL_PERIOD, size)
         return np.tile(response.reshape(-1, 1), (1, inputs))
+
+
+class Quadratic:
+    """The cost of a window around a linearisation: ½ δᵀHδ + gradientᵀδ.
+
+    Args:
+        jacobian: (2W, W·M) ∂tip/∂command [m/Pa].
+        hessian: (W·M, W·M) with smoothness and nearness [m²/Pa²].
+    """
+
+    def __init__(self, jacobian: Vector, hessian: Vector) -> None:
+        self.jacobian = jacobian
+        self._hessian = hessian
+        self._factor = cho_factor(hessian, lower=True)
+
+    def step(self, gradient: Vector, band: Band) -> tuple[Vector, bool]:
+        """Return the change of the commands (W, M) within the band, and whether a limit shaped it."""
+        change: Vector = -cho_solve(self._factor, gradient).reshape(band.command.shape)
+        if band.contains(change):
+            return change, False
+        return solve_limited(self._hessian, gradient, band), True
 
 
 @dataclass(frozen=True)
@@ -195,15 +218,16 @@ class Optimiser:
         """Improve ``command[first:last]`` in place; return the steps and whether a limit was met."""
         settings = self.settings
         met, damping = False, 0.0
-        jacobian: Vector | None = None
+        quadratic: Quadratic | None = None
         cost, misses = self._evaluate(command, state, first, last)
         for step in range(settings.iterations):
             rms = _rms(misses)
             if rms < settings.tolerance:
                 return step, met
-            if jacobian is None:
-                jacobian = self._jacobian(command, state, first, last)
-            change, limited = self._step(command, misses, jacobian, first, last, damping)
+            if quadratic is None:
+                quadratic = self._linearise(command, state, first, last, damping)
+            gradient = quadratic.jacobian.T @ misses.ravel() + self._pull(command, first, last)
+            change, limited = quadratic.step(gradient, self._band(command, first, last))
             met = met or limited
             trial = command[:last].copy()
             trial[first:] += change
@@ -212,12 +236,15 @@ class Optimiser:
             except ConvergenceError:
                 new_cost = np.inf
             if new_cost > cost:
-                damping = max(10 * damping, 1e-7)
+                damping, quadratic = max(10 * damping, 1e-7), None
                 continue
+            gained = rms - _rms(new_misses)
             command[:last] = trial
-            cost, misses, jacobian = new_cost, new_misses, None
-            if rms - _rms(misses) < max(settings.tolerance / 5, 0.02 * rms):
+            cost, misses = new_cost, new_misses
+            if gained < max(settings.tolerance / 5, 0.02 * rms):
                 return step + 1, met
+            if gained < settings.reuse * rms:
+                quadratic = None
         return settings.iterations, met
 
     def _evaluate(
@@ -231,17 +258,23 @@ class Optimiser:
         misses = motion.tip[1:, :2] - self.target[first:last]
         return float((misses**2).sum()) + self._roughness(command, first, last), misses
 
-    def _jacobian(self, command: Vector, state: RodState, first: int, last: int) -> Vector:
-        """Return ∂tip/∂command (W, 2, W, M) [m/Pa] of a window."""
+    def _linearise(
+        self, command: Vector, state: RodState, first: int, last: int, damping: float
+    ) -> Quadratic:
+        """Return the quadratic model of the cost around the commands of a window."""
         effective, slope = self.actuation.effective(command[:last], first)
         motion = self.model.rod.simulate(
             state, effective, CONTROL_PERIOD, substeps=self.actuation.substeps, linearise=True
         )
         if motion.linearisation is None:
             raise AssertionError("a linearised motion has a linearisation")
-        sensitivity = motion.linearisation.sensitivity(self._pulse)
-        jacobian: Vector = sensitivity[1:, :2] * slope
-        return jacobian
+        sensitivity = motion.linearisation.sensitivity(self._pulse)[1:, :2] * slope
+        size, inputs = last - first, command.shape[1]
+        J = sensitivity.reshape(2 * size, size * inputs)
+        second = _second_difference(size)
+        weight = self.settings.smoothness**2 * second.T @ second
+        weight[np.diag_indices(size)] += self.settings.nearness**2 + damping**2
+        return Quadratic(J, J.T @ J + np.kron(weight, np.eye(inputs)))
 
     def _deviation(self, command: Vector, first: int, last: int) -> Vector:
         """Return u − u⁰ (W + 2, M) from two setpoints before the window on."""
@@ -256,32 +289,13 @@ class Optimiser:
         smooth, near = self.settings.smoothness, self.settings.nearness
         return float(smooth**2 * (bends**2).sum() + near**2 * (deviation[2:] ** 2).sum())
 
-    def _step(
-        self,
-        command: Vector,
-        misses: Vector,
-        jacobian: Vector,
-        first: int,
-        last: int,
-        damping: float,
-    ) -> tuple[Vector, bool]:
-        """Return the change of the commands (W, M) and whether a limit shaped it."""
-        size, inputs = last - first, command.shape[1]
-        J = jacobian.reshape(2 * size, size * inputs)
-        second = _second_difference(size)
-        weight = self.settings.smoothness**2 * second.T @ second
-        weight[np.diag_indices(size)] += self.settings.nearness**2
-        H = J.T @ J + np.kron(weight, np.eye(inputs))
-        H[np.diag_indices(len(H))] += damping**2
+    def _pull(self, command: Vector, first: int, last: int) -> Vector:
+        """Return the gradient (W·M,) of smoothness and nearness."""
         deviation = self._deviation(command, first, last)
+        second = _second_difference(last - first)
         rough = self.settings.smoothness**2 * second.T @ np.diff(deviation, 2, axis=0)
-        gradient = J.T @ misses.ravel() + rough.ravel()
-        gradient += self.settings.nearness**2 * deviation[2:].ravel()
-        change = -cho_solve(cho_factor(H, lower=True), gradient).reshape(size, inputs)
-        band = self._band(command, first, last)
-        if band.contains(change):
-            return change, False
-        return solve_limited(H, gradient, band), True
+        pull: Vector = rough + self.settings.nearness**2 * deviation[2:]
+        return pull.ravel()
 
     def _band(self, command: Vector, first: int, last: int) -> Band:
         air = self.model.limb.pneumatics

@@ -21,11 +21,17 @@ from der_planner.planning.rod_model import NODES, RodModel
 
 Vector = NDArray[np.float64]
 
-DEFAULT_METHOD = {"der": "projected", "pcc": "paper"}
+DEFAULT_METHOD = {"der": "optimal", "pcc": "paper"}
 SUBSTEPS = 5
 """Integrator steps a control period: 10 ms."""
 _FINE = 2
 """Points of the feedforward's grid a control period."""
+
+
+_STRAIGHT = 1e-3
+"""A limb that rests within this bend [rad] of straight starts there."""
+_NOTABLE_CUT = 20.0
+"""Cuts by limits are worth a warning from here on [Pa]."""
 
 
 def plan(
@@ -47,7 +53,7 @@ def plan(
         method: ``paper``, ``projected`` or ``optimal`` for the rod, ``paper`` for PCC; empty takes the
             model's default.
         nodes: of the rod.
-        start: where another motion is left; None: at rest, vented.
+        start: where another motion is left; None: where the vented limb rests.
         progress: called with the share that is done, 0 … 1.
 
     Returns:
@@ -61,6 +67,8 @@ def plan(
     method = choose_method(model, method)
     report = progress or (lambda share: None)
     physics = models.build(limb, model, nodes)
+    if start is None:
+        start = resting_start(limb)
     reference = motion.reference(limb, start)
     report(0.1)
     spline = physics.configuration(reference)
@@ -98,6 +106,15 @@ def plan(
         warnings=tuple(_warnings(physics.limb, wanted, bend, cut)),
         details=details,
     )
+
+
+def resting_start(limb: Limb) -> Start | None:
+    """Return the pose of a vented limb that does not rest straight, None for one that does."""
+    rest = np.array([s.rest_curvature * s.length for s in limb.segments])
+    if np.abs(rest).max() < _STRAIGHT:
+        return None
+    zero = np.zeros_like(rest)
+    return Start(rest, zero, zero, zero)
 
 
 def choose_method(model: str, method: str) -> str:
@@ -152,7 +169,7 @@ def effective_pressures(limb: Limb, spline: BSpline, chambers: Vector) -> Vector
 def _warnings(limb: Limb, wanted: Vector, bend: Vector, cut: float) -> list[str]:
     said = []
     air = limb.pneumatics
-    if cut > 1.0:
+    if cut > _NOTABLE_CUT:
         largest = float(np.abs(wanted).max())
         fastest = float(np.abs(np.diff(wanted, axis=0)).max(initial=0.0)) / CONTROL_PERIOD
         said.append(
