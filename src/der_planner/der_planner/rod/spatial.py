@@ -48,7 +48,7 @@ class SpatialBackend:
         self.lever = 0.1 * float(mesh.rest.sum())
 
     def work_space(self) -> tuple[Array, ...]:
-        """Return new work arrays: twists, work, s, frame, own, link, local, vectors."""
+        """Return new work arrays: twists, work, s, frame, own, link, local, vectors, a."""
         n = (self.size + 1) // 4
         return (
             np.zeros(n),
@@ -59,6 +59,7 @@ class SpatialBackend:
             np.zeros((n, 4, 4)),
             np.zeros((12, 8)),
             np.zeros((10, 3)),
+            np.zeros((self.size, 21)),
         )
 
     def _extended(self, of_nodes: Array, of_edges: Array) -> Array:
@@ -185,7 +186,7 @@ class SpatialBackend:
         if iterations < 0:
             return start, iterations, update
         q = x[self.offset :].copy()
-        return self.carry_frames(start, q, np.zeros_like(q)), iterations, update
+        return self._state(q, np.zeros_like(q), directors, twists), iterations, update
 
     def _place(self, state: RodState) -> tuple[Array, tuple[Array, ...]]:
         """Return the kernel coordinates of a state and a work space with its frames and twists."""
@@ -198,11 +199,11 @@ class SpatialBackend:
 
     def energy(self, state: RodState) -> float:
         """Return the elastic energy."""
-        x, (twists, _, _, frame, _, _, local, _) = self._place(state)
+        x, (twists, _, _, frame, _, _, local, _, _) = self._place(state)
         return float(spatial_kernel.energy(x, frame, twists, local, *self.rod))
 
     def _assemble(self, state: RodState, v: Array) -> tuple[Array, Array]:
-        x, (twists, _, s, frame, own, link, local, vectors) = self._place(state)
+        x, (twists, _, s, frame, own, link, local, vectors, _) = self._place(state)
         gradient = np.zeros(self.size)
         spatial_kernel.assemble(
             x, v, 0.0, np.zeros(len(self.mesh.gain)), False, gradient, s, frame, twists, own, link,

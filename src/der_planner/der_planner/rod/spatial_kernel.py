@@ -292,6 +292,45 @@ def stretch(frame, u, convex, own, rest, axial, first, last, gain):
 
 
 @kernel
+def unsymmetric(frame, u, own, first, last, gain, a):
+    """Add to a (4n-1, 21) what `assemble` left out of the derivative at the frames' own base.
+
+    That is the unsymmetric part of the couples, which keep turning about z when their edge tilts, and
+    half of each edge's twisting torque times [t]×/|e|², as the force is no gradient under transport.
+    """
+    for j in range(frame.shape[0]):
+        half = 0.5 * own[j, 3, 4] * frame[j, 3] * frame[j, 3]
+        for k in range(3):
+            k1, k2 = (k + 1) % 3, (k + 2) % 3
+            add_to_edge(j, k1, k2, -half * frame[j, k], a)
+            add_to_edge(j, k2, k1, half * frame[j, k], a)
+    for m in range(gain.shape[0]):
+        for end in range(2):
+            j = first[m] if end == 0 else last[m]
+            force = (-gain[m] if end == 0 else gain[m]) * u[m] * frame[j, 3]
+            nx, ny = -frame[j, 1], frame[j, 0]
+            for c in range(3):
+                tc = frame[j, c]
+                nc = nx if c == 0 else (ny if c == 1 else 0.0)
+                for r in range(3):
+                    tr = frame[j, r]
+                    nr = nx if r == 0 else (ny if r == 1 else 0.0)
+                    spin = -1.0 if (r == 0 and c == 1) else (1.0 if (r == 1 and c == 0) else 0.0)
+                    exact = -(spin - nr * tc)  # −[z]× (1 − t tᵀ), with [z]× t = n
+                    add_to_edge(j, r, c, force * (exact - tr * nc - nr * tc), a)
+
+
+@kernel
+def add_to_edge(j, r, c, value, a):
+    """Add ∂(force by edge j)_r/∂(edge j)_c to the general band a of the nodes."""
+    row, column = 4 * j + r, 4 * j + c
+    a[row, 10 + column - row] += value
+    a[row + 4, 10 + column - row] += value
+    a[row, 14 + column - row] -= value
+    a[row + 4, 6 + column - row] -= value
+
+
+@kernel
 def to_nodes(own, link, g, s):
     """Bring gradient and Hessian by edges, w_j = (x_{j+1} − x_j, φ_j), to the nodes: g (4n-1,), s."""
     edges = own.shape[0]

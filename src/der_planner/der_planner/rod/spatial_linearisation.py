@@ -86,7 +86,7 @@ def residual_derivatives(
     Args:
         stage: where. rod: the kernels' rod arrays. space: the backend's work arrays.
     """
-    twists, _, s, frame, own, link, local, vectors = space
+    twists, _, s, frame, own, link, local, vectors, _ = space
     size = len(stage.x)
     spatial_kernel.frames(stage.x, stage.tangents, stage.directors, frame)
     spatial_kernel.reference_twists(frame, stage.twists_n, twists)

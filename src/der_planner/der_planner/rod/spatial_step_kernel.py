@@ -4,20 +4,41 @@ from __future__ import annotations
 
 import numpy as np
 
-from der_planner.rod.band_kernel import hold_fixed, put, smallest, solve_10
+from der_planner.rod.band_kernel import (
+    expand,
+    factor_general,
+    hold_fixed,
+    hold_fixed_general,
+    put,
+    smallest,
+    solve_10,
+    solve_one,
+)
 from der_planner.rod.compile import kernel
-from der_planner.rod.spatial_kernel import D1, T, assemble, frames, reference_twists
+from der_planner.rod.spatial_kernel import D1, T, assemble, frames, reference_twists, unsymmetric
+
+
+@kernel
+def carry(x, twists_n, tangents, directors, twists, frame):
+    """Move the reference frames to x: tangents, directors and twists_n are replaced."""
+    frames(x, tangents, directors, frame)
+    reference_twists(frame, twists_n, twists)
+    for j in range(frame.shape[0]):
+        for k in range(3):
+            tangents[j, k] = frame[j, T + k]
+            directors[j, k] = frame[j, D1 + k]
+        twists_n[j] = twists[j]
 
 
 @kernel
 def newton(
     x, x_n, v_n, rate, u, tolerance, lever, limit, tangents, directors, twists_n, twists,
-    work, s, frame, own, link, local, vectors, mass, damping, load, fixed,
+    work, s, frame, own, link, local, vectors, a, mass, damping, load, fixed,
     rest, axial, bend, twist, cubic, viscous, rest_kappa, rest_twist, first, last, gain,
 ):  # fmt: skip
     """Solve M·rate·((x − x_n)·rate − v_n) + D·rate·(x − x_n) = F(x) for x, from the guess in x.
 
-    rate = 0 is statics. tangents, directors (n-1, 3) and twists_n (n,) are the reference frames at x_n.
+    rate = 0 is statics, where the reference frames follow each iterate. tangents, directors (n-1, 3) and twists_n (n,) are the reference frames at x_n.
     Returns (iterations, size of the last update); iterations is negative without convergence. The
     update is a length: an angle counts times lever [m].
     """
@@ -39,8 +60,17 @@ def newton(
         for k in range(size):
             residual[k] += mass[k] * rate * (v[k] - v_n[k]) + damping[k] * v[k] - load[k]
             s[k, 0] += rate * (mass[k] * rate + damping[k])
-        hold_fixed(s, residual, fixed)
-        solve_10(s, residual)
+        # Inertia makes the symmetric part of the derivative good enough; rest does not.
+        if rate == 0.0 or iteration > 5:
+            expand(s, a)
+            unsymmetric(frame, u, own, first, last, gain, a)
+            hold_fixed(s, residual, fixed)
+            hold_fixed_general(a, fixed)
+            factor_general(a)
+            solve_one(a, residual)
+        else:
+            hold_fixed(s, residual, fixed)
+            solve_10(s, residual)
         update = 0.0
         turn = 0.0
         for k in range(size):
@@ -58,27 +88,19 @@ def newton(
         update = max(update, lever * turn)
         for k in range(size):
             x[k] -= scale * residual[k]
+        if rate == 0.0:
+            # Far from their base the frames' holonomy, which the symmetric derivative leaves out, would
+            # slow the iteration down; at rest nothing depends on when the frames were carried along.
+            carry(x, twists_n, tangents, directors, twists, frame)
         if update < tolerance:
             return iteration + 1, update
     return -limit, update
 
 
 @kernel
-def carry(x, twists_n, tangents, directors, twists, frame):
-    """Move the reference frames to x: tangents, directors and twists_n are replaced."""
-    frames(x, tangents, directors, frame)
-    reference_twists(frame, twists_n, twists)
-    for j in range(frame.shape[0]):
-        for k in range(3):
-            tangents[j, k] = frame[j, T + k]
-            directors[j, k] = frame[j, D1 + k]
-        twists_n[j] = twists[j]
-
-
-@kernel
 def simulate(
     q, v, pressures, h, extrapolate, tolerance, lever, limit, tangents, directors, twists_n,
-    twists, work, s, frame, own, link, local, vectors,
+    twists, work, s, frame, own, link, local, vectors, a,
     mass, damping, load, fixed,
     rest, axial, bend, twist, cubic, viscous, rest_kappa, rest_twist, first, last, gain,
 ):  # fmt: skip
@@ -115,7 +137,7 @@ def simulate(
                     put(x_n, x)
                 iterations, update = newton(
                     x, x_n, v_n, rate, u, tolerance, lever, limit, tangents, directors, twists_n, twists,
-                    work, s, frame, own, link, local, vectors, mass, damping, load, fixed,
+                    work, s, frame, own, link, local, vectors, a, mass, damping, load, fixed,
                     rest, axial, bend, twist, cubic, viscous, rest_kappa, rest_twist,
                     first, last, gain)  # fmt: skip
                 if iterations > 0:

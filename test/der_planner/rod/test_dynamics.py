@@ -1,0 +1,199 @@
+"""Time steps against known motions, frequencies, orders and conserved quantities."""
+
+import numpy as np
+import pytest
+from der_planner.limb import Limb
+from der_planner.rod import Rod
+
+RADIUS = 0.015
+AREA = np.pi * RADIUS**2
+INERTIA = np.pi * RADIUS**4 / 4
+YOUNG = 1.5e6
+
+
+def cantilever(nodes=21, clamp="inside", plane="xz", gravity=(0, 0, -9.81), **options) -> Rod:
+    return Rod.uniform(
+        length=0.25, nodes=nodes, EI=YOUNG * INERTIA, EA=YOUNG * AREA,
+        GJ=YOUNG / 3 * 2 * INERTIA, mass_per_length=1240 * AREA, clamp=clamp, gravity=gravity,
+        plane=plane, **options,
+    )  # fmt: skip
+
+
+def released(rod: Rod, dt: float, method: str, duration: float = 1.0) -> np.ndarray:
+    """Displacement of the tip after falling from straight."""
+    still = np.zeros((round(duration / dt), rod.segment_count))
+    tip = rod.simulate(rod.straight_state(), still, dt, method=method).tip
+    return tip[-1] - tip[0]
+
+
+@pytest.mark.parametrize("plane", ["xz", None])
+def test_backward_euler_agrees_with_three_independent_codes(plane):
+    shift = released(cantilever(plane=plane), 5e-3, "backward_euler")
+    assert shift[2] == pytest.approx(-88.614e-3, abs=5e-7)
+    assert shift[0] == pytest.approx(-19.353e-3, abs=5e-7)
+    assert shift[1] == 0.0
+
+
+@pytest.mark.parametrize("plane", ["xz", None])
+def test_midpoint_agrees_with_the_known_tips(plane):
+    for dt, tip in ((10e-3, -113.41e-3), (5e-3, -112.89e-3)):
+        assert released(cantilever(plane=plane), dt, "midpoint")[2] == pytest.approx(tip, abs=1e-5)
+
+
+def test_every_method_converges_to_the_known_limit():
+    rod = cantilever()
+    assert released(rod, 1e-4, "midpoint")[2] == pytest.approx(-112.78e-3, abs=1.5e-5)
+    assert released(rod, 2e-4, "sdirk2")[2] == pytest.approx(-112.78e-3, abs=2e-5)
+    coarse, fine = (released(rod, dt, "backward_euler")[2] for dt in (4e-4, 2e-4))
+    assert 2 * fine - coarse == pytest.approx(-112.78e-3, abs=5e-4)
+
+
+@pytest.mark.parametrize("clamp", ["ghost", "inside"])
+def test_bending_frequencies_are_those_of_euler_and_bernoulli(clamp):
+    nodes = 81
+    rod = cantilever(nodes, clamp, gravity=(0, 0, 0))
+    stiffness = rod.stiffness(rod.straight_state())
+    vertical = rod.free[rod.free % 4 == 2]
+    mass = rod.mass_diagonal[vertical]
+    scaled = stiffness[np.ix_(vertical, vertical)] / np.sqrt(np.outer(mass, mass))
+    found = np.sqrt(np.linalg.eigvalsh(scaled)[:3]) / (2 * np.pi)
+    length = 0.25 if clamp == "ghost" else 0.25 - 0.5 * rod.rest_lengths[0]
+    roots = np.array([1.87510407, 4.69409113, 7.85475744])
+    exact = (roots / length) ** 2 * np.sqrt(YOUNG * INERTIA / (1240 * AREA)) / (2 * np.pi)
+    np.testing.assert_allclose(found, exact, rtol=2e-3)
+    if clamp == "ghost":
+        assert found[0] == pytest.approx(2.34 * (0.25 / 0.25) ** 2, rel=0.02)
+
+
+def test_torsional_frequencies():
+    """A clamped-free shaft: f = (2n−1)/(4L) √(GJ/ρI), with the polar inertia of a solid circle."""
+    rod = cantilever(81, "ghost", plane=None, gravity=(0, 0, 0))
+    twist = rod.free[rod.free % 4 == 3]
+    stiffness = rod.stiffness(rod.straight_state())
+    mass = rod.mass_diagonal[twist]
+    scaled = stiffness[np.ix_(twist, twist)] / np.sqrt(np.outer(mass, mass))
+    found = np.sqrt(np.linalg.eigvalsh(scaled)[:3]) / (2 * np.pi)
+    speed = np.sqrt(YOUNG / 3 / 1240)
+    np.testing.assert_allclose(found, np.array([1, 3, 5]) / (4 * 0.25) * speed, rtol=1e-3)
+
+
+def test_small_motion_swings_at_the_first_frequency():
+    rod = cantilever(41, "ghost", gravity=(0, 0, -1e-3))
+    time = np.arange(1, 1001) * 2e-3
+    tip = rod.simulate(rod.straight_state(), np.zeros((1000, 0)), 2e-3, method="midpoint").tip[1:, 2]
+    rest = rod.tip(rod.equilibrium([]))[2]
+    crossings = time[:-1][np.diff(np.sign(tip - rest)) > 0]
+    period = np.diff(crossings).mean()
+    roots = 1.87510407
+    exact = (roots / 0.25) ** 2 * np.sqrt(YOUNG * INERTIA / (1240 * AREA)) / (2 * np.pi)
+    assert 1 / period == pytest.approx(exact, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("method", "order"), [("midpoint", 2.0), ("sdirk2", 2.0), ("backward_euler", 1.0)]
+)
+@pytest.mark.parametrize("tau", [0.0, 0.01])
+def test_order_in_the_time_step(method, order, tau):
+    """Smooth motion in space (all modes resolved), with bending viscosity as well."""
+    rod = Rod.uniform(
+        length=0.2, nodes=6, EI=0.02, EA=20.0, GJ=0.02, mass_per_length=1.0, damping=0.3,
+        gravity=(0, -2.0, -9.81), segments=[(0, 6)], moment_gain=[1e-5], material_damping=tau,
+        rest_curvature=(1.0, 0.5),
+    )  # fmt: skip
+    start = rod.equilibrium([0.0])
+
+    def end(dt):
+        count = round(0.16 / dt)
+        u = np.full((count, 1), 2e3)
+        return rod.simulate(start, u, dt, method=method).final.q
+
+    steps = 1e-3 / 2 ** np.arange(3 if method != "backward_euler" else 4)
+    reference = end(1e-3 / 64) if method != "backward_euler" else None
+    values = [end(dt) for dt in steps]
+    if reference is None:  # first order: compare successive differences
+        differences = [np.abs(b - a).max() for a, b in zip(values, values[1:], strict=False)]
+        measured = np.log2(differences[-2] / differences[-1])
+    else:
+        errors = [np.abs(value - reference).max() for value in values]
+        measured = np.log2(errors[-2] / errors[-1])
+    assert measured == pytest.approx(order, abs=0.2)
+
+
+def total_energy(rod: Rod, q, v) -> float:
+    kinetic = 0.5 * rod.mass_diagonal @ v**2
+    return rod.energy(rod.state(q, v)) + kinetic - rod.external_force @ q
+
+
+@pytest.mark.parametrize("plane", ["xz", None])
+def test_energy_neither_grows_nor_drains_undamped(plane):
+    rod = cantilever(11, "ghost", plane)
+    start = rod.equilibrium([])
+    push = np.zeros((11, 3))
+    push[-1, 2] = -0.05
+    start = rod.equilibrium([], start=start, forces=push)
+    run = rod.simulate(start, np.zeros((2000, 0)), 1e-3, method="midpoint")
+    base = total_energy(rod, rod.equilibrium([]).q, 0 * start.v)
+    energy = np.array([total_energy(rod, q, v) - base for q, v in zip(run.q, run.v, strict=True)])
+    assert energy[0] > 0
+    early, late = energy[:500].mean(), energy[-500:].mean()
+    assert late == pytest.approx(early, rel=2e-3)
+    assert np.ptp(energy) < 0.02 * energy[0]
+
+
+@pytest.mark.parametrize("option", [{"damping": 1.5}, {"material_damping": 0.02}])
+def test_damping_drains_energy_and_ends_at_the_equilibrium(option):
+    rod = cantilever(11, "ghost", **option)
+    run = rod.simulate(rod.straight_state(), np.zeros((4000, 0)), 5e-3)
+    energy = [total_energy(rod, q, v) for q, v in zip(run.q[::50], run.v[::50], strict=True)]
+    assert np.all(np.diff(energy) < 1e-9)
+    np.testing.assert_allclose(run.tip[-1], rod.tip(rod.equilibrium([])), atol=1e-5)
+
+
+def test_mass_damping_decays_the_first_mode_at_half_its_rate():
+    rod = cantilever(21, "ghost", gravity=(0, 0, -1e-3), damping=2.0)
+    run = rod.simulate(rod.straight_state(), np.zeros((1500, 0)), 2e-3, method="midpoint")
+    swing = run.tip[:, 2] - rod.tip(rod.equilibrium([]))[2]
+    peaks = np.flatnonzero((np.abs(swing[1:-1]) > np.abs(swing[:-2])) & (np.abs(swing[1:-1]) >= np.abs(swing[2:]))) + 1
+    rate = np.polyfit(run.time[peaks], np.log(np.abs(swing[peaks])), 1)[0]
+    assert rate == pytest.approx(-1.0, rel=0.03)
+
+
+@pytest.mark.parametrize("method", ["sdirk2", "midpoint", "backward_euler"])
+@pytest.mark.parametrize("tau", [0.0, 0.02])
+def test_a_planar_problem_moves_the_same_in_space(method, tau):
+    limb = Limb.default()
+    options = {
+        "length": limb.length, "nodes": 21, "EI": 0.0175, "EA": 1380.0, "GJ": 0.0117,
+        "mass_per_length": 1.066, "damping": 0.75, "segments": [(0, 10), (11, 10)],
+        "moment_gain": [9.1e-6, 9.1e-6], "material_damping": tau, "gravity": (0.5, -1.0, 0.0),
+    }  # fmt: skip
+    planar, spatial = Rod.uniform(plane="xy", **options), Rod.uniform(**options)
+    time = np.arange(80)[:, None] * 0.02
+    u = 1e4 * np.sin(4 * time + [0.0, 1.0])
+    a = planar.simulate(planar.straight_state(), u, 0.01, method=method)
+    b = spatial.simulate(spatial.straight_state(), u, 0.01, method=method)
+    assert np.abs(a.tip[:, 1]).max() > 0.03
+    np.testing.assert_allclose(a.q, b.q, atol=2e-10)
+    np.testing.assert_allclose(a.v, b.v, atol=2e-7)
+
+
+def test_step_by_step_is_the_same_as_a_simulation():
+    rod = Rod.from_limb(Limb.default())
+    u = 1e4 * np.sin(np.arange(20)[:, None] + [0.0, 1.0])
+    run = rod.simulate(rod.straight_state(), u, 0.02)
+    state = rod.straight_state()
+    for row in u:
+        state = rod.step(state, row, 0.02)
+    np.testing.assert_allclose(run.final.q, state.q, atol=1e-10)
+    np.testing.assert_allclose(run.q[-1], run.final.q)
+    assert run.positions.shape == (21, 21, 3)
+    np.testing.assert_array_equal(run.positions[-1], rod.positions(run.final))
+
+
+def test_the_default_method_stays_bounded_where_the_midpoint_rule_does_not():
+    """Fast large bending without resolving the stretch: why the default is not the midpoint rule."""
+    rod = Rod.from_limb(Limb.default())
+    time = np.arange(400)[:, None] * 0.05
+    u = 15e3 * np.sin(2 * np.pi * time / 3 + [0.0, 1.0])
+    run = rod.simulate(rod.straight_state(), u, 0.05, substeps=4)
+    assert np.abs(run.v[:, -3:]).max() < 3.0

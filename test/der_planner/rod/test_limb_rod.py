@@ -1,0 +1,178 @@
+"""The rod of a limb: its mesh, its gain, its rest shape, and what the caller gets wrong."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from der_planner.limb import Limb
+from der_planner.rod import ConvergenceError, Rod
+
+
+def changed(*segments, **limb_options) -> Limb:
+    limb = Limb.default()
+    parts = [
+        dataclasses.replace(segment, **options)
+        for segment, options in zip(limb.segments, segments, strict=True)
+    ]
+    return dataclasses.replace(limb, segments=tuple(parts), **limb_options)
+
+
+@pytest.mark.parametrize("nodes", [11, 20, 21, 22, 40])
+@pytest.mark.parametrize("connector", [0.0, 0.01])
+def test_mesh_covers_the_limb(nodes, connector):
+    limb = changed({"length": 0.1}, {"length": 0.15}, connector_length=connector)
+    rod = Rod.from_limb(limb, nodes)
+    assert rod.nodes == nodes
+    assert rod.plane == "xy"
+    assert rod.rest_lengths.sum() == pytest.approx(limb.length)
+    (first, count), (second, second_count) = rod.segments
+    assert (first, second, second_count) == (0, count, nodes - count)
+    ends = np.append(0.0, np.cumsum(rod.rest_lengths))
+    boundary = 0.5 * (ends[count - 1] + ends[count])
+    assert boundary == pytest.approx(0.1 + 0.5 * connector)
+    assert rod.mass_diagonal[0::4].sum() == pytest.approx(1.066 * limb.length)
+
+
+def test_three_segments():
+    limb = Limb.default()
+    limb = dataclasses.replace(limb, segments=limb.segments[:1] * 3)
+    rod = Rod.from_limb(limb, 32)
+    state = rod.equilibrium([3e3, -2e3, 1e3])
+    expected = limb.static_gain * [3e3, -2e3, 1e3]
+    np.testing.assert_allclose(rod.bend_angles(state), expected, rtol=1e-3)
+
+
+@pytest.mark.parametrize("connector", [0.0, 0.015])
+def test_static_bend_angles_are_those_of_the_segments(connector):
+    limb = changed(
+        {"length": 0.1, "bending_stiffness": 0.02, "rest_curvature": 0.8},
+        {"length": 0.15, "moment_gain": 7e-6, "rest_curvature": -0.5},
+        connector_length=connector,
+    )
+    rod = Rod.from_limb(limb)
+    u = np.array([4e3, -6e3])
+    expected = limb.static_gain * u + [0.8 * 0.1, -0.5 * 0.15]
+    state = rod.equilibrium(u)
+    np.testing.assert_allclose(rod.bend_angles(state), expected, rtol=3e-3)
+    q, _ = rod.configuration_from_bend_angles(rod.bend_angles(state))
+    np.testing.assert_allclose(q, state.q, atol=1e-9)
+
+
+def test_cubic_stiffness_is_the_segments_law():
+    stiffening = 2e-5
+    limb = changed({"cubic_stiffness": stiffening}, {"cubic_stiffness": stiffening})
+    rod = Rod.from_limb(limb, 41)
+    u = np.array([1e4, -1.5e4])
+    curvature = rod.bend_angles(rod.equilibrium(u)) / 0.122
+    moment = 0.0175 * curvature + stiffening * curvature**3
+    np.testing.assert_allclose(moment, 9.1e-6 * u, rtol=3e-3)
+    assert np.all(np.abs(curvature) < 0.98 * np.abs(9.1e-6 * u / 0.0175))
+
+
+def test_tangent_of_the_even_bend():
+    rod = Rod.from_limb(Limb.default())
+    angles = np.array([0.7, -0.4])
+    q, tangent = rod.configuration_from_bend_angles(angles)
+    np.testing.assert_allclose(rod.bend_angles(q), angles, atol=1e-14)
+    for m in range(2):
+        step = np.zeros(2)
+        step[m] = 1e-6
+        ahead, _ = rod.configuration_from_bend_angles(angles + step)
+        behind, _ = rod.configuration_from_bend_angles(angles - step)
+        np.testing.assert_allclose(tangent[:, m], (ahead - behind) / 2e-6, atol=1e-10)
+    many = rod.bend_angles(np.stack([q, rod.straight_state().q]))
+    np.testing.assert_allclose(many, [angles, [0.0, 0.0]], atol=1e-14)
+
+
+def test_gravity_out_of_the_plane_makes_the_rod_spatial():
+    limb = changed({}, {}, gravity=(0.0, 0.0, -9.81))
+    rod = Rod.from_limb(limb)
+    assert rod.plane is None
+    sagging = rod.equilibrium([8e3, 8e3])
+    assert rod.tip(sagging)[2] < -0.005
+    assert rod.tip(sagging)[1] > 0.02
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda rod: rod.step(rod.straight_state(), [1.0], 0.01), r"u must have shape \(2,\), got \(1,\)"),
+        (lambda rod: rod.step(rod.straight_state(), [1.0, np.nan], 0.01), "u must be finite"),
+        (lambda rod: rod.step(rod.straight_state(), [1.0, "a"], 0.01), "u must be numbers"),
+        (lambda rod: rod.step(rod.straight_state(), [0.0, 0.0], 0.0), "dt must be a positive number"),
+        (lambda rod: rod.step(rod.straight_state(), [0.0, 0.0], 0.1, "euler"), "method must be one of"),
+        (lambda rod: rod.simulate(rod.straight_state(), np.zeros(3), 0.1), "pressures must be"),
+        (lambda rod: rod.simulate(rod.straight_state(), np.zeros((3, 3)), 0.1), "pressures must have"),
+        (lambda rod: rod.simulate(rod.straight_state(), np.zeros((3, 2)), 0.1, substeps=0), "substeps"),
+        (lambda rod: rod.state(np.ones(83)), "q must stay in the plane xy"),
+        (lambda rod: rod.state(np.ones(7)), r"q must have shape \(83,\), got \(7,\)"),
+        (lambda rod: rod.equilibrium([0, 0], forces=np.ones((21, 3))), "forces must stay in the plane"),
+        (lambda rod: rod.configuration_from_bend_angles([1.0]), "angles must have shape"),
+        (lambda rod: Rod.from_limb(Limb.default(), 4), "nodes must be an int of 6 or more"),
+        (lambda rod: Rod.from_limb(Limb.default(), plane="yz"), "plane must be"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_named_at_the_border(call, message):
+    with pytest.raises(ValueError, match=message):
+        call(Rod.from_limb(Limb.default()))
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ({"EI": -1.0}, "EI must be a positive number, got -1.0"),
+        ({"length": np.inf}, "length must be a positive number"),
+        ({"damping": -0.1}, "damping must be 0 or more"),
+        ({"nodes": 2}, "nodes must be an int of 3 or more"),
+        ({"clamp": "pinned"}, "clamp must be 'ghost', 'inside' or 'free'"),
+        ({"segments": [(0, 6), (5, 6)], "moment_gain": [1, 1]}, "sharing no node"),
+        ({"segments": [(0, 12)], "moment_gain": [1]}, "within 11 nodes"),
+        ({"segments": [(0, 2)], "moment_gain": [1]}, "at least 3 nodes"),
+        ({"segments": [(0, 5)]}, r"moment_gain must have shape \(1,\)"),
+        ({"gravity": (0, 0)}, r"gravity must have shape \(3,\)"),
+        ({"gravity": (0, 0, -9.81), "plane": "xy"}, "gravity must stay in the plane xy"),
+        ({"fixed": [99]}, "fixed must be"),
+    ],
+)
+def test_bad_parameters_are_named(option, message):
+    good = {"length": 0.2, "nodes": 11, "EI": 0.02, "EA": 1e3, "GJ": 0.02, "mass_per_length": 1.0}
+    with pytest.raises(ValueError, match=message):
+        Rod.uniform(**{**good, **option})
+
+
+@pytest.mark.parametrize("plane", ["xy", None])
+def test_a_step_that_does_not_converge_raises_and_says_where(plane):
+    rod = Rod.from_limb(Limb.default(), plane=plane)
+    state = rod.straight_state()
+    good = rod.step(state, [1e3, 1e3], 0.02)
+    pressures = np.array([[1e3, 1e3], [1e9, -1e9]])
+    with pytest.raises(ConvergenceError, match=r"step 1 of 0\.02 s") as caught:
+        rod.simulate(state, pressures, 0.02)
+    assert caught.value.step == 1
+    assert caught.value.iterations > 0
+    assert not caught.value.residual < 1e-9
+    np.testing.assert_allclose(caught.value.state.q, good.q, atol=1e-12)
+
+
+def test_halving_is_the_callers_choice():
+    rod = Rod.from_limb(Limb.default())
+    state, jolt = rod.straight_state(), [1e5, -1e5]
+    with pytest.raises(ConvergenceError):
+        rod.step(state, jolt, 0.1, "backward_euler")
+    halved = rod.step(state, jolt, 0.1, "backward_euler", halvings=4)
+    assert np.isfinite(halved.q).all()
+    assert np.abs(rod.bend_angles(halved)).max() > 1.0
+
+
+def test_fixed_degrees_of_freedom_do_not_move():
+    rod = Rod.uniform(
+        length=0.2, nodes=11, EI=0.02, EA=1e3, GJ=0.02, mass_per_length=1.0, gravity=(0, 0, -9.81),
+        fixed=[4 * 10 + 2, 3],
+    )  # fmt: skip
+    assert not {42, 3, 0, 1, 2} & set(rod.free.tolist())
+    state = rod.straight_state()
+    for _ in range(20):
+        state = rod.step(state, [], 0.01)
+    assert state.q[42] == 0.0
+    assert state.q[3] == 0.0
+    assert state.q[4 * 5 + 2] < -1e-4

@@ -1,0 +1,191 @@
+"""Exact derivatives of steps and motions, against finite differences and against each other."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from der_planner.limb import Limb
+from der_planner.rod import Rod
+
+METHODS = ["sdirk2", "midpoint", "backward_euler"]
+
+
+def limb_rod(**options) -> Rod:
+    limb = Limb.default()
+    segments = tuple(dataclasses.replace(segment, **options) for segment in limb.segments)
+    return Rod.from_limb(dataclasses.replace(limb, segments=segments, gravity=(0.3, -2.0, 0.0)))
+
+
+def spatial_rod() -> Rod:
+    return Rod.uniform(
+        length=0.2, nodes=8, EI=0.02, EA=500.0, GJ=0.015, mass_per_length=1.0, damping=0.5,
+        gravity=(0, -3, -9.81), segments=[(0, 4), (4, 4)], moment_gain=[1e-5, 1.2e-5],
+        material_damping=0.02, rest_curvature=(2, 3), rest_twist=4.0,
+    )  # fmt: skip
+
+
+def moving_state(rod: Rod, seed: int):
+    random = np.random.default_rng(seed)
+    state = rod.equilibrium(random.normal(size=2) * 4e3)
+    for _ in range(4):
+        forces = random.normal(size=(rod.nodes, 3)) * 0.05
+        if rod.plane is not None:
+            forces[:, 2] = 0.0
+        state = rod.step(state, random.normal(size=2) * 1e4, 0.01, forces=forces)
+    return state
+
+
+def in_chart(rod: Rod, state, nominal) -> np.ndarray:
+    """Free (q, v) of a state, its angles counted from frames transported from the nominal state."""
+    carried = rod.state(state.q, state.v, like=nominal)
+    tangents = np.diff(state.positions, axis=0)
+    tangents /= np.linalg.norm(tangents, axis=1)[:, None]
+    across = np.cross(carried.directors, state.directors)
+    q = state.q.copy()
+    q[3::4] += np.arctan2(
+        np.sum(tangents * across, axis=1), np.sum(carried.directors * state.directors, axis=1)
+    )
+    return np.concatenate([q[rod.free], state.v[rod.free]])
+
+
+def step_by_differences(rod, state, u, dt, method):
+    nominal = rod.step(state, u, dt, method)
+    count = len(rod.free)
+    columns = []
+    for c in range(2 * count + len(u)):
+        ends = []
+        size = 1e-6 if c < 2 * count else 1.0
+        for sign in (1, -1):
+            q, v, pressure = state.q.copy(), state.v.copy(), u.copy()
+            if c < count:
+                q[rod.free[c]] += sign * size
+            elif c < 2 * count:
+                v[rod.free[c - count]] += sign * size
+            else:
+                pressure[c - 2 * count] += sign * size
+            moved = rod.step(rod.state(q, v, like=state), pressure, dt, method)
+            ends.append(in_chart(rod, moved, nominal))
+        columns.append((ends[0] - ends[1]) / (2 * size))
+    both = np.array(columns).T
+    return both[:, : 2 * count], both[:, 2 * count :]
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "rod",
+    [
+        pytest.param(limb_rod(), id="planar"),
+        pytest.param(limb_rod(material_damping=0.03, cubic_stiffness=1e-5), id="planar viscous"),
+        pytest.param(spatial_rod(), id="space"),
+    ],
+)
+def test_linearised_step_is_the_derivative_of_the_step(rod, method):
+    state = moving_state(rod, 1)
+    u = np.array([9e3, -6e3])
+    A, B = rod.linearise_step(state, u, 0.01, method)
+    expected_A, expected_B = step_by_differences(rod, state, u, 0.01, method)
+    np.testing.assert_allclose(A, expected_A, atol=1e-6 * np.abs(A).max())
+    np.testing.assert_allclose(B, expected_B, atol=1e-6 * np.abs(B).max())
+
+
+def test_it_needs_the_derivative_of_the_couples():
+    """Under pressure the couples turn with their edges: A depends on u also where q and v are held."""
+    rod = limb_rod()
+    state = rod.equilibrium([5e3, 5e3])
+    calm, _ = rod.linearise_step(state, [5e3, 5e3], 1e-4, "backward_euler")
+    # internal stiffness alone: the implicit step without the couples' derivative
+    free = rod.free
+    mass = rod.mass_diagonal[free]
+    after = rod.step(state, [5e3, 5e3], 1e-4, "backward_euler")
+    without = np.diag((mass / 1e-4 + rod.damping_diagonal[free]) / 1e-4)
+    right = without.copy()
+    without += rod.stiffness(after)[np.ix_(free, free)]
+    difference = np.abs(np.linalg.solve(without, right) - calm[: len(free), : len(free)]).max()
+    assert difference > 1e-5
+
+
+@pytest.fixture(scope="module", params=METHODS)
+def motion(request):
+    rod = limb_rod(material_damping=0.01)
+    start = rod.equilibrium([1e3, -1e3])
+    time = np.arange(30)[:, None] * 0.05
+    u = 8e3 * np.sin(3 * time + [0.0, 1.0])
+    run = rod.simulate(start, u, 0.05, substeps=3, method=request.param, linearise=True)
+    return rod, start, u, request.param, run
+
+
+def test_tangent_is_the_derivative_of_the_motion(motion):
+    rod, start, u, method, run = motion
+    change = np.random.default_rng(2).normal(size=u.shape) * 10
+    predicted = run.linearisation.tangent(change)
+    ends = [
+        rod.simulate(start, u + sign * change, 0.05, substeps=3, method=method).tip
+        for sign in (1, -1)
+    ]
+    expected = (ends[0] - ends[1])[:, :2] / 2
+    np.testing.assert_allclose(predicted, expected, atol=1e-5 * np.abs(expected).max())
+
+
+def test_tangent_by_the_initial_state(motion):
+    rod, start, u, method, run = motion
+    random = np.random.default_rng(3)
+    count = len(rod.free)
+    dq, dv = random.normal(size=count) * 1e-6, random.normal(size=count) * 1e-5
+    predicted = run.linearisation.tangent(np.zeros_like(u), (dq, dv))
+    ends = []
+    for sign in (1, -1):
+        q, v = start.q.copy(), start.v.copy()
+        q[rod.free] += sign * dq
+        v[rod.free] += sign * dv
+        ends.append(rod.simulate(rod.state(q, v), u, 0.05, substeps=3, method=method).tip)
+    expected = (ends[0] - ends[1])[:, :2] / 2
+    np.testing.assert_allclose(predicted, expected, atol=1e-5 * np.abs(expected).max())
+
+
+def test_adjoint_is_the_transpose_of_the_tangent(motion):
+    linearisation = motion[-1].linearisation
+    random = np.random.default_rng(4)
+    change = random.normal(size=(30, 3, 2))
+    weight = random.normal(size=(31, 2))
+    gradient = linearisation.adjoint(weight, by_step=True)
+    forward = np.sum(weight * linearisation.tangent(change))
+    assert np.sum(gradient * change) == pytest.approx(forward, rel=1e-9)
+    np.testing.assert_allclose(linearisation.adjoint(weight), gradient.sum(axis=1), rtol=1e-12)
+
+
+def test_sensitivity_is_the_matrix_of_the_tangent(motion):
+    linearisation = motion[-1].linearisation
+    matrix = linearisation.sensitivity()
+    assert matrix.shape == (31, 2, 30, 2)
+    change = np.random.default_rng(5).normal(size=(30, 2))
+    np.testing.assert_allclose(
+        np.einsum("kpjm,jm->kp", matrix, change), linearisation.tangent(change), atol=1e-12
+    )
+    for j in (0, 7, 29):
+        assert not matrix[: j + 1, :, j].any()
+        assert matrix[j + 1, :, j].any()
+
+
+def test_sensitivity_to_a_pulse_of_the_pneumatics(motion):
+    linearisation = motion[-1].linearisation
+    pulse = np.stack([np.linspace(0, 1, 8), np.linspace(1, 0.2, 8)], axis=1)
+    matrix = linearisation.sensitivity(pulse)
+    for j, m in ((0, 0), (4, 1), (29, 1)):
+        by_step = np.zeros((90, 2))
+        part = pulse[: 90 - 3 * j, m]
+        by_step[3 * j : 3 * j + len(part), m] = part
+        expected = linearisation.tangent(by_step.reshape(30, 3, 2))
+        np.testing.assert_allclose(matrix[:, :, j, m], expected, atol=1e-13)
+
+
+def test_one_interval_is_the_linearised_step():
+    rod = limb_rod(material_damping=0.01)
+    state = moving_state(rod, 6)
+    outputs = rod.free
+    run = rod.simulate(state, [[4e3, -2e3]], 0.01, linearise=True, outputs=outputs)
+    A, B = rod.linearise_step(state, [4e3, -2e3], 0.01)
+    count = len(rod.free)
+    np.testing.assert_allclose(run.linearisation.sensitivity()[1, :, 0, :], B[:count], rtol=1e-10)
+    dq = np.random.default_rng(7).normal(size=count)
+    moved = run.linearisation.tangent(np.zeros((1, 2)), (dq, 0 * dq))[1]
+    np.testing.assert_allclose(moved, A[:count, :count] @ dq, atol=1e-10)
