@@ -26,6 +26,7 @@ class Simulation:
 
     def __init__(self, protocol="ezloop", seed=0, **settings):
         self.time = 0
+        self.clock_error = 0
         self.settings = replace(CoreSettings(), **settings)
         self.core = DriverCore(host_protocol(protocol), self.settings, steady=lambda: self.steady)
         self.board = EmulatedBoard(board_protocol(protocol), Pneumatics(2, seed), seed)
@@ -41,7 +42,7 @@ class Simulation:
 
     @property
     def wall(self):
-        return START + self.time
+        return START + self.time + self.clock_error
 
     @property
     def mode(self):

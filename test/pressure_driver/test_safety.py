@@ -455,6 +455,38 @@ def test_corrupt_lines_do_not_end_a_run(simulate):
     assert sim.core.protocol.rejected > 10
 
 
+@pytest.mark.parametrize("step", [-3600, -2, 2, 3600])
+def test_a_wall_clock_that_is_set_drops_the_schedule_and_ends_vented(simulate, step):
+    sim = simulate(schedule=ScheduleLimits(horizon=60.0))
+    sim.track()
+    held = sim.core.snapshot().commanded_differential
+    for index in range(100):
+        assert sim.offer(held, ahead=0.25 + 0.05 * index, plan_id="next") is Verdict.ACCEPTED
+    sim.run(1.0)
+    sim.clock_error = step * 1_000_000_000
+    begin = sim.steady
+    sim.run_until(lambda: sim.mode is Mode.ARMED, 4.0)
+    assert sim.steady - begin > 1.0
+    sim.run_until(lambda: vented(sim), 5.0)
+    sim.run(8.0)
+    assert sim.mode is Mode.ARMED, "no setpoint of the old clock may come back"
+    # Setpoints in the new time are played.
+    assert sim.offer((1_000.0, 0.0), plan_id="new") is Verdict.ACCEPTED
+    sim.run_until(lambda: sim.mode is Mode.TRACKING, 0.3)
+
+
+@pytest.mark.parametrize("protocol", NAMES)
+@pytest.mark.parametrize("fault", ["drop:0.2", "corrupt:0.005"])
+def test_a_bad_line_still_ends_vented(simulate, protocol, fault):
+    """A fifth of the commands lost, or one byte in two hundred damaged, both ways."""
+    sim = simulate(protocol, seed=3)
+    sim.track()
+    sim.have(fault)
+    sim.core.vent()
+    sim.run(8.0)
+    assert vented(sim)
+
+
 def test_the_round_trip_is_measured_where_there_are_echoes(simulate):
     for protocol in ("ctrlp", "native"):
         sim = simulate(protocol)

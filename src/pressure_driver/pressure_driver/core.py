@@ -28,6 +28,8 @@ from pressure_driver.schedule import Counters, Schedule, ScheduleLimits, Setpoin
 STANDARD_ATMOSPHERE = 101_325.0
 """[Pa] on the wire until the room's has been measured; only vent commands are sent before."""
 
+LARGEST_CLOCK_STEP = 0.3
+"""[s] between two ticks, above slewing and late wakes, that means the wall clock was set."""
 IDENTITY_RETRY = 1.0
 """[s] after which a board that has not introduced itself is asked again."""
 
@@ -103,6 +105,7 @@ class DriverCore:
         self._round_trip = float("nan")
         self._pending_number: int | None = None
         self._asked_at = 0.0
+        self._clock_offset = 0.0
         self.last_text = ""
 
     # ------------------------------------------------------------------ from any thread
@@ -189,8 +192,7 @@ class DriverCore:
         """Return the command of this tick."""
         with self._lock:
             now = self._steady()
-            if instant < self._last_tick:
-                self._schedule.forget_ticks()
+            self._watch_wall_clock(instant, now)
             self._last_tick = instant
             action = self._machine.tick(instant, now)
             if action.dump:
@@ -199,6 +201,16 @@ class DriverCore:
                 action.differential, self._wire_atmosphere(), self.settings.command_validity
             )
             return data
+
+    def _watch_wall_clock(self, instant: int, now: float) -> None:
+        """Drop the schedule if the wall clock was set: its stamps do not mean what they meant."""
+        offset = instant * 1e-9 - now
+        step = offset - self._clock_offset
+        self._clock_offset = offset
+        if self._last_tick and abs(step) > LARGEST_CLOCK_STEP:
+            self._log(f"the clock was set by {step:.1f} s: waiting setpoints are dropped", True)
+            self._schedule.clear()
+            self._schedule.forget_ticks()
 
     def sent(self, instant: int) -> None:  # noqa: ARG002 - the protocol of the link
         """Do what can wait until the bytes are out."""

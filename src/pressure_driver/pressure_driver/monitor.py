@@ -87,7 +87,8 @@ class Monitor:
     @property
     def gauge(self) -> NDArray[np.float64]:
         """(2M,) [Pa] measured pressures above those at rest."""
-        return np.subtract(self.chamber_pressure, self.rest_pressure)
+        gauge: NDArray[np.float64] = self.chamber_pressure - self.rest_pressure
+        return gauge
 
     def telemetry_age(self, now: float) -> float:
         """Return the age [s] of the newest chamber pressures; NaN before the first."""

@@ -88,6 +88,7 @@ class SafetyMachine:
         """(M,) [Pa] commanded at the last tick."""
         self._latched = False
         self._vent_since = 0.0
+        self._fresh_at = 0.0
 
     # ----------------------------------------------------------------------------- requests
 
@@ -176,18 +177,21 @@ class SafetyMachine:
             return Action(self._zero, dump=True)
         if self._latched:
             return self._vent_latched(now)
-        self._follow(sample, tick)
+        self._follow(sample, now)
         return Action(self.differential, dump=self.mode is Mode.ARMED)
 
-    def _follow(self, sample: Sample | None, tick: int) -> None:
-        """Move between ARMED, TRACKING, HOLDING and VENTING, and set what is commanded."""
+    def _follow(self, sample: Sample | None, now: float) -> None:
+        """Move between ARMED, TRACKING, HOLDING and VENTING, and set what is commanded.
+
+        How long setpoints have been missing is taken on the steady clock: a wall clock that is set
+        back must not keep a limb under pressure.
+        """
         if sample is not None and sample.fresh:
             self.differential = sample.differential
+            self._fresh_at = now
             self._enter(Mode.TRACKING)
             return
-        if sample is None or self.mode is Mode.ARMED:
-            return
-        silence = (tick - sample.setpoint.stamp) / NANOSECONDS
+        silence = now - self._fresh_at
         if self.mode is Mode.TRACKING and silence > self.limits.setpoint_timeout:
             self._enter(Mode.HOLDING)
         if self.mode is Mode.HOLDING and (

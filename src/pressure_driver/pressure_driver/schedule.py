@@ -25,7 +25,8 @@ class Verdict(Enum):
     REFUSED = "refused"
 
 
-class Setpoint(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Setpoint:
     """Differential pressures and the instant at which they take effect."""
 
     stamp: int
