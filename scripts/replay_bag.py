@@ -201,6 +201,8 @@ def _run(options: argparse.Namespace, stop: threading.Event) -> int:
             time.sleep(0.2)  # the last messages leave the process
         finally:
             executor.shutdown()
+            spinner.join(5.0)  # a thread that still waits in rcl would abort the process
+            node.destroy_node()
             rclpy.try_shutdown()
     print(f"published {count} messages of {len(topics)} topics")
     if output.unanswered:

@@ -23,9 +23,8 @@ def test_mean_error_over_trials_ignores_gaps():
 
 def test_figures_are_written_and_repeatable(tmp_path):
     runs = [
-        series(reference(FRAMES) + np.array([0.0, error]), model=model, motion=motion)
+        series(reference(FRAMES) + np.array([0.0, error]), model=model)
         for model, error in (("der", 0.002), ("pcc", 0.01))
-        for motion in ("same_direction", "asynchronous")
     ]
     for plot, name in ((plot_tip, "tip"), (plot_error, "error")):
         first = plot(runs, tmp_path / "one")

@@ -238,7 +238,7 @@ def test_bags_in_parallel_keep_their_order_and_their_errors(bag: Path, tmp_path:
     found = evaluate_bags(
         [bag, missing, bag],
         workers=2,
-        progress=lambda done, total, path: seen.append((done, total)),
+        progress=lambda done, total, _: seen.append((done, total)),
     )
     assert [entry.path for entry in found] == [bag, missing, bag]
     assert f"no bag at {missing}" in found[1].error

@@ -81,7 +81,7 @@ def test_bytes_behind_the_content_are_no_damage_but_missing_ones_are(tmp_path: P
     with BagReader(bag.close()) as reader:
         messages = reader.messages()
         assert next(messages)[2].data == "whole"
-        with pytest.raises(Exception, match="String|string|Truncated|size"):
+        with pytest.raises(Exception, match=r"String|string|Truncated|size"):
             next(messages)
 
 

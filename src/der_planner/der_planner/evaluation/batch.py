@@ -15,6 +15,9 @@ from der_planner.evaluation.metrics import RunResult, evaluate_run
 from der_planner.evaluation.series import EvaluationError, RunSeries
 from der_planner.recording.reader import BagError
 
+WORTH_WHILE = 64 << 20
+"""Bags of fewer bytes in total are read by one process."""
+
 
 @dataclass(frozen=True)
 class Evaluated:
@@ -38,14 +41,15 @@ def evaluate_bags(
     Args:
         paths: bag folders or files.
         settings: for all of them.
-        workers: processes; 0 = the machine's cores, 1 = this process.
+        workers: processes; 0 = as many as there are cores, but only this one for so few bytes that
+            starting others would take longer; 1 = this process.
         progress: called with the number done, the number of bags and the last one's path.
 
     Returns:
         One entry per path, in the order given.
     """
     chosen = settings or Settings()
-    workers = min(workers or os.cpu_count() or 1, len(paths))
+    workers = min(workers or _worth_while(paths), len(paths))
     if workers <= 1:
         found = []
         for count, path in enumerate(paths, start=1):
@@ -63,6 +67,13 @@ def evaluate_bags(
             if progress is not None:
                 progress(count, len(paths), path)
     return [done[path] for path in paths]
+
+
+def _worth_while(paths: Sequence[Path]) -> int:
+    """Return how many processes pay for their start of a few seconds."""
+    files = [file for path in paths for file in (path.glob("*") if path.is_dir() else [path])]
+    size = sum(file.stat().st_size for file in files if file.is_file())
+    return os.cpu_count() or 1 if size > WORTH_WHILE else 1
 
 
 def _evaluate(path: Path, settings: Settings) -> Evaluated:
