@@ -1,5 +1,6 @@
 """The port's thread on a real pseudo-terminal, with an emulated board at the other end."""
 
+import itertools
 import os
 import re
 import select
@@ -8,6 +9,7 @@ import time
 
 import pytest
 
+from pressure_driver import link
 from pressure_driver.core import CoreSettings, DriverCore
 from pressure_driver.emulator.board import EmulatedBoard
 from pressure_driver.emulator.faults import Faults
@@ -18,6 +20,7 @@ from pressure_driver.grid import TickGrid
 from pressure_driver.link import PortError, SerialLink, open_port
 from pressure_driver.monitor import MonitorLimits
 from pressure_driver.protocols import board_protocol, host_protocol
+from pressure_driver.realtime import prefer_thread
 from pressure_driver.safety import Mode
 from pressure_driver.schedule import Setpoint, Verdict
 
@@ -154,11 +157,11 @@ def test_a_board_that_takes_no_bytes_does_not_stop_the_ticks(tmp_path):
     master, slave = os.openpty()
     try:
         core = DriverCore(host_protocol("ezloop"), CoreSettings())
-        link = SerialLink(os.ttyname(slave), 115_200, TickGrid(1_000_000), core)
-        link.start()
-        wait_for(lambda: link.bytes_sent > 3000, 30.0)
+        port = SerialLink(os.ttyname(slave), 115_200, TickGrid(1_000_000), core)
+        port.start()
+        wait_for(lambda: port.bytes_sent > 3000, 30.0)
         wait_for(lambda: "takes no bytes" in core._machine.link_fault, 30.0)
-        assert link.close()
+        assert port.close()
     finally:
         os.close(master)
         os.close(slave)
@@ -211,3 +214,56 @@ def test_a_pty_of_the_system_is_a_port():
     finally:
         os.close(master)
         os.close(slave)
+
+
+def test_a_port_is_kept_by_its_stable_name(tmp_path, monkeypatch):
+    (tmp_path / "by-id").mkdir()
+    device, other = tmp_path / "ttyACM0", tmp_path / "ttyACM1"
+    device.touch()
+    other.touch()
+    stable = tmp_path / "by-id" / "usb-Arduino_Mega-if00"
+    stable.symlink_to(device)
+    monkeypatch.setattr(link, "STABLE_NAMES", tmp_path / "by-id")
+    assert link.stable_name(str(device)) == str(stable)
+    assert link.stable_name(str(stable)) == str(stable)
+    assert link.stable_name(str(other)) == str(other)
+    assert str(stable) in link.available_ports()
+
+
+def test_a_lost_port_is_looked_for_with_growing_delays(rig, monkeypatch):
+    looks = []
+
+    def fails(*_):
+        looks.append(time.monotonic())
+        raise PortError("not there")
+
+    monkeypatch.setattr(link, "FIRST_RETRY", 0.02)
+    monkeypatch.setattr(link, "LAST_RETRY", 0.2)
+    rig.link._retry_delay = 0.02
+    monkeypatch.setattr(link, "open_port", fails)
+    rig.have("unplug")
+    wait_for(lambda: len(looks) >= 10)
+    gaps = [b - a for a, b in itertools.pairwise(looks)]
+    # A gap is the delay or longer, since the thread also waits for its ticks.
+    for count, gap in enumerate(gaps):
+        assert gap >= min(0.02 * 1.6 ** (count + 1), 0.2) - 0.005
+    assert rig.link.reconnects == 0
+    monkeypatch.undo()
+    rig.have()
+    wait_for(lambda: rig.link.reconnects == 1)
+
+
+def test_telemetry_that_comes_too_late_is_no_telemetry(rig):
+    rig.arm()
+    rig.have("delay:60")
+    wait_for(lambda: rig.mode is Mode.FAULT)
+    assert "no telemetry" in rig.core.snapshot().faults[0]
+
+
+def test_without_the_right_to_real_time_the_thread_runs_as_well(rig, monkeypatch):
+    def refuse(*_):
+        raise PermissionError("not allowed")
+
+    monkeypatch.setattr("os.sched_setscheduler", refuse)
+    assert not prefer_thread(10)
+    assert not prefer_thread(0)

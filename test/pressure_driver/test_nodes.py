@@ -94,7 +94,7 @@ class Bench:
         self.rest = np.array(self.air[-1].pressure)
         self.wait(try_to_arm, "the driver to arm", 40.0)
 
-    def play(self, count, shape=lambda k: (min(400.0 * k, 4000.0), -min(200.0 * k, 2500.0))):
+    def play(self, count, shape=lambda k: (min(600.0 * k, 3500.0), -min(300.0 * k, 2000.0))):
         """Publish setpoints 0.2 s ahead in real time; return stamp -> differential pressures."""
         start = (time.time_ns() // PERIOD + 8) * PERIOD
         wanted = {}
@@ -112,8 +112,8 @@ class Bench:
 
     def pressurise(self):
         self.arm()
-        self.play(24)
-        self.wait(lambda: self.gauge().max() > 2500.0, "pressure in a chamber")
+        self.play(12)
+        self.wait(lambda: self.gauge().max() > 2000.0, "pressure in a chamber")
 
     def have(self, faults):
         """Tell the emulated board to have these faults and no others."""
@@ -144,7 +144,7 @@ def test_a_run_from_arming_to_the_end_of_the_process(bench, protocol):
     run = bench(protocol)
     assert run.mode in (-1, PressureState.DISARMED)
     run.arm()
-    wanted = run.play(40, lambda k: (100.0 * (k + 1), -50.0 * (k + 1)))
+    wanted = run.play(24, lambda k: (200.0 * (k + 1), -100.0 * (k + 1)))
     # Setpoints stop: hold, ramp down, vented.
     run.wait_mode(PressureState.HOLDING)
     run.wait_mode(PressureState.VENTING)
@@ -205,7 +205,7 @@ def test_every_fault_of_the_board_ends_vented(bench):
         # To the other side, so that a valve which does not move is noticed.
         while run.mode != PressureState.FAULT:
             assert time.monotonic() - begin < 30.0, f"{fault} was not noticed"
-            run.play(10, lambda _: (-3500.0, -2500.0))
+            run.play(10, lambda _: (-3500.0, -2000.0))
         assert any(part in " ".join(run.states[-1].faults) for part in reason.split("|"))
         noticed = nanoseconds(run.states[-1].header.stamp)
         if fault.startswith(("stick", "runaway")):

@@ -33,6 +33,8 @@ LAST_RETRY = 2.0
 """[s] between looks after a long absence."""
 WRITE_TIMEOUT = 0.05
 """[s] that the port may refuse bytes before it counts as lost."""
+STABLE_NAMES = Path("/dev/serial/by-id")
+"""Where the system keeps names of ports that survive re-plugging."""
 VENT_REPEATS = 3
 """How often the vent command is sent at the end: there may be no checksum, and no second chance."""
 
@@ -65,8 +67,7 @@ class LinkClient(Protocol):
 
 def available_ports() -> list[str]:
     """Return the serial ports of this machine, by their stable names where there are any."""
-    stable = Path("/dev/serial/by-id")
-    by_id = sorted(str(path) for path in stable.iterdir()) if stable.is_dir() else []
+    by_id = sorted(map(str, STABLE_NAMES.iterdir())) if STABLE_NAMES.is_dir() else []
     known = {os.path.realpath(path) for path in by_id}
     others = [port.device for port in list_ports.comports() if port.device not in known]
     emulated = sorted(str(path) for path in Path("/tmp").glob("der_limb_board_*"))
@@ -75,9 +76,8 @@ def available_ports() -> list[str]:
 
 def stable_name(port: str) -> str:
     """Return the by-id name of a port, which survives re-plugging, or the name itself."""
-    folder = Path("/dev/serial/by-id")
-    if folder.is_dir():
-        for path in sorted(folder.iterdir()):
+    if STABLE_NAMES.is_dir():
+        for path in sorted(STABLE_NAMES.iterdir()):
             if os.path.realpath(path) == os.path.realpath(port):
                 return str(path)
     return port
