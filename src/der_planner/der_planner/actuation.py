@@ -106,6 +106,82 @@ def maxwell(time: Array, strain: Array, relaxation: float) -> Array:
     return q
 
 
+def resting_bend(limb: Limb, time: ArrayLike, differential: ArrayLike) -> Array:
+    """Return the bend angles (K, M) [rad] of a slow motion under chamber pressures (K, M) [Pa].
+
+    Without inertia each segment bends by its own moment alone; friction and creep are solved for at
+    each instant together with the bend, since they act along it.
+    """
+    times = np.ascontiguousarray(time, dtype=float)
+    pressures = np.asarray(differential, dtype=float)
+    bend = np.empty_like(pressures)
+    for index, segment in enumerate(limb.segments):
+        u = pressures[:, index]
+        stiffer = 1.0 + segment.pressure_stiffening * np.abs(u)
+        driven = u * (1.0 + segment.gain_asymmetry * np.sign(u))
+        bend[:, index] = _follow(
+            times,
+            np.ascontiguousarray(driven),
+            np.ascontiguousarray(stiffer),
+            float(limb.static_gain[index]),
+            segment.rest_curvature * segment.length,
+            segment.friction_moment / segment.moment_gain,
+            max(segment.friction_curvature * segment.length, 1e-6),
+            segment.creep_stiffness / segment.length / segment.moment_gain,
+            max(segment.creep_time, 1e-6),
+        )
+    return bend
+
+
+@njit(cache=True)
+def _follow(
+    time: Array,
+    driven: Array,
+    stiffer: Array,
+    gain: float,
+    rest: float,
+    friction: float,
+    turn: float,
+    creep: float,
+    relaxation: float,
+) -> Array:
+    """Solve θ (1 + s|u|)-stiff against friction and creep at each instant by Newton's method.
+
+    The residual rises with θ, bending away from the last angle stiffens it: one root, on the side to
+    which it points at the last angle.
+    """
+    bend = np.empty(time.shape[0])
+    angle = rest + gain * driven[0] / stiffer[0]
+    bend[0] = angle
+    z, q = 0.0, 0.0
+    for k in range(1, time.shape[0]):
+        rate = (time[k] - time[k - 1]) / relaxation
+        keep = np.exp(-rate)
+        share = (1.0 - keep) / rate
+        last = angle
+        scale = gain / stiffer[k]
+        error = last - rest - scale * (driven[k] - friction * z - creep * q * keep)
+        sign = -1.0 if error > 0.0 else 1.0
+        for _ in range(30):
+            change = angle - last
+            fade = np.exp(-abs(change) / turn)
+            moved = sign + (z - sign) * fade
+            load = friction * moved + creep * (q * keep + change * share)
+            error = angle - rest - scale * (driven[k] - load)
+            slope = 1.0 + scale * (friction * (1.0 - z * sign) * fade / turn + creep * share)
+            step = error / slope
+            angle -= step
+            if (angle - last) * sign < 0.0:
+                angle = last
+            if abs(step) < 1e-12:
+                break
+        change = angle - last
+        z = sign + (z - sign) * np.exp(-abs(change) / turn)
+        q = q * keep + change * share
+        bend[k] = angle
+    return bend
+
+
 def lead(
     limb: Limb, time: ArrayLike, differential: ArrayLike, largest_step: float = 0.02
 ) -> Array:

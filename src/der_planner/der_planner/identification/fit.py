@@ -18,12 +18,14 @@ from der_planner.identification.parameters import (
     GROUPS,
     TERMS,
     column,
+    put,
     start_values,
     to_limb,
     without,
 )
+from der_planner.identification.pcc_fit import fit_pcc
 from der_planner.identification.prediction import NODES, RodPrediction
-from der_planner.identification.prepare import PERIOD, Prepared, prepare
+from der_planner.identification.prepare import LONGEST_GAP, PERIOD, Prepared, prepare
 from der_planner.identification.report import FitReport, Unknown
 from der_planner.identification.statics import static_gain
 from der_planner.limb import CalibratedRange, Limb
@@ -49,6 +51,7 @@ def fit(
     terms: Iterable[str] = GROUPS,
     geometry: bool = True,
     nodes: int = NODES,
+    longest_gap: float = LONGEST_GAP,
 ) -> tuple[Limb, FitReport]:
     """Identify a limb from a calibration run.
 
@@ -56,8 +59,9 @@ def fit(
         limb: geometry, masses, limits and first guesses; mass and axial stiffness are kept.
         log: of a calibration run, or of any run that excites every input.
         terms: model terms to fit beside gain and rest angle, of `GROUPS`.
-        geometry: fit the segment lengths to the tips as well.
+        geometry: fit the lengths to the tips as well.
         nodes: of the rod in the fit.
+        longest_gap: between two rows of the log that a straight line may bridge [s].
 
     Returns:
         The identified limb, with provenance and calibrated ranges, and what the data say of it.
@@ -69,7 +73,7 @@ def fit(
     groups = frozenset(terms)
     if not groups <= set(GROUPS):
         raise LogError(f"unknown model term {sorted(groups - set(GROUPS))}: choose {GROUPS}")
-    prepared = prepare(log, limb)
+    prepared = prepare(log, limb, longest_gap=longest_gap)
     warnings = list(prepared.warnings)
     air = _try_air(prepared, warnings)
     lengths = fit_geometry(limb, prepared.log) if geometry else None
@@ -79,8 +83,20 @@ def fit(
     problem = _Problem(limb, prepared, offset, groups, nodes)
     values, jacobian = problem.solve()
     unknowns, correlation = problem.uncertainties(values, jacobian)
+    if "dynamics" in groups and all(u.untold for u in unknowns if u.name.startswith("log_stiff")):
+        warnings.append(
+            "the log is too slow to tell the stiffness apart from the gain: stiffness and damping keep "
+            "their old values; steps or a sweep would tell them"
+        )
+        problem = _Problem(limb, prepared, offset, groups - {"dynamics"}, nodes)
+        values, jacobian = problem.solve()
+        unknowns, correlation = problem.uncertainties(values, jacobian)
     remaining = problem.remaining(values)
     found = _finish(limb, to_limb(limb, values), air, prepared, remaining)
+    pcc_residual = np.full(limb.segment_count, np.nan)
+    if "dynamics" in problem.groups:
+        pcc_segments, pcc_residual = fit_pcc(found, prepared, offset)
+        found = replace(found, pcc_segments=pcc_segments)
     report = FitReport(
         source=log.source,
         unknowns=unknowns,
@@ -91,6 +107,7 @@ def fit(
         geometry=lengths,
         residual=np.sqrt(np.nanmean(remaining**2, axis=0)),
         largest=np.nanmax(np.abs(remaining), axis=0),
+        pcc_residual=pcc_residual,
         span=np.ptp(prepared.bend[prepared.usable], axis=0),
         duration=float(prepared.log.time[-1] - prepared.log.time[0]),
         rows=int(prepared.usable.sum()),
@@ -107,13 +124,13 @@ class _Problem:
     def __init__(
         self, limb: Limb, prepared: Prepared, offset: Array, groups: frozenset[str], nodes: int
     ) -> None:
-        self._groups = groups
+        self.groups = groups
         self._prepared = prepared
         self._wanted = [
             (segment, index)
             for segment in range(limb.segment_count)
             for index, term in enumerate(TERMS)
-            if term.group == "linear" or term.group in groups
+            if (term.group == "linear" or term.group in groups) and not (term.shared and segment)
         ]
         self._scale = np.array([TERMS[index].scale for _, index in self._wanted])
         self._spread = np.array([TERMS[index].spread for _, index in self._wanted])
@@ -168,7 +185,7 @@ class _Problem:
             sigma = float(deviation[place] * term.scale)
             unknowns.append(
                 Unknown(
-                    name=f"{term.name}[{segment}]",
+                    name=term.name if term.shared else f"{term.name}[{segment}]",
                     unit=term.unit,
                     value=float(values[segment, index]),
                     deviation=sigma,
@@ -184,15 +201,15 @@ class _Problem:
     def _start_values(self, limb: Limb, prepared: Prepared, offset: Array) -> Array:
         rows = prepared.usable
         gains, rests = static_gain((prepared.pressure - offset)[rows], prepared.bend[rows])
-        values = without(start_values(limb), self._groups)
+        values = without(start_values(limb), self.groups)
         values[:, column("gain")] = np.clip(gains, 1.1 * TERMS[0].low, 0.9 * TERMS[0].high)
         values[:, column("rest_angle")] = np.clip(rests, -0.5, 0.5)
         return values
 
     def _values(self, x: Array) -> Array:
         values = self._start.copy()
-        for place, scaled in zip(self._wanted, x * self._scale, strict=True):
-            values[place] = scaled
+        for (segment, index), value in zip(self._wanted, x * self._scale, strict=True):
+            put(values, segment, index, float(value))
         return values
 
     def _evaluate(self, x: Array) -> tuple[Array, Array]:

@@ -24,6 +24,8 @@ class Term:
         low, high: bounds.
         spread: standard deviation of what is known before any data; infinite for nothing.
         group: the model term that it belongs to; `linear` is always fitted.
+        shared: one value for all segments.
+        step: of a difference quotient, for what has no exact derivative.
     """
 
     name: str
@@ -33,6 +35,8 @@ class Term:
     high: float
     spread: float
     group: str
+    shared: bool = False
+    step: float = 0.0
 
 
 TERMS = (
@@ -44,10 +48,12 @@ TERMS = (
     Term("friction_angle", "rad", 0.1, 0.02, 0.8, 0.1, "friction"),
     Term("creep_pressure", "Pa/rad", 500.0, 0.0, 5000.0, 1000.0, "creep"),
     Term("creep_time", "s", 15.0, 3.0, 120.0, 15.0, "creep"),
-    Term("log_stiffness", "-", 0.2, -1.2, 1.2, 0.3, "dynamics"),
-    Term("log_damping", "-", 0.5, -3.0, 3.0, 1.0, "dynamics"),
+    Term("material_damping", "s", 0.01, 0.0, 0.1, 0.02, "dynamics", step=2e-3),
+    Term("log_stiffness", "-", 0.2, -1.2, 1.2, 0.3, "dynamics", step=0.02),
+    Term("log_damping", "-", 0.5, -3.0, 3.0, 0.5, "dynamics", shared=True, step=0.1),
 )
-"""Unknowns of each segment. The last two are relative to the prior's, as natural logarithms."""
+"""Unknowns of each segment. The last two are relative to the prior's, as natural logarithms. Damping
+by the air and the plate is one number for the limb: it cannot be told apart by segments."""
 
 GROUPS = ("asymmetry", "stiffening", "friction", "creep", "dynamics")
 """Model terms that may be left out, in the order in which they are explained."""
@@ -69,6 +75,7 @@ def start_values(limb: Limb) -> Array:
                 segment.friction_curvature * segment.length or 0.1,
                 segment.creep_stiffness / (gain * segment.length) or 400.0,
                 segment.creep_time or 15.0,
+                segment.material_damping,
                 0.0,
                 0.0,
             ]
@@ -97,6 +104,7 @@ def _segment(prior: Segment, value: dict[str, float]) -> Segment:
         bending_stiffness=float(stiffness),
         moment_gain=float(gain),
         damping=float(prior.damping * math.exp(value["log_damping"])),
+        material_damping=float(value["material_damping"]),
         rest_curvature=float(value["rest_angle"] / prior.length),
         gain_asymmetry=float(value["gain_asymmetry"]),
         pressure_stiffening=float(value["pressure_stiffening"]),
@@ -127,3 +135,11 @@ def without(values: Array, groups: frozenset[str]) -> Array:
         if group not in groups:
             result[:, column(name)] = 0.0
     return result
+
+
+def put(values: Array, segment: int, term: int, value: float) -> None:
+    """Write one unknown, of all segments where it is shared."""
+    if TERMS[term].shared:
+        values[:, term] = value
+    else:
+        values[segment, term] = value

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.actuation import dahl, effective_pressure, maxwell
-from der_planner.identification.parameters import TERMS, column, to_limb
+from der_planner.identification.parameters import TERMS, column, put, to_limb
 from der_planner.limb import Limb
 from der_planner.rod import Rod, Trajectory
 
@@ -90,9 +90,9 @@ class RodPrediction:
         return rod, trajectory
 
     def _difference(self, values: Array, segment: int, term: int, angles: Array) -> Array:
-        step = 0.02
+        step = TERMS[term].step
         moved = values.copy()
-        moved[segment, term] += step
+        put(moved, segment, term, float(values[segment, term]) + step)
         changed: Array = (self.angles(moved) - angles) / step
         return changed
 

@@ -22,6 +22,10 @@ LONGEST_GAP = 1.0
 LEAST_EXCITATION = 1000.0
 """Standard deviation of an input below which nothing can be told of it [Pa]."""
 LEAST_VALID = 0.5
+_WRONG_WAY = (
+    "segment {index} bends the wrong way: positive differential pressure must bend toward +y; "
+    "swap the two chambers or the sign in the column map"
+)
 
 
 @dataclass(frozen=True)
@@ -43,8 +47,16 @@ class Prepared:
     warnings: tuple[str, ...]
 
 
-def prepare(log: CalibrationLog, limb: Limb, period: float = PERIOD) -> Prepared:
+def prepare(
+    log: CalibrationLog, limb: Limb, period: float = PERIOD, longest_gap: float = LONGEST_GAP
+) -> Prepared:
     """Resample and check a log.
+
+    Args:
+        log: as recorded.
+        limb: that it should belong to.
+        period: of the grid [s].
+        longest_gap: between two rows that a straight line may bridge [s].
 
     Raises:
         LogError: another number of segments, an input without excitation, too few tags, or pressures
@@ -55,7 +67,7 @@ def prepare(log: CalibrationLog, limb: Limb, period: float = PERIOD) -> Prepared
             f"the log has {log.segment_count} segments, the limb '{limb.name}' {limb.segment_count}: "
             "this limb file belongs to another limb"
         )
-    grid = log.resampled(period, LONGEST_GAP)
+    grid = log.resampled(period, longest_gap)
     warnings: list[str] = []
     valid = np.all(np.isfinite(grid.bend_angles), axis=1)
     if valid.mean() < LEAST_VALID:
@@ -66,7 +78,7 @@ def prepare(log: CalibrationLog, limb: Limb, period: float = PERIOD) -> Prepared
     if valid.mean() < 0.98:
         warnings.append(f"tags lost in {100 * (1 - valid.mean()):.1f} % of the log")
     pressure = _pressures(grid, limb, warnings)
-    _check_excitation(pressure)
+    _check_excitation(pressure, warnings)
     _check_saturation(pressure, limb, warnings)
     bend = np.stack([_bridge(column) for column in grid.bend_angles.T], axis=1)
     _check_match(pressure, bend, warnings)
@@ -109,7 +121,7 @@ def _pressures(log: CalibrationLog, limb: Limb, warnings: list[str]) -> Array:
     return pressure
 
 
-def _check_excitation(pressure: Array) -> None:
+def _check_excitation(pressure: Array, warnings: list[str]) -> None:
     spread = np.std(pressure, axis=0)
     for index, value in enumerate(spread):
         if value < LEAST_EXCITATION:
@@ -123,9 +135,9 @@ def _check_excitation(pressure: Array) -> None:
         for i in range(len(together)):
             for j in range(i):
                 if abs(together[i, j]) > 0.98:
-                    raise LogError(
-                        f"inputs {j} and {i} always move together: a coupling between the segments "
-                        "cannot be told from their own gains; excite each input alone as well"
+                    warnings.append(
+                        f"inputs {j} and {i} always move together (correlation {together[i, j]:+.2f}): "
+                        "swapped columns and coupling between segments cannot be told"
                     )
 
 
@@ -144,6 +156,12 @@ def _check_saturation(pressure: Array, limb: Limb, warnings: list[str]) -> None:
 def _check_match(pressure: Array, bend: Array, warnings: list[str]) -> None:
     """Each segment must follow its own pressure, not its neighbour's, and with the right sign."""
     count = pressure.shape[1]
+    if count > 1 and np.abs(np.corrcoef(pressure.T) - np.eye(count)).max() > 0.98:
+        # Which input bends a segment cannot be told: only the sign can.
+        for index in range(count):
+            if np.polyfit(pressure[:, index], bend[:, index], 1)[0] < 0:
+                raise LogError(_WRONG_WAY.format(index=index))
+        return
     design = np.concatenate([pressure, np.ones((len(pressure), 1))], axis=1)
     solution = np.linalg.lstsq(design, bend, rcond=None)[0][:count]
     for index in range(count):
@@ -155,10 +173,7 @@ def _check_match(pressure: Array, bend: Array, warnings: list[str]) -> None:
                 f"with input {index}: columns or tubes are swapped"
             )
         if own < 0:
-            raise LogError(
-                f"segment {index} bends the wrong way: positive differential pressure must bend "
-                "toward +y; swap the two chambers or the sign in the column map"
-            )
+            raise LogError(_WRONG_WAY.format(index=index))
         if others.size and others.max() > 0.2 * own:
             warnings.append(
                 f"segment {index} answers to another segment's pressure with "

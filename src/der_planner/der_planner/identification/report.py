@@ -23,7 +23,7 @@ class Unknown:
         unit: of the value.
         value: identified.
         deviation: standard deviation.
-        untold: the data say next to nothing of it; the prior's value was kept.
+        untold: the data say next to nothing of it; its spread is the prior's.
         at_bound: the value sits at a bound of its range.
     """
 
@@ -44,10 +44,11 @@ class FitReport:
         unknowns: (P,) with standard deviations.
         correlation: (P, P) of the unknowns.
         strongly_correlated: pairs that the data tell only together.
-        untold: names of unknowns that kept their prior value.
+        untold: names of unknowns whose spread is the prior's still.
         air: fit of the chambers; None if the log has no smooth commands.
         geometry: fit of the lengths; None if the log has no tips.
-        residual, largest: (M,) root mean square and largest bend angle error [rad].
+        residual, largest: (M,) root mean square and largest bend angle error of the rod [rad].
+        pcc_residual: (M,) root mean square error of the PCC model [rad]; NaN where it shares all numbers.
         span: (M,) range of the measured bend angles [rad].
         duration: of the log [s].
         rows: used by the fit.
@@ -65,6 +66,7 @@ class FitReport:
     geometry: GeometryFit | None
     residual: Array
     largest: Array
+    pcc_residual: Array
     span: Array
     duration: float
     rows: int
@@ -93,16 +95,17 @@ class FitReport:
         ]
         for item in self.unknowns:
             value, deviation, unit = _readable(item)
-            note = "  kept from the prior: the data do not tell" if item.untold else ""
+            note = "  the data hardly tell it" if item.untold else ""
             note += "  at its bound" if item.at_bound else ""
             lines.append(f"{item.name:26s} {value:12.4g} {deviation:10.2g}  {unit}{note}")
         lines.append("")
-        for index, (error, largest, span) in enumerate(
-            zip(self.residual, self.largest, self.span, strict=True)
+        for index, (error, largest, pcc, span) in enumerate(
+            zip(self.residual, self.largest, self.pcc_residual, self.span, strict=True)
         ):
+            other = f" (PCC rms {math.degrees(pcc):.2f}°)" if math.isfinite(pcc) else ""
             lines.append(
                 f"segment {index}: bend angle error rms {math.degrees(error):.2f}°, "
-                f"max {math.degrees(largest):.2f}°, {100 * error / max(span, 1e-9):.2f} % of its range"
+                f"max {math.degrees(largest):.2f}°, {100 * error / max(span, 1e-9):.2f} % of its range{other}"
             )
         lines += self._air_lines() + self._geometry_lines()
         for first, second, value in self.strongly_correlated:
