@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from der_planner.limb import Limb
-from der_planner.pcc import Pcc
-from der_planner.pcc import kernels
+from der_planner.pcc import Pcc, kernels
 
 SEED = 4
 
@@ -142,7 +141,9 @@ def test_undamped_motion_keeps_its_energy(count):
     q0, v0 = np.linspace(0.5, -0.4, count), np.linspace(1.0, -2.0, count)
     angles, rates = model.simulate(np.zeros((100, 20, count)), 5e-4, q0, v0)
     energies = np.array([model.energy(q, v) for q, v in zip(angles, rates, strict=True)])
-    swing = np.ptp([0.5 * v @ model.matrices(q, v)[0] @ v for q, v in zip(angles, rates, strict=True)])
+    swing = np.ptp(
+        [0.5 * v @ model.matrices(q, v)[0] @ v for q, v in zip(angles, rates, strict=True)]
+    )
     assert swing > 1e-4
     assert np.ptp(energies) < 1e-5 * swing
 

@@ -98,7 +98,9 @@ def test_a_path_through_the_straight_pose_is_smooth():
         found, miss = inverse.solve(CHAIN, ARCS.tip(wanted), wanted)
         assert miss.max() < 1e-6
         assert np.all(np.isfinite(found))
-        assert np.abs(np.diff(found, 2, axis=0)).max() < 3 * np.abs(np.diff(wanted, 2, axis=0)).max()
+        assert (
+            np.abs(np.diff(found, 2, axis=0)).max() < 3 * np.abs(np.diff(wanted, 2, axis=0)).max()
+        )
 
 
 @pytest.mark.parametrize("count", [3, 4])
@@ -117,7 +119,9 @@ def test_more_than_two_segments_stay_near_the_first_guess(count):
 
 def test_distance_to_reach_agrees_with_a_search():
     low, high = inverse.angle_limits(LIMB)
-    grid = np.stack(np.meshgrid(*(np.linspace(a, b, 301) for a, b in zip(low, high, strict=True))), -1)
+    grid = np.stack(
+        np.meshgrid(*(np.linspace(a, b, 301) for a, b in zip(low, high, strict=True))), -1
+    )
     tips = ARCS.tip(grid).reshape(-1, 2)
     for point in ([0.26, 0.10], [0.10, 0.02], [0.0, 0.0]):
         searched = np.linalg.norm(tips - point, axis=1).min()

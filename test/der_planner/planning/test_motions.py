@@ -166,9 +166,7 @@ def test_an_unreachable_path_names_time_point_and_distance():
 
 
 def test_a_pose_beyond_the_pressure_limit_says_what_it_would_need():
-    weak = Limb(
-        "weak", LIMB.segments, type(LIMB.pneumatics)(10e3, 9e3, 9e3, 0.15)
-    )
+    weak = Limb("weak", LIMB.segments, type(LIMB.pneumatics)(10e3, 9e3, 9e3, 0.15))
     tip = ArcKinematics(weak).tip(np.radians([[45.0, 45.0], [46.0, 46.0]]))
     with pytest.raises(UnreachableError, match=r"it would need 1\d\.\d kPa") as caught:
         Motion.from_tip_path([0.0, 1.0], tip).reference(weak)

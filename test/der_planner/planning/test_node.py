@@ -8,11 +8,12 @@ pytestmark = pytest.mark.graph
 
 @pytest.fixture
 def planner(graph):
-    from der_msgs.msg import MotionCommand, PressurePlan, PressureSetpoint
     from geometry_msgs.msg import PointStamped
-    from limb_interfaces import qos, topics
     from nav_msgs.msg import Path
     from visualization_msgs.msg import MarkerArray
+
+    from der_msgs.msg import MotionCommand, PressurePlan, PressureSetpoint
+    from limb_interfaces import qos, topics
 
     class Planner:
         def __init__(self, **parameters):
@@ -113,8 +114,10 @@ def test_what_cannot_be_done_is_refused_with_a_reason(planner):
     for number, (fields, reason) in enumerate(cases):
         node.command(plan_id=f"bad {number}", **fields)
         node.client.wait_for(
-            lambda number=number: node.state().get("plan_id") == f"bad {number}"
-            and node.state()["state"] == "refused",
+            lambda number=number: (
+                node.state().get("plan_id") == f"bad {number}"
+                and node.state()["state"] == "refused"
+            ),
             60.0,
             reason,
         )

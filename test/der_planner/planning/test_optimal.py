@@ -59,9 +59,9 @@ def test_gradient_of_the_cost_against_finite_differences(fast):
     ahead, behind = command.copy(), command.copy()
     ahead[first:last] += direction
     behind[first:last] -= direction
-    slope = fast._evaluate(ahead, state, first, last)[0] - fast._evaluate(
-        behind, state, first, last
-    )[0]
+    slope = (
+        fast._evaluate(ahead, state, first, last)[0] - fast._evaluate(behind, state, first, last)[0]
+    )
     assert gradient @ direction.ravel() == pytest.approx(slope / 4, rel=1e-5)
 
 

@@ -6,8 +6,15 @@ import numpy as np
 import pytest
 
 from der_planner.limb import CalibratedRange, Limb
-from der_planner.planning import METHODS, Motion, PlanningError, Start, UnreachableError, plan
-from der_planner.planning import pneumatics
+from der_planner.planning import (
+    METHODS,
+    Motion,
+    PlanningError,
+    Start,
+    UnreachableError,
+    plan,
+    pneumatics,
+)
 from der_planner.planning.inverse import static_pressure
 from der_planner.planning.rod_model import RodModel
 
@@ -262,14 +269,14 @@ def test_too_large_an_amplitude_is_refused_by_all(which):
 
 
 def test_cancelling_by_progress_ends_the_planning():
-    class Stop(Exception):
+    class StopError(Exception):
         pass
 
     def progress(share):
         if share > 0.3:
-            raise Stop
+            raise StopError
 
-    with pytest.raises(Stop):
+    with pytest.raises(StopError):
         plan(LIMB, Motion.named("asynchronous"), "der", "optimal", progress=progress)
 
 

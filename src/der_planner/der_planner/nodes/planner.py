@@ -85,7 +85,7 @@ class PlannerNode(Node):
                  choices=tuple(METHODS))
         )  # fmt: skip
         self._method = str(
-            read("default_method", "", "method of the rod where none is named; empty: the package's",
+            read("default_method", "", "method of the rod where none is named; empty: the best",
                  choices=("", *METHODS["der"]))
         )  # fmt: skip
         self._nodes = int(read("nodes", 21, "nodes of the rod", at_least=6, at_most=201))  # type: ignore[arg-type]
@@ -96,7 +96,7 @@ class PlannerNode(Node):
         self._limits = PathLimits(
             float(read("path_speed", 0.03, "speed along a path without times [m/s]",
                        at_least=1e-3, at_most=1.0)),  # type: ignore[arg-type]
-            float(read("path_acceleration", 0.05, "acceleration along and across such a path [m/s^2]",
+            float(read("path_acceleration", 0.05, "acceleration along and across it [m/s^2]",
                        at_least=1e-3, at_most=10.0)),  # type: ignore[arg-type]
         )  # fmt: skip
 
@@ -155,7 +155,9 @@ class PlannerNode(Node):
             return response
         if newest[1].reference.start is not None:
             response.success = False
-            response.message = f"plan {newest[0]} began in another motion: publish its command again"
+            response.message = (
+                f"plan {newest[0]} began in another motion: publish its command again"
+            )
             return response
         schedule = self._play(*newest, start=0)
         response.message = f"plan {schedule.plan_id} starts at {schedule.start * 1e-9:.2f} s"

@@ -1,4 +1,4 @@
-"""Markers of the planner for RViz and Foxglove: reference and predicted tip, and the reference limb."""
+"""Markers of the planner for RViz and Foxglove: both tip paths, and the reference limb."""
 
 from __future__ import annotations
 

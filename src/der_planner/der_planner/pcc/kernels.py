@@ -1,19 +1,21 @@
 """Compiled kernels of the piecewise-constant-curvature (PCC) model.
 
-The plane is written with complex numbers, x + i y. One segment with bend angle θ and length L reaches,
-at the fraction σ of its length, the point L σ g(σ θ) of its own frame, with
+The plane is written with complex numbers, x + i y. One segment with bend angle θ and length L
+reaches, at the fraction σ of its length, the point L σ g(σ θ) of its own frame, with
 
     g(z) = ∫₀¹ exp(i z η) dη = sin z / z + i (1 − cos z) / z.
 
-Its derivatives are g⁽ᵏ⁾(z) = iᵏ ∫₀¹ ηᵏ exp(i z η) dη, smooth through z = 0: a power series is used there
-instead of the quotient, so that a straight limb is an ordinary configuration.
+Its derivatives are g⁽ᵏ⁾(z) = iᵏ ∫₀¹ ηᵏ exp(i z η) dη, smooth through z = 0: a power series is used
+there instead of the quotient, so that a straight limb is an ordinary configuration.
 
 Symbols: q (n,) bend angles [rad], P position of a material point as a function of q, J_i = ∂P/∂q_i,
-H_ik = ∂²P/∂q_i∂q_k. With these M_ij = ∫ μ ⟨J_i, J_j⟩ ds and C_ij = ∫ μ ⟨J_i, Σ_k H_jk q̇_k⟩ ds. Since H
-is symmetric these are Christoffel's symbols, and Ṁ = C + Cᵀ holds exactly, term by term.
+H_ik = ∂²P/∂q_i∂q_k. With these M_ij = ∫ μ ⟨J_i, J_j⟩ ds and C_ij = ∫ μ ⟨J_i, Σ_k H_jk q̇_k⟩ ds.
+Since H is symmetric these are Christoffel's symbols, and Ṁ = C + Cᵀ holds exactly, term by term.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -26,7 +28,7 @@ _SERIES_TERMS = 14
 
 
 @njit(cache=True)
-def arc_moment(z: float, k: int) -> complex:
+def arc_moment(z: float, k: int) -> Any:
     """Return ∫₀¹ ηᵏ exp(i z η) dη for k = 0, 1, 2, to rounding for every real z."""
     if abs(z) < SERIES_BELOW:
         total = 0.0 + 0.0j
@@ -43,7 +45,7 @@ def arc_moment(z: float, k: int) -> complex:
 
 
 @njit(cache=True)
-def arc_point(z: float, k: int) -> complex:
+def arc_point(z: float, k: int) -> Any:
     """Return the k-th derivative of g at z (k = 0, 1, 2)."""
     value = arc_moment(z, k)
     if k == 1:
@@ -62,12 +64,12 @@ def point_derivatives(
     sigma: float,
     J: NDArray[np.complex128],
     H: NDArray[np.complex128],
-) -> complex:
-    """Return the point at fraction sigma of segment j; fill J (n,) and H (n, n) with its derivatives.
+) -> Any:
+    """Return the point at fraction sigma of segment j; fill J (n,), H (n, n): its derivatives.
 
     A bend angle q_i turns everything beyond segment i as one body, hence the recurrences
-    J_i = exp(iΦ_i) L_i g′(q_i) + i (P − p_i) and H_ik = i J_k for k > i, with p_i the end of segment i
-    and Φ_i = q_0 + … + q_{i−1}.
+    J_i = exp(iΦ_i) L_i g′(q_i) + i (P − p_i) and H_ik = i J_k for k > i, with p_i the end of
+    segment i and Φ_i = q_0 + … + q_{i−1}.
     """
     n = q.size
     J[:] = 0.0
@@ -111,12 +113,9 @@ def inertia(
 ) -> tuple[Vector, Vector, Vector, Vector]:
     """Return M (n, n), C (n, n), the mass-proportional damping D (n, n) and gravity's torque (n,).
 
-    Args:
-        q, v: bend angles [rad] and their rates [rad/s], (n,).
-        lengths: of the segments [m]; connector: between two segments [m].
-        masses: of the segments [kg]; damping: mass-proportional coefficients [1/s], (n,).
-        gravity: (2,) acceleration in the plane [m/s²].
-        fractions, weights: nodes and weights on [0, 1] that carry the mass of a segment.
+    q, v are bend angles [rad] and their rates [rad/s], lengths [m], masses [kg] and damping
+    [1/s] of the segments, all (n,); connector is the length between two segments [m], gravity (2,) [m/s²];
+    fractions and weights are the nodes and weights on [0, 1] that carry the mass of a segment.
     """
     n = q.size
     M = np.zeros((n, n))
@@ -193,14 +192,9 @@ def simulate(
 ) -> tuple[Vector, Vector]:
     """Roll the model forward with the classical Runge-Kutta method.
 
-    Args:
-        q, v: angles [rad] and rates [rad/s] at the beginning, (n,).
-        pressures: (K, S, n) [Pa], constant over each of the S steps of an interval.
-        step: of the integrator [s].
-        gain: (n,) moment per pressure [N·m/Pa]; the others as in `acceleration`.
-
-    Returns:
-        Angles and rates (K + 1, n) at the interval boundaries.
+    pressures (K, S, n) [Pa] are constant over each of the S steps of an interval, step [s] is that
+    of the integrator, gain (n,) the moment per pressure [N·m/Pa]; the others are those of
+    `acceleration`. Returns angles and rates (K + 1, n) at the interval boundaries.
     """
     count, substeps, n = pressures.shape
     angles = np.zeros((count + 1, n))

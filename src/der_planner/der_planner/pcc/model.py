@@ -1,7 +1,7 @@
 """The piecewise-constant-curvature limb: kinematics, exact dynamics and its inverse.
 
-Each segment is one circular arc with one bend angle; the mass is spread over the arc (or lumped at the
-end of each segment, as parts of the literature do). The equation of motion is
+Each segment is one circular arc with one bend angle; the mass is spread over the arc (or lumped at
+the end of each segment, as parts of the literature do). The equation of motion is
 
     M(q) q̈ + (C(q, q̇) + D(q)) q̇ + K (q − q_rest) = G u + Q_gravity
 
@@ -148,7 +148,9 @@ class Pcc:
         """Invert the dynamics: u = Λ† τ with τ = M q̈ + (C + D) q̇ + K (q − q_rest) − Q_gravity.
 
         Args:
-            angles, rates, accelerations: (K, n) in rad, rad/s and rad/s².
+            angles: (K, n) [rad].
+            rates: (K, n) [rad/s].
+            accelerations: (K, n) [rad/s²].
 
         Returns:
             (K, n) differential pressures [Pa].
@@ -175,7 +177,8 @@ class Pcc:
         Args:
             pressures: (K, S, n) effective differential pressures [Pa], constant over each step.
             step: of the Runge-Kutta integrator [s]; an interval lasts S steps.
-            angles, rates: (n,) at the beginning [rad], [rad/s]; at rest if None.
+            angles: (n,) at the beginning [rad]; at rest if None.
+            rates: (n,) at the beginning [rad/s]; zero if None.
 
         Returns:
             Angles [rad] and rates [rad/s], each (K + 1, n), at the interval boundaries.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 
 class PlanningError(ValueError):
     """A motion, method or limit does not allow a plan; the message says what to change."""
@@ -23,7 +25,7 @@ class UnreachableError(PlanningError):
     ) -> None:
         needed = (
             "no pressure reaches it"
-            if required_pressure != required_pressure  # NaN
+            if math.isnan(required_pressure)
             else f"it would need {required_pressure / 1000:.1f} kPa"
         )
         super().__init__(

@@ -1,9 +1,11 @@
 """Inverse kinematics: bend angles for tip positions, by damped least squares on given kinematics.
 
-A limb of two segments reaches most points in two ways, on either side of the fold where the Jacobian
-loses its rank (the straight limb lies on that fold). A branch is named by how the last segment bends
+A limb of two segments reaches most points in two ways, on either side of the fold where the
+Jacobian loses its rank (the straight limb lies on that fold). A branch is named by how the last
+segment bends
 compared with the fold: ``counter_clockwise`` or ``clockwise``. A whole path is solved at once, each
-point from its own first guess, so that the branch is the guess's and speed is that of one matrix code.
+point from its own first guess, so that the branch is the guess's and speed is that of one matrix
+code.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import least_squares
 
 from der_planner.limb import Limb
 from der_planner.planning.errors import PlanningError, UnreachableError
@@ -20,9 +23,9 @@ from der_planner.planning.kinematics import Kinematics
 Vector = NDArray[np.float64]
 
 TOLERANCE = 1e-3
-"""Points that are missed by less than this [m] are taken as reached (the models' reach differs by less)."""
+"""Points missed by less than this [m] count as reached (the models' reach differs by less)."""
 PRIOR_WEIGHT = 1e-5
-"""Pull toward the first guess [m/rad]: decides where the tip leaves it open (straight limb, M > 2)."""
+"""Pull toward the first guess [m/rad]: decides what the tip leaves open (straight limb, M > 2)."""
 BRANCHES = ("counter_clockwise", "clockwise")
 _ITERATIONS = 60
 _SMALLEST_STEP = 1e-11
@@ -101,7 +104,10 @@ def check_reach(
     Args:
         limb: its `pneumatics.pressure_limit` counts.
         kinematics: that solved the path.
-        time: (K,) [s]; tip: (K, 2) [m]; angles: (K, M) [rad]; distances: (K,) [m], from `solve`.
+        time: (K,) [s].
+        tip: (K, 2) [m].
+        angles: (K, M) from `solve` [rad].
+        distances: (K,) from `solve` [m].
         tolerance: largest distance that still counts as reached [m].
 
     Raises:
@@ -132,18 +138,21 @@ def distance_to_reach(
 
     Bounded least squares from several starts, so that the nearest of the folds' sides counts.
     """
-    from scipy.optimize import least_squares
-
     low, high = angle_limits(limb)
     target = np.asarray(point, dtype=float)
+
+    def miss(theta: Vector) -> Vector:
+        difference: Vector = kinematics.tip(theta) - target
+        return difference
+
     starts = [np.clip(np.asarray(guess, dtype=float), low, high)]
     starts += [low + (high - low) * share for share in _corner_shares(limb.segment_count)]
     best = np.inf
     for start in starts:
         result = least_squares(
-            lambda theta: kinematics.tip(theta) - target,
+            miss,
             np.clip(start, low + 1e-9, high - 1e-9),
-            jac=lambda theta: kinematics.tip_jacobians(theta),
+            jac=kinematics.tip_jacobians,
             bounds=(low, high),
         )
         best = min(best, float(np.linalg.norm(result.fun)))
@@ -151,7 +160,7 @@ def distance_to_reach(
 
 
 def angle_limits(limb: Limb) -> tuple[Vector, Vector]:
-    """Return the smallest and largest bend angles (M,) [rad] that the pressure limit holds at rest."""
+    """Return the least and largest bend angles (M,) [rad] that the pressure limit holds at rest."""
     limit = limb.pneumatics.pressure_limit
     bounds = []
     for segment in limb.segments:
@@ -266,8 +275,8 @@ def follow(
         chosen = [item for item in found if not branch or item.branch == branch]
         if not chosen:
             raise PlanningError(
-                f"the first point ({points[0, 0]:.4f}, {points[0, 1]:.4f}) m has no solution on the "
-                f"branch '{branch}' within the pressure limit, only on '{found[0].branch}'"
+                f"the first point ({points[0, 0]:.4f}, {points[0, 1]:.4f}) m has no solution "
+                f"on the branch '{branch}' within the pressure limit, only on '{found[0].branch}'"
             )
         start = chosen[0].bend_angles
     angles = np.zeros((len(points), limb.segment_count))

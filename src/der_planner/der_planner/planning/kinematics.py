@@ -34,8 +34,8 @@ class Kinematics(Protocol):
 class PolylineKinematics:
     """The planar chain of edges that a discrete rod forms when its segments bend evenly.
 
-    Edge e has rest length ē_e and heading ψ_e = Σ_j W_ej θ_j. Segment j of n nodes from node a turns at
-    its n − 2 inner nodes, hence W_ej = clip((e − a) / (n − 2), 0, 1).
+    Edge e has rest length ē_e and heading ψ_e = Σ_j W_ej θ_j. Segment j of n nodes from node a
+    turns at its n − 2 inner nodes, hence W_ej = clip((e − a) / (n − 2), 0, 1).
 
     Args:
         rest_lengths: (N-1,) edges [m].

@@ -26,7 +26,10 @@ class PlanningModel(Protocol):
     """What a planner needs of a model."""
 
     limb: Limb
-    kinematics: Kinematics
+
+    @property
+    def kinematics(self) -> Kinematics:
+        """Forward kinematics."""
 
     def configuration(self, reference: Reference) -> BSpline:
         """Return the model's bend angles (M,) [rad] along the reference, as a spline of time."""
@@ -47,7 +50,7 @@ class ArcModel:
     def __init__(self, limb: Limb) -> None:
         self.limb = limb
         self.model = Pcc(limb)
-        self.kinematics: Kinematics = ArcKinematics(limb)
+        self.kinematics = ArcKinematics(limb)
 
     def configuration(self, reference: Reference) -> BSpline:
         """Return q̄(t) itself: the reference is made of arcs."""

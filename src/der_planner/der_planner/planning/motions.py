@@ -1,8 +1,9 @@
 """Motions: what the tip should do, as bend angles first and tip positions after them.
 
-Every motion becomes a `Reference`: smooth bend angles q̄(t) of constant-curvature arcs, which begin and
-end at rest in the straight pose, and the tip r̄(t) of these arcs. The reference belongs to no model:
-all planners get the same r̄(t) and find their own configuration for it, so that their errors compare.
+Every motion becomes a `Reference`: smooth bend angles q̄(t) of constant-curvature arcs, which
+begin and end at rest in the straight pose, and the tip r̄(t) of these arcs. The reference belongs
+to no model: all planners get the same r̄(t) and find their own configuration for it, so that their
+errors compare.
 
 Named motions of the paper, with s(t) = ½ (1 − cos 2πt/T), amplitude A and period T:
 
@@ -11,8 +12,8 @@ Named motions of the paper, with s(t) = ½ (1 − cos 2πt/T), amplitude A and p
 - ``opposite_direction``: segment j follows (−1)ʲ A s(t).
 
 The first quarter of a period is faded in by a quintic, and a closing quarter after the last cycle
-brings the limb back to rest by a quintic that meets angle, rate and acceleration: the driver can vent
-without a jump. A motion of two cycles of 20 s thus lasts 45 s.
+brings the limb back to rest by a quintic that meets angle, rate and acceleration: the driver can
+vent without a jump. A motion of two cycles of 20 s thus lasts 45 s.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -85,7 +87,7 @@ class Reference:
         return float(self.time[-1])
 
     def sample(self, time: ArrayLike) -> tuple[Vector, Vector, Vector]:
-        """Return q̄, its rate and acceleration (…, M) at instants, held at rest outside the motion."""
+        """Return q̄, its rate and acceleration (…, M) at instants, at rest outside the motion."""
         return sample_spline(self.spline, time)
 
 
@@ -104,11 +106,11 @@ def sample_spline(spline: BSpline, time: ArrayLike) -> tuple[Vector, Vector, Vec
 
 
 def resting_spline(time: ArrayLike, values: ArrayLike, start: Start | None = None) -> BSpline:
-    """Return the quintic spline through (K, M) values that ends at rest, and starts so or as given."""
+    """Return the quintic spline through (K, M) values that ends at rest and starts as given."""
     samples = np.asarray(values, dtype=float)
     rest = np.zeros(samples.shape[1:])
     begin = (rest, rest) if start is None else (start.rate, start.acceleration)
-    ends = ([(1, begin[0]), (2, begin[1])], [(1, rest), (2, rest)])
+    ends: Any = ([(1, begin[0]), (2, begin[1])], [(1, rest), (2, rest)])
     return make_interp_spline(np.asarray(time), samples, k=5, bc_type=ends)
 
 
@@ -124,7 +126,8 @@ class Motion:
         period: of one cycle; 0 for a path [s].
         cycles: number of them; 1 for a path.
         path: the tip path of shapes and paths.
-        branch: of the arcs at the first point of a path, see `inverse.BRANCHES`; empty: least pressure.
+        branch: of the arcs at the first point of a path, see `inverse.BRANCHES`; empty: least
+            pressure.
     """
 
     name: str
@@ -147,8 +150,8 @@ class Motion:
 
         Args:
             name: of the motion.
-            amplitude: largest bend of a segment [rad]; a shape is drawn around the tip of a limb bent by
-                1.2 times of it, and grows in proportion.
+            amplitude: largest bend of a segment [rad]; a shape is drawn around the tip of a limb
+                bent by 1.2 times of it, and grows in proportion.
             period: of one cycle [s].
             cycles: how many.
             branch: for shapes, which way to reach the first point.
@@ -187,7 +190,8 @@ class Motion:
     ) -> Motion:
         """Return a motion along a path of the tip.
 
-        The limb first goes from rest to the first point and at the end back, over times of their own.
+        The limb first goes from rest to the first point and at the end back, over times of their
+        own.
 
         Args:
             time: (P,) increasing instants [s]; None: the path gets its timing from the limits.
@@ -205,7 +209,7 @@ class Motion:
     def from_csv(
         cls, path: str | Path, branch: str = "", limits: paths.PathLimits | None = None
     ) -> Motion:
-        """Return a motion along the path in a CSV file with columns x, y [m] and, if timed, time [s].
+        """Return a motion along a path in a CSV file: columns x, y [m] and, if timed, time [s].
 
         Raises:
             PlanningError: the file cannot be read; the message names line and column.
@@ -310,9 +314,7 @@ def quintic(
     return result
 
 
-def _led_in(
-    limb: Limb, start: Start, time: Vector, angles: Vector
-) -> tuple[Vector, Vector]:
+def _led_in(limb: Limb, start: Start, time: Vector, angles: Vector) -> tuple[Vector, Vector]:
     """Return time and angles with the way from another motion to the straight pose before them."""
     zero = np.zeros(limb.segment_count)
     state = (start.bend_angles, start.rate, start.acceleration)

@@ -4,16 +4,19 @@ Unknown are the commands u (K, M) themselves. Minimised is, over the setpoints k
 
     Σ |tip_k(u) − r̄_k|² + λ Σ |D²(u − u⁰)_k|² + μ Σ |(u − u⁰)_k|²
 
-with u⁰ the `projected` commands (the warm start, smooth and nearly right), D² the second difference,
-|u_k| within the pressure limit and |u_k − u_{k−1}| within the slew limit. The model is everything the
-limb file knows: hold, dead time and lag of the chambers, unequal chambers, friction and creep, the rod.
+with u⁰ the `projected` commands (the warm start, smooth and nearly right), D² the second
+difference, |u_k| within the pressure limit and |u_k − u_{k−1}| within the slew limit. The model is
+everything the
+limb file knows: hold, dead time and lag of the chambers, unequal chambers, friction and creep, the
+rod.
 
-tip(u) comes from the rod's integrator, its derivative from the exact linearisation of that integrator.
-A response dies out in seconds, so that a long motion is solved as a row of overlapping windows: each
-starts from the rod's state at the end of what the last one settled, and its tail, which does not yet
-know what follows, is solved again by the next. Cost grows with the first power of the motion's length.
-Where no limit is in the way the step is one Cholesky factorisation, else the quadratic programme is
-handed to `der_planner.planning.quadratic`.
+tip(u) comes from the rod's integrator, its derivative from the exact linearisation of that
+integrator.
+A response dies out in seconds, so that a long motion is solved as a row of overlapping windows:
+each starts from the rod's state at the end of what the last one settled, and its tail, which does
+not yet know what follows, is solved again by the next. Cost grows with the first power of the
+motion's length. Where no limit is in the way the step is one Cholesky factorisation, else the
+quadratic programme is handed to `der_planner.planning.quadratic`.
 """
 
 from __future__ import annotations
@@ -47,8 +50,8 @@ class Settings:
         window: setpoints that are solved together.
         settled: setpoints of a window that are kept; the rest is solved again.
         iterations: Gauss-Newton steps a window at most.
-        tolerance: root mean square tip error below which a window is done, and change of it below which
-            another step is not worth its time [m].
+        tolerance: root mean square tip error below which a window is done, and change of it below
+            which another step is not worth its time [m].
         reuse: share of the error that a step must take away for its linearisation to be used again.
     """
 
@@ -78,7 +81,7 @@ class Actuation:
         self.air = limb.pneumatics
         self.substeps = substeps
         self.initial = initial
-        middle = (np.arange(count * substeps) + 0.5) * (CONTROL_PERIOD / substeps)
+        middle = (np.arange(count * substeps, dtype=np.float64) + 0.5) * (CONTROL_PERIOD / substeps)
         bend = sample_spline(spline, middle)[0]
         self._memory = np.column_stack(
             [
@@ -107,7 +110,7 @@ class Actuation:
         return effective, slope.mean(axis=1)
 
     def pulse(self, inputs: int) -> Vector:
-        """Return the chamber pressure (R, M) in the steps after a setpoint is raised by one Pascal."""
+        """Return the chamber pressure (R, M) in the steps after one setpoint is raised by 1 Pa."""
         air, size = self.air, self.substeps
         mean = 0.5 * (air.time_constant + (air.vent_time_constant or air.time_constant))
         reach = int(np.ceil((air.delay + 12 * mean) / CONTROL_PERIOD)) + 1
@@ -132,7 +135,7 @@ class Quadratic:
         self._factor = cho_factor(hessian, lower=True)
 
     def step(self, gradient: Vector, band: Band) -> tuple[Vector, bool]:
-        """Return the change of the commands (W, M) within the band, and whether a limit shaped it."""
+        """Return the change (W, M) of the commands within the band, and if a limit shaped it."""
         change: Vector = -cho_solve(self._factor, gradient).reshape(band.command.shape)
         if band.contains(change):
             return change, False
@@ -212,10 +215,8 @@ class Optimiser:
             progress(first / count)
         return Outcome(command, tip, steps, limited)
 
-    def improve(
-        self, command: Vector, state: RodState, first: int, last: int
-    ) -> tuple[int, bool]:
-        """Improve ``command[first:last]`` in place; return the steps and whether a limit was met."""
+    def improve(self, command: Vector, state: RodState, first: int, last: int) -> tuple[int, bool]:
+        """Improve ``command[first:last]`` in place; return the steps and if a limit was met."""
         settings = self.settings
         met, damping = False, 0.0
         quadratic: Quadratic | None = None
@@ -300,7 +301,9 @@ class Optimiser:
     def _band(self, command: Vector, first: int, last: int) -> Band:
         air = self.model.limb.pneumatics
         before = command[first - 1] if first else self.before
-        return Band(command[first:last], before, air.pressure_limit, air.slew_limit * CONTROL_PERIOD)
+        return Band(
+            command[first:last], before, air.pressure_limit, air.slew_limit * CONTROL_PERIOD
+        )
 
 
 def _rms(misses: Vector) -> float:
@@ -308,7 +311,7 @@ def _rms(misses: Vector) -> float:
 
 
 def _second_difference(size: int) -> Vector:
-    """Return the matrix (size, size) of second differences with two known values before the first."""
+    """Return the matrix (size, size) of second differences after two known values."""
     matrix = np.eye(size)
     matrix[np.arange(1, size), np.arange(size - 1)] = -2.0
     matrix[np.arange(2, size), np.arange(size - 2)] = 1.0

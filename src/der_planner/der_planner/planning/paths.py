@@ -59,7 +59,8 @@ class TipPath:
         points = np.asarray(tip, dtype=float)
         if points.ndim != 2 or points.shape[1] != 2 or len(points) < 2:
             raise PlanningError(
-                f"a tip path needs two or more points as (P, 2) numbers in m, got shape {points.shape}"
+                "a tip path needs two or more points as (P, 2) numbers in m, "
+                f"got shape {points.shape}"
             )
         if not np.all(np.isfinite(points)):
             row = int(np.argmax(~np.isfinite(points).all(axis=1)))
@@ -69,7 +70,8 @@ class TipPath:
         instants = np.asarray(time, dtype=float)
         if instants.shape != (len(points),):
             raise PlanningError(
-                f"a tip path of {len(points)} points needs as many times, got shape {instants.shape}"
+                f"a tip path of {len(points)} points needs as many times, "
+                f"got shape {instants.shape}"
             )
         steps = np.diff(instants)
         if not np.all(np.isfinite(instants)) or np.any(steps <= 0):
@@ -80,7 +82,8 @@ class TipPath:
             )
         if instants[-1] - instants[0] > LONGEST:
             raise PlanningError(
-                f"the tip path lasts {instants[-1] - instants[0]:.0f} s, the longest is {LONGEST:.0f} s"
+                f"the tip path lasts {instants[-1] - instants[0]:.0f} s, "
+                f"the longest is {LONGEST:.0f} s"
             )
         return cls(instants - instants[0], points)
 
@@ -138,18 +141,21 @@ def time_path(points: Vector, limits: PathLimits) -> TipPath:
     time = np.concatenate([[0.0], np.cumsum(durations)])
     if time[-1] > LONGEST:
         raise PlanningError(
-            f"at {limits.speed} m/s the tip path lasts {time[-1]:.0f} s, the longest is {LONGEST:.0f} s"
+            f"at {limits.speed} m/s the tip path lasts {time[-1]:.0f} s, "
+            f"the longest is {LONGEST:.0f} s"
         )
     grid = np.linspace(0.0, time[-1], max(20, round(time[-1] / 0.02) + 1))
     step = float(grid[1])
     along = _smoothed(PchipInterpolator(time, s)(grid), window=max(1, round(_SOFTNESS / step)))
-    return TipPath(np.arange(len(along)) * step, spline(along))
+    instants = np.arange(len(along), dtype=np.float64) * step
+    return TipPath(instants, spline(along))
 
 
 def polygon(corners: Vector, period: float) -> TipPath:
     """Return the timed path along straight lines that rests at every corner.
 
-    Each side takes a share of the period in proportion to its length, with a quintic from rest to rest.
+    Each side takes a share of the period in proportion to its length, with a quintic from rest to
+    rest.
     """
     lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
     shares = lengths / lengths.sum() * period
@@ -177,7 +183,8 @@ def read_csv(path: str | Path) -> tuple[Vector | None, Vector]:
     """Read a tip path: a header with x and y [m], and time [s] if the path is timed.
 
     Raises:
-        PlanningError: no such file, no such column, not a number; the message names line and column.
+        PlanningError: no such file, no such column, not a number; the message names line and
+            column.
     """
     try:
         with Path(path).open(newline="") as stream:

@@ -50,8 +50,8 @@ def plan(
         limb: the robot.
         motion: what the tip should do.
         model: ``der`` (discrete elastic rod) or ``pcc`` (constant curvature).
-        method: ``paper``, ``projected`` or ``optimal`` for the rod, ``paper`` for PCC; empty takes the
-            model's default.
+        method: ``paper``, ``projected`` or ``optimal`` for the rod, ``paper`` for PCC; empty takes
+            the model's default.
         nodes: of the rod.
         start: where another motion is left; None: where the vented limb rests.
         progress: called with the share that is done, 0 … 1.
@@ -65,7 +65,7 @@ def plan(
     """
     begin = clock.perf_counter()
     method = choose_method(model, method)
-    report = progress or (lambda share: None)
+    report = progress or (lambda _share: None)
     physics = models.build(limb, model, nodes)
     if start is None:
         start = resting_start(limb)
@@ -139,7 +139,7 @@ def feedforward(
     """Return the commands (K, M) [Pa] that a balance of forces asks for, before any limit."""
     ahead = CONTROL_PERIOD + physics.limb.pneumatics.delay
     count = int(np.ceil((reference.duration + ahead) / CONTROL_PERIOD * _FINE - 1e-6)) + 1
-    fine = np.arange(count) * (CONTROL_PERIOD / _FINE)
+    fine = np.arange(count, dtype=np.float64) * (CONTROL_PERIOD / _FINE)
     fine[-1] = reference.duration + ahead
     q, v, a = sample_spline(spline, fine)
     effective = physics.pressures(method, q, v, a)
@@ -158,7 +158,7 @@ def predict(
 
 
 def effective_pressures(limb: Limb, spline: BSpline, chambers: Vector) -> Vector:
-    """Return what the linear model feels, (K, S, M) [Pa], of chamber pressures along a known bend."""
+    """Return what the model feels, (K, S, M) [Pa], of chamber pressures along a known bend."""
     count, substeps, inputs = chambers.shape
     middle = (np.arange(count * substeps) + 0.5) * (CONTROL_PERIOD / substeps)
     bend = sample_spline(spline, middle)[0]
@@ -173,15 +173,15 @@ def _warnings(limb: Limb, wanted: Vector, bend: Vector, cut: float) -> list[str]
         largest = float(np.abs(wanted).max())
         fastest = float(np.abs(np.diff(wanted, axis=0)).max(initial=0.0)) / CONTROL_PERIOD
         said.append(
-            f"limits cut the wanted pressures by up to {cut:.0f} Pa: the motion wants {largest:.0f} Pa "
-            f"and {fastest:.0f} Pa/s, allowed are {air.pressure_limit:.0f} Pa and "
+            f"limits cut the wanted pressures by up to {cut:.0f} Pa: the motion wants "
+            f"{largest:.0f} Pa and {fastest:.0f} Pa/s, allowed are {air.pressure_limit:.0f} Pa and "
             f"{air.slew_limit:.0f} Pa/s; a longer period or a smaller amplitude keeps them"
         )
     seen = np.array(limb.calibrated.bend_angle)
     if seen.size == limb.segment_count and np.any(np.abs(bend).max(axis=0) > seen * 1.05):
         j = int(np.argmax(np.abs(bend).max(axis=0) - seen))
         said.append(
-            f"segment {j} bends by {np.degrees(np.abs(bend[:, j]).max()):.0f} degrees, its calibration "
-            f"covered {np.degrees(seen[j]):.0f}"
+            f"segment {j} bends by {np.degrees(np.abs(bend[:, j]).max()):.0f} degrees, "
+            f"its calibration covered {np.degrees(seen[j]):.0f}"
         )
     return said

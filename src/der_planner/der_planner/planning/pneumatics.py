@@ -1,9 +1,9 @@
 """What lies between a command and the pressure that the linear model feels, as the planners see it.
 
-A command is held for one control period. The chambers follow it after a dead time with a first-order
-lag, one time constant while |pressure| rises and another while it falls. What they hold becomes the
-*effective* pressure of `der_planner.actuation`: unequal chambers, stiffening, friction and creep along
-a known bend.
+A command is held for one control period. The chambers follow it after a dead time with a
+first-order lag, one time constant while |pressure| rises and another while it falls. What they
+hold becomes the *effective* pressure of `der_planner.actuation`: unequal chambers, stiffening,
+friction and creep along a known bend.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ Vector = NDArray[np.float64]
 def commands(limb: Limb, time: Vector, effective: Vector, bend: Vector, period: float) -> Vector:
     """Return the commands (K, M) [Pa] that make the limb feel effective pressures.
 
-    The inverse of hold, dead time and lag: what is wanted in the middle of a held period, led by the lag.
+    The inverse of hold, dead time and lag: what is wanted in the middle of a held period, led by
+    the lag.
 
     Args:
         limb: calibrated limb.
@@ -48,7 +49,7 @@ def chamber_pressures(
     substeps: int,
     initial: ArrayLike | None = None,
 ) -> Vector:
-    """Return the differential pressures in the chambers (K, S, M) [Pa], in the middle of each substep.
+    """Return the chambers' differential pressures (K, S, M) [Pa] in the middle of each substep.
 
     Args:
         air: lag and dead time.
@@ -67,7 +68,8 @@ def chamber_pressures(
         held = (1 - part) * padded[1 : len(held) + 1] + part * padded[: len(held)]
     vent = air.vent_time_constant or air.time_constant
     pressure = _lag(held, start, period / substeps, air.time_constant, vent)
-    return pressure.reshape(len(commands_), substeps, commands_.shape[1])
+    shaped: Vector = pressure.reshape(len(commands_), substeps, commands_.shape[1])
+    return shaped
 
 
 @njit(cache=True)

@@ -41,7 +41,7 @@ class Band:
         return bool(np.abs(command).max() <= self.limit and np.abs(steps).max() <= self.step)
 
     def cut(self, change: Vector) -> Vector:
-        """Return the change (W, M) with rounding errors of a solver cut off, setpoint by setpoint."""
+        """Return the change (W, M) with a solver's rounding errors cut off, command by command."""
         result = np.empty_like(change)
         last = self.before
         for k in range(len(change)):

@@ -20,11 +20,11 @@ HORIZON = 40
 
 
 class RecedingHorizon:
-    """Keeps a plan on its path: one Gauss-Newton step over the coming setpoints from where the limb is.
+    """Keeps a plan on its path: one Gauss-Newton step from where the limb is.
 
-    The step is that of the method ``optimal``, with the same limits, from the measured bend angles and
-    rates, the chambers' lag behind the commands already given included. Beyond the horizon the plan
-    stays as it was; the next call moves the horizon on.
+    The step is over the coming setpoints, that of the method ``optimal`` with its limits, from the
+    measured bend angles and rates; the chambers' lag behind the commands already given is part of
+    it. Beyond the horizon the plan stays as it was; the next call moves the horizon on.
 
     Args:
         plan: of the rod, by any method.
@@ -44,7 +44,9 @@ class RecedingHorizon:
         settings: Settings | None = None,
     ) -> None:
         if plan.model != "der":
-            raise PlanningError(f"only plans of the rod can be replanned, this is of '{plan.model}'")
+            raise PlanningError(
+                f"only plans of the rod can be replanned, this is of '{plan.model}'"
+            )
         if horizon < 4:
             raise PlanningError(f"the horizon must be 4 setpoints or more, got {horizon}")
         self.plan = plan
@@ -62,7 +64,7 @@ class RecedingHorizon:
         )
 
     def replan(self, index: int, bend_angles: ArrayLike, rates: ArrayLike) -> Vector:
-        """Return new commands (H, M) [Pa] for the setpoints from ``index`` on; keep them in `commands`.
+        """Return new commands (H, M) [Pa] from setpoint ``index`` on, and keep them.
 
         Args:
             index: of the first setpoint that may still change.

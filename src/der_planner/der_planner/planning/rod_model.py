@@ -1,4 +1,4 @@
-"""The rod as the planners use it: evenly bent reference configurations, force balance, simulation."""
+"""The rod as planners use it: evenly bent configurations, balance of forces, simulation."""
 
 from __future__ import annotations
 
@@ -16,12 +16,14 @@ Vector = NDArray[np.float64]
 
 NODES = 21
 REFERENCE_PRIOR = 2e-3
-"""Pull of the rod's bend angles toward the arcs' [m/rad]. The rod's polyline reaches a little less far
-than the arcs: the pull keeps its angles smooth where the reference touches its fold, for 0.03 mm."""
+"""Pull of the rod's bend angles toward the arcs' [m/rad]. The rod's polyline reaches a little less
+far
+than the arcs: the pull keeps its angles smooth where the reference touches its fold, for 0.03
+mm."""
 
 
 class RodModel:
-    """A limb's rod, its kinematics for evenly bent segments, and the balance of forces along a motion.
+    """A limb's rod with the kinematics and the balance of forces of evenly bent segments.
 
     Args:
         limb: the physical parameters.
@@ -108,8 +110,8 @@ class RodModel:
     def _needed_force(self, q: Vector, v: Vector, a: Vector) -> Vector:
         """Return M q̈ + D q̇ − F_int − F_ext (K, N, 2) of evenly bent configurations [N].
 
-        Edges keep their rest length, so that F_int is that of the nodes' bending moments alone: with
-        c_e = ∂E/∂ψ_e, the node behind edge e feels +c_e n̂/ē and the node ahead −c_e n̂/ē.
+        Edges keep their rest length, so that F_int is that of the nodes' bending moments alone:
+        with c_e = ∂E/∂ψ_e, the node behind edge e feels +c_e n̂/ē and the node ahead −c_e n̂/ē.
         """
         _, velocity, acceleration = self.kinematics.motion(q, v, a)
         mesh = self.rod.mesh

@@ -22,8 +22,8 @@ def draw(
 ) -> TipPath:
     """Return a shape as a timed path around the tip of a limb bent by 1.2 times the amplitude.
 
-    Curves start and end at rest by a fade of their phase over the first and last quarter of a period;
-    polygons rest at each corner.
+    Curves start and end at rest by a fade of their phase over the first and last quarter of a
+    period; polygons rest at each corner.
 
     Args:
         name: one of `NAMES`.

@@ -1,8 +1,8 @@
 """When each setpoint is sent: a schedule on the absolute 50 ms grid of ROS time, and its player.
 
-The player is plain Python with an injected clock and an injected sender; the node gives it ROS time and
-publishers. It sends every setpoint a fixed lead before its stamp, in order, from a thread of its own, so
-that planning in the background does not make it late.
+The player is plain Python with an injected clock and an injected sender; the node gives it ROS
+time and publishers. It sends every setpoint a fixed lead before its stamp, in order, from a thread
+of its own, so that planning in the background does not make it late.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Schedule:
         return self.start + index * GRID
 
     def leave(self, stamp: int) -> Start | None:
-        """Return where the motion is at an instant [ns]; None before it starts and after it ends."""
+        """Return where the motion is at an instant [ns]; None before its start, after its end."""
         index = (stamp - self.start) // GRID
         if not 0 < index < self.count:
             return None
