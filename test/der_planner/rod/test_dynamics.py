@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from der_planner.limb import Limb
 from der_planner.rod import Rod
 
@@ -80,7 +81,9 @@ def test_torsional_frequencies():
 def test_small_motion_swings_at_the_first_frequency():
     rod = cantilever(41, "ghost", gravity=(0, 0, -1e-3))
     time = np.arange(1, 1001) * 2e-3
-    tip = rod.simulate(rod.straight_state(), np.zeros((1000, 0)), 2e-3, method="midpoint").tip[1:, 2]
+    tip = rod.simulate(rod.straight_state(), np.zeros((1000, 0)), 2e-3, method="midpoint").tip[
+        1:, 2
+    ]
     rest = rod.tip(rod.equilibrium([]))[2]
     crossings = time[:-1][np.diff(np.sign(tip - rest)) > 0]
     period = np.diff(crossings).mean()
@@ -153,7 +156,12 @@ def test_mass_damping_decays_the_first_mode_at_half_its_rate():
     rod = cantilever(21, "ghost", gravity=(0, 0, -1e-3), damping=2.0)
     run = rod.simulate(rod.straight_state(), np.zeros((1500, 0)), 2e-3, method="midpoint")
     swing = run.tip[:, 2] - rod.tip(rod.equilibrium([]))[2]
-    peaks = np.flatnonzero((np.abs(swing[1:-1]) > np.abs(swing[:-2])) & (np.abs(swing[1:-1]) >= np.abs(swing[2:]))) + 1
+    peaks = (
+        np.flatnonzero(
+            (np.abs(swing[1:-1]) > np.abs(swing[:-2])) & (np.abs(swing[1:-1]) >= np.abs(swing[2:]))
+        )
+        + 1
+    )
     rate = np.polyfit(run.time[peaks], np.log(np.abs(swing[peaks])), 1)[0]
     assert rate == pytest.approx(-1.0, rel=0.03)
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from der_planner.rod import Rod, RodState
 
 NODES = 7

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+
 from der_planner.rod import Rod
 
 EI = 0.02
@@ -88,9 +89,13 @@ def test_uneven_edges_break_the_localisation(grading):
     tangents = np.diff(uneven.positions(q), axis=0) / rest[:, None]
     normals = np.stack([-tangents[:, 1], tangents[:, 0], 0 * rest], axis=1)
     by_edge = edge_force[:, None] * normals
-    predicted = np.concatenate([np.zeros((1, 3)), by_edge]) - np.concatenate([by_edge, np.zeros((1, 3))])
+    predicted = np.concatenate([np.zeros((1, 3)), by_edge]) - np.concatenate(
+        [by_edge, np.zeros((1, 3))]
+    )
     np.testing.assert_allclose(forces, -predicted, atol=1e-9)
-    share = expected / np.abs(edge_force).max()  # what an inner edge carries of an end edge's couple
+    share = (
+        expected / np.abs(edge_force).max()
+    )  # what an inner edge carries of an end edge's couple
     assert share == pytest.approx(2 * grading / 10, rel=0.5)
     assert (np.abs(forces[2:-2]).max() > 1e-6) == (grading > 0)
 

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+
 from der_planner.limb import Limb
 from der_planner.rod import Rod
 

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from der_planner.rod import ConvergenceError, Rod
 from scipy.integrate import solve_bvp
+
+from der_planner.rod import ConvergenceError, Rod
 
 RADIUS = 0.015
 AREA = np.pi * RADIUS**2

@@ -10,14 +10,12 @@ import contextlib
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numba
 
 _FOLDER = Path(__file__).resolve().parent
 _FLAGS = {"contract", "reassoc", "nsz", "arcp"}  # NaN must stay visible: it ends an iteration
-
-Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def _drop_stale_caches() -> None:
@@ -37,9 +35,9 @@ def _drop_stale_caches() -> None:
 _drop_stale_caches()
 
 
-def kernel(function: Function) -> Function:
+def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function with a cache on disk, without the interpreter lock."""
-    compiled: Function = numba.njit(
+    compiled: Callable[..., Any] = numba.njit(
         cache=True, fastmath=_FLAGS, nogil=True, boundscheck=False, error_model="numpy"
     )(function)
     return compiled

@@ -110,7 +110,12 @@ class Linearisation:
             shape = array(pulse, (rows, self.input_count), "pulse")
         out = np.zeros((self.intervals + 1, len(self.outputs), self.intervals, self.input_count))
         sensitivity_kernel.sensitivity(
-            np.repeat(shape, self.stages, axis=0), self.intervals, 16, *self._stored, self._output_rows, out
+            np.repeat(shape, self.stages, axis=0),
+            self.intervals,
+            16,
+            *self._stored,
+            self._output_rows,
+            out,
         )
         return out
 

@@ -98,13 +98,13 @@ def array(value: ArrayLike, shape: tuple[int, ...], name: str) -> Array:
     if result.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, got {result.shape}")
     if not np.isfinite(result).all():
-        raise ValueError(f"{name} must be finite, got {int((~np.isfinite(result)).sum())} that are not")
+        raise ValueError(
+            f"{name} must be finite, got {int((~np.isfinite(result)).sum())} that are not"
+        )
     return result
 
 
-def check_segments(
-    segments: Sequence[tuple[int, int]], nodes: int
-) -> tuple[tuple[int, int], ...]:
+def check_segments(segments: Sequence[tuple[int, int]], nodes: int) -> tuple[tuple[int, int], ...]:
     """Return the segments as pairs of ints; raise a ValueError if they leave the rod or share a node."""
     last = -1
     for index, (first, count) in enumerate(segments):
@@ -132,7 +132,9 @@ def uniform_mesh(
     fixed: Sequence[int],
 ) -> Mesh:  # fmt: skip
     """Return the mesh of `Rod.uniform`; see there for the arguments."""
-    require(isinstance(nodes, (int, np.integer)) and nodes >= 3, "nodes", "an int of 3 or more", nodes)
+    require(
+        isinstance(nodes, (int, np.integer)) and nodes >= 3, "nodes", "an int of 3 or more", nodes
+    )
     step = positive(length, "length") / (nodes - 1)
     for value, name in ((EI, "EI"), (EA, "EA"), (GJ, "GJ"), (mass_per_length, "mass_per_length")):
         positive(value, name)
@@ -159,7 +161,9 @@ def uniform_mesh(
         ghost=ghost,
         clamped=clamped_indices(clamp, fixed, nodes),
         segments=pairs,
-        gain=np.array([g * (c - 1) / ((c - 2) * step) for g, (_, c) in zip(gain, pairs, strict=True)]),
+        gain=np.array(
+            [g * (c - 1) / ((c - 2) * step) for g, (_, c) in zip(gain, pairs, strict=True)]
+        ),
     )
 
 

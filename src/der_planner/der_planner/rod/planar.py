@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.rod import planar_kernel
+from der_planner.rod import planar_kernel, planar_step_kernel
 from der_planner.rod.linearisation import StepFactors, step_matrices
 from der_planner.rod.mesh import Mesh
-from der_planner.rod.state import Array, RodState
+from der_planner.rod.state import Array, Arrays, RodState
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class PlanarBackend:
         )
         one = np.zeros(self.ghost)
         actuated = plane == "xy"
-        self.rod = (
+        self.rod: Arrays = (
             np.concatenate([mesh.rest[: self.ghost], mesh.rest]),
             np.concatenate([one, mesh.axial]),
             np.concatenate([one, mesh.bend]),
@@ -79,7 +79,7 @@ class PlanarBackend:
         n = nodes + self.ghost
         self.size = 2 * n
 
-    def work_space(self) -> tuple[Array, ...]:
+    def work_space(self) -> Arrays:
         """Return new work arrays: work, s, band, edge, turn, torque, parts."""
         n = self.size // 2
         return (
@@ -102,6 +102,9 @@ class PlanarBackend:
     def extend_rate(self, v: Array) -> Array:
         """Return a velocity or force (4N-1,) in the kernels' coordinates."""
         return np.concatenate([np.zeros(2 * self.ghost), v[self.index]])
+
+    def _body(self, load: Array) -> Arrays:
+        return self.mass, self.damping, self.extend_rate(load), self.fixed
 
     def restore(self, x: Array, base: Array) -> Array:
         """Return copies of base (4N-1,) with the planar coordinates of x (…, 2n)."""
@@ -131,9 +134,9 @@ class PlanarBackend:
         rate = np.empty((intervals + 1, self.size))
         x[0] = self.extend(state.q)
         rate[0] = self.extend_rate(state.v)
-        done, iterations, update, failed = planar_kernel.simulate(
+        done, iterations, update, failed = planar_step_kernel.simulate(
             x, rate, pressures, h, extrapolate, tolerance, limit, factors, bands, columns,
-            *self.work_space(), self.mass, self.damping, self.extend_rate(load), self.fixed, *self.rod,
+            self.work_space(), self._body(load), self.rod,
         )  # fmt: skip
         q = self.restore(x, state.q)
         v = self.restore(rate, state.v)
@@ -178,11 +181,9 @@ class PlanarBackend:
     ) -> tuple[RodState, int, float]:
         """Solve the balance of forces from `start`; iterations are negative without convergence."""
         x = self.extend(start.q)
-        work, s, _, edge, turn, torque, _ = self.work_space()
-        iterations, update = planar_kernel.newton(
-            x, x.copy(), np.zeros(self.size), 0.0, u, tolerance, limit, work, s,
-            edge, turn, torque, self.mass, self.damping, self.extend_rate(load),
-            self.fixed, *self.rod,
+        iterations, update = planar_step_kernel.newton(
+            x, x.copy(), np.zeros(self.size), 0.0, u, tolerance, limit,
+            self.work_space(), self._body(load), self.rod,
         )  # fmt: skip
         q = self.restore(x, start.q)
         return RodState(q, 0.0 * q, start.directors, start.reference_twist), iterations, update
@@ -194,7 +195,7 @@ class PlanarBackend:
     def energy(self, state: RodState) -> float:
         """Return the elastic energy."""
         _, _, _, edge, turn, _, _ = self.work_space()
-        return float(planar_kernel.energy(self.extend(state.q), edge, turn, *self.rod))
+        return float(planar_kernel.energy(self.extend(state.q), edge, turn, self.rod))
 
     def gradient_and_hessian(self, state: RodState) -> tuple[Array, Array]:
         """Return ∇E (4N-1,) and ∇²E (4N-1, 4N-1); entries off the plane are zero."""
@@ -203,7 +204,7 @@ class PlanarBackend:
         u = np.zeros(len(self.mesh.gain))
         _, s, _, edge, turn, torque, _ = self.work_space()
         planar_kernel.assemble(
-            x, np.zeros(self.size), 0.0, u, False, gradient, s, edge, turn, torque, *self.rod
+            x, np.zeros(self.size), 0.0, u, False, gradient, s, edge, turn, torque, self.rod
         )
         return self._full(gradient), self._full_matrix(band_to_dense(s))
 
@@ -212,7 +213,7 @@ class PlanarBackend:
         columns = np.zeros((self.size, len(self.mesh.gain)))
         _, _, _, edge, turn, _, _ = self.work_space()
         planar_kernel.edges_and_turns(self.extend(state.q), edge, turn)
-        planar_kernel.input_columns(edge, *self.rod[-3:], columns)
+        planar_kernel.input_columns(edge, self.rod, columns)
         return self._full(columns)
 
     def viscous_force(self, state: RodState) -> Array:
@@ -222,9 +223,7 @@ class PlanarBackend:
         _, _, band, edge, turn, _, parts = self.work_space()
         u = np.zeros(len(self.mesh.gain))
         planar_kernel.edges_and_turns(x, edge, turn)
-        planar_kernel.unsymmetric(
-            v, 1.0, u, a, band, edge, turn, parts, self.rod[5], *self.rod[-3:]
-        )
+        planar_kernel.unsymmetric(v, 1.0, u, a, band, edge, turn, parts, self.rod)
         return self._full(-band_to_dense(band) @ v)
 
     def _full(self, planar: Array) -> Array:

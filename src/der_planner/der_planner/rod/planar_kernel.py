@@ -9,25 +9,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from der_planner.rod.band_kernel import (
-    expand,
-    factor_general,
-    hold_fixed,
-    hold_fixed_general,
-    put,
-    smallest,
-    solve_5,
-)
 from der_planner.rod.compile import kernel
-from der_planner.rod.state import Array
+from der_planner.rod.state import Array, Arrays
 
-# A rod's arrays, in the order in which every kernel takes them after its own arguments:
+# `rod` is the tuple of a rod's arrays:
 # rest (n-1,) edge lengths; axial (n-1,) EA; bend (n,) w; rest_kappa (n,); cubic (n,); viscous (n,) c;
 # first (M,), last (M,) edge indices of the segments; gain (M,) Λ.
 
 
 @kernel
-def edges_and_turns(x, edge, turn):
+def edges_and_turns(
+    x: Array,
+    edge: Array,
+    turn: Array,
+) -> None:
     """Fill edge (n-1, 3) with t and 1/|e|, turn (n,) with κ at the interior nodes."""
     n = turn.shape[0]
     for j in range(n - 1):
@@ -44,8 +39,14 @@ def edges_and_turns(x, edge, turn):
 
 
 @kernel
-def energy(x, edge, turn, rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain):
+def energy(
+    x: Array,
+    edge: Array,
+    turn: Array,
+    rod: Arrays,
+) -> float:
     """Return the elastic energy [J]."""
+    rest, axial, bend, rest_kappa, cubic = rod[:5]
     edges_and_turns(x, edge, turn)
     total = 0.0
     n = turn.shape[0]
@@ -60,9 +61,18 @@ def energy(x, edge, turn, rest, axial, bend, rest_kappa, cubic, viscous, first, 
 
 @kernel
 def assemble(
-    x, v, rate, u, convex, g, s, edge, turn, torque,
-    rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain,
-):  # fmt: skip
+    x: Array,
+    v: Array,
+    rate: float,
+    u: Array,
+    convex: bool,
+    g: Array,
+    s: Array,
+    edge: Array,
+    turn: Array,
+    torque: Array,
+    rod: Arrays,
+) -> None:
     """Elastic, viscous and actuating terms of the residual and its symmetric derivative.
 
     g (2n,) becomes ∇E + viscous force − B(q)Λu; s (2n, 6) its derivative by x with v = rate·(x − x_n),
@@ -70,6 +80,7 @@ def assemble(
     `convex` the negative geometric terms are left out too: a safer direction far from the solution.
     edge (n-1, 3), turn (n,), torque (n, 2) are work space: t and 1/|e|; κ; moment and its derivative.
     """
+    rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain = rod
     n = turn.shape[0]
     edges_and_turns(x, edge, turn)
     torque[0, 0] = 0.0
@@ -160,7 +171,11 @@ def assemble(
 
 
 @kernel
-def turning_rate(v, edge, i):
+def turning_rate(
+    v: Array,
+    edge: Array,
+    i: int,
+) -> float:
     """Return dθ/dt at node i for node velocities v."""
     total = 0.0
     for side in range(2):
@@ -173,12 +188,23 @@ def turning_rate(v, edge, i):
 
 
 @kernel
-def unsymmetric(v, rate, u, a, damping, edge, turn, parts, viscous, first, last, gain):
+def unsymmetric(
+    v: Array,
+    rate: float,
+    u: Array,
+    a: Array,
+    damping: Array,
+    edge: Array,
+    turn: Array,
+    parts: Array,
+    rod: Arrays,
+) -> None:
     """Complete a (2n, 11) to the exact derivative; fill damping (2n, 6) with the viscous matrix·rate.
 
     Missing in `assemble` are −(Λu/|e|) n̂ tᵀ of a couple that keeps its force while its edge stretches,
     and c κ'² ∇θ (∇²θ v)ᵀ of the viscous moment.
     """
+    viscous, first, last, gain = rod[5], rod[6], rod[7], rod[8]
     n = turn.shape[0]
     damping[:] = 0.0
     for m in range(gain.shape[0]):
@@ -230,8 +256,9 @@ def unsymmetric(v, rate, u, a, damping, edge, turn, parts, viscous, first, last,
 
 
 @kernel
-def input_columns(edge, first, last, gain, columns):
+def input_columns(edge: Array, rod: Arrays, columns: Array) -> None:
     """Fill columns (2n, M) with B(q)Λ for the tangents in edge."""
+    first, last, gain = rod[6], rod[7], rod[8]
     columns[:] = 0.0
     for m in range(gain.shape[0]):
         for end in range(2):
@@ -241,153 +268,3 @@ def input_columns(edge, first, last, gain, columns):
             columns[2 * j + 1, m] -= force * edge[j, 0]
             columns[2 * j + 2, m] -= force * edge[j, 1]
             columns[2 * j + 3, m] += force * edge[j, 0]
-
-
-@kernel
-def newton(
-    x, x_n, v_n, rate, u, tolerance, limit, work, s, edge, turn, torque,
-    mass, damping, load, fixed,
-    rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain,
-):  # fmt: skip
-    """Solve M·rate·((x − x_n)·rate − v_n) + D·rate·(x − x_n) = F(x) for x, from the guess in x.
-
-    rate = 0 is statics. work (6, 2n): the first two rows are used.
-    Returns (iterations, size of the last update); iterations is negative without convergence.
-    """
-    size = x.shape[0]
-    residual = work[0]
-    v = work[1]
-    largest = 2.0 * smallest(rest)
-    careful = 0.1 * smallest(rest)
-    update = np.inf
-    convex = rate < 0.0
-    for iteration in range(limit):
-        for k in range(size):
-            v[k] = (x[k] - x_n[k]) * rate
-        assemble(x, v, rate, u, convex, residual, s, edge, turn, torque,
-                 rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain)  # fmt: skip
-        for k in range(size):
-            residual[k] += mass[k] * rate * (v[k] - v_n[k]) + damping[k] * v[k] - load[k]
-            s[k, 0] += rate * (mass[k] * rate + damping[k])
-        hold_fixed(s, residual, fixed)
-        solve_5(s, residual)
-        update = 0.0
-        for k in range(size):
-            # written so that NaN counts as too large
-            if not abs(residual[k]) <= update:
-                update = abs(residual[k])
-        if not update < 1e6:
-            return -iteration - 1, update
-        scale = 1.0 if update < largest else largest / update
-        convex = rate > 0.0 and update > careful
-        for k in range(size):
-            x[k] -= scale * residual[k]
-        if update < tolerance:
-            return iteration + 1, update
-    return -limit, update
-
-
-@kernel
-def predict(x, x_n, v_n, acceleration, h, fixed, rest):
-    """Fill x with a guess of the step's end: the last acceleration goes on, unless it leads far."""
-    far = 0.5 * smallest(rest)
-    for d in range(x.shape[0]):
-        move = h * (v_n[d] + h * acceleration[d])
-        x[d] = x_n[d] + move
-        if not abs(move) < far:
-            put(x_n, x)
-            return
-    for d in fixed:
-        x[d] = x_n[d]
-
-
-@kernel
-def simulate(
-    q, v, pressures, h, extrapolate, tolerance, limit,
-    factors, viscous_bands, inputs, work, s, band, edge, turn, torque, parts,
-    mass, damping, load, fixed,
-    rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain,
-):  # fmt: skip
-    """Run K intervals of S steps from q[0], v[0] into q, v (K+1, 2n).
-
-    Each step solves backward Euler over h and goes on to x_n + e (x − x_n) with e = extrapolate[step
-    modulo its length] (P,). pressures is (K, S, M). factors (K·S, 2n, 11), viscous_bands (K·S or 0, 2n, 6)
-    and inputs (K·S, 2n, M) receive the linearisation unless empty. Work space: work (6, 2n), s and band
-    (2n, 6), edge (n-1, 3), turn (n,), torque (n, 2), parts (2, 6).
-
-    Returns (steps done, Newton iterations, last update, iterations of the failed step or 0).
-    """
-    intervals, steps, _ = pressures.shape
-    size = q.shape[1]
-    x, x_n, v_n, acceleration = work[2], work[3], work[4], work[5]
-    put(q[0], x_n)
-    put(v[0], v_n)
-    acceleration[:] = 0.0
-    rate = 1.0 / h
-    total = 0
-    for k in range(intervals):
-        for step in range(steps):
-            u = pressures[k, step]
-            predict(x, x_n, v_n, acceleration, h, fixed, rest)
-            iterations = -1
-            update = np.inf
-            for attempt in range(2):
-                if attempt == 1:  # the guess may have been at fault: once more from rest
-                    put(x_n, x)
-                iterations, update = newton(
-                    x, x_n, v_n, rate, u, tolerance, limit, work, s, edge, turn, torque,
-                    mass, damping, load, fixed,
-                    rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain)  # fmt: skip
-                if iterations > 0:
-                    break
-            index = k * steps + step
-            if iterations < 0:
-                put(x_n, q[k + 1])
-                put(v_n, v[k + 1])
-                return index, total - iterations, update, -iterations
-            total += iterations
-            if factors.shape[0] > 0:
-                linearise(x, x_n, rate, u, factors[index], inputs[index], band, work, s, edge, turn,
-                          torque, parts, mass, damping, fixed,
-                          rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain)  # fmt: skip
-                factor_general(factors[index])
-                if viscous_bands.shape[0] > 0:
-                    for d in range(size):
-                        put(band[d], viscous_bands[index, d])
-            e = extrapolate[index % extrapolate.shape[0]]
-            for d in range(size):
-                velocity = (x[d] - x_n[d]) * rate
-                acceleration[d] = (velocity - v_n[d]) * rate
-                x_n[d] += e * (x[d] - x_n[d])
-                v_n[d] += e * (velocity - v_n[d])
-        put(x_n, q[k + 1])
-        put(v_n, v[k + 1])
-    return intervals * steps, total, 0.0, 0
-
-
-@kernel
-def linearise(
-    x, x_n, rate, u, a, columns, band, work, s, edge, turn, torque, parts, mass, damping, fixed,
-    rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain,
-):  # fmt: skip
-    """Fill a (2n, 11) with the exact derivative of the step's residual at x, columns with B(q)Λ.
-
-    band (2n, 6) receives the viscous matrix times rate. Fixed unknowns have unit rows.
-    """
-    size = x.shape[0]
-    v = work[1]
-    for k in range(size):
-        v[k] = (x[k] - x_n[k]) * rate
-    assemble(x, v, rate, u, rate < 0.0, work[0], s, edge, turn, torque,
-             rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain)  # fmt: skip
-    for k in range(size):
-        s[k, 0] += rate * (mass[k] * rate + damping[k])
-    expand(s, a)
-    unsymmetric(v, rate, u, a, band, edge, turn, parts, viscous, first, last, gain)
-    hold_fixed_general(a, fixed)
-    hold_fixed(band, work[0], fixed)
-    for d in fixed:
-        band[d, 0] = 0.0
-    input_columns(edge, first, last, gain, columns)
-    for d in fixed:
-        columns[d] = 0.0

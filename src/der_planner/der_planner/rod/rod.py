@@ -134,6 +134,22 @@ class Rod:
             plane = "xy" if limb.gravity[2] == 0.0 else None
         return cls(limb_mesh(limb, nodes, clamp), plane)
 
+    def warm_up(self) -> None:
+        """Compile, or load from the cache, every kernel that this rod will call."""
+        state = self.straight_state()
+        still = np.zeros((1, self.segment_count))
+        planar = self.plane is not None
+        motion = self.simulate(state, still, 1e-3, linearise=planar)
+        if motion.linearisation is not None:
+            motion.linearisation.tangent(still)
+            motion.linearisation.adjoint(np.zeros((2, len(motion.linearisation.outputs))))
+            motion.linearisation.sensitivity()
+        self.linearise_step(state, still[0], 1e-3)
+        self.control_affine(state)
+        self.energy(state)
+        self.stiffness(state)
+        self.equilibrium(still[0])
+
     def straight_state(self) -> RodState:
         """Return the straight, unloaded, resting state."""
         q = np.zeros(4 * self.nodes - 1)
@@ -276,7 +292,9 @@ class Rod:
         """Return B(q)Λ (4N-1, M) [N/Pa]: unit couples times Λ; rows of φ are zero."""
         return self._backend.input_matrix(self._as_state(state))
 
-    def control_affine(self, state: RodState, forces: ArrayLike | None = None) -> tuple[Array, Array]:
+    def control_affine(
+        self, state: RodState, forces: ArrayLike | None = None
+    ) -> tuple[Array, Array]:
         """Return f (2F,) and g (2F, M) of ẋ = f(x) + g(x) u, x = (q[free], v[free])."""
         free = self.free
         force = (
@@ -331,7 +349,6 @@ class Rod:
             angles: (M,) bend angles [rad], as `bend_angles` measures them.
         """
         return even_bend(array(angles, (self.segment_count,), "angles"), self.mesh)
-
 
     def _run(
         self,

@@ -11,10 +11,21 @@ import numpy as np
 
 from der_planner.rod.band_kernel import put, solve_columns, solve_transposed
 from der_planner.rod.compile import kernel
+from der_planner.rod.state import Array
 
 
 @kernel
-def advance(dq, dv, y, factors, viscous, inertia, momentum, rate, extrapolate):
+def advance(
+    dq: Array,
+    dv: Array,
+    y: Array,
+    factors: Array,
+    viscous: Array,
+    inertia: Array,
+    momentum: Array,
+    rate: float,
+    extrapolate: float,
+) -> None:
     """Advance the columns dq, dv (n, C) by one step, given B δu in y (n, C)."""
     size, columns = dq.shape
     for i in range(size):
@@ -42,7 +53,19 @@ def advance(dq, dv, y, factors, viscous, inertia, momentum, rate, extrapolate):
 
 
 @kernel
-def tangent(change, start, factors, viscous, inputs, inertia, momentum, rate, extrapolate, outputs, out):
+def tangent(
+    change: Array,
+    start: Array,
+    factors: Array,
+    viscous: Array,
+    inputs: Array,
+    inertia: Array,
+    momentum: Array,
+    rate: float,
+    extrapolate: Array,
+    outputs: Array,
+    out: Array,
+) -> None:
     """Fill out (K+1, P) with the change of the outputs for a change (K, S, M) of the inputs.
 
     start (2, n) is the change of the initial q and v.
@@ -71,8 +94,18 @@ def tangent(change, start, factors, viscous, inputs, inertia, momentum, rate, ex
 
 @kernel
 def adjoint(
-    weight, factors, viscous, inputs, inertia, momentum, rate, extrapolate, outputs, gradient, start
-):
+    weight: Array,
+    factors: Array,
+    viscous: Array,
+    inputs: Array,
+    inertia: Array,
+    momentum: Array,
+    rate: float,
+    extrapolate: Array,
+    outputs: Array,
+    gradient: Array,
+    start: Array,
+) -> None:
     """Fill gradient (K, S, M) and start (2, n) with the transpose of `tangent` applied to weight (K+1, P)."""
     intervals, steps, count = gradient.shape
     size = start.shape[1]
@@ -110,8 +143,19 @@ def adjoint(
 
 @kernel
 def sensitivity(
-    pulse, intervals, chunk, factors, viscous, inputs, inertia, momentum, rate, extrapolate, outputs, out
-):
+    pulse: Array,
+    intervals: int,
+    chunk: int,
+    factors: Array,
+    viscous: Array,
+    inputs: Array,
+    inertia: Array,
+    momentum: Array,
+    rate: float,
+    extrapolate: Array,
+    outputs: Array,
+    out: Array,
+) -> None:
     """Fill out (K+1, P, K, M): change of each output for a unit pulse of each input in each interval.
 
     pulse (R·S, M) is the pressure of the steps that follow the start of an interval. `chunk` intervals

@@ -9,7 +9,7 @@ from der_planner.rod import spatial_kernel, spatial_step_kernel
 from der_planner.rod.mesh import Mesh
 from der_planner.rod.planar import Run, band_to_dense
 from der_planner.rod.spatial_linearisation import Stage, propagate, residual_derivatives
-from der_planner.rod.state import Array, RodState
+from der_planner.rod.state import Array, Arrays, RodState
 
 
 class SpatialBackend:
@@ -22,7 +22,9 @@ class SpatialBackend:
         size = 4 * mesh.nodes - 1
         self.index = np.arange(size)
         held = set(mesh.clamped.tolist())
-        self.fixed = np.array([*range(self.offset), *(d + self.offset for d in sorted(held))], dtype=np.int64)
+        self.fixed = np.array(
+            [*range(self.offset), *(d + self.offset for d in sorted(held))], dtype=np.int64
+        )
         self.free = np.array([d for d in range(size) if d not in held], dtype=np.int64)
         self.free_rows = self.free + self.offset
         self.mass = self._extended(mesh.node_mass, mesh.edge_inertia)
@@ -30,7 +32,7 @@ class SpatialBackend:
         one, rows = np.zeros(self.ghost), np.zeros((self.ghost, 2))
         first = [first + self.ghost for first, _ in mesh.segments]
         last = [first + count - 2 + self.ghost for first, count in mesh.segments]
-        self.rod = (
+        self.rod: Arrays = (
             np.concatenate([mesh.rest[: self.ghost], mesh.rest]),
             np.concatenate([one, mesh.axial]),
             np.concatenate([one, mesh.bend]),
@@ -47,14 +49,14 @@ class SpatialBackend:
         self.size = 4 * n - 1
         self.lever = 0.1 * float(mesh.rest.sum())
 
-    def work_space(self) -> tuple[Array, ...]:
+    def work_space(self) -> Arrays:
         """Return new work arrays: twists, work, s, frame, own, link, local, vectors, a."""
         n = (self.size + 1) // 4
         return (
             np.zeros(n),
             np.zeros((6, self.size)),
             np.zeros((self.size, 11)),
-            np.zeros((n - 1, 16)),
+            np.zeros((n - 1, 13)),
             np.zeros((n - 1, 4, 5)),
             np.zeros((n, 4, 4)),
             np.zeros((12, 8)),
@@ -79,7 +81,7 @@ class SpatialBackend:
         """Return a velocity or force (4N-1,) in the kernels' coordinates."""
         return np.concatenate([np.zeros(self.offset), v])
 
-    def reference(self, state: RodState) -> tuple[Array, Array, Array]:
+    def reference(self, state: RodState) -> Arrays:
         """Return tangents, directors (n-1, 3) and reference twists (n,) of a state, for the kernels."""
         x = state.q
         nodes = np.stack([x[0::4], x[1::4], x[2::4]], axis=1)
@@ -95,13 +97,16 @@ class SpatialBackend:
 
     def carry_frames(self, base: RodState, q: Array, v: Array) -> RodState:
         """Return a state at q whose frames are those of `base`, transported."""
-        tangents, directors, twists = self.reference(base)
-        space = self.work_space()
-        spatial_step_kernel.carry(self.extend(q), twists, tangents, directors, space[0], space[3])
-        return self._state(q, v, directors, twists)
+        frames = self.reference(base)
+        spatial_step_kernel.carry(self.extend(q), frames, self.work_space())
+        return self._state(q, v, frames)
 
-    def _state(self, q: Array, v: Array, directors: Array, twists: Array) -> RodState:
+    def _state(self, q: Array, v: Array, base: Arrays) -> RodState:
+        _, directors, twists = base
         return RodState(q, v, directors[self.ghost :].copy(), twists[self.ghost :].copy())
+
+    def _body(self, load: Array) -> Arrays:
+        return self.mass, self.damping, self.extend_rate(load), self.fixed
 
     def simulate(
         self,
@@ -116,21 +121,23 @@ class SpatialBackend:
     ) -> Run:
         """Run the kernel `simulate`; load is (4N-1,)."""
         if linearise:
-            raise ValueError("a rod in space keeps no linearisation of a motion: use linearise_step")
+            raise ValueError(
+                "a rod in space keeps no linearisation of a motion: use linearise_step"
+            )
         intervals, steps, _ = pressures.shape
         x = np.empty((intervals + 1, self.size))
         rate = np.empty((intervals + 1, self.size))
         x[0] = self.extend(state.q)
         rate[0] = self.extend_rate(state.v)
-        tangents, directors, twists = self.reference(state)
+        base = self.reference(state)
         done, iterations, update, failed = spatial_step_kernel.simulate(
-            x, rate, pressures, h, extrapolate, tolerance, self.lever, limit, tangents, directors,
-            twists, *self.work_space(), self.mass, self.damping, self.extend_rate(load), self.fixed, *self.rod,
+            x, rate, pressures, h, extrapolate, tolerance, self.lever, limit, base,
+            self.work_space(), self._body(load), self.rod,
         )  # fmt: skip
         q = x[:, self.offset :].copy()
         v = rate[:, self.offset :].copy()
         at = done // steps + 1 if failed else intervals
-        final = self._state(q[at].copy(), v[at].copy(), directors, twists)
+        final = self._state(q[at].copy(), v[at].copy(), base)
         return Run(q, v, final, done, iterations, update, failed, None)
 
     def linearise(
@@ -178,17 +185,17 @@ class SpatialBackend:
     ) -> tuple[RodState, int, float]:
         """Solve the balance of forces from `start`; iterations are negative without convergence."""
         x = self.extend(start.q)
-        tangents, directors, twists = self.reference(start)
+        base = self.reference(start)
         iterations, update = spatial_step_kernel.newton(
-            x, x.copy(), np.zeros(self.size), 0.0, u, tolerance, self.lever, limit, tangents,
-            directors, twists, *self.work_space(), self.mass, self.damping, self.extend_rate(load), self.fixed, *self.rod,
+            x, x.copy(), np.zeros(self.size), 0.0, u, tolerance, self.lever, limit, base,
+            self.work_space(), self._body(load), self.rod,
         )  # fmt: skip
         if iterations < 0:
             return start, iterations, update
         q = x[self.offset :].copy()
-        return self._state(q, np.zeros_like(q), directors, twists), iterations, update
+        return self._state(q, np.zeros_like(q), base), iterations, update
 
-    def _place(self, state: RodState) -> tuple[Array, tuple[Array, ...]]:
+    def _place(self, state: RodState) -> tuple[Array, Arrays]:
         """Return the kernel coordinates of a state and a work space with its frames and twists."""
         x = self.extend(state.q)
         tangents, directors, twists = self.reference(state)
@@ -200,14 +207,14 @@ class SpatialBackend:
     def energy(self, state: RodState) -> float:
         """Return the elastic energy."""
         x, (twists, _, _, frame, _, _, local, _, _) = self._place(state)
-        return float(spatial_kernel.energy(x, frame, twists, local, *self.rod))
+        return float(spatial_kernel.energy(x, frame, twists, local, self.rod))
 
     def _assemble(self, state: RodState, v: Array) -> tuple[Array, Array]:
         x, (twists, _, s, frame, own, link, local, vectors, _) = self._place(state)
         gradient = np.zeros(self.size)
         spatial_kernel.assemble(
             x, v, 0.0, np.zeros(len(self.mesh.gain)), False, gradient, s, frame, twists, own, link,
-            local, vectors, *self.rod,
+            local, vectors, self.rod,
         )  # fmt: skip
         return gradient[self.offset :], s
 
@@ -226,5 +233,5 @@ class SpatialBackend:
         """Return B(q)Λ (4N-1, M)."""
         _, space = self._place(state)
         columns = np.zeros((self.size, len(self.mesh.gain)))
-        spatial_kernel.input_columns(space[3], *self.rod[-3:], columns)
+        spatial_kernel.input_columns(space[3], self.rod, columns)
         return columns[self.offset :]

@@ -12,18 +12,24 @@ from __future__ import annotations
 import numpy as np
 
 from der_planner.rod.compile import kernel
+from der_planner.rod.state import Array, Arrays
 
-# A rod's arrays, in the order in which every kernel takes them after its own arguments:
+# `rod` is the tuple of a rod's arrays:
 # rest (n-1,); axial (n-1,) EA; bend (n,) EI/l; twist (n,) GJ/l; cubic (n,) k3/l³; viscous (n,) EI τ/l;
 # rest_kappa (n, 2); rest_twist (n,); first (M,), last (M,) edges of the segments; gain (M,) Λ.
 
-# Columns of the work array `frame` (n-1, 16)
-T, INVERSE, M1, M2, D1 = 0, 3, 4, 7, 10
+# Columns of the work array `frame` (n-1, 13): t, 1/|e|, m1, m2, d1
+T, D1 = 0, 10
 
 
 @kernel
-def frames(x, base_tangent, base_director, frame):
-    """Fill frame (n-1, 16): t, 1/|e|, m1, m2 and the transported director of each edge."""
+def frames(
+    x: Array,
+    base_tangent: Array,
+    base_director: Array,
+    frame: Array,
+) -> None:
+    """Fill frame (n-1, 13): t, 1/|e|, m1, m2 and the transported director of each edge."""
     for j in range(frame.shape[0]):
         k = 4 * j
         ex = x[k + 4] - x[k]
@@ -56,7 +62,11 @@ def frames(x, base_tangent, base_director, frame):
 
 
 @kernel
-def reference_twists(frame, before, twists):
+def reference_twists(
+    frame: Array,
+    before: Array,
+    twists: Array,
+) -> None:
     """Fill twists (n,) with the angle from P(t_e→t_f) d1_e to d1_f about t_f, the one near `before`."""
     for i in range(1, frame.shape[0]):
         ex, ey, ez = frame[i - 1, 0], frame[i - 1, 1], frame[i - 1, 2]
@@ -68,9 +78,7 @@ def reference_twists(frame, before, twists):
         dy -= shift * (ey + fy)
         dz -= shift * (ez + fz)
         cosine = dx * ux + dy * uy + dz * uz
-        sine = (
-            fx * (dy * uz - dz * uy) + fy * (dz * ux - dx * uz) + fz * (dx * uy - dy * ux)
-        )
+        sine = fx * (dy * uz - dz * uy) + fy * (dz * ux - dx * uz) + fz * (dx * uy - dy * ux)
         old = before[i]
         if sine == 0.0 and cosine > 0.0 and old == 0.0:
             twists[i] = 0.0
@@ -80,7 +88,14 @@ def reference_twists(frame, before, twists):
 
 
 @kernel
-def node_strains(i, frame, twists, x, strain, gradient):
+def node_strains(
+    i: int,
+    frame: Array,
+    twists: Array,
+    x: Array,
+    strain: Array,
+    gradient: Array,
+) -> None:
     """Fill strain (8,): κ1, κ2, τ, χ, κb and gradient (3, 8) of κ1, κ2, τ by (e, φe, f, φf)."""
     ex, ey, ez, le = frame[i - 1, 0], frame[i - 1, 1], frame[i - 1, 2], frame[i - 1, 3]
     fx, fy, fz, lf = frame[i, 0], frame[i, 1], frame[i, 2], frame[i, 3]
@@ -127,7 +142,16 @@ def node_strains(i, frame, twists, x, strain, gradient):
 
 
 @kernel
-def add_curvature_hessian(i, c1, c2, c3, frame, strain, vectors, h):
+def add_curvature_hessian(
+    i: int,
+    c1: float,
+    c2: float,
+    c3: float,
+    frame: Array,
+    strain: Array,
+    vectors: Array,
+    h: Array,
+) -> None:
     """Add c1 ∇²κ1 + c2 ∇²κ2 + c3 ∇²τ, symmetric, to h (8, 8), whose lower triangle is filled.
 
     With a = c1 m2 − c2 m1 on each edge, c1 κ1 + c2 κ2 = ½ κb·(a_e + a_f): one formula does both.
@@ -212,9 +236,21 @@ def add_curvature_hessian(i, c1, c2, c3, frame, strain, vectors, h):
 
 @kernel
 def assemble(
-    x, v, rate, u, convex, g, s, frame, twists, own, link, local, vectors,
-    rest, axial, bend, twist, cubic, viscous, rest_kappa, rest_twist, first, last, gain,
-):  # fmt: skip
+    x: Array,
+    v: Array,
+    rate: float,
+    u: Array,
+    convex: bool,
+    g: Array,
+    s: Array,
+    frame: Array,
+    twists: Array,
+    own: Array,
+    link: Array,
+    local: Array,
+    vectors: Array,
+    rod: Arrays,
+) -> None:
     """Elastic, viscous and actuating terms of the residual and its symmetric derivative.
 
     g (4n-1,) becomes ∇E + viscous force − B(q)Λu; s (4n-1, 11) the symmetric derivative by x, the viscous
@@ -222,8 +258,9 @@ def assemble(
     column) and Hessian of each edge's (e, φ); link (n, 4, 4) coupling of a node's two edges, rows of the
     second; local (12, 8); vectors (10, 3).
     """
+    _, _, bend, twist, cubic, viscous, rest_kappa, rest_twist, _, _, _ = rod
     edges = frame.shape[0]
-    stretch(frame, u, convex, own, rest, axial, first, last, gain)
+    stretch(frame, u, convex, own, rod)
     strain = local[11]
     gradient = local[8:11]
     for i in range(1, edges):
@@ -251,7 +288,9 @@ def assemble(
         add_curvature_hessian(i, c1, c2, c3, frame, strain, vectors, local)
         for r in range(4):
             own[i - 1, r, 4] += c1 * gradient[0, r] + c2 * gradient[1, r] + c3 * gradient[2, r]
-            own[i, r, 4] += c1 * gradient[0, 4 + r] + c2 * gradient[1, 4 + r] + c3 * gradient[2, 4 + r]
+            own[i, r, 4] += (
+                c1 * gradient[0, 4 + r] + c2 * gradient[1, 4 + r] + c3 * gradient[2, 4 + r]
+            )
             for c in range(r + 1):
                 own[i - 1, r, c] += local[r, c]
                 own[i, r, c] += local[4 + r, 4 + c]
@@ -261,8 +300,10 @@ def assemble(
 
 
 @kernel
-def stretch(frame, u, convex, own, rest, axial, first, last, gain):
+def stretch(frame: Array, u: Array, convex: bool, own: Array, rod: Arrays) -> None:
     """Start own (n-1, 4, 5) with stretching and with the couples, symmetrised (see `unsymmetric`)."""
+    rest, axial = rod[0], rod[1]
+    first, last, gain = rod[8], rod[9], rod[10]
     own[:] = 0.0
     for j in range(frame.shape[0]):
         inverse = frame[j, 3]
@@ -292,12 +333,13 @@ def stretch(frame, u, convex, own, rest, axial, first, last, gain):
 
 
 @kernel
-def unsymmetric(frame, u, own, first, last, gain, a):
+def unsymmetric(frame: Array, u: Array, own: Array, rod: Arrays, a: Array) -> None:
     """Add to a (4n-1, 21) what `assemble` left out of the derivative at the frames' own base.
 
     That is the unsymmetric part of the couples, which keep turning about z when their edge tilts, and
     half of each edge's twisting torque times [t]×/|e|², as the force is no gradient under transport.
     """
+    first, last, gain = rod[8], rod[9], rod[10]
     for j in range(frame.shape[0]):
         half = 0.5 * own[j, 3, 4] * frame[j, 3] * frame[j, 3]
         for k in range(3):
@@ -321,7 +363,13 @@ def unsymmetric(frame, u, own, first, last, gain, a):
 
 
 @kernel
-def add_to_edge(j, r, c, value, a):
+def add_to_edge(
+    j: int,
+    r: int,
+    c: int,
+    value: float,
+    a: Array,
+) -> None:
     """Add ∂(force by edge j)_r/∂(edge j)_c to the general band a of the nodes."""
     row, column = 4 * j + r, 4 * j + c
     a[row, 10 + column - row] += value
@@ -331,7 +379,12 @@ def add_to_edge(j, r, c, value, a):
 
 
 @kernel
-def to_nodes(own, link, g, s):
+def to_nodes(
+    own: Array,
+    link: Array,
+    g: Array,
+    s: Array,
+) -> None:
     """Bring gradient and Hessian by edges, w_j = (x_{j+1} − x_j, φ_j), to the nodes: g (4n-1,), s."""
     edges = own.shape[0]
     for r in range(3):
@@ -382,10 +435,14 @@ def to_nodes(own, link, g, s):
 
 @kernel
 def energy(
-    x, frame, twists, local,
-    rest, axial, bend, twist, cubic, viscous, rest_kappa, rest_twist, first, last, gain,
-):  # fmt: skip
+    x: Array,
+    frame: Array,
+    twists: Array,
+    local: Array,
+    rod: Arrays,
+) -> float:
     """Return the elastic energy [J]; frame and twists are those of x."""
+    rest, axial, bend, twist, cubic, _, rest_kappa, rest_twist, _, _, _ = rod
     total = 0.0
     strain = local[11]
     for j in range(frame.shape[0]):
@@ -400,8 +457,9 @@ def energy(
 
 
 @kernel
-def input_columns(frame, first, last, gain, columns):
+def input_columns(frame: Array, rod: Arrays, columns: Array) -> None:
     """Fill columns (4n-1, M) with B(q)Λ."""
+    first, last, gain = rod[8], rod[9], rod[10]
     columns[:] = 0.0
     for m in range(gain.shape[0]):
         for end in range(2):

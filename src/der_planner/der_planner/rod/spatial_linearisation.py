@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from der_planner.rod import spatial_kernel
 from der_planner.rod.planar import band_to_dense
-from der_planner.rod.state import Array
+from der_planner.rod.state import Array, Arrays
 
 
 @dataclass(frozen=True)
@@ -78,9 +78,7 @@ def edge_block(matrix: Array, j: int, block: Array) -> None:
     matrix[b, a] -= block
 
 
-def residual_derivatives(
-    stage: Stage, rod: tuple[Array, ...], space: tuple[Array, ...]
-) -> tuple[Array, Array, Array]:
+def residual_derivatives(stage: Stage, rod: Arrays, space: Arrays) -> tuple[Array, Array, Array]:
     """Return ∂R/∂x, ∂R/∂x_n without inertia and drag (4n-1, 4n-1), and B(q)Λ (4n-1, M).
 
     Args:
@@ -94,7 +92,7 @@ def residual_derivatives(
     gradient = np.zeros(size)
     spatial_kernel.assemble(
         stage.x, v, 0.0, 0.0 * stage.u, False, gradient, s, frame, twists, own, link, local, vectors,
-        *rod,
+        rod,
     )  # fmt: skip
     elastic = band_to_dense(s)
     for j in range(len(frame)):
@@ -108,9 +106,9 @@ def residual_derivatives(
     g, g_start = holonomy(edge_vectors(stage.x_n), edges)
     by_x = elastic + gauge_columns(elastic, g) + drag
     by_x_n = gauge_columns(elastic, g_start) - drag
-    first, last, gain = rod[-3:]
+    first, last, gain = rod[8], rod[9], rod[10]
     columns = np.zeros((size, len(gain)))
-    spatial_kernel.input_columns(frame, first, last, gain, columns)
+    spatial_kernel.input_columns(frame, rod, columns)
     spin = cross_matrix(np.array([0.0, 0.0, 1.0]))
     for m in range(len(gain)):
         for j, sign in ((first[m], -1.0), (last[m], 1.0)):

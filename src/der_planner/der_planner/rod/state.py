@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from der_planner.rod.linearisation import Linearisation
 
 Array = NDArray[np.float64]
+Arrays = tuple[Any, ...]
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,6 @@ class StaticSolver(Protocol):
         ...
 
 
-
 def find_equilibrium(solver: StaticSolver, start: RodState, u: Array, load: Array) -> RodState:
     """Return the resting state under u (M,) [Pa] and load (4N-1,) [N], going there from `start`.
 
