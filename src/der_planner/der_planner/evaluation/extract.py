@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from der_planner.evaluation.columns import Columns
 from der_planner.evaluation.series import (
     Array,
     BoardLog,
@@ -28,6 +31,7 @@ CHAMBERS_TYPE = "der_msgs/msg/ChamberPressures"
 TRUTH_SUFFIX = "twin/ground_truth"
 BOARD_SUFFIX = "twin/board_commands"
 FAULT_MODE = 5
+MOST_FAULTS = 1000
 
 
 @dataclass
@@ -35,12 +39,15 @@ class _Collected:
     """Plain numbers of the messages of interest; stamps as integer ns."""
 
     plans: dict[str, tuple[int, Any]] = field(default_factory=dict)
-    setpoints: dict[str, dict[int, tuple[int, Array]]] = field(default_factory=dict)
-    tip: list[tuple[int, float, float, Array]] = field(default_factory=list)
-    truth: list[tuple[int, float, float]] = field(default_factory=list)
-    pressure: list[tuple[int, Array, Array]] = field(default_factory=list)
+    setpoints: dict[str, Columns] = field(default_factory=dict)
+    setpoint_indices: dict[str, array[int]] = field(default_factory=dict)
+    tip: Columns = field(default_factory=lambda: Columns(2))
+    angles: Columns = field(default_factory=Columns)
+    truth: Columns = field(default_factory=lambda: Columns(2))
+    commanded: Columns = field(default_factory=Columns)
+    measured: Columns = field(default_factory=Columns)
     faults: list[tuple[int, str]] = field(default_factory=list)
-    board: list[tuple[int, Array]] = field(default_factory=list)
+    board: Columns = field(default_factory=Columns)
 
 
 def load_run(
@@ -105,59 +112,76 @@ def _take_plan(found: _Collected, message: Any) -> None:
 
 
 def _take_setpoint(found: _Collected, message: Any) -> None:
-    of_plan = found.setpoints.setdefault(message.plan_id, {})
-    of_plan[int(message.index)] = (_stamp(message), np.array(message.differential_pressure))
+    of_plan = found.setpoints.setdefault(message.plan_id, Columns())
+    of_plan.append(_stamp(message), message.differential_pressure)
+    found.setpoint_indices.setdefault(message.plan_id, array("q")).append(int(message.index))
 
 
 def _take_state(found: _Collected, message: Any) -> None:
-    valid = bool(message.valid)
-    x, y = (message.tip.x, message.tip.y) if valid else (np.nan, np.nan)
-    angles = np.array(message.bend_angle) if valid else np.empty(0)
-    found.tip.append((_stamp(message), x, y, angles))
+    stamp, valid = _stamp(message), bool(message.valid)
+    found.tip.append(stamp, (message.tip.x, message.tip.y) if valid else ())
+    found.angles.append(stamp, message.bend_angle if valid else ())
 
 
 def _take_truth(found: _Collected, message: Any) -> None:
     if message.valid:
-        found.truth.append((_stamp(message), message.tip.x, message.tip.y))
+        found.truth.append(_stamp(message), (message.tip.x, message.tip.y))
 
 
 def _take_pressure(found: _Collected, message: Any) -> None:
     stamp = _stamp(message)
-    found.pressure.append(
-        (
-            stamp,
-            np.array(message.commanded_differential),
-            np.array(message.measured_differential),
-        )
-    )
+    found.commanded.append(stamp, message.commanded_differential)
+    found.measured.append(stamp, message.measured_differential)
     if message.mode == FAULT_MODE:
-        found.faults += [(stamp, reason) for reason in message.faults or ["fault"]]
+        new = [(stamp, reason) for reason in message.faults or ["fault"]]
+        found.faults += [entry for entry in new if len(found.faults) < MOST_FAULTS]
 
 
 def _take_board(found: _Collected, message: Any) -> None:
-    chambers = np.array(message.pressure)
-    found.board.append((_stamp(message), chambers[0::2] - chambers[1::2]))
+    chambers = np.asarray(message.pressure)
+    found.board.append(_stamp(message), chambers[0::2] - chambers[1::2])
+
+
+@dataclass(frozen=True)
+class _Setpoints:
+    """Setpoints of one plan in the order of their indices, each once."""
+
+    index: NDArray[np.int64]
+    stamp: NDArray[np.int64]
+    value: Array
+
+
+def _setpoints(found: _Collected, plan_id: str, segment_count: int) -> _Setpoints:
+    if plan_id not in found.setpoints:
+        none = np.empty(0, dtype=np.int64)
+        return _Setpoints(none, none, np.empty((0, segment_count)))
+    rows = found.setpoints[plan_id]
+    index, first = np.unique(np.array(found.setpoint_indices[plan_id]), return_index=True)
+    return _Setpoints(index, rows.stamps()[first], rows.values(segment_count)[first])
 
 
 def _series(found: _Collected, run: dict[str, Any], path: Path, plan_id: str) -> RunSeries:
     chosen = _choose_plan(found, path, plan_id)
     stamp, plan = found.plans[chosen]
-    setpoints = found.setpoints.get(chosen, {})
+    segment_count = int(plan.segment_count)
+    setpoints = _setpoints(found, chosen, segment_count)
     times = np.array(plan.time)
     origin = _origin(stamp, times, setpoints)
     if origin == 0:
         raise EvaluationError(
             f"{path}: the plan '{chosen}' carries no stamp and none of its setpoints was recorded"
         )
-    played = max(setpoints, default=len(times) - 1)
-    segment_count = int(plan.segment_count)
-    ticks = np.array([(entry[0] - origin) / NANOSECONDS for entry in found.pressure])
-    commanded = _matrix([entry[1] for entry in found.pressure], segment_count)
-    measured = _matrix([entry[2] for entry in found.pressure], segment_count)
+
+    def stream(columns: Columns, width: int) -> Stream:
+        """Return rows in the order of their stamps, each stamp once."""
+        stamps, first = np.unique(columns.stamps(), return_index=True)
+        return Stream((stamps - origin) / NANOSECONDS, columns.values(width)[first])
+
     end = times[-1]
+    played = int(setpoints.index[-1]) if len(setpoints.index) else len(times) - 1
     faults = [text for when, text in found.faults if 0 <= (when - origin) / NANOSECONDS <= end]
-    frames, positions, angles = _frames(found, origin, segment_count)
-    if not len(frames) or frames[-1] < 0 or frames[0] > end:
+    tip = stream(found.tip, 2)
+    if not len(tip) or tip.time[-1] < 0 or tip.time[0] > end:
         raise EvaluationError(
             f"{path}: no limb state was recorded while the plan was played: did the tracker run?"
         )
@@ -165,14 +189,14 @@ def _series(found: _Collected, run: dict[str, Any], path: Path, plan_id: str) ->
         description=_describe(plan, run, path),
         reference=Stream(times, np.array(plan.tip_reference).reshape(-1, 2)),
         predicted=Stream(times, np.array(plan.tip_predicted).reshape(-1, 2)),
-        tip=Stream(frames, positions),
-        bend_angle=Stream(frames, angles),
-        commanded=Stream(ticks, commanded),
-        measured=Stream(ticks, measured),
-        truth=_truth(found, origin),
+        tip=tip,
+        bend_angle=stream(found.angles, segment_count),
+        commanded=stream(found.commanded, segment_count),
+        measured=stream(found.measured, segment_count),
+        truth=stream(found.truth, 2) if len(found.truth) else None,
         board=_board(found, setpoints, origin),
         faults=tuple(dict.fromkeys(faults)),
-        finished=played == len(times) - 1 and frames[-1] >= end - 1.0,
+        finished=played == len(times) - 1 and tip.time[-1] >= end - 1.0,
         origin=origin,
     )
 
@@ -187,56 +211,28 @@ def _choose_plan(found: _Collected, path: Path, plan_id: str) -> str:
         if plan_id not in usable:
             raise EvaluationError(f"{path}: no plan '{plan_id}', only {', '.join(sorted(usable))}")
         return plan_id
-    return max(usable, key=lambda name: (len(found.setpoints.get(name, {})), usable[name][0]))
+    return max(usable, key=lambda name: (len(found.setpoints.get(name, ())), usable[name][0]))
 
 
-def _origin(stamp: int, times: Array, setpoints: dict[int, tuple[int, Array]]) -> int:
+def _origin(stamp: int, times: Array, setpoints: _Setpoints) -> int:
     """Return the instant of the first setpoint [ns]: of the setpoints played, else of the plan."""
-    starts = [
-        when - round(times[index] * NANOSECONDS)
-        for index, (when, _) in setpoints.items()
-        if when and index < len(times)
-    ]
-    return int(np.median(np.array(starts, dtype=np.int64))) if starts else stamp
+    usable = (setpoints.stamp > 0) & (setpoints.index < len(times))
+    if not usable.any():
+        return stamp
+    planned = np.rint(times[setpoints.index[usable]] * NANOSECONDS).astype(np.int64)
+    starts = np.sort(setpoints.stamp[usable] - planned)
+    return int(starts[len(starts) // 2])  # a mean of int64 stamps would lose nanoseconds
 
 
-def _frames(found: _Collected, origin: int, segment_count: int) -> tuple[Array, Array, Array]:
-    """Return times, tips and bend angles in the order of the stamps, each stamp once."""
-    unique = {entry[0]: entry for entry in found.tip}
-    ordered = [unique[stamp] for stamp in sorted(unique)]
-    times = np.array([(entry[0] - origin) / NANOSECONDS for entry in ordered])
-    tips = np.array([entry[1:3] for entry in ordered]).reshape(-1, 2)
-    return times, tips, _matrix([entry[3] for entry in ordered], segment_count)
-
-
-def _matrix(rows: list[Array], columns: int) -> Array:
-    """Stack rows; NaN where a row has another length (not yet measured)."""
-    result = np.full((len(rows), columns), np.nan)
-    for index, row in enumerate(rows):
-        if len(row) == columns:
-            result[index] = row
-    return result
-
-
-def _truth(found: _Collected, origin: int) -> Stream | None:
-    if not found.truth:
+def _board(found: _Collected, setpoints: _Setpoints, origin: int) -> BoardLog | None:
+    if not len(found.board) or not len(setpoints.index):
         return None
-    data = sorted(set(found.truth))
-    time = np.array([(entry[0] - origin) / NANOSECONDS for entry in data])
-    return Stream(time, np.array([entry[1:] for entry in data]))
-
-
-def _board(
-    found: _Collected, setpoints: dict[int, tuple[int, Array]], origin: int
-) -> BoardLog | None:
-    if not found.board or not setpoints:
-        return None
-    ordered = [setpoints[index] for index in sorted(setpoints)]
+    stamps = found.board.stamps()
     return BoardLog(
-        setpoint_time=np.array([(stamp - origin) / NANOSECONDS for stamp, _ in ordered]),
-        setpoint=np.array([value for _, value in ordered]),
-        command_time=np.array([(stamp - origin) / NANOSECONDS for stamp, _ in found.board]),
-        command=np.array([value for _, value in found.board]),
+        setpoint_time=(setpoints.stamp - origin) / NANOSECONDS,
+        setpoint=setpoints.value,
+        command_time=(stamps - origin) / NANOSECONDS,
+        command=found.board.values(setpoints.value.shape[1]),
     )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from der_planner.evaluation.series import Array, BoardLog, Stream
 
@@ -98,23 +99,26 @@ def check_board(log: BoardLog | None) -> BoardCheck | None:
     """
     if log is None or not len(log.setpoint_time):
         return None
-    taken: dict[int, int] = {}
+    order = np.argsort(log.command_time, kind="stable")
+    arrival = log.command_time[order]
+    taken: set[int] = set()
     matched: dict[int, int] = {}
+
+    def take(index: int, places: NDArray[np.int64]) -> None:
+        for place in places:
+            number = int(order[place])
+            if number not in taken and _difference(log, index, number) <= ROUNDING:
+                taken.add(number)
+                matched[index] = number
+                return
+
     for index, stamp in enumerate(log.setpoint_time):
-        nearest = int(np.argmin(np.abs(log.command_time - stamp)))
-        near = abs(log.command_time[nearest] - stamp) <= ON_TIME
-        if near and nearest not in taken and _difference(log, index, nearest) <= ROUNDING:
-            taken[nearest], matched[index] = index, nearest
+        first, last = np.searchsorted(arrival, [stamp - ON_TIME, stamp + ON_TIME])
+        near = np.arange(first, last)
+        take(index, near[np.argsort(np.abs(arrival[near] - stamp))][:1])
     for index, stamp in enumerate(log.setpoint_time):
-        if index in matched:
-            continue
-        late = np.flatnonzero(
-            (log.command_time > stamp - ON_TIME) & (log.command_time <= stamp + LATEST)
-        )
-        for place in late:
-            if int(place) not in taken and _difference(log, index, int(place)) <= ROUNDING:
-                taken[int(place)], matched[index] = index, int(place)
-                break
+        if index not in matched:
+            take(index, np.arange(*np.searchsorted(arrival, [stamp - ON_TIME, stamp + LATEST])))
     return _board_figures(log, matched)
 
 
