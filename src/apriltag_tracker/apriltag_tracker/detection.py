@@ -99,7 +99,7 @@ class Detector:
     """
 
     def __init__(
-        self, smallest: float = SMALLEST_TAG, correct_bits: int = 2, largest_residual: float = 0.6
+        self, smallest: float = SMALLEST_TAG, correct_bits: int = 2, largest_residual: float = 0.4
     ) -> None:
         if smallest < 8.0:
             raise ValueError(f"smallest tag of {smallest} px: 8 px or more can be read")
@@ -253,6 +253,8 @@ def _opencv_detector(extent: int, smallest: float) -> Any:
     # Else the outline of the white sheet takes the place of the black border inside of it.
     parameters.minMarkerDistanceRate = 0.02
     parameters.minDistanceToBorder = 2
+    # Loose, so that a border with a dent where something covers it is still taken for four sides.
+    parameters.polygonalApproxAccuracyRate = 0.08
     parameters.perspectiveRemovePixelPerCell = 4
     parameters.errorCorrectionRate = 1.0
     return cv2.aruco.ArucoDetector(family.dictionary(), parameters)

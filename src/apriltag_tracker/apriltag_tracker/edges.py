@@ -1,10 +1,10 @@
 """Corners of tags from the edges of their black border, to a few hundredths of a pixel.
 
-Along each side, profiles are taken across the border. Where the border crosses from black to white
-is the centroid of the profile's slope: with bilinear samples this is a sum of intensities, so it
-does not depend on where the edge lies between pixels, and a symmetric blur does not move it. A line
-goes through the crossings of a side, outliers are taken out, and neighbouring lines are
-intersected. A second and third pass start from the corners of the one before.
+Along each side, profiles are taken across the border. The border is where the centroid of the
+profile's slope lies under a Gaussian window: this does not depend on the levels of black and white,
+nor on light that changes slowly, and a symmetric blur does not move it. A line goes through the
+crossings of a side, outliers are taken out, and neighbouring lines are intersected. Passes are
+repeated from the corners of the one before until these stay.
 """
 
 from __future__ import annotations
@@ -20,6 +20,12 @@ EDGE_VALUES = 6
 """Per side: angle, offset variance, angle variance, residual RMS, used fraction, contrast."""
 
 _PROFILE = 9
+_GAUSSIAN = 0.9
+"""Standard deviation of the window in which slopes count [px]."""
+
+_USUAL_BLUR = 0.7
+"""Of edges: lens and pixel together [px]."""
+
 _FURTHER_PASSES = 3
 _SETTLED = 0.05
 """A pass that moves no corner further than this is the last one [px]."""
@@ -43,28 +49,57 @@ def inside(image: NDArray[np.uint8], x: float, y: float) -> bool:
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def _crossing(profile: NDArray[np.float64], window: float, coarse: bool) -> tuple[float, float]:
-    """Return offset of the edge from the middle of a profile [px] and its contrast."""
+def _coarse_crossing(profile: NDArray[np.float64], window: float) -> tuple[float, float]:
+    """Return offset of the edge from the middle of a profile [px] and its contrast.
+
+    The centroid of the squared slopes: pulled little by the cells further in, though a bit toward
+    pixel centres.
+    """
     step = 2.0 * window / (_PROFILE - 1)
-    if coarse:
-        # Squared slopes: pulled less by the cells further in, though a little toward pixel centres.
-        weight, moment, contrast = 0.0, 0.0, 0.0
+    weight, moment, contrast = 0.0, 0.0, 0.0
+    for k in range(_PROFILE - 1):
+        slope = profile[k + 1] - profile[k]
+        if slope > 0.0:
+            weight += slope * slope
+            moment += slope * slope * (-window + (k + 0.5) * step)
+            contrast += slope
+    return (moment / weight if weight > 0.0 else 0.0), contrast
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _fine_crossings(
+    profiles: NDArray[np.float64],
+    usable: NDArray[np.bool_],
+    window: float,
+    across: NDArray[np.float64],
+) -> None:
+    """Place the edge of each profile by the centroid of its slope under a Gaussian.
+
+    The contrast is that of the whole side, which keeps the noise of single profiles out. An edge in
+    the middle stays in the middle whatever its blur; one beside it is pulled toward the middle,
+    which the gain undoes for a usual blur and the next pass for any.
+    """
+    step = 2.0 * window / (_PROFILE - 1)
+    weights = np.empty(_PROFILE - 1)
+    for k in range(_PROFILE - 1):
+        weights[k] = math.exp(-0.5 * ((-window + (k + 0.5) * step) / _GAUSSIAN) ** 2)
+    total, count = 0.0, 0
+    for i in range(profiles.shape[0]):
+        if not usable[i]:
+            continue
+        moment = 0.0
         for k in range(_PROFILE - 1):
-            slope = profile[k + 1] - profile[k]
-            if slope > 0.0:
-                weight += slope * slope
-                moment += slope * slope * (-window + (k + 0.5) * step)
-                contrast += slope
-        return (moment / weight if weight > 0.0 else 0.0), contrast
-    low, high = profile[0], profile[_PROFILE - 1]
-    contrast = high - low
-    if contrast <= 1.0:
-        return 0.0, contrast
-    # Black area of the profile by the trapezoid rule; the ends are black and white by definition.
-    area = 0.5
-    for k in range(1, _PROFILE - 1):
-        area += (high - profile[k]) / contrast
-    return area * step - window, contrast
+            slope = weights[k] * (profiles[i, k + 1] - profiles[i, k])
+            moment += slope * (-window + (k + 0.5) * step)
+            total += slope
+        across[i] = moment
+        count += 1
+    if total <= 0.0:
+        return
+    gain = 1.0 + _USUAL_BLUR**2 / _GAUSSIAN**2
+    for i in range(profiles.shape[0]):
+        if usable[i]:
+            across[i] *= gain * count / total
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -127,11 +162,11 @@ def _fit_side(
     tx, ty = (end[0] - start[0]) / length, (end[1] - start[1]) / length
     nx, ny = turn * ty, -turn * tx
     middle_x, middle_y = 0.5 * (start[0] + end[0]), 0.5 * (start[1] + end[1])
-    inset = min(max(1.5, 0.08 * length), 0.25 * length)
+    inset = min(max(1.5, 0.05 * length), 0.25 * length)
     count = min(max(int(length - 2.0 * inset), 6), MAX_SAMPLES)
     spacing = (length - 2.0 * inset) / (count - 1)
     along, across, contrasts = np.empty(count), np.zeros(count), np.zeros(count)
-    profile = np.empty(_PROFILE)
+    profiles = np.zeros((count, _PROFILE))
     step = 2.0 * window / (_PROFILE - 1)
     for i in range(count):
         along[i] = inset + i * spacing - 0.5 * length
@@ -140,12 +175,18 @@ def _fit_side(
         if not (inside(image, x, y) and inside(image, px + window * nx, py + window * ny)):
             continue
         for k in range(_PROFILE):
-            profile[k] = sample(image, x + k * step * nx, y + k * step * ny)
-        across[i], contrasts[i] = _crossing(profile, window, coarse)
+            profiles[i, k] = sample(image, x + k * step * nx, y + k * step * ny)
+        if coarse:
+            across[i], contrasts[i] = _coarse_crossing(profiles[i], window)
+        else:
+            contrasts[i] = profiles[i, _PROFILE - 1] - profiles[i, 0]
     typical = np.median(contrasts)
     if typical < 8.0:
         return False
-    usable = (contrasts > 0.6 * typical) & (np.abs(across) < 0.95 * window)
+    usable = contrasts > 0.6 * typical
+    if not coarse:
+        _fine_crossings(profiles, usable, window, across)
+    usable &= np.abs(across) < 0.95 * window
     fit = np.empty(6)
     if not _fit_line(along, across, usable.astype(np.float64), fit):
         return False

@@ -217,6 +217,10 @@ class SyntheticCamera:
             cv2.fillPoly(image, [points], 70, cv2.LINE_AA, 4)
         return result
 
+    def still(self) -> NDArray[np.uint8]:
+        """Return what does not move, without noise."""
+        return self._background.copy()
+
     def _placements(self, tag_id: int, shape: Shape, velocity: Shape | None) -> NDArray[np.float64]:
         """Return x, y, z, yaw, size of a limb tag over the exposure, (k, 5)."""
         tag = self.tags.limb_tag(tag_id)
