@@ -175,7 +175,8 @@ class Recorder(Node):
 
     def _describe(self, name: str, type_name: str, qos: tuple[OfferedQos, ...]) -> None:
         definition = find_definition(type_name)
-        latched = bool(qos) and all(q.durability == "transient_local" for q in qos)
+        # /rosout is latched, too, but an old log line is no state that a new file should repeat.
+        latched = name != "/rosout" and _is_latched(qos)
         self._specs[name] = TopicSpec(
             name, type_name, definition.text, definition.type_hash, qos, latched
         )
@@ -342,16 +343,21 @@ def offered_qos(endpoints: list[TopicEndpointInfo]) -> tuple[OfferedQos, ...]:
     return tuple(sorted(found, key=repr))
 
 
+def _is_latched(offered: tuple[OfferedQos, ...]) -> bool:
+    return bool(offered) and all(q.durability == "transient_local" for q in offered)
+
+
 def _profile(type_name: str, offered: tuple[OfferedQos, ...]) -> QoSProfile:
     """Return the strictest profile that every publisher still matches."""
     is_image = type_name == IMAGE_TYPE
     reliable = not is_image and all(q.reliability == "reliable" for q in offered)
-    latched = bool(offered) and all(q.durability == "transient_local" for q in offered)
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
         depth=IMAGE_DEPTH if is_image else DEPTH,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL
+        if _is_latched(offered)
+        else DurabilityPolicy.VOLATILE,
     )
 
 

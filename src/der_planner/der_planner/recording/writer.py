@@ -2,8 +2,8 @@
 
 rosbag2's own writer keeps a chunk open until it is full; here every `flush` ends the chunk and
 hands it to the operating system, so a killed process leaves whole chunks and `recover` only has to
-add the index. A write that fails (full disk, removed folder) truncates the file to its last
-whole chunk and finishes it there.
+add the index. After a write that fails (full disk) the file is cut behind its last whole chunk and
+finished there; after its folder is removed it is written again.
 """
 
 from __future__ import annotations
@@ -291,19 +291,31 @@ class BagWriter:
         """Cut off what was half written, finish the file there, and say how that went."""
         sink, self._sink = self._sink, None
         try:
-            if sink is not None:
-                os.ftruncate(sink.file.fileno(), self._safe_end)
-                sink.file.close()
-                found = finish_file(sink.path)
-                self.bytes_finished += sink.path.stat().st_size
-                self._recount(sink.path.name, found.log_times, found.counts)
-            self._write_metadata()
+            try:
+                self._finish_cut(sink)
+            except OSError:
+                # No room even for the index: give back the chunks since the last flush.
+                if sink is None:
+                    raise
+                os.truncate(sink.path, self._safe_end)
+                self._finish_cut(sink)
         except OSError as error:
             return (
                 f"Its index could not be written either ({error}): free some space, then "
                 f"scripts/recover_bag.py {self.folder} repairs it"
             )
-        return "Everything up to the last flush is in the bag, which is closed and readable"
+        finally:
+            if sink is not None:
+                sink.file.close()
+        return "Every whole chunk is in the bag, which is closed and readable"
+
+    def _finish_cut(self, sink: _Sink | None) -> None:
+        if sink is not None:
+            finish_file(sink.path)
+            found = scan_file(sink.path)
+            self.bytes_finished += sink.path.stat().st_size
+            self._recount(sink.path.name, found.log_times, found.counts)
+        self._write_metadata()
 
     def _recount(self, name: str, times: tuple[int, int], counts: Mapping[str, int]) -> None:
         """Take over what the last file really holds after it was cut."""
