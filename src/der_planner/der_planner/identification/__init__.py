@@ -1,16 +1,30 @@
 """From logs to a limb file: excitation, fits, reports, and checks of later runs."""
 
+from der_planner.identification.bag_log import read_bag
+from der_planner.identification.check import Check, check
+from der_planner.identification.csv_log import ColumnMap, read_csv
+from der_planner.identification.excitation import Excitation, calibration_run
 from der_planner.identification.fit import fit
 from der_planner.identification.log import CalibrationLog, LogError
 from der_planner.identification.offline import calibrate_twin, record_twin
+from der_planner.identification.predict import Prediction, predict
 from der_planner.identification.report import FitReport, Unknown
 
 __all__ = [
     "CalibrationLog",
+    "Check",
+    "ColumnMap",
+    "Excitation",
     "FitReport",
     "LogError",
+    "Prediction",
     "Unknown",
     "calibrate_twin",
+    "calibration_run",
+    "check",
     "fit",
+    "predict",
+    "read_bag",
+    "read_csv",
     "record_twin",
 ]

@@ -80,7 +80,7 @@ def prepare(
     pressure = _pressures(grid, limb, warnings)
     _check_excitation(pressure, warnings)
     _check_saturation(pressure, limb, warnings)
-    bend = np.stack([_bridge(column) for column in grid.bend_angles.T], axis=1)
+    bend = np.stack([bridge(column) for column in grid.bend_angles.T], axis=1)
     _check_match(pressure, bend, warnings)
     count = min(SMOOTHING, len(bend) - (len(bend) + 1) % 2)
     bend = np.asarray(savgol_filter(bend, count, 2, axis=0))
@@ -97,7 +97,7 @@ def _pressures(log: CalibrationLog, limb: Limb, warnings: list[str]) -> Array:
                 f"pressure {index} was measured in {100 * share:.0f} % of the log only: the fit needs "
                 "the board's telemetry"
             )
-    pressure = np.stack([_bridge(column) for column in measured.T], axis=1)
+    pressure = np.stack([bridge(column) for column in measured.T], axis=1)
     largest = np.nanmax(np.abs(pressure))
     if largest > 20.0 * limb.pneumatics.pressure_limit or largest < 100.0:
         raise LogError(
@@ -187,7 +187,8 @@ def _correlation(a: Array, b: Array) -> float:
     return float(np.corrcoef(a, b)[0, 1])
 
 
-def _bridge(column: Array) -> Array:
+def bridge(column: Array) -> Array:
+    """Return a column (K,) whose missing rows are straight lines between the known ones."""
     known = np.isfinite(column)
     index = np.arange(len(column))
     bridged: Array = np.interp(index, index[known], column[known])

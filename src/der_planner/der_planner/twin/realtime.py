@@ -24,7 +24,7 @@ class RealTimeLoop:
         busy: share of one core spent in `advance` and `publish`, smoothed.
         lag: how late the last tick was [s].
         dropped: time that was never simulated [s].
-        behind: the last ticks dropped time.
+        behind: time was dropped within the last seconds.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class RealTimeLoop:
         self._publish = publish
         self._period = period
         self._clock = clock or time.monotonic
-        self._simulated_until = 0.0
+        self._begin = self._simulated_until = 0.0
         self._next_publish = 0.0
         self._started = False
         self._spent = self._covered = 0.0
@@ -49,10 +49,16 @@ class RealTimeLoop:
         self.dropped = 0.0
         self.behind = False
 
+    @property
+    def real_time_factor(self) -> float:
+        """Simulated over passed time since the start; 1 when nothing was dropped."""
+        passed = self._simulated_until - self._begin
+        return 1.0 - self.dropped / passed if passed > 0 else 1.0
+
     def tick(self, now: float) -> float:
         """Bring the simulation to ``now`` [s, steady], publish if due, return the time to sleep [s]."""
         if not self._started:
-            self._simulated_until = self._next_publish = now
+            self._begin = self._simulated_until = self._next_publish = now
             self._started = True
         passed = now - self._simulated_until
         self.lag = max(0.0, passed - self._period / TICKS_PER_PERIOD)

@@ -1,0 +1,124 @@
+"""Does a limb file still fit? Open-loop prediction of a later run against what was seen."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from der_planner.identification.log import CalibrationLog
+from der_planner.identification.predict import predict
+from der_planner.identification.prepare import bridge, prepare
+from der_planner.limb import Limb
+
+Array = NDArray[np.float64]
+
+GAIN_DRIFT = 0.08
+"""Relative change of a gain that asks for a new calibration."""
+REST_DRIFT = math.radians(1.5)
+"""Change of a rest angle that does [rad]."""
+ERROR_GROWTH = 2.5
+"""Growth of the error over the calibration's own that does."""
+LEAST_ERROR = math.radians(0.4)
+
+
+@dataclass(frozen=True)
+class Check:
+    """How a limb file does on a later run.
+
+    Attributes:
+        fits: nothing asks for a new calibration.
+        findings: sentences; empty where all is well.
+        error: (M,) root mean square open-loop error of the bend angles [rad].
+        tip_error: mean distance of predicted and measured tips [m]; NaN without tips.
+        gain_change: (M,) measured over predicted range of motion, less one.
+        rest_change: (M,) mean of measured less predicted, at the gain that fits best [rad].
+    """
+
+    fits: bool
+    findings: tuple[str, ...]
+    error: Array
+    tip_error: float
+    gain_change: Array
+    rest_change: Array
+
+    def text(self) -> str:
+        """Return the verdict for people."""
+        lines = []
+        for index, (error, gain, rest) in enumerate(
+            zip(self.error, self.gain_change, self.rest_change, strict=True)
+        ):
+            lines.append(
+                f"segment {index}: open-loop error rms {math.degrees(error):.2f}°, gain "
+                f"{100 * gain:+.1f} %, rest angle {math.degrees(rest):+.2f}°"
+            )
+        if math.isfinite(self.tip_error):
+            lines.append(f"tip: mean error {1e3 * self.tip_error:.2f} mm")
+        lines += [f"finding: {text}" for text in self.findings]
+        lines.append(
+            "the limb file fits" if self.fits else "the limb file does not fit: calibrate again"
+        )
+        return "\n".join(lines)
+
+
+def check(limb: Limb, log: CalibrationLog) -> Check:
+    """Compare a limb file with a later run.
+
+    Raises:
+        LogError: the log cannot be used, see `prepare`.
+    """
+    prepared = prepare(log, limb)
+    rows = prepared.usable
+    predicted = predict(limb, prepared.log.time, prepared.pressure)
+    measured = prepared.log.bend_angles
+    error = np.sqrt(np.nanmean((measured - predicted.bend_angles) ** 2, axis=0))
+    gains, rests = np.empty(len(error)), np.empty(len(error))
+    for index in range(len(error)):
+        slope, offset = np.polyfit(predicted.bend_angles[rows, index], measured[rows, index], 1)
+        gains[index], rests[index] = slope - 1.0, offset
+    distance = np.linalg.norm(prepared.log.tip - predicted.tip, axis=1)
+    tip_error = float(np.nanmean(distance)) if np.isfinite(distance).any() else math.nan
+    findings = [*prepared.warnings, *_drift(limb, error, gains, rests)]
+    drifted = len(findings) > len(prepared.warnings)
+    findings += _range(limb, prepared.pressure[rows], np.stack([bridge(c) for c in measured.T], 1))
+    return Check(not drifted, tuple(findings), error, tip_error, gains, rests)
+
+
+def _drift(limb: Limb, error: Array, gains: Array, rests: Array) -> list[str]:
+    found = []
+    before = limb.provenance.get("residual_deg") or [0.0] * len(error)
+    for index in range(len(error)):
+        if abs(gains[index]) > GAIN_DRIFT:
+            found.append(f"the gain of segment {index} changed by {100 * gains[index]:+.0f} %")
+        if abs(rests[index]) > REST_DRIFT:
+            found.append(
+                f"the rest angle of segment {index} moved by {math.degrees(rests[index]):+.1f}°"
+            )
+        usual = max(LEAST_ERROR, math.radians(float(before[index])))
+        if error[index] > ERROR_GROWTH * usual:
+            found.append(
+                f"the error of segment {index} is {math.degrees(error[index]):.2f}°, at its "
+                f"calibration it was {math.degrees(usual):.2f}°"
+            )
+    return found
+
+
+def _range(limb: Limb, pressure: Array, bend: Array) -> list[str]:
+    found = []
+    for values, known, name, unit, factor in (
+        (pressure, limb.calibrated.differential_pressure, "pressure", "hPa", 0.01),
+        (bend, limb.calibrated.bend_angle, "bend", "°", math.degrees(1.0)),
+    ):
+        if len(known) != limb.segment_count:
+            continue
+        for index, (largest, limit) in enumerate(
+            zip(np.abs(values).max(axis=0), known, strict=True)
+        ):
+            if largest > 1.05 * limit:
+                found.append(
+                    f"the {name} of segment {index} reaches {factor * largest:.0f} {unit}, calibrated "
+                    f"were {factor * limit:.0f} {unit}"
+                )
+    return found
