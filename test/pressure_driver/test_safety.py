@@ -226,6 +226,21 @@ def test_rest_pressures_are_not_taken_from_chambers_under_pressure(simulate):
     assert sim.core.atmosphere == pytest.approx(sim.board.pneumatics.atmosphere, abs=250.0)
 
 
+@pytest.mark.parametrize("given", [False, True])
+def test_a_driver_that_finds_the_limb_under_pressure_vents_it_without_a_false_alarm(
+    simulate, given
+):
+    atmosphere = simulate().board.atmosphere if given else 0.0
+    sim = simulate(atmosphere=atmosphere)
+    sim.track()
+    after_a_crash = simulate(atmosphere=atmosphere)
+    after_a_crash.board = sim.board
+    assert sim.gauge.max() > 8_000.0
+    after_a_crash.run_until(lambda: after_a_crash.core.arm()[0], 8.0)
+    assert vented(after_a_crash)
+    assert Mode.FAULT not in after_a_crash.modes
+
+
 def test_a_given_atmosphere_is_used_as_it_is(simulate):
     sim = simulate(atmosphere=101_000.0)
     sim.run(1.0)

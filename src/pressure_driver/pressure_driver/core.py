@@ -107,6 +107,7 @@ class DriverCore:
         self._asked_at = 0.0
         self._clock_offset = 0.0
         self.last_text = ""
+        """What the board has said last in plain words."""
 
     # ------------------------------------------------------------------ from any thread
 
@@ -128,11 +129,6 @@ class DriverCore:
         """Take a setpoint; ``wall`` is the wall clock now in ns."""
         with self._lock:
             return self._machine.offer(setpoint, wall)
-
-    def refuse(self, reason: str) -> None:
-        """Count an input that could not even be read as a setpoint."""
-        with self._lock:
-            self._schedule.refuse(reason)
 
     def obstacles(self) -> list[str]:
         """Return what forbids arming now."""
@@ -297,9 +293,13 @@ class DriverCore:
             self._log(f"board: {event.text}", False)
 
     def _take_echo(self, echo: Echo, now: float) -> None:
+        """Measure the round trip; an echo without a number is that of the newest command."""
+        if echo.sequence is None and self._awaiting_echo:
+            self._round_trip = now - self._awaiting_echo[-1][1]
+            self._awaiting_echo.clear()
         while self._awaiting_echo:
             number, sent = self._awaiting_echo.popleft()
-            if echo.sequence is None or number == echo.sequence:
+            if number == echo.sequence:
                 self._round_trip = now - sent
                 return
 

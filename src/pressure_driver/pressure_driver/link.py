@@ -304,8 +304,3 @@ class SerialLink:
             device.close()
         self._device = None
         self.connected = False
-
-
-def period_nanoseconds(rate: float) -> int:
-    """Return the tick period [ns] of a rate [Hz]."""
-    return round(NANOSECONDS / rate)

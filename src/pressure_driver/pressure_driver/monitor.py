@@ -127,6 +127,8 @@ class Monitor:
         if telemetry.chamber_pressure is None:
             return
         self.chamber_pressure = np.asarray(telemetry.chamber_pressure)
+        if self._last_telemetry is None:
+            self.reset_following(now)
         self._last_telemetry = now
         reference = np.where(np.isnan(self.rest_pressure), 101_325.0, self.rest_pressure)
         over = np.max(self.chamber_pressure - reference) > self.limits.over_pressure
@@ -189,9 +191,8 @@ class Monitor:
     def reset_following(self, now: float) -> None:
         """Start the following check afresh from what is measured now."""
         gauge = np.nan_to_num(self.gauge)
-        self._upper = np.maximum(gauge, 0.0)
-        self._lower = np.minimum(gauge, 0.0)
-        self._command = np.zeros(self.chamber_count)
+        self._upper = np.maximum(gauge, self._command)
+        self._lower = np.minimum(gauge, self._command)
         self._envelope_time = now
         self._outside_since = [None] * self.chamber_count
 

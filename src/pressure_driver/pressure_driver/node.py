@@ -156,6 +156,7 @@ class PressureDriver(Node):
             "last_refusal": self._core.last_refusal or "none",
             "protocol": protocol.name,
             "protocol_weaknesses": "; ".join(protocol.weaknesses) or "none",
+            "board": self._core.identity.firmware if self._core.identity else self._core.last_text,
             "atmosphere_pa": f"{self._core.atmosphere:.0f}",
             "telemetry_age_s": f"{snapshot.telemetry_age:.3f}",
             "round_trip_s": f"{snapshot.round_trip:.4f}",

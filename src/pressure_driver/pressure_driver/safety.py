@@ -82,7 +82,6 @@ class SafetyMachine:
         """What is wrong with the line; empty while it works."""
         self.board_obstacle: str = ""
         """What is wrong with the board itself; empty if nothing is."""
-        self.transitions = 0
         self._zero = (0.0,) * schedule.limits.segment_count
         self.differential = self._zero
         """(M,) [Pa] commanded at the last tick."""
@@ -246,6 +245,4 @@ class SafetyMachine:
         self._enter(Mode.FAULT)
 
     def _enter(self, mode: Mode) -> None:
-        if mode is not self.mode:
-            self.mode = mode
-            self.transitions += 1
+        self.mode = mode

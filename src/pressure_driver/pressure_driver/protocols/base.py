@@ -29,7 +29,7 @@ class Echo:
     """The board repeats that it has received a command."""
 
     sequence: int | None = None
-    """Number of the command; None where the protocol has no numbers: the oldest not yet echoed."""
+    """Number of the command; None where the protocol has none: the newest command."""
 
 
 @dataclass(frozen=True)
