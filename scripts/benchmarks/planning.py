@@ -49,7 +49,7 @@ def predicted(quick: bool) -> Figures:
     print("\nPredicted tip error on the model itself, mean / max [cm] (two cycles, 45 degrees)")
     periods = (20.0, 3.0) if quick else (20.0, 6.0, 3.0)
     for label, robot in (("limits kept", limb), ("no limits", without_limits(limb))):
-        print(f"  {label:36}" + "".join(f"{m} {k:>10}   " for m, k in METHODS_OF))
+        print(f"  {label:34}" + "".join(f"{f'{m} {k}':>16}" for m, k in METHODS_OF))
         for period in periods:
             if label == "no limits" and period == 20.0:
                 continue  # no limit is met at this period
@@ -63,7 +63,7 @@ def predicted(quick: bool) -> Figures:
                     row.append(
                         f"{result.predicted_error * 100:7.4f}/{result.largest_error * 100:6.3f}"
                     )
-                print(f"  T = {period:4.0f} s  {case:22}" + "  ".join(row))
+                print(f"  T = {period:4.0f} s  {case:22}" + " ".join(row))
     return figures
 
 

@@ -115,7 +115,8 @@ def test_at_rest_every_method_is_the_static_inversion(method, model):
     rng = np.random.default_rng(4)
     angles = rng.uniform(-1.0, 1.0, size=(5, 2))
     zero = np.zeros_like(angles)
-    pressures = model.pressures(method, angles, zero, zero)
+    solve = {"paper": model.paper_pressures, "projected": model.projected_pressures}[method]
+    pressures = solve(angles, zero, zero)
     for wanted, pressure in zip(angles, pressures, strict=True):
         resting = model.rod.equilibrium(pressure)
         np.testing.assert_allclose(model.rod.bend_angles(resting), wanted, atol=1e-7)
@@ -133,6 +134,20 @@ def test_paper_becomes_the_static_inversion_as_speed_goes_to_zero(name):
         gaps.append(np.abs(moving - resting).max())
     # Inertia falls with the square of speed, damping with speed.
     assert gaps[0] > 1.8 * gaps[1] > 3.2 * gaps[2]
+
+
+def test_the_papers_gains_add_nothing_without_an_error_and_little_with_one():
+    model = RodModel(LIMB)
+    q = np.tile([0.3, 0.2], (40, 1))
+    zero = np.zeros_like(q)
+    balance = model.paper_pressures(q[:1], zero[:1], zero[:1])[0]
+    # The rolled rod starts straight, far from the reference: (B Λ)† sees only the few rows beside
+    # the couples, so that a distributed error hardly comes back.
+    away = model._paper_beside_the_model(q, zero, zero, 0.025)
+    assert 1e-5 < np.abs(away[0] / balance - 1).max() < 1e-2
+    model.rest = model.rod.equilibrium(balance)
+    settled = model._paper_beside_the_model(q, zero, zero, 0.025)
+    np.testing.assert_allclose(settled, np.tile(balance, (40, 1)), rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -113,9 +113,9 @@ def inertia(
 ) -> tuple[Vector, Vector, Vector, Vector]:
     """Return M (n, n), C (n, n), the mass-proportional damping D (n, n) and gravity's torque (n,).
 
-    q, v are bend angles [rad] and their rates [rad/s], lengths [m], masses [kg] and damping
-    [1/s] of the segments, all (n,); connector is the length between two segments [m], gravity (2,) [m/s²];
-    fractions and weights are the nodes and weights on [0, 1] that carry the mass of a segment.
+    q, v are bend angles [rad] and their rates [rad/s], lengths [m], masses [kg] and damping [1/s]
+    of the segments, all (n,); connector is the length between two segments [m], gravity (2,) is
+    in m/s²; fractions and weights are the nodes and weights on [0, 1] that carry a segment's mass.
     """
     n = q.size
     M = np.zeros((n, n))

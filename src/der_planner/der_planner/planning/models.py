@@ -13,7 +13,7 @@ from der_planner.pcc import Pcc
 from der_planner.planning.errors import PlanningError
 from der_planner.planning.inverse import check_reach
 from der_planner.planning.kinematics import ArcKinematics, Kinematics
-from der_planner.planning.motions import Reference
+from der_planner.planning.motions import Reference, sample_spline
 from der_planner.planning.rod_model import RodModel
 
 Vector = NDArray[np.float64]
@@ -34,8 +34,8 @@ class PlanningModel(Protocol):
     def configuration(self, reference: Reference) -> BSpline:
         """Return the model's bend angles (M,) [rad] along the reference, as a spline of time."""
 
-    def pressures(self, method: str, q: Vector, v: Vector, a: Vector) -> Vector:
-        """Return effective pressures (K, M) [Pa] for angles, rates and accelerations (K, M)."""
+    def pressures(self, method: str, spline: BSpline, time: Vector) -> Vector:
+        """Return effective pressures (K, M) [Pa] at evenly spaced instants (K,) of a motion."""
 
     def simulate(self, pressures: Vector, period: float, spline: BSpline | None = None) -> Vector:
         """Return the tip (K, 2) [m] at the start of each interval, under (K, S, M) pressures [Pa].
@@ -60,11 +60,11 @@ class ArcModel:
         )
         return reference.spline
 
-    def pressures(self, method: str, q: Vector, v: Vector, a: Vector) -> Vector:
-        """Return u = Λ† (M q̈ + (C + D) q̇ + K q)."""
+    def pressures(self, method: str, spline: BSpline, time: Vector) -> Vector:
+        """Return u = Λ† (M q̈ + (C + D) q̇ + K q) at instants (K,) [s]."""
         if method != "paper":
             raise PlanningError(f"the PCC model has no method '{method}': choose paper")
-        return self.model.pressures(q, v, a)
+        return self.model.pressures(*sample_spline(spline, time))
 
     def simulate(self, pressures: Vector, period: float, spline: BSpline | None = None) -> Vector:
         """Return the tip (K, 2) [m] at the start of each interval."""

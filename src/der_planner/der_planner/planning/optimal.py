@@ -81,6 +81,8 @@ class Actuation:
         self.air = limb.pneumatics
         self.substeps = substeps
         self.initial = initial
+        slowest = max(self.air.time_constant, self.air.vent_time_constant)
+        self._remembered = int(np.ceil((self.air.delay + 25 * slowest) / CONTROL_PERIOD))
         middle = (np.arange(count * substeps, dtype=np.float64) + 0.5) * (CONTROL_PERIOD / substeps)
         bend = sample_spline(spline, middle)[0]
         self._memory = np.column_stack(
@@ -99,9 +101,11 @@ class Actuation:
             command: (first + W, M) commands from the beginning [Pa].
             first: of the window.
         """
+        begin = max(0, first - self._remembered)
+        before = command[begin - 1] if begin else self.initial
         chambers = pneumatics.chamber_pressures(
-            self.air, command, CONTROL_PERIOD, self.substeps, self.initial
-        )[first:]
+            self.air, command[begin:], CONTROL_PERIOD, self.substeps, before
+        )[first - begin :]
         memory = self._memory[first : len(command)]
         side = np.sign(chambers)
         stiffer = 1 + self._stiffening * np.abs(chambers)

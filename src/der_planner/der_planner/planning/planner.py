@@ -141,9 +141,9 @@ def feedforward(
     count = int(np.ceil((reference.duration + ahead) / CONTROL_PERIOD * _FINE - 1e-6)) + 1
     fine = np.arange(count, dtype=np.float64) * (CONTROL_PERIOD / _FINE)
     fine[-1] = reference.duration + ahead
-    q, v, a = sample_spline(spline, fine)
-    effective = physics.pressures(method, q, v, a)
-    return pneumatics.commands(physics.limb, fine, effective, q, CONTROL_PERIOD)
+    effective = physics.pressures(method, spline, fine)
+    bend = sample_spline(spline, fine)[0]
+    return pneumatics.commands(physics.limb, fine, effective, bend, CONTROL_PERIOD)
 
 
 def predict(

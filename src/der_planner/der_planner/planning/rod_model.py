@@ -9,7 +9,7 @@ from scipy.interpolate import BSpline
 from der_planner.limb import Limb
 from der_planner.planning.inverse import check_reach, solve
 from der_planner.planning.kinematics import PolylineKinematics
-from der_planner.planning.motions import Reference, resting_spline
+from der_planner.planning.motions import Reference, resting_spline, sample_spline
 from der_planner.rod import Rod, RodState
 
 Vector = NDArray[np.float64]
@@ -20,6 +20,11 @@ REFERENCE_PRIOR = 2e-3
 far
 than the arcs: the pull keeps its angles smooth where the reference touches its fold, for 0.03
 mm."""
+
+POSITION_GAIN = 20.0
+"""K_p of the method ``paper`` [1/s²]."""
+VELOCITY_GAIN = 8.0
+"""K_d of the method ``paper`` [1/s]: with K_p a damped return at 0.7 Hz."""
 
 
 class RodModel:
@@ -52,11 +57,38 @@ class RodModel:
         check_reach(self.limb, self.kinematics, time, tip, angles, distances)
         return resting_spline(time, angles, reference.start)
 
-    def pressures(self, method: str, q: Vector, v: Vector, a: Vector) -> Vector:
-        """Return effective pressures (K, M) [Pa] by the method ``paper`` or ``projected``."""
+    def pressures(self, method: str, spline: BSpline, time: Vector) -> Vector:
+        """Return effective pressures (K, M) [Pa] by ``paper`` or ``projected``.
+
+        Args:
+            method: of the two.
+            spline: bend angles of evenly bent segments [rad].
+            time: (K,) evenly spaced instants [s].
+        """
+        q, v, a = sample_spline(spline, time)
         if method == "paper":
-            return self.paper_pressures(q, v, a)
+            return self._paper_beside_the_model(q, v, a, float(time[1] - time[0]))
         return self.projected_pressures(q, v, a)
+
+    def _paper_beside_the_model(self, q: Vector, v: Vector, a: Vector, step: float) -> Vector:
+        """Return (B Λ)† (M (q̄̈ + K_d ė + K_p e) + D q̄̇ − F_int − F_ext), e from the rolled rod.
+
+        The rod is rolled forward beside the equation, under the pressures that it has given so far,
+        and its distance e from the reference comes back through the gains.
+        """
+        force = self._needed_force(q, v, a)[:, 1:]
+        position, velocity, _ = (part[:, 1:] for part in self.kinematics.motion(q, v, a))
+        inverse = np.linalg.pinv(self._input_matrix(q))
+        mass = self.rod.mesh.node_mass[1:, None]
+        state = self.rest if not v[0].any() else self.state(q[0], v[0])
+        pressures = np.empty_like(q)
+        for k in range(len(q)):
+            gap = position[k] - np.column_stack([state.q[4::4], state.q[5::4]])
+            rate = velocity[k] - np.column_stack([state.v[4::4], state.v[5::4]])
+            wanted = force[k] + mass * (VELOCITY_GAIN * rate + POSITION_GAIN * gap)
+            pressures[k] = inverse[k] @ wanted.ravel()
+            state = self.rod.simulate(state, pressures[k, None], step, substeps=2).final
+        return pressures
 
     def state(self, angles: Vector, rates: Vector) -> RodState:
         """Return the rod evenly bent, at bend angles and rates (M,) [rad], [rad/s]."""
