@@ -97,6 +97,26 @@ def test_bag_in_rosbags_own_layout_evaluates_the_same(folder: Path, tmp_path: Pa
     assert one == two
 
 
+def test_what_was_not_yet_measured_is_left_out(tmp_path: Path):
+    bag = BagOfRun(tmp_path / "run")
+    bag.pressure(-0.2, [], [])
+    bag.plan()
+    for index in range(len(TIMES)):
+        bag.setpoint(index, [0.0, 0.0])
+        measured = [] if index < 10 else [200.0, 300.0]
+        bag.pressure(TIMES[index], [100.0, 100.0], measured)
+    for index, when in enumerate(FRAMES):
+        bag.state(when, reference(when)[0], valid=index != 50)
+    bag.bag.close()
+    run = load_run(tmp_path / "run")
+    assert np.isnan(run.measured.value[:11]).all()
+    assert np.isnan(run.bend_angle.value[50]).all()
+    assert np.allclose(np.delete(run.bend_angle.value, 50, axis=0), [0.1, 0.2])
+    result = evaluate_run(run)
+    assert result.pressure_rms_error_pa == pytest.approx((100.0, 200.0))
+    assert 0.99 < result.valid_fraction < 1.0
+
+
 def test_interrupted_run_says_so(tmp_path: Path):
     bag = BagOfRun(tmp_path / "run")
     bag.plan()

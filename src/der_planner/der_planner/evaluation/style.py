@@ -43,7 +43,7 @@ def paper_style() -> Iterator[None]:
         "legend.frameon": False,
         "pdf.fonttype": 42,
         "svg.fonttype": "none",
-        "savefig.dpi": 200,
+        "savefig.dpi": 160,
         "figure.constrained_layout.use": True,
     }
     with mpl.rc_context(settings):
