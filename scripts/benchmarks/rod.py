@@ -105,7 +105,7 @@ def run_elastica(elements: int, dt: float, simulated: float, *, shear_factor: fl
 
 
 def largest_stable_step(elements: int) -> float:
-    """Return PyElastica's largest step that survives 1 s, by 5 % of a wave's time through an element."""
+    """Return PyElastica's largest step that survives 1 s, to 5 % of a wave's time per element."""
     crossing = LENGTH / elements / np.sqrt(YOUNG / DENSITY)
     for part in np.arange(1.2, 0.1, -0.05):
         tip = run_elastica(elements, float(part) * crossing, 1.0).tip
@@ -167,7 +167,8 @@ def _scaling(figures: dict[str, float | str], sizes: list[int], repetitions: int
         ]
         print(f"  {nodes:4d} {row[0]:13.2f} {row[1]:13.2f} {row[2]:15.2f} {row[3]:13.2f}")
     print(
-        f"  growth exponent of an iteration with N: planar {figures['planar_growth_exponent']:.2f}, "
+        f"  growth exponent of an iteration with N: "
+        f"planar {figures['planar_growth_exponent']:.2f}, "
         f"3D {figures['3d_growth_exponent']:.2f}"
     )
 
@@ -198,8 +199,10 @@ def _peer(figures: dict[str, float | str], sizes: list[int], repetitions: int) -
         figures[f"3d_midpoint_10ms_{key}_s_per_simulated_s"] = run.per_simulated_second
         figures[f"3d_midpoint_10ms_{key}_error_mm"] = error
         figures[f"{key}_times_faster_than_pyelastica"] = faster
-        print(f"  {nodes:4d} {1e6 / peer.steps:15.1f} {peer.per_simulated_second:10.4f} "
-              f"{peer_error:9.3f} | {run.per_simulated_second:20.5f} {error:13.3f} {faster:12.0f}")  # fmt: skip
+        print(
+            f"  {nodes:4d} {1e6 / peer.steps:15.1f} {peer.per_simulated_second:10.4f} "
+            f"{peer_error:9.3f} | {run.per_simulated_second:20.5f} {error:13.3f} {faster:12.0f}"
+        )
 
 
 def _limit(tips: list[NDArray[np.float64]], order: int) -> NDArray[np.float64]:

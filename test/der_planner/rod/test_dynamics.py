@@ -1,5 +1,7 @@
 """Time steps against known motions, frequencies, orders and conserved quantities."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -114,7 +116,7 @@ def test_order_in_the_time_step(method, order, tau):
     reference = end(1e-3 / 64) if method != "backward_euler" else None
     values = [end(dt) for dt in steps]
     if reference is None:  # first order: compare successive differences
-        differences = [np.abs(b - a).max() for a, b in zip(values, values[1:], strict=False)]
+        differences = [np.abs(b - a).max() for a, b in pairwise(values)]
         measured = np.log2(differences[-2] / differences[-1])
     else:
         errors = [np.abs(value - reference).max() for value in values]
@@ -199,7 +201,7 @@ def test_step_by_step_is_the_same_as_a_simulation():
 
 
 def test_the_default_method_stays_bounded_where_the_midpoint_rule_does_not():
-    """Fast large bending without resolving the stretch: why the default is not the midpoint rule."""
+    """Fast large bending, stretching unresolved: why the default is not the midpoint rule."""
     rod = Rod.from_limb(Limb.default())
     time = np.arange(400)[:, None] * 0.05
     u = 15e3 * np.sin(2 * np.pi * time / 3 + [0.0, 1.0])

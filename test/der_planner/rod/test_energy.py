@@ -69,8 +69,9 @@ def test_stiffness_is_the_symmetric_hessian_of_the_energy(options):
     hessian = rod.stiffness(state)[np.ix_(rod.free, rod.free)]
     np.testing.assert_array_equal(hessian, hessian.T)
     jacobian = by_differences(lambda s: -rod.internal_force(s)[rod.free], state, rod, rod.free)
-    # Under parallel transport the force is no gradient in a chart: its derivative has an antisymmetric
-    # part (the transport's curvature times the twisting torque), and the Hessian is the symmetric part.
+    # Under parallel transport the force is no gradient in a chart: its derivative has an
+    # antisymmetric part (the transport's curvature times the twisting torque), and the Hessian is
+    # the symmetric part.
     symmetric = 0.5 * (jacobian + jacobian.T)
     np.testing.assert_allclose(hessian, symmetric, atol=1e-7 * np.abs(hessian).max())
 

@@ -59,7 +59,7 @@ def test_input_matrix_is_the_direction_against_bending():
 
 
 def test_couples_balance_an_even_bend_exactly():
-    """The pressure of Theorem 1 holds the even bend: the whole force vanishes, not only a projection."""
+    """The pressure of Theorem 1 holds the even bend: the whole force vanishes."""
     rod = segment_rod(segments=((0, 6), (6, 6)))
     angles = np.array([0.5, -0.8])
     q, _ = rod.configuration_from_bend_angles(angles)
@@ -73,7 +73,7 @@ def test_couples_balance_an_even_bend_exactly():
 
 @pytest.mark.parametrize("grading", [0.0, 0.05, 0.2])
 def test_uneven_edges_break_the_localisation(grading):
-    """Edges that grow along the rod leave interior forces (M_i − M_{i+1})/ē, first order in the growth."""
+    """Growing edges leave interior forces (M_i − M_{i+1})/ē, first order in the growth."""
     rod = segment_rod()
     rest = rod.rest_lengths * np.linspace(1 - grading, 1 + grading, 11)
     cells = 0.5 * (rest[1:] + rest[:-1])
@@ -101,7 +101,7 @@ def test_uneven_edges_break_the_localisation(grading):
 
 
 def test_pressure_bends_as_the_continuum_does():
-    """The couples span N_j − 2 edges; the gain makes up for it: bend angle = G u L / EI for small u."""
+    """The couples span N_j − 2 edges, the gain makes up for it: angle = G u L / EI if small."""
     for count in (5, 9, 20):
         rod = segment_rod(nodes=count, segments=((0, count),), plane="xy")
         clamped = Rod(dataclasses.replace(rod.mesh, clamped=np.arange(7)), "xy")

@@ -94,28 +94,52 @@ def test_gravity_out_of_the_plane_makes_the_rod_spatial():
     assert rod.tip(sagging)[1] > 0.02
 
 
+NOTHING = np.zeros(2)
+
+
+@pytest.mark.parametrize(
+    ("method", "arguments", "message"),
+    [
+        ("step", ([1.0], 0.01), r"u must have shape \(2,\), got \(1,\)"),
+        ("step", ([1.0, np.nan], 0.01), "u must be finite"),
+        ("step", ([1.0, "a"], 0.01), "u must be numbers"),
+        ("step", (NOTHING, 0.0), "dt must be a positive number"),
+        ("step", (NOTHING, 0.1, "euler"), "method must be one of"),
+        ("simulate", (np.zeros(3), 0.1), "pressures must be"),
+        ("simulate", (np.zeros((3, 3)), 0.1), "pressures must have"),
+        ("linearise_step", (NOTHING, -0.1), "dt must be a positive number"),
+        ("linearise_step", (NOTHING, 0.1, "euler"), "method must be one of"),
+    ],
+)
+def test_bad_arguments_of_a_motion_are_named(method, arguments, message):
+    rod = Rod.from_limb(Limb.default())
+    with pytest.raises(ValueError, match=message):
+        getattr(rod, method)(rod.straight_state(), *arguments)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda rod: rod.step(rod.straight_state(), [1.0], 0.01), r"u must have shape \(2,\), got \(1,\)"),
-        (lambda rod: rod.step(rod.straight_state(), [1.0, np.nan], 0.01), "u must be finite"),
-        (lambda rod: rod.step(rod.straight_state(), [1.0, "a"], 0.01), "u must be numbers"),
-        (lambda rod: rod.step(rod.straight_state(), [0.0, 0.0], 0.0), "dt must be a positive number"),
-        (lambda rod: rod.step(rod.straight_state(), [0.0, 0.0], 0.1, "euler"), "method must be one of"),
-        (lambda rod: rod.simulate(rod.straight_state(), np.zeros(3), 0.1), "pressures must be"),
-        (lambda rod: rod.simulate(rod.straight_state(), np.zeros((3, 3)), 0.1), "pressures must have"),
-        (lambda rod: rod.simulate(rod.straight_state(), np.zeros((3, 2)), 0.1, substeps=0), "substeps"),
         (lambda rod: rod.state(np.ones(83)), "q must stay in the plane xy"),
         (lambda rod: rod.state(np.ones(7)), r"q must have shape \(83,\), got \(7,\)"),
-        (lambda rod: rod.equilibrium([0, 0], forces=np.ones((21, 3))), "forces must stay in the plane"),
+        (lambda rod: rod.equilibrium([0, 0], forces=np.ones((21, 3))), "forces must stay in"),
         (lambda rod: rod.configuration_from_bend_angles([1.0]), "angles must have shape"),
-        (lambda rod: Rod.from_limb(Limb.default(), 4), "nodes must be an int of 6 or more"),
-        (lambda rod: Rod.from_limb(Limb.default(), plane="yz"), "plane must be"),
+        (lambda _: Rod.from_limb(Limb.default(), 4), "nodes must be an int of 6 or more"),
+        (lambda _: Rod.from_limb(Limb.default(), plane="yz"), "plane must be"),
     ],
-)  # fmt: skip
+)
 def test_bad_input_is_named_at_the_border(call, message):
     with pytest.raises(ValueError, match=message):
         call(Rod.from_limb(Limb.default()))
+
+
+def test_bad_substeps_and_outputs_are_named():
+    rod = Rod.from_limb(Limb.default())
+    start, still = rod.straight_state(), np.zeros((3, 2))
+    with pytest.raises(ValueError, match="substeps must be an int of 1 or more, got 0"):
+        rod.simulate(start, still, 0.1, substeps=0)
+    with pytest.raises(ValueError, match="outputs must be"):
+        rod.simulate(start, still, 0.1, linearise=True, outputs=[2])
 
 
 @pytest.mark.parametrize(

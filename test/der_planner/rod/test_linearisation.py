@@ -90,7 +90,7 @@ def test_linearised_step_is_the_derivative_of_the_step(rod, method):
 
 
 def test_it_needs_the_derivative_of_the_couples():
-    """Under pressure the couples turn with their edges: A depends on u also where q and v are held."""
+    """Couples turn with their edges: A depends on u also where q and v are held."""
     rod = limb_rod()
     state = rod.equilibrium([5e3, 5e3])
     calm, _ = rod.linearise_step(state, [5e3, 5e3], 1e-4, "backward_euler")

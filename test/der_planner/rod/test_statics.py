@@ -141,7 +141,8 @@ def test_a_twisted_ring_becomes_unstable_at_michells_twist(nodes):
         np.testing.assert_allclose(force, 0.0, atol=1e-7)  # the plane ring stays an equilibrium
         stiffness = rod.stiffness(state)[np.ix_(rod.free, rod.free)]
         values = np.linalg.eigvalsh(stiffness)
-        # turning the ring about the held edge and its cross-sections back costs an isotropic rod nothing
+        # turning the ring about the held edge and its cross-sections back costs an isotropic rod
+        # nothing
         neutral = np.argmin(np.abs(values))
         assert abs(values[neutral]) < 1e-6
         return np.delete(values, neutral)[0]
@@ -164,7 +165,7 @@ def test_point_forces_deflect_a_cantilever_as_beam_theory_says():
 
 
 def test_a_torque_free_twist_is_shared_evenly():
-    """A rod twisted at rest by τ̄ L turns its free end by that angle, to half an edge at each end."""
+    """A rod twisted at rest by τ̄ turns by τ̄ s at the middle of each edge."""
     rod = Rod.uniform(
         length=0.25, nodes=26, EI=0.02, EA=1e5, GJ=0.02, mass_per_length=1.0, rest_twist=3.0
     )

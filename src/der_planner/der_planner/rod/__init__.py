@@ -1,7 +1,7 @@
 """The discrete elastic rod with explicit inputs.
 
-`Rod` describes one rod and holds its compiled kernels; `RodState` is where it is; `Trajectory` is where
-it went. All values are SI.
+`Rod` describes one rod and holds its compiled kernels; `RodState` is where it is; `Trajectory` is
+where it went. All values are SI.
 """
 
 from der_planner.rod.errors import ConvergenceError

@@ -1,7 +1,7 @@
 """Banded linear algebra without pivoting, for the matrices of a chain of nodes.
 
-A symmetric matrix of half-bandwidth b is stored by columns: s[j, k] = A[j+k, j], k = 0 … b. A general one
-is stored by rows: a[i, k] = A[i, i+k-b], k = 0 … 2b.
+A symmetric matrix of half-bandwidth b is stored by columns: s[j, k] = A[j+k, j], k = 0 … b. A
+general one is stored by rows: a[i, k] = A[i, i+k-b], k = 0 … 2b.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def hold_fixed_general(a: Array, fixed: Array) -> None:
 
 @kernel
 def factor_general(a: Array) -> None:
-    """Replace a general band by L (unit diagonal) and U, with the inverse of U's diagonal in place."""
+    """Replace a general band by L (unit diagonal) and U (its diagonal inverted)."""
     n = a.shape[0]
     b = (a.shape[1] - 1) // 2
     for j in range(n):

@@ -18,7 +18,8 @@ _FOLDER = Path(__file__).resolve().parent
 _FLAGS = {"contract", "reassoc", "nsz", "arcp"}  # NaN must stay visible: it ends an iteration
 
 
-def _drop_stale_caches() -> None:
+def drop_stale_caches() -> None:
+    """Delete cached kernels if any kernel source is not the one that they were compiled from."""
     digest = hashlib.sha256()
     for source in sorted(_FOLDER.glob("*_kernel.py")):
         digest.update(source.read_bytes())
@@ -32,7 +33,7 @@ def _drop_stale_caches() -> None:
         stamp.write_text(digest.hexdigest())
 
 
-_drop_stale_caches()
+drop_stale_caches()
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -37,9 +37,9 @@ class StepFactors(NamedTuple):
 class Linearisation:
     """First-order effect of the pressures on P outputs along a simulated motion of K intervals.
 
-    A product with the K·P × K·M sensitivity (`tangent`) or its transpose (`adjoint`) costs about as much
-    as the simulation's linear solves; the matrix itself (`sensitivity`) K/2 times as much, at vector
-    speed. Both ways are exact for the discrete motion.
+    A product with the K·P × K·M sensitivity (`tangent`) or its transpose (`adjoint`) costs about as
+    much as the simulation's linear solves; the matrix itself (`sensitivity`) K/2 times as much, at
+    vector speed. Both ways are exact for the discrete motion.
 
     Attributes:
         intervals: K. steps: S, integrator steps in an interval.
@@ -92,16 +92,18 @@ class Linearisation:
         start = np.empty((2, self._stored.inertia.shape[0]))
         sensitivity_kernel.adjoint(weight, *self._stored, self._output_rows, gradient, start)
         if not by_step:
-            return gradient.sum(axis=1)
-        return gradient.reshape(self.intervals, self.steps, self.stages, -1).sum(axis=2)
+            total: Array = gradient.sum(axis=1)
+            return total
+        of_steps: Array = gradient.reshape(self.intervals, self.steps, self.stages, -1).sum(axis=2)
+        return of_steps
 
     def sensitivity(self, pulse: ArrayLike | None = None) -> Array:
         """Return ∂output/∂input (K+1, P, K, M) [m/Pa], zero where the input comes later.
 
         Args:
-            pulse: (R, M) pressure in the R integrator steps that follow the start of an interval when
-                that interval's setpoint is raised by one: the response of the pneumatics, for instance.
-                Default: one for the S steps of the interval, zero later.
+            pulse: (R, M) pressure in the R integrator steps that follow the start of an interval
+                when that interval's setpoint is raised by one: the response of the pneumatics, for
+                instance. Default: one for the S steps of the interval, zero later.
         """
         if pulse is None:
             shape = np.ones((self.steps, self.input_count))
@@ -129,7 +131,7 @@ class Linearisation:
 
 
 def step_matrices(stored: StepFactors, rows: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Return A (2F, 2F) and B (2F, M) of all stored stages under one input, on the unknowns `rows`."""
+    """Return A (2F, 2F) and B (2F, M) of all stored stages under one input, on `rows`."""
     size = stored.inertia.shape[0]
     count = len(rows)
     columns = 2 * count + stored.inputs.shape[2]

@@ -62,13 +62,15 @@ class Mesh:
     def node_mass(self) -> Array:
         """(N,) half the mass of the edges at each node."""
         half = 0.5 * self.edge_mass
-        return np.append(half, 0.0) + np.append(0.0, half)
+        total: Array = np.append(half, 0.0) + np.append(0.0, half)
+        return total
 
     @property
     def node_damping(self) -> Array:
         """(N,) damping coefficient of each node [kg/s]."""
         half = 0.5 * self.edge_mass * self.edge_damping
-        return np.append(half, 0.0) + np.append(0.0, half)
+        total: Array = np.append(half, 0.0) + np.append(0.0, half)
+        return total
 
 
 def require(condition: bool, name: str, expected: str, got: object) -> None:
@@ -105,7 +107,7 @@ def array(value: ArrayLike, shape: tuple[int, ...], name: str) -> Array:
 
 
 def check_segments(segments: Sequence[tuple[int, int]], nodes: int) -> tuple[tuple[int, int], ...]:
-    """Return the segments as pairs of ints; raise a ValueError if they leave the rod or share a node."""
+    """Return the segments; raise a ValueError if they leave the rod or share a node."""
     last = -1
     for index, (first, count) in enumerate(segments):
         name = f"segments[{index}]"
@@ -194,7 +196,8 @@ def limb_mesh(limb: Limb, nodes: int, clamp: str) -> Mesh:
 
     def of_edges(name: str) -> Array:
         values = np.array([getattr(segment, name) for segment in limb.segments])
-        return 0.5 * (values[behind] + values[ahead])
+        mean: Array = 0.5 * (values[behind] + values[ahead])
+        return mean
 
     def of_nodes(name: str) -> tuple[Array, Array]:
         values = of_edges(name)
@@ -220,7 +223,8 @@ def limb_mesh(limb: Limb, nodes: int, clamp: str) -> Mesh:
         step = rest[first]
         turn = segment.rest_curvature * segment.length / (size - 2)
         rest_kappa[inner, 0] = 2.0 * math.tan(0.5 * turn)
-        # The couples sit in the middle of the first and last edge: size - 2 edges bend, not the segment.
+        # The couples sit in the middle of the first and last edge: size - 2 edges bend, not the
+        # segment.
         ratio = segment.length / ((size - 2) * step)
         gain[index] = segment.moment_gain * ratio / step
         # k3 (κ-κ̄)² against EI is kept when the curvature is spread over the shorter length

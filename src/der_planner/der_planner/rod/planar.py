@@ -94,7 +94,7 @@ class PlanarBackend:
 
     def extend(self, q: Array) -> Array:
         """Return the kernels' coordinates of q, with the ghost node."""
-        planar = q[self.index]
+        planar: Array = q[self.index]
         if not self.ghost:
             return planar
         return np.concatenate([[planar[0] - self.mesh.rest[0], planar[1]], planar])

@@ -1,8 +1,10 @@
 """Compiled kernels of a rod in a plane: two unknowns a node, half-bandwidth 5.
 
-Symbols: n nodes (with the ghost node, if any), x (2n,) positions, edge j = x_{j+1} − x_j of length |e_j|,
+Symbols: n nodes (with the ghost node, if any), x (2n,) positions, edge j = x_{j+1} − x_j of length
+|e_j|,
 t its tangent and n̂ its left normal; at node i the turning angle θ and the integrated curvature
-κ = 2 tan(θ/2), κ' = dκ/dθ = 1 + κ²/4, κ'' = κ κ'/2; w = EI/l, c = EI τ/l (Kelvin-Voigt), k3/l³ (cubic).
+κ = 2 tan(θ/2), κ' = dκ/dθ = 1 + κ²/4, κ'' = κ κ'/2; w = EI/l, c = EI τ/l (Kelvin-Voigt), k3/l³
+(cubic).
 """
 
 from __future__ import annotations
@@ -13,8 +15,8 @@ from der_planner.rod.compile import kernel
 from der_planner.rod.state import Array, Arrays
 
 # `rod` is the tuple of a rod's arrays:
-# rest (n-1,) edge lengths; axial (n-1,) EA; bend (n,) w; rest_kappa (n,); cubic (n,); viscous (n,) c;
-# first (M,), last (M,) edge indices of the segments; gain (M,) Λ.
+# rest (n-1,) edge lengths; axial (n-1,) EA; bend (n,) w; rest_kappa (n,); cubic (n,); viscous (n,)
+# c; first (M,), last (M,) edge indices of the segments; gain (M,) Λ.
 
 
 @kernel
@@ -60,7 +62,7 @@ def energy(
 
 
 @kernel
-def assemble(
+def assemble(  # noqa: PLR0915 - scalars, so that nothing is stored between the edges
     x: Array,
     v: Array,
     rate: float,
@@ -75,10 +77,11 @@ def assemble(
 ) -> None:
     """Elastic, viscous and actuating terms of the residual and its symmetric derivative.
 
-    g (2n,) becomes ∇E + viscous force − B(q)Λu; s (2n, 6) its derivative by x with v = rate·(x − x_n),
-    of which the unsymmetric part is left out or symmetrised (`unsymmetric` adds what is missing). With
-    `convex` the negative geometric terms are left out too: a safer direction far from the solution.
-    edge (n-1, 3), turn (n,), torque (n, 2) are work space: t and 1/|e|; κ; moment and its derivative.
+    g (2n,) becomes ∇E + viscous force − B(q)Λu; s (2n, 6) its derivative by x with v = rate·(x −
+    x_n), of which the unsymmetric part is left out or symmetrised (`unsymmetric` adds what is
+    missing). With `convex` the negative geometric terms are left out too: a safer direction far
+    from the solution. edge (n-1, 3), turn (n,), torque (n, 2) are work space: t and 1/|e|; κ;
+    moment and its derivative.
     """
     rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain = rod
     n = turn.shape[0]
@@ -102,7 +105,8 @@ def assemble(
             torque[i, 1] += viscous[i] * slope * (slope * rate + 2.0 * second * turning)
     for k in range(2 * n):
         g[k] = 0.0
-    # Edge by edge: gradient (gx, gy) and Hessian (hxx, hxy, hyy) by e; then the coupling of two edges.
+    # Edge by edge: gradient (gx, gy) and Hessian (hxx, hxy, hyy) by e; then the coupling of two
+    # edges.
     left_xx = left_xy = left_yx = left_yy = 0.0  # coupling of edges j-1 and j, rows of j-1
     before_xx = before_xy = before_yy = 0.0  # Hessian of edge j-1
     for j in range(n - 1):
@@ -199,10 +203,10 @@ def unsymmetric(
     parts: Array,
     rod: Arrays,
 ) -> None:
-    """Complete a (2n, 11) to the exact derivative; fill damping (2n, 6) with the viscous matrix·rate.
+    """Complete a (2n, 11) to the exact derivative; fill damping (2n, 6): viscous matrix·rate.
 
-    Missing in `assemble` are −(Λu/|e|) n̂ tᵀ of a couple that keeps its force while its edge stretches,
-    and c κ'² ∇θ (∇²θ v)ᵀ of the viscous moment.
+    Missing in `assemble` are −(Λu/|e|) n̂ tᵀ of a couple that keeps its force while its edge
+    stretches, and c κ'² ∇θ (∇²θ v)ᵀ of the viscous moment.
     """
     viscous, first, last, gain = rod[5], rod[6], rod[7], rod[8]
     n = turn.shape[0]

@@ -1,6 +1,7 @@
 """Compiled time steps of a planar rod; see `planar_kernel` for the symbols and the rod's arrays.
 
-Every kernel takes, after its own arguments: space, the work arrays (6, 2n), (2n, 6), (2n, 6), (n-1, 3), (n,),
+Every kernel takes, after its own arguments: space, the work arrays (6, 2n), (2n, 6), (2n, 6), (n-1,
+3), (n,),
 (n, 2), (2, 6); body, the tuple of mass, damping, load (2n,) and of the fixed indices; rod.
 """
 
@@ -81,14 +82,15 @@ def predict(
 
 @kernel
 def simulate(
-    q: Array, v: Array, pressures: Array, h: float, extrapolate: Array, tolerance: float, limit: int,
-    factors: Array, viscous: Array, inputs: Array, space: Arrays, body: Arrays, rod: Arrays,
+    q: Array, v: Array, pressures: Array, h: float, extrapolate: Array, tolerance: float,
+    limit: int, factors: Array, viscous: Array, inputs: Array, space: Arrays,
+    body: Arrays, rod: Arrays,
 ) -> tuple[int, int, float, int]:  # fmt: skip
     """Run K intervals of S steps from q[0], v[0] into q, v (K+1, 2n).
 
-    Each step solves backward Euler over h and goes on to x_n + e (x − x_n) with e = extrapolate[step
-    modulo its length] (P,). pressures is (K, S, M). factors (K·S, 2n, 11), viscous (K·S or 0, 2n, 6) and
-    inputs (K·S, 2n, M) receive the linearisation unless empty.
+    Each step solves backward Euler over h and goes on to x_n + e (x − x_n) with e =
+    extrapolate[step modulo its length] (P,). pressures is (K, S, M). factors (K·S, 2n, 11), viscous
+    (K·S or 0, 2n, 6) and inputs (K·S, 2n, M) receive the linearisation unless empty.
 
     Returns (steps done, Newton iterations, last update, iterations of the failed step or 0).
     """

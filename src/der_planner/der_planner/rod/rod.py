@@ -25,8 +25,8 @@ Plane = Literal["xy", "xz"]
 class Rod:
     """A rod of N nodes along x with M pressure inputs: M q̈ = F_int(q) − D q̇ + B(q) Λ u + F_ext.
 
-    q = [x0, φ0, x1, φ1, …, φ_{N-2}, x_{N-1}] in R^(4N-1). A rod with a `plane` moves in it alone: its
-    kernels carry two unknowns a node, everything public keeps the full layout.
+    q = [x0, φ0, x1, φ1, …, φ_{N-2}, x_{N-1}] in R^(4N-1). A rod with a `plane` moves in it alone:
+    its kernels carry two unknowns a node, everything public keeps the full layout.
 
     Attributes:
         nodes: N.
@@ -94,8 +94,8 @@ class Rod:
             GJ: torsional stiffness [N·m²].
             mass_per_length: [kg/m].
             damping: mass-proportional rate [1/s].
-            clamp: "ghost" holds x0 and a ghost edge behind it, "inside" holds x0, φ0 and x1, "free" holds
-                nothing.
+            clamp: "ghost" holds x0 and a ghost edge behind it, "inside" holds x0, φ0 and x1, "free"
+                holds nothing.
             gravity: (3,) acceleration [m/s²].
             segments: (first node, node count) of each actuated segment.
             moment_gain: (M,) bending moment per pressure [N·m/Pa].
@@ -185,9 +185,9 @@ class Rod:
             state: where the step begins.
             u: held over the step.
             dt: length of the step.
-            method: "sdirk2" (two stages, second order, damps what the step cannot resolve), "midpoint"
-                (second order, one solve, keeps energy, unstable when a step turns an edge far while
-                stretching is undamped) or "backward_euler" (first order, robust).
+            method: "sdirk2" (two stages, second order, damps what the step cannot resolve),
+                "midpoint" (second order, one solve, keeps energy, unstable when a step turns an
+                edge far while stretching is undamped) or "backward_euler" (first order, robust).
             forces: on the nodes.
             halvings: how often a step that does not converge may be cut in two.
 
@@ -226,9 +226,9 @@ class Rod:
             substeps: S, integrator steps in an interval.
             method: as in `step`.
             forces: (N, 3) constant point forces [N].
-            linearise: also keep the exact linearisation of every step: `Trajectory.linearisation` has
-                `.tangent(pressure change) -> output change`, `.adjoint(output weight) -> gradient` and
-                `.sensitivity(pulse=None)` (K+1, P, K, M), all compiled.
+            linearise: also keep the exact linearisation of every step: `Trajectory.linearisation`
+                has `.tangent(pressure change) -> output change`, `.adjoint(output weight) ->
+                gradient` and `.sensitivity(pulse=None)` (K+1, P, K, M), all compiled.
             outputs: (P,) indices into q of the outputs; default the tip's free coordinates.
 
         Raises:
@@ -259,7 +259,7 @@ class Rod:
     def equilibrium(
         self, u: ArrayLike, *, start: RodState | None = None, forces: ArrayLike | None = None
     ) -> RodState:
-        """Return the resting state under pressures u (M,) [Pa], gravity and point forces (N, 3) [N].
+        """Return the resting state under pressures u (M,) [Pa], gravity and forces (N, 3) [N].
 
         Raises:
             ConvergenceError: neither Newton nor load stepping found one.
@@ -335,7 +335,7 @@ class Rod:
         return matrices
 
     def bend_angles(self, state: RodState | ArrayLike) -> Array:
-        """Return (…, M) the turning of each segment about +z from its first to its last edge [rad]."""
+        """Return (…, M) each segment's turning about +z from its first to its last edge [rad]."""
         q = state.q if isinstance(state, RodState) else np.asarray(state, dtype=np.float64)
         edges = np.diff(positions_of(q), axis=-2)
         turns = 2.0 * np.arctan2(*_half_turns(edges))
@@ -343,7 +343,7 @@ class Rod:
         return np.stack(result, axis=-1) if result else np.zeros((*q.shape[:-1], 0))
 
     def configuration_from_bend_angles(self, angles: ArrayLike) -> tuple[Array, Array]:
-        """Return q (4N-1,) of a planar rod whose segments bend evenly, and S = ∂q/∂angles (4N-1, M).
+        """Return q (4N-1,) of segments that bend evenly in xy, and S = ∂q/∂angles (4N-1, M).
 
         Args:
             angles: (M,) bend angles [rad], as `bend_angles` measures them.
@@ -373,8 +373,9 @@ class Rod:
     def _failure(self, run: Run, dt: float, method: str) -> ConvergenceError:
         step = run.steps // len(_STAGES[method][1])
         return ConvergenceError(
-            f"step {step} of {dt:g} s ({method}) did not converge in {run.failed_iterations} Newton "
-            f"iterations (last update {run.update:.3g} m): take a shorter step",
+            f"step {step} of {dt:g} s ({method}) did not converge in "
+            f"{run.failed_iterations} Newton iterations "
+            f"(last update {run.update:.3g} m): take a shorter step",
             step=step, residual=run.update, iterations=run.failed_iterations, state=run.final,
         )  # fmt: skip
 
@@ -412,9 +413,9 @@ class Rod:
         return wanted
 
 
-# Each method is a chain of backward Euler solves over fraction·dt from (q, v), after each of which the
-# state goes on to (q, v) + e ((q', v') − (q, v)). e = 2 is the implicit midpoint rule; γ = 1 − 1/√2 with
-# e = (1 − γ)/γ, then 1, is Alexander's two-stage SDIRK: second order and L-stable.
+# Each method is a chain of backward Euler solves over fraction·dt from (q, v), after each of which
+# the state goes on to (q, v) + e ((q', v') − (q, v)). e = 2 is the implicit midpoint rule; γ = 1 −
+# 1/√2 with e = (1 − γ)/γ, then 1, is Alexander's two-stage SDIRK: second order and L-stable.
 _LIMIT = 30  # Newton iterations of a step
 _GAMMA = 1.0 - math.sqrt(0.5)
 _STAGES = {

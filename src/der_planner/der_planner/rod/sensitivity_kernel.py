@@ -1,8 +1,8 @@
 """Compiled sweeps over the stored linearisation of a simulation, for any half-bandwidth.
 
 One step is J y = (M·rate² + D·rate + V) δq + M·rate δv + B δu, then δq' = δq + e (y − δq) and
-δv' = δv + e (rate (y − δq) − δv), e = extrapolate[step modulo its length] (P,). `inertia` and `momentum`
-hold the two diagonals (zero where fixed), V is the viscous band, J is stored factored.
+δv' = δv + e (rate (y − δq) − δv), e = extrapolate[step modulo its length] (P,). `inertia` and
+`momentum` hold the two diagonals (zero where fixed), V is the viscous band, J is stored factored.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def adjoint(
     gradient: Array,
     start: Array,
 ) -> None:
-    """Fill gradient (K, S, M) and start (2, n) with the transpose of `tangent` applied to weight (K+1, P)."""
+    """Fill gradient (K, S, M) and start (2, n): `tangent` transposed, times weight (K+1, P)."""
     intervals, steps, count = gradient.shape
     size = start.shape[1]
     lq = np.zeros(size)
@@ -156,10 +156,11 @@ def sensitivity(
     outputs: Array,
     out: Array,
 ) -> None:
-    """Fill out (K+1, P, K, M): change of each output for a unit pulse of each input in each interval.
+    """Fill out (K+1, P, K, M): each output's change by a unit pulse of each input.
 
-    pulse (R·S, M) is the pressure of the steps that follow the start of an interval. `chunk` intervals
-    are propagated together, so that their columns stay in the nearest cache and fill the vector unit.
+    pulse (R·S, M) is the pressure of the steps that follow the start of an interval. `chunk`
+    intervals are propagated together, so that their columns stay in the nearest cache and fill the
+    vector unit.
     """
     count = inputs.shape[2]
     size = inputs.shape[1]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.rod import spatial_kernel, spatial_step_kernel
+from der_planner.rod import spatial_assembly_kernel, spatial_kernel, spatial_step_kernel
 from der_planner.rod.mesh import Mesh
 from der_planner.rod.planar import Run, band_to_dense
 from der_planner.rod.spatial_linearisation import Stage, propagate, residual_derivatives
@@ -13,7 +13,7 @@ from der_planner.rod.state import Array, Arrays, RodState
 
 
 class SpatialBackend:
-    """Kernels and arrays of a rod in space. A ghost edge is a node and an edge before the rod's own."""
+    """Kernels and arrays of a rod in space; a ghost edge comes before the rod's own."""
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
@@ -82,7 +82,7 @@ class SpatialBackend:
         return np.concatenate([np.zeros(self.offset), v])
 
     def reference(self, state: RodState) -> Arrays:
-        """Return tangents, directors (n-1, 3) and reference twists (n,) of a state, for the kernels."""
+        """Return tangents, directors (n-1, 3) and reference twists (n,) for the kernels."""
         x = state.q
         nodes = np.stack([x[0::4], x[1::4], x[2::4]], axis=1)
         edges = np.diff(nodes, axis=0)
@@ -212,7 +212,7 @@ class SpatialBackend:
     def _assemble(self, state: RodState, v: Array) -> tuple[Array, Array]:
         x, (twists, _, s, frame, own, link, local, vectors, _) = self._place(state)
         gradient = np.zeros(self.size)
-        spatial_kernel.assemble(
+        spatial_assembly_kernel.assemble(
             x, v, 0.0, np.zeros(len(self.mesh.gain)), False, gradient, s, frame, twists, own, link,
             local, vectors, self.rod,
         )  # fmt: skip

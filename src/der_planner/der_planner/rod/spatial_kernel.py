@@ -1,10 +1,10 @@
 """Compiled kernels of a rod in space: four unknowns a node, half-bandwidth 10.
 
-Symbols: n nodes (with the ghost node, if any), x (4n-1,) = x0, φ0, x1, …; edge j = x_{j+1} − x_j with
-tangent t; d̂, t̂ the reference director and tangent of the last converged step, d1 = P(t̂→t) d̂ the director
-now, m1, m2 the material frame at φ; at node i κb = 2 t_e×t_f / χ, χ = 1 + t_e·t_f, and
-κ1 = ½ κb·(m2e + m2f), κ2 = −½ κb·(m1e + m1f), τ = φf − φe + reference twist (Bergou 2008, 2010). Derivatives
-are kept by edge, w = (e, φ), and brought to the nodes at the end.
+Symbols: n nodes (with the ghost node, if any), x (4n-1,) = x0, φ0, x1, …; edge j = x_{j+1} − x_j
+with
+tangent t; d̂, t̂ the reference director and tangent of the last converged step, d1 = P(t̂→t) d̂ the
+director now, m1, m2 the material frame at φ; at node i κb = 2 t_e×t_f / χ, χ = 1 + t_e·t_f, and κ1
+= ½ κb·(m2e + m2f), κ2 = −½ κb·(m1e + m1f), τ = φf − φe + reference twist (Bergou 2008, 2010).
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from der_planner.rod.compile import kernel
 from der_planner.rod.state import Array, Arrays
 
 # `rod` is the tuple of a rod's arrays:
-# rest (n-1,); axial (n-1,) EA; bend (n,) EI/l; twist (n,) GJ/l; cubic (n,) k3/l³; viscous (n,) EI τ/l;
-# rest_kappa (n, 2); rest_twist (n,); first (M,), last (M,) edges of the segments; gain (M,) Λ.
+# rest (n-1,); axial (n-1,) EA; bend (n,) EI/l; twist (n,) GJ/l; cubic (n,) k3/l³; viscous (n,) EI
+# τ/l; rest_kappa (n, 2); rest_twist (n,); first (M,), last (M,) edges of the segments; gain (M,) Λ.
 
 # Columns of the work array `frame` (n-1, 13): t, 1/|e|, m1, m2, d1
 T, D1 = 0, 10
@@ -67,7 +67,7 @@ def reference_twists(
     before: Array,
     twists: Array,
 ) -> None:
-    """Fill twists (n,) with the angle from P(t_e→t_f) d1_e to d1_f about t_f, the one near `before`."""
+    """Fill twists (n,): angle from P(t_e→t_f) d1_e to d1_f about t_f, the one near `before`."""
     for i in range(1, frame.shape[0]):
         ex, ey, ez = frame[i - 1, 0], frame[i - 1, 1], frame[i - 1, 2]
         fx, fy, fz = frame[i, 0], frame[i, 1], frame[i, 2]
@@ -142,7 +142,7 @@ def node_strains(
 
 
 @kernel
-def add_curvature_hessian(
+def add_curvature_hessian(  # noqa: PLR0912 - one loop a block
     i: int,
     c1: float,
     c2: float,
@@ -232,205 +232,6 @@ def add_curvature_hessian(
                 h[4 + k, row] += by_f
             else:
                 h[row, 4 + k] += by_f
-
-
-@kernel
-def assemble(
-    x: Array,
-    v: Array,
-    rate: float,
-    u: Array,
-    convex: bool,
-    g: Array,
-    s: Array,
-    frame: Array,
-    twists: Array,
-    own: Array,
-    link: Array,
-    local: Array,
-    vectors: Array,
-    rod: Arrays,
-) -> None:
-    """Elastic, viscous and actuating terms of the residual and its symmetric derivative.
-
-    g (4n-1,) becomes ∇E + viscous force − B(q)Λu; s (4n-1, 11) the symmetric derivative by x, the viscous
-    part with v = rate·(x − x_n). frame and twists are those of x. Work space: own (n-1, 4, 5) gradient (last
-    column) and Hessian of each edge's (e, φ); link (n, 4, 4) coupling of a node's two edges, rows of the
-    second; local (12, 8); vectors (10, 3).
-    """
-    _, _, bend, twist, cubic, viscous, rest_kappa, rest_twist, _, _, _ = rod
-    edges = frame.shape[0]
-    stretch(frame, u, convex, own, rod)
-    strain = local[11]
-    gradient = local[8:11]
-    for i in range(1, edges):
-        node_strains(i, frame, twists, x, strain, gradient)
-        d1 = strain[0] - rest_kappa[i, 0]
-        d2 = strain[1] - rest_kappa[i, 1]
-        d3 = strain[2] - rest_twist[i]
-        stiff = bend[i] + cubic[i] * (d1 * d1 + d2 * d2)
-        c1, c2, c3 = stiff * d1, stiff * d2, twist[i] * d3
-        if viscous[i] != 0.0:
-            for k in range(4):
-                ve = v[4 * i + k] - v[4 * i - 4 + k] if k < 3 else v[4 * i - 1]
-                vf = v[4 * i + 4 + k] - v[4 * i + k] if k < 3 else v[4 * i + 3]
-                c1 += viscous[i] * (gradient[0, k] * ve + gradient[0, 4 + k] * vf)
-                c2 += viscous[i] * (gradient[1, k] * ve + gradient[1, 4 + k] * vf)
-            stiff += viscous[i] * rate
-        weight = 2.0 * cubic[i]
-        for r in range(8):
-            g1, g2, g3 = stiff * gradient[0, r], stiff * gradient[1, r], twist[i] * gradient[2, r]
-            gr = weight * (d1 * gradient[0, r] + d2 * gradient[1, r])
-            g1 += gr * d1
-            g2 += gr * d2
-            for c in range(8):
-                local[r, c] = g1 * gradient[0, c] + g2 * gradient[1, c] + g3 * gradient[2, c]
-        add_curvature_hessian(i, c1, c2, c3, frame, strain, vectors, local)
-        for r in range(4):
-            own[i - 1, r, 4] += c1 * gradient[0, r] + c2 * gradient[1, r] + c3 * gradient[2, r]
-            own[i, r, 4] += (
-                c1 * gradient[0, 4 + r] + c2 * gradient[1, 4 + r] + c3 * gradient[2, 4 + r]
-            )
-            for c in range(r + 1):
-                own[i - 1, r, c] += local[r, c]
-                own[i, r, c] += local[4 + r, 4 + c]
-            for c in range(4):
-                link[i, r, c] = local[4 + r, c]
-    to_nodes(own, link, g, s)
-
-
-@kernel
-def stretch(frame: Array, u: Array, convex: bool, own: Array, rod: Arrays) -> None:
-    """Start own (n-1, 4, 5) with stretching and with the couples, symmetrised (see `unsymmetric`)."""
-    rest, axial = rod[0], rod[1]
-    first, last, gain = rod[8], rod[9], rod[10]
-    own[:] = 0.0
-    for j in range(frame.shape[0]):
-        inverse = frame[j, 3]
-        tension = axial[j] * (1.0 / (inverse * rest[j]) - 1.0)
-        across = tension * inverse
-        if convex and across < 0.0:  # a safer direction far from the solution
-            across = 0.0
-        along = axial[j] / rest[j] - across
-        for r in range(3):
-            own[j, r, 4] = tension * frame[j, r]
-            for c in range(r + 1):
-                own[j, r, c] = along * frame[j, r] * frame[j, c]
-            own[j, r, r] += across
-    for m in range(gain.shape[0]):
-        for end in range(2):
-            j = first[m] if end == 0 else last[m]
-            force = (-gain[m] if end == 0 else gain[m]) * u[m]
-            nx, ny = -frame[j, 1], frame[j, 0]
-            own[j, 0, 4] -= force * nx
-            own[j, 1, 4] -= force * ny
-            force *= frame[j, 3]
-            own[j, 0, 0] += force * 2.0 * nx * frame[j, 0]
-            own[j, 1, 0] += force * (ny * frame[j, 0] + nx * frame[j, 1])
-            own[j, 1, 1] += force * 2.0 * ny * frame[j, 1]
-            own[j, 2, 0] += force * frame[j, 2] * nx
-            own[j, 2, 1] += force * frame[j, 2] * ny
-
-
-@kernel
-def unsymmetric(frame: Array, u: Array, own: Array, rod: Arrays, a: Array) -> None:
-    """Add to a (4n-1, 21) what `assemble` left out of the derivative at the frames' own base.
-
-    That is the unsymmetric part of the couples, which keep turning about z when their edge tilts, and
-    half of each edge's twisting torque times [t]×/|e|², as the force is no gradient under transport.
-    """
-    first, last, gain = rod[8], rod[9], rod[10]
-    for j in range(frame.shape[0]):
-        half = 0.5 * own[j, 3, 4] * frame[j, 3] * frame[j, 3]
-        for k in range(3):
-            k1, k2 = (k + 1) % 3, (k + 2) % 3
-            add_to_edge(j, k1, k2, -half * frame[j, k], a)
-            add_to_edge(j, k2, k1, half * frame[j, k], a)
-    for m in range(gain.shape[0]):
-        for end in range(2):
-            j = first[m] if end == 0 else last[m]
-            force = (-gain[m] if end == 0 else gain[m]) * u[m] * frame[j, 3]
-            nx, ny = -frame[j, 1], frame[j, 0]
-            for c in range(3):
-                tc = frame[j, c]
-                nc = nx if c == 0 else (ny if c == 1 else 0.0)
-                for r in range(3):
-                    tr = frame[j, r]
-                    nr = nx if r == 0 else (ny if r == 1 else 0.0)
-                    spin = -1.0 if (r == 0 and c == 1) else (1.0 if (r == 1 and c == 0) else 0.0)
-                    exact = -(spin - nr * tc)  # −[z]× (1 − t tᵀ), with [z]× t = n
-                    add_to_edge(j, r, c, force * (exact - tr * nc - nr * tc), a)
-
-
-@kernel
-def add_to_edge(
-    j: int,
-    r: int,
-    c: int,
-    value: float,
-    a: Array,
-) -> None:
-    """Add ∂(force by edge j)_r/∂(edge j)_c to the general band a of the nodes."""
-    row, column = 4 * j + r, 4 * j + c
-    a[row, 10 + column - row] += value
-    a[row + 4, 10 + column - row] += value
-    a[row, 14 + column - row] -= value
-    a[row + 4, 6 + column - row] -= value
-
-
-@kernel
-def to_nodes(
-    own: Array,
-    link: Array,
-    g: Array,
-    s: Array,
-) -> None:
-    """Bring gradient and Hessian by edges, w_j = (x_{j+1} − x_j, φ_j), to the nodes: g (4n-1,), s."""
-    edges = own.shape[0]
-    for r in range(3):
-        g[r] = 0.0
-    for j in range(edges):
-        k = 4 * j
-        for r in range(3):
-            g[k + r] -= own[j, r, 4]
-            g[k + 4 + r] = own[j, r, 4]
-        g[k + 3] = own[j, 3, 4]
-        before = j > 0
-        after = j < edges - 1
-        for a in range(3):
-            for b in range(a, 3):
-                value = own[j, b, a]
-                if before:
-                    value += own[j - 1, b, a] - link[j, a, b] - link[j, b, a]
-                s[k + a, b - a] = value
-            value = -own[j, 3, a]
-            if before:
-                value += link[j, 3, a]
-            s[k + a, 3 - a] = value
-            for b in range(3):
-                value = -(own[j, b, a] if b >= a else own[j, a, b])
-                if before:
-                    value += link[j, b, a]
-                if after:
-                    value += link[j + 1, b, a]
-                s[k + a, 4 + b - a] = value
-            s[k + a, 7 - a] = -link[j + 1, 3, a] if after else 0.0
-            for b in range(3):
-                s[k + a, 8 + b - a] = -link[j + 1, b, a] if after else 0.0
-            for b in range(11 - a, 11):
-                s[k + a, b] = 0.0
-        s[k + 3, 0] = own[j, 3, 3]
-        for b in range(3):
-            s[k + 3, 1 + b] = own[j, 3, b] - (link[j + 1, b, 3] if after else 0.0)
-            s[k + 3, 5 + b] = link[j + 1, b, 3] if after else 0.0
-            s[k + 3, 8 + b] = 0.0
-        s[k + 3, 4] = link[j + 1, 3, 3] if after else 0.0
-    k = 4 * edges
-    for a in range(3):
-        for b in range(11):
-            s[k + a, b] = 0.0
-        for b in range(a, 3):
-            s[k + a, b - a] = own[edges - 1, b, a]
 
 
 @kernel

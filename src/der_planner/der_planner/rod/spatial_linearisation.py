@@ -1,10 +1,12 @@
 """The exact linearisation of one backward Euler stage of a rod in space.
 
-The unknowns are a chart: reference directors are transported from the base configuration, and φ is counted
-from them. Away from the base the transport itself depends on the tangents (holonomy): a change δt turns
-the director about t by g·δt, g = t×t̂ / (1 + t̂·t), beyond what transport from the present tangent would
-do, and a change δt̂ of the base turns it by g·δt̂. The force formula is not a gradient in this chart, so
-its derivative is not symmetric: each edge adds half its twisting torque times [t]×/|e|².
+The unknowns are a chart: reference directors are transported from the base configuration, and φ is
+counted
+from them. Away from the base the transport itself depends on the tangents (holonomy): a change δt
+turns the director about t by g·δt, g = t×t̂ / (1 + t̂·t), beyond what transport from the present
+tangent would do, and a change δt̂ of the base turns it by g·δt̂. The force formula is not a
+gradient in this chart, so its derivative is not symmetric: each edge adds half its twisting torque
+times [t]×/|e|².
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.rod import spatial_kernel
+from der_planner.rod import spatial_assembly_kernel, spatial_kernel
 from der_planner.rod.planar import band_to_dense
 from der_planner.rod.state import Array, Arrays
 
@@ -41,7 +43,8 @@ def holonomy(start: Array, end: Array) -> tuple[Array, Array]:
     """Return g, ĝ (E, 3): turning of P(start→end) d about `end` by changes of `end` and of `start`.
 
     Args:
-        start: (E, 3) edges, not normalised; end: likewise. g and ĝ are by edge vectors.
+        start: (E, 3) edges, not normalised.
+        end: (E, 3) likewise; g and ĝ are by edge vectors.
     """
     long, short = np.linalg.norm(end, axis=1), np.linalg.norm(start, axis=1)
     t, b = end / long[:, None], start / short[:, None]
@@ -82,7 +85,9 @@ def residual_derivatives(stage: Stage, rod: Arrays, space: Arrays) -> tuple[Arra
     """Return ∂R/∂x, ∂R/∂x_n without inertia and drag (4n-1, 4n-1), and B(q)Λ (4n-1, M).
 
     Args:
-        stage: where. rod: the kernels' rod arrays. space: the backend's work arrays.
+        stage: where.
+        rod: the kernels' rod arrays.
+        space: the backend's work arrays.
     """
     twists, _, s, frame, own, link, local, vectors, _ = space
     size = len(stage.x)
@@ -90,9 +95,9 @@ def residual_derivatives(stage: Stage, rod: Arrays, space: Arrays) -> tuple[Arra
     spatial_kernel.reference_twists(frame, stage.twists_n, twists)
     v = (stage.x - stage.x_n) * stage.rate
     gradient = np.zeros(size)
-    spatial_kernel.assemble(
-        stage.x, v, 0.0, 0.0 * stage.u, False, gradient, s, frame, twists, own, link, local, vectors,
-        rod,
+    spatial_assembly_kernel.assemble(
+        stage.x, v, 0.0, 0.0 * stage.u, False, gradient, s, frame, twists, own, link, local,
+        vectors, rod,
     )  # fmt: skip
     elastic = band_to_dense(s)
     for j in range(len(frame)):
@@ -130,8 +135,13 @@ def propagate(
     """Carry changes (δq, δv), each (4n-1, C) with M input columns last, through a stage.
 
     Args:
-        stage: the solved stage. derivatives: of `residual_derivatives`. mass, damping: (4n-1,) diagonals.
-        free: indices that move. extrapolate: e of the stage. change: at the base, in its chart.
+        stage: the solved stage.
+        derivatives: of `residual_derivatives`.
+        mass: (4n-1,) diagonal.
+        damping: (4n-1,) diagonal.
+        free: indices that move.
+        extrapolate: e of the stage.
+        change: at the base, in its chart.
 
     Returns:
         The changes at the extrapolated state, in the chart of its own frames.

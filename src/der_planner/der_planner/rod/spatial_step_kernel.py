@@ -1,8 +1,10 @@
 """Compiled time steps of a rod in space; see `spatial_kernel` for the symbols and the rod's arrays.
 
-Every kernel takes, after its own arguments: base, the reference frames at x_n as tangents, directors (n-1, 3)
-and twists (n,); space, the work arrays (n,), (6, 4n-1), (4n-1, 11), (n-1, 13), (n-1, 4, 5), (n, 4, 4),
-(12, 8), (10, 3), (4n-1, 21); body, the tuple of mass, damping, load (4n-1,) and of the fixed indices; rod.
+Every kernel takes, after its own arguments: base, the reference frames at x_n as tangents,
+directors (n-1, 3)
+and twists (n,); space, the work arrays (n,), (6, 4n-1), (4n-1, 11), (n-1, 13), (n-1, 4, 5), (n, 4,
+4), (12, 8), (10, 3), (4n-1, 21); body, the tuple of mass, damping, load (4n-1,) and of the fixed
+indices; rod.
 """
 
 from __future__ import annotations
@@ -20,7 +22,8 @@ from der_planner.rod.band_kernel import (
     solve_one,
 )
 from der_planner.rod.compile import kernel
-from der_planner.rod.spatial_kernel import D1, T, assemble, frames, reference_twists, unsymmetric
+from der_planner.rod.spatial_assembly_kernel import assemble, unsymmetric
+from der_planner.rod.spatial_kernel import D1, T, frames, reference_twists
 from der_planner.rod.state import Array, Arrays
 
 
@@ -61,9 +64,9 @@ def newton(
 ) -> tuple[int, float]:  # fmt: skip
     """Solve M·rate·((x − x_n)·rate − v_n) + D·rate·(x − x_n) = F(x) for x, from the guess in x.
 
-    rate = 0 is statics, where the reference frames follow each iterate. Returns (iterations, size of the
-    last update); iterations is negative without convergence. The update is a length: an angle counts
-    times lever [m].
+    rate = 0 is statics, where the reference frames follow each iterate. Returns (iterations, size
+    of the last update); iterations is negative without convergence. The update is a length: an
+    angle counts times lever [m].
     """
     twists, work, s, frame, own, link, local, vectors, a = space
     mass, damping, load, fixed = body
@@ -101,8 +104,8 @@ def newton(
         for k in range(size):
             x[k] -= scale * residual[k]
         if rate == 0.0:
-            # Far from their base the frames' holonomy, which the derivative leaves out, would slow the
-            # iteration down; at rest nothing depends on when the frames were carried along.
+            # Far from their base the frames' holonomy, which the derivative leaves out, would slow
+            # the iteration down; at rest nothing depends on when the frames were carried along.
             carry(x, base, space)
         if update < tolerance:
             return iteration + 1, update

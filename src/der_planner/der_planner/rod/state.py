@@ -17,13 +17,13 @@ Arrays = tuple[Any, ...]
 
 @dataclass(frozen=True)
 class RodState:
-    """Configuration and velocity of a rod of N nodes, with the frames that give its angles a meaning.
+    """Configuration and velocity of N nodes, with the frames that its angles count from.
 
     Attributes:
         q: (4N-1,) positions [m] and edge angles [rad]: x0, φ0, x1, φ1, …, x_{N-1}.
         v: (4N-1,) its rate [m/s, rad/s].
-        directors: (N-1, 3) first reference director of each edge, time-parallel transported from the
-            straight rod; φ is counted from it.
+        directors: (N-1, 3) first reference director of each edge, time-parallel transported from
+            the straight rod; φ is counted from it.
         reference_twist: (N,) twist of the reference frames at each node [rad] (node 0: against the
             ghost edge; the last entry is not used).
     """

@@ -1,4 +1,4 @@
-"""Resting states: even bending in closed form, and equilibria by Newton's method with load stepping."""
+"""Resting states: even bending in closed form, equilibria by Newton's method and load stepping."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class StaticSolver(Protocol):
 def find_equilibrium(solver: StaticSolver, start: RodState, u: Array, load: Array) -> RodState:
     """Return the resting state under u (M,) [Pa] and load (4N-1,) [N], going there from `start`.
 
-    Newton's method is tried on the whole load first. If it fails, the load is raised from zero in parts
-    that shrink where it fails and grow where it works.
+    Newton's method is tried on the whole load first. If it fails, the load is raised from zero in
+    parts that shrink where it fails and grow where it works.
 
     Raises:
         ConvergenceError: the parts became too small.
@@ -58,8 +58,8 @@ def find_equilibrium(solver: StaticSolver, start: RodState, u: Array, load: Arra
         part *= 0.5
         if part < _SMALLEST_PART:
             raise ConvergenceError(
-                f"no equilibrium beyond {reached:.4f} of the load (load step {index}, {spent} Newton "
-                f"iterations, last update {update:.3g}): is the rod about to buckle or coil? "
+                f"no equilibrium beyond {reached:.4f} of the load (load step {index}, {spent} "
+                f"Newton iterations, last update {update:.3g}): is it about to buckle or coil? "
                 "Start from a nearer state or simulate with damping",
                 step=index, residual=update, iterations=spent, state=state,
             )  # fmt: skip
@@ -69,8 +69,9 @@ def find_equilibrium(solver: StaticSolver, start: RodState, u: Array, load: Arra
 def even_bend(angles: Array, mesh: Mesh) -> tuple[Array, Array]:
     """Return q (4N-1,) and S = ∂q/∂angles (4N-1, M) of segments that bend evenly in the xy plane.
 
-    Each of a segment's inner nodes turns by the same angle, everything else is straight and unstretched:
-    where the rod rests under constant pressures without loads (Corollary 1 of the paper).
+    Each of a segment's inner nodes turns by the same angle, everything else is straight and
+    unstretched: where the rod rests under constant pressures without loads (Corollary 1 of the
+    paper).
     """
     nodes = mesh.nodes
     share = np.zeros((nodes, len(angles)))

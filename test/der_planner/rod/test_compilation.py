@@ -1,0 +1,47 @@
+"""Kernels come from the cache of an earlier process, and never from sources that have changed."""
+
+import subprocess
+import sys
+
+from der_planner.limb import Limb
+from der_planner.rod import Rod, compile
+
+COUNT = """
+from der_planner.limb import Limb
+from der_planner.rod import Rod, planar_step_kernel, spatial_step_kernel
+for plane in ("xy", None):
+    Rod.from_limb(Limb.default(), plane=plane).warm_up()
+kernels = (planar_step_kernel.simulate, planar_step_kernel.newton, spatial_step_kernel.simulate)
+print(sum(sum(kernel.stats.cache_misses.values()) for kernel in kernels))
+print(sum(sum(kernel.stats.cache_hits.values()) for kernel in kernels))
+"""
+
+
+def test_a_second_process_compiles_nothing():
+    for plane in ("xy", None):
+        Rod.from_limb(Limb.default(), plane=plane).warm_up()
+    result = subprocess.run(
+        [sys.executable, "-c", COUNT], capture_output=True, text=True, check=True
+    )
+    misses, hits = map(int, result.stdout.split())
+    assert misses == 0
+    assert hits >= 3
+
+
+def test_changed_sources_drop_the_cache(tmp_path, monkeypatch):
+    source = tmp_path / "some_kernel.py"
+    cache = tmp_path / "__pycache__"
+    cache.mkdir()
+    index = cache / "some_kernel.function-3.py311.nbi"
+    other = cache / "another.function-3.py311.nbi"
+    monkeypatch.setattr(compile, "_FOLDER", tmp_path)
+    source.write_text("one")
+    compile.drop_stale_caches()
+    index.touch()
+    other.touch()
+    compile.drop_stale_caches()
+    assert index.exists()
+    source.write_text("two")
+    compile.drop_stale_caches()
+    assert not index.exists()
+    assert other.exists()
