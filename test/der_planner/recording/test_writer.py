@@ -108,6 +108,28 @@ def test_split_repeats_latched_messages(tmp_path: Path, how: str):
     ]
 
 
+def test_small_messages_do_not_share_chunks_with_large_ones(tmp_path: Path):
+    bag = BagWriter(tmp_path / "run", compression="none")
+    for name in ("/talk", "/image"):
+        bag.add_topic(spec(name, TEXT))
+    for index in range(60):
+        when = START + index * SECOND // 30
+        bag.write("/talk", when, when, string(f"word {index}"))
+        bag.write("/image", when + 5, when, string("x" * 200_000))
+        if index % 30 == 29:
+            bag.flush()
+    bag.close()
+    with (tmp_path / "run" / "run_0.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    topics = {number: channel.topic for number, channel in summary.channels.items()}
+    held = [{topics[n] for n in index.message_index_offsets} for index in summary.chunk_indexes]
+    assert held.count({"/image"}) == 60
+    assert held.count({"/talk"}) == 2
+    assert len(held) == 62
+    everything = [text[:4] for text in read_texts(tmp_path / "run")]
+    assert everything == ["word", "xxxx"] * 60  # still in the order of time
+
+
 def test_a_folder_with_content_is_refused(tmp_path: Path):
     (tmp_path / "mine.txt").write_text("precious")
     with pytest.raises(BagWriteError, match="not empty"):

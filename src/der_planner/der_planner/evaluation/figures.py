@@ -203,5 +203,9 @@ def _draw_pressures(row: Sequence[Axes], run: RunSeries, label: str, look: str) 
         )
         if len(measured):
             axis.plot(
-                measured.time, measured.value[:, segment], color=look, label=f"{label}, measured"
+                measured.time,
+                measured.value[:, segment],
+                color=look,
+                ls=style.DASHES.get(run.description.model, "-."),
+                label=f"{label}, measured",
             )

@@ -32,6 +32,9 @@ COMPRESSIONS = {
     "zstd": CompressionType.ZSTD,
 }
 CHUNK_SIZE = 1 << 20
+LARGE = 1 << 17
+"""Messages of so many bytes get a chunk of their own, so that whoever reads only the small ones
+does not have to read the images between them."""
 PROFILE = "ros2"
 LIBRARY = "der_planner recorder"
 
@@ -117,6 +120,9 @@ class BagWriter:
         self._files: list[FileSummary] = []
         self._sink: _Sink | None = None
         self._safe_end = 0
+        self._small: list[tuple[TopicSpec, int, int, bytes]] = []
+        self._small_bytes = 0
+        self._sequences: dict[str, int] = {}
         self.bytes_finished = 0
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -186,7 +192,7 @@ class BagWriter:
         if self._sink is None:
             return
         with self._guarded():
-            self._writer.flush()
+            self._emit_small()
             self._safe_end = self._sink.tell()
         if not self._sink.is_still_there():
             self._save_vanished()
@@ -238,17 +244,37 @@ class BagWriter:
         self._safe_end = self._sink.tell()
 
     def _append(self, spec: TopicSpec, log_time: int, publish_time: int, data: bytes) -> None:
+        self._files[-1].add(log_time)
+        self._counts[spec.name] += 1
+        if len(data) >= LARGE:
+            self._emit(spec, log_time, publish_time, data)
+            self._writer.flush()
+            return
+        self._small.append((spec, log_time, publish_time, data))
+        self._small_bytes += len(data)
+        if self._small_bytes >= self._chunk_size:
+            self._emit_small()
+
+    def _emit_small(self) -> None:
+        """Write the small messages that wait, as one chunk."""
+        for message in self._small:
+            self._emit(*message)
+        self._small.clear()
+        self._small_bytes = 0
+        self._writer.flush()
+
+    def _emit(self, spec: TopicSpec, log_time: int, publish_time: int, data: bytes) -> None:
         if spec.name not in self._channels:
             self._register(spec)
+        sequence = self._sequences.get(spec.name, 0)
+        self._sequences[spec.name] = sequence + 1
         self._writer.add_message(
             channel_id=self._channels[spec.name],
             log_time=log_time,
             publish_time=publish_time,
-            sequence=self._counts[spec.name] & 0xFFFFFFFF,
+            sequence=sequence & 0xFFFFFFFF,
             data=data,
         )
-        self._counts[spec.name] += 1
-        self._files[-1].add(log_time)
 
     def _register(self, spec: TopicSpec) -> None:
         if spec.type_name not in self._schemas:
@@ -267,6 +293,7 @@ class BagWriter:
 
     def _finish_file(self) -> None:
         assert self._sink is not None
+        self._emit_small()
         self._writer.finish()
         self.bytes_finished += self._sink.tell()
         self._sink.file.close()
@@ -332,6 +359,7 @@ class BagWriter:
         sink, self._sink = self._sink, None
         assert sink is not None
         with contextlib.suppress(OSError):
+            self._emit_small()
             self._writer.finish()
         try:
             sink.save_again()
