@@ -48,7 +48,7 @@ def test_set_up_errors_stay_within_the_systematic_part(straight_tags, model, swi
     uncertainty = Uncertainty(survey=5e-4, height=0.0, mounting=4e-4, mounting_angle=5e-3)
     options = TrackerOptions(uncertainty=uncertainty, reject_beyond=0.01)
     normalised = []
-    for seed in range(12):
+    for seed in range(8):
         errors = Errors(survey=5e-4, mounting=4e-4, mounting_angle=5e-3)
         camera = SyntheticCamera(model, straight_tags, Optics(), errors, seed=seed)
         tracker = LimbTracker(straight_tags, model.intrinsics, options)

@@ -67,6 +67,23 @@ def open_source(name: str, rate: float, clock: Callable[[], int] = time.time_ns)
     )
 
 
+class _Pace:
+    """Says when the next picture is due; one that comes late does not hurry the others."""
+
+    def __init__(self, period: int) -> None:
+        self._period = period
+        self._due: int | None = None
+
+    def is_due(self, now: int) -> bool:
+        """Tell whether a picture is due, and if so, plan the next."""
+        if self._due is not None and now < self._due:
+            return False
+        late = self._due is not None and now - self._due < self._period
+        start = self._due if late and self._due is not None else now
+        self._due = start + self._period
+        return True
+
+
 class FolderSource:
     """Plays the pictures of a folder in the order of their names."""
 
@@ -75,9 +92,8 @@ class FolderSource:
         if not self._files:
             raise SourceError(f"no picture ({', '.join(sorted(PICTURES))}) in {folder}")
         self._folder = folder
-        self._period = round(1e9 / rate)
+        self._pace = _Pace(round(1e9 / rate))
         self._clock = clock
-        self._due = 0
         self._next = 0
 
     def read(self) -> Grabbed | None:
@@ -85,9 +101,8 @@ class FolderSource:
         if self._next >= len(self._files):
             raise SourceError(f"the {len(self._files)} pictures of {self._folder} have been played")
         now = self._clock()
-        if now < self._due:
+        if not self._pace.is_due(now):
             return None
-        self._due = max(self._due + self._period, now - self._period)
         path = self._files[self._next]
         self._next += 1
         image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
@@ -108,16 +123,14 @@ class VideoSource:
             raise SourceError(f"{path} is no video that OpenCV reads")
         self._path = path
         rate = float(self._video.get(cv2.CAP_PROP_FPS))
-        self._period = round(1e9 / (rate if 0.1 < rate < 1000.0 else 30.0))
+        self._pace = _Pace(round(1e9 / (rate if 0.1 < rate < 1000.0 else 30.0)))
         self._clock = clock
-        self._due = 0
 
     def read(self) -> Grabbed | None:
         """Return the next frame once it is due."""
         now = self._clock()
-        if now < self._due:
+        if not self._pace.is_due(now):
             return None
-        self._due = max(self._due + self._period, now - self._period)
         found, image = self._video.read()
         if not found:
             raise SourceError(f"the video {self._path} has been played")

@@ -1,0 +1,165 @@
+from __future__ import annotations
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from apriltag_tracker.calibration import (
+    BoardFinder,
+    BoardView,
+    CalibrationError,
+    calibrate_camera,
+    calibrate_mounting,
+    with_offsets,
+)
+from apriltag_tracker.camera import Intrinsics
+from apriltag_tracker.sheets import BoardLayout
+from apriltag_tracker.synthetic.camera import SyntheticCamera
+from apriltag_tracker.synthetic.shapes import constant_curvature
+from apriltag_tracker.tag_map import TagMap
+
+LAYOUT = BoardLayout()
+TRUE = Intrinsics.create(
+    640,
+    480,
+    [620.0, 0.0, 322.7, 0.0, 618.0, 236.4, 0.0, 0.0, 1.0],
+    [-0.12, 0.07, 0.0008, -0.0005, 0.0],
+)
+
+
+def poses(count, random, tilt=0.5):
+    for k in range(count):
+        rotation = cv2.Rodrigues(
+            np.array([*random.uniform(-tilt, tilt, 2), random.uniform(-0.3, 0.3)])
+        )[0]
+        middle = np.array([0.1125, 0.075, 0.0])
+        place = np.array([((k % 4) - 1.5) * 0.055, ((k // 4 % 3) - 1.0) * 0.05, 0.33])
+        yield rotation, place - rotation @ middle
+
+
+def corner_views(count, noise, tilt=0.5, seed=0):
+    """Views as a perfect corner finder would give them, with noise."""
+    random = np.random.default_rng(seed)
+    points = np.asarray(LAYOUT.board().getChessboardCorners(), dtype=float)
+    views = []
+    for k, (rotation, translation) in enumerate(poses(count, random, tilt)):
+        inside = points @ rotation.T + translation
+        pixels = TRUE.pixels(inside[:, :2] / inside[:, 2:])
+        seen = ((pixels > 5) & (pixels < (634, 474))).all(axis=1)
+        pixels = pixels + random.normal(0.0, noise, pixels.shape)
+        views.append(BoardView(f"view {k}", pixels[seen], points[seen]))
+    return views
+
+
+def board_pictures(count):
+    """Pictures of the printed board: first without a lens, large and sharp, then through it."""
+    random = np.random.default_rng(1)
+    fine, dots, margin = 2, 4000.0, 60
+    texture = LAYOUT.board().generateImage((900, 600), marginSize=0, borderBits=1)
+    texture = cv2.copyMakeBorder(
+        np.asarray(texture), margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=255
+    )
+    to_board = np.array(
+        [[1 / dots, 0, (0.5 - margin) / dots], [0, 1 / dots, (0.5 - margin) / dots], [0, 0, 1]]
+    )
+    focal, wide, high = 620.0 * fine, 900 * fine, 700 * fine
+    pinhole = np.array([[focal, 0, wide / 2], [0, focal, high / 2], [0, 0, 1]])
+    x, y = np.meshgrid(np.arange(640 * fine), np.arange(480 * fine))
+    rays = TRUE.rays((np.stack([x, y], axis=-1).reshape(-1, 2) + 0.5) / fine - 0.5)
+    where = (rays * focal + (wide / 2, high / 2)).astype(np.float32)
+    where = where.reshape(480 * fine, 640 * fine, 2)
+    for rotation, translation in poses(count, random):
+        plane = np.column_stack([rotation[:, :2], translation])
+        straight = cv2.warpPerspective(
+            texture, pinhole @ plane @ to_board, (wide, high), borderValue=128
+        )
+        large = cv2.remap(straight, where, None, cv2.INTER_LINEAR)
+        yield cv2.resize(large, (640, 480), interpolation=cv2.INTER_AREA)
+
+
+def test_the_lens_is_recovered_from_pictures():
+    finder = BoardFinder(LAYOUT)
+    found = [finder.find(image, f"{k}") for k, image in enumerate(board_pictures(12))]
+    result = calibrate_camera([view for view in found if view], 640, 480)
+    assert len(result.per_view) >= 9
+    assert result.rms < 0.15
+    got, true = result.intrinsics.matrix, TRUE.matrix
+    assert np.abs(got - true).max() < 3.0
+    # What counts: rays over the whole picture.
+    grid = np.stack(np.meshgrid(np.linspace(40, 600, 9), np.linspace(40, 440, 7)), -1).reshape(
+        -1, 2
+    )
+    assert np.abs(result.intrinsics.rays(grid) - TRUE.rays(grid)).max() < 4e-3
+
+
+def test_errors_are_as_large_as_their_sigmas_say():
+    result = calibrate_camera(corner_views(24, 0.1), 640, 480)
+    matrix = result.intrinsics.matrix
+    values = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
+    true = np.array([620.0, 618.0, 322.7, 236.4])
+    assert np.all(np.abs(values - true) < 4.0 * np.array(result.sigma))
+    assert result.rms == pytest.approx(0.1 * np.sqrt(2.0), rel=0.1)
+    assert result.left_out == {}
+
+
+def test_a_spoilt_picture_is_left_out_by_name():
+    views = corner_views(20, 0.1)
+    random = np.random.default_rng(5)
+    spoilt = views[7].pixels + random.normal(0.0, 4.0, views[7].pixels.shape)
+    views[7] = dataclasses.replace(views[7], pixels=spoilt)
+    result = calibrate_camera(views, 640, 480, unseen=["dark.png"])
+    assert set(result.left_out) == {"view 7", "dark.png"}
+    assert result.rms < 0.2
+
+
+def test_too_few_pictures_are_refused_with_advice():
+    with pytest.raises(CalibrationError, match="tilted by 20 to 40"):
+        calibrate_camera(corner_views(5, 0.1), 640, 480)
+
+
+def test_pictures_from_one_direction_are_refused():
+    with pytest.raises(CalibrationError, match="same direction"):
+        calibrate_camera(corner_views(12, 0.1, tilt=0.01), 640, 480)
+
+
+def test_a_corner_of_the_picture_without_corners_is_remarked():
+    views = corner_views(24, 0.1)
+    left = [
+        dataclasses.replace(
+            view,
+            pixels=view.pixels[view.pixels[:, 0] < 300],
+            points=view.points[view.pixels[:, 0] < 300],
+        )
+        for view in views
+    ]
+    result = calibrate_camera([view for view in left if len(view.pixels) >= 12], 640, 480)
+    assert result.covered < 0.7
+    assert any("guess" in remark for remark in result.remarks)
+
+
+def test_mounting_is_measured_on_the_straight_limb(config, tags, model):
+    wrong = tuple(
+        dataclasses.replace(tag, offset=(4e-4 * k, -3e-4 * k, 0.01 * k))
+        for k, tag in enumerate(tags.limb)
+    )
+    camera = SyntheticCamera(model, dataclasses.replace(tags, limb=wrong), seed=4)
+    straight = constant_curvature(tags.segment_lengths, [0.0, 0.0])
+    images = [camera.frame(straight).image for _ in range(6)]
+    result = calibrate_mounting(images, tags, model.intrinsics)
+    for tag in wrong:
+        assert result.offsets[tag.id] == pytest.approx(tag.offset, abs=1e-3)
+        assert result.offsets[tag.id][:2] == pytest.approx(tag.offset[:2], abs=3e-5)
+    text = with_offsets((config / "tags.yaml").read_text(), tags.limb, result)
+    again = TagMap.from_dict(yaml.safe_load(text))
+    assert "# Where every AprilTag" in text
+    for tag in wrong:
+        assert again.limb_tag(tag.id).offset == pytest.approx(tag.offset, abs=1e-3)
+
+
+def test_mounting_without_fixed_tags_names_the_cause(tags, model):
+    blank = [np.zeros((720, 1280), np.uint8)]
+    with pytest.raises(CalibrationError, match="no fixed tag"):
+        calibrate_mounting(blank, tags, model.intrinsics)

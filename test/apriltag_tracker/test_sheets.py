@@ -1,0 +1,101 @@
+from __future__ import annotations
+
+import re
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+
+from apriltag_tracker.calibration import BoardFinder
+from apriltag_tracker.sheets import (
+    BoardLayout,
+    SheetError,
+    _black_rectangles,
+    board_page,
+    rasterise,
+    tag_pages,
+    write_pdf,
+    write_svg,
+)
+from apriltag_tracker.tag_map import LimbTag, TagMap
+
+
+def test_rectangles_cover_exactly_the_black_cells():
+    black = np.random.default_rng(0).random((20, 30)) < 0.4
+    drawn = np.zeros_like(black, dtype=int)
+    for x, y, w, h in _black_rectangles(black):
+        drawn[y : y + h, x : x + w] += 1
+    assert np.array_equal(drawn, black.astype(int))
+
+
+def test_printed_tags_have_their_size_and_direction(tags, detector):
+    dots = 4.0
+    found = {}
+    for page in tag_pages(tags):
+        for tag in detector.detect(rasterise(page, dots)):
+            found[tag.id] = tag
+    assert found.keys() == set(tags.ids)
+    for entry in (*tags.limb, *tags.world):
+        corners = found[entry.id].corners
+        assert found[entry.id].pixel_size / dots == pytest.approx(1e3 * entry.size, abs=0.3)
+        right, up = corners[1] - corners[0], corners[3] - corners[0]
+        assert right[0] > 0.9 * np.hypot(*right)
+        assert up[1] < -0.9 * np.hypot(*up)
+
+
+def test_the_board_is_seen_with_its_squares_at_the_right_distance():
+    layout, dots = BoardLayout(), 4.0
+    view = BoardFinder(layout).find(rasterise(board_page(layout), dots), "sheet")
+    assert len(view.pixels) == (layout.columns - 1) * (layout.rows - 1)
+    apart = view.pixels[:, None] - view.pixels[None]
+    true = view.points[:, None, :2] - view.points[None, :, :2]
+    assert np.abs(apart / dots / 1e3 - true).max() < 2e-4
+
+
+def test_svg_and_pdf_are_drawn_in_millimetres(tmp_path, tags):
+    pages = tag_pages(tags)
+    write_svg(pages[0], tmp_path / "tags.svg")
+    text = (tmp_path / "tags.svg").read_text()
+    assert 'width="210.0mm"' in text
+    assert text.count("<rect") >= len(pages[0].rectangles)
+
+    write_pdf(pages, tmp_path / "tags.pdf")
+    data = (tmp_path / "tags.pdf").read_bytes()
+    boxes = re.findall(rb"/MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", data)
+    assert len(boxes) == len(pages)
+    assert float(boxes[0][0]) / 72.0 * 25.4 == pytest.approx(210.0, abs=1e-3)
+    stream = data[data.index(b"stream\n") + 7 : data.index(b"\nendstream")]
+    drawing = zlib.decompress(stream).decode()
+    assert drawing.count(" re") == len(pages[0].rectangles) + len(pages[0].cuts)
+    # Every object is where the table of the file says.
+    start = int(data.rsplit(b"startxref\n", 1)[1].split(b"\n")[0])
+    places = [int(line.split()[0]) for line in data[start:].split(b"\n")[3:] if b" n" in line]
+    assert all(data[p:].startswith(b"%d 0 obj" % k) for k, p in enumerate(places, 1))
+
+
+def test_what_does_not_fit_is_refused():
+    large = TagMap((0.1,), (LimbTag(0, 0.0, 0.0, 0.3),), ())
+    with pytest.raises(SheetError, match="does not fit"):
+        tag_pages(large)
+    with pytest.raises(SheetError, match="does not fit"):
+        board_page(BoardLayout(columns=20))
+    with pytest.raises(SheetError, match="half millimetres"):
+        board_page(BoardLayout(square=0.0251))
+
+
+def test_many_tags_take_several_pages():
+    tags = TagMap((1.0,), tuple(LimbTag(k, 0.0, 0.0, 0.04) for k in range(40)), ())
+    pages = tag_pages(tags, "letter")
+    assert len(pages) > 1
+    assert sum(len(page.cuts) for page in pages) == 40
+    for page in pages:
+        for x, y, w, h in page.cuts:
+            assert 0.0 < x < x + w < page.width
+            assert 0.0 < y < y + h < page.height - 16.0
+
+
+def test_pictures_without_a_board_give_nothing():
+    assert BoardFinder(BoardLayout()).find(np.full((480, 640), 200, np.uint8), "blank") is None
+    image = cv2.resize(rasterise(board_page(BoardLayout()), 4.0)[:300], (640, 480))
+    assert BoardFinder(BoardLayout(square=0.01, marker=0.006)).find(image[:40], "cut") is None

@@ -1,0 +1,206 @@
+from __future__ import annotations
+
+import threading
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from apriltag_tracker.encodings import ImageError, to_grey
+from apriltag_tracker.sources import (
+    DeviceSource,
+    SourceError,
+    VideoSource,
+    open_source,
+)
+
+
+class Clock:
+    def __init__(self):
+        self.now = 1_000_000_000
+
+    def __call__(self):
+        return self.now
+
+
+@pytest.fixture
+def picture():
+    return np.random.default_rng(0).integers(0, 256, (48, 64), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("encoding", ["mono8", "8UC1"])
+def test_mono_is_passed_on_and_padding_dropped(picture, encoding):
+    padded = np.pad(picture, ((0, 0), (0, 16)))
+    assert np.array_equal(to_grey(padded.tobytes(), 48, 64, 80, encoding), picture)
+
+
+def test_sixteen_bits_keep_their_upper_byte(picture):
+    wide = picture.astype(np.uint16) << 8 | 0x55
+    little = to_grey(wide.astype("<u2").tobytes(), 48, 64, 128, "mono16")
+    big = to_grey(wide.astype(">u2").tobytes(), 48, 64, 128, "mono16", big_endian=True)
+    assert np.array_equal(little, picture)
+    assert np.array_equal(big, picture)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "order"),
+    [("bgr8", [0, 1, 2]), ("rgb8", [2, 1, 0]), ("bgra8", [0, 1, 2, 0]), ("rgba8", [2, 1, 0, 0])],
+)
+def test_colours_become_the_same_grey(encoding, order):
+    colours = np.random.default_rng(1).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    data = np.ascontiguousarray(colours[:, :, order])
+    grey = to_grey(data.tobytes(), 48, 64, 64 * len(order), encoding)
+    assert np.array_equal(grey, cv2.cvtColor(colours, cv2.COLOR_BGR2GRAY))
+
+
+def test_yuv_keeps_its_brightness(picture):
+    pairs = np.stack([picture, np.full_like(picture, 128)], axis=-1)
+    assert np.array_equal(to_grey(pairs.tobytes(), 48, 64, 128, "yuv422_yuy2"), picture)
+    assert np.array_equal(to_grey(pairs[..., ::-1].tobytes(), 48, 64, 128, "uyvy"), picture)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((b"x" * 3072, 48, 64, 64, "bayer_rggb8"), "unknown encoding 'bayer_rggb8'"),
+        ((b"x" * 100, 48, 64, 64, "mono8"), "100 bytes"),
+        ((b"x" * 3072, 48, 64, 60, "mono8"), "60 bytes a row"),
+        ((b"", 0, 0, 0, "mono8"), "0 x 0"),
+    ],
+)
+def test_broken_messages_are_refused(arguments, message):
+    with pytest.raises(ImageError, match=message):
+        to_grey(*arguments)
+
+
+def test_a_folder_is_played_in_order_at_its_rate(tmp_path, picture):
+    for k in (2, 0, 1):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), picture // (k + 1))
+    (tmp_path / "notes.txt").write_text("no picture")
+    clock = Clock()
+    source = open_source(str(tmp_path), 10.0, clock)
+    stamps = []
+    for k in range(3):
+        grabbed = source.read()
+        assert np.array_equal(grabbed.gray, picture // (k + 1))
+        stamps.append(grabbed.stamp)
+        if k < 2:
+            clock.now += 50_000_000
+            assert source.read() is None
+            clock.now += 50_000_000
+    assert np.diff(stamps).tolist() == [100_000_000] * 2
+    with pytest.raises(SourceError, match="have been played"):
+        source.read()
+
+
+def test_a_video_is_played_to_its_end(tmp_path, picture):
+    path = tmp_path / "run.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 20.0, (64, 48), False)
+    if not writer.isOpened():
+        pytest.skip("this OpenCV writes no video")
+    for _ in range(3):
+        writer.write(picture)
+    writer.release()
+    clock = Clock()
+    source = open_source(str(path), 30.0, clock)
+    assert isinstance(source, VideoSource)
+    for _ in range(3):
+        assert source.read().gray.shape == (48, 64)
+        clock.now += 50_000_000
+    with pytest.raises(SourceError, match="has been played"):
+        source.read()
+    source.close()
+
+
+@pytest.mark.parametrize("name", ["nowhere.avi", "/dev/video77", "folder"])
+def test_sources_that_are_not_there_are_named(tmp_path, name):
+    (tmp_path / "folder").mkdir()
+    path = name if name.startswith("/dev") else str(tmp_path / name)
+    with pytest.raises(SourceError, match=r"nowhere|video77|no picture"):
+        open_source(path, 30.0)
+
+
+class FakeCamera:
+    """A V4L2 camera that can be unplugged."""
+
+    def __init__(self):
+        self.plugged = threading.Event()
+        self.plugged.set()
+        self.image = np.full((48, 64, 3), 100, np.uint8)
+
+    def isOpened(self):
+        return self.plugged.is_set()
+
+    def set(self, *_):
+        return True
+
+    def read(self):
+        time.sleep(0.002)
+        return (True, self.image.copy()) if self.plugged.is_set() else (False, None)
+
+    def release(self):
+        pass
+
+
+def wait_until(condition, timeout=10.0):
+    end = time.monotonic() + timeout
+    while time.monotonic() < end:
+        if condition():
+            return True
+        time.sleep(0.005)
+    return False
+
+
+def test_an_unplugged_camera_is_named_and_comes_back(monkeypatch):
+    camera = FakeCamera()
+    monkeypatch.setattr(DeviceSource, "_RETRY", 0.01)
+    source = DeviceSource("/dev/video0", 30.0, time.time_ns, lambda _: camera)
+
+    def gone():
+        try:
+            source.read()
+        except SourceError as error:
+            return "unplugged" in str(error)
+        return False
+
+    def there():
+        try:
+            return source.read() is not None
+        except SourceError:
+            return False
+
+    try:
+        assert wait_until(there)
+        camera.plugged.clear()
+        assert wait_until(gone)
+        # A frame from before is never given again.
+        assert gone()
+        camera.plugged.set()
+        assert wait_until(there)
+    finally:
+        source.close()
+
+
+def test_a_frame_is_given_once():
+    camera = FakeCamera()
+    camera.read = lambda first=[True]: (
+        (True, camera.image)
+        if first and first.pop()
+        else (
+            time.sleep(0.01),
+            (False, None),
+        )[1]
+    )
+    source = DeviceSource("/dev/video0", 30.0, time.time_ns, lambda _: camera)
+    try:
+        seen = 0
+        end = time.monotonic() + 0.3
+        while time.monotonic() < end:
+            try:
+                seen += source.read() is not None
+            except SourceError:
+                break
+        assert seen <= 1
+    finally:
+        source.close()
