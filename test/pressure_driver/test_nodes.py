@@ -41,6 +41,7 @@ class Bench:
         self.client = graph.client
         self.link = f"/tmp/der_limb_board_test_{uuid.uuid4().hex[:8]}"
         self.states, self.air, self.commands = [], [], []
+        self.looked_at = 0
         self.client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES, self.states.append)
         self.client.subscribe(
             ChamberPressures, topics.TWIN_CHAMBER_PRESSURES, qos.STATES, self.air.append
@@ -76,7 +77,15 @@ class Bench:
         return self.states[-1].mode if self.states else -1
 
     def wait_mode(self, mode, limit=30.0):
-        self.wait(lambda: self.mode == mode, f"mode {mode}, now {self.mode}", limit)
+        """Wait for a mode, even if it has been left again before anybody looked."""
+
+        def seen():
+            later = self.states[self.looked_at :]
+            return any(state.mode == mode for state in later)
+
+        self.wait(seen, f"mode {mode}, now {self.mode}", limit)
+        while self.states[self.looked_at].mode != mode:
+            self.looked_at += 1
 
     def gauge(self):
         """True gauge pressures from the newest message of the air; the lowest chamber is vented."""
@@ -94,7 +103,7 @@ class Bench:
         self.rest = np.array(self.air[-1].pressure)
         self.wait(try_to_arm, "the driver to arm", 40.0)
 
-    def play(self, count, shape=lambda k: (min(600.0 * k, 3500.0), -min(300.0 * k, 2000.0))):
+    def play(self, count, shape):
         """Publish setpoints 0.2 s ahead in real time; return stamp -> differential pressures."""
         start = (time.time_ns() // PERIOD + 8) * PERIOD
         wanted = {}
@@ -111,9 +120,12 @@ class Bench:
         return wanted
 
     def pressurise(self):
+        """Arm and play until a chamber is full; a machine that stalls may need several turns."""
         self.arm()
-        self.play(12)
-        self.wait(lambda: self.gauge().max() > 2000.0, "pressure in a chamber")
+        deadline = time.monotonic() + 40.0
+        while self.gauge().max() < 2000.0:
+            assert time.monotonic() < deadline, "no pressure in any chamber"
+            self.play(8, lambda k: (min(900.0 * (k + 1), 3500.0), -min(500.0 * (k + 1), 2000.0)))
 
     def have(self, faults):
         """Tell the emulated board to have these faults and no others."""
