@@ -188,6 +188,9 @@ def test_optimal_uses_what_the_limits_leave_better_than_cutting():
     best = plan(LIMB, motion, "der", "optimal")
     assert best.predicted_error < 0.25 * cut.predicted_error
     assert best.details["limited_windows"] > 0
+    slow = Motion.named("same_direction", period=3.0, cycles=1)
+    warnings = plan(LIMB, slow, "der", "optimal").warnings
+    assert any("the limits leave a mean error of" in warning for warning in warnings)
 
 
 @pytest.mark.parametrize(("model_name", "method"), EVERY)

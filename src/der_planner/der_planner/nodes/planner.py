@@ -21,6 +21,7 @@ from der_msgs.msg import MotionCommand, PressurePlan, PressureSetpoint
 from der_planner.limb import Limb
 from der_planner.nodes.planner_markers import limb_marker, path_markers
 from der_planner.planning import METHODS, Motion, PathLimits, Plan, Start, choose_method, plan
+from der_planner.planning.inverse import BRANCHES
 from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD
 from der_planner.planning.streaming import GRID, Player, Schedule, first_stamp
 from limb_interfaces import qos, topics
@@ -93,6 +94,10 @@ class PlannerNode(Node):
                     at_least=0.05, at_most=2.0)  # fmt: skip
         self._lead = round(float(lead) * 1e9)  # type: ignore[arg-type]
         self._auto_start = bool(read("auto_start", True, "play a plan as soon as it is ready"))
+        self._branch = str(
+            read("branch", "", "side of the fold for paths and shapes; empty: the least pressure",
+                 choices=("", *BRANCHES))
+        )  # fmt: skip
         self._limits = PathLimits(
             float(read("path_speed", 0.03, "speed along a path without times [m/s]",
                        at_least=1e-3, at_most=1.0)),  # type: ignore[arg-type]
@@ -111,6 +116,7 @@ class PlannerNode(Node):
                 amplitude=message.amplitude or DEFAULT_AMPLITUDE,
                 period=message.period or DEFAULT_PERIOD,
                 cycles=message.cycles or DEFAULT_CYCLES,
+                branch=self._branch,
             )
             method = self._choose_method(model, message.method)
         except ValueError as error:
@@ -130,7 +136,9 @@ class PlannerNode(Node):
             tip = np.array([(p.pose.position.x, p.pose.position.y) for p in message.poses])
             stamps = [nanoseconds(pose.header.stamp) for pose in message.poses]
             time = (np.array(stamps) - stamps[0]) * 1e-9 if any(stamps) else None
-            motion = Motion.from_tip_path(time, tip.reshape(-1, 2), limits=self._limits)
+            motion = Motion.from_tip_path(
+                time, tip.reshape(-1, 2), branch=self._branch, limits=self._limits
+            )
             method = self._choose_method(self._model, "")
         except (ValueError, IndexError) as error:
             self._refuse(plan_id, str(error))

@@ -32,6 +32,8 @@ _STRAIGHT = 1e-3
 """A limb that rests within this bend [rad] of straight starts there."""
 _NOTABLE_CUT = 20.0
 """Cuts by limits are worth a warning from here on [Pa]."""
+_NOTABLE_ERROR = 5e-4
+"""What the limits leave is worth a warning from here on [m]."""
 
 
 def plan(
@@ -87,6 +89,13 @@ def plan(
         commands, cut = pneumatics.within_limits(wanted, limb.pneumatics, CONTROL_PERIOD, before)
         tip = predict(physics, spline, commands, start)
     bend = sample_spline(spline, reference.time)[0]
+    warnings = _warnings(physics.limb, wanted, bend, cut)
+    missed = float(np.linalg.norm(tip - reference.tip, axis=1).mean())
+    if details.get("limited_windows") and missed > _NOTABLE_ERROR:
+        warnings.append(
+            f"the limits leave a mean error of {missed * 1000:.1f} mm on the model itself: "
+            + _excess(physics.limb, wanted)
+        )
     report(1.0)
     return Plan(
         time=reference.time,
@@ -103,7 +112,7 @@ def plan(
         limb=physics.limb,
         kinematics=physics.kinematics,
         solve_time=clock.perf_counter() - begin,
-        warnings=tuple(_warnings(physics.limb, wanted, bend, cut)),
+        warnings=tuple(warnings),
         details=details,
     )
 
@@ -168,14 +177,9 @@ def effective_pressures(limb: Limb, spline: BSpline, chambers: Vector) -> Vector
 
 def _warnings(limb: Limb, wanted: Vector, bend: Vector, cut: float) -> list[str]:
     said = []
-    air = limb.pneumatics
     if cut > _NOTABLE_CUT:
-        largest = float(np.abs(wanted).max())
-        fastest = float(np.abs(np.diff(wanted, axis=0)).max(initial=0.0)) / CONTROL_PERIOD
         said.append(
-            f"limits cut the wanted pressures by up to {cut:.0f} Pa: the motion wants "
-            f"{largest:.0f} Pa and {fastest:.0f} Pa/s, allowed are {air.pressure_limit:.0f} Pa and "
-            f"{air.slew_limit:.0f} Pa/s; a longer period or a smaller amplitude keeps them"
+            f"limits cut the wanted pressures by up to {cut:.0f} Pa: " + _excess(limb, wanted)
         )
     seen = np.array(limb.calibrated.bend_angle)
     if seen.size == limb.segment_count and np.any(np.abs(bend).max(axis=0) > seen * 1.05):
@@ -185,3 +189,14 @@ def _warnings(limb: Limb, wanted: Vector, bend: Vector, cut: float) -> list[str]
             f"its calibration covered {np.degrees(seen[j]):.0f}"
         )
     return said
+
+
+def _excess(limb: Limb, wanted: Vector) -> str:
+    air = limb.pneumatics
+    largest = float(np.abs(wanted).max())
+    fastest = float(np.abs(np.diff(wanted, axis=0)).max(initial=0.0)) / CONTROL_PERIOD
+    return (
+        f"the motion wants {largest:.0f} Pa and {fastest:.0f} Pa/s, allowed are "
+        f"{air.pressure_limit:.0f} Pa and {air.slew_limit:.0f} Pa/s; a longer period or a smaller "
+        "amplitude keeps them"
+    )

@@ -1,0 +1,152 @@
+#!/usr/bin/env python3
+"""Draw the pictures of the planning page.
+
+python3 scripts/figures/planning.py
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+import workspace
+
+workspace.enter()
+
+import matplotlib  # noqa: E402
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt  # noqa: E402
+import numpy as np  # noqa: E402
+from matplotlib.axes import Axes  # noqa: E402
+
+from der_planner.limb import Limb  # noqa: E402
+from der_planner.planning import METHODS, Motion, Plan, plan  # noqa: E402
+from der_planner.planning.inverse import angle_limits, solutions  # noqa: E402
+from der_planner.planning.kinematics import ArcKinematics  # noqa: E402
+
+DPI = 68
+FOLDER = workspace.ROOT / "src" / "der_planner" / "doc"
+CASES = ("asynchronous", "same_direction", "opposite_direction")
+COLORS = {
+    ("der", "paper"): "tab:orange",
+    ("der", "projected"): "tab:blue",
+    ("der", "optimal"): "tab:green",
+    ("pcc", "paper"): "tab:gray",
+}
+
+
+def every_plan(limb: Limb, case: str, period: float) -> dict[tuple[str, str], Plan]:
+    """Return the plans of all models and methods."""
+    motion = Motion.named(case, period=period, cycles=1)
+    return {
+        (model, method): plan(limb, motion, model, method)
+        for model, methods in METHODS.items()
+        for method in methods
+    }
+
+
+def draw_methods(path: Path) -> None:
+    """Paths, pressures and predicted errors of all methods, three cases at a period of 6 s."""
+    figure, axes = plt.subplots(3, 3, figsize=(10, 8), layout="constrained")
+    for row, case in zip(axes, CASES, strict=True):
+        plans = every_plan(Limb.default(), case, 6.0)
+        reference = next(iter(plans.values())).tip_reference * 100
+        row[0].plot(*reference.T, "k--", lw=1, label="reference")
+        for which, result in plans.items():
+            color, name = COLORS[which], " ".join(which)
+            row[0].plot(*(result.tip_predicted.T * 100), color=color, lw=1, label=name)
+            for j, style in enumerate(("-", ":")):
+                pressure = result.differential_pressure[:, j] / 1000
+                row[1].plot(result.time, pressure, style, color=color, lw=1)
+            row[2].semilogy(result.time, np.maximum(result.error * 1000, 1e-5), color=color, lw=1)
+        row[0].set(xlabel="x [cm]", ylabel=f"{case}\ny [cm]", aspect="equal")
+        row[1].set(xlabel="time [s]", ylabel="pressure [kPa]")
+        row[2].set(xlabel="time [s]", ylabel="predicted error [mm]", ylim=(1e-4, 20))
+    axes[0, 0].legend(fontsize=6)
+    axes[0, 1].set_title("segment 0 solid, segment 1 dotted", fontsize=8)
+    figure.savefig(path, dpi=DPI)
+    plt.close(figure)
+
+
+def draw_branches(path: Path) -> None:
+    """The tip's reach, its fold, and the two ways to one point."""
+    limb = Limb.default()
+    kinematics = ArcKinematics(limb)
+    low, high = angle_limits(limb)
+    figure, axes = plt.subplots(figsize=(5, 4.5), layout="constrained")
+    grid = np.stack(
+        np.meshgrid(*(np.linspace(a, b, 161) for a, b in zip(low, high, strict=True))), -1
+    )
+    tips = kinematics.tip(grid).reshape(-1, 2) * 100
+    side = np.linalg.det(kinematics.tip_jacobians(grid)).ravel() > 0
+    for sign, color, name in (
+        (side, "tab:blue", "counter_clockwise"),
+        (~side, "tab:red", "clockwise"),
+    ):
+        axes.plot(*tips[sign].T, ".", ms=1, color=color, alpha=0.15)
+        axes.plot([], [], "o", color=color, label=name)
+    point = kinematics.tip(np.radians([35.0, 20.0]))
+    for found in solutions(limb, kinematics, point):
+        color = "tab:blue" if found.branch == "counter_clockwise" else "tab:red"
+        axes.plot(*(kinematics.curve(found.bend_angles).T * 100), color=color, lw=3)
+    axes.plot(*(point * 100), "k*", ms=10)
+    axes.set(xlabel="x [cm]", ylabel="y [cm]", aspect="equal")
+    axes.legend(loc="lower left", fontsize=8)
+    figure.savefig(path, dpi=DPI)
+    plt.close(figure)
+
+
+def draw_limits(path: Path) -> None:
+    """What a slew limit leaves of a fast motion: cut afterwards, or known to the optimisation."""
+    limb = Limb.default()
+    free = dataclasses.replace(
+        limb, pneumatics=dataclasses.replace(limb.pneumatics, slew_limit=1e6, fill_rate=1e6)
+    )
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), layout="constrained")
+    motion = Motion.named("opposite_direction", period=3.0, cycles=2)
+    for robot, method, label, color in (
+        (free, "optimal", "no slew limit", "0.7"),
+        (limb, "projected", "projected, cut at 9 kPa/s", "tab:blue"),
+        (limb, "optimal", "optimal, 9 kPa/s as a constraint", "tab:green"),
+    ):
+        result = plan(robot, motion, "der", method)
+        axes[0].plot(result.time, result.differential_pressure[:, 0] / 1000, color=color, lw=1.2)
+        axes[1].semilogy(
+            result.time, np.maximum(result.error * 1000, 1e-3), color=color, lw=1.2, label=label
+        )
+    _label(axes[0], "pressure of segment 0 [kPa]")
+    _label(axes[1], "predicted error [mm]")
+    axes[1].legend(fontsize=7)
+    figure.savefig(path, dpi=DPI)
+    plt.close(figure)
+
+
+def _label(axes: Axes, what: str) -> None:
+    axes.set(xlabel="time [s]", ylabel=what)
+
+
+def main() -> int:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--out", type=Path, default=FOLDER, help="folder for the pictures")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    for name, draw in (
+        ("planning_methods", draw_methods),
+        ("planning_branches", draw_branches),
+        ("planning_limits", draw_limits),
+    ):
+        path = options.out / f"{name}.png"
+        draw(path)
+        print(f"{path} ({path.stat().st_size // 1000} kB)")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
