@@ -1,0 +1,232 @@
+"""The tracker and the rendered camera as running nodes."""
+
+from __future__ import annotations
+
+import array
+import signal
+
+import cv2
+import numpy as np
+import pytest
+from geometry_msgs.msg import Point
+from sensor_msgs.msg import CameraInfo, Image
+
+from apriltag_tracker.synthetic.camera import SyntheticCamera
+from apriltag_tracker.synthetic.shapes import constant_curvature
+from der_msgs.msg import LimbShape, LimbState, TagDetectionArray
+from limb_interfaces import qos, topics
+from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
+
+pytestmark = pytest.mark.graph
+
+PATIENCE = 60.0
+
+
+class ShapeStream:
+    """Publishes a swinging limb 30 times a second while the test waits."""
+
+    def __init__(self, graph, tags):
+        self.node = graph.client.node
+        self.tags = tags
+        self.truth = {}
+        self.publisher = self.node.create_publisher(LimbShape, topics.TWIN_SHAPE, qos.STATES)
+        self.timer = self.node.create_timer(1.0 / 30.0, self.publish)
+
+    def publish(self):
+        now = self.node.get_clock().now().nanoseconds
+        time = now * 1e-9 % 1000.0
+        bends = [0.7 * np.sin(time), 0.7 * np.sin(1.3 * time)]
+        shape = constant_curvature(self.tags.segment_lengths, bends, points=61)
+        message = LimbShape(
+            arc_length=shape.arc_length.tolist(),
+            heading=shape.heading.tolist(),
+            points=[Point(x=x, y=y) for x, y in shape.points.tolist()],
+        )
+        message.header.stamp = stamp_from_nanoseconds(now)
+        self.truth[now] = shape.points[-1]
+        self.publisher.publish(message)
+
+
+@pytest.fixture
+def states(graph):
+    received = []
+    graph.client.subscribe(LimbState, topics.LIMB_STATE, qos.STATES, received.append)
+    return received
+
+
+def test_shapes_become_images_and_images_become_the_tip(graph, states, tags):
+    client = graph.client
+    seen = []
+    client.subscribe(TagDetectionArray, topics.TAGS, qos.STATES, seen.append)
+    camera = graph.start("apriltag_tracker", "synthetic_camera", seed=2)
+    tracker = graph.start("apriltag_tracker", "apriltag_tracker")
+    client.watch([camera, tracker])
+    stream = ShapeStream(graph, tags)
+    client.wait_for(lambda: sum(state.valid for state in states) > 45, PATIENCE, "valid states")
+    client.wait_ready(["synthetic_camera", "apriltag_tracker"])
+    valid = [state for state in states if state.valid]
+    errors = []
+    for state in valid:
+        stamp = nanoseconds(state.header.stamp)
+        assert stamp in stream.truth  # the stamp of the image is that of the shape
+        errors.append(np.array([state.tip.x, state.tip.y]) - stream.truth[stamp])
+        assert 0.0 < state.latency < PATIENCE
+        assert state.header.frame_id == topics.BASE_FRAME
+    # Stiff stretches of the tag map are not in these arcs: a quarter of a millimetre is allowed.
+    assert np.sqrt(np.mean(np.sum(np.square(errors), axis=1))) < 2.5e-4
+    assert len({nanoseconds(state.header.stamp) for state in states}) == len(states)
+
+    detections = seen[-1].detections
+    assert {detection.id for detection in detections} <= set(tags.ids)
+    assert all(detection.pose_valid for detection in detections)
+    assert {d.id for d in detections if d.on_limb} <= {tag.id for tag in tags.limb}
+
+    pictures = []
+    client.subscribe(Image, "camera/image_annotated", qos.IMAGES, pictures.append)
+    client.wait_for(lambda: pictures, PATIENCE, "an annotated picture")
+    assert pictures[0].encoding == "bgr8"
+    assert len(pictures[0].data) == 3 * 1280 * 720
+
+    for process in (camera, tracker):
+        process.signal(signal.SIGTERM)
+        client.watch([])
+        client.wait_for(lambda p=process: not p.alive, PATIENCE, "the end of a node")
+        assert process.exit_code == 0
+
+
+def image_message(gray, stamp, encoding="mono8"):
+    message = Image(
+        height=gray.shape[0],
+        width=gray.shape[1],
+        step=gray.shape[1],
+        encoding=encoding,
+        data=array.array("B", gray.tobytes()),
+    )
+    message.header.stamp = stamp_from_nanoseconds(stamp)
+    return message
+
+
+def info_message(lens, focal=None):
+    matrix = lens.matrix.copy()
+    if focal is not None:
+        matrix[0, 0] = matrix[1, 1] = focal
+    return CameraInfo(
+        width=lens.width,
+        height=lens.height,
+        distortion_model="plumb_bob",
+        d=lens.distortion[:5].tolist(),
+        k=matrix.ravel().tolist(),
+    )
+
+
+def test_bad_input_is_named_and_gives_no_state(graph, states, tags, model):
+    client = graph.client
+    tracker = graph.start("apriltag_tracker", "apriltag_tracker", bridge_frames=0)
+    client.watch([tracker])
+    # Reliable here, best effort in the other test: the tracker hears both.
+    images = client.node.create_publisher(Image, topics.IMAGE, qos.STATES)
+    infos = client.node.create_publisher(CameraInfo, topics.CAMERA_INFO, qos.LATCHED)
+    client.wait_for(
+        lambda: images.get_subscription_count() and infos.get_subscription_count(),
+        PATIENCE,
+        "the tracker's subscriptions",
+    )
+    client.wait_for(
+        lambda: (
+            "start the camera" in message_of(client)
+            or "waiting" in message_of(client)
+            or "large images" in message_of(client)
+        ),
+        PATIENCE,
+        "the remedy for missing images",
+    )
+    camera = SyntheticCamera(model, tags)
+    good = camera.frame(constant_curvature(tags.segment_lengths, [0.3, 0.2])).image
+    now = client.node.get_clock().now().nanoseconds
+
+    def answer(message):
+        wanted = nanoseconds(message.header.stamp)
+        images.publish(message)
+        return client.wait_for(
+            lambda: next((s for s in states if nanoseconds(s.header.stamp) == wanted), None),
+            PATIENCE,
+            f"the state at {wanted}",
+        )
+
+    state = answer(image_message(good, now + 1))
+    assert not state.valid
+    assert "camera_info" in state.reason
+    assert np.isnan(state.tip.x)
+
+    infos.publish(info_message(model.intrinsics, focal=0.0))
+    client.spin(0.3)
+    offset = 100
+    state = answer(image_message(good, now + offset))
+    while "not calibrated" not in state.reason:  # the calibration may come after the image
+        offset += 1
+        assert offset < 150, state.reason
+        state = answer(image_message(good, now + offset))
+    infos.publish(info_message(model.intrinsics))
+    while not state.valid:
+        offset += 1
+        assert offset < 250, state.reason
+        state = answer(image_message(good, now + offset))
+    assert state.tags_used == len(tags.limb)
+
+    for k, (message, reason) in enumerate(
+        [
+            (image_message(good[:480, :640], now + 301), "640 x 480"),
+            (image_message(good, now + 302, encoding="bayer_rggb8"), "bayer_rggb8"),
+            (image_message(np.zeros_like(good), now + 303), "no limb tag"),
+        ]
+    ):
+        state = answer(message)
+        assert not state.valid, k
+        assert reason in state.reason
+        assert np.isnan(state.tip.x)
+        assert len(state.bend_angle) == 2
+    client.wait_for(lambda: "no limb tag" in message_of(client), PATIENCE, "the diagnostics")
+    values = client.diagnostic_values("apriltag_tracker")
+    assert int(values["images_failed"]) >= 3
+
+
+def message_of(client):
+    status = client.diagnostics.get("apriltag_tracker")
+    return status.message if status is not None else ""
+
+
+def test_pictures_of_a_folder_are_tracked(graph, states, tags, model, tmp_path):
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    camera = SyntheticCamera(model, tags)
+    shape = constant_curvature(tags.segment_lengths, [0.3, 0.2])
+    for k in range(40):
+        cv2.imwrite(str(folder / f"{k:03d}.png"), camera.frame(shape).image)
+    model.intrinsics.to_yaml(tmp_path / "camera.yaml")
+    tracker = graph.start(
+        "apriltag_tracker",
+        "apriltag_tracker",
+        source=str(folder),
+        source_rate=5.0,
+        calibration_file=str(tmp_path / "camera.yaml"),
+    )
+    graph.client.watch([tracker])
+    graph.client.wait_for(lambda: [s for s in states if s.valid], PATIENCE, "a valid state")
+    state = next(s for s in states if s.valid)
+    assert np.hypot(state.tip.x - shape.points[-1][0], state.tip.y - shape.points[-1][1]) < 5e-4
+
+
+@pytest.mark.parametrize(
+    ("parameters", "named"),
+    [
+        ({"calibration_file": "/nowhere/camera.yaml"}, "/nowhere/camera.yaml"),
+        ({"tag_map": "/nowhere/tags.yaml"}, "/nowhere/tags.yaml"),
+        ({"source": "/nowhere/video.avi"}, "calibration_file"),
+        ({"smallest_tag": 2.0}, "smallest_tag"),
+    ],
+)
+def test_a_bad_parameter_ends_the_node_with_its_name(graph, parameters, named):
+    tracker = graph.start("apriltag_tracker", "apriltag_tracker", **parameters)
+    graph.client.wait_for(lambda: not tracker.alive, PATIENCE, "the end of the node")
+    assert tracker.exit_code == 1
+    assert named in tracker.last_words(20)
