@@ -295,6 +295,16 @@ def _build() -> None:
     (ROOT / "build" / "environment.json").unlink(missing_ok=True)
 
 
+def _compile_kernels() -> None:
+    """Compile what numba compiles now, rather than in seven nodes at once at the first start."""
+    stamp = ROOT / "build" / "kernels.txt"
+    if stamp.exists():
+        return
+    command = [str(VENV / "bin" / "python"), str(ROOT / "scripts" / "compile_kernels.py")]
+    _run(command, ROOT / "log" / "kernels.log", "compiling the kernels", environment())
+    stamp.write_text("compiled\n")
+
+
 def _captured_environment() -> dict[str, str]:
     """Return what sourcing the workspace adds to an empty environment (kept in build/)."""
     kept = ROOT / "build" / "environment.json"
@@ -366,6 +376,7 @@ def ensure() -> None:
         if not _venv_is_complete():
             _install_venv()
         _build()
+        _compile_kernels()
 
 
 def enter() -> None:

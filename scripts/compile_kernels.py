@@ -1,0 +1,62 @@
+#!/usr/bin/env python3
+"""Compile the kernels of planner, twin, camera and tracker, so that no node starts cold.
+
+Called once by the set-up. A kernel that is changed later is compiled again by what uses it first.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import workspace
+
+workspace.enter()
+
+import numpy as np  # noqa: E402
+
+from apriltag_tracker.pipeline import LimbTracker  # noqa: E402
+from apriltag_tracker.synthetic.camera import CameraModel, SyntheticCamera  # noqa: E402
+from apriltag_tracker.synthetic.shapes import constant_curvature  # noqa: E402
+from apriltag_tracker.tag_map import TagMap  # noqa: E402
+from der_planner.limb import Limb  # noqa: E402
+from der_planner.planning import METHODS, Motion, plan  # noqa: E402
+from der_planner.twin.offline import play  # noqa: E402
+
+
+CONFIG = workspace.ROOT / "src" / "apriltag_tracker" / "config"
+
+
+def _track() -> None:
+    tags = TagMap.from_yaml(CONFIG / "tags.yaml")
+    model = CameraModel.from_yaml(CONFIG / "synthetic_camera.yaml")
+    straight = constant_curvature(tags.segment_lengths, [0.0] * len(tags.segment_lengths))
+    picture = SyntheticCamera(model, tags).frame(straight).image
+    tracker = LimbTracker(tags, model.intrinsics)
+    # The first image is searched in full, the next by regions.
+    for stamp in (0.0, 0.03):
+        tracker.observe(picture, stamp)
+
+
+def main() -> int:
+    """Use every kernel once and say how long each part took."""
+    limb = Limb.default()
+    quick = Motion.named("asynchronous", amplitude=0.1, period=2.0, cycles=1)
+    parts = {
+        f"planner {model} {method}": lambda model=model, method=method: plan(
+            limb, quick, model, method
+        )
+        for model, methods in METHODS.items()
+        for method in methods
+    }
+    parts["twin"] = lambda: play(np.array([0.0, 0.05]), np.zeros((2, 2)))
+    parts["camera and tracker"] = _track
+    for name, use in parts.items():
+        begin = time.monotonic()
+        use()
+        print(f"{name}: {time.monotonic() - begin:.1f} s", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
