@@ -80,7 +80,7 @@ class PlanarBackend:
         self.size = 2 * n
 
     def work_space(self) -> Arrays:
-        """Return new work arrays: work, s, band, edge, turn, torque, parts."""
+        """Return new work arrays: work, s, band, edge, turn, torque, parts, a."""
         n = self.size // 2
         return (
             np.zeros((6, self.size)),
@@ -90,6 +90,7 @@ class PlanarBackend:
             np.zeros(n),
             np.zeros((n, 2)),
             np.zeros((2, 6)),
+            np.zeros((self.size, 11)),
         )
 
     def extend(self, q: Array) -> Array:
@@ -194,7 +195,7 @@ class PlanarBackend:
 
     def energy(self, state: RodState) -> float:
         """Return the elastic energy."""
-        _, _, _, edge, turn, _, _ = self.work_space()
+        _, _, _, edge, turn, _, _, _ = self.work_space()
         return float(planar_kernel.energy(self.extend(state.q), edge, turn, self.rod))
 
     def gradient_and_hessian(self, state: RodState) -> tuple[Array, Array]:
@@ -202,7 +203,7 @@ class PlanarBackend:
         x = self.extend(state.q)
         gradient = np.zeros(self.size)
         u = np.zeros(len(self.mesh.gain))
-        _, s, _, edge, turn, torque, _ = self.work_space()
+        _, s, _, edge, turn, torque, _, _ = self.work_space()
         planar_kernel.assemble(
             x, np.zeros(self.size), 0.0, u, False, gradient, s, edge, turn, torque, self.rod
         )
@@ -211,7 +212,7 @@ class PlanarBackend:
     def input_matrix(self, state: RodState) -> Array:
         """Return B(q)Λ (4N-1, M)."""
         columns = np.zeros((self.size, len(self.mesh.gain)))
-        _, _, _, edge, turn, _, _ = self.work_space()
+        _, _, _, edge, turn, _, _, _ = self.work_space()
         planar_kernel.edges_and_turns(self.extend(state.q), edge, turn)
         planar_kernel.input_columns(edge, self.rod, columns)
         return self._full(columns)
@@ -220,7 +221,7 @@ class PlanarBackend:
         """Return the Kelvin-Voigt force (4N-1,) at a state."""
         x, v = self.extend(state.q), self.extend_rate(state.v)
         a = np.zeros((self.size, 11))
-        _, _, band, edge, turn, _, parts = self.work_space()
+        _, _, band, edge, turn, _, parts, _ = self.work_space()
         u = np.zeros(len(self.mesh.gain))
         planar_kernel.edges_and_turns(x, edge, turn)
         planar_kernel.unsymmetric(v, 1.0, u, a, band, edge, turn, parts, self.rod)

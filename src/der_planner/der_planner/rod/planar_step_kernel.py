@@ -2,7 +2,7 @@
 
 Every kernel takes, after its own arguments: space, the work arrays (6, 2n), (2n, 6), (2n, 6), (n-1,
 3), (n,),
-(n, 2), (2, 6); body, the tuple of mass, damping, load (2n,) and of the fixed indices; rod.
+(n, 2), (2, 6), (2n, 11); body, the tuple of mass, damping, load (2n,) and of the fixed indices; rod.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from der_planner.rod.band_kernel import (
     put,
     smallest,
     solve_5,
+    solve_one,
 )
 from der_planner.rod.compile import kernel
 from der_planner.rod.planar_kernel import assemble, input_columns, unsymmetric
@@ -33,7 +34,7 @@ def newton(
     rate = 0 is statics. Returns (iterations, size of the last update [m]); iterations is negative
     without convergence.
     """
-    work, s, _, edge, turn, torque, _ = space
+    work, s, band, edge, turn, torque, parts, a = space
     mass, damping, load, fixed = body
     size = x.shape[0]
     residual, v = work[0], work[1]
@@ -48,7 +49,14 @@ def newton(
             residual[k] += mass[k] * rate * (v[k] - v_n[k]) + damping[k] * v[k] - load[k]
             s[k, 0] += rate * (mass[k] * rate + damping[k])
         hold_fixed(s, residual, fixed)
-        solve_5(s, residual)
+        if iteration > 5:  # slow without the unsymmetric part of the derivative
+            expand(s, a)
+            unsymmetric(v, rate, u, a, band, edge, turn, parts, rod)
+            hold_fixed_general(a, fixed)
+            factor_general(a)
+            solve_one(a, residual)
+        else:
+            solve_5(s, residual)
         update = 0.0
         for k in range(size):
             # written so that NaN counts as too large
@@ -147,7 +155,7 @@ def linearise(
 
     The third work array receives the viscous matrix times rate. Fixed unknowns have unit rows.
     """
-    work, s, band, edge, turn, torque, parts = space
+    work, s, band, edge, turn, torque, parts, _ = space
     mass, damping, _, fixed = body
     size = x.shape[0]
     v = work[1]
