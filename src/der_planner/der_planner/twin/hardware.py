@@ -39,9 +39,9 @@ RANGES: dict[str, tuple[float, float]] = {
     "wander": (0.1, 0.3),  # [deg] standard deviation of the rest angle within a run
     "wander_time": (60.0, 180.0),  # [s] correlation time of it
     "elongation": (0.001, 0.003),  # strain at a chamber gauge pressure of 10 kPa
-    "end_fitting": (0.003, 0.005),  # [m] stiff length at the clamp and at the tip
+    "end_fitting": (0.006, 0.010),  # [m] stiff length at the clamp and at the tip
     "connector": (0.006, 0.012),  # [m] stiff length between the segments
-    "fitting_mass": (0.002, 0.008),  # [kg] of the connector and of the tip, with tags
+    "fitting_mass": (0.004, 0.010),  # [kg] of the connector and of the tip, with tags
     "mass_per_length": (0.95, 1.05),  # × 1.066 kg/m
     "drag": (0.4, 0.7),  # [1/s] mass-proportional damping
 }

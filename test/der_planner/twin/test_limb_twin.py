@@ -1,0 +1,209 @@
+"""The simulated limb against the mechanics of a beam, and its behaviour over every drawn hardware."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from der_planner.twin import LimbTwin, TwinError
+from der_planner.twin.hardware import RANGES, draw
+from der_planner.twin.limb_twin import ATMOSPHERE, TIME_STEP
+
+REST = np.full(4, ATMOSPHERE)
+
+
+def plain(seed: int = 0, **changes: float):
+    """Return hardware without friction, creep and stiffening: an elastic rod with straight fittings."""
+    hardware = draw(seed)
+    segments = tuple(
+        replace(
+            segment,
+            cubic_stiffness=0.0,
+            pressure_stiffening=0.0,
+            elongation=0.0,
+            rest_curvature=0.0,
+            friction_moment=0.0,
+            creep_stiffness=(0.0, 0.0, 0.0),
+            wander=0.0,
+            **changes,
+        )
+        for segment in hardware.segments
+    )
+    return replace(hardware, segments=segments)
+
+
+def settled(twin: LimbTwin, pressure: np.ndarray, duration: float = 5.0) -> LimbTwin:
+    twin.step(pressure, duration)
+    return twin
+
+
+def test_straight_limb_reaches_along_x():
+    twin = LimbTwin(hardware=plain())
+    np.testing.assert_allclose(twin.tip, [0.244, 0.0], atol=1e-9)
+    twin.step(REST, 0.5)
+    np.testing.assert_allclose(twin.tip, [0.244, 0.0], atol=1e-9)
+
+
+@pytest.mark.parametrize(("chamber", "segment", "sign"), [(0, 0, 1), (1, 0, -1), (2, 1, 1), (3, 1, -1)])
+def test_each_chamber_bends_its_own_segment_by_moment_over_stiffness(chamber, segment, sign):
+    hardware = replace(plain(), drag=6.0)
+    pressure = REST.copy()
+    pressure[chamber] += 8000.0
+    twin = settled(LimbTwin(hardware=hardware), pressure)
+    part = hardware.segments[segment]
+    moment = part.chamber_gain[chamber % 2] * 8000.0
+    expected = sign * moment * part.flexible_length / part.bending_stiffness
+    assert twin.bend_angles[segment] == pytest.approx(expected, rel=2e-3)
+    assert abs(twin.bend_angles[1 - segment]) < 1e-3
+    assert np.sign(twin.tip[1]) == sign
+
+
+def test_bent_limb_is_arcs_between_straight_fittings():
+    hardware = replace(plain(), drag=6.0)
+    pressure = REST + np.array([9000.0, 0.0, 0.0, 6000.0])
+    twin = settled(LimbTwin(hardware=hardware), pressure)
+    first, second = hardware.segments
+    lengths = [hardware.base_fitting, first.flexible_length, hardware.connector,
+               second.flexible_length, hardware.tip_fitting]  # fmt: skip
+    bends = [0.0, twin.bend_angles[0], 0.0, twin.bend_angles[1], 0.0]
+    position, heading = 0j, 1 + 0j
+    for length, bend in zip(lengths, bends, strict=True):
+        arc = 1.0 if bend == 0 else (np.exp(1j * bend) - 1) / (1j * bend)
+        position += heading * length * arc
+        heading *= np.exp(1j * bend)
+    # The rod shears and stretches, and a polyline of eight elements is not quite an arc.
+    np.testing.assert_allclose(twin.tip, [position.real, position.imag], atol=2e-4)
+
+
+def test_first_frequency_is_a_cantilevers():
+    hardware = replace(plain(), drag=0.05, base_fitting=5e-3, connector_mass=0.0, tip_mass=0.0)
+    hardware = replace(
+        hardware,
+        segments=tuple(replace(s, bending_stiffness=0.0175) for s in hardware.segments),
+    )
+    twin = LimbTwin(hardware=hardware)
+    twin.step(REST + np.array([600.0, 0.0, 600.0, 0.0]), 0.3)
+    heights = []
+    for _ in range(500):
+        twin.step(REST, 0.01)
+        heights.append(twin.tip[1])
+    wave = np.array(heights)
+    crossings = np.nonzero((wave[:-1] < 0) & (wave[1:] >= 0))[0]
+    instants = 0.01 * (crossings + wave[crossings] / (wave[crossings] - wave[crossings + 1]))
+    frequency = 1.0 / np.diff(instants).mean()
+    flexible = sum(s.flexible_length for s in hardware.segments)
+    slowest = 3.516 / (2 * np.pi) * np.sqrt(0.0175 / hardware.mass_per_length / 0.244**4)
+    # The stiff parts shorten what bends: the frequency lies between the whole and the flexible length.
+    assert slowest < frequency < slowest * (0.244 / flexible) ** 2
+
+
+def test_stable_for_every_admissible_pressure():
+    generator = np.random.default_rng(1)
+    for seed in range(6):
+        twin = LimbTwin(seed)
+        for _ in range(8):
+            twin.step(ATMOSPHERE + generator.choice([0.0, 24_000.0, 40_000.0], 4), 0.15)
+            stretch = twin._rod.lengths / twin._rod.rest_lengths
+            assert 0.5 < stretch.min() < stretch.max() < 1.7
+            assert np.linalg.norm(twin.tip) < 0.3
+            assert np.abs(twin.shape().heading).max() < 3 * np.pi
+
+
+def test_stays_in_its_plane_and_clamped():
+    twin = LimbTwin(3)
+    twin.step(REST + np.array([12_000.0, 0.0, 9000.0, 0.0]), 0.7)
+    shape = twin.shape()
+    assert np.abs(twin._rod.position_collection[2]).max() == 0.0
+    np.testing.assert_allclose(shape.points[0], 0.0, atol=1e-15)
+    assert shape.heading[0] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_shape_is_interpolated_along_the_material():
+    twin = LimbTwin(2)
+    twin.step(REST + np.array([9000.0, 0.0, 0.0, 4000.0]), 1.0)
+    nodes, fine = twin.shape(), twin.shape(401)
+    np.testing.assert_allclose(fine.points[-1], twin.tip, atol=1e-12)
+    assert fine.arc_length[-1] == pytest.approx(0.244, abs=1e-12)
+    steps = np.diff(fine.points, axis=0)
+    chord = np.arctan2(steps[:, 1], steps[:, 0])
+    middle = 0.5 * (fine.heading[1:] + fine.heading[:-1])
+    assert np.abs(chord - middle).max() < np.deg2rad(2.0)
+    assert len(nodes.points) == len(nodes.arc_length) == len(nodes.heading)
+
+
+def test_friction_leaves_a_loop_that_an_elastic_limb_has_not():
+    def loop(twin: LimbTwin) -> float:
+        at_zero, last = [], 0.0
+        for height in (9000.0, 0.0, -9000.0, 0.0):
+            for share in np.linspace(0.02, 1.0, 50):
+                level = last + share * (height - last)
+                twin.step(REST + np.array([max(level, 0.0), max(-level, 0.0), 0.0, 0.0]), 0.04)
+            last = height
+            twin.step(REST + np.array([max(last, 0.0), max(-last, 0.0), 0.0, 0.0]), 1.5)
+            if height == 0.0:
+                at_zero.append(twin.bend_angles[0])
+        return abs(at_zero[0] - at_zero[1])
+
+    rubbing = replace(draw(0), drag=4.0)
+    assert np.deg2rad(0.7) < loop(LimbTwin(hardware=rubbing)) < np.deg2rad(9.0)
+    assert loop(LimbTwin(hardware=replace(plain(), drag=4.0))) < np.deg2rad(0.4)
+
+
+def test_creep_goes_on_after_the_step():
+    calm = replace(plain(), drag=6.0)
+    creeping = replace(
+        calm,
+        segments=tuple(
+            replace(s, creep_stiffness=(0.0, 0.03 * s.bending_stiffness, 0.0), creep_time=(0.03, 5.0, 60.0))
+            for s in calm.segments
+        ),
+    )
+    moved = []
+    for hardware in (calm, creeping):
+        twin = LimbTwin(hardware=hardware)
+        twin.step(REST + np.array([9000.0, 0.0, 0.0, 0.0]), 3.0)
+        early = twin.bend_angles[0]
+        twin.step(REST + np.array([9000.0, 0.0, 0.0, 0.0]), 4.0)
+        moved.append(twin.bend_angles[0] - early)
+    assert moved[1] > 5 * abs(moved[0])
+    assert moved[1] > np.deg2rad(0.1)
+
+
+def test_a_seed_is_a_limb():
+    def run(seed: int, wander: int = 0) -> np.ndarray:
+        twin = LimbTwin(seed, wander)
+        for _ in range(10):
+            twin.step(REST + np.array([5000.0, 0.0, 3000.0, 0.0]), 0.05)
+        return twin.tip
+
+    np.testing.assert_array_equal(run(4), run(4))
+    assert np.linalg.norm(run(4) - run(5)) > 1e-4
+    other = np.linalg.norm(run(4) - run(4, wander=1))
+    assert 0 < other < 5e-3
+
+
+def test_drawn_limbs_agree_with_logs_of_real_ones():
+    for seed in range(40):
+        hardware = draw(seed)
+        total = hardware.base_fitting + hardware.connector + hardware.tip_fitting
+        total += sum(s.flexible_length for s in hardware.segments)
+        assert total == pytest.approx(0.244, abs=1e-12)
+        for segment in hardware.segments:
+            gain = np.mean(segment.chamber_gain) * segment.flexible_length / segment.bending_stiffness
+            assert 0.22 < np.degrees(gain) * 100 < 0.50  # deg/hPa
+            rest = np.degrees(segment.rest_curvature * segment.flexible_length)
+            assert abs(rest) <= RANGES["rest_angle"][1]
+
+
+@pytest.mark.parametrize(
+    "pressure", [np.full(4, 4e5), np.full(3, ATMOSPHERE), np.full(4, np.nan), np.full(4, -2e5)]
+)
+def test_impossible_pressures_are_refused(pressure):
+    with pytest.raises(TwinError, match="chamber pressures"):
+        LimbTwin(0, hardware=plain()).step(pressure, 0.1)
+
+
+def test_time_shorter_than_a_step_is_kept():
+    twin = LimbTwin(0, hardware=plain())
+    for _ in range(10):
+        twin.step(REST, 1e-4)
+    assert 1e-3 - TIME_STEP < twin.time <= 1e-3 + 1e-12
