@@ -5,8 +5,8 @@ python3 scripts/replay_bag.py BAG --topics /limb/camera/image_raw /limb/camera/c
 python3 scripts/replay_bag.py BAG --rate 0 --step-by /limb/camera/image_raw=/limb/state
 
 Nodes that should live in recorded time need the parameter use_sim_time:=true. With --step-by each
-message of the first topic waits for the answer to the one before, so no image is lost however slow
-the receiver is, and the answers are the same each time.
+message of the first topic is followed by nothing until the message of the same stamp is on the
+second, so no image is lost however slow the receiver is, and the answers are the same each time.
 """
 
 from __future__ import annotations
@@ -45,6 +45,13 @@ from der_planner.recording.replay import (  # noqa: E402
     replay,
 )
 
+ATTEMPTS = 3
+
+
+def stamp_of(data: bytes) -> bytes:
+    """Return the stamp of a serialized message that begins with a std_msgs/Header, as it is."""
+    return bytes(data[4:12])
+
 
 def message_class(type_name: str) -> Any:
     """Return the class of a message type.
@@ -71,7 +78,7 @@ class GraphOutput:
         show_clock: publish /clock.
         step_by: name to publish on that waits for answers, or empty.
         answer: topic of the answers.
-        patience: longest wait for one answer [s].
+        patience: longest wait for one answer [s]; then the message is sent again, at most twice.
     """
 
     def __init__(
@@ -81,12 +88,13 @@ class GraphOutput:
         show_clock: bool,
         step_by: str = "",
         answer: str = "",
-        patience: float = 5.0,
+        patience: float = 3.0,
     ) -> None:
         self.unanswered = 0
         self._patience = patience
         self._step_by = step_by
-        self._answered = threading.Semaphore(1)
+        self._answers: set[bytes] = set()
+        self._answered = threading.Condition()
         self._publishers: dict[str, Publisher] = {
             name: node.create_publisher(message_class(topic.type_name), name, _profile(topic))
             for name, topic in topics.items()
@@ -96,7 +104,7 @@ class GraphOutput:
             self._subscription = node.create_subscription(
                 self._type_of_answer(node, answer),
                 answer,
-                lambda _: self._answered.release(),
+                self._on_answer,
                 QoSProfile(depth=100),
                 raw=True,
             )
@@ -118,11 +126,24 @@ class GraphOutput:
                 return
             time.sleep(0.02)
 
+    def _on_answer(self, data: bytes) -> None:
+        with self._answered:
+            self._answers.add(stamp_of(data))
+            self._answered.notify_all()
+
     def publish(self, topic: str, message: RawMessage) -> None:
-        """Publish one message, after the answer to the last where the topic is stepped by."""
-        if topic == self._step_by and not self._answered.acquire(timeout=self._patience):
-            self.unanswered += 1
-        self._publishers[topic].publish(message.data)
+        """Publish one message, and wait for its answer where the topic is stepped by."""
+        if topic != self._step_by:
+            self._publishers[topic].publish(message.data)
+            return
+        stamp = stamp_of(message.data)
+        with self._answered:
+            self._answers.clear()
+            for _ in range(ATTEMPTS):
+                self._publishers[topic].publish(message.data)
+                if self._answered.wait_for(lambda: stamp in self._answers, self._patience):
+                    return
+        self.unanswered += 1
 
     def show_time(self, now: int) -> None:
         """Publish recorded time."""

@@ -289,6 +289,7 @@ def track(graph, folder: Path, name: str) -> list[tuple]:
     with subprocess.Popen(command, env=environment) as replay:
         graph.client.wait_for(lambda: replay.poll() is not None, 120.0, "the replay")
         assert replay.returncode == 0
-    graph.client.spin(1.0)
+    graph.client.wait_for(lambda: states, 30.0, "states")
+    graph.client.spin(0.5)
     tracker.stop()
     return list(states)
