@@ -20,8 +20,8 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
-from benchmarks.rod import cantilever, run_elastica  # noqa: E402
 
+from benchmarks.rod import cantilever, run_elastica  # noqa: E402
 from der_planner.limb import Limb  # noqa: E402
 from der_planner.rod import Rod, RodState  # noqa: E402
 

@@ -1,8 +1,8 @@
 """Compiled time steps of a planar rod; see `planar_kernel` for the symbols and the rod's arrays.
 
-Every kernel takes, after its own arguments: space, the work arrays (6, 2n), (2n, 6), (2n, 6), (n-1,
-3), (n,),
-(n, 2), (2, 6), (2n, 11); body, the tuple of mass, damping, load (2n,) and of the fixed indices; rod.
+Every kernel takes, after its own arguments: space, work arrays (6, 2n), (2n, 6), (2n, 6), (n-1, 3),
+(n,), (n, 2), (2, 6), (2n, 11); body, the tuple of mass, damping, load (2n,) and of the fixed
+indices; rod.
 """
 
 from __future__ import annotations
