@@ -102,6 +102,7 @@ class TrackerNode(Node):
         self._warm_up()
         self._tracker: LimbTracker | None = None
         self._last_stamp = -1
+        self._level = ""
         self._last_markers = 0.0
         self._image_topic = self.resolve_topic_name(topics.IMAGE)
         self._monitor = Monitor(
@@ -120,7 +121,9 @@ class TrackerNode(Node):
                     f"source '{source}' brings no camera_info: set the parameter calibration_file "
                     "(scripts/calibrate_camera.py writes one)"
                 )
-            self._source = open_source(source, rate)
+            assert self._tracker is not None
+            lens = self._tracker.intrinsics
+            self._source = open_source(source, rate, size=(lens.width, lens.height))
             self._source_timer = self.create_timer(0.002, self._poll_source)
         self._diagnostics = DiagnosticsPublisher(self, self._health, source)
 
@@ -338,6 +341,12 @@ class TrackerNode(Node):
     def _health(self) -> Health:
         publishers = self.count_publishers(self._image_topic) if self._source is None else 0
         report = self._monitor.report(self._tracker, publishers)
+        if report.level != self._level:
+            self._level = report.level
+            if report.level == "ok":
+                self.get_logger().info(report.message)
+            else:
+                self.get_logger().warning(report.message)
         return Health(report.level, report.message, report.values)
 
 

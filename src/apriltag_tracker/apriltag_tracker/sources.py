@@ -44,20 +44,26 @@ class Source(Protocol):
         """Release it."""
 
 
-def open_source(name: str, rate: float, clock: Callable[[], int] = time.time_ns) -> Source:
+def open_source(
+    name: str,
+    rate: float,
+    clock: Callable[[], int] = time.time_ns,
+    size: tuple[int, int] | None = None,
+) -> Source:
     """Open a source by its name.
 
     Args:
         name: /dev/videoN or a number, a video file, or a folder.
         rate: images a second, for a folder and as a wish to a device.
         clock: nanoseconds since the epoch.
+        size: width and height to ask a device for [px], those of its calibration.
 
     Raises:
         SourceError: there is no such thing, or it cannot be opened.
     """
     path = Path(name)
     if name.isdigit() or name.startswith("/dev/"):
-        return DeviceSource(name, rate, clock)
+        return DeviceSource(name, rate, clock, size=size)
     if path.is_dir():
         return FolderSource(path, rate, clock)
     if path.is_file():
@@ -152,18 +158,19 @@ class DeviceSource:
         rate: float,
         clock: Callable[[], int],
         capture: Callable[[str], Any] | None = None,
+        size: tuple[int, int] | None = None,
     ) -> None:
         self._name = name
         self._rate = rate
         self._clock = clock
+        self._size = size
         self._capture = capture or _open_device
-        self._video = self._capture(name)
+        self._video = self._open()
         if not self._video.isOpened():
             raise SourceError(
                 f"cannot open the camera {name}: is it plugged in, free, and may you read it "
                 "(group video)?"
             )
-        self._video.set(cv2.CAP_PROP_FPS, rate)
         self._newest: Grabbed | None = None
         self._problem = ""
         self._lock = threading.Lock()
@@ -185,6 +192,14 @@ class DeviceSource:
         self._thread.join(timeout=3.0)
         self._video.release()
 
+    def _open(self) -> Any:
+        video = self._capture(self._name)
+        if self._size is not None:
+            video.set(cv2.CAP_PROP_FRAME_WIDTH, self._size[0])
+            video.set(cv2.CAP_PROP_FRAME_HEIGHT, self._size[1])
+        video.set(cv2.CAP_PROP_FPS, self._rate)
+        return video
+
     def _run(self) -> None:
         while not self._stop.is_set():
             found, image = self._video.read()
@@ -200,7 +215,7 @@ class DeviceSource:
             self._stop.wait(self._RETRY)
             if not self._stop.is_set():
                 self._video.release()
-                self._video = self._capture(self._name)
+                self._video = self._open()
 
 
 def _open_device(name: str) -> Any:

@@ -43,7 +43,8 @@ class TrackingOptions:
         keep_frames: frames for which a lost tag is still looked for where it was.
         region_growth: half the side of a search region over half the diagonal of the tag; it grows
             by a fifth with every frame in which the tag was not found.
-        largest_jump: distance from the prediction at which a tag cannot be the same [tag sizes].
+        largest_jump: distance from the prediction beyond which a duplicate is not the tag [tag
+            sizes].
     """
 
     full_search_period: float = 1.0
@@ -64,7 +65,6 @@ class TrackingCounts:
     by_region: int = 0
     by_full: int = 0
     duplicates: int = 0
-    jumps: int = 0
     unknown: dict[int, int] = field(default_factory=dict)
 
 
