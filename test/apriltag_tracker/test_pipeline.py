@@ -5,8 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from apriltag_tracker import decoding, edges, lens, plane
 from apriltag_tracker.camera import Intrinsics
-from apriltag_tracker.pipeline import LimbTracker, TrackerOptions, Uncertainty
+from apriltag_tracker.pipeline import LimbTracker, TrackerOptions, Uncertainty, warm_up
 from apriltag_tracker.synthetic.camera import Errors, Optics, SyntheticCamera
 
 PERIOD = 1.0 / 30.0
@@ -136,3 +137,18 @@ def test_a_wrong_calibration_shows_in_the_residual(straight_tags, model, camera,
     tracker = LimbTracker(straight_tags, wrong)
     tracker.observe(camera.frame(swing.shape(0.0)).image, 0.0)
     assert tracker.world.pose is None or tracker.world.residual > 0.5 or tracker.world.excluded
+
+
+def test_warming_up_leaves_no_kernel_for_the_first_image(detector):
+    warm_up(detector)
+    kernels = [
+        edges.refine_quads,
+        edges.corner_covariances,
+        decoding.distances,
+        decoding.identify,
+        lens.undistort_pixels,
+        lens.distort_to_pixels,
+        plane._locate,
+    ]
+    before = [len(kernel.signatures) for kernel in kernels]
+    assert min(before) == 1

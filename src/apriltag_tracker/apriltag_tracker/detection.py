@@ -111,10 +111,12 @@ class Detector:
     def warm_up(self) -> None:
         """Load or compile everything a first image would wait for."""
         canvas = np.full((96, 96), 255, dtype=np.uint8)
-        cells = np.kron(family.printed_cells(0, margin=0), np.ones((5, 5))).astype(np.uint8)
-        canvas[28:68, 28:68] = cells * 255
+        canvas[28:68, 28:68] = enlarged_tag(0, 5)
         if [tag.id for tag in self.detect(canvas)] != [0]:
             raise family.FamilyError("a perfect picture of tag 0 is not detected")
+        quad = np.array([[[27.5, 67.5], [67.5, 67.5], [67.5, 27.5], [27.5, 27.5]]])
+        if [tag.id for tag in self._read_again(canvas, quad, [], "full")] != [0]:
+            raise family.FamilyError("a perfect picture of tag 0 is not read")
 
     def detect(self, gray: NDArray[np.uint8]) -> list[Tag]:
         """Find tags in a grey image (rows, columns) of uint8; duplicates are returned as they are.
@@ -260,6 +262,12 @@ def _opencv_detector(extent: int, smallest: float) -> Any:
     return cv2.aruco.ArucoDetector(family.dictionary(), parameters)
 
 
+def enlarged_tag(tag: int, scale: int) -> NDArray[np.uint8]:
+    """Return a perfect picture of a tag without its margin, (8 scale, 8 scale) of 0 and 255."""
+    cells = family.printed_cells(tag, margin=0) * np.uint8(255)
+    return np.repeat(np.repeat(cells, scale, axis=0), scale, axis=1)
+
+
 @functools.cache
 def check_orientation() -> None:
     """Detect one known tag and check id, corner order, rotation and pixel convention.
@@ -270,8 +278,7 @@ def check_orientation() -> None:
     family.check_code_of_tag_0()
     scale, left, top = 5, 30, 20
     canvas = np.full((100, 110), 255, dtype=np.uint8)
-    cells = np.kron(family.printed_cells(0, margin=0), np.ones((scale, scale))).astype(np.uint8)
-    canvas[top : top + 8 * scale, left : left + 8 * scale] = cells * 255
+    canvas[top : top + 8 * scale, left : left + 8 * scale] = enlarged_tag(0, scale)
     ids, quads, _ = find_quads(canvas, 20.0)
     right, bottom = left + 8 * scale, top + 8 * scale
     expected = np.array([[left, bottom], [right, bottom], [right, top], [left, top]]) - 0.5

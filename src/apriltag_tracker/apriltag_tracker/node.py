@@ -29,6 +29,7 @@ from apriltag_tracker.pipeline import (
     PlacedTag,
     TrackerOptions,
     Uncertainty,
+    warm_up,
 )
 from apriltag_tracker.sources import Grabbed, SourceError, open_source
 from apriltag_tracker.tag_map import TagMap
@@ -184,7 +185,7 @@ class TrackerNode(Node):
 
     def _warm_up(self) -> None:
         """Compile or load every kernel and check OpenCV's conventions before the first image."""
-        self._detector.warm_up()
+        warm_up(self._detector)
 
     def _make_topics(self) -> None:
         self._tags = self.create_publisher(TagDetectionArray, topics.TAGS, qos.STATES)

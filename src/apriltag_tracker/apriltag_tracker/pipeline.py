@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apriltag_tracker.camera import CameraPose, Intrinsics
-from apriltag_tracker.detection import Detector, Tag
+from apriltag_tracker.detection import Detector, Tag, enlarged_tag
 from apriltag_tracker.plane import centreline_pose, locate
 from apriltag_tracker.shape import LimbEstimate, PlanarTag, ShapeFitter, ShapePrior
-from apriltag_tracker.tag_map import TagMap
+from apriltag_tracker.tag_map import LimbTag, TagMap, WorldTag
 from apriltag_tracker.tracking import TagTracker, TrackingOptions
 from apriltag_tracker.world import WorldPose
 
@@ -262,3 +262,24 @@ class LimbTracker:
         frames = "frame" if self._bridged == 1 else "frames"
         remark = f"bridged {self._bridged} {frames}: {cause}"
         return LimbObservation(placed, estimate, remark, bridged=True)
+
+
+def warm_up(detector: Detector) -> None:
+    """Follow a tiny still limb through two images, so that no kernel is compiled in a run."""
+    detector.warm_up()
+    side, f = 40, 500.0
+    tags = TagMap(
+        (0.02,),
+        (LimbTag(0, 0.01, 0.0, 0.01),),
+        (WorldTag(1, (0.03, 0.0, 0.0), 0.0, 0.01),),
+    )
+    # 125 mm above the plane, a pixel is a quarter of a millimetre.
+    image = np.full((120, 240), 255, dtype=np.uint8)
+    for tag, left in ((0, 40), (1, 120)):
+        image[40 : 40 + side, left : left + side] = enlarged_tag(tag, side // 8)
+    matrix = [f, 0.0, 59.5, 0.0, f, 59.5, 0.0, 0.0, 1.0]
+    tracker = LimbTracker(tags, Intrinsics.create(240, 120, matrix, []), detector=detector)
+    for stamp in (0.0, 0.03):
+        observation = tracker.observe(image, stamp)
+    if observation.estimate is None:
+        raise RuntimeError(f"the tracker does not work here: {observation.reason}")
