@@ -194,11 +194,19 @@ def test_the_port_is_free_again_after_closing(rig):
     open_port(str(rig.port.link), 115_200).close()
 
 
-def test_only_the_thread_touches_the_port(rig):
-    users = set()
-    device = rig.link._device
-    original = device.write
-    device.write = lambda data: (users.add(threading.current_thread().name), original(data))[1]
+def test_only_the_thread_touches_the_port(rig, monkeypatch):
+    users, port = set(), rig.link._device.fileno()
+
+    def watch(original):
+        def watched(descriptor, argument):
+            if descriptor == port:
+                users.add(threading.current_thread().name)
+            return original(descriptor, argument)
+
+        return watched
+
+    monkeypatch.setattr(os, "write", watch(os.write))
+    monkeypatch.setattr(os, "read", watch(os.read))
     rig.arm()
     rig.play(5)
     rig.link.urge()

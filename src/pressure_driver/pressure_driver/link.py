@@ -31,8 +31,6 @@ FIRST_RETRY = 0.1
 """[s] after a lost port until it is looked for again."""
 LAST_RETRY = 2.0
 """[s] between looks after a long absence."""
-WRITE_TIMEOUT = 0.05
-"""[s] that the port may refuse bytes before it counts as lost."""
 STABLE_NAMES = Path("/dev/serial/by-id")
 """Where the system keeps names of ports that survive re-plugging."""
 VENT_REPEATS = 3
@@ -109,9 +107,7 @@ def open_port(port: str, baud_rate: int) -> serial.Serial:
         PortError: it does not exist, is in use, or may not be opened.
     """
     try:
-        device = serial.Serial(
-            port, baud_rate, timeout=0, write_timeout=WRITE_TIMEOUT, exclusive=True
-        )
+        device = serial.Serial(port, baud_rate, timeout=0, write_timeout=0.05, exclusive=True)
     except (serial.SerialException, OSError, ValueError) as error:
         raise PortError(_explain(port, error)) from error
     with contextlib.suppress(OSError):
@@ -160,6 +156,8 @@ class SerialLink:
         self._priority = real_time_priority
         self._log = log
         self._device: serial.Serial | None = None
+        self._bytes_waiting: select.epoll | None = None
+        self._unsent = b""
         self._retry_delay = FIRST_RETRY
         self._retry_at = 0.0
         self._stop = False
@@ -216,8 +214,9 @@ class SerialLink:
         if self._device is None and time.monotonic() >= self._retry_at:
             self._reopen()
         delay = max(self.grid.delay(time.time_ns()), 0.0)
-        port = -1 if self._device is None else self._device.fileno()
-        watched = [self._wake_read] if port < 0 else [self._wake_read, port]
+        watched = [self._wake_read]
+        if self._bytes_waiting is not None:
+            watched.append(self._bytes_waiting.fileno())
         readable, _, _ = select.select(watched, [], [], delay)
         wall = time.time_ns()
         instant = self.grid.take(wall, time.monotonic_ns())
@@ -231,13 +230,16 @@ class SerialLink:
             if self._urgent:
                 self._urgent = False
                 self._write(self._client.farewell())
-        if port in readable and self._device is not None:
+        if self._bytes_waiting is not None and self._bytes_waiting.fileno() in readable:
             self._read()
 
     def _read(self) -> None:
+        """Take the bytes that are there; none means that the device has gone."""
         assert self._device is not None
+        assert self._bytes_waiting is not None
+        self._bytes_waiting.poll(0)
         try:
-            data = self._device.read(4096)
+            data = self._device.read(max(self._device.in_waiting, 1))
         except (serial.SerialException, OSError) as error:
             self._lose(f"reading from {self.port} failed: {error}")
             return
@@ -245,28 +247,47 @@ class SerialLink:
         self._client.received(data)
 
     def _write(self, data: bytes) -> None:
+        """Hand bytes to the operating system without ever waiting for it.
+
+        What it does not take is sent before the next command; if that is not taken either, the
+        port counts as lost. (pyserial's own `write` waits for the terminal after each write.)
+        """
         if self._device is None or not data:
             return
+        left_over = len(self._unsent)
+        pending = self._unsent + data
         try:
-            self._device.write(data)
-        except serial.SerialTimeoutException:
-            self._lose(f"{self.port} takes no bytes")
+            count = os.write(self._device.fileno(), pending)
+        except BlockingIOError:
+            count = 0
         except (serial.SerialException, OSError) as error:
             self._lose(f"writing to {self.port} failed: {error}")
-        else:
-            self.bytes_sent += len(data)
+            return
+        self.bytes_sent += count
+        self._unsent = pending[count:]
+        if count < left_over:
+            self._lose(f"{self.port} takes no bytes")
 
     def _opened(self) -> None:
+        assert self._device is not None
+        # Edge-triggered: to ask a terminal that has no bytes (as `select` on it does) makes the
+        # kernel finish pending deliveries first, which on busy cores takes milliseconds.
+        self._bytes_waiting = select.epoll()
+        self._bytes_waiting.register(self._device.fileno(), select.EPOLLIN | select.EPOLLET)
         self.connected = True
         self._retry_delay = FIRST_RETRY
         self._write(self._client.opening())
 
     def _lose(self, reason: str) -> None:
         """Close what is left of the port and arrange for the next attempt."""
+        if self._bytes_waiting is not None:
+            self._bytes_waiting.close()
+            self._bytes_waiting = None
         if self._device is not None:
             with contextlib.suppress(Exception):
                 self._device.close()
         self._device = None
+        self._unsent = b""
         self.connected = False
         self._retry_at = time.monotonic() + self._retry_delay
         self._log(reason)
@@ -289,10 +310,9 @@ class SerialLink:
         if device is None:
             return
         with contextlib.suppress(Exception):
-            farewell = self._client.farewell()
-            for _ in range(VENT_REPEATS):
-                device.write(farewell)
-                self.bytes_sent += len(farewell)
+            farewell = self._unsent + self._client.farewell() * VENT_REPEATS
+            device.write(farewell)
+            self.bytes_sent += len(farewell)
             deadline = time.monotonic() + 0.5
             while device.out_waiting and time.monotonic() < deadline:
                 time.sleep(0.002)
@@ -302,5 +322,7 @@ class SerialLink:
             fcntl.ioctl(device.fileno(), termios.TIOCNXCL)
         with contextlib.suppress(Exception):
             device.close()
-        self._device = None
+        if self._bytes_waiting is not None:
+            self._bytes_waiting.close()
+        self._device = self._bytes_waiting = None
         self.connected = False

@@ -67,11 +67,11 @@ class PressureDriver(Node):
         self.create_service(Trigger, "~/vent", self._on_vent)
         self._diagnostics = DiagnosticsPublisher(self, self._report, hardware_id=self._link.port)
         self.create_timer(0.2, self._watch_link)
+        prepare_process(options.real_time_priority)
         self._link.start()
         self.get_logger().info(
             f"{protocol.name} board on {self._link.port}: vented, waiting for `arm`"
         )
-        prepare_process(options.real_time_priority)
 
     # ------------------------------------------------------------------------------ inputs
 

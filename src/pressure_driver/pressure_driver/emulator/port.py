@@ -7,7 +7,10 @@ import os
 import pty
 import tty
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
+
+from pressure_driver.emulator.tap import LineTap
 
 BITS_PER_BYTE = 10
 """Start bit, eight data bits, stop bit."""
@@ -51,6 +54,7 @@ class EmulatedPort:
         device = os.ttyname(slave)
         os.close(slave)
         os.set_blocking(master, False)
+        self._tap = LineTap(device)
         temporary = self.link.with_name(f"{self.link.name}.{os.getpid()}")
         with contextlib.suppress(FileNotFoundError):
             temporary.unlink()
@@ -65,17 +69,29 @@ class EmulatedPort:
         with contextlib.suppress(OSError):
             self.link.unlink()
         os.close(self._master)
+        self._tap.close()
         self._master = None
         self.host_present = False
         self._outgoing.clear()
         self._incoming.clear()
 
     def watched(self) -> list[int]:
-        """Return the descriptors to wait for; empty while no host has the port open."""
-        return [self._master] if self._master is not None and self.host_present else []
+        """Return the descriptors to wait for; empty while no host has the port open.
 
-    def read(self, now: int) -> bool:
-        """Take what the host has sent; ``now`` in ns of the wall clock.
+        Where writes can be tapped, the terminal itself is left out: waiting for it would wait for
+        the kernel's worker as well.
+        """
+        if self._master is None or not self.host_present:
+            return []
+        return [self._tap.descriptor if self._tap.descriptor >= 0 else self._master]
+
+    def read(self, now: int, clock: Callable[[], int] | None = None) -> bool:
+        """Take what the host has sent.
+
+        Args:
+            now: [ns] wall clock when the wait ended: the arrival of bytes whose writing ended it.
+            clock: the wall clock, for the arrival of bytes that were not announced; ``now`` if
+                None.
 
         Returns:
             Whether a host has just opened the port.
@@ -83,6 +99,7 @@ class EmulatedPort:
         if self._master is None:
             return False
         was_present = self.host_present
+        announced = self._tap.take()
         try:
             data = os.read(self._master, 4096)
             self.host_present = True
@@ -93,7 +110,8 @@ class EmulatedPort:
             self.host_present = False
             self._outgoing.clear()
             return False
-        first = max(now, self._line_free)
+        arrival = now if announced or clock is None else clock()
+        first = max(arrival, self._line_free)
         self._line_free = first + len(data) * self._byte_time
         self._incoming.append((self._line_free, first, data))
         return not was_present

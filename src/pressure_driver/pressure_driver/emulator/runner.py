@@ -111,7 +111,7 @@ class BoardRunner:
                 self.port.send(self._delayed.popleft()[1])
 
     def _serve_line(self, now: int) -> None:
-        if self.port.read(now) and self._reset_on_open:
+        if self.port.read(now, time.time_ns) and self._reset_on_open:
             self.port.send(self.board.boot())
         for stamp, data in self.port.arrived(now):
             commands, answer = self.board.receive(data, stamp)
