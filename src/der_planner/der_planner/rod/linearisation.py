@@ -33,6 +33,19 @@ class StepFactors(NamedTuple):
     extrapolate: Array
 
 
+class StageStates(NamedTuple):
+    """The states at which the steps were linearised.
+
+    Attributes:
+        states: (steps, 3, n) position, velocity and acceleration of each solution.
+        pressures: (steps, M). load: (4N-1,) gravity and point forces.
+    """
+
+    states: Array
+    pressures: Array
+    load: Array
+
+
 @dataclass(frozen=True)
 class Linearisation:
     """First-order effect of the pressures on P outputs along a simulated motion of K intervals.
@@ -56,11 +69,22 @@ class Linearisation:
     _stored: StepFactors
     _output_rows: NDArray[np.int64]
     _state_rows: NDArray[np.int64]
+    _stages: StageStates
 
     @property
     def input_count(self) -> int:
         """M."""
         return int(self._stored.inputs.shape[2])
+
+    @property
+    def rate(self) -> float:
+        """1/h of the stages [1/s]."""
+        return self._stored.rate
+
+    @property
+    def stage_states(self) -> StageStates:
+        """The states at which the steps were linearised."""
+        return self._stages
 
     def tangent(
         self, pressures: ArrayLike, start: tuple[ArrayLike, ArrayLike] | None = None
@@ -71,13 +95,23 @@ class Linearisation:
             pressures: (K, M) held over the steps of an interval, or (K, S, M) [Pa].
             start: change of q[free] and v[free] at the beginning, each (F,).
         """
-        change = self._by_step(pressures)
-        initial = np.zeros((2, self._stored.inertia.shape[0]))
+        return self._propagate(self._by_step(pressures), self._stored, start)
+
+    def forced(self, forcing: Array, start: tuple[ArrayLike, ArrayLike] | None = None) -> Array:
+        """Return the change of the outputs (K+1, P) for forces (steps, n) added in each step."""
+        stored = self._stored._replace(inputs=np.ascontiguousarray(forcing[:, :, None]))
+        once = np.ones((self.intervals, self.steps * self.stages, 1))
+        return self._propagate(once, stored, start)
+
+    def _propagate(
+        self, change: Array, stored: StepFactors, start: tuple[ArrayLike, ArrayLike] | None
+    ) -> Array:
+        initial = np.zeros((2, stored.inertia.shape[0]))
         if start is not None:
             for row, value in enumerate(start):
                 initial[row, self._state_rows] = array(value, self._state_rows.shape, "start")
         out = np.empty((self.intervals + 1, len(self.outputs)))
-        sensitivity_kernel.tangent(change, initial, *self._stored, self._output_rows, out)
+        sensitivity_kernel.tangent(change, initial, *stored, self._output_rows, out)
         return out
 
     def adjoint(self, weights: ArrayLike, *, by_step: bool = False) -> Array:

@@ -59,6 +59,24 @@ class Mesh:
         return len(self.rest) + 1
 
     @property
+    def mass_diagonal(self) -> Array:
+        """(4N-1,) M."""
+        return interleave(self.node_mass, self.edge_inertia)
+
+    @property
+    def damping_diagonal(self) -> Array:
+        """(4N-1,) D of the mass-proportional damping."""
+        return interleave(self.node_damping, self.edge_inertia * self.edge_damping)
+
+    @property
+    def weight(self) -> Array:
+        """(4N-1,) gravity on the nodes [N]."""
+        result = np.zeros(4 * self.nodes - 1)
+        for axis in range(3):
+            result[axis::4] = self.node_mass * self.gravity[axis]
+        return result
+
+    @property
     def node_mass(self) -> Array:
         """(N,) half the mass of the edges at each node."""
         half = 0.5 * self.edge_mass
@@ -71,6 +89,15 @@ class Mesh:
         half = 0.5 * self.edge_mass * self.edge_damping
         total: Array = np.append(half, 0.0) + np.append(0.0, half)
         return total
+
+
+def interleave(of_nodes: Array, of_edges: Array) -> Array:
+    """Return (4N-1,) with values of nodes (N,) at positions and of edges (N-1,) at angles."""
+    result = np.zeros(4 * len(of_nodes) - 1)
+    for axis in range(3):
+        result[axis::4] = of_nodes
+    result[3::4] = of_edges
+    return result
 
 
 def require(condition: bool, name: str, expected: str, got: object) -> None:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.rod import planar_kernel, planar_step_kernel
-from der_planner.rod.linearisation import StepFactors, step_matrices
+from der_planner.rod import band_kernel, planar_kernel, planar_step_kernel
+from der_planner.rod.linearisation import StageStates, StepFactors, step_matrices
 from der_planner.rod.mesh import Mesh
 from der_planner.rod.state import Array, Arrays, RodState
 
@@ -23,7 +23,7 @@ class Run:
         steps: steps done. iterations: Newton iterations of all of them.
         update: size of the last Newton update if a step failed.
         failed_iterations: iterations of the failed step, 0 if none failed.
-        factors: the linearisation, if asked for.
+        factors: the linearisation, if asked for. stages: the states that it belongs to.
     """
 
     q: Array
@@ -34,6 +34,7 @@ class Run:
     update: float
     failed_iterations: int
     factors: StepFactors | None
+    stages: StageStates | None = None
 
 
 class PlanarBackend:
@@ -44,6 +45,7 @@ class PlanarBackend:
         axis = {"xy": 1, "xz": 2}[plane]
         nodes = mesh.nodes
         self.ghost = int(mesh.ghost)
+        self.gravity = mesh.weight
         self.index = (4 * np.arange(nodes)[:, None] + np.array([0, axis])).ravel()
         held = set(mesh.clamped.tolist())
         fixed = [k for k, d in enumerate(self.index) if d in held]
@@ -131,22 +133,24 @@ class PlanarBackend:
         factors = np.empty((kept, self.size, 11))
         bands = np.empty((viscous, self.size, 6))
         columns = np.empty((kept, self.size, inputs))
+        stages = np.empty((kept, 3, self.size))
         x = np.empty((intervals + 1, self.size))
         rate = np.empty((intervals + 1, self.size))
         x[0] = self.extend(state.q)
         rate[0] = self.extend_rate(state.v)
         done, iterations, update, failed = planar_step_kernel.simulate(
             x, rate, pressures, h, extrapolate, tolerance, limit, factors, bands, columns,
-            self.work_space(), self._body(load), self.rod,
+            stages, self.work_space(), self._body(load), self.rod,
         )  # fmt: skip
         q = self.restore(x, state.q)
         v = self.restore(rate, state.v)
         at = done // steps + 1 if failed else intervals
         final = RodState(q[at].copy(), v[at].copy(), state.directors, state.reference_twist)
-        stored = None
+        stored = motion = None
         if linearise and not failed:
             stored = StepFactors(factors, bands, columns, *self._diagonals(h), 1.0 / h, extrapolate)
-        return Run(q, v, final, done, iterations, update, failed, stored)
+            motion = StageStates(stages, pressures.reshape(kept, inputs), load)
+        return Run(q, v, final, done, iterations, update, failed, stored, motion)
 
     def linearise(
         self,
@@ -164,6 +168,28 @@ class PlanarBackend:
         if run.factors is None:
             return run, None
         return run, step_matrices(run.factors, self.free_rows)
+
+    def residual_changes(self, other: PlanarBackend, motion: StageStates, rate: float) -> Array:
+        """Return (steps, n) what a change to the other rod adds to the right sides of the steps."""
+        out = np.empty((len(motion.states), self.size))
+        load = motion.load + other.gravity - self.gravity
+        planar_step_kernel.residual_changes(
+            motion.states, motion.pressures, rate, self.work_space(), self._body(motion.load),
+            self.rod, other._body(load), other.rod, out,
+        )  # fmt: skip
+        return out
+
+    def linearise_equilibrium(self, state: RodState, u: Array) -> Array:
+        """Return ∂q/∂u (4N-1, M) of a resting state."""
+        x = self.extend(state.q)
+        a = np.zeros((self.size, 11))
+        columns = np.zeros((self.size, len(u)))
+        planar_step_kernel.linearise(
+            x, x, 0.0, u, a, columns, self.work_space(), self._body(0.0 * state.q), self.rod
+        )
+        band_kernel.factor_general(a)
+        band_kernel.solve_columns(a, columns)
+        return self._full(columns)
 
     def _diagonals(self, h: float) -> tuple[Array, Array]:
         inertia = (self.mass / h + self.damping) / h

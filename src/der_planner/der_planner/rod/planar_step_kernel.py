@@ -91,14 +91,15 @@ def predict(
 @kernel
 def simulate(
     q: Array, v: Array, pressures: Array, h: float, extrapolate: Array, tolerance: float,
-    limit: int, factors: Array, viscous: Array, inputs: Array, space: Arrays,
-    body: Arrays, rod: Arrays,
+    limit: int, factors: Array, viscous: Array, inputs: Array, stages: Array,
+    space: Arrays, body: Arrays, rod: Arrays,
 ) -> tuple[int, int, float, int]:  # fmt: skip
     """Run K intervals of S steps from q[0], v[0] into q, v (K+1, 2n).
 
     Each step solves backward Euler over h and goes on to x_n + e (x − x_n) with e =
     extrapolate[step modulo its length] (P,). pressures is (K, S, M). factors (K·S, 2n, 11), viscous
-    (K·S or 0, 2n, 6) and inputs (K·S, 2n, M) receive the linearisation unless empty.
+    (K·S or 0, 2n, 6) and inputs (K·S, 2n, M) receive the linearisation unless empty, stages (K·S,
+    3, 2n) each solution's position, velocity and acceleration.
 
     Returns (steps done, Newton iterations, last update, iterations of the failed step or 0).
     """
@@ -131,6 +132,11 @@ def simulate(
         if factors.shape[0] > 0:
             linearise(x, x_n, rate, u, factors[index], inputs[index], space, body, rod)
             factor_general(factors[index])
+            for d in range(size):
+                velocity = (x[d] - x_n[d]) * rate
+                stages[index, 0, d] = x[d]
+                stages[index, 1, d] = velocity
+                stages[index, 2, d] = (velocity - v_n[d]) * rate
             if viscous.shape[0] > 0:
                 for d in range(size):
                     put(band[d], viscous[index, d])
@@ -144,6 +150,27 @@ def simulate(
             put(x_n, q[k + 1])
             put(v_n, v[k + 1])
     return intervals * steps, total, 0.0, 0
+
+
+@kernel
+def residual_changes(
+    stages: Array, pressures: Array, rate: float, space: Arrays, body: Arrays, rod: Arrays,
+    other_body: Arrays, other_rod: Arrays, out: Array,
+) -> None:  # fmt: skip
+    """Fill out (steps, 2n) with this rod's residual minus another's at stored solutions."""
+    work, s, _, edge, turn, torque, _, _ = space
+    for index in range(stages.shape[0]):
+        x, v, acceleration = stages[index, 0], stages[index, 1], stages[index, 2]
+        u = pressures[index]
+        assemble(x, v, rate, u, rate < 0.0, work[0], s, edge, turn, torque, rod)
+        assemble(x, v, rate, u, rate < 0.0, work[1], s, edge, turn, torque, other_rod)
+        for d in range(out.shape[1]):
+            change = work[0, d] - work[1, d]
+            change += (body[0][d] - other_body[0][d]) * acceleration[d]
+            change += (body[1][d] - other_body[1][d]) * v[d]
+            out[index, d] = change - (body[2][d] - other_body[2][d])
+        for d in body[3]:
+            out[index, d] = 0.0
 
 
 @kernel

@@ -16,7 +16,7 @@ from der_planner.rod.mesh import Mesh, array, limb_mesh, positive, require, unif
 from der_planner.rod.planar import PlanarBackend, Run
 from der_planner.rod.spatial import SpatialBackend
 from der_planner.rod.state import Array, RodState, Trajectory, positions_of
-from der_planner.rod.statics import even_bend, find_equilibrium
+from der_planner.rod.statics import even_bend, find_equilibrium, turning
 
 Method = Literal["sdirk2", "midpoint", "backward_euler"]
 Plane = Literal["xy", "xz"]
@@ -50,13 +50,9 @@ class Rod:
         self.plane = plane
         self.rest_lengths = mesh.rest
         self.input_gain = mesh.gain
-        self.mass_diagonal = _interleave(mesh.node_mass, mesh.edge_inertia)
-        self.damping_diagonal = _interleave(
-            mesh.node_damping, mesh.edge_inertia * mesh.edge_damping
-        )
-        self.external_force = np.zeros(4 * mesh.nodes - 1)
-        for axis in range(3):
-            self.external_force[axis::4] = mesh.node_mass * mesh.gravity[axis]
+        self.mass_diagonal = mesh.mass_diagonal
+        self.damping_diagonal = mesh.damping_diagonal
+        self.external_force = mesh.weight
         self._backend = PlanarBackend(mesh, plane) if plane else SpatialBackend(mesh)
         self.free = self._backend.free
         self._tolerance = 1e-10 * float(mesh.rest.sum())
@@ -247,11 +243,11 @@ class Rod:
         h = positive(dt, "dt") / substeps
         run = self._run(state, inputs, h, method, self._load(forces), linearise)
         linearisation = None
-        if linearise and run.factors is not None:
+        if run.factors is not None and run.stages is not None:
             wanted = self._output_indices(outputs)
             linearisation = Linearisation(
                 intervals, substeps, len(_STAGES[method][1]), wanted, self.free, run.factors,
-                self._backend.rows(wanted), self._backend.free_rows,
+                self._backend.rows(wanted), self._backend.free_rows, run.stages,
             )  # fmt: skip
         time = dt * np.arange(intervals + 1)
         return Trajectory(time, run.q, run.v, run.final, run.iterations, linearisation)
@@ -308,6 +304,40 @@ class Rod:
         gain = self.input_matrix(state)[free] / mass[:, None]
         return drift, np.concatenate([np.zeros_like(gain), gain])
 
+    def linearise_equilibrium(self, state: RodState, u: ArrayLike) -> Array:
+        """Return ∂q/∂u (4N-1, M) [m/Pa] of a state that rests under u (M,) [Pa]."""
+        return self._backend.linearise_equilibrium(state, array(u, (self.segment_count,), "u"))
+
+    def parameter_tangent(
+        self,
+        motion: Trajectory,
+        other: Rod,
+        start: tuple[ArrayLike, ArrayLike] | None = None,
+    ) -> Array:
+        """Return the change of a motion's outputs, to first order, if this rod became `other`.
+
+        Stiffness, mass, damping, gain, rest shape and gravity may differ a little; divided by a
+        small difference of one parameter this is the sensitivity to it, at the cost of one sweep.
+
+        Args:
+            motion: of this rod, simulated with `linearise`; a planar rod.
+            other: a rod with the same nodes, segments and plane.
+            start: change of q[free] and v[free] at the beginning, each (F,).
+
+        Returns:
+            (K+1, P) change of the outputs.
+        """
+        linearisation = motion.linearisation
+        mine, its = self._backend, other._backend
+        same = (self.nodes, self.segments, self.plane) == (other.nodes, other.segments, other.plane)
+        require(same, "other", "a rod with the same nodes, segments and plane", other.segments)
+        if linearisation is None or isinstance(mine, SpatialBackend):
+            raise ValueError("motion must be a planar rod's, simulated with linearise=True")
+        if isinstance(its, SpatialBackend):
+            raise AssertionError("a rod with a plane has a planar backend")
+        forcing = mine.residual_changes(its, linearisation.stage_states, linearisation.rate)
+        return linearisation.forced(forcing, start)
+
     def linearise_step(
         self,
         state: RodState,
@@ -337,10 +367,7 @@ class Rod:
     def bend_angles(self, state: RodState | ArrayLike) -> Array:
         """Return (…, M) each segment's turning about +z from its first to its last edge [rad]."""
         q = state.q if isinstance(state, RodState) else np.asarray(state, dtype=np.float64)
-        edges = np.diff(positions_of(q), axis=-2)
-        turns = 2.0 * np.arctan2(*_half_turns(edges))
-        result = [turns[..., first : first + count - 2].sum(-1) for first, count in self.segments]
-        return np.stack(result, axis=-1) if result else np.zeros((*q.shape[:-1], 0))
+        return turning(q, self.segments)
 
     def configuration_from_bend_angles(self, angles: ArrayLike) -> tuple[Array, Array]:
         """Return q (4N-1,) of segments that bend evenly in xy, and S = ∂q/∂angles (4N-1, M).
@@ -423,19 +450,3 @@ _STAGES = {
     "midpoint": (0.5, np.array([2.0])),
     "sdirk2": (_GAMMA, np.array([(1.0 - _GAMMA) / _GAMMA, 1.0])),
 }
-
-
-def _interleave(of_nodes: Array, of_edges: Array) -> Array:
-    result = np.zeros(4 * len(of_nodes) - 1)
-    for axis in range(3):
-        result[axis::4] = of_nodes
-    result[3::4] = of_edges
-    return result
-
-
-def _half_turns(edges: Array) -> tuple[Array, Array]:
-    """Return sine and cosine, up to one factor, of half the turning about z of (…, E, 3) edges."""
-    e, f = edges[..., :-1, :], edges[..., 1:, :]
-    sine = e[..., 0] * f[..., 1] - e[..., 1] * f[..., 0]
-    cosine = e[..., 0] * f[..., 0] + e[..., 1] * f[..., 1]
-    return sine, np.hypot(sine, cosine) + cosine

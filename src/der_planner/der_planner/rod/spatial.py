@@ -27,8 +27,8 @@ class SpatialBackend:
         )
         self.free = np.array([d for d in range(size) if d not in held], dtype=np.int64)
         self.free_rows = self.free + self.offset
-        self.mass = self._extended(mesh.node_mass, mesh.edge_inertia)
-        self.damping = self._extended(mesh.node_damping, mesh.edge_inertia * mesh.edge_damping)
+        self.mass = self.extend_rate(mesh.mass_diagonal)
+        self.damping = self.extend_rate(mesh.damping_diagonal)
         one, rows = np.zeros(self.ghost), np.zeros((self.ghost, 2))
         first = [first + self.ghost for first, _ in mesh.segments]
         last = [first + count - 2 + self.ghost for first, count in mesh.segments]
@@ -63,13 +63,6 @@ class SpatialBackend:
             np.zeros((10, 3)),
             np.zeros((self.size, 21)),
         )
-
-    def _extended(self, of_nodes: Array, of_edges: Array) -> Array:
-        result = np.zeros(4 * self.mesh.nodes - 1)
-        for axis in range(3):
-            result[axis::4] = of_nodes
-        result[3::4] = of_edges
-        return np.concatenate([np.zeros(self.offset), result])
 
     def extend(self, q: Array) -> Array:
         """Return the kernels' coordinates of q, with the ghost node."""
@@ -174,6 +167,16 @@ class SpatialBackend:
             state = self.carry_frames(state, q, v)
         both = np.concatenate([dq[self.free_rows], dv[self.free_rows]])
         return run, (both[:, : 2 * count], both[:, 2 * count :])
+
+    def linearise_equilibrium(self, state: RodState, u: Array) -> Array:
+        """Return ∂q/∂u (4N-1, M) of a resting state."""
+        x = self.extend(state.q)
+        stage = Stage(x, x, 0.0, u, *self.reference(state))
+        by_x, _, columns = residual_derivatives(stage, self.rod, self.work_space())
+        rows = self.free_rows
+        result = np.zeros((4 * self.mesh.nodes - 1, len(u)))
+        result[self.free] = np.linalg.solve(by_x[np.ix_(rows, rows)], columns[rows])
+        return result
 
     def rows(self, indices: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the kernel's rows of indices into q; -1 for indices out of range."""

@@ -1,10 +1,9 @@
 """Compiled time steps of a rod in space; see `spatial_kernel` for the symbols and the rod's arrays.
 
 Every kernel takes, after its own arguments: base, the reference frames at x_n as tangents,
-directors (n-1, 3)
-and twists (n,); space, the work arrays (n,), (6, 4n-1), (4n-1, 11), (n-1, 13), (n-1, 4, 5), (n, 4,
-4), (12, 8), (10, 3), (4n-1, 21); body, the tuple of mass, damping, load (4n-1,) and of the fixed
-indices; rod.
+directors (n-1, 3) and twists (n,); space, the work arrays (n,), (6, 4n-1), (4n-1, 11), (n-1, 13),
+(n-1, 4, 5), (n, 4, 4), (12, 8), (10, 3), (4n-1, 21); body, the tuple of mass, damping, load (4n-1,)
+and of the fixed indices; rod.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ import numpy as np
 
 from der_planner.rod.errors import ConvergenceError
 from der_planner.rod.mesh import Mesh
-from der_planner.rod.state import Array, RodState
+from der_planner.rod.state import Array, RodState, positions_of
 
 _LIMIT = 40
 _SMALLEST_PART = 1.0 / 4096.0
@@ -64,6 +64,19 @@ def find_equilibrium(solver: StaticSolver, start: RodState, u: Array, load: Arra
                 step=index, residual=update, iterations=spent, state=state,
             )  # fmt: skip
     return state
+
+
+def turning(q: Array, segments: tuple[tuple[int, int], ...]) -> Array:
+    """Return (…, M) the turning about z of each segment from its first to its last edge [rad]."""
+    edges = np.diff(positions_of(q), axis=-2)
+    e, f = edges[..., :-1, :], edges[..., 1:, :]
+    sine = e[..., 0] * f[..., 1] - e[..., 1] * f[..., 0]
+    cosine = e[..., 0] * f[..., 0] + e[..., 1] * f[..., 1]
+    turns = np.arctan2(sine, cosine)
+    result = np.zeros((*q.shape[:-1], len(segments)))
+    for index, (first, count) in enumerate(segments):
+        result[..., index] = turns[..., first : first + count - 2].sum(axis=-1)
+    return result
 
 
 def even_bend(angles: Array, mesh: Mesh) -> tuple[Array, Array]:
