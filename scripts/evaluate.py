@@ -2,7 +2,7 @@
 """Compute the tracking errors of recorded runs again, from their bags alone.
 
 python3 scripts/evaluate.py out/bags/*
-python3 scripts/evaluate.py out/bags/* --report report
+python3 scripts/evaluate.py out --report report           every bag of an experiment's folder
 python3 scripts/evaluate.py out/bags/same_direction_der_1 --video film.mp4
 """
 
@@ -35,7 +35,9 @@ def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="bag folders or files")
+    parser.add_argument(
+        "bags", nargs="+", type=Path, metavar="BAG", help="bags, or experiment folders"
+    )
     parser.add_argument(
         "--report",
         type=Path,
@@ -59,6 +61,16 @@ def _arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
+def expand(paths: list[Path]) -> list[Path]:
+    """Replace the folder of an experiment by the bags in it."""
+    found: list[Path] = []
+    for path in paths:
+        inside = path / "bags"
+        is_experiment = inside.is_dir() and not (path / "metadata.yaml").exists()
+        found += sorted(inside.iterdir()) if is_experiment else [path]
+    return found
+
+
 def _show(done: int, total: int, path: Path) -> None:
     if sys.stderr.isatty() or done == total:
         print(f"\r  {done} of {total} bags read, {path.name}", end="", file=sys.stderr, flush=True)
@@ -74,7 +86,8 @@ def main() -> int:
     """Run the command line; 0 when every bag was evaluated, 1 otherwise."""
     options = _arguments()
     settings = Settings(window=options.window, remove_lag=options.remove_lag)
-    found = evaluate_bags(options.bags, settings, workers=options.workers, progress=_show)
+    bags = expand(options.bags)
+    found = evaluate_bags(bags, settings, workers=options.workers, progress=_show)
     for entry in found:
         if entry.error:
             print(f"error: {entry.error}", file=sys.stderr)
@@ -96,7 +109,7 @@ def main() -> int:
     except (BagError, EvaluationError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    return 0 if len(results) == len(options.bags) else 1
+    return 0 if len(results) == len(bags) else 1
 
 
 if __name__ == "__main__":

@@ -120,10 +120,13 @@ def kill_and_recover(seconds: float) -> dict[str, float]:
         report = recover_bag(folder / "bag")
         took = time.perf_counter() - begin
         with BagReader(folder / "bag") as bag:
-            lost = (killed - bag.end) / 1e9
+            last: dict[str, int] = {}
+            for message in bag.raw(["/limb/camera/image_raw", "/limb/bench/state_0"]):
+                last[message.topic.rsplit("/", 1)[-1]] = message.log_time
         size = sum(path.stat().st_size for path in (folder / "bag").glob("*.mcap"))
     return {
-        "killed_lost_s": lost,
+        "killed_lost_of_images_s": (killed - last["image_raw"]) / 1e9,
+        "killed_lost_of_small_topics_s": (killed - last["state_0"]) / 1e9,
         "recovered_messages": report.message_count,
         "recover_s_per_GB": took / (size / 1e9),
     }
