@@ -20,6 +20,7 @@ import workspace
 workspace.enter()
 
 import numpy as np  # noqa: E402
+
 from der_planner.identification import (  # noqa: E402
     CalibrationLog,
     ColumnMap,
@@ -83,7 +84,9 @@ def main() -> int:
             print(f"{run.duration:.0f} s of excitation in {given.excitation}")
             return 0
         if given.offline:
-            print(f"playing {run.duration:.0f} s on the twin of seed {given.seed} …", file=sys.stderr)
+            print(
+                f"playing {run.duration:.0f} s on the twin of seed {given.seed} …", file=sys.stderr
+            )
             log = record_twin(given.seed, run)
         else:
             log = _read(given.bag or given.csv, given.columns)

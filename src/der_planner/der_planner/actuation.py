@@ -84,7 +84,7 @@ def memory_pressure(segment: Segment, time: Array, bend_angle: Array) -> Array:
     return pressure
 
 
-@njit(cache=True)
+@njit(cache=True)  # type: ignore[untyped-decorator]
 def dahl(angle: Array, turn: float) -> Array:
     """Return z (K,) of a Dahl element along an angle (K,) [rad], exact for straight pieces."""
     z = np.zeros(angle.shape[0])
@@ -95,7 +95,7 @@ def dahl(angle: Array, turn: float) -> Array:
     return z
 
 
-@njit(cache=True)
+@njit(cache=True)  # type: ignore[untyped-decorator]
 def maxwell(time: Array, strain: Array, relaxation: float) -> Array:
     """Return the strain (K,) of the spring of a Maxwell element, exact for straight pieces."""
     q = np.zeros(strain.shape[0])
@@ -133,7 +133,7 @@ def resting_bend(limb: Limb, time: ArrayLike, differential: ArrayLike) -> Array:
     return bend
 
 
-@njit(cache=True)
+@njit(cache=True)  # type: ignore[untyped-decorator]
 def _follow(
     time: Array,
     driven: Array,
@@ -182,9 +182,7 @@ def _follow(
     return bend
 
 
-def lead(
-    limb: Limb, time: ArrayLike, differential: ArrayLike, largest_step: float = 0.02
-) -> Array:
+def lead(limb: Limb, time: ArrayLike, differential: ArrayLike, largest_step: float = 0.02) -> Array:
     """Return the commands (K, M) that put these pressures (K, M) into the chambers in time [Pa].
 
     The inverse of a dead time and a first-order lag, with one time constant while |pressure| rises and
@@ -205,7 +203,8 @@ def lead(
         lag = np.where(value * slope >= 0, air.time_constant, vent)
         result[:, index] = value + lag * slope
     limit = air.pressure_limit
-    return np.clip(result, -limit, limit)
+    clipped: Array = np.clip(result, -limit, limit)
+    return clipped
 
 
 def _check(

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from der_planner.twin import LimbTwin, TwinError
 from der_planner.twin.hardware import RANGES, draw
 from der_planner.twin.limb_twin import ATMOSPHERE, TIME_STEP
@@ -43,7 +44,9 @@ def test_straight_limb_reaches_along_x():
     np.testing.assert_allclose(twin.tip, [0.244, 0.0], atol=1e-9)
 
 
-@pytest.mark.parametrize(("chamber", "segment", "sign"), [(0, 0, 1), (1, 0, -1), (2, 1, 1), (3, 1, -1)])
+@pytest.mark.parametrize(
+    ("chamber", "segment", "sign"), [(0, 0, 1), (1, 0, -1), (2, 1, 1), (3, 1, -1)]
+)
 def test_each_chamber_bends_its_own_segment_by_moment_over_stiffness(chamber, segment, sign):
     hardware = replace(plain(), drag=6.0)
     pressure = REST.copy()
@@ -153,7 +156,11 @@ def test_creep_goes_on_after_the_step():
     creeping = replace(
         calm,
         segments=tuple(
-            replace(s, creep_stiffness=(0.0, 0.03 * s.bending_stiffness, 0.0), creep_time=(0.03, 5.0, 60.0))
+            replace(
+                s,
+                creep_stiffness=(0.0, 0.03 * s.bending_stiffness, 0.0),
+                creep_time=(0.03, 5.0, 60.0),
+            )
             for s in calm.segments
         ),
     )
@@ -188,7 +195,9 @@ def test_drawn_limbs_agree_with_logs_of_real_ones():
         total += sum(s.flexible_length for s in hardware.segments)
         assert total == pytest.approx(0.244, abs=1e-12)
         for segment in hardware.segments:
-            gain = np.mean(segment.chamber_gain) * segment.flexible_length / segment.bending_stiffness
+            gain = (
+                np.mean(segment.chamber_gain) * segment.flexible_length / segment.bending_stiffness
+            )
             assert 0.22 < np.degrees(gain) * 100 < 0.50  # deg/hPa
             rest = np.degrees(segment.rest_curvature * segment.flexible_length)
             assert abs(rest) <= RANGES["rest_angle"][1]

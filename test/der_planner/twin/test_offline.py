@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from der_planner.twin import TwinError
 from der_planner.twin.offline import play, split
 from pressure_driver.emulator.pneumatics import Pneumatics

@@ -1,6 +1,7 @@
 """The loop that keeps the simulation in step with the clock, on a clock of its own."""
 
 import pytest
+
 from der_planner.twin.realtime import BACKLOG, RealTimeLoop
 
 

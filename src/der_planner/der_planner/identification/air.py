@@ -87,11 +87,12 @@ def fit_air(log: CalibrationLog, period: float) -> AirFit:
         loss="soft_l1",
         f_scale=50.0,
         x_scale=(0.1, 0.1, 0.1),
-        diff_step=1e-2,
+        diff_step=(1e-2, 1e-2, 1e-2),
     )
     remaining = residual(solution.x)
     spread = float(np.sqrt(np.mean(remaining**2)))
-    covariance = np.linalg.pinv(solution.jac.T @ solution.jac) * spread**2 / period
+    jacobian = np.asarray(solution.jac)
+    covariance = np.linalg.pinv(jacobian.T @ jacobian) * spread**2 / period
     return AirFit(
         fill_lag=float(solution.x[0]),
         vent_lag=float(solution.x[1]),

@@ -46,15 +46,17 @@ def read_bag(path: str | Path) -> CalibrationLog:
                         )
                     )
                 elif message.valid:
-                    states.append(
-                        (stamp, list(message.bend_angle), [message.tip.x, message.tip.y])
-                    )
+                    states.append((stamp, list(message.bend_angle), [message.tip.x, message.tip.y]))
     except BagError as error:
         raise LogError(str(error)) from error
     if len(pressures) < 10:
-        raise LogError(f"the bag {path} holds no pressures ({PRESSURE_TYPE}): was the driver running?")
+        raise LogError(
+            f"the bag {path} holds no pressures ({PRESSURE_TYPE}): was the driver running?"
+        )
     if len(states) < 10:
-        raise LogError(f"the bag {path} holds no valid limb state ({STATE_TYPE}): was the limb seen?")
+        raise LogError(
+            f"the bag {path} holds no valid limb state ({STATE_TYPE}): was the limb seen?"
+        )
     return _merge(pressures, states, str(path))
 
 

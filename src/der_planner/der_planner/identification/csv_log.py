@@ -6,6 +6,7 @@ import csv
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -74,7 +75,7 @@ class ColumnMap:
                 + (f"{missing[0]} is missing; " if missing else "")
                 + f"the keys are {', '.join(sorted(known))}"
             )
-        values = {
+        values: dict[str, Any] = {
             key: tuple(tuple(v) if isinstance(v, list) else v for v in value)
             if isinstance(value, list)
             else value
@@ -116,7 +117,9 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
     if columns.rest_until > 0:
         rest = (time < columns.rest_until) & np.all(command == 0, axis=1)
         if not rest.any():
-            raise LogError(f"{path} has no row at rest before {columns.rest_until} s: see rest_until")
+            raise LogError(
+                f"{path} has no row at rest before {columns.rest_until} s: see rest_until"
+            )
         measured = measured - np.nanmean(measured[rest], axis=0)
     if columns.tags:
         tags = pick(columns.tags)

@@ -43,7 +43,9 @@ def directions(segment_count: int) -> list[Array]:
     return result
 
 
-def staircase(amplitude: float, segment_count: int = 2, levels: int = 2, hold: float = 3.0) -> Array:
+def staircase(
+    amplitude: float, segment_count: int = 2, levels: int = 2, hold: float = 3.0
+) -> Array:
     """Return a staircase (K, M) [Pa] both ways along each of `directions`.
 
     Args:
@@ -87,7 +89,10 @@ def steps(amplitude: float, segment_count: int = 2, hold: float = 4.0) -> Array:
 
 
 def sweep(
-    amplitude: float, segment_count: int = 2, duration: float = 16.0, band: tuple[float, float] = (0.1, 1.2)
+    amplitude: float,
+    segment_count: int = 2,
+    duration: float = 16.0,
+    band: tuple[float, float] = (0.1, 1.2),
 ) -> Array:
     """Return a sweep (K, M) [Pa] through a band of frequencies [Hz], its inputs out of step."""
     t = np.arange(round(duration / PERIOD)) * PERIOD
@@ -123,7 +128,7 @@ def calibration_run(amplitude: float, segment_count: int = 2, quick: bool = Fals
         for (name, block), end in zip(named, ends, strict=True)
     )
     pressure = np.concatenate([block for _, block in named])
-    return Excitation(np.arange(len(pressure)) * PERIOD, pressure, parts)
+    return Excitation(np.arange(len(pressure), dtype=np.float64) * PERIOD, pressure, parts)
 
 
 def _fade(wave: Array, duration: float) -> Array:

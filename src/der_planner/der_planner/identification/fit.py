@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 import time as clock
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,7 @@ ANGLE_ERROR = np.deg2rad(0.3)
 """Error of a predicted bend angle that is taken for granted [rad]; the residual replaces it."""
 CORRELATION = 20.0
 """Rows over which an error of the model stays the same (1 s)."""
-MOST_EVALUATIONS = 15
+MOST_EVALUATIONS = 10
 """Of model and derivatives; a fit that has not settled by then changes less than its uncertainty."""
 STRONG = 0.9
 """|correlation| above which two unknowns are said to be told only together."""

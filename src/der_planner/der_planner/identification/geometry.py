@@ -62,7 +62,10 @@ def fit_geometry(limb: Limb, log: CalibrationLog, nodes: int = NODES) -> Geometr
     several = limb.segment_count > 1
     spread = np.append(LENGTH_PRIOR * prior, CONNECTOR_PRIOR)
     start = np.append(prior, np.clip(connector, 1.1 * CONNECTOR_RANGE[0], 0.9 * CONNECTOR_RANGE[1]))
-    low, high = np.append(0.8 * prior, CONNECTOR_RANGE[0]), np.append(1.2 * prior, CONNECTOR_RANGE[1])
+    low, high = (
+        np.append(0.8 * prior, CONNECTOR_RANGE[0]),
+        np.append(1.2 * prior, CONNECTOR_RANGE[1]),
+    )
     weight = np.sqrt(every / CORRELATION) / TIP_ERROR
     free = len(start) if several else len(prior)
 

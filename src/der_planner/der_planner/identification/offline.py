@@ -36,7 +36,7 @@ def record_twin(
         noise: factor on the sensors' noise.
     """
     # PyElastica takes a second to import: only who plays pays for it.
-    from der_planner.twin.offline import play
+    from der_planner.twin.offline import play  # noqa: PLC0415
 
     played = play(excitation.time, excitation.differential_pressure, seed, run=run)
     generator = np.random.default_rng([seed, run])

@@ -71,7 +71,7 @@ def fit_pcc(limb: Limb, prepared: Prepared, offset: Array) -> tuple[tuple[Segmen
         diff_step=1e-3,
         xtol=1e-3,
         ftol=1e-4,
-        max_nfev=5,
+        max_nfev=4,
     )
     error = np.sqrt(np.nanmean((angles(solution.x) - prepared.log.bend_angles) ** 2, axis=0))
     return segments_of(limb, solution.x), np.asarray(error)

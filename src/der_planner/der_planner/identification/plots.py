@@ -23,8 +23,8 @@ def plot_prediction(
         path: of the PNG.
         held_out: a log that the fit has not seen.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
+    from matplotlib.figure import Figure  # noqa: PLC0415
 
     logs = [("fitted", log)] + ([("not seen by the fit", held_out)] if held_out else [])
     figure = Figure(figsize=(5.2 * len(logs), 4.2), layout="constrained")

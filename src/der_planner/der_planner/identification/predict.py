@@ -71,4 +71,3 @@ def _simulate(limb: Limb, effective: Array, period: float, model: str) -> tuple[
     run = rod.simulate(rod.equilibrium(effective[0]), middle, period)
     tip: Array = run.tip[:, :2]
     return bend_of(rod, run.q), tip
-

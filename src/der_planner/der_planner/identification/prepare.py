@@ -117,7 +117,9 @@ def _pressures(log: CalibrationLog, limb: Limb, warnings: list[str]) -> Array:
                 f"{agreement:.2f}): check the column map and the tubes"
             )
         if agreement < 0.8:
-            warnings.append(f"measured pressure {index} follows its command loosely ({agreement:.2f})")
+            warnings.append(
+                f"measured pressure {index} follows its command loosely ({agreement:.2f})"
+            )
     return pressure
 
 
@@ -131,7 +133,7 @@ def _check_excitation(pressure: Array, warnings: list[str]) -> None:
                 "run the calibration motion"
             )
     if pressure.shape[1] > 1:
-        together = np.corrcoef(pressure.T)
+        together = np.asarray(np.corrcoef(pressure.T))
         for i in range(len(together)):
             for j in range(i):
                 if abs(together[i, j]) > 0.98:

@@ -9,16 +9,16 @@ import time
 
 import numpy as np
 import rclpy
-from der_msgs.msg import ChamberPressures, LimbShape, LimbState
 from geometry_msgs.msg import Point
-from limb_interfaces import parameters, qos, stamps, topics
-from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
-from limb_interfaces.runner import run_node
 from rclpy.node import Node
 from std_msgs.msg import Header
 
+from der_msgs.msg import ChamberPressures, LimbShape, LimbState
 from der_planner.twin import LimbTwin, TwinError
 from der_planner.twin.realtime import RealTimeLoop
+from limb_interfaces import parameters, qos, stamps, topics
+from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
+from limb_interfaces.runner import run_node
 
 SILENCE = 1.0
 """Without chamber pressures for this long [s] the node warns."""

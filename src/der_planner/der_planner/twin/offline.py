@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pressure_driver.emulator.pneumatics import Pneumatics
 
 from der_planner.twin.limb_twin import LimbTwin, TwinError
+from pressure_driver.emulator.pneumatics import Pneumatics
 
 Array = NDArray[np.float64]
 

@@ -1,0 +1,126 @@
+"""Unequal chambers, stiffening, friction and creep as pressures."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from der_planner import actuation
+from der_planner.limb import Limb, LimbError
+
+
+def rubbing(**changes: float) -> Limb:
+    limb = Limb.default()
+    segments = tuple(
+        replace(
+            s,
+            gain_asymmetry=0.05,
+            pressure_stiffening=5e-6,
+            friction_moment=400 * s.moment_gain,
+            friction_curvature=0.1 / s.length,
+            creep_stiffness=500 * s.moment_gain * s.length,
+            creep_time=8.0,
+            rest_curvature=0.2,
+            **changes,
+        )
+        for s in limb.segments
+    )
+    return replace(limb, segments=segments)
+
+
+TIME = np.arange(600) * 0.05
+BEND = 0.6 * np.stack([np.sin(TIME / 3), np.cos(TIME / 2) - 1], axis=1)
+WANTED = 11_000.0 * np.stack([np.sin(TIME / 3), np.sin(TIME / 5)], axis=1)
+
+
+def test_differential_and_effective_pressure_are_inverse():
+    limb = rubbing()
+    given = actuation.differential_pressure(limb, TIME, WANTED, BEND)
+    np.testing.assert_allclose(
+        actuation.effective_pressure(limb, TIME, given, BEND), WANTED, atol=1e-8
+    )
+    assert np.abs(given - WANTED).max() > 300.0
+
+
+def test_a_plain_limb_feels_what_its_chambers_hold():
+    np.testing.assert_array_equal(
+        actuation.effective_pressure(Limb.default(), TIME, WANTED, BEND), WANTED
+    )
+
+
+def test_friction_saturates_closes_its_loops_and_does_not_depend_on_rate():
+    angle = np.concatenate(
+        [np.linspace(0, 2, 400), np.linspace(2, -2, 800), np.linspace(-2, 2, 800)]
+    )
+    z = actuation.dahl(angle, 0.1)
+    assert np.abs(z).max() <= 1.0
+    assert z[399] == pytest.approx(1.0, abs=1e-6)
+    assert z[1199] == pytest.approx(-1.0, abs=1e-6)
+    np.testing.assert_allclose(z[-1], z[399], atol=1e-6)
+    np.testing.assert_allclose(actuation.dahl(angle[::4], 0.1)[-1], z[-1], atol=1e-6)
+    # half way round after 0.1 ln 2 from saturation
+    turned = actuation.dahl(np.array([0.0, 5.0, 5.0 - 0.1 * np.log(2)]), 0.1)
+    assert turned[-1] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_creep_relaxes_exponentially():
+    time = np.linspace(0, 20, 401)
+    strain = np.where(time > 0, 1.0, 0.0)
+    q = actuation.maxwell(time, strain, 4.0)
+    np.testing.assert_allclose(q[1:], q[1] * np.exp(-(time[1:] - time[1]) / 4.0), rtol=1e-12)
+
+
+def test_resting_bend_is_where_moment_and_effective_pressure_agree():
+    limb = rubbing()
+    bend = actuation.resting_bend(limb, TIME, WANTED)
+    effective = actuation.effective_pressure(limb, TIME, WANTED, bend)
+    rest = np.array([s.rest_curvature * s.length for s in limb.segments])
+    np.testing.assert_allclose(bend[1:], (rest + limb.static_gain * effective)[1:], atol=1e-9)
+
+
+def test_lead_undoes_a_first_order_lag():
+    limb = Limb.default()
+    limb = replace(limb, pneumatics=replace(limb.pneumatics, time_constant=0.3, delay=0.1))
+    time = np.arange(0, 12, 0.01)
+    wanted = 5000.0 * np.sin(time)[:, None] * [1.0, -1.0]
+    command = actuation.lead(limb, time, wanted)
+    held = np.zeros(2)
+    for k in range(len(time)):
+        past = command[max(0, k - 10)]
+        held = held + 0.01 / 0.3 * (past - held)
+        if time[k] > 3.0 and time[k] < 11.0:
+            assert np.abs(held - wanted[k]).max() < 80.0
+
+
+def test_too_much_stiffening_is_refused_by_its_name():
+    limb = rubbing()
+    segments = tuple(replace(s, pressure_stiffening=1e-4) for s in limb.segments)
+    with pytest.raises(ValueError, match="pressure_stiffening"):
+        actuation.differential_pressure(replace(limb, segments=segments), TIME, WANTED, BEND)
+
+
+def test_limb_file_keeps_everything(tmp_path):
+    limb = rubbing()
+    limb = replace(limb, pcc_segments=tuple(replace(s, damping=2.0) for s in limb.segments))
+    limb.to_yaml(tmp_path / "limb.yaml")
+    again = Limb.from_yaml(tmp_path / "limb.yaml")
+    assert again == limb
+    assert again.for_model("pcc").segments == limb.pcc_segments
+    assert again.for_model("der") == again
+    with pytest.raises(LimbError, match="model"):
+        again.for_model("arc")
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"friction_moment": 0.1}, "friction_curvature"),
+        ({"creep_stiffness": 0.1}, "creep_time"),
+        ({"gain_asymmetry": 1.5}, "gain_asymmetry"),
+        ({"friction_moment": -1.0}, "friction_moment"),
+    ],
+)
+def test_impossible_segments_are_refused(change, match):
+    limb = Limb.default()
+    with pytest.raises(LimbError, match=match):
+        replace(limb, segments=(replace(limb.segments[0], **change), limb.segments[1]))

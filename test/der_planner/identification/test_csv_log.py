@@ -1,0 +1,83 @@
+"""Tables of any lab, through a map of columns."""
+
+import numpy as np
+import pytest
+
+from der_planner.identification import ColumnMap, LogError, read_csv
+
+COLUMNS = dict(
+    time="t", commanded=("u",), chambers=("a", "b"), angles=("theta",), pressure_unit="hPa",
+    angle_unit="deg", angle_factor=2.0, rest_until=0.25, tags=("px",),
+)  # fmt: skip
+ROWS = """t,u,a,b,theta,px
+0.0,0,1002,1000,1.0,5.0
+0.1,0,1002,1000,1.0,5.1
+0.2,0,1002,1000,1.0,5.1
+0.3,40,1022,1000,3.0,5.3
+0.4,40,1042,1000,5.0,5.4
+"""
+
+
+@pytest.fixture
+def table(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text(ROWS)
+    return path
+
+
+def test_units_zeros_factors_and_lost_tags(table):
+    log = read_csv(table, ColumnMap(**COLUMNS))
+    np.testing.assert_allclose(log.measured_differential[:, 0], [0, 0, 0, 2000, 4000])
+    np.testing.assert_allclose(log.commanded_differential[:, 0], [0, 0, 0, 4000, 4000])
+    expected = np.deg2rad([2.0, 2.0, np.nan, 6.0, 10.0])
+    np.testing.assert_allclose(log.bend_angles[:, 0], expected)
+    assert np.isnan(log.tip).all()
+
+
+def test_stretches_are_left_out(table):
+    log = read_csv(table, ColumnMap(**{**COLUMNS, "ignore": ((0.05, 0.15),)}))
+    np.testing.assert_allclose(log.time, [0.0, 0.2, 0.3, 0.4])
+
+
+def test_gaps_are_bridged_up_to_a_length(table):
+    log = read_csv(table, ColumnMap(**COLUMNS))
+    assert np.isfinite(log.resampled(0.05, 0.5).bend_angles).all()
+    assert np.isnan(log.resampled(0.05, 0.15).bend_angles).any()
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"angles": ("phi",)}, "no column 'phi'"),
+        ({"chambers": ("a",)}, "needs 1 commands and 2 chambers"),
+        ({"pressure_unit": "bar"}, "pressure_unit is 'bar'"),
+        ({"rest_until": 0.3, "commanded": ("t",), "ignore": ()}, None),
+    ],
+)
+def test_wrong_maps_are_named(table, change, match):
+    if match is None:
+        read_csv(table, ColumnMap(**{**COLUMNS, **change}))
+        return
+    with pytest.raises(LogError, match=match):
+        read_csv(table, ColumnMap(**{**COLUMNS, **change}))
+
+
+def test_map_files(tmp_path):
+    path = tmp_path / "columns.yaml"
+    path.write_text("time: t\ncommanded: [u]\nchambers: [a, b]\nangles: [theta]\n")
+    assert ColumnMap.from_yaml(path).chambers == ("a", "b")
+    path.write_text("time: t\ncolour: red\n")
+    with pytest.raises(LogError, match="colour"):
+        ColumnMap.from_yaml(path)
+    with pytest.raises(LogError, match="cannot read"):
+        ColumnMap.from_yaml(tmp_path / "nothing.yaml")
+
+
+def test_damaged_tables_are_refused(tmp_path):
+    path = tmp_path / "bad.csv"
+    path.write_text("t,u\n0,x\n1,2\n")
+    with pytest.raises(LogError, match="no number"):
+        read_csv(path, ColumnMap(**COLUMNS))
+    path.write_text("t,u\n")
+    with pytest.raises(LogError, match="fewer than two rows"):
+        read_csv(path, ColumnMap(**COLUMNS))

@@ -1,0 +1,224 @@
+"""Fits on logs whose truth is known, and logs that must be refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from der_planner.identification import CalibrationLog, LogError, check, fit, predict
+from der_planner.identification.air import fit_air
+from der_planner.identification.excitation import calibration_run, steps, sweep, waves
+from der_planner.identification.geometry import fit_geometry, with_geometry
+from der_planner.identification.parameters import TERMS, put, start_values
+from der_planner.identification.prediction import RodPrediction
+from der_planner.limb import Limb
+from der_planner.planning.kinematics import PolylineKinematics
+from der_planner.planning.pneumatics import chamber_pressures
+from der_planner.rod import Rod
+
+NOISE = np.deg2rad(0.1)
+
+
+def hidden_limb() -> Limb:
+    limb = Limb.default()
+    factors = ((1.12, 0.35, 0.04), (0.9, -0.25, -0.03))
+    return replace(
+        limb,
+        segments=tuple(
+            replace(
+                s,
+                moment_gain=factor * s.moment_gain,
+                rest_curvature=rest,
+                gain_asymmetry=asymmetry,
+                pressure_stiffening=4e-6,
+                friction_moment=300 * factor * s.moment_gain,
+                friction_curvature=0.12 / s.length,
+                creep_stiffness=400 * factor * s.moment_gain * s.length,
+                creep_time=9.0,
+                bending_stiffness=0.0175,
+            )
+            for s, (factor, rest, asymmetry) in zip(limb.segments, factors, strict=True)
+        ),
+    )
+
+
+def synthetic_log(limb: Limb, seed: int = 0, slow: bool = False) -> CalibrationLog:
+    pressure = waves(14_000.0, 2, 40.0)
+    if not slow:
+        pressure = np.concatenate([pressure, steps(5000.0), sweep(3500.0, 2, 12.0)])
+    time = 0.05 * np.arange(len(pressure))
+    generator = np.random.default_rng(seed)
+    # a chamber is never as steep as its command
+    held = np.stack([np.convolve(c, np.ones(8) / 8, "full")[: len(time)] for c in pressure.T], 1)
+    predicted = predict(limb, time, held)
+    bend = predicted.bend_angles
+    for _ in range(12):  # friction and creep along the bend itself, by relaxed fixed point
+        moved = RodPrediction(limb, time, held, bend, nodes=13).angles(start_values(limb))
+        bend = bend + 0.5 * (moved - bend)
+    return CalibrationLog(
+        time=time,
+        commanded_differential=pressure,
+        measured_differential=held + 5.0 * generator.standard_normal(held.shape),
+        bend_angles=bend + NOISE * generator.standard_normal(held.shape),
+        tip=predicted.tip + 3e-4 * generator.standard_normal((len(time), 2)),
+        source="synthetic",
+    )
+
+
+@pytest.fixture(scope="module")
+def log() -> CalibrationLog:
+    return synthetic_log(hidden_limb())
+
+
+@pytest.fixture(scope="module")
+def fitted(log):
+    return fit(Limb.default(), log, geometry=False)
+
+
+def test_derivatives_agree_with_differences(log):
+    rows = slice(0, 300)
+    pressure = log.measured_differential[rows]
+    bend = hidden_limb().static_gain * pressure
+    prediction = RodPrediction(Limb.default(), log.time[rows], pressure, bend)
+    values = start_values(hidden_limb())
+    wanted = [(0, k) for k in range(len(TERMS))] + [(1, 0), (1, 4)]
+    _, exact = prediction.derivatives(values, wanted)
+    for place, (segment, term) in enumerate(wanted):
+        if TERMS[term].name == "material_damping":
+            continue  # zero is its lower bound
+        step = 1e-4 * TERMS[term].scale
+        ends = []
+        for sign in (1, -1):
+            moved = values.copy()
+            put(moved, segment, term, values[segment, term] + sign * step)
+            ends.append(prediction.angles(moved))
+        difference = (ends[0] - ends[1]) / (2 * step)
+        scale = np.abs(difference).max()
+        # what is no pressure goes through a coarse difference, and a rest angle bends the start too
+        tolerance = 0.2 if TERMS[term].group == "dynamics" else 0.02
+        assert np.abs(exact[:, :, place] - difference).max() < tolerance * scale, TERMS[term].name
+
+
+def test_known_parameters_are_recovered_within_their_uncertainty(fitted):
+    limb, report = fitted
+    truth = start_values(hidden_limb())
+    for segment in range(2):
+        for name in ("gain", "rest_angle", "gain_asymmetry", "pressure_stiffening"):
+            item = report.value(f"{name}[{segment}]")
+            true = truth[segment, [term.name for term in TERMS].index(name)]
+            spread = max(item.deviation, 1e-3 * abs(true))
+            assert abs(item.value - true) < 4 * spread, (name, item, true)
+    assert np.degrees(report.residual).max() < 0.25
+    assert report.value("gain[0]").deviation < 0.02 * report.value("gain[0]").value
+
+
+def test_each_model_term_buys_something(log, fitted):
+    _, full = fitted
+    _, linear = fit(Limb.default(), log, geometry=False, terms=())
+    _, static = fit(Limb.default(), log, geometry=False, terms=("asymmetry", "stiffening"))
+    assert full.residual.mean() < 0.5 * static.residual.mean() < 0.5 * linear.residual.mean()
+
+
+def test_unseen_motion_is_predicted(fitted):
+    limb, _ = fitted
+    time = 0.05 * np.arange(500)
+    pressure = 9000.0 * np.stack([np.sin(time / 2), np.sin(time / 3)], axis=1)
+    truth, guess = predict(hidden_limb(), time, pressure), predict(limb, time, pressure)
+    distance = np.linalg.norm(truth.tip - guess.tip, axis=1)
+    assert distance.mean() < 0.003 * limb.length * 2
+
+
+def test_a_limb_that_fits_passes_the_check_and_a_changed_one_does_not(fitted):
+    limb, _ = fitted
+    assert check(limb, synthetic_log(hidden_limb(), seed=5, slow=True)).fits
+    drifted = hidden_limb()
+    weaker = replace(drifted.segments[0], moment_gain=0.8 * drifted.segments[0].moment_gain)
+    changed_limb = replace(drifted, segments=(weaker, drifted.segments[1]))
+    verdict = check(limb, synthetic_log(changed_limb, slow=True))
+    assert not verdict.fits
+    assert any("gain of segment 0" in finding for finding in verdict.findings)
+    assert not any("gain of segment 1" in finding for finding in verdict.findings)
+
+
+def test_lag_of_the_air_is_recovered():
+    limb = Limb.default()
+    air = replace(limb.pneumatics, time_constant=0.32, vent_time_constant=0.14, delay=0.0)
+    command = waves(12_000.0, 2, 60.0)
+    held = chamber_pressures(air, command, 0.05, 4)
+    middle = (np.arange(4) + 0.5) / 4 * 0.05
+    fine = (0.05 * np.arange(len(command))[:, None] + middle).ravel()
+    grid = 0.05 * np.arange(len(command))
+    measured = np.stack([np.interp(grid, fine, held[:, :, j].ravel()) for j in range(2)], 1) + 7.0
+    zeros = np.zeros((len(grid), 2))
+    found = fit_air(CalibrationLog(grid, command, measured, zeros, zeros), 0.05)
+    assert found.fill_lag + found.delay == pytest.approx(0.32, abs=0.02)
+    assert found.vent_lag + found.delay == pytest.approx(0.14, abs=0.02)
+    np.testing.assert_allclose(found.offset, 7.0, atol=3.0)
+
+
+def test_lengths_are_recovered_from_tips():
+    limb = with_geometry(Limb.default(), np.array([0.1195, 0.1235]), 6e-3)
+    rod = Rod.from_limb(limb, 21)
+    generator = np.random.default_rng(2)
+    angles = generator.uniform(-0.8, 0.8, (400, 2))
+    tip = PolylineKinematics(rod.rest_lengths, list(rod.segments)).tip(angles)
+    tip += 2e-4 * generator.standard_normal(tip.shape)
+    time, none = 0.05 * np.arange(400), np.zeros((400, 2))
+    found = fit_geometry(Limb.default(), CalibrationLog(time, none, none, angles, tip))
+    assert found is not None
+    error = np.append(found.lengths - [0.1195, 0.1235], found.connector - 6e-3)
+    assert np.all(np.abs(error) < 3 * found.uncertainty)
+    assert found.residual < 0.4e-3 < found.residual_before
+
+
+def test_a_slow_log_does_not_tell_stiffness_from_gain():
+    time = 0.05 * np.arange(2400)
+    pressure = 8000 * np.stack([np.sin(time / 15), np.sin(time / 11 + 1) - np.sin(1)], axis=1)
+    predicted = predict(hidden_limb(), time, pressure)
+    noise = NOISE * np.random.default_rng(0).standard_normal(pressure.shape)
+    slow = CalibrationLog(time, pressure, pressure, predicted.bend_angles + noise, predicted.tip)
+    limb, report = fit(Limb.default(), slow, geometry=False)
+    assert any("too slow" in warning for warning in report.warnings)
+    assert limb.segments[0].bending_stiffness == Limb.default().segments[0].bending_stiffness
+
+
+def changed(log: CalibrationLog, **values) -> CalibrationLog:
+    return replace(log, **values)
+
+
+def test_bad_logs_are_refused_by_what_is_wrong(log):
+    limb, u, q = Limb.default(), log.measured_differential, log.bend_angles
+    still = u.copy()
+    still[:, 1] = 0.0
+    blind = q.copy()
+    blind[: int(0.7 * len(q))] = np.nan
+    cases = {
+        "input 1 was not excited": changed(
+            log, measured_differential=still, commanded_differential=still
+        ),
+        "tags were seen": changed(log, bend_angles=blind),
+        "swapped": changed(log, bend_angles=q[:, ::-1]),
+        "wrong way": changed(log, bend_angles=-q),
+        "follow its command": changed(log, commanded_differential=u[::-1].copy()),
+        "units": changed(log, measured_differential=u * 1e-4),
+        "saturated": changed(log, measured_differential=24_000 * np.sign(u - 50.0)),
+    }
+    for match, bad in cases.items():
+        with pytest.raises(LogError, match=match):
+            fit(limb, bad)
+    one = replace(limb, segments=limb.segments[:1])
+    with pytest.raises(LogError, match="another limb"):
+        fit(one, log)
+    with pytest.raises(LogError, match="unknown model term"):
+        fit(limb, log, terms=("magic",))
+
+
+def test_excitation_stays_inside_its_amplitude_and_excites_each_input_alone():
+    run = calibration_run(10_000.0)
+    assert np.abs(run.differential_pressure).max() <= 10_000.0
+    assert 150 < run.duration < 240
+    assert calibration_run(10_000.0, quick=True).duration < 0.5 * run.duration
+    assert abs(np.corrcoef(run.differential_pressure.T)[0, 1]) < 0.5
+    np.testing.assert_array_equal(run.differential_pressure[[0, -1]], 0.0)
+    names = {name for name, _, _ in run.parts}
+    assert names == {"rest", "waves", "staircase", "steps", "sweep"}

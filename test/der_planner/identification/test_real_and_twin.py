@@ -1,0 +1,41 @@
+"""The whole procedure on the twin, and on numbers of a real limb where they are at hand."""
+
+import numpy as np
+import pytest
+
+from der_planner.identification import ColumnMap, calibrate_twin, fit, predict, read_csv
+from der_planner.identification.excitation import PERIOD, Excitation
+from der_planner.identification.offline import record_twin
+from der_planner.limb import Limb
+
+REAL = ColumnMap(
+    time="t", commanded=("u0", "u1"), chambers=("p0", "p1", "p2", "p3"), angles=("theta0", "theta1"),
+    tags=("x103", "y103", "x104", "y104"), pressure_unit="hPa", angle_unit="deg", angle_factor=2.0,
+    rest_until=12.0, ignore=((1.5, 3.0),),
+)  # fmt: skip
+
+
+@pytest.mark.slow
+def test_twin_is_predicted_after_one_calibration():
+    limb, report = calibrate_twin(0, Limb.default())
+    assert np.degrees(report.residual).max() < 1.0
+    time = np.arange(0, 30, PERIOD)
+    pressure = 9000.0 * np.stack([1 - np.cos(time / 3), np.sin(time / 2)], axis=1)
+    log = record_twin(0, Excitation(time, pressure, ()), run=2)
+    predicted = predict(limb, log.time, log.measured_differential)
+    error = np.linalg.norm(predicted.tip - log.tip, axis=1) / limb.length
+    assert error.mean() < 0.03
+    assert error.max() < 0.08
+    default = predict(Limb.default(), log.time, log.measured_differential)
+    assert error.mean() < 0.5 * np.linalg.norm(default.tip - log.tip, axis=1).mean() / limb.length
+
+
+@pytest.mark.slow
+def test_real_limb_is_fitted(shared_data):
+    folder = shared_data / "real_limb"
+    log = read_csv(folder / "A_calibration.csv", REAL)
+    limb, report = fit(Limb.default(), log, longest_gap=10.0)
+    assert np.degrees(report.residual).max() < 1.0
+    gains = np.degrees(limb.static_gain) * 100
+    assert 0.22 < gains[1] < gains[0] < 0.50 or gains[1] == pytest.approx(0.21, abs=0.02)
+    assert any("always move together" in warning for warning in report.warnings)
