@@ -1,6 +1,9 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -21,6 +24,7 @@ from apriltag_tracker.synthetic.camera import SyntheticCamera
 from apriltag_tracker.synthetic.shapes import constant_curvature
 from apriltag_tracker.tag_map import TagMap
 
+SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 LAYOUT = BoardLayout()
 TRUE = Intrinsics.create(
     640,
@@ -163,3 +167,45 @@ def test_mounting_without_fixed_tags_names_the_cause(tags, model):
     blank = [np.zeros((720, 1280), np.uint8)]
     with pytest.raises(CalibrationError, match="no fixed tag"):
         calibrate_mounting(blank, tags, model.intrinsics)
+
+
+def run_script(*arguments):
+    command = [sys.executable, *(str(argument) for argument in arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+
+def test_the_script_calibrates_a_folder_of_pictures(tmp_path):
+    for k, image in enumerate(board_pictures(12)):
+        cv2.imwrite(str(tmp_path / f"{k:02d}.png"), image)
+    cv2.imwrite(str(tmp_path / "99.png"), np.full((480, 640), 90, np.uint8))
+    out = tmp_path / "camera.yaml"
+    done = run_script(SCRIPTS / "calibrate_camera.py", "intrinsics", tmp_path, "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert "left out: 99.png" in done.stdout
+    assert np.abs(Intrinsics.from_yaml(out).matrix - TRUE.matrix).max() < 3.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["intrinsics"], "--topic or --bag"),
+        (["intrinsics", "--bag", "/nowhere.mcap"], "/nowhere.mcap"),
+        (["mounting", "--calibration", "/nowhere.yaml"], "/nowhere.yaml"),
+    ],
+)
+def test_the_script_names_what_is_missing(tmp_path, arguments, named):
+    arguments = [*arguments, "--out", tmp_path / "x.yaml"]
+    done = run_script(SCRIPTS / "calibrate_camera.py", *arguments)
+    assert done.returncode == 1
+    assert named in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_the_script_prints_sheets(tmp_path):
+    for what in ("tags", "board"):
+        done = run_script(SCRIPTS / "make_tags.py", what, "--out", tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert (tmp_path / f"{what}.pdf").read_bytes().startswith(b"%PDF")
+    done = run_script(SCRIPTS / "make_tags.py", "tags", "--tag-map", tmp_path / "none.yaml")
+    assert done.returncode == 1
+    assert "none.yaml" in done.stderr

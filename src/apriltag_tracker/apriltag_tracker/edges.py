@@ -26,9 +26,9 @@ _GAUSSIAN = 0.9
 _USUAL_BLUR = 0.7
 """Of edges: lens and pixel together [px]."""
 
-_FURTHER_PASSES = 3
-_SETTLED = 0.05
-"""A pass that moves no corner further than this is the last one [px]."""
+_COARSE_PASSES, _FINE_PASSES = 3, 8
+_NEAR, _SETTLED = 0.5, 0.02
+"""Passes end when no corner moves further than this, coarse and fine [px]."""
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -238,6 +238,24 @@ def _refine_once(
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
+def _refine_until(
+    image: NDArray[np.uint8],
+    corners: NDArray[np.float64],
+    window: float,
+    coarse: bool,
+    stats: NDArray[np.float64],
+) -> bool:
+    """Repeat passes until the corners stay where they are."""
+    for _ in range(_COARSE_PASSES if coarse else _FINE_PASSES):
+        before = corners.copy()
+        if not _refine_once(image, corners, window, coarse, stats):
+            return False
+        if np.abs(corners - before).max() < (_NEAR if coarse else _SETTLED):
+            break
+    return True
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
 def refine_quads(
     image: NDArray[np.uint8],
     quads: NDArray[np.float64],
@@ -269,14 +287,9 @@ def refine_quads(
         cell = shortest / 8.0
         wide = min(max(search, 1.0), 0.9 * cell + 0.4)
         fine = min(max(0.55 * cell, 1.1), 2.5)
-        found[i] = _refine_once(image, corners[i], wide, True, stats[i])
-        for _ in range(_FURTHER_PASSES):
-            if not found[i]:
-                break
-            before = corners[i].copy()
-            found[i] = _refine_once(image, corners[i], fine, False, stats[i])
-            if np.abs(corners[i] - before).max() < _SETTLED:
-                break
+        found[i] = _refine_until(image, corners[i], wide, True, stats[i]) and _refine_until(
+            image, corners[i], fine, False, stats[i]
+        )
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]

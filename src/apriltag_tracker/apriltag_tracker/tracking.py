@@ -164,7 +164,7 @@ class TagTracker:
             quads = (np.array([tag.corners for tag in seen]) + 0.5) / scale - 0.5
             quads = _from_mosaic(quads, boxes, corners)
             ids = np.array([tag.id for tag in seen], dtype=np.int64)
-            found = self._detector.confirm(image, ids, quads, 1.5, "region")
+            found = self._detector.confirm(image, ids, quads, 2.5, "region")
             if {tag.id for tag in found} >= set(lost):
                 break
         return found
