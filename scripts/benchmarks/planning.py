@@ -14,8 +14,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 
 from der_planner.limb import Limb
-from der_planner.planning import METHODS, Motion, Plan, plan
+from der_planner.planning import CONTROL_PERIOD, METHODS, Motion, Plan, inverse, plan, rod_model
+from der_planner.planning.kinematics import ArcKinematics
 from der_planner.planning.receding import RecedingHorizon
+from der_planner.planning.rod_model import REFERENCE_PRIOR, RodModel
 
 CASES = ("asynchronous", "same_direction", "opposite_direction")
 METHODS_OF = [(model, method) for model, methods in METHODS.items() for method in methods]
@@ -30,6 +32,7 @@ def run(quick: bool) -> Figures:
     """Measure everything; ``quick`` takes one seed, one case on the twin and fewer sizes."""
     figures: Figures = {}
     figures |= predicted(quick)
+    figures |= kinematics_and_gains()
     figures |= speed(quick)
     figures |= growth(quick)
     figures |= replanning(quick)
@@ -65,6 +68,44 @@ def predicted(quick: bool) -> Figures:
                         f"{result.predicted_error * 100:7.4f}/{result.largest_error * 100:6.3f}"
                     )
                 print(f"  T = {period:4.0f} s  {case:22}" + " ".join(row))
+    return figures
+
+
+def kinematics_and_gains() -> Figures:
+    """How far the rod's polyline is from the arcs, what its fold costs, and what the gains do."""
+    limb = Limb.default()
+    model = RodModel(limb)
+    opposite = np.radians([45.0, -45.0])
+    gap = np.linalg.norm(model.kinematics.tip(opposite) - ArcKinematics(limb).tip(opposite))
+    # With a short connector, as calibrations find it, the rod's fold lies across this motion.
+    joined = dataclasses.replace(limb, connector_length=0.002)
+    kinematics = RodModel(joined).kinematics
+    reference = Motion.named("asynchronous").reference(joined)
+    figures: Figures = {"tip_arcs_to_polyline_at_45_and_-45_degrees_mm": float(gap) * 1e3}
+    print(f"\nArcs and polyline at 45/-45 degrees: tips {gap * 1e3:.1f} mm apart")
+    for name, pull in (("exact", inverse.PRIOR_WEIGHT), ("smooth", REFERENCE_PRIOR)):
+        angles, miss = inverse.solve(
+            kinematics, reference.tip, reference.bend_angles, prior_weight=pull
+        )
+        twirl = np.abs(np.diff(angles, 2, axis=0)).max() / CONTROL_PERIOD**2
+        figures |= {
+            f"inverse_{name}_mean_miss_mm": float(miss.mean()) * 1e3,
+            f"inverse_{name}_max_miss_mm": float(miss.max()) * 1e3,
+            f"inverse_{name}_largest_acceleration_rad_per_s2": float(twirl),
+        }
+        print(
+            f"  asynchronous, T = 20 s, {name:6} inverse (pull {pull:g} m/rad): miss "
+            f"{miss.mean() * 1e3:.3f} mm mean, {miss.max() * 1e3:.3f} mm max, "
+            f"largest acceleration {twirl:.2f} rad/s2"
+        )
+    motion = Motion.named("same_direction", period=6.0)
+    gains = rod_model.POSITION_GAIN, rod_model.VELOCITY_GAIN
+    rod_model.POSITION_GAIN = rod_model.VELOCITY_GAIN = 0.0
+    without = plan(limb, motion, "der", "paper").predicted_error
+    rod_model.POSITION_GAIN, rod_model.VELOCITY_GAIN = gains
+    effect = plan(limb, motion, "der", "paper").predicted_error / without - 1
+    figures["paper_gains_change_of_error_percent"] = effect * 100
+    print(f"  K_p, K_d of paper change its predicted error by {effect * 100:+.3f} %")
     return figures
 
 

@@ -28,6 +28,7 @@ setup(
         "matplotlib",
         "pyelastica",
         "piqp",
+        "threadpoolctl",
     ],
     extras_require={"test": ["pytest"]},
     zip_safe=False,

@@ -27,7 +27,7 @@ SERIES_BELOW = 0.5
 _SERIES_TERMS = 14
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def arc_moment(z: float, k: int) -> Any:
     """Return ∫₀¹ ηᵏ exp(i z η) dη for k = 0, 1, 2, to rounding for every real z."""
     if abs(z) < SERIES_BELOW:
@@ -44,7 +44,7 @@ def arc_moment(z: float, k: int) -> Any:
     return value
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def arc_point(z: float, k: int) -> Any:
     """Return the k-th derivative of g at z (k = 0, 1, 2)."""
     value = arc_moment(z, k)
@@ -55,7 +55,7 @@ def arc_point(z: float, k: int) -> Any:
     return value
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def point_derivatives(
     q: Vector,
     lengths: Vector,
@@ -99,7 +99,7 @@ def point_derivatives(
     return point
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def inertia(
     q: Vector,
     v: Vector,
@@ -144,7 +144,7 @@ def inertia(
     return M, C, D, torque
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def acceleration(
     q: Vector,
     v: Vector,
@@ -171,7 +171,7 @@ def acceleration(
     return np.linalg.solve(M, force)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def simulate(
     q: Vector,
     v: Vector,

@@ -21,6 +21,7 @@ from der_planner.limb import Limb
 from der_planner.pcc import kernels
 
 Vector = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 MassModel = Literal["distributed", "lumped"]
 
 QUADRATURE_POINTS = 8
@@ -70,24 +71,25 @@ class Pcc:
 
     def tip(self, bend_angles: ArrayLike) -> Vector:
         """Return the tip (..., 2) [m] for bend angles (..., n) [rad]."""
-        angles = np.asarray(bend_angles, dtype=float)
-        position = np.zeros(angles.shape[:-1], dtype=complex)
-        heading = np.ones(angles.shape[:-1], dtype=complex)
-        for j in range(self.segment_count):
-            if j:
-                position = position + heading * self.connector
-            position = position + heading * self.lengths[j] * _arc(angles[..., j])
-            heading = heading * np.exp(1j * angles[..., j])
-        return np.stack([position.real, position.imag], axis=-1)
+        tip = self._joints(np.asarray(bend_angles, dtype=float))[0]
+        return np.stack([tip.real, tip.imag], axis=-1)
 
     def tip_jacobian(self, bend_angles: ArrayLike) -> Vector:
-        """Return ∂tip/∂bend angles (2, n) [m/rad] at one configuration (n,) [rad]."""
-        q = self._check("bend_angles", bend_angles)
-        J = np.zeros(q.size, dtype=complex)
-        H = np.zeros((q.size, q.size), dtype=complex)
-        last = self.segment_count - 1
-        kernels.point_derivatives(q, self.lengths, self.connector, last, 1.0, J, H)
-        return np.stack([J.real, J.imag])
+        """Return ∂tip/∂bend angles (..., 2, n) [m/rad] for bend angles (..., n) [rad]."""
+        angles = np.asarray(bend_angles, dtype=float)
+        tip, ends, headings = self._joints(angles)
+        columns = headings * self.lengths * _arc_slope(angles) + 1j * (tip[..., None] - ends)
+        return np.stack([columns.real, columns.imag], axis=-2)
+
+    def _joints(self, angles: Vector) -> tuple[Complex, Complex, Complex]:
+        """Return the tip (...), the ends of the segments and their first headings (..., n)."""
+        turned = np.cumsum(angles, axis=-1)
+        headings = np.exp(1j * (turned - angles))
+        steps = headings * self.lengths * _arc(angles)
+        between = np.exp(1j * turned) * self.connector
+        between[..., -1] = 0.0
+        ends = np.cumsum(steps, axis=-1) + np.cumsum(between, axis=-1) - between
+        return ends[..., -1], ends, headings
 
     def curve(self, bend_angles: ArrayLike, points_per_segment: int = 12) -> Vector:
         """Return points (P, 2) [m] of the centreline from clamp to tip for one configuration."""
@@ -206,8 +208,22 @@ class Pcc:
         )  # fmt: skip
 
 
-def _arc(angle: Vector) -> NDArray[np.complex128]:
+def _arc(angle: Vector) -> Complex:
     """Return g(angle) = ∫₀¹ exp(i angle η) dη, by half angles: exact and smooth through zero."""
     half = np.asarray(angle) / 2
-    result: NDArray[np.complex128] = np.sinc(half / np.pi) * np.exp(1j * half)
+    result: Complex = np.sinc(half / np.pi) * np.exp(1j * half)
+    return result
+
+
+def _arc_slope(angle: Vector) -> Complex:
+    """Return g′(angle) = i ∫₀¹ η exp(i angle η) dη; by its series where the quotient cancels."""
+    small = np.abs(angle) < kernels.SERIES_BELOW
+    safe = np.where(small, 1.0, angle)
+    quotient = (np.exp(1j * safe) - _arc(safe)) / safe
+    series = np.zeros(np.shape(angle), dtype=complex)
+    term = np.full(np.shape(angle), 1j)
+    for m in range(14):
+        series += term / (m + 2)
+        term = term * 1j * np.where(small, angle, 0.0) / (m + 1)
+    result: Complex = np.where(small, series, quotient)
     return result

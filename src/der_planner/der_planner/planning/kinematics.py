@@ -114,10 +114,7 @@ class ArcKinematics:
 
     def tip_jacobians(self, bend_angles: ArrayLike) -> Vector:
         """Return ∂tip/∂bend angles (..., 2, M) [m/rad]."""
-        angles = np.asarray(bend_angles, dtype=float)
-        flat = angles.reshape(-1, self.segment_count)
-        parts = np.array([self._model.tip_jacobian(row) for row in flat])
-        return parts.reshape(*angles.shape[:-1], 2, self.segment_count)
+        return self._model.tip_jacobian(bend_angles)
 
     def curve(self, bend_angles: ArrayLike) -> Vector:
         """Return points (P, 2) [m] of the centreline of one configuration (M,) [rad]."""

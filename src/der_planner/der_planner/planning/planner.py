@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
+from threadpoolctl import ThreadpoolController
 
 from der_planner import actuation
 from der_planner.limb import Limb
@@ -18,10 +20,12 @@ from der_planner.planning.motions import CONTROL_PERIOD, Motion, Reference, Star
 from der_planner.planning.optimal import Optimiser
 from der_planner.planning.result import Plan
 from der_planner.planning.rod_model import NODES, RodModel
+from der_planner.rod import ConvergenceError
 
 Vector = NDArray[np.float64]
 
 DEFAULT_METHOD = {"der": "optimal", "pcc": "paper"}
+_THREADS = ThreadpoolController()
 SUBSTEPS = 5
 """Integrator steps a control period: 10 ms."""
 _FINE = 2
@@ -69,39 +73,24 @@ def plan(
     method = choose_method(model, method)
     report = progress or (lambda _share: None)
     physics = models.build(limb, model, nodes)
-    if start is None:
-        start = resting_start(limb)
-    reference = motion.reference(limb, start)
+    reference = motion.reference(limb, start or resting_start(limb))
     report(0.1)
     spline = physics.configuration(reference)
     report(0.3)
-    details: dict[str, float] = {}
-    optimal = method == "optimal"
-    wanted = feedforward(physics, spline, reference, "projected" if optimal else method)
-    report(0.4)
-    if optimal and isinstance(physics, RodModel):
-        solver = Optimiser(physics, spline, reference, wanted, SUBSTEPS)
-        outcome = solver.run(lambda share: report(0.4 + 0.6 * share))
-        commands, tip, cut = outcome.commands, outcome.tip, 0.0
-        details = {"steps": outcome.steps, "limited_windows": outcome.limited}
-    else:
-        before = None if start is None else start.pressure
-        commands, cut = pneumatics.within_limits(wanted, limb.pneumatics, CONTROL_PERIOD, before)
-        tip = predict(physics, spline, commands, start)
+    try:
+        solved = _solve(physics, spline, reference, method, report)
+    except ConvergenceError as error:
+        raise PlanningError(
+            f"the rod cannot be rolled forward along this motion ({error}): take a longer period, "
+            "a smaller amplitude, or check the limb file's stiffness and mass"
+        ) from error
     bend = sample_spline(spline, reference.time)[0]
-    warnings = _warnings(physics.limb, wanted, bend, cut)
-    missed = float(np.linalg.norm(tip - reference.tip, axis=1).mean())
-    if details.get("limited_windows") and missed > _NOTABLE_ERROR:
-        warnings.append(
-            f"the limits leave a mean error of {missed * 1000:.1f} mm on the model itself: "
-            + _excess(physics.limb, wanted)
-        )
     report(1.0)
     return Plan(
         time=reference.time,
-        differential_pressure=commands,
+        differential_pressure=solved.commands,
         reference=reference,
-        tip_predicted=tip,
+        tip_predicted=solved.tip,
         bend_angles=bend,
         motion=motion.name,
         model=model,
@@ -112,9 +101,50 @@ def plan(
         limb=physics.limb,
         kinematics=physics.kinematics,
         solve_time=clock.perf_counter() - begin,
-        warnings=tuple(warnings),
-        details=details,
+        warnings=tuple(solved.warnings + _calibration_warnings(physics.limb, bend)),
+        details=solved.details,
     )
+
+
+@dataclass(frozen=True)
+class _Solved:
+    commands: Vector
+    tip: Vector
+    warnings: list[str]
+    details: dict[str, float]
+
+
+def _solve(
+    physics: PlanningModel,
+    spline: BSpline,
+    reference: Reference,
+    method: str,
+    report: Callable[[float], None],
+) -> _Solved:
+    """Return commands that keep the limits, and what the model expects of them."""
+    air = physics.limb.pneumatics
+    if method == "optimal" and isinstance(physics, RodModel):
+        wanted = feedforward(physics, spline, reference, "projected")
+        solver = Optimiser(physics, spline, reference, wanted, SUBSTEPS)
+        # Matrices of a few hundred rows: more threads only get into other processes' way.
+        with _THREADS.limit(limits=1, user_api="blas"):
+            outcome = solver.run(lambda share: report(0.4 + 0.6 * share))
+        commands, tip, said = outcome.commands, outcome.tip, ""
+        missed = float(np.linalg.norm(tip - reference.tip, axis=1).mean())
+        if outcome.limited and missed > _NOTABLE_ERROR:
+            said = f"the limits leave a mean error of {missed * 1000:.1f} mm on the model itself"
+        details: dict[str, float] = {"steps": outcome.steps, "limited_windows": outcome.limited}
+    else:
+        wanted = feedforward(physics, spline, reference, method)
+        before = None if reference.start is None else reference.start.pressure
+        commands, cut = pneumatics.within_limits(wanted, air, CONTROL_PERIOD, before)
+        tip = predict(physics, spline, commands, reference.start)
+        said = (
+            f"limits cut the wanted pressures by up to {cut:.0f} Pa" if cut > _NOTABLE_CUT else ""
+        )
+        details = {}
+    warnings = [f"{said}: {_excess(physics.limb, wanted)}"] if said else []
+    return _Solved(commands, tip, warnings, details)
 
 
 def resting_start(limb: Limb) -> Start | None:
@@ -175,12 +205,8 @@ def effective_pressures(limb: Limb, spline: BSpline, chambers: Vector) -> Vector
     return actuation.effective_pressure(limb, middle, flat, bend).reshape(chambers.shape)
 
 
-def _warnings(limb: Limb, wanted: Vector, bend: Vector, cut: float) -> list[str]:
+def _calibration_warnings(limb: Limb, bend: Vector) -> list[str]:
     said = []
-    if cut > _NOTABLE_CUT:
-        said.append(
-            f"limits cut the wanted pressures by up to {cut:.0f} Pa: " + _excess(limb, wanted)
-        )
     seen = np.array(limb.calibrated.bend_angle)
     if seen.size == limb.segment_count and np.any(np.abs(bend).max(axis=0) > seen * 1.05):
         j = int(np.argmax(np.abs(bend).max(axis=0) - seen))

@@ -72,7 +72,7 @@ def chamber_pressures(
     return shaped
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _lag(command: Vector, start: Vector, h: float, fill: float, vent: float) -> Vector:
     result = np.empty_like(command)
     for m in range(command.shape[1]):
@@ -104,7 +104,7 @@ def within_limits(
     return kept, float(np.abs(kept - wanted).max(initial=0.0))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _limit_slew(wanted: Vector, start: Vector, step: float) -> Vector:
     result = np.empty_like(wanted)
     for m in range(wanted.shape[1]):
