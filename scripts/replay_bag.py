@@ -25,6 +25,7 @@ import workspace
 workspace.enter()
 
 import rclpy  # noqa: E402
+from rclpy.duration import Duration  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.node import Node  # noqa: E402
 from rclpy.publisher import Publisher  # noqa: E402
@@ -46,6 +47,8 @@ from der_planner.recording.replay import (  # noqa: E402
 )
 
 ATTEMPTS = 3
+SETTLE = 0.3
+"""Time [s] for a receiver's callback after the first message of a topic that nothing answers."""
 
 
 def stamp_of(data: bytes) -> bytes:
@@ -93,6 +96,7 @@ class GraphOutput:
         self.unanswered = 0
         self._patience = patience
         self._step_by = step_by
+        self._begun: set[str] = set()
         self._answers: set[bytes] = set()
         self._answered = threading.Condition()
         self._publishers: dict[str, Publisher] = {
@@ -135,6 +139,11 @@ class GraphOutput:
         """Publish one message, and wait for its answer where the topic is stepped by."""
         if topic != self._step_by:
             self._publishers[topic].publish(message.data)
+            if self._step_by and topic not in self._begun:
+                # E.g. the camera's calibration: it must be taken before the first image comes.
+                self._begun.add(topic)
+                self._publishers[topic].wait_for_all_acked(Duration(seconds=1))
+                time.sleep(SETTLE)
             return
         stamp = stamp_of(message.data)
         with self._answered:

@@ -219,7 +219,7 @@ def test_recorded_images_give_the_same_states_at_every_replay(graph, tmp_path: P
     first, second = (track(graph, folder, name) for name in ("one", "two"))
     assert len(first) > 8  # images are best effort: a loaded machine may lose one
     assert sum(valid for _, valid, *_ in first) > 8
-    assert first == second
+    assert repr(first) == repr(second)  # bit for bit, and NaN is NaN
 
 
 def film(graph, folder: Path, count: int) -> None:
