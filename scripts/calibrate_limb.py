@@ -5,8 +5,9 @@
     python3 scripts/calibrate_limb.py --bag out/bags/calibration --out my_limb.yaml
     python3 scripts/calibrate_limb.py --csv log.csv --columns columns.yaml --out my_limb.yaml
 
---offline plays the calibration on the twin in one process, in seconds. A bag is any recorded run that
-excites every input; `--excitation FILE.csv` writes the pressures of the calibration run to play.
+--offline plays the calibration on the twin in one process, in seconds. A bag is any recorded run
+that excites every input; `--excitation FILE.csv` writes the pressures of the calibration run to
+play.
 """
 
 from __future__ import annotations

@@ -1,15 +1,15 @@
 """Between the pressure in the chambers and the pressure that a memoryless, linear limb feels.
 
 A segment that was calibrated has chambers of unequal gain, grows stiffer with pressure, rubs and
-creeps. Along a motion whose bend is known, all of that is a known pressure, so that the planners may
-stay with a linear rod driven by an *effective* pressure w and convert at the end:
+creeps. Along a motion whose bend is known, all of that is a known pressure, so that the planners
+may stay with a linear rod driven by an *effective* pressure w and convert at the end:
 
     w (1 + s |u|) = u (1 + a sgn u) − (F z + C q) / G
     θ_f dz = (1 − z sgn dθ) dθ          Dahl friction, −1 < z < 1
     q̇ = κ̇ − q / τ                       Maxwell creep
 
-with u the differential pressure [Pa], θ the bend angle, κ = θ / L. All memory starts at zero: a limb
-that has rested.
+with u the differential pressure [Pa], θ the bend angle, κ = θ / L. All memory starts at zero: a
+limb that has rested.
 """
 
 from __future__ import annotations
@@ -147,8 +147,8 @@ def _follow(
 ) -> Array:
     """Solve θ (1 + s|u|)-stiff against friction and creep at each instant by Newton's method.
 
-    The residual rises with θ, bending away from the last angle stiffens it: one root, on the side to
-    which it points at the last angle.
+    The residual rises with θ, bending away from the last angle stiffens it: one root, on the side
+    to which it points at the last angle.
     """
     bend = np.empty(time.shape[0])
     angle = rest + gain * driven[0] / stiffer[0]
@@ -185,8 +185,8 @@ def _follow(
 def lead(limb: Limb, time: ArrayLike, differential: ArrayLike, largest_step: float = 0.02) -> Array:
     """Return the commands (K, M) that put these pressures (K, M) into the chambers in time [Pa].
 
-    The inverse of a dead time and a first-order lag, with one time constant while |pressure| rises and
-    another while it falls.
+    The inverse of a dead time and a first-order lag, with one time constant while |pressure|
+    rises and another while it falls.
     """
     times = np.asarray(time, dtype=float)
     wanted = np.asarray(differential, dtype=float)

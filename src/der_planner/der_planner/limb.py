@@ -1,7 +1,8 @@
 """One robot: every physical parameter of a limb, validated, from and to YAML.
 
-All values are SI. A limb file names the unit of each key, carries a schema version and says where its
-numbers come from, so that the nodes of one run and the runs of one lab share a single description.
+All values are SI. A limb file names the unit of each key, carries a schema version and says where
+its numbers come from, so that the nodes of one run and the runs of one lab share a single
+description.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ DEFAULT_LIMB_FILE = Path(__file__).resolve().parent / "data" / "default_limb.yam
 
 
 class LimbError(ValueError):
-    """A limb description is incomplete or impossible; the message names the file, key and remedy."""
+    """A limb description is incomplete or impossible; the message says where and why."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +48,9 @@ class Segment:
         creep_stiffness: of a Maxwell element beside EI [N·m²].
         creep_time: relaxation time of it [s].
 
-    The last six are what `der_planner.actuation` turns into pressures; the rod and the PCC model are
-    driven by the effective pressure that remains. All zero: effective and differential are the same.
+    The last six are what `der_planner.actuation` turns into pressures; the rod and the PCC model
+    are driven by the effective pressure that remains. All zero: effective and differential are the
+    same.
     """
 
     length: float
@@ -113,8 +115,8 @@ class Limb:
         name: of the robot.
         segments: (M,) from the clamp to the tip.
         pneumatics: of all chamber pairs.
-        connector_length: straight passive piece between two segments [m]; 0 lets the rod's mesh choose
-            one edge that belongs to neither segment.
+        connector_length: straight passive piece between two segments [m]; 0 lets the rod's mesh
+            choose one edge that belongs to neither segment.
         gravity: acceleration in `limb_base` [m/s²]; the limb lies on its plane by default.
         calibrated: what the numbers were identified on.
         provenance: free text by key: source, date, bag, residuals.
@@ -166,7 +168,7 @@ class Limb:
         return np.array([s.moment_gain * s.length / s.bending_stiffness for s in self.segments])
 
     def for_model(self, model: str) -> Limb:
-        """Return the limb as a model sees it: "der" as it is, "pcc" with its own segments if any."""
+        """Return the limb as a model sees it: "pcc" with its own segments, if any."""
         if model not in ("der", "pcc"):
             raise LimbError(f"model must be 'der' or 'pcc', got {model!r}")
         if model == "der" or not self.pcc_segments:

@@ -5,10 +5,17 @@ import pytest
 
 from der_planner.identification import ColumnMap, LogError, read_csv
 
-COLUMNS = dict(
-    time="t", commanded=("u",), chambers=("a", "b"), angles=("theta",), pressure_unit="hPa",
-    angle_unit="deg", angle_factor=2.0, rest_until=0.25, tags=("px",),
-)  # fmt: skip
+COLUMNS = {
+    "time": "t",
+    "commanded": ("u",),
+    "chambers": ("a", "b"),
+    "angles": ("theta",),
+    "pressure_unit": "hPa",
+    "angle_unit": "deg",
+    "angle_factor": 2.0,
+    "rest_until": 0.25,
+    "tags": ("px",),
+}
 ROWS = """t,u,a,b,theta,px
 0.0,0,1002,1000,1.0,5.0
 0.1,0,1002,1000,1.0,5.1

@@ -9,10 +9,17 @@ from der_planner.identification.offline import record_twin
 from der_planner.limb import Limb
 
 REAL = ColumnMap(
-    time="t", commanded=("u0", "u1"), chambers=("p0", "p1", "p2", "p3"), angles=("theta0", "theta1"),
-    tags=("x103", "y103", "x104", "y104"), pressure_unit="hPa", angle_unit="deg", angle_factor=2.0,
-    rest_until=12.0, ignore=((1.5, 3.0),),
-)  # fmt: skip
+    time="t",
+    commanded=("u0", "u1"),
+    chambers=("p0", "p1", "p2", "p3"),
+    angles=("theta0", "theta1"),
+    tags=("x103", "y103", "x104", "y104"),
+    pressure_unit="hPa",
+    angle_unit="deg",
+    angle_factor=2.0,
+    rest_until=12.0,
+    ignore=((1.5, 3.0),),
+)
 
 
 @pytest.mark.slow

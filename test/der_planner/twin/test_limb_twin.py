@@ -1,4 +1,4 @@
-"""The simulated limb against the mechanics of a beam, and its behaviour over every drawn hardware."""
+"""The simulated limb against the mechanics of a beam, and over drawn hardware."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ REST = np.full(4, ATMOSPHERE)
 
 
 def plain(seed: int = 0, **changes: float):
-    """Return hardware without friction, creep and stiffening: an elastic rod with straight fittings."""
+    """Return hardware without friction, creep and stiffening: an elastic rod."""
     hardware = draw(seed)
     segments = tuple(
         replace(
@@ -95,7 +95,8 @@ def test_first_frequency_is_a_cantilevers():
     frequency = 1.0 / np.diff(instants).mean()
     flexible = sum(s.flexible_length for s in hardware.segments)
     slowest = 3.516 / (2 * np.pi) * np.sqrt(0.0175 / hardware.mass_per_length / 0.244**4)
-    # The stiff parts shorten what bends: the frequency lies between the whole and the flexible length.
+    # The stiff parts shorten what bends: the frequency lies between the whole and the flexible
+    # length.
     assert slowest < frequency < slowest * (0.244 / flexible) ** 2
 
 

@@ -1,4 +1,4 @@
-"""From commanded to measured pressure: lag while filling and venting, dead time, fill rate, offset."""
+"""From commanded to measured pressure: lags, dead time, fill rate, offset."""
 
 from __future__ import annotations
 

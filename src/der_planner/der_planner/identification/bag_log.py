@@ -1,4 +1,4 @@
-"""A calibration log from a recorded run: the driver's pressures and the tracker's angles, by stamps."""
+"""A calibration log from a recorded run: pressures and bend angles, by stamps."""
 
 from __future__ import annotations
 

@@ -118,7 +118,8 @@ def _range(limb: Limb, pressure: Array, bend: Array) -> list[str]:
         ):
             if largest > 1.05 * limit:
                 found.append(
-                    f"the {name} of segment {index} reaches {factor * largest:.0f} {unit}, calibrated "
+                    f"the {name} of segment {index} reaches {factor * largest:.0f} {unit}, "
+                    f"calibrated "
                     f"were {factor * limit:.0f} {unit}"
                 )
     return found

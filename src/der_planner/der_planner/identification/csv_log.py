@@ -34,8 +34,8 @@ class ColumnMap:
         tags: columns that repeat their last value, all of them, when a tag is lost; empty: never.
         pressure_unit, angle_unit, length_unit: see `PRESSURE_UNITS`, `ANGLE_UNITS`, `LENGTH_UNITS`.
         angle_factor: bend angle per listed angle: 2 for chord angles, −1 for the other sign.
-        rest_until: rows before this time [s] with zero commands give the sensors' offsets and are the
-            zero of the pressures; 0 keeps them as they are.
+        rest_until: rows before this time [s] with zero commands give the sensors' offsets and are
+            the zero of the pressures; 0 keeps them as they are.
         ignore: (first, last) [s] stretches to leave out.
     """
 
@@ -97,7 +97,8 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
     count = len(columns.angles)
     if len(columns.commanded) != count or len(columns.chambers) != 2 * count:
         raise LogError(
-            f"the column map names {count} angles: it needs {count} commands and {2 * count} chambers, "
+            f"the column map names {count} angles: it needs {count} commands and {2 * count} "
+            f"chambers, "
             f"got {len(columns.commanded)} and {len(columns.chambers)}"
         )
 

@@ -37,7 +37,7 @@ ANGLE_ERROR = np.deg2rad(0.3)
 CORRELATION = 20.0
 """Rows over which an error of the model stays the same (1 s)."""
 MOST_EVALUATIONS = 10
-"""Of model and derivatives; a fit that has not settled by then changes less than its uncertainty."""
+"""Of model and derivatives; what still moves by then moves less than its uncertainty."""
 STRONG = 0.9
 """|correlation| above which two unknowns are said to be told only together."""
 UNTOLD = 0.8
@@ -85,7 +85,8 @@ def fit(
     unknowns, correlation = problem.uncertainties(values, jacobian)
     if "dynamics" in groups and all(u.untold for u in unknowns if u.name.startswith("log_stiff")):
         warnings.append(
-            "the log is too slow to tell the stiffness apart from the gain: stiffness and damping keep "
+            "the log is too slow to tell the stiffness apart from the gain: stiffness and "
+            "damping keep "
             "their old values; steps or a sweep would tell them"
         )
         problem = _Problem(limb, prepared, offset, groups - {"dynamics"}, nodes)
@@ -164,7 +165,7 @@ class _Problem:
         return values, self._jacobian(solution.x)
 
     def remaining(self, values: Array) -> Array:
-        """Return measured less predicted bend angles (K, M) [rad], NaN where nothing was measured."""
+        """Return measured less predicted bend angles (K, M) [rad], NaN where unmeasured."""
         return self._prepared.log.bend_angles - self._prediction.angles(values)
 
     def uncertainties(self, values: Array, jacobian: Array) -> tuple[tuple[Unknown, ...], Array]:

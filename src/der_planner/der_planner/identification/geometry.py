@@ -39,8 +39,8 @@ class GeometryFit:
         lengths: (M,) [m].
         connector: between two segments [m]; the prior's for one segment.
         uncertainty: (M + 1,) standard deviations of lengths and connector [m].
-        residual_before, residual: root mean square distance of the tips from those of an evenly bent
-            rod with the prior's and with the fitted lengths [m].
+        residual_before, residual: root mean square distance of the tips from those of an evenly
+            bent rod with the prior's and with the fitted lengths [m].
     """
 
     lengths: Array
@@ -96,7 +96,7 @@ def fit_geometry(limb: Limb, log: CalibrationLog, nodes: int = NODES) -> Geometr
 
 
 def with_geometry(limb: Limb, lengths: Array, connector: float | None) -> Limb:
-    """Return the limb with these segment lengths (M,) and this connector [m], None keeps the old."""
+    """Return the limb with these lengths (M,) and connector [m]; None keeps the old."""
     segments = tuple(
         replace(segment, length=float(length))
         for segment, length in zip(limb.segments, lengths, strict=True)

@@ -1,4 +1,4 @@
-"""The unknowns of a fit: names, units, scales, bounds, what is known before, and their place in a limb."""
+"""The unknowns of a fit: names, units, bounds, prior knowledge, place in a limb."""
 
 from __future__ import annotations
 
@@ -52,7 +52,8 @@ TERMS = (
     Term("log_stiffness", "-", 0.2, -1.2, 1.2, 0.3, "dynamics", step=0.02),
     Term("log_damping", "-", 0.5, -3.0, 3.0, 0.5, "dynamics", shared=True, step=0.1),
 )
-"""Unknowns of each segment. The last two are relative to the prior's, as natural logarithms. Damping
+"""Unknowns of each segment. The last two are relative to the prior's, as natural logarithms. "
+"Damping
 by the air and the plate is one number for the limb: it cannot be told apart by segments."""
 
 GROUPS = ("asymmetry", "stiffening", "friction", "creep", "dynamics")

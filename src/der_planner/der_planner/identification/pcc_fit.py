@@ -1,8 +1,8 @@
 """The same data for the baseline: stiffness and damping of the constant-curvature model.
 
 Under no gravity both models have the same statics, segment by segment, so gain, rest angle, unequal
-chambers, stiffening, friction and creep are shared. Their dynamics differ - an arc is stiffer than a rod
-that may bend unevenly - and are fitted to each.
+chambers, stiffening, friction and creep are shared. Their dynamics differ - an arc is stiffer
+than a rod that may bend unevenly - and are fitted to each.
 """
 
 from __future__ import annotations

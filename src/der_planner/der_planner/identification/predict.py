@@ -1,4 +1,4 @@
-"""What a limb file says a log should look like: open-loop prediction from measured pressures alone."""
+"""Open-loop prediction of a log from its measured pressures alone."""
 
 from __future__ import annotations
 

@@ -54,8 +54,8 @@ class RodPrediction:
             values: (M, T) unknowns.
             wanted: (segment, term) of each of the P unknowns.
 
-        What enters through the effective pressure goes through the rod's exact tangent; stiffness and
-        damping, which change the rod itself, are differences of two simulations.
+        What enters through the effective pressure goes through the rod's exact tangent; stiffness
+        and damping, which change the rod itself, are differences of two simulations.
         """
         rod, trajectory = self._simulate(to_limb(self._prior, values), linearise=True)
         angles = bend_of(rod, trajectory.q)
@@ -127,7 +127,7 @@ class RodPrediction:
 
 
 def bend_of(rod: Rod, q: Array) -> Array:
-    """Return bend angles (K, M) [rad] as tags see them: heading after each segment less before it."""
+    """Return bend angles (K, M) [rad] as tags see them: heading after less before."""
     headings = [_heading(q, a, b) for a, b in _edges(rod)]
     absolute = np.unwrap(np.stack(headings, axis=1), axis=0)
     relative: Array = np.diff(absolute, axis=1, prepend=0.0)

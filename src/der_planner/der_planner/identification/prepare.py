@@ -1,4 +1,4 @@
-"""From a log as recorded to rows on a regular grid that a fit can use, and what is wrong with them."""
+"""From a log as recorded to rows that a fit can use, and what is wrong with them."""
 
 from __future__ import annotations
 
@@ -59,12 +59,13 @@ def prepare(
         longest_gap: between two rows that a straight line may bridge [s].
 
     Raises:
-        LogError: another number of segments, an input without excitation, too few tags, or pressures
-            that contradict the commands (a wrong column map).
+        LogError: another number of segments, an input without excitation, too few tags, or
+            pressures that contradict the commands (a wrong column map).
     """
     if log.segment_count != limb.segment_count:
         raise LogError(
-            f"the log has {log.segment_count} segments, the limb '{limb.name}' {limb.segment_count}: "
+            f"the log has {log.segment_count} segments, the limb '{limb.name}' "
+            f"{limb.segment_count}: "
             "this limb file belongs to another limb"
         )
     grid = log.resampled(period, longest_gap)
@@ -94,7 +95,8 @@ def _pressures(log: CalibrationLog, limb: Limb, warnings: list[str]) -> Array:
         share = known[:, index].mean()
         if share < 0.5:
             raise LogError(
-                f"pressure {index} was measured in {100 * share:.0f} % of the log only: the fit needs "
+                f"pressure {index} was measured in {100 * share:.0f} % of the log only: the fit "
+                f"needs "
                 "the board's telemetry"
             )
     pressure = np.stack([bridge(column) for column in measured.T], axis=1)
@@ -138,7 +140,8 @@ def _check_excitation(pressure: Array, warnings: list[str]) -> None:
             for j in range(i):
                 if abs(together[i, j]) > 0.98:
                     warnings.append(
-                        f"inputs {j} and {i} always move together (correlation {together[i, j]:+.2f}): "
+                        f"inputs {j} and {i} always move together (correlation "
+                        f"{together[i, j]:+.2f}): "
                         "swapped columns and coupling between segments cannot be told"
                     )
 
@@ -171,7 +174,8 @@ def _check_match(pressure: Array, bend: Array, warnings: list[str]) -> None:
         others = np.abs(np.delete(solution[:, index], index))
         if others.size and others.max() > 1.5 * abs(own):
             raise LogError(
-                f"segment {index} bends with input {int(np.argmax(np.abs(solution[:, index])))}, not "
+                f"segment {index} bends with input "
+                f"{int(np.argmax(np.abs(solution[:, index])))}, not "
                 f"with input {index}: columns or tubes are swapped"
             )
         if own < 0:

@@ -48,7 +48,8 @@ class FitReport:
         air: fit of the chambers; None if the log has no smooth commands.
         geometry: fit of the lengths; None if the log has no tips.
         residual, largest: (M,) root mean square and largest bend angle error of the rod [rad].
-        pcc_residual: (M,) root mean square error of the PCC model [rad]; NaN where it shares all numbers.
+        pcc_residual: (M,) root mean square error of the PCC model [rad]; NaN where it shares all
+            numbers.
         span: (M,) range of the measured bend angles [rad].
         duration: of the log [s].
         rows: used by the fit.
@@ -105,7 +106,8 @@ class FitReport:
             other = f" (PCC rms {math.degrees(pcc):.2f}°)" if math.isfinite(pcc) else ""
             lines.append(
                 f"segment {index}: bend angle error rms {math.degrees(error):.2f}°, "
-                f"max {math.degrees(largest):.2f}°, {100 * error / max(span, 1e-9):.2f} % of its range{other}"
+                f"max {math.degrees(largest):.2f}°, {100 * error / max(span, 1e-9):.2f} % of "
+                f"its range{other}"
             )
         lines += self._air_lines() + self._geometry_lines()
         for first, second, value in self.strongly_correlated:
@@ -132,7 +134,8 @@ class FitReport:
         )
         return [
             f"lengths: {lengths} mm, connector {1e3 * geometry.connector:.1f} mm; tips within "
-            f"{1e3 * geometry.residual:.2f} mm of an evenly bent rod at the measured angles (with the "
+            f"{1e3 * geometry.residual:.2f} mm of an evenly bent rod at the measured angles "
+            f"(with the "
             f"prior's lengths {1e3 * geometry.residual_before:.2f} mm)"
         ]
 

@@ -17,7 +17,7 @@ LEAST_EXCITATION = 1000.0
 
 
 def resting_points(log: CalibrationLog, intervals: Array) -> tuple[Array, Array]:
-    """Return the mean pressures (S, M) [Pa] and bend angles (S, M) [rad] over each interval (S, 2) [s].
+    """Return mean pressures and bend angles (S, M) [Pa], [rad] of intervals (S, 2) [s].
 
     Intervals without a single valid row are left out.
     """
@@ -35,7 +35,8 @@ def resting_points(log: CalibrationLog, intervals: Array) -> tuple[Array, Array]
 def static_gain(pressure: Array, angle: Array) -> tuple[Array, Array]:
     """Fit angle = gain · pressure + rest for each segment.
 
-    A planar limb without gravity bends each segment by its own couple alone, so the segments decouple.
+    A planar limb without gravity bends each segment by its own couple alone, so the segments
+    decouple.
 
     Args:
         pressure: (S, M) [Pa].

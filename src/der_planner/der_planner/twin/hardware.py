@@ -1,7 +1,7 @@
-"""What a seed draws: the hardware of one trial, with everything that the planners' models do not know.
+"""What a seed draws: the hardware of one trial, with what planners do not know.
 
-The ranges stand in `RANGES`, around the limb of `Limb.default()`. Nothing here is written to a topic, a
-file or a log that a planner reads.
+The ranges stand in `RANGES`, around the limb of `Limb.default()`. Nothing here is written to a
+topic, a file or a log that a planner reads.
 """
 
 from __future__ import annotations
@@ -66,7 +66,8 @@ class SegmentHardware:
         friction_curvature: change of curvature over which the friction turns round [1/m].
         friction_exponent, friction_share: n and β of its Bouc-Wen law.
         creep_stiffness, creep_time: Maxwell branches, fast, middle and slow [N·m²], [s].
-        wander, wander_time: standard deviation [1/m] and correlation time [s] of the rest curvature.
+        wander, wander_time: standard deviation [1/m] and correlation time [s] of the rest
+            curvature.
     """
 
     flexible_length: float

@@ -1,9 +1,10 @@
 """The time loop of the simulated limb, compiled around PyElastica's own kernels.
 
-PyElastica's module system calls Python code several times a step, which costs more than the physics of
-a rod of twenty elements. Here its kinematic update, its internal forces and torques and its
-accelerations are called in the order of its position Verlet stepper, from one compiled loop. What the
-limb adds - chambers, friction, creep - enters as the constitutive law of PyElastica's bending couple.
+PyElastica's module system calls Python code several times a step, which costs more than the
+physics of a rod of twenty elements. Here its kinematic update, its internal forces and torques
+and its accelerations are called in the order of its position Verlet stepper, from one compiled
+loop. What the limb adds - chambers, friction, creep - enters as the constitutive law of
+PyElastica's bending couple.
 """
 
 from __future__ import annotations
@@ -64,7 +65,8 @@ class RodArrays(NamedTuple):
 class Material(NamedTuple):
     """The bending law at each vertex (K,): parameters, then the state that it remembers.
 
-    moment = stiffness (κ − rest) + cubic (κ − rest)³ + friction_moment z + Σ creep_stiffness q − active
+    moment = stiffness (κ − rest) + cubic (κ − rest)³ + friction_moment z + Σ creep_stiffness q −
+    active
     """
 
     flexible_share: Array  # flexible length at a vertex over its Voronoi length
@@ -87,9 +89,9 @@ class Material(NamedTuple):
 def bending_law(material: Material, kappa: Array, couple: Array, dt: float) -> None:
     """Write the planar bending moment of each vertex (K,) [N·m] and advance what it remembers.
 
-    Friction is a Bouc-Wen element, κ_f dz = (1 − |z|ⁿ (β sgn(z dκ) + 1 − β)) dκ, kept within ±1, and
-    creep a Maxwell element, q̇ = κ̇ − q/τ, integrated exactly for a constant rate, so that any rate of
-    bending is stable.
+    Friction is a Bouc-Wen element, κ_f dz = (1 − |z|ⁿ (β sgn(z dκ) + 1 − β)) dκ, kept within ±1,
+    and creep a Maxwell element, q̇ = κ̇ − q/τ, integrated exactly for a constant rate, so that any
+    rate of bending is stable.
     """
     for k in range(kappa.shape[0]):
         curvature = kappa[k] / material.flexible_share[k]

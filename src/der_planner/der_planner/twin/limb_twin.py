@@ -106,7 +106,8 @@ class LimbTwin:
         The explicit step is fixed: a remainder shorter than it is kept for the next call.
 
         Args:
-            chamber_pressure: (2M,) absolute pressures: chambers 0, 1 of segment 0, then of segment 1 [Pa].
+            chamber_pressure: (2M,) absolute pressures: chambers 0, 1 of segment 0, then of
+                segment 1 [Pa].
             duration: [s].
 
         Raises:
@@ -125,7 +126,8 @@ class LimbTwin:
         """Return the true centreline.
 
         Args:
-            points: number of equally spaced points; 0 gives the nodes and the middle of each element.
+            points: number of equally spaced points; 0 gives the nodes and the middle of each
+                element.
 
         Returns:
             Interpolated between nodes by cubic Hermite pieces along the material tangents.
@@ -248,7 +250,8 @@ class LimbTwin:
         rod = self._rod
         flexible = rest_lengths[self._element_segment == 0][0]
         for k in range(rod.n_elems):
-            # A short stiff fitting would shorten the step for nothing: it gives like a whole element.
+            # A short stiff fitting would shorten the step for nothing: it gives like a whole
+            # element.
             share = 1.0 if self._element_segment[k] >= 0 else rest_lengths[k] / flexible
             rod.shear_matrix[0, 0, k] = rod.shear_matrix[1, 1, k] = SHEAR_STIFFNESS * share
             rod.shear_matrix[2, 2, k] = AXIAL_STIFFNESS * share

@@ -1,4 +1,4 @@
-"""Pressures played on the twin in one process: pneumatics and limb, faster than real time, without ROS."""
+"""Pressures played on the twin in one process, faster than real time, without ROS."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ def play(
 ) -> Playback:
     """Play differential pressures on the twin of a seed, from rest.
 
-    Each setpoint takes effect at its instant and holds until the next, as on the graph; row k of the
-    result is the twin at that instant, before the setpoint acts.
+    Each setpoint takes effect at its instant and holds until the next, as on the graph; row k of
+    the result is the twin at that instant, before the setpoint acts.
 
     Args:
         time: (K,) rising instants [s].
@@ -95,7 +95,7 @@ def play(
 
 
 def split(differential: Array) -> Array:
-    """Return (2M,) gauge pressures: one chamber of each pair carries |u|, the other is vented [Pa]."""
+    """Return (2M,) gauge pressures [Pa]: one chamber of a pair has |u|, one is vented."""
     pairs: Array = np.stack([np.maximum(differential, 0.0), np.maximum(-differential, 0.0)], axis=1)
     return pairs.ravel()
 

@@ -56,7 +56,7 @@ class RealTimeLoop:
         return 1.0 - self.dropped / passed if passed > 0 else 1.0
 
     def tick(self, now: float) -> float:
-        """Bring the simulation to ``now`` [s, steady], publish if due, return the time to sleep [s]."""
+        """Simulate up to ``now`` [s, steady], publish if due, return the time to sleep [s]."""
         if not self._started:
             self._begin = self._simulated_until = self._next_publish = now
             self._started = True
