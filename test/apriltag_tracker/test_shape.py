@@ -5,13 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+from apriltag_tracker.curve import Curve, Evaluation, wrap
 from apriltag_tracker.shape import (
     PlanarTag,
     ShapeFitter,
     ShapePrior,
-    _Curve,
-    _Evaluation,
-    wrap,
 )
 from apriltag_tracker.synthetic.camera import Shape
 from apriltag_tracker.synthetic.shapes import constant_curvature
@@ -52,8 +50,8 @@ def test_arcs_are_recovered(plain, bends, elongation):
 
 
 def test_derivatives_agree_with_finite_differences(tags):
-    curve = _Curve(tags.segment_lengths, 3, tags.stiff)
-    evaluation = _Evaluation(curve, [0.01, 0.122, 0.2, 0.244])
+    curve = Curve(tags.segment_lengths, 3, tags.stiff)
+    evaluation = Evaluation(curve, [0.01, 0.122, 0.2, 0.244])
     random = np.random.default_rng(0)
     parameters = random.normal(0.0, 1.0, curve.size) * 0.3
     parameters[3] = 0.02
@@ -67,7 +65,7 @@ def test_derivatives_agree_with_finite_differences(tags):
 
 
 def test_stiff_stretches_keep_their_heading(tags):
-    curve = _Curve(tags.segment_lengths, 2, ((0.0, 0.004), (0.1175, 0.1265), (0.24, 0.244)))
+    curve = Curve(tags.segment_lengths, 2, ((0.0, 0.004), (0.1175, 0.1265), (0.24, 0.244)))
     parameters = np.random.default_rng(1).normal(0.0, 2.0, curve.size)
     heading = curve.heading_basis(np.array([0.0, 0.004, 0.1175, 0.1265, 0.24, 0.244])) @ parameters
     assert heading[0] == pytest.approx(heading[1])

@@ -2,23 +2,20 @@
 
 The limb's heading is θ(s) = θ0 + ∫κ ds with one constant curvature a segment and smooth corrections
 (Legendre polynomials of the segment's coordinate) that a prior keeps small. Positions follow from
-integrating the tangent, stretched by one elongation. All unknowns come from one weighted least-
-squares fit of the tags' positions and headings (maximum a posteriori, Gauss-Newton).
+integrating the tangent, stretched by one elongation. All unknowns come from one weighted
+least-squares fit of the tags' positions and headings (maximum a posteriori, Gauss-Newton).
 """
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apriltag_tracker.curve import PLACE, Curve, Evaluation, wrap
 from apriltag_tracker.tag_map import TagMap
-
-PLACE = 3
-"""Numbers of a planar pose: x, y [m], heading [rad]."""
 
 
 @dataclass(frozen=True)
@@ -99,112 +96,6 @@ class LimbEstimate:
     rejected: dict[int, float] = field(default_factory=dict)
 
 
-class _Curve:
-    """A family of curves: heading linear in the parameters, evaluated at fixed arc lengths.
-
-    Parameters are x0, y0, θ0, elongation − 1, one curvature a segment, then the corrections. Stiff
-    stretches keep their heading.
-    """
-
-    def __init__(
-        self,
-        lengths: Sequence[float],
-        degrees: int,
-        stiff: Sequence[tuple[float, float]] = (),
-        grid: int = 20,
-    ) -> None:
-        ends = np.concatenate([[0.0], np.cumsum(lengths)])
-        self.ends = ends
-        self.segments = len(lengths)
-        self.degrees = degrees
-        self.size = 4 + self.segments * (1 + degrees)
-        nodes, weights = np.polynomial.legendre.leggauss(4)
-        self._stiff = tuple(stiff)
-        self.active = np.diff(self._bending_length(ends))
-        edges = np.unique(
-            np.concatenate(
-                [np.linspace(a, b, grid + 1) for a, b in itertools.pairwise(ends)]
-                + [np.array(stretch) for stretch in self._stiff]
-            )
-        )
-        self._edges = edges
-        self._nodes = nodes
-        self._weights = weights
-
-    def _bending_length(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how much of the limb up to each arc length can bend [m]."""
-        result = np.clip(s, 0.0, self.ends[-1])
-        for start, end in self._stiff:
-            result = result - (np.clip(s, start, end) - start)
-        return result
-
-    def heading_basis(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return dθ/dp at arc lengths (n,), (n, size)."""
-        basis = np.zeros((len(s), self.size))
-        basis[:, 2] = 1.0
-        bending, starts = self._bending_length(s), self._bending_length(self.ends)
-        for j in range(self.segments):
-            half = 0.5 * self.active[j]
-            local = np.clip((bending - starts[j]) / half - 1.0, -1.0, 1.0)
-            basis[:, 4 + j] = half * (local + 1.0)
-            for degree in range(1, self.degrees + 1):
-                column = 4 + self.segments + j * self.degrees + degree - 1
-                # Integral of the Legendre polynomial from -1.
-                series = np.zeros(degree + 1)
-                series[degree] = 1.0
-                integral = np.polynomial.legendre.legint(series, lbnd=-1.0)
-                basis[:, column] = half * np.polynomial.legendre.legval(local, integral)
-        return basis
-
-    def quadrature(self, s: Sequence[float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return Gauss points of the limb and weights (n, points) that integrate up to each s."""
-        edges = np.unique(np.concatenate([self._edges, np.clip(s, 0.0, self.ends[-1])]))
-        middle, half = 0.5 * (edges[1:] + edges[:-1]), 0.5 * np.diff(edges)
-        points = (middle[:, None] + half[:, None] * self._nodes).ravel()
-        weights = (half[:, None] * self._weights).ravel()
-        table = np.where(points[None, :] < np.asarray(s)[:, None], weights, 0.0)
-        return points, table
-
-
-class _Evaluation:
-    """A curve at a fixed set of arc lengths: places and their derivatives."""
-
-    def __init__(self, curve: _Curve, s: Sequence[float]) -> None:
-        self.s = np.asarray(s, dtype=np.float64)
-        points, self._integral = curve.quadrature(s)
-        self._inner = curve.heading_basis(points)
-        self._outer = curve.heading_basis(self.s)
-        self._size = curve.size
-
-    def places(
-        self, parameters: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return x, y, heading (n, 3) and their derivatives (n, 3, size)."""
-        heading = self._inner @ parameters
-        stretch = 1.0 + parameters[3]
-        cosine, sine = np.cos(heading), np.sin(heading)
-        x, y = self._integral @ cosine, self._integral @ sine
-        places = np.empty((len(self.s), PLACE))
-        places[:, 0] = parameters[0] + stretch * x
-        places[:, 1] = parameters[1] + stretch * y
-        places[:, 2] = self._outer @ parameters
-        jacobian = np.empty((len(self.s), PLACE, self._size))
-        jacobian[:, 0] = -stretch * (self._integral @ (sine[:, None] * self._inner))
-        jacobian[:, 1] = stretch * (self._integral @ (cosine[:, None] * self._inner))
-        jacobian[:, 2] = self._outer
-        jacobian[:, 0, 0] = 1.0
-        jacobian[:, 1, 1] = 1.0
-        jacobian[:, 0, 3] = x
-        jacobian[:, 1, 3] = y
-        return places, jacobian
-
-
-def wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return angles between −π and π."""
-    result: NDArray[np.float64] = (angle + np.pi) % (2.0 * np.pi) - np.pi
-    return result
-
-
 @dataclass(frozen=True)
 class _Fit:
     parameters: NDArray[np.float64]
@@ -246,12 +137,12 @@ class ShapeFitter:
         self.prior = prior or ShapePrior()
         self.reject_beyond = reject_beyond
         self._mounting = np.array([mounting, mounting, mounting_angle])
-        self._smooth = _Curve(tags.segment_lengths, len(self.prior.corrections), tags.stiff)
-        self._constant = _Curve(tags.segment_lengths, 0, tags.stiff)
-        self._outline = _Evaluation(
+        self._smooth = Curve(tags.segment_lengths, len(self.prior.corrections), tags.stiff)
+        self._constant = Curve(tags.segment_lengths, 0, tags.stiff)
+        self._outline = Evaluation(
             self._smooth, np.linspace(0.0, tags.length, curve_points).tolist()
         )
-        self._evaluations: dict[tuple[int, tuple[float, ...]], _Evaluation] = {}
+        self._evaluations: dict[tuple[int, tuple[float, ...]], Evaluation] = {}
         self._last = np.zeros(self._smooth.size)
 
     def reset(self) -> None:
@@ -323,21 +214,21 @@ class ShapeFitter:
         place, _ = self._evaluation(self._constant, [tag]).places(fits[outside].parameters)
         return outside, float(np.hypot(*(place[0, :2] - tag.pose[:2]))), rest[outside]
 
-    def _evaluation(self, curve: _Curve, tags: Sequence[PlanarTag]) -> _Evaluation:
+    def _evaluation(self, curve: Curve, tags: Sequence[PlanarTag]) -> Evaluation:
         key = (curve.size, tuple(tag.arc_length for tag in tags))
         if key not in self._evaluations:
             if len(self._evaluations) > 200:
                 self._evaluations.clear()
-            self._evaluations[key] = _Evaluation(curve, key[1])
+            self._evaluations[key] = Evaluation(curve, key[1])
         return self._evaluations[key]
 
-    def _prior_sigma(self, curve: _Curve) -> NDArray[np.float64]:
+    def _prior_sigma(self, curve: Curve) -> NDArray[np.float64]:
         prior = self.prior
         base = [prior.base_position, prior.base_position, prior.base_heading, prior.elongation]
         mean = [prior.curvature] * curve.segments
         return np.array(base + mean + list(prior.corrections[: curve.degrees]) * curve.segments)
 
-    def _solve(self, curve: _Curve, tags: Sequence[PlanarTag], start: NDArray[np.float64]) -> _Fit:
+    def _solve(self, curve: Curve, tags: Sequence[PlanarTag], start: NDArray[np.float64]) -> _Fit:
         """Find the most probable parameters and the gain (size, n, 3) from measurements to them."""
         evaluation = self._evaluation(curve, tags)
         measured = np.array([tag.pose for tag in tags])
@@ -365,7 +256,7 @@ class ShapeFitter:
             normal = rows.T @ rows
             move = np.linalg.solve(normal, rows.T @ right)
             # A step of more than a radian of heading is damped: the fit may start far away.
-            reach = float(np.abs(evaluation._inner @ move).max())
+            reach = float(np.abs(evaluation.inner @ move).max())
             parameters = parameters + move * min(1.0, 1.0 / max(reach, 1e-9))
             if reach < 1e-9 and float(np.abs(move[:2]).max()) < 1e-9:
                 break

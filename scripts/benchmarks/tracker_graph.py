@@ -1,0 +1,98 @@
+"""The tracker in a running graph with the twin and the synthetic camera."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from der_msgs.msg import ChamberPressures, LimbState
+from limb_interfaces import qos, topics
+from limb_interfaces.stamps import nanoseconds
+from orchestrator.client import GraphClient
+from orchestrator.processes import NodeProcess
+
+
+def measure_graph(seconds: float) -> dict[str, float]:
+    """Run twin, camera and tracker as nodes and compare the tracker's tip with the twin's own."""
+    states: dict[int, LimbState] = {}
+    truth: dict[int, LimbState] = {}
+    with tempfile.TemporaryDirectory() as folder, GraphClient("tracker_benchmark", 97) as client:
+        environment = {**os.environ, "ROS_DOMAIN_ID": "97"}
+        nodes = [
+            NodeProcess(package, name, {}, Path(folder), None, environment, name)
+            for package, name in (
+                ("der_planner", "limb_twin"),
+                ("apriltag_tracker", "synthetic_camera"),
+                ("apriltag_tracker", "apriltag_tracker"),
+            )
+        ]
+        try:
+            client.watch(nodes)
+            client.subscribe(
+                LimbState,
+                topics.LIMB_STATE,
+                qos.STATES,
+                lambda message: states.update({nanoseconds(message.header.stamp): message}),
+            )
+            client.subscribe(
+                LimbState,
+                topics.TWIN_GROUND_TRUTH,
+                qos.STATES,
+                lambda message: truth.update({nanoseconds(message.header.stamp): message}),
+            )
+            _press(client)
+            client.wait_for(lambda: len(states) > 60, 60.0, "the tracker")
+            states.clear()
+            truth.clear()
+            before = [node.measure_cpu() for node in nodes]
+            started = time.monotonic()
+            client.spin(seconds)
+            took = time.monotonic() - started
+            after = [node.measure_cpu() for node in nodes]
+        finally:
+            for node in nodes:
+                node.stop()
+    both = [stamp for stamp in states if stamp in truth and states[stamp].valid]
+    gaps = np.array(
+        [(states[k].tip.x - truth[k].tip.x, states[k].tip.y - truth[k].tip.y) for k in both]
+    )
+    latency = 1e3 * np.array([states[k].latency for k in both])
+    result = {
+        "graph_states_per_s": len(states) / took,
+        "graph_shapes_per_s": len(truth) / took,
+        "graph_valid_percent": 100.0 * len(both) / max(len(states), 1),
+        "graph_tip_rms_mm": 1e3 * float(np.sqrt(np.mean(np.sum(gaps**2, axis=1)))),
+        "graph_tip_max_mm": 1e3 * float(np.hypot(*gaps.T).max()),
+        "graph_latency_median_ms": float(np.median(latency)),
+        "graph_latency_p99_ms": float(np.percentile(latency, 99)),
+    }
+    for node, first, last in zip(("twin", "camera", "tracker"), before, after, strict=True):
+        result[f"graph_cpu_{node}_percent"] = 100.0 * (last - first) / took
+    print(f"\nTwin, camera and tracker as nodes, {took:.0f} s; latency from stamp to published tip")
+    for key, value in result.items():
+        print(f"  {key:42s} {value:9.3f}")
+    return result
+
+
+def _press(client: GraphClient) -> None:
+    """Publish chamber pressures that make the twin swing, 50 times a second."""
+    publisher = client.node.create_publisher(
+        ChamberPressures, topics.TWIN_CHAMBER_PRESSURES, qos.STATES
+    )
+    begin = time.monotonic()
+
+    def publish() -> None:
+        moment = time.monotonic() - begin
+        swing = 12e3 * np.sin(2.0 * np.pi * moment / np.array([6.0, 4.5]))
+        chambers = 101325.0 + np.array(
+            [max(swing[0], 0.0), max(-swing[0], 0.0), max(swing[1], 0.0), max(-swing[1], 0.0)]
+        ) * min(moment / 3.0, 1.0)
+        message = ChamberPressures(pressure=chambers.tolist())
+        message.header.stamp = client.node.get_clock().now().to_msg()
+        publisher.publish(message)
+
+    client.node.create_timer(0.02, publish)
