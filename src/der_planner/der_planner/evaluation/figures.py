@@ -116,8 +116,13 @@ def plot_error(
                 )
             axis.set(xlabel="time [s]", title=f"Case {CASE.get(motion, motion)}")
             axis.set_ylim(bottom=0.0)
-            axis.legend()
         axes[0].set_ylabel("tip error [cm]")
+        handles = {
+            label: handle
+            for axis in axes
+            for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
+        }
+        figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=4)
         return style.save(figure, folder, "error", formats)
 
 
