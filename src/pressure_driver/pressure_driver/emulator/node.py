@@ -34,6 +34,7 @@ class BoardEmulator(Node):
         pneumatics = Pneumatics(segment_count, seed)
         protocol = board_protocol(self._value("protocol"), 2 * segment_count)
         self._board = EmulatedBoard(protocol, pneumatics, seed)
+        faults = self._parse(self._value("faults"))  # before the port stands where others see it
         self._port = EmulatedPort(self._value("port_link"), self._value("baud_rate"))
         self._air: deque[tuple[int, list[float]]] = deque(maxlen=100)
         self._commands: deque[ReceivedCommand] = deque(maxlen=1000)
@@ -53,7 +54,7 @@ class BoardEmulator(Node):
             self._value("real_time_priority"),
             self._value("reset_on_open"),
         )
-        self._runner.set_faults(self._parse(self._value("faults")))
+        self._runner.set_faults(faults)
         self.add_on_set_parameters_callback(self._on_parameters)
         prepare_process(self._value("real_time_priority"))
         self._runner.start()
