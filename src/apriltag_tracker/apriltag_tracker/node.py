@@ -93,8 +93,8 @@ class TrackerNode(Node):
                 declare(
                     self,
                     "correct_bits",
-                    2,
-                    "wrong bits of a code that are forgiven",
+                    1,
+                    "wrong bits of a code that are forgiven in a search",
                     at_least=0,
                     at_most=3,
                 )
