@@ -17,7 +17,7 @@ setup(
         (f"share/{PACKAGE}", ["package.xml"]),
         (f"share/{PACKAGE}/config", config),
     ],
-    install_requires=["setuptools", "numpy", "scipy", "opencv-python-headless", "PyYAML"],
+    install_requires=["setuptools", "numpy", "numba", "opencv-python-headless", "PyYAML"],
     extras_require={"test": ["pytest"]},
     zip_safe=False,
     maintainer="DER planner maintainers",
