@@ -231,12 +231,13 @@ class _Problem:
     def _jacobian(self, x: Array) -> Array:
         _, derivatives = self._evaluate(x)
         rows = self._prepared.usable
-        data = self._weight * derivatives[rows].reshape(-1, len(x)) * self._scale
+        data: Array = self._weight * derivatives[rows].reshape(-1, len(x)) * self._scale
         prior = np.diag(self._scale / self._spread)[self._known]
         return np.concatenate([data, prior])
 
     def _start_scaled(self) -> Array:
-        return np.array([self._start[place] for place in self._wanted]) / self._scale
+        start = np.array([self._start[place] for place in self._wanted])
+        return np.asarray(start / self._scale)
 
 
 def correlation_length(remaining: Array, longest: int = 200) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -55,24 +56,25 @@ def fit_geometry(limb: Limb, log: CalibrationLog, nodes: int = NODES) -> Geometr
     rows = np.all(np.isfinite(log.bend_angles), axis=1) & np.all(np.isfinite(log.tip), axis=1)
     if np.count_nonzero(rows) < 20:
         return None
-    every = max(1, np.count_nonzero(rows) // 800)
+    every = max(1, int(np.count_nonzero(rows)) // 800)
     angles, tip = log.bend_angles[rows][::every], log.tip[rows][::every]
     prior = np.array([segment.length for segment in limb.segments])
-    connector = limb.connector_length or 4e-3
+    known = limb.connector_length or 4e-3
+    connector = min(max(known, 1.1 * CONNECTOR_RANGE[0]), 0.9 * CONNECTOR_RANGE[1])
     several = limb.segment_count > 1
     spread = np.append(LENGTH_PRIOR * prior, CONNECTOR_PRIOR)
-    start = np.append(prior, np.clip(connector, 1.1 * CONNECTOR_RANGE[0], 0.9 * CONNECTOR_RANGE[1]))
+    start = np.append(prior, connector)
     low, high = (
         np.append(0.8 * prior, CONNECTOR_RANGE[0]),
         np.append(1.2 * prior, CONNECTOR_RANGE[1]),
     )
-    weight = np.sqrt(every / CORRELATION) / TIP_ERROR
+    weight = math.sqrt(every / CORRELATION) / TIP_ERROR
     free = len(start) if several else len(prior)
 
     def difference(candidate: Limb) -> Array:
         rod = Rod.from_limb(candidate, nodes)
         chain = PolylineKinematics(rod.rest_lengths, list(rod.segments))
-        return chain.tip(angles) - tip
+        return np.asarray(chain.tip(angles) - tip)
 
     def candidate(x: Array) -> Limb:
         return with_geometry(limb, x[: len(prior)], float(x[-1]) if several else None)
@@ -84,7 +86,8 @@ def fit_geometry(limb: Limb, log: CalibrationLog, nodes: int = NODES) -> Geometr
     solution = least_squares(
         residual, start[:free], bounds=(low[:free], high[:free]), x_scale=spread[:free]
     )
-    covariance = np.linalg.inv(solution.jac.T @ solution.jac)
+    jacobian = np.asarray(solution.jac)
+    covariance = np.linalg.inv(jacobian.T @ jacobian)
     found = candidate(solution.x)
     return GeometryFit(
         lengths=np.array([segment.length for segment in found.segments]),

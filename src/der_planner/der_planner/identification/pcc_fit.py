@@ -68,7 +68,7 @@ def fit_pcc(limb: Limb, prepared: Prepared, offset: Array) -> tuple[tuple[Segmen
         x_scale=np.concatenate([np.full(count, 0.2), np.full(count, 0.01), [0.5]]),
         loss="soft_l1",
         f_scale=3.0 / np.sqrt(CORRELATION),
-        diff_step=1e-3,
+        diff_step=np.full(len(start), 1e-3),
         xtol=1e-3,
         ftol=1e-4,
         max_nfev=4,
