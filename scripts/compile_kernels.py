@@ -23,7 +23,6 @@ from der_planner.limb import Limb  # noqa: E402
 from der_planner.planning import METHODS, Motion, plan  # noqa: E402
 from der_planner.twin.offline import play  # noqa: E402
 
-
 CONFIG = workspace.ROOT / "src" / "apriltag_tracker" / "config"
 
 

@@ -148,7 +148,7 @@ def parser() -> argparse.ArgumentParser:
         "--models", nargs="+", default=list(MODELS), metavar="MODEL", help=f"of {', '.join(MODELS)}"
     )
     what.add_argument(
-        "--method", default="paper", help=f"of {', '.join(METHODS)}; PCC always uses paper"
+        "--method", default="optimal", help=f"of {', '.join(METHODS)}; PCC always uses paper"
     )
     what.add_argument("--trials", type=int, default=1, help="runs of each motion and model")
     what.add_argument(

@@ -18,6 +18,7 @@ from der_planner.evaluation import (
     plot_pressures,
     plot_tip,
     summarise,
+    write_report,
     write_results,
 )
 from orchestrator.errors import GraphError
@@ -51,6 +52,9 @@ def conclude(options: Options, kept: Kept, progress: Progress) -> Path:
     for plot in (plot_tip, plot_error, plot_pressures):
         plot(runs, options.out)
     progress.say(f"results: {path}")
+    if options.report:
+        page = write_report(runs, found, options.out / "report")
+        progress.say(f"report: {page}")
     progress.say(f"figures: {options.out}/tip.png, error.png, pressures.png")
     return path
 

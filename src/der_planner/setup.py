@@ -26,6 +26,7 @@ setup(
         "mcap",
         "rosbags",
         "matplotlib",
+        "opencv-python-headless",
         "pyelastica",
         "piqp",
         "threadpoolctl",

@@ -40,6 +40,8 @@ class Experiment:
                 sys.executable,
                 ROOT / "scripts" / "run_experiment.py",
                 "--no-calibration",
+                "--method",
+                "paper",
                 "--period",
                 "3",
                 "--cycles",
