@@ -53,8 +53,8 @@ def conclude(options: Options, kept: Kept, progress: Progress) -> Path:
         plot(runs, options.out)
     progress.say(f"results: {path}")
     if options.report:
-        page = write_report(runs, found, options.out / "report")
-        progress.say(f"report: {page}")
+        written = write_report(runs, found, options.out / "report")
+        progress.say(f"report: {written.page}")
     progress.say(f"figures: {options.out}/tip.png, error.png, pressures.png")
     return path
 
