@@ -1,1 +1,1 @@
-"""The Python half of the graph's contract: topic names, QoS profiles, diagnostics and clean exit."""
+"""The Python half of the graph's contract: topics, QoS profiles, diagnostics, clean exit."""

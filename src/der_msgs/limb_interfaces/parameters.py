@@ -30,7 +30,8 @@ def declare(
         name: of the parameter.
         default: used where neither a file nor the command line sets it; its type is the type.
         description: one sentence with the unit, shown by ``ros2 param describe``.
-        at_least, at_most: the range of a number.
+        at_least: smallest admissible number.
+        at_most: largest admissible number.
         choices: the admissible values of a string.
         read_only: refuse changes while the node runs.
 

@@ -1,4 +1,4 @@
-"""Names of every topic and service of the graph, relative to the namespace of the node (`/limb`)."""
+"""Names of every topic and service of the graph, relative to the namespace `/limb`."""
 
 NAMESPACE = "limb"
 

@@ -1,1 +1,1 @@
-"""Plans chamber pressures of a soft limb with a discrete elastic rod, records runs and evaluates them."""
+"""Plans the pressures of a soft limb with a discrete elastic rod; records and evaluates runs."""
