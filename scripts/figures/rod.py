@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Draw the checks of the rod that src/der_planner/doc/rod.md shows.
 
-python3 scripts/rod_pictures.py [FOLDER]
+python3 scripts/figures/rod.py [FOLDER]
 """
 
 from __future__ import annotations
@@ -9,6 +9,8 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import workspace
 
@@ -25,7 +27,7 @@ from benchmarks.rod import cantilever, run_elastica  # noqa: E402
 from der_planner.limb import Limb  # noqa: E402
 from der_planner.rod import Rod, RodState  # noqa: E402
 
-FOLDER = Path(__file__).resolve().parents[1] / "src" / "der_planner" / "doc"
+FOLDER = workspace.ROOT / "src" / "der_planner" / "doc"
 ELASTICA_TIP_MM = 66.3753  # exact inextensible elastica, see test_statics
 
 

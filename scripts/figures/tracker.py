@@ -2,7 +2,7 @@
 """Draw the pictures of src/apriltag_tracker/README.md.
 
 python3 scripts/benchmark.py tracker --json figures.json
-python3 scripts/tracker_pictures.py --figures figures.json
+python3 scripts/figures/tracker.py --figures figures.json
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ import argparse
 import json
 import sys
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import workspace
 
