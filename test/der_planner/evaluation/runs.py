@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
+from bags import SECOND, START, spec, store
 
 from der_planner.evaluation import Description, RunSeries
 from der_planner.recording.layout import RUN_KEY
 from der_planner.recording.writer import BagWriter
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "recording"))
-from bags import SECOND, START, spec, store
 
 PERIOD, CYCLES = 4.0, 2
 TIMES = np.arange(0.0, PERIOD * CYCLES + 1.0 + 1e-9, 0.05)
