@@ -2,18 +2,23 @@
 """Identify a limb: run or read a calibration, fit, and write a limb file that every node takes.
 
     python3 scripts/calibrate_limb.py --offline --seed 3 --out my_twin.yaml
-    python3 scripts/calibrate_limb.py --bag out/bags/calibration --out my_limb.yaml
+    python3 scripts/calibrate_limb.py --graph --seed 3 --out my_twin.yaml
+    python3 scripts/calibrate_limb.py --graph --hardware my_rig.yaml --out my_limb.yaml
+    python3 scripts/calibrate_limb.py --bag calibrations/DATE/bag --out my_limb.yaml
     python3 scripts/calibrate_limb.py --csv log.csv --columns columns.yaml --out my_limb.yaml
 
---offline plays the calibration on the twin in one process, in seconds. A bag is any recorded run
-that excites every input; `--excitation FILE.csv` writes the pressures of the calibration run to
-play.
+--offline plays the calibration on the twin in one process, in seconds. --graph plays it in real
+time on the running graph, on the twin or the hardware, records a bag, vents, and fits to the bag:
+about three minutes. A bag is any recorded run that excites every input; `--excitation FILE.csv`
+writes the pressures of the calibration run, and `--play FILE.csv` plays such a file instead.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import sys
+import time
 from pathlib import Path
 
 import workspace
@@ -25,6 +30,7 @@ import numpy as np  # noqa: E402
 from der_planner.identification import (  # noqa: E402
     CalibrationLog,
     ColumnMap,
+    Excitation,
     FitReport,
     LogError,
     calibration_run,
@@ -32,12 +38,20 @@ from der_planner.identification import (  # noqa: E402
     predict,
     read_bag,
     read_csv,
+    read_excitation,
     record_twin,
+    within_limits,
+    write_excitation,
 )
 from der_planner.identification.offline import AMPLITUDE  # noqa: E402
 from der_planner.identification.parameters import GROUPS  # noqa: E402
 from der_planner.identification.plots import plot_prediction  # noqa: E402
 from der_planner.limb import Limb, LimbError  # noqa: E402
+from orchestrator.errors import GraphError, NodeError  # noqa: E402
+from orchestrator.interrupts import interrupt_once  # noqa: E402
+from orchestrator.options import Hardware, OptionError  # noqa: E402
+from orchestrator.progress import Progress  # noqa: E402
+from pressure_driver.schedule import ScheduleLimits  # noqa: E402
 
 
 def _arguments() -> argparse.Namespace:
@@ -46,10 +60,24 @@ def _arguments() -> argparse.Namespace:
     )
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--offline", action="store_true", help="calibrate the twin of --seed")
+    source.add_argument(
+        "--graph", action="store_true", help="play on the running graph, record a bag and fit to it"
+    )
     source.add_argument("--bag", type=Path, help="fit to a recorded run")
     source.add_argument("--csv", type=Path, help="fit to a table; needs --columns")
     source.add_argument(
         "--excitation", type=Path, metavar="FILE", help="write the run's pressures as CSV and stop"
+    )
+    parser.add_argument(
+        "--hardware", type=Path, metavar="FILE", help="with --graph: in place of the twin"
+    )
+    parser.add_argument(
+        "--play", type=Path, metavar="FILE", help="pressures to play, a table as of --excitation"
+    )
+    parser.add_argument(
+        "--folder",
+        type=Path,
+        help="with --graph: for bag, logs and report (default: calibrations/ and the time)",
     )
     parser.add_argument("--columns", type=Path, help="YAML map of the table's columns")
     parser.add_argument("--prior", type=Path, help="limb file to start from (default: built in)")
@@ -67,38 +95,105 @@ def _arguments() -> argparse.Namespace:
     given = parser.parse_args()
     if given.csv and not given.columns:
         parser.error("--csv needs --columns FILE")
+    for name in ("hardware", "folder"):
+        if getattr(given, name) and not given.graph:
+            parser.error(f"--{name} goes with --graph")
+    if given.play and not (given.graph or given.offline):
+        parser.error("--play goes with --graph or --offline")
+    if not 0 <= given.seed < 2**31:
+        parser.error(f"--seed is {given.seed}: choose 0 to {2**31 - 1}")
+    if given.graph:
+        stamp = time.strftime("%Y-%m-%d_%H-%M-%S")
+        given.folder = (given.folder or Path("calibrations") / stamp).resolve()
+        given.report = given.report or given.folder / "report"
     return given
 
 
 def main() -> int:
-    """Run the command line: 0 when a limb file was written, 1 after an error."""
+    """Run the command line: 0 when a limb file was written, 1 after an error, 2 for bad options."""
     given = _arguments()
     try:
         prior = Limb.from_yaml(given.prior) if given.prior else Limb.default()
-        amplitude = AMPLITUDE * prior.pneumatics.pressure_limit
-        run = calibration_run(amplitude, prior.segment_count, given.quick)
         if given.excitation:
-            table = np.column_stack([run.time, run.differential_pressure])
-            names = [f"differential_pressure_{i}_Pa" for i in range(prior.segment_count)]
-            header = ",".join(["time_s", *names])
-            np.savetxt(given.excitation, table, delimiter=",", header=header, comments="", fmt="%g")
+            run = _excitation(prior, prior.pneumatics.pressure_limit, given)
+            write_excitation(run, given.excitation)
             print(f"{run.duration:.0f} s of excitation in {given.excitation}")
             return 0
-        if given.offline:
-            print(
-                f"playing {run.duration:.0f} s on the twin of seed {given.seed} …", file=sys.stderr
-            )
-            log = record_twin(given.seed, run)
-        else:
-            log = _read(given.bag or given.csv, given.columns)
+        log = _obtain(prior, given)
         terms = () if given.terms == "none" else given.terms.split(",")
         limb, report = fit(prior, log, terms=terms, longest_gap=given.longest_gap)
         held_out = _read(given.held_out, given.columns) if given.held_out else None
         _conclude(limb, report, log, held_out, given)
-    except (LogError, LimbError) as error:
+    except OptionError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except (LogError, LimbError, GraphError, NodeError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt as error:
+        print(f"stopped by {error or 'SIGINT'}; no limb file was written", file=sys.stderr)
+        return 130
     return 0
+
+
+def _excitation(prior: Limb, pressure_limit: float, given: argparse.Namespace) -> Excitation:
+    if given.play:
+        return read_excitation(given.play, prior.segment_count)
+    return calibration_run(AMPLITUDE * pressure_limit, prior.segment_count, given.quick)
+
+
+def _obtain(prior: Limb, given: argparse.Namespace) -> CalibrationLog:
+    """Play or read the log to fit to."""
+    if given.graph:
+        return read_bag(_play_on_graph(prior, given))
+    if not given.offline:
+        return _read(given.bag or given.csv, given.columns)
+    limit = prior.pneumatics.pressure_limit
+    run = within_limits(_excitation(prior, limit, given), limit, math.inf)
+    print(f"playing {run.duration:.0f} s on the twin of seed {given.seed} …", file=sys.stderr)
+    return record_twin(given.seed, run)
+
+
+def _play_on_graph(prior: Limb, given: argparse.Namespace) -> Path:
+    """Play the calibration on the twin's nodes or the hardware; return the bag."""
+    # ROS is imported only by who needs it.
+    from orchestrator.calibration import GraphCalibration  # noqa: PLC0415
+
+    interrupt_once()
+    progress = Progress()
+    hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
+    driver = hardware.driver if hardware else {}
+    defaults = ScheduleLimits()
+    count = int(driver.get("segment_count", defaults.segment_count))
+    if count != prior.segment_count:
+        raise OptionError(
+            f"the driver's segment_count is {count}, the limb '{prior.name}' has "
+            f"{prior.segment_count}: give the limb's --prior, or set it in the hardware file"
+        )
+    limit = min(
+        prior.pneumatics.pressure_limit,
+        float(driver.get("pressure_limit", defaults.pressure_limit)),
+    )
+    # Steps may be faster than the limb's own slew_limit, which is for plans: they show how the air
+    # follows. The driver's limit holds for every setpoint.
+    slew = float(driver.get("slew_limit", defaults.slew_limit))
+    run = within_limits(_excitation(prior, limit, given), limit, slew)
+    stage = f"the hardware at {driver['port']}" if hardware else f"the twin of seed {given.seed}"
+    progress.say(f"playing {run.duration:.0f} s on {stage}, into {given.folder}")
+    metadata = {
+        "motion": "calibration",
+        "stage": stage,
+        "seed": None if hardware else given.seed,
+        "largest_pressure_Pa": float(np.abs(run.differential_pressure).max()),
+        "parts": [list(part) for part in run.parts],
+        "prior": prior.name,
+    }
+    player = GraphCalibration(
+        run, given.folder, metadata, progress, seed=given.seed, hardware=hardware
+    )
+    bag = player.play().bag
+    progress.say(f"bag: {bag}")
+    return bag
 
 
 def _read(path: Path, columns: Path | None) -> CalibrationLog:

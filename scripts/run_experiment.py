@@ -11,9 +11,7 @@ Sets up what is missing first (ROS 2, Python packages, the nodes); --help shows 
 
 from __future__ import annotations
 
-import signal
 import sys
-from types import FrameType
 
 import workspace
 
@@ -21,22 +19,13 @@ workspace.enter()
 
 from orchestrator.errors import GraphError, NodeError  # noqa: E402
 from orchestrator.experiment import run  # noqa: E402
+from orchestrator.interrupts import interrupt_once  # noqa: E402
 from orchestrator.options import OptionError, parse  # noqa: E402
-
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-
-
-def _interrupt_once(number: int, _frame: FrameType | None) -> None:
-    # A second signal must not cut the venting short.
-    for each in SIGNALS:
-        signal.signal(each, signal.SIG_IGN)
-    raise KeyboardInterrupt(signal.Signals(number).name)
 
 
 def main() -> int:
     """Run the command line; 0 when every trial was played, 1 after an error, 2 for bad options."""
-    for each in SIGNALS:
-        signal.signal(each, _interrupt_once)
+    interrupt_once()
     try:
         run(parse(sys.argv[1:]))
     except OptionError as error:

@@ -1,4 +1,4 @@
-"""One trial on the running graph: start the nodes, play the motion, vent, stop, keep the bag."""
+"""One run of the graph: start the nodes, play something, vent, stop, keep the bag."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import json
 import os
 import tempfile
 import time
-from collections.abc import Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from der_msgs.msg import MotionCommand, PressurePlan, PressureState
 from limb_interfaces import qos, stamps, topics
 from orchestrator.client import GraphClient
 from orchestrator.errors import GraphError, NodeError
-from orchestrator.options import Options, Trial
+from orchestrator.options import Hardware, Options, Trial
 from orchestrator.processes import NodeProcess
 from orchestrator.progress import Progress
 
@@ -32,6 +33,8 @@ STOP_ORDER = (
     "pressure_driver",
     "board_emulator",
 )
+TWIN_NODES = ("board_emulator", "limb_twin", "synthetic_camera")
+"""Nodes that stand in for the hardware."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +47,24 @@ class NodeSpec:
 
 
 @dataclass(frozen=True)
+class Playing:
+    """What the graph plays, from when to when.
+
+    Attributes:
+        begin: ROS time at which the first setpoint takes effect [s].
+        length: from the first setpoint to the last [s].
+        feed: called at least every 50 ms until the end; publishes what is due, if the orchestrator
+            is the one who publishes.
+    """
+
+    begin: float
+    length: float
+    feed: Callable[[], None] = lambda: None
+
+
+@dataclass(frozen=True)
 class GraphRun:
-    """What a trial left behind.
+    """What a run left behind.
 
     Attributes:
         bag: folder of the bag.
@@ -61,64 +80,75 @@ class GraphRun:
 
 
 def node_specs(
-    trial: Trial, options: Options, limb: Path | None, port: str, metadata: dict[str, Any]
+    port: str,
+    bag: Path,
+    metadata: dict[str, Any],
+    *,
+    seed: int = 0,
+    hardware: Hardware | None = None,
+    planner: dict[str, Any] | None = None,
+    record_images: bool = False,
 ) -> list[NodeSpec]:
-    """Return the nodes of a trial in the order in which they start."""
-    hardware = options.hardware
-    driver = {"port": port, "protocol": "ezloop"}
-    planner = {"limb_file": str(limb) if limb else ""}
-    recorder = {
-        "output": str(options.out / "bags" / trial.name),
-        "metadata": json.dumps(metadata),
-        "record_images": options.record_images,
-    }
-    if hardware is not None:
-        return [
-            NodeSpec("pressure_driver", "pressure_driver", {**driver, **hardware.driver}),
-            NodeSpec("apriltag_tracker", "apriltag_tracker", dict(hardware.tracker)),
-            NodeSpec("der_planner", "planner", {**planner, **hardware.planner}),
-            NodeSpec("der_planner", "recorder", {**recorder, **hardware.recorder}),
-        ]
-    return [
-        NodeSpec("pressure_driver", "board_emulator", {"port_link": port, "seed": trial.seed}),
-        NodeSpec("pressure_driver", "pressure_driver", driver),
-        NodeSpec("der_planner", "limb_twin", {"seed": trial.seed}),
-        NodeSpec("apriltag_tracker", "synthetic_camera", {"seed": trial.seed}),
-        NodeSpec("apriltag_tracker", "apriltag_tracker"),
-        NodeSpec("der_planner", "planner", planner),
-        NodeSpec("der_planner", "recorder", recorder),
-    ]
-
-
-class GraphTrial:
-    """Runs one trial; use `play`.
+    """Return the nodes of a run in the order in which they start.
 
     Args:
-        trial, options: what to play.
-        limb: limb file for the planner, or None for the default limb.
+        port: where the emulated board appears.
+        bag: folder that the recorder makes.
         metadata: stored in the bag.
+        seed: of the twin.
+        hardware: in place of the twin.
+        planner: parameters of the planner; None for a graph without one.
+        record_images: whether the bag holds the raw images, too.
+    """
+    rig = hardware or Hardware()
+    driver = {"port": port, "protocol": "ezloop", **rig.driver}
+    recorder = {
+        "output": str(bag),
+        "metadata": json.dumps(metadata),
+        "record_images": record_images,
+        **rig.recorder,
+    }
+    specs = [
+        NodeSpec("pressure_driver", "board_emulator", {"port_link": port, "seed": seed}),
+        NodeSpec("pressure_driver", "pressure_driver", driver),
+        NodeSpec("der_planner", "limb_twin", {"seed": seed}),
+        NodeSpec("apriltag_tracker", "synthetic_camera", {"seed": seed}),
+        NodeSpec("apriltag_tracker", "apriltag_tracker", dict(rig.tracker)),
+    ]
+    if hardware is not None:
+        specs = [spec for spec in specs if spec.executable not in TWIN_NODES]
+    if planner is not None:
+        specs.append(NodeSpec("der_planner", "planner", {**planner, **rig.planner}))
+    specs.append(NodeSpec("der_planner", "recorder", recorder))
+    return specs
+
+
+class GraphPlayer(ABC):
+    """Plays something on the graph; whatever happens, the limb is vented and every node stopped.
+
+    Args:
+        logs: folder of the nodes' logs.
+        hardware: in place of the twin, or None.
         progress: shows what happens.
     """
 
-    def __init__(
-        self,
-        trial: Trial,
-        options: Options,
-        limb: Path | None,
-        metadata: dict[str, Any],
-        progress: Progress,
-    ) -> None:
-        self._trial = trial
-        self._options = options
-        self._limb = limb
-        self._metadata = metadata
+    def __init__(self, logs: Path, hardware: Hardware | None, progress: Progress) -> None:
+        self._logs = logs
+        self._hardware = hardware
         self._progress = progress
-        self._logs = options.out / "logs" / trial.name
         self._processes: dict[str, NodeProcess] = {}
         self._driver_spec: NodeSpec | None = None
 
+    @abstractmethod
+    def _specs(self, port: str) -> list[NodeSpec]:
+        """Return the nodes in the order in which they start."""
+
+    @abstractmethod
+    def _begin(self, client: GraphClient) -> Playing:
+        """Arrange what is played; the recorder runs and the driver is armed."""
+
     def play(self) -> GraphRun:
-        """Start the graph, play the motion and stop everything, whatever happens on the way.
+        """Start the graph, play and stop everything, whatever happens on the way.
 
         Raises:
             GraphError: a node is not ready, the planner refuses, the driver reports a fault.
@@ -126,12 +156,16 @@ class GraphTrial:
         """
         with tempfile.TemporaryDirectory(prefix="der_limb_") as folder, GraphClient() as client:
             port = str(Path(folder) / "board")
-            specs = node_specs(self._trial, self._options, self._limb, port, self._metadata)
+            specs = self._specs(port)
             self._refuse_second_graph(client, specs)
-            self._watch_topics(client)
+            self._join(client)
             with self._everything_stops(client):
                 self._start(client, specs, port)
-                return self._play_motion(client)
+                return self._record(client)
+
+    def _join(self, client: GraphClient) -> None:
+        """Subscribe and advertise, before the nodes start."""
+        client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES)
 
     def _refuse_second_graph(self, client: GraphClient, specs: list[NodeSpec]) -> None:
         others = set(client.other_nodes()) & {spec.executable for spec in specs}
@@ -141,14 +175,10 @@ class GraphTrial:
                 "set ROS_DOMAIN_ID to another number for one of them"
             )
 
-    def _watch_topics(self, client: GraphClient) -> None:
-        client.subscribe(PressurePlan, topics.PLAN, qos.LATCHED)
-        client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES)
-
     def _start(self, client: GraphClient, specs: list[NodeSpec], port: str) -> None:
         begin = time.monotonic()
         self._progress.say(f"  starting {', '.join(spec.executable for spec in specs)}")
-        remap = self._options.hardware.remap if self._options.hardware else None
+        remap = self._hardware.remap if self._hardware else None
         for spec in specs:
             process = NodeProcess(spec.package, spec.executable, spec.parameters, self._logs, remap)
             self._processes[spec.executable] = process
@@ -160,20 +190,13 @@ class GraphTrial:
         client.wait_ready(self._processes)
         self._progress.say(f"  ready after {time.monotonic() - begin:.1f} s")
 
-    def _play_motion(self, client: GraphClient) -> GraphRun:
+    def _record(self, client: GraphClient) -> GraphRun:
         bag = Path(client.call("recorder/start"))
         client.call("pressure_driver/arm")
-        publisher = client.node.create_publisher(MotionCommand, topics.COMMAND, qos.COMMANDS)
-        client.wait_for(publisher.get_subscription_count, 10.0, "the planner to listen")
-        publisher.publish(self._command())
-        plan = client.wait_for(lambda: self._plan_or_refusal(client), PLAN_TIMEOUT, "the plan")
-        self._progress.say(
-            f"  planned in {plan.solve_time:.2f} s, "
-            f"predicted error {plan.predicted_error * 100:.2f} cm"
-        )
+        playing = self._begin(client)
         before = {name: process.measure_cpu() for name, process in self._processes.items()}
         begin = time.monotonic()
-        self._await_end(client, plan)
+        self._await_end(client, playing)
         wall = time.monotonic() - begin
         cpu = {
             name: 100.0 * (process.measure_cpu() - before[name]) / wall
@@ -182,39 +205,19 @@ class GraphTrial:
         factor = client.diagnostic_values("limb_twin").get("real_time_factor", "nan")
         self._vent(client)
         client.call("recorder/stop", timeout=20.0)
-        return GraphRun(bag, cpu, float(factor), plan.time[-1] if plan.time else 0.0)
+        return GraphRun(bag, cpu, float(factor), playing.length)
 
-    def _command(self) -> MotionCommand:
-        return MotionCommand(
-            motion=self._trial.motion,
-            model=self._trial.model,
-            method=self._trial.method,
-            amplitude=self._options.amplitude,
-            period=self._options.period,
-            cycles=self._options.cycles,
-            plan_id=self._trial.name,
-        )
-
-    def _plan_or_refusal(self, client: GraphClient) -> PressurePlan | None:
-        plan = client.newest.get(topics.PLAN)
-        if plan is not None and plan.plan_id == self._trial.name:
-            return plan
-        said = client.diagnostic_values("planner")
-        if said.get("state") == "refused":
-            raise GraphError(f"the planner refused: {said.get('reason', 'no reason given')}")
-        return None
-
-    def _await_end(self, client: GraphClient, plan: PressurePlan) -> None:
-        begin = stamps.seconds(plan.header.stamp)
-        length = plan.time[-1]
+    def _await_end(self, client: GraphClient, playing: Playing) -> None:
+        length = playing.length
 
         def played() -> float:
-            return float(client.node.get_clock().now().nanoseconds * 1e-9 - begin)
+            return float(client.node.get_clock().now().nanoseconds * 1e-9 - playing.begin)
 
         def finished() -> bool:
             state = client.newest.get(topics.PRESSURE_STATE)
             if state is not None and state.mode == PressureState.FAULT:
                 raise GraphError(f"the driver vented: {'; '.join(state.faults) or 'fault'}")
+            playing.feed()
             return played() >= length
 
         client.wait_for(
@@ -287,3 +290,74 @@ class GraphTrial:
     def _stop_all(self) -> dict[str, int]:
         order = [name for name in STOP_ORDER if name in self._processes]
         return {name: self._processes[name].stop() for name in order}
+
+
+class GraphTrial(GraphPlayer):
+    """Runs one trial of a planned motion; use `play`.
+
+    Args:
+        trial, options: what to play.
+        limb: limb file for the planner, or None for the default limb.
+        metadata: stored in the bag.
+        progress: shows what happens.
+    """
+
+    def __init__(
+        self,
+        trial: Trial,
+        options: Options,
+        limb: Path | None,
+        metadata: dict[str, Any],
+        progress: Progress,
+    ) -> None:
+        super().__init__(options.out / "logs" / trial.name, options.hardware, progress)
+        self._trial = trial
+        self._options = options
+        self._limb = limb
+        self._metadata = metadata
+
+    def _specs(self, port: str) -> list[NodeSpec]:
+        return node_specs(
+            port,
+            self._options.out / "bags" / self._trial.name,
+            self._metadata,
+            seed=self._trial.seed,
+            hardware=self._hardware,
+            planner={"limb_file": str(self._limb) if self._limb else ""},
+            record_images=self._options.record_images,
+        )
+
+    def _join(self, client: GraphClient) -> None:
+        super()._join(client)
+        client.subscribe(PressurePlan, topics.PLAN, qos.LATCHED)
+
+    def _begin(self, client: GraphClient) -> Playing:
+        publisher = client.node.create_publisher(MotionCommand, topics.COMMAND, qos.COMMANDS)
+        client.wait_for(publisher.get_subscription_count, 10.0, "the planner to listen")
+        publisher.publish(self._command())
+        plan = client.wait_for(lambda: self._plan_or_refusal(client), PLAN_TIMEOUT, "the plan")
+        self._progress.say(
+            f"  planned in {plan.solve_time:.2f} s, "
+            f"predicted error {plan.predicted_error * 100:.2f} cm"
+        )
+        return Playing(stamps.seconds(plan.header.stamp), float(plan.time[-1]))
+
+    def _command(self) -> MotionCommand:
+        return MotionCommand(
+            motion=self._trial.motion,
+            model=self._trial.model,
+            method=self._trial.method,
+            amplitude=self._options.amplitude,
+            period=self._options.period,
+            cycles=self._options.cycles,
+            plan_id=self._trial.name,
+        )
+
+    def _plan_or_refusal(self, client: GraphClient) -> PressurePlan | None:
+        plan = client.newest.get(topics.PLAN)
+        if plan is not None and plan.plan_id == self._trial.name:
+            return plan
+        said = client.diagnostic_values("planner")
+        if said.get("state") == "refused":
+            raise GraphError(f"the planner refused: {said.get('reason', 'no reason given')}")
+        return None

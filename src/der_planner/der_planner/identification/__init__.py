@@ -3,7 +3,13 @@
 from der_planner.identification.bag_log import read_bag
 from der_planner.identification.check import Check, check
 from der_planner.identification.csv_log import ColumnMap, read_csv
-from der_planner.identification.excitation import Excitation, calibration_run
+from der_planner.identification.excitation import (
+    Excitation,
+    calibration_run,
+    read_excitation,
+    within_limits,
+    write_excitation,
+)
 from der_planner.identification.fit import fit
 from der_planner.identification.log import CalibrationLog, LogError
 from der_planner.identification.offline import calibrate_twin, record_twin
@@ -26,5 +32,8 @@ __all__ = [
     "predict",
     "read_bag",
     "read_csv",
+    "read_excitation",
     "record_twin",
+    "within_limits",
+    "write_excitation",
 ]

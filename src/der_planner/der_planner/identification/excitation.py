@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+from der_planner.identification.log import LogError
 
 Array = NDArray[np.float64]
 
@@ -33,6 +36,65 @@ class Excitation:
     def duration(self) -> float:
         """Length of the run [s]."""
         return float(self.time[-1] + PERIOD)
+
+
+def write_excitation(excitation: Excitation, path: Path) -> None:
+    """Write a run as CSV: time_s and one column of pressures [Pa] a segment."""
+    table = np.column_stack([excitation.time, excitation.differential_pressure])
+    names = [f"differential_pressure_{i}_Pa" for i in range(table.shape[1] - 1)]
+    header = ",".join(["time_s", *names])
+    np.savetxt(path, table, delimiter=",", header=header, comments="", fmt="%.10g")
+
+
+def read_excitation(path: Path, segment_count: int) -> Excitation:
+    """Read what `write_excitation` wrote, or a table of one's own in the same form.
+
+    Raises:
+        LogError: the file cannot be read, has other columns, numbers that are not finite, or
+            times that are not 0, 0.05, 0.10 … s.
+    """
+    try:
+        table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise LogError(f"cannot read the excitation {path}: {error}") from error
+    if table.shape[0] < 2 or table.shape[1] != segment_count + 1:
+        raise LogError(
+            f"the excitation {path} has {table.shape[0]} rows of {table.shape[1]} columns, "
+            f"expected time_s and {segment_count} pressures below one line of names"
+        )
+    if not np.all(np.isfinite(table)):
+        raise LogError(f"the excitation {path} holds numbers that are not finite")
+    if np.abs(table[:, 0] - PERIOD * np.arange(len(table))).max() > 1e-6:
+        raise LogError(f"the times of the excitation {path} must be 0, {PERIOD}, {2 * PERIOD} … s")
+    return Excitation(table[:, 0], table[:, 1:], (("table", 0.0, float(table[-1, 0])),))
+
+
+def within_limits(excitation: Excitation, pressure_limit: float, slew_limit: float) -> Excitation:
+    """Return the run with steps drawn out to ramps where they are steeper than allowed.
+
+    Args:
+        excitation: to be played from rest.
+        pressure_limit: largest |differential pressure| [Pa].
+        slew_limit: largest change of a setpoint [Pa/s].
+
+    Raises:
+        LogError: a pressure beyond the limit.
+    """
+    wanted = excitation.differential_pressure
+    largest = float(np.abs(wanted).max())
+    if largest > pressure_limit:
+        raise LogError(
+            f"the excitation asks for {largest:.0f} Pa, the limit is ±{pressure_limit:.0f} Pa"
+        )
+    step = slew_limit * PERIOD
+    if np.abs(np.diff(wanted, axis=0, prepend=np.zeros((1, wanted.shape[1])))).max() <= step:
+        return excitation
+    pressure = np.empty_like(wanted)
+    held = np.zeros(wanted.shape[1])
+    for row, target in enumerate(wanted):
+        held = held + np.clip(target - held, -step, step)
+        pressure[row] = held
+    return replace(excitation, differential_pressure=pressure)
 
 
 def directions(segment_count: int) -> list[Array]:

@@ -1,0 +1,20 @@
+"""Signals that end a run: the first interrupts it, a second must not cut the venting short."""
+
+from __future__ import annotations
+
+import signal
+from types import FrameType
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+def interrupt_once() -> None:
+    """Turn the first of `SIGNALS` into a KeyboardInterrupt with its name; ignore later ones."""
+    for each in SIGNALS:
+        signal.signal(each, _interrupt)
+
+
+def _interrupt(number: int, _frame: FrameType | None) -> None:
+    for each in SIGNALS:
+        signal.signal(each, signal.SIG_IGN)
+    raise KeyboardInterrupt(signal.Signals(number).name)

@@ -1,0 +1,96 @@
+"""The calibration through the running graph agrees with the one in a single process."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+SEED = 3
+pytestmark = pytest.mark.graph
+
+
+def calibrate(out: Path, excitation: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    domain = os.environ.get("TEST_DOMAIN_ID", str(21 + os.getpid() % 80))
+    return subprocess.run(
+        [
+            sys.executable,
+            ROOT / "scripts" / "calibrate_limb.py",
+            *("--seed", str(SEED), "--play", excitation, "--terms", "none", "--out", out),
+            *arguments,
+        ],
+        env={**os.environ, "ROS_DOMAIN_ID": domain},
+        capture_output=True,
+        text=True,
+        timeout=200,
+        check=False,
+    )
+
+
+def test_the_graph_calibrates_as_one_process_does(tmp_path: Path):
+    from der_planner.identification import Excitation, read_bag, write_excitation
+    from der_planner.identification.excitation import PERIOD, waves
+    from der_planner.limb import Limb
+    from der_planner.recording.reader import BagReader
+
+    rest = np.zeros((20, 2))
+    pressure = np.concatenate([rest, waves(10_000.0, 2, duration=18.0), rest])
+    time = PERIOD * np.arange(len(pressure))
+    excitation = tmp_path / "excitation.csv"
+    write_excitation(Excitation(time, pressure, ()), excitation)
+
+    # A first guess far from the twin, so that only the data can bring both files together.
+    guess = Limb.default()
+    segments = tuple(replace(s, moment_gain=1.3 * s.moment_gain) for s in guess.segments)
+    prior = tmp_path / "prior.yaml"
+    replace(guess, segments=segments).to_yaml(prior)
+
+    graph_file, offline_file = tmp_path / "graph.yaml", tmp_path / "offline.yaml"
+    given = ("--prior", str(prior))
+    run = calibrate(graph_file, excitation, "--graph", "--folder", str(tmp_path / "run"), *given)
+    assert run.returncode == 0, run.stderr
+    assert "WARNING" not in run.stderr
+    offline = calibrate(offline_file, excitation, "--offline", *given)
+    assert offline.returncode == 0, offline.stderr
+
+    bag = tmp_path / "run" / "bag"
+    with BagReader(bag) as reader:
+        sent = [m for _, _, m in reader.messages(["/limb/pressure_setpoint"])]
+    assert {message.plan_id for message in sent} == {"calibration"}
+    assert [message.index for message in sent] == list(range(len(pressure)))
+    assert all(message.header.stamp.nanosec % 50_000_000 == 0 for message in sent)
+    np.testing.assert_allclose([m.differential_pressure for m in sent], pressure, atol=1e-4)
+    log = read_bag(bag)
+    np.testing.assert_allclose(log.commanded_differential[-1], 0.0, atol=1.0)
+    assert (tmp_path / "run" / "report" / "report.txt").stat().st_size > 100
+
+    gains = [
+        np.array([segment.moment_gain for segment in Limb.from_yaml(path).segments])
+        for path in (graph_file, offline_file)
+    ]
+    wrong = np.array([segment.moment_gain for segment in segments])
+    assert np.all(np.abs(gains[1] / wrong - 1.0) > 0.15)
+    np.testing.assert_allclose(gains[0], gains[1], rtol=0.08)
+
+
+@pytest.mark.parametrize(
+    ("rows", "complaint"),
+    [
+        ("time_s,a,b\n0,0,0\n0.05,0,30000\n", "asks for 30000 Pa, the limit is ±24000 Pa"),
+        ("time_s,a,b\n0,0,0\n0.1,0,0\n", "must be 0, 0.05, 0.1"),
+        ("time_s,a\n0,0\n0.05,0\n", "expected time_s and 2 pressures"),
+    ],
+)
+def test_a_table_that_cannot_be_played_starts_nothing(tmp_path: Path, rows: str, complaint: str):
+    excitation = tmp_path / "excitation.csv"
+    excitation.write_text(rows)
+    run = calibrate(tmp_path / "x.yaml", excitation, "--graph", "--folder", str(tmp_path / "run"))
+    assert run.returncode == 1
+    assert complaint in run.stderr
+    assert not (tmp_path / "run").exists()
