@@ -135,6 +135,7 @@ class GraphPlayer(ABC):
     def __init__(self, logs: Path, hardware: Hardware | None, progress: Progress) -> None:
         self._logs = logs
         self._hardware = hardware
+        self._remap = hardware.remap if hardware is not None else None
         self._progress = progress
         self._processes: dict[str, NodeProcess] = {}
         self._driver_spec: NodeSpec | None = None
@@ -178,9 +179,10 @@ class GraphPlayer(ABC):
     def _start(self, client: GraphClient, specs: list[NodeSpec], port: str) -> None:
         begin = time.monotonic()
         self._progress.say(f"  starting {', '.join(spec.executable for spec in specs)}")
-        remap = self._hardware.remap if self._hardware else None
         for spec in specs:
-            process = NodeProcess(spec.package, spec.executable, spec.parameters, self._logs, remap)
+            process = NodeProcess(
+                spec.package, spec.executable, spec.parameters, self._logs, self._remap
+            )
             self._processes[spec.executable] = process
             if spec.executable == "pressure_driver":
                 self._driver_spec = spec
@@ -255,6 +257,7 @@ class GraphPlayer(ABC):
                     spec.executable,
                     spec.parameters,
                     self._logs,
+                    self._remap,
                     name="pressure_driver_restarted",
                 )
                 self._processes["pressure_driver"] = driver

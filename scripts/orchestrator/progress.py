@@ -27,7 +27,7 @@ class Progress:
             return
         self._last_shown = -1e9 if finished else now
         share = min(max(done / total, 0.0), 1.0) if total > 0 else 1.0
-        line = f"  [{'#' * int(30 * share):<30}] {done:5.0f} / {total:.0f} s {text}"
+        line = f"  [{'#' * int(30 * share):<30}] {max(done, 0.0):5.0f} / {total:.0f} s {text}"
         if self._terminal:
             print(f"\r{line:<78}", end="", file=sys.stderr, flush=True)
             self._open_line = True

@@ -119,9 +119,12 @@ class FitReport:
         if self.air is None:
             return []
         air = self.air
+        # A run without fast steps never shows how fast a chamber fills.
+        seen = np.isfinite(air.fill_rate)
+        rate = f"{air.fill_rate:.0f} Pa/s" if seen else "not shown by this run, kept"
         return [
             f"air: lag {air.fill_lag:.3f} s filling, {air.vent_lag:.3f} s venting, dead time "
-            f"{air.delay:.3f} s, fill rate {air.fill_rate:.0f} Pa/s, residual {air.residual:.0f} Pa"
+            f"{air.delay:.3f} s, fill rate {rate}, residual {air.residual:.0f} Pa"
         ]
 
     def _geometry_lines(self) -> list[str]:
