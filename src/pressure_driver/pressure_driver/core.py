@@ -297,6 +297,10 @@ class DriverCore:
         if echo.sequence is None and self._awaiting_echo:
             self._round_trip = now - self._awaiting_echo[-1][1]
             self._awaiting_echo.clear()
+        # A status that left the board before the newest command came echoes an older one: the
+        # newest goes on waiting for its own.
+        if echo.sequence not in [number for number, _ in self._awaiting_echo]:
+            return
         while self._awaiting_echo:
             number, sent = self._awaiting_echo.popleft()
             if number == echo.sequence:
