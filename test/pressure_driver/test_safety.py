@@ -1,14 +1,16 @@
 """Every transition of the state machine, every refusal and every fault, in simulated time."""
 
+from collections import deque
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from pressure_driver.core import CoreSettings
+from pressure_driver.core import CoreSettings, DriverCore
 from pressure_driver.monitor import MonitorLimits
 from pressure_driver.protocols import NAMES
-from pressure_driver.protocols.base import BoardReport
+from pressure_driver.protocols.base import BoardReport, Echo
 from pressure_driver.safety import Mode, SafetyLimits
 from pressure_driver.schedule import ScheduleLimits, Setpoint, Verdict
 
@@ -528,3 +530,11 @@ def test_the_monitor_bounds_are_those_of_the_settings(simulate):
     begin = sim.steady
     push(sim, 6.0)
     assert sim.steady - begin > quick + 1.0
+
+
+def test_a_late_status_of_an_older_command_leaves_the_newest_waiting():
+    waiting = SimpleNamespace(_awaiting_echo=deque([(8, 1.00)]), _round_trip=float("nan"))
+    DriverCore._take_echo(waiting, Echo(7), 1.01)
+    assert np.isnan(waiting._round_trip)
+    DriverCore._take_echo(waiting, Echo(8), 1.02)
+    assert waiting._round_trip == pytest.approx(0.02)
