@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import platform
 import subprocess
@@ -143,8 +142,3 @@ def _commit() -> str:
         check=False,
     )
     return result.stdout.strip() or "unknown"
-
-
-def write_json(path: Path, content: object) -> None:
-    """Write a JSON file that people can read."""
-    path.write_text(json.dumps(content, indent=1) + "\n")
