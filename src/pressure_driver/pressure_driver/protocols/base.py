@@ -121,6 +121,13 @@ class HostProtocol(ABC):
     def reset(self) -> None:
         """Forget half-received bytes, as after a reconnect."""
 
+    def _check_segments(self, differential: Sequence[float]) -> None:
+        """Raise ValueError unless there is one difference a pair of chambers."""
+        if 2 * len(differential) != self.chamber_count:
+            raise ValueError(
+                f"expected {self.chamber_count // 2} differences, got {len(differential)}"
+            )
+
 
 @dataclass(frozen=True)
 class BoardCommand:

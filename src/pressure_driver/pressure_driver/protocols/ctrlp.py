@@ -27,10 +27,9 @@ from pressure_driver.protocols.base import (
     BoardText,
     Echo,
     Event,
-    HostProtocol,
     Telemetry,
 )
-from pressure_driver.protocols.lines import LineSplitter
+from pressure_driver.protocols.lines import LineHost, LineSplitter
 
 PASCAL_PER_KILOPASCAL = 1000.0
 LARGEST_GAUGE = 500.0
@@ -42,7 +41,7 @@ _REPORT = re.compile(r"\d{1,10}\t1(?:\t-?\d{1,4}(?:\.\d{1,6})?)+")
 _COMMAND = re.compile(r"[A-Z]{2,12}(?:;-?\d{1,6}(?:\.\d{1,6})?)*")
 
 
-class CtrlpHost(HostProtocol):
+class CtrlpHost(LineHost):
     """The driver's end of ``ctrlp``."""
 
     name = "ctrlp"
@@ -51,11 +50,6 @@ class CtrlpHost(HostProtocol):
         "no checksum: a damaged number can pass for a pressure",
         "the supply pressure is not reported",
     )
-
-    def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count)
-        self._lines = LineSplitter()
-        self._malformed = 0
 
     def start(self) -> bytes:
         """Echoes on, kPa, ramps between setpoints, reports at 20 Hz."""
@@ -72,10 +66,7 @@ class CtrlpHost(HostProtocol):
         Raises:
             ValueError: wrong number of segments, or a value that the wire cannot carry.
         """
-        if 2 * len(differential) != self.chamber_count:
-            raise ValueError(
-                f"expected {self.chamber_count // 2} differences, got {len(differential)}"
-            )
+        self._check_segments(differential)
         values: list[float] = []
         for difference in differential:
             size = abs(difference) / PASCAL_PER_KILOPASCAL
@@ -88,18 +79,6 @@ class CtrlpHost(HostProtocol):
     def vent(self, atmosphere: float) -> tuple[bytes, int | None]:  # noqa: ARG002
         """Zero gauge pressure on every channel, without a ramp."""
         return ("SET;0.000" + ";0.000" * self.chamber_count + "\n").encode(), None
-
-    def decode(self, data: bytes) -> list[Event]:
-        """Return telemetry, echoes and free text; damaged lines are counted in ``rejected``."""
-        events: list[Event] = []
-        for _, line in self._lines.feed(data):
-            event = self._parse(line)
-            if event is None:
-                self._malformed += 1
-            else:
-                events.append(event)
-        self.rejected = self._malformed + self._lines.damaged
-        return events
 
     def _parse(self, line: str) -> Event | None:
         if line.startswith("_"):
@@ -123,10 +102,6 @@ class CtrlpHost(HostProtocol):
         if text.startswith("UNREC"):
             return BoardReport("a command was not understood", fatal=False)
         return BoardText(text)
-
-    def reset(self) -> None:
-        """Forget a half-received line."""
-        self._lines.reset()
 
 
 class CtrlpBoard(BoardProtocol):

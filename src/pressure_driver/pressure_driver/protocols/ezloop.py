@@ -28,10 +28,9 @@ from pressure_driver.protocols.base import (
     BoardReading,
     BoardText,
     Event,
-    HostProtocol,
     Telemetry,
 )
-from pressure_driver.protocols.lines import LineSplitter
+from pressure_driver.protocols.lines import LineHost
 
 PASCAL_PER_HECTOPASCAL = 100.0
 LARGEST_WIRE_VALUE = 1250.0
@@ -50,7 +49,7 @@ def _numbers(text: str, separator: str | None) -> list[float] | None:
     return [float(part) for part in parts]
 
 
-class EzloopHost(HostProtocol):
+class EzloopHost(LineHost):
     """The driver's end of ``ezloop``."""
 
     name = "ezloop"
@@ -59,11 +58,6 @@ class EzloopHost(HostProtocol):
         "no checksum: a damaged number can pass for a pressure",
     )
     reports_supply = True
-
-    def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count)
-        self._lines = LineSplitter()
-        self._malformed = 0
 
     def start(self) -> bytes:
         """A line end, which finishes whatever an earlier program left half-sent."""
@@ -82,10 +76,7 @@ class EzloopHost(HostProtocol):
         Raises:
             ValueError: wrong number of segments, or a difference that the wire cannot carry.
         """
-        if 2 * len(differential) != self.chamber_count:
-            raise ValueError(
-                f"expected {self.chamber_count // 2} differences, got {len(differential)}"
-            )
+        self._check_segments(differential)
         values: list[float] = []
         for difference in differential:
             size = abs(difference) / PASCAL_PER_HECTOPASCAL
@@ -100,18 +91,6 @@ class EzloopHost(HostProtocol):
     def vent(self, atmosphere: float) -> tuple[bytes, int | None]:
         """Equal pressures in every pair: the board opens both chambers."""
         return self.setpoint([0.0] * (self.chamber_count // 2), atmosphere, 0.0)
-
-    def decode(self, data: bytes) -> list[Event]:
-        """Return telemetry and free text; damaged lines are counted in ``rejected``."""
-        events: list[Event] = []
-        for _, line in self._lines.feed(data):
-            event = self._parse(line)
-            if event is None:
-                self._malformed += 1
-            else:
-                events.append(event)
-        self.rejected = self._malformed + self._lines.damaged
-        return events
 
     def _parse(self, line: str) -> Event | None:
         tag, separator, rest = line.partition(":")
@@ -130,10 +109,6 @@ class EzloopHost(HostProtocol):
         if tag == "[RPR]":
             return Telemetry(supply_pressure=pascals[0])
         return Telemetry(chamber_pressure=pascals)
-
-    def reset(self) -> None:
-        """Forget a half-received line."""
-        self._lines.reset()
 
 
 class EzloopBoard(BoardProtocol):

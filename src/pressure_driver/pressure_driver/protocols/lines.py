@@ -1,6 +1,10 @@
-"""Cut a byte stream into text lines, whatever garbage is in it."""
+"""Text lines: cut a byte stream into them, whatever garbage is in it, and decode what they say."""
 
 from __future__ import annotations
+
+from abc import abstractmethod
+
+from pressure_driver.protocols.base import Event, HostProtocol
 
 LONGEST_LINE = 512
 """[bytes] A longer line is garbage: its bytes are dropped up to the next line end."""
@@ -51,3 +55,32 @@ class LineSplitter:
         self._position += len(self._buffer)
         self._buffer.clear()
         self._overlong = False
+
+
+class LineHost(HostProtocol):
+    """The driver's end of a protocol whose board sends text lines."""
+
+    def __init__(self, chamber_count: int = 4) -> None:
+        super().__init__(chamber_count)
+        self._lines = LineSplitter()
+        self._malformed = 0
+
+    def decode(self, data: bytes) -> list[Event]:
+        """Return what complete lines say; damaged lines are counted in ``rejected``."""
+        events: list[Event] = []
+        for _, line in self._lines.feed(data):
+            event = self._parse(line)
+            if event is None:
+                self._malformed += 1
+            else:
+                events.append(event)
+        self.rejected = self._malformed + self._lines.damaged
+        return events
+
+    @abstractmethod
+    def _parse(self, line: str) -> Event | None:
+        """Return what a line says; None: it is damaged."""
+
+    def reset(self) -> None:
+        """Forget a half-received line."""
+        self._lines.reset()

@@ -143,10 +143,7 @@ class NativeHost(HostProtocol):
         Raises:
             ValueError: wrong number of segments, or a value that the frame cannot carry.
         """
-        if 2 * len(differential) != self.chamber_count:
-            raise ValueError(
-                f"expected {self.chamber_count // 2} differences, got {len(differential)}"
-            )
+        self._check_segments(differential)
         milliseconds = round(valid_for * 1000.0)
         if not 0 < milliseconds <= LONGEST_VALIDITY:
             raise ValueError(f"a setpoint cannot stay valid for {valid_for} s")
