@@ -49,11 +49,12 @@ def conclude(options: Options, kept: Kept, progress: Progress) -> Path:
     path = write_results(found, options.out)
     print(format_table(summarise(found), compare(found)))
     _print_instruments(found, kept)
-    for plot in (plot_tip, plot_error, plot_pressures):
-        plot(runs, options.out)
+    figures = [
+        path for plot in (plot_tip, plot_error, plot_pressures) for path in plot(runs, options.out)
+    ]
     progress.say(f"results: {path}")
     if options.report:
-        written = write_report(runs, found, options.out / "report")
+        written = write_report(runs, found, options.out / "report", drawn=figures)
         progress.say(f"report: {written.page}")
     progress.say(f"figures: {options.out}/tip.png, error.png, pressures.png")
     return path

@@ -1,5 +1,6 @@
 """The page, the figures over camera frames and the film, from bags with images."""
 
+import base64
 import csv
 import json
 import shutil
@@ -207,6 +208,23 @@ def test_report_is_one_page_with_everything_in_it(bag: Path, tmp_path: Path):
         rows = {row["model"]: float(row["mean_error_m"]) for row in csv.DictReader(file)}
     assert rows["der"] == pytest.approx(0.002, abs=5e-5)
     assert rows["pcc"] == pytest.approx(0.01, abs=5e-5)
+
+
+def test_report_takes_figures_that_are_drawn_already(tmp_path: Path):
+    run = series(reference(FRAMES))
+    drawn = [tmp_path / f"tip.{ending}" for ending in ("png", "pdf")]
+    for path in drawn:
+        path.write_bytes(f"the {path.suffix} of an earlier drawing".encode())
+    seen = []
+    report = write_report(
+        [run], [evaluate_run(run)], tmp_path / "report", drawn=drawn, progress=seen.append
+    )
+    for path in drawn:
+        assert (tmp_path / "report" / path.name).read_bytes() == path.read_bytes()
+    assert base64.b64encode(drawn[0].read_bytes()).decode() in report.page.read_text()
+    assert "figure error" in seen
+    assert "figure tip" not in seen
+    assert (tmp_path / "report" / "error.pdf").exists()
 
 
 def test_film_has_every_frame(bag: Path, tmp_path: Path):

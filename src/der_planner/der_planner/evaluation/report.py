@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import math
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,6 +70,7 @@ def write_report(
     folder: Path,
     *,
     title: str = "Tracking errors",
+    drawn: Sequence[Path] = (),
     progress: Callable[[str], None] | None = None,
 ) -> Report:
     """Write page, tables and figures into a folder.
@@ -79,6 +81,7 @@ def write_report(
         folder: made if missing; receives ``report.html``, ``results.json``, ``table.md``,
             ``table.csv``, ``table.tex`` and each figure as PDF and PNG.
         title: of the page.
+        drawn: files of figures of the same runs that exist already; they are copied.
         progress: called with what is being made.
 
     Returns:
@@ -105,8 +108,12 @@ def write_report(
         ("shapes", plot_shapes),
         ("pressures", plot_pressures),
     ):
-        say(f"figure {name}")
-        written = plot(runs, folder)
+        ready = [path for path in drawn if path.stem == name]
+        if ready:
+            written = [Path(shutil.copy(path, folder)) for path in ready]
+        else:
+            say(f"figure {name}")
+            written = plot(runs, folder)
         files += written
         pictures = [path for path in written if path.suffix == ".png"]
         if pictures:
