@@ -15,8 +15,9 @@ ROOT = Path(__file__).resolve().parent.parent.parent
 def bare_clone(tmp_path: Path) -> Path:
     """Return a folder with the set-up script and nothing installed."""
     shutil.copytree(ROOT / "requirements", tmp_path / "requirements")
-    (tmp_path / "scripts").mkdir()
-    shutil.copy(ROOT / "scripts" / "workspace.py", tmp_path / "scripts")
+    scripts = ROOT / "scripts"
+    shutil.copytree(scripts / "workspace_setup", tmp_path / "scripts" / "workspace_setup")
+    shutil.copy(scripts / "workspace.py", tmp_path / "scripts")
     return tmp_path
 
 
@@ -43,7 +44,7 @@ def test_a_machine_without_compiler_is_told_the_command(bare_clone: Path, tmp_pa
 
 
 def test_an_unsupported_python_is_named(bare_clone: Path, tmp_path: Path):
-    script = bare_clone / "scripts" / "workspace.py"
+    script = bare_clone / "scripts" / "workspace_setup" / "python_packages.py"
     script.write_text(script.read_text().replace("((3, 10), (3, 13))", "((3, 5), (3, 6))"))
     result = _setup(bare_clone, tmp_path)
     assert result.returncode == 1

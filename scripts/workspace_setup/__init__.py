@@ -1,0 +1,1 @@
+"""Parts of `workspace`: what sets up the machine. Only the standard library is imported."""
