@@ -35,7 +35,7 @@ from apriltag_tracker.synthetic.camera import (  # noqa: E402
     SyntheticCamera,
 )
 from apriltag_tracker.tag_map import TagMap  # noqa: E402
-from benchmarks.tracker import CONDITIONS  # noqa: E402
+from benchmarks.tracker_pictures import CONDITIONS  # noqa: E402
 from der_planner.twin import LimbTwin  # noqa: E402
 
 PACKAGE = workspace.ROOT / "src" / "apriltag_tracker"
