@@ -15,6 +15,8 @@ from pressure_driver.schedule import Setpoint, Verdict
 
 PERIOD = 50_000_000
 START = 1_700_000_000_000_000_000
+VENTED = 500.0
+"""[Pa] gauge that counts as vented."""
 
 
 class Simulation:
@@ -55,6 +57,23 @@ class Simulation:
     @property
     def gauge(self):
         return self.board.pneumatics.pressure - self.board.pneumatics.atmosphere
+
+    @property
+    def vented(self):
+        return bool(np.all(self.gauge < VENTED))
+
+    def is_vent(self, data):
+        """Tell whether the bytes of a tick ask the board to open every chamber."""
+        name = self.core.protocol.name
+        commands = [c for c in board_protocol(name).decode(data) if c.kind in ("setpoint", "vent")]
+        return bool(commands) and all(
+            c.kind == "vent"
+            or (
+                np.ptp(np.reshape(c.pressure, (-1, 2)), axis=1).max() == 0.0
+                and (name != "ctrlp" or max(c.pressure) == 0.0)
+            )
+            for c in commands
+        )
 
     def _receive(self, data):
         if data and self.plugged:
