@@ -6,88 +6,60 @@ general one is stored by rows: a[i, k] = A[i, i+k-b], k = 0 … 2b.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from der_planner.rod.compile import kernel
 from der_planner.rod.state import Array
 
 
-@kernel
-def solve_5(s: Array, r: Array) -> float:
-    """Factor s (n, 6) into LDLᵀ in place, solve into r (n,); return the smallest pivot."""
-    n = r.shape[0]
-    least = np.inf
-    for j in range(n - 5):
-        pivot = s[j, 0]
-        least = min(least, pivot)
-        inverse = 1.0 / pivot
-        rj = r[j]
-        for i in range(1, 6):
-            factor = s[j, i] * inverse
-            for k in range(i, 6):
-                s[j + i, k - i] -= factor * s[j, k]
-            r[j + i] -= factor * rj
-        s[j, 0] = inverse
-    for j in range(n - 5, n):
-        pivot = s[j, 0]
-        least = min(least, pivot)
-        inverse = 1.0 / pivot
-        for i in range(1, n - j):
-            factor = s[j, i] * inverse
-            for k in range(i, n - j):
-                s[j + i, k - i] -= factor * s[j, k]
-            r[j + i] -= factor * r[j]
-        s[j, 0] = inverse
-    for j in range(n - 1, n - 6, -1):
-        total = r[j]
-        for i in range(1, n - j):
-            total -= s[j, i] * r[j + i]
-        r[j] = total * s[j, 0]
-    for j in range(n - 6, -1, -1):
-        total = r[j]
-        for i in range(1, 6):
-            total -= s[j, i] * r[j + i]
-        r[j] = total * s[j, 0]
-    return least
+def _symmetric_solver(b: int) -> Callable[[Array, Array], float]:
+    """Return a kernel for half-bandwidth b; with b a constant its inner loops are unrolled."""
+
+    @kernel
+    def solve(s: Array, r: Array) -> float:
+        n = r.shape[0]
+        least = np.inf
+        for j in range(n - b):
+            pivot = s[j, 0]
+            least = min(least, pivot)
+            inverse = 1.0 / pivot
+            rj = r[j]
+            for i in range(1, b + 1):
+                factor = s[j, i] * inverse
+                for k in range(i, b + 1):
+                    s[j + i, k - i] -= factor * s[j, k]
+                r[j + i] -= factor * rj
+            s[j, 0] = inverse
+        for j in range(n - b, n):
+            pivot = s[j, 0]
+            least = min(least, pivot)
+            inverse = 1.0 / pivot
+            for i in range(1, n - j):
+                factor = s[j, i] * inverse
+                for k in range(i, n - j):
+                    s[j + i, k - i] -= factor * s[j, k]
+                r[j + i] -= factor * r[j]
+            s[j, 0] = inverse
+        for j in range(n - 1, n - b - 1, -1):
+            total = r[j]
+            for i in range(1, n - j):
+                total -= s[j, i] * r[j + i]
+            r[j] = total * s[j, 0]
+        for j in range(n - b - 1, -1, -1):
+            total = r[j]
+            for i in range(1, b + 1):
+                total -= s[j, i] * r[j + i]
+            r[j] = total * s[j, 0]
+        return least
+
+    return solve
 
 
-@kernel
-def solve_10(s: Array, r: Array) -> float:
-    """As `solve_5` for s (n, 11)."""
-    n = r.shape[0]
-    least = np.inf
-    for j in range(n - 10):
-        pivot = s[j, 0]
-        least = min(least, pivot)
-        inverse = 1.0 / pivot
-        rj = r[j]
-        for i in range(1, 11):
-            factor = s[j, i] * inverse
-            for k in range(i, 11):
-                s[j + i, k - i] -= factor * s[j, k]
-            r[j + i] -= factor * rj
-        s[j, 0] = inverse
-    for j in range(n - 10, n):
-        pivot = s[j, 0]
-        least = min(least, pivot)
-        inverse = 1.0 / pivot
-        for i in range(1, n - j):
-            factor = s[j, i] * inverse
-            for k in range(i, n - j):
-                s[j + i, k - i] -= factor * s[j, k]
-            r[j + i] -= factor * r[j]
-        s[j, 0] = inverse
-    for j in range(n - 1, n - 11, -1):
-        total = r[j]
-        for i in range(1, n - j):
-            total -= s[j, i] * r[j + i]
-        r[j] = total * s[j, 0]
-    for j in range(n - 11, -1, -1):
-        total = r[j]
-        for i in range(1, 11):
-            total -= s[j, i] * r[j + i]
-        r[j] = total * s[j, 0]
-    return least
+# Factor s (n, b+1) into LDLᵀ in place, solve into r (n,), return the smallest pivot.
+solve_5 = _symmetric_solver(5)
+solve_10 = _symmetric_solver(10)
 
 
 @kernel

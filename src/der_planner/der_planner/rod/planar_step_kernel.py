@@ -22,6 +22,7 @@ from der_planner.rod.band_kernel import (
 from der_planner.rod.compile import kernel
 from der_planner.rod.planar_kernel import assemble, input_columns, unsymmetric
 from der_planner.rod.state import Array, Arrays
+from der_planner.rod.step_kernel import add_inertia, go_on, predict
 
 
 @kernel
@@ -35,7 +36,7 @@ def newton(
     without convergence.
     """
     work, s, band, edge, turn, torque, parts, a = space
-    mass, damping, load, fixed = body
+    fixed = body[3]
     size = x.shape[0]
     residual, v = work[0], work[1]
     largest, careful = 2.0 * smallest(rod[0]), 0.1 * smallest(rod[0])
@@ -45,9 +46,7 @@ def newton(
         for k in range(size):
             v[k] = (x[k] - x_n[k]) * rate
         assemble(x, v, rate, u, convex, residual, s, edge, turn, torque, rod)
-        for k in range(size):
-            residual[k] += mass[k] * rate * (v[k] - v_n[k]) + damping[k] * v[k] - load[k]
-            s[k, 0] += rate * (mass[k] * rate + damping[k])
+        add_inertia(residual, s, v, v_n, rate, body)
         hold_fixed(s, residual, fixed)
         if iteration > 5:  # slow without the unsymmetric part of the derivative
             expand(s, a)
@@ -71,21 +70,6 @@ def newton(
         if update < tolerance:
             return iteration + 1, update
     return -limit, update
-
-
-@kernel
-def predict(
-    x: Array, x_n: Array, v_n: Array, acceleration: Array, h: float, fixed: Array, far: float
-) -> None:
-    """Fill x with a guess of the step's end: the last acceleration goes on, unless it leads far."""
-    for d in range(x.shape[0]):
-        move = h * (v_n[d] + h * acceleration[d])
-        x[d] = x_n[d] + move
-        if not abs(move) < far:
-            put(x_n, x)
-            return
-    for d in fixed:
-        x[d] = x_n[d]
 
 
 @kernel
@@ -115,7 +99,7 @@ def simulate(
     for index in range(intervals * steps):
         k, step = index // steps, index % steps
         u = pressures[k, step]
-        predict(x, x_n, v_n, acceleration, h, body[3], far)
+        predict(x, x_n, v_n, acceleration, h, body[3], far, False)
         iterations = -1
         update = np.inf
         for attempt in range(2):
@@ -141,11 +125,7 @@ def simulate(
                 for d in range(size):
                     put(band[d], viscous[index, d])
         e = extrapolate[index % extrapolate.shape[0]]
-        for d in range(size):
-            velocity = (x[d] - x_n[d]) * rate
-            acceleration[d] = (velocity - v_n[d]) * rate
-            x_n[d] += e * (x[d] - x_n[d])
-            v_n[d] += e * (velocity - v_n[d])
+        go_on(x, x_n, v_n, acceleration, rate, e)
         if step == steps - 1:
             put(x_n, q[k + 1])
             put(v_n, v[k + 1])

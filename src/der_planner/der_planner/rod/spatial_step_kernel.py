@@ -24,6 +24,7 @@ from der_planner.rod.compile import kernel
 from der_planner.rod.spatial_assembly_kernel import assemble, unsymmetric
 from der_planner.rod.spatial_kernel import D1, T, frames, reference_twists
 from der_planner.rod.state import Array, Arrays
+from der_planner.rod.step_kernel import add_inertia, go_on, predict
 
 
 @kernel
@@ -68,7 +69,7 @@ def newton(
     angle counts times lever [m].
     """
     twists, work, s, frame, own, link, local, vectors, a = space
-    mass, damping, load, fixed = body
+    fixed = body[3]
     size = x.shape[0]
     residual, v = work[0], work[1]
     largest, careful = 2.0 * smallest(rod[0]), 0.1 * smallest(rod[0])
@@ -80,9 +81,7 @@ def newton(
         frames(x, base[0], base[1], frame)
         reference_twists(frame, base[2], twists)
         assemble(x, v, rate, u, convex, residual, s, frame, twists, own, link, local, vectors, rod)
-        for k in range(size):
-            residual[k] += mass[k] * rate * (v[k] - v_n[k]) + damping[k] * v[k] - load[k]
-            s[k, 0] += rate * (mass[k] * rate + damping[k])
+        add_inertia(residual, s, v, v_n, rate, body)
         # Inertia makes the symmetric part of the derivative good enough; rest does not.
         if rate == 0.0 or iteration > 5:
             expand(s, a)
@@ -112,21 +111,6 @@ def newton(
 
 
 @kernel
-def predict(
-    x: Array, x_n: Array, v_n: Array, acceleration: Array, h: float, fixed: Array, far: float
-) -> None:
-    """Fill x with a guess of the step's end: the last acceleration goes on, unless it leads far."""
-    for d in range(x.shape[0]):
-        move = h * (v_n[d] + h * acceleration[d])
-        x[d] = x_n[d] + move
-        if not abs(move) < (0.5 if d % 4 == 3 else far):
-            put(x_n, x)
-            return
-    for d in fixed:
-        x[d] = x_n[d]
-
-
-@kernel
 def simulate(
     q: Array, v: Array, pressures: Array, h: float, extrapolate: Array, tolerance: float,
     lever: float, limit: int, base: Arrays, space: Arrays, body: Arrays, rod: Arrays,
@@ -137,7 +121,6 @@ def simulate(
     Returns (steps done, Newton iterations, last update, iterations of the failed step or 0).
     """
     intervals, steps, _ = pressures.shape
-    size = q.shape[1]
     work = space[1]
     x, x_n, v_n, acceleration = work[2], work[3], work[4], work[5]
     put(q[0], x_n)
@@ -148,7 +131,7 @@ def simulate(
     for index in range(intervals * steps):
         k, step = index // steps, index % steps
         u = pressures[k, step]
-        predict(x, x_n, v_n, acceleration, h, body[3], far)
+        predict(x, x_n, v_n, acceleration, h, body[3], far, True)
         iterations = -1
         update = np.inf
         for attempt in range(2):
@@ -165,11 +148,7 @@ def simulate(
             return index, total - iterations, update, -iterations
         total += iterations
         e = extrapolate[index % extrapolate.shape[0]]
-        for d in range(size):
-            velocity = (x[d] - x_n[d]) * rate
-            acceleration[d] = (velocity - v_n[d]) * rate
-            x_n[d] += e * (x[d] - x_n[d])
-            v_n[d] += e * (velocity - v_n[d])
+        go_on(x, x_n, v_n, acceleration, rate, e)
         carry(x_n, base, space)
         if step == steps - 1:
             put(x_n, q[k + 1])
