@@ -10,7 +10,7 @@ import yaml
 from ros2_verbs.cli import CommandError, add_verb, add_verbs
 from ros2_verbs.filling import Filler
 from ros2_verbs.messages import interface
-from ros2_verbs.session import Session, add_session_arguments, is_hidden
+from ros2_verbs.session import Session, add_session_arguments, is_hidden, print_types
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -60,12 +60,7 @@ def _list(options: argparse.Namespace) -> None:
 
 
 def _type(options: argparse.Namespace) -> int:
-    with Session(options) as session:
-        session.discover(lambda: options.service_name in session.services())
-        types = session.services().get(options.service_name, [])
-    for kind in types:
-        print(kind)
-    return 0 if types else 1
+    return print_types(options, options.service_name, Session.services)
 
 
 def _call(options: argparse.Namespace) -> None:

@@ -175,6 +175,24 @@ class Session:
         return future.result()
 
 
+def print_types(
+    options: argparse.Namespace, name: str, known: Callable[[Session], dict[str, list[str]]]
+) -> int:
+    """Print the types of a topic or service; return the exit code, 1 if it is not there.
+
+    Args:
+        options: of the session.
+        name: of the topic or service.
+        known: `Session.topics` or `Session.services`.
+    """
+    with Session(options) as session:
+        session.discover(lambda: name in known(session))
+        types = known(session).get(name, [])
+    for kind in types:
+        print(kind)
+    return 0 if types else 1
+
+
 def full_name(name: str, namespace: str) -> str:
     """Return a node's full name."""
     return f"{namespace}{'' if namespace.endswith('/') else '/'}{name}"

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from ros2_verbs import topic_echo, topic_hz, topic_pub
 from ros2_verbs.cli import add_verb, add_verbs
-from ros2_verbs.session import Session, add_session_arguments, is_hidden
+from ros2_verbs.session import Session, add_session_arguments, is_hidden, print_types
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -91,9 +91,4 @@ def _info(options: argparse.Namespace) -> str | None:
 
 
 def _type(options: argparse.Namespace) -> int:
-    with Session(options) as session:
-        session.discover(lambda: options.topic_name in session.topics())
-        types = session.topics().get(options.topic_name, [])
-    for kind in types:
-        print(kind)
-    return 0 if types else 1
+    return print_types(options, options.topic_name, Session.topics)
