@@ -43,9 +43,9 @@ from apriltag_tracker.calibration import (  # noqa: E402
 )
 from apriltag_tracker.camera import CameraError, Intrinsics  # noqa: E402
 from apriltag_tracker.encodings import ImageError, to_grey  # noqa: E402
-from apriltag_tracker.sheets import BoardLayout  # noqa: E402
 from apriltag_tracker.sources import PICTURES  # noqa: E402
 from apriltag_tracker.tag_map import TagMap, TagMapError  # noqa: E402
+from calibration_board import add_board_arguments, given_board  # noqa: E402
 from limb_interfaces import qos  # noqa: E402
 
 DEFAULT_MAP = workspace.ROOT / "src" / "apriltag_tracker" / "config" / "tags.yaml"
@@ -132,7 +132,7 @@ def pictures(options: argparse.Namespace) -> Iterator[Picture]:
 
 def intrinsics(options: argparse.Namespace) -> None:
     """Calibrate the camera and write the result."""
-    layout = BoardLayout(options.columns, options.rows, options.square, options.marker)
+    layout = given_board(options)
     finder = BoardFinder(layout)
     views, unseen, size = [], [], None
     for name, image in pictures(options):
@@ -196,11 +196,7 @@ def main() -> int:
     common.add_argument("--every", type=float, default=1.5, help="s between pictures")
     common.add_argument("--out", type=Path, required=True, metavar="FILE")
     lens = what.add_parser("intrinsics", parents=[common], help="focal length and distortion")
-    layout = BoardLayout()
-    lens.add_argument("--columns", type=int, default=layout.columns)
-    lens.add_argument("--rows", type=int, default=layout.rows)
-    lens.add_argument("--square", type=float, default=layout.square, help="edge in m")
-    lens.add_argument("--marker", type=float, default=layout.marker, help="edge in m")
+    add_board_arguments(lens)
     lens.add_argument("--rational", action="store_true", help="eight coefficients, for wide lenses")
     tags = what.add_parser("mounting", parents=[common], help="tags on the straight limb")
     tags.add_argument("--tag-map", type=Path, default=DEFAULT_MAP, metavar="FILE")

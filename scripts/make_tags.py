@@ -17,7 +17,6 @@ workspace.enter()
 
 from apriltag_tracker.sheets import (  # noqa: E402
     PAPERS,
-    BoardLayout,
     Page,
     SheetError,
     board_page,
@@ -26,6 +25,7 @@ from apriltag_tracker.sheets import (  # noqa: E402
     write_svg,
 )
 from apriltag_tracker.tag_map import TagMap, TagMapError  # noqa: E402
+from calibration_board import add_board_arguments, given_board  # noqa: E402
 
 DEFAULT_MAP = workspace.ROOT / "src" / "apriltag_tracker" / "config" / "tags.yaml"
 
@@ -56,18 +56,13 @@ def main() -> int:
     tags = what.add_parser("tags", parents=[common], help="every tag of a tag map")
     tags.add_argument("--tag-map", type=Path, default=DEFAULT_MAP, metavar="FILE")
     board = what.add_parser("board", parents=[common], help="a calibration board")
-    layout = BoardLayout()
-    board.add_argument("--columns", type=int, default=layout.columns)
-    board.add_argument("--rows", type=int, default=layout.rows)
-    board.add_argument("--square", type=float, default=layout.square, help="edge in m")
-    board.add_argument("--marker", type=float, default=layout.marker, help="edge in m")
+    add_board_arguments(board)
     options = parser.parse_args()
     try:
         if options.what == "tags":
             _write(tag_pages(TagMap.from_yaml(options.tag_map), options.paper), "tags", options)
         else:
-            chosen = BoardLayout(options.columns, options.rows, options.square, options.marker)
-            _write([board_page(chosen, options.paper)], "board", options)
+            _write([board_page(given_board(options), options.paper)], "board", options)
     except (TagMapError, SheetError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
