@@ -2,39 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.rod import band_kernel, planar_kernel, planar_step_kernel
+from der_planner.rod.backend import Run, Solves, band_to_dense
 from der_planner.rod.linearisation import StageStates, StepFactors, step_matrices
 from der_planner.rod.mesh import Mesh
 from der_planner.rod.state import Array, Arrays, RodState
-
-
-@dataclass(frozen=True)
-class Run:
-    """What a backend's simulation returned.
-
-    Attributes:
-        q: (K+1, 4N-1). v: likewise.
-        final: the last converged state.
-        steps: steps done. iterations: Newton iterations of all of them.
-        update: size of the last Newton update if a step failed.
-        failed_iterations: iterations of the failed step, 0 if none failed.
-        factors: the linearisation, if asked for. stages: the states that it belongs to.
-    """
-
-    q: Array
-    v: Array
-    final: RodState
-    steps: int
-    iterations: int
-    update: float
-    failed_iterations: int
-    factors: StepFactors | None
-    stages: StageStates | None = None
 
 
 class PlanarBackend:
@@ -116,17 +91,9 @@ class PlanarBackend:
         return result
 
     def simulate(
-        self,
-        state: RodState,
-        pressures: Array,
-        h: float,
-        extrapolate: Array,
-        load: Array,
-        tolerance: float,
-        limit: int,
-        linearise: bool,
+        self, state: RodState, pressures: Array, solves: Solves, linearise: bool = False
     ) -> Run:
-        """Run the kernel `simulate`; load is (4N-1,)."""
+        """Run the kernel `simulate` under pressures (K, S, M)."""
         intervals, steps, inputs = pressures.shape
         kept = intervals * steps if linearise else 0
         viscous = kept if self.mesh.viscous.any() else 0
@@ -139,8 +106,8 @@ class PlanarBackend:
         x[0] = self.extend(state.q)
         rate[0] = self.extend_rate(state.v)
         done, iterations, update, failed = planar_step_kernel.simulate(
-            x, rate, pressures, h, extrapolate, tolerance, limit, factors, bands, columns,
-            stages, self.work_space(), self._body(load), self.rod,
+            x, rate, pressures, solves.h, solves.extrapolate, solves.tolerance, solves.limit,
+            factors, bands, columns, stages, self.work_space(), self._body(solves.load), self.rod,
         )  # fmt: skip
         q = self.restore(x, state.q)
         v = self.restore(rate, state.v)
@@ -148,23 +115,19 @@ class PlanarBackend:
         final = RodState(q[at].copy(), v[at].copy(), state.directors, state.reference_twist)
         stored = motion = None
         if linearise and not failed:
-            stored = StepFactors(factors, bands, columns, *self._diagonals(h), 1.0 / h, extrapolate)
-            motion = StageStates(stages, pressures.reshape(kept, inputs), load)
+            stored = StepFactors(
+                factors, bands, columns, *self._diagonals(solves.h), 1.0 / solves.h,
+                solves.extrapolate,
+            )  # fmt: skip
+            motion = StageStates(stages, pressures.reshape(kept, inputs), solves.load)
         return Run(q, v, final, done, iterations, update, failed, stored, motion)
 
     def linearise(
-        self,
-        state: RodState,
-        u: Array,
-        h: float,
-        extrapolate: Array,
-        load: Array,
-        tolerance: float,
-        limit: int,
+        self, state: RodState, u: Array, solves: Solves
     ) -> tuple[Run, tuple[Array, Array] | None]:
         """Return the run and (A, B) of one step; no matrices if a stage failed."""
-        pressures = np.ascontiguousarray(np.broadcast_to(u, (1, len(extrapolate), len(u))))
-        run = self.simulate(state, pressures, h, extrapolate, load, tolerance, limit, True)
+        pressures = np.ascontiguousarray(np.broadcast_to(u, (1, len(solves.extrapolate), len(u))))
+        run = self.simulate(state, pressures, solves, linearise=True)
         if run.factors is None:
             return run, None
         return run, step_matrices(run.factors, self.free_rows)
@@ -264,14 +227,3 @@ class PlanarBackend:
         inner = planar[2 * self.ghost :, 2 * self.ghost :]
         result[np.ix_(self.index, self.index)] = inner
         return result
-
-
-def band_to_dense(band: Array) -> Array:
-    """Return the full matrix of a symmetric band stored by columns."""
-    size, width = band.shape
-    result = np.diag(band[:, 0].copy())
-    for k in range(1, width):
-        rows = np.arange(k, size)
-        result[rows, rows - k] = band[: size - k, k]
-        result[rows - k, rows] = band[: size - k, k]
-    return result

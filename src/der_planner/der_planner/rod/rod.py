@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Literal
 
@@ -11,14 +10,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from der_planner.limb import Limb
 from der_planner.rod.errors import ConvergenceError
+from der_planner.rod.integration import Integrator, Method, by_step, stage_count
 from der_planner.rod.linearisation import Linearisation
 from der_planner.rod.mesh import Mesh, array, limb_mesh, positive, require, uniform_mesh
-from der_planner.rod.planar import PlanarBackend, Run
+from der_planner.rod.planar import PlanarBackend
 from der_planner.rod.spatial import SpatialBackend
 from der_planner.rod.state import Array, RodState, Trajectory, positions_of
 from der_planner.rod.statics import even_bend, find_equilibrium, turning
 
-Method = Literal["sdirk2", "midpoint", "backward_euler"]
 Plane = Literal["xy", "xz"]
 
 
@@ -55,7 +54,7 @@ class Rod:
         self.external_force = mesh.weight
         self._backend = PlanarBackend(mesh, plane) if plane else SpatialBackend(mesh)
         self.free = self._backend.free
-        self._tolerance = 1e-10 * float(mesh.rest.sum())
+        self._integrator = Integrator(self._backend, 1e-10 * float(mesh.rest.sum()))
         if plane:
             self._check_plane(self.external_force, "gravity")
 
@@ -193,7 +192,7 @@ class Rod:
         pressures = array(u, (self.segment_count,), "u")[None, None, :]
         load = self._load(forces)
         try:
-            return self._run(state, pressures, positive(dt, "dt"), method, load).final
+            return self._integrator.run(state, pressures, positive(dt, "dt"), method, load).final
         except ConvergenceError:
             if halvings < 1:
                 raise
@@ -230,23 +229,15 @@ class Rod:
         Raises:
             ConvergenceError: with the step's index and the last good state.
         """
-        require(isinstance(substeps, (int, np.integer)) and substeps > 0, "substeps",
-                "an int of 1 or more", substeps)  # fmt: skip
-        given = np.asarray(pressures, dtype=np.float64)
-        require(given.ndim in (2, 3), "pressures", "(K, M) or (K, substeps, M)", given.shape)
-        intervals = given.shape[0]
-        shape = (intervals, substeps, self.segment_count)
-        if given.ndim == 2:
-            array(given, (intervals, self.segment_count), "pressures")
-            given = np.repeat(given[:, None, :], substeps, axis=1)
-        inputs = array(given, shape, "pressures")
+        inputs = by_step(pressures, substeps, self.segment_count)
+        intervals = inputs.shape[0]
         h = positive(dt, "dt") / substeps
-        run = self._run(state, inputs, h, method, self._load(forces), linearise)
+        run = self._integrator.run(state, inputs, h, method, self._load(forces), linearise)
         linearisation = None
         if run.factors is not None and run.stages is not None:
             wanted = self._output_indices(outputs)
             linearisation = Linearisation(
-                intervals, substeps, len(_STAGES[method][1]), wanted, self.free, run.factors,
+                intervals, substeps, stage_count(method), wanted, self.free, run.factors,
                 self._backend.rows(wanted), self._backend.free_rows, run.stages,
             )  # fmt: skip
         time = dt * np.arange(intervals + 1)
@@ -354,15 +345,9 @@ class Rod:
         beginning and of the step's result at the end: what `Rod.state(q, like=…)` does.
         """
         pressures = array(u, (self.segment_count,), "u")
-        require(method in _STAGES, "method", f"one of {sorted(_STAGES)}", method)
-        fraction, extrapolate = _STAGES[method]
-        h = positive(dt, "dt") * fraction
-        run, matrices = self._backend.linearise(
-            state, pressures, h, extrapolate, self._load(forces), self._tolerance, _LIMIT
+        return self._integrator.linearise(
+            state, pressures, positive(dt, "dt"), method, self._load(forces)
         )
-        if matrices is None:
-            raise self._failure(run, dt, method)
-        return matrices
 
     def bend_angles(self, state: RodState | ArrayLike) -> Array:
         """Return (…, M) each segment's turning about +z from its first to its last edge [rad]."""
@@ -376,35 +361,6 @@ class Rod:
             angles: (M,) bend angles [rad], as `bend_angles` measures them.
         """
         return even_bend(array(angles, (self.segment_count,), "angles"), self.mesh)
-
-    def _run(
-        self,
-        state: RodState,
-        pressures: Array,
-        dt: float,
-        method: str,
-        load: Array,
-        linearise: bool = False,
-    ) -> Run:
-        require(method in _STAGES, "method", f"one of {sorted(_STAGES)}", method)
-        fraction, extrapolate = _STAGES[method]
-        if len(extrapolate) > 1:
-            pressures = np.repeat(pressures, len(extrapolate), axis=1)
-        run = self._backend.simulate(
-            state, pressures, dt * fraction, extrapolate, load, self._tolerance, _LIMIT, linearise
-        )
-        if run.failed_iterations:
-            raise self._failure(run, dt, method)
-        return run
-
-    def _failure(self, run: Run, dt: float, method: str) -> ConvergenceError:
-        step = run.steps // len(_STAGES[method][1])
-        return ConvergenceError(
-            f"step {step} of {dt:g} s ({method}) did not converge in "
-            f"{run.failed_iterations} Newton iterations "
-            f"(last update {run.update:.3g} m): take a shorter step",
-            step=step, residual=run.update, iterations=run.failed_iterations, state=run.final,
-        )  # fmt: skip
 
     def _load(self, forces: ArrayLike | None) -> Array:
         if forces is None:
@@ -438,15 +394,3 @@ class Rod:
         require(wanted.ndim == 1 and bool((rows >= 0).all()), "outputs",
                 "indices into q that this rod's plane has", outputs)  # fmt: skip
         return wanted
-
-
-# Each method is a chain of backward Euler solves over fraction·dt from (q, v), after each of which
-# the state goes on to (q, v) + e ((q', v') − (q, v)). e = 2 is the implicit midpoint rule; γ = 1 −
-# 1/√2 with e = (1 − γ)/γ, then 1, is Alexander's two-stage SDIRK: second order and L-stable.
-_LIMIT = 30  # Newton iterations of a step
-_GAMMA = 1.0 - math.sqrt(0.5)
-_STAGES = {
-    "backward_euler": (1.0, np.array([1.0])),
-    "midpoint": (0.5, np.array([2.0])),
-    "sdirk2": (_GAMMA, np.array([(1.0 - _GAMMA) / _GAMMA, 1.0])),
-}

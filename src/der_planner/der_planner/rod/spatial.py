@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.rod import spatial_assembly_kernel, spatial_kernel, spatial_step_kernel
+from der_planner.rod.backend import Run, Solves, band_to_dense
 from der_planner.rod.mesh import Mesh
-from der_planner.rod.planar import Run, band_to_dense
 from der_planner.rod.spatial_linearisation import Stage, propagate, residual_derivatives
 from der_planner.rod.state import Array, Arrays, RodState
 
@@ -102,17 +104,9 @@ class SpatialBackend:
         return self.mass, self.damping, self.extend_rate(load), self.fixed
 
     def simulate(
-        self,
-        state: RodState,
-        pressures: Array,
-        h: float,
-        extrapolate: Array,
-        load: Array,
-        tolerance: float,
-        limit: int,
-        linearise: bool,
+        self, state: RodState, pressures: Array, solves: Solves, linearise: bool = False
     ) -> Run:
-        """Run the kernel `simulate`; load is (4N-1,)."""
+        """Run the kernel `simulate` under pressures (K, S, M)."""
         if linearise:
             raise ValueError(
                 "a rod in space keeps no linearisation of a motion: use linearise_step"
@@ -124,8 +118,8 @@ class SpatialBackend:
         rate[0] = self.extend_rate(state.v)
         base = self.reference(state)
         done, iterations, update, failed = spatial_step_kernel.simulate(
-            x, rate, pressures, h, extrapolate, tolerance, self.lever, limit, base,
-            self.work_space(), self._body(load), self.rod,
+            x, rate, pressures, solves.h, solves.extrapolate, solves.tolerance, self.lever,
+            solves.limit, base, self.work_space(), self._body(solves.load), self.rod,
         )  # fmt: skip
         q = x[:, self.offset :].copy()
         v = rate[:, self.offset :].copy()
@@ -134,14 +128,7 @@ class SpatialBackend:
         return Run(q, v, final, done, iterations, update, failed, None)
 
     def linearise(
-        self,
-        state: RodState,
-        u: Array,
-        h: float,
-        extrapolate: Array,
-        load: Array,
-        tolerance: float,
-        limit: int,
+        self, state: RodState, u: Array, solves: Solves
     ) -> tuple[Run, tuple[Array, Array] | None]:
         """Return the run and (A, B) of one step; no matrices if a stage failed."""
         count, inputs = len(self.free), len(u)
@@ -149,15 +136,13 @@ class SpatialBackend:
         dv = np.zeros_like(dq)
         dq[self.free_rows, np.arange(count)] = 1.0
         dv[self.free_rows, np.arange(count, 2 * count)] = 1.0
-        once = np.ones(1)
-        for e in extrapolate:
-            run = self.simulate(
-                state, u[None, None, :], h, once, load, tolerance, limit, linearise=False
-            )
+        once = replace(solves, extrapolate=np.ones(1))
+        for e in solves.extrapolate:
+            run = self.simulate(state, u[None, None, :], once)
             if run.failed_iterations:
                 return run, None
             x_n, x = self.extend(state.q), self.extend(run.final.q)
-            stage = Stage(x, x_n, 1.0 / h, u, *self.reference(state))
+            stage = Stage(x, x_n, 1.0 / solves.h, u, *self.reference(state))
             derivatives = residual_derivatives(stage, self.rod, self.work_space())
             dq, dv = propagate(
                 stage, derivatives, self.mass, self.damping, self.free_rows, e, (dq, dv)

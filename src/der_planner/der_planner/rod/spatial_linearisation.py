@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.rod import spatial_assembly_kernel, spatial_kernel
-from der_planner.rod.planar import band_to_dense
+from der_planner.rod.backend import band_to_dense
 from der_planner.rod.state import Array, Arrays
 
 
