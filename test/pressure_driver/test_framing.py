@@ -78,3 +78,4 @@ def test_an_endless_frame_is_dropped_and_the_next_one_is_read():
     splitter = FrameSplitter(longest=64)
     assert splitter.feed(b"\x01" * 10_000) == []
     assert [p for _, p in splitter.feed(b"\0" + seal(b"abc"))] == [b"abc"]
+    assert splitter.rejected == 1

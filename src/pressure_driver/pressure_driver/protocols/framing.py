@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pressure_driver.protocols.pieces import StreamCutter
+
 POLYNOMIAL = 0x1021
 INITIAL = 0xFFFF
 FULL_BLOCK = 254
@@ -76,47 +78,33 @@ class FrameSplitter:
     """
 
     def __init__(self, longest: int = 256) -> None:
-        self._longest = longest
-        self._buffer = bytearray()
-        self._position = 0
-        self._overlong = False
+        self._pieces = StreamCutter(b"\0", longest)
         self.rejected = 0
 
     def feed(self, data: bytes) -> list[tuple[int, bytes]]:
         """Return (place of the first byte, payload without CRC) of every sound frame."""
         frames: list[tuple[int, bytes]] = []
-        self._buffer += data
-        while (end := self._buffer.find(0)) >= 0:
-            coded = bytes(self._buffer[:end])
-            start = self._position
-            del self._buffer[: end + 1]
-            self._position += end + 1
-            payload = None if self._overlong else self._open(coded)
-            self._overlong = False
-            if payload is not None:
-                frames.append((start, payload))
-            elif coded:
+        for start, coded in self._pieces.feed(data):
+            if coded == b"":
+                continue
+            payload = None if coded is None else _open(coded)
+            if payload is None:
                 self.rejected += 1
-        if len(self._buffer) > self._longest:
-            self._position += len(self._buffer)
-            self._buffer.clear()
-            self._overlong = True
+            else:
+                frames.append((start, payload))
         return frames
-
-    def _open(self, coded: bytes) -> bytes | None:
-        if len(coded) > self._longest:
-            return None
-        data = unstuff(coded)
-        if data is None or len(data) < 3:
-            return None
-        payload, check = data[:-2], data[-2:]
-        return payload if crc16(payload).to_bytes(2, "little") == check else None
 
     def reset(self) -> None:
         """Forget a half-received frame."""
-        self._position += len(self._buffer)
-        self._buffer.clear()
-        self._overlong = False
+        self._pieces.reset()
+
+
+def _open(coded: bytes) -> bytes | None:
+    data = unstuff(coded)
+    if data is None or len(data) < 3:
+        return None
+    payload, check = data[:-2], data[-2:]
+    return payload if crc16(payload).to_bytes(2, "little") == check else None
 
 
 def seal(payload: bytes) -> bytes:

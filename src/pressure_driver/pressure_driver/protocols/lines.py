@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 
 from pressure_driver.protocols.base import Event, HostProtocol
+from pressure_driver.protocols.pieces import StreamCutter
 
 LONGEST_LINE = 512
 """[bytes] A longer line is garbage: its bytes are dropped up to the next line end."""
@@ -18,22 +19,14 @@ class LineSplitter:
     """
 
     def __init__(self) -> None:
-        self._buffer = bytearray()
-        self._position = 0
-        self._overlong = False
+        self._pieces = StreamCutter(b"\n", LONGEST_LINE)
         self.damaged = 0
 
     def feed(self, data: bytes) -> list[tuple[int, str]]:
         """Return the lines completed by ``data`` as (place of the first byte, text)."""
         lines: list[tuple[int, str]] = []
-        self._buffer += data
-        while (end := self._buffer.find(b"\n")) >= 0:
-            raw = bytes(self._buffer[:end])
-            start = self._position
-            del self._buffer[: end + 1]
-            self._position += end + 1
-            if self._overlong or len(raw) > LONGEST_LINE:
-                self._overlong = False
+        for start, raw in self._pieces.feed(data):
+            if raw is None:
                 self.damaged += 1
                 continue
             leading = len(raw) - len(raw.lstrip())
@@ -44,17 +37,11 @@ class LineSplitter:
                 self.damaged += 1
                 continue
             lines.append((start + leading, text.decode("ascii")))
-        if len(self._buffer) > LONGEST_LINE:
-            self._position += len(self._buffer)
-            self._buffer.clear()
-            self._overlong = True
         return lines
 
     def reset(self) -> None:
         """Forget a half-received line."""
-        self._position += len(self._buffer)
-        self._buffer.clear()
-        self._overlong = False
+        self._pieces.reset()
 
 
 class LineHost(HostProtocol):
