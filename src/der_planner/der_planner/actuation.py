@@ -4,12 +4,13 @@ A segment that was calibrated has chambers of unequal gain, grows stiffer with p
 creeps. Along a motion whose bend is known, all of that is a known pressure, so that the planners
 may stay with a linear rod driven by an *effective* pressure w and convert at the end:
 
-    w (1 + s |u|) = u (1 + a sgn u) − (F z + C q) / G
+    w_i (1 + s |u_i|) = u_i (1 + a sgn u_i) + Σ_j c_ij u_j − (F z + C q) / G
     θ_f dz = (1 − z sgn dθ) dθ          Dahl friction, −1 < z < 1
     q̇ = κ̇ − q / τ                       Maxwell creep
 
-with u the differential pressure [Pa], θ the bend angle, κ = θ / L. All memory starts at zero: a
-limb that has rested.
+with u the differential pressure [Pa], θ the bend angle, κ = θ / L, and c the coupling to the
+neighbours' pressures. All memory starts at zero: a limb that has rested. A cubic stiffness belongs
+to the models themselves, which take it from the limb.
 """
 
 from __future__ import annotations
@@ -21,6 +22,11 @@ from numpy.typing import ArrayLike, NDArray
 from der_planner.limb import Limb, Segment
 
 Array = NDArray[np.float64]
+
+_COUPLING_ROUNDS = 60
+"""At the most; each leaves the coupling's share of what was left, usually some per cent."""
+_SAME_PRESSURE = 1e-6
+"""[Pa] change below which the neighbours' pressures are known."""
 
 
 def differential_pressure(
@@ -41,20 +47,32 @@ def differential_pressure(
         ValueError: shapes do not fit, or the stiffening makes a pressure unreachable.
     """
     times, wanted, angles = _check(limb, time, effective, bend_angle)
-    result = np.empty_like(wanted)
-    for index, segment in enumerate(limb.segments):
-        load = wanted[:, index] + memory_pressure(segment, times, angles[:, index])
-        # w (1 + s|u|) = u (1 + a sgn u) − m  is linear in u on either side of zero.
-        side = np.sign(load)
-        slope = 1.0 + segment.gain_asymmetry * side
-        slope = slope - segment.pressure_stiffening * wanted[:, index] * side
-        if not np.all(slope > 0.1):
-            raise ValueError(
-                f"segment {index} is too stiff for an effective pressure of "
-                f"{np.abs(wanted[:, index]).max():.0f} Pa: check its pressure_stiffening"
-            )
-        result[:, index] = load / slope
+    held = wanted + memory_pressures(limb, times, angles)
+    coupling = coupling_matrix(limb)
+    result = np.zeros_like(wanted)
+    # The neighbours' pressures are known but for what their own neighbours change: a contraction.
+    for _ in range(_COUPLING_ROUNDS if coupling.any() else 1):
+        before = result.copy()
+        load = held - before @ coupling.T
+        for index, segment in enumerate(limb.segments):
+            result[:, index] = _own_pressure(segment, index, load[:, index], wanted[:, index])
+        if np.abs(result - before).max(initial=0.0) < _SAME_PRESSURE:
+            break
     return result
+
+
+def _own_pressure(segment: Segment, index: int, load: Array, wanted: Array) -> Array:
+    """Return u (K,) [Pa] of w (1 + s |u|) = u (1 + a sgn u) − load + w, linear on either side."""
+    side = np.sign(load)
+    slope = 1.0 + segment.gain_asymmetry * side
+    slope = slope - segment.pressure_stiffening * wanted * side
+    if not np.all(slope > 0.1):
+        raise ValueError(
+            f"segment {index} is too stiff for an effective pressure of "
+            f"{np.abs(wanted).max():.0f} Pa: check its pressure_stiffening"
+        )
+    pressure: Array = load / slope
+    return pressure
 
 
 def effective_pressure(
@@ -62,13 +80,45 @@ def effective_pressure(
 ) -> Array:
     """Return the (K, M) effective pressures [Pa] of measured ones; the inverse of the above."""
     times, measured, angles = _check(limb, time, differential, bend_angle)
-    result = np.empty_like(measured)
+    return without_memory(limb, measured, memory_pressures(limb, times, angles))[0]
+
+
+def without_memory(limb: Limb, differential: Array, memory: Array) -> tuple[Array, Array]:
+    """Return effective pressures w [Pa] and their slopes ∂w_i/∂u_i at a known memory pressure.
+
+    Args:
+        limb: calibrated limb.
+        differential: (..., M) pressures in the chambers [Pa].
+        memory: (..., M) what friction and creep take [Pa].
+    """
+    asymmetry = np.array([s.gain_asymmetry for s in limb.segments])
+    stiffening = np.array([s.pressure_stiffening for s in limb.segments])
+    side = np.sign(differential)
+    driven = differential * (1.0 + asymmetry * side) + differential @ coupling_matrix(limb).T
+    stiffer = 1.0 + stiffening * np.abs(differential)
+    effective = (driven - memory) / stiffer
+    return effective, (1.0 + asymmetry * side - stiffening * side * effective) / stiffer
+
+
+def coupling_matrix(limb: Limb) -> Array:
+    """Return c (M, M): moment on segment i by pressure j, over that of its own [-]."""
+    count = limb.segment_count
+    matrix = np.zeros((count, count))
     for index, segment in enumerate(limb.segments):
-        u = measured[:, index]
-        driven = u * (1.0 + segment.gain_asymmetry * np.sign(u))
-        driven = driven - memory_pressure(segment, times, angles[:, index])
-        result[:, index] = driven / (1.0 + segment.pressure_stiffening * np.abs(u))
-    return result
+        if index > 0:
+            matrix[index, index - 1] = segment.coupling_before
+        if index < count - 1:
+            matrix[index, index + 1] = segment.coupling_after
+    return matrix
+
+
+def memory_pressures(limb: Limb, time: Array, bend_angle: Array) -> Array:
+    """Return the (K, M) pressures that friction and creep take along bend histories (K, M) [Pa]."""
+    columns = [
+        memory_pressure(segment, time, bend_angle[:, index])
+        for index, segment in enumerate(limb.segments)
+    ]
+    return np.column_stack(columns)
 
 
 def memory_pressure(segment: Segment, time: Array, bend_angle: Array) -> Array:
@@ -115,15 +165,17 @@ def resting_bend(limb: Limb, time: ArrayLike, differential: ArrayLike) -> Array:
     times = np.ascontiguousarray(time, dtype=float)
     pressures = np.asarray(differential, dtype=float)
     bend = np.empty_like(pressures)
+    crossed = pressures @ coupling_matrix(limb).T
     for index, segment in enumerate(limb.segments):
         u = pressures[:, index]
         stiffer = 1.0 + segment.pressure_stiffening * np.abs(u)
-        driven = u * (1.0 + segment.gain_asymmetry * np.sign(u))
+        driven = u * (1.0 + segment.gain_asymmetry * np.sign(u)) + crossed[:, index]
         bend[:, index] = _follow(
             times,
             np.ascontiguousarray(driven),
             np.ascontiguousarray(stiffer),
             float(limb.static_gain[index]),
+            segment.cubic_stiffness / segment.bending_stiffness / segment.length**2,
             segment.rest_curvature * segment.length,
             segment.friction_moment / segment.moment_gain,
             max(segment.friction_curvature * segment.length, 1e-6),
@@ -139,19 +191,25 @@ def _follow(
     driven: Array,
     stiffer: Array,
     gain: float,
+    cubic: float,
     rest: float,
     friction: float,
     turn: float,
     creep: float,
     relaxation: float,
 ) -> Array:
-    """Solve θ (1 + s|u|)-stiff against friction and creep at each instant by Newton's method.
+    """Solve the bend against stiffness, friction and creep at each instant by Newton's method.
 
-    The residual rises with θ, bending away from the last angle stiffens it: one root, on the side
-    to which it points at the last angle.
+    With φ = θ − rest, φ + cubic φ³ = gain (driven − friction z − creep q) / stiffer. The residual
+    rises with θ, bending away from the last angle stiffens it: one root, on the side to which it
+    points at the last angle.
     """
     bend = np.empty(time.shape[0])
-    angle = rest + gain * driven[0] / stiffer[0]
+    linear = gain * driven[0] / stiffer[0]
+    angle = rest + linear
+    for _ in range(20):
+        bent = angle - rest
+        angle -= (bent + cubic * bent**3 - linear) / (1.0 + 3.0 * cubic * bent**2)
     bend[0] = angle
     z, q = 0.0, 0.0
     for k in range(1, time.shape[0]):
@@ -160,15 +218,18 @@ def _follow(
         share = (1.0 - keep) / rate
         last = angle
         scale = gain / stiffer[k]
-        error = last - rest - scale * (driven[k] - friction * z - creep * q * keep)
+        bent = last - rest
+        error = bent + cubic * bent**3 - scale * (driven[k] - friction * z - creep * q * keep)
         sign = -1.0 if error > 0.0 else 1.0
         for _ in range(30):
             change = angle - last
             fade = np.exp(-abs(change) / turn)
             moved = sign + (z - sign) * fade
             load = friction * moved + creep * (q * keep + change * share)
-            error = angle - rest - scale * (driven[k] - load)
-            slope = 1.0 + scale * (friction * (1.0 - z * sign) * fade / turn + creep * share)
+            bent = angle - rest
+            error = bent + cubic * bent**3 - scale * (driven[k] - load)
+            slope = 1.0 + 3.0 * cubic * bent**2
+            slope += scale * (friction * (1.0 - z * sign) * fade / turn + creep * share)
             step = error / slope
             angle -= step
             if (angle - last) * sign < 0.0:

@@ -47,8 +47,11 @@ class Segment:
         friction_curvature: change of curvature over which friction turns round [1/m].
         creep_stiffness: of a Maxwell element beside EI [N·m²].
         creep_time: relaxation time of it [s].
+        coupling_before, coupling_after: moment on this segment by the pressure in the segment
+            before and in the one after it, over that of its own pressure [-]: a tube that passes
+            through, a wall that is shared.
 
-    The last six are what `der_planner.actuation` turns into pressures; the rod and the PCC model
+    The last eight are what `der_planner.actuation` turns into pressures; the rod and the PCC model
     are driven by the effective pressure that remains. All zero: effective and differential are the
     same.
     """
@@ -69,6 +72,8 @@ class Segment:
     friction_curvature: float = 0.0
     creep_stiffness: float = 0.0
     creep_time: float = 0.0
+    coupling_before: float = 0.0
+    coupling_after: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -117,6 +122,7 @@ class Limb:
         pneumatics: of all chamber pairs.
         connector_length: straight passive piece between two segments [m]; 0 lets the rod's mesh
             choose one edge that belongs to neither segment.
+        base_length: straight passive piece between the clamp and the first segment [m].
         gravity: acceleration in `limb_base` [m/s²]; the limb lies on its plane by default.
         calibrated: what the numbers were identified on.
         provenance: free text by key: source, date, bag, residuals.
@@ -132,6 +138,7 @@ class Limb:
     calibrated: CalibratedRange = field(default_factory=CalibratedRange)
     provenance: Mapping[str, Any] = field(default_factory=dict)
     pcc_segments: tuple[Segment, ...] = ()
+    base_length: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.segments:
@@ -146,8 +153,10 @@ class Limb:
                 f"pcc_segments has {len(self.pcc_segments)} entries, segments {len(self.segments)}"
             )
         _check_numbers(self.pneumatics, "pneumatics", may_be_zero=_PNEUMATICS_MAY_BE_ZERO)
-        if not (math.isfinite(self.connector_length) and self.connector_length >= 0):
-            raise LimbError(f"connector_length must be 0 or more m, got {self.connector_length}")
+        for key in ("connector_length", "base_length"):
+            length = getattr(self, key)
+            if not (math.isfinite(length) and length >= 0):
+                raise LimbError(f"{key} must be 0 or more m, got {length}")
         if len(self.gravity) != 3 or not all(math.isfinite(value) for value in self.gravity):
             raise LimbError(f"gravity must be three finite numbers in m/s², got {self.gravity}")
 
@@ -160,7 +169,7 @@ class Limb:
     def length(self) -> float:
         """Length from the clamp to the tip at rest [m]."""
         connectors = (self.segment_count - 1) * self.connector_length
-        return sum(segment.length for segment in self.segments) + connectors
+        return self.base_length + sum(segment.length for segment in self.segments) + connectors
 
     @property
     def static_gain(self) -> NDArray[np.float64]:
@@ -220,6 +229,7 @@ class Limb:
             pcc_segments=_segments(content.get("pcc_segments") or [], "pcc_segments"),
             pneumatics=_from_mapping(Pneumatics, content.get("pneumatics"), "pneumatics"),
             connector_length=_number(content.get("connector_length", 0.0), "connector_length"),
+            base_length=_number(content.get("base_length", 0.0), "base_length"),
             gravity=_triple(content.get("gravity", (0.0, 0.0, 0.0))),
             calibrated=CalibratedRange(
                 **{key: tuple(float(v) for v in values) for key, values in calibrated.items()}
@@ -241,16 +251,23 @@ class Limb:
 
 _UNITS = """\
 # A limb: every number in SI units.
-# length, connector_length [m]; bending_stiffness EI, torsional_stiffness GJ [N m^2];
+# length, connector_length, base_length [m]; bending_stiffness EI, torsional_stiffness GJ [N m^2];
 # axial_stiffness EA [N]; mass_per_length [kg/m]; damping [1/s]; moment_gain [N m/Pa];
 # rest_curvature [1/m]; cubic_stiffness [N m^4]; material_damping [s]; pressure_limit [Pa];
 # gain_asymmetry [-]; pressure_stiffening [1/Pa]; friction_moment [N m]; friction_curvature [1/m];
-# creep_stiffness [N m^2]; creep_time [s];
+# creep_stiffness [N m^2]; creep_time [s]; coupling_before, coupling_after [-];
 # slew_limit, fill_rate [Pa/s]; time_constant, vent_time_constant, delay [s];
 # minimum_supply [Pa, absolute];
 # gravity [m/s^2]; calibrated.differential_pressure [Pa]; calibrated.bend_angle [rad].
 """
-_SIGNED = {"rest_curvature", "cubic_stiffness", "gain_asymmetry", "pressure_stiffening"}
+_SIGNED = {
+    "rest_curvature",
+    "cubic_stiffness",
+    "gain_asymmetry",
+    "pressure_stiffening",
+    "coupling_before",
+    "coupling_after",
+}
 _MAY_BE_ZERO = {
     "damping",
     "material_damping",
@@ -269,8 +286,11 @@ def _check_memory(segment: Segment, where: str) -> None:
     ):
         if getattr(segment, strength) > 0 and getattr(segment, scale) == 0:
             raise LimbError(f"{where}.{scale} must be positive where {strength} is")
-    if not abs(segment.gain_asymmetry) < 1:
-        raise LimbError(f"{where}.gain_asymmetry must be within ±1, got {segment.gain_asymmetry}")
+    for name, limit in (("gain_asymmetry", 1.0), ("coupling_before", 0.5), ("coupling_after", 0.5)):
+        if not abs(getattr(segment, name)) < limit:
+            raise LimbError(
+                f"{where}.{name} must be within ±{limit:g}, got {getattr(segment, name)}"
+            )
 
 
 def _segments(content: object, key: str) -> tuple[Segment, ...]:

@@ -21,6 +21,8 @@ def rubbing(**changes: float) -> Limb:
             creep_stiffness=500 * s.moment_gain * s.length,
             creep_time=8.0,
             rest_curvature=0.2,
+            coupling_before=0.04,
+            coupling_after=-0.03,
             **changes,
         )
         for s in limb.segments
@@ -71,11 +73,33 @@ def test_creep_relaxes_exponentially():
 
 
 def test_resting_bend_is_where_moment_and_effective_pressure_agree():
+    cubic = 0.3
     limb = rubbing()
+    stiffer = [
+        replace(s, cubic_stiffness=cubic * s.bending_stiffness * s.length**2) for s in limb.segments
+    ]
+    limb = replace(limb, segments=tuple(stiffer))
     bend = actuation.resting_bend(limb, TIME, WANTED)
     effective = actuation.effective_pressure(limb, TIME, WANTED, bend)
-    rest = np.array([s.rest_curvature * s.length for s in limb.segments])
-    np.testing.assert_allclose(bend[1:], (rest + limb.static_gain * effective)[1:], atol=1e-9)
+    bent = bend - np.array([s.rest_curvature * s.length for s in limb.segments])
+    held = bent + cubic * bent**3
+    np.testing.assert_allclose(held[1:], (limb.static_gain * effective)[1:], atol=1e-9)
+
+
+def test_coupling_adds_the_share_of_the_neighbours_pressure():
+    limb = Limb.default()
+    first, second = limb.segments
+    coupled = replace(
+        limb,
+        segments=(replace(first, coupling_after=0.04), replace(second, coupling_before=-0.02)),
+    )
+    felt = actuation.effective_pressure(coupled, TIME, WANTED, BEND)
+    expected = WANTED + WANTED[:, ::-1] * [0.04, -0.02]
+    np.testing.assert_allclose(felt, expected, rtol=1e-12)
+    alone = replace(limb, segments=(replace(first, coupling_before=0.04), second))
+    np.testing.assert_array_equal(actuation.effective_pressure(alone, TIME, WANTED, BEND), WANTED)
+    with pytest.raises(LimbError, match="coupling_after"):
+        replace(limb, segments=(replace(first, coupling_after=0.6), second))
 
 
 def test_lead_undoes_a_first_order_lag():

@@ -25,6 +25,7 @@ def plain(seed: int = 0, **changes: float):
             friction_moment=0.0,
             creep_stiffness=(0.0, 0.0, 0.0),
             wander=0.0,
+            coupling=0.0,
             **changes,
         )
         for segment in hardware.segments

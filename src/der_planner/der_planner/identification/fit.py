@@ -18,6 +18,7 @@ from der_planner.identification.parameters import (
     GROUPS,
     TERMS,
     column,
+    exists,
     put,
     start_values,
     to_limb,
@@ -78,7 +79,7 @@ def fit(
     air = _try_air(prepared, warnings)
     lengths = fit_geometry(limb, prepared.log) if geometry else None
     if lengths is not None:
-        limb = with_geometry(limb, lengths.lengths, lengths.connector)
+        limb = with_geometry(limb, lengths.lengths, lengths.connector, lengths.base)
     offset = np.zeros(limb.segment_count) if air is None else air.offset
     problem = _Problem(limb, prepared, offset, groups, nodes)
     values, jacobian = problem.solve()
@@ -131,14 +132,13 @@ class _Problem:
             (segment, index)
             for segment in range(limb.segment_count)
             for index, term in enumerate(TERMS)
-            if (term.group == "linear" or term.group in groups) and not (term.shared and segment)
+            if (term.group == "linear" or term.group in groups)
+            and exists(segment, index, limb.segment_count)
         ]
         self._scale = np.array([TERMS[index].scale for _, index in self._wanted])
         self._spread = np.array([TERMS[index].spread for _, index in self._wanted])
         self._known = np.isfinite(self._spread)
-        self._prediction = RodPrediction(
-            limb, prepared.log.time, prepared.pressure - offset, prepared.bend, nodes
-        )
+        self._prediction = RodPrediction(limb, prepared.log.time, prepared.pressure - offset, nodes)
         self._start = self._start_values(limb, prepared, offset)
         self._weight = 1.0 / (ANGLE_ERROR * np.sqrt(CORRELATION))
         self._cache: tuple[bytes, Array, Array] | None = None
@@ -240,12 +240,13 @@ class _Problem:
         return np.asarray(start / self._scale)
 
 
-def correlation_length(remaining: Array, longest: int = 200) -> float:
+def correlation_length(remaining: Array) -> float:
     """Return over how many rows the errors (K, M) of a prediction stay alike, 1 or more.
 
-    One plus twice the sum of the autocorrelation up to its first zero, the larger of the columns.
+    One plus twice the sum of the autocorrelation up to its first zero, at most a third of the log;
+    the larger of the columns.
     """
-    lengths = [1.0]
+    lengths, longest = [1.0], len(remaining) // 3
     for error in remaining.T:
         known = error[np.isfinite(error)]
         known = known - known.mean()

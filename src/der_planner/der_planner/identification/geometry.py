@@ -1,4 +1,4 @@
-"""Lengths of segments and connector from tips and bend angles: where the tags sit on the rod."""
+"""Lengths of segments and stiff pieces from tips and bend angles: where the tags sit on the rod."""
 
 from __future__ import annotations
 
@@ -16,20 +16,22 @@ from der_planner.rod import Rod
 
 Array = NDArray[np.float64]
 
-LENGTH_PRIOR = 0.02
-"""Relative standard deviation of a length measured with a ruler."""
+LENGTH_PRIOR = 0.05
+"""Relative standard deviation of how much of a segment bends: its fittings do not."""
 CONNECTOR_RANGE = (1e-3, 3e-2)
 """Of the connector [m]: the rod needs an edge there."""
-CONNECTOR_PRIOR = 0.01
-"""Standard deviation of what is known of the connector before [m]."""
+BASE_RANGE = (0.0, 3e-2)
+"""Of the stiff piece at the clamp [m]."""
+STIFF_PRIOR = 0.01
+"""Standard deviation of what is known of connector and base before [m]."""
 TIP_ERROR = 1e-3
 """Error of an evenly bent limb at single instants [m]: a real one does not bend quite evenly."""
 CORRELATION = 20.0
 """Rows over which that error stays the same (1 s)."""
 NODES = 21
 """Of the rod whose chain of edges is fitted, as the planners use it. A polyline bends at its inner
-nodes alone and leaves a straight half edge at both ends of a segment; the fitted connector makes up
-for that."""
+nodes alone and leaves a straight half edge at both ends of a segment; the fitted stiff pieces make
+up for that."""
 
 
 @dataclass(frozen=True)
@@ -39,13 +41,16 @@ class GeometryFit:
     Attributes:
         lengths: (M,) [m].
         connector: between two segments [m]; the prior's for one segment.
-        uncertainty: (M + 1,) standard deviations of lengths and connector [m].
+        base: between clamp and first segment [m].
+        uncertainty: (M + 2,) standard deviations of lengths, base and connector [m]; without the
+            connector for one segment.
         residual_before, residual: root mean square distance of the tips from those of an evenly
             bent rod with the prior's and with the fitted lengths [m].
     """
 
     lengths: Array
     connector: float
+    base: float
     uncertainty: Array
     residual_before: float
     residual: float
@@ -62,22 +67,21 @@ def fit_geometry(limb: Limb, log: CalibrationLog, nodes: int = NODES) -> Geometr
     known = limb.connector_length or 4e-3
     connector = min(max(known, 1.1 * CONNECTOR_RANGE[0]), 0.9 * CONNECTOR_RANGE[1])
     several = limb.segment_count > 1
-    spread = np.append(LENGTH_PRIOR * prior, CONNECTOR_PRIOR)
-    start = np.append(prior, connector)
-    low, high = (
-        np.append(0.8 * prior, CONNECTOR_RANGE[0]),
-        np.append(1.2 * prior, CONNECTOR_RANGE[1]),
-    )
+    base = min(max(limb.base_length, 1e-3), 0.9 * BASE_RANGE[1])
+    spread = np.concatenate([LENGTH_PRIOR * prior, [STIFF_PRIOR, STIFF_PRIOR]])
+    start = np.concatenate([prior, [base, connector]])
+    low = np.concatenate([0.8 * prior, [BASE_RANGE[0], CONNECTOR_RANGE[0]]])
+    high = np.concatenate([1.2 * prior, [BASE_RANGE[1], CONNECTOR_RANGE[1]]])
     weight = math.sqrt(every / CORRELATION) / TIP_ERROR
-    free = len(start) if several else len(prior)
+    count = len(prior)
+    free = count + 2 if several else count + 1
 
     def difference(candidate: Limb) -> Array:
         rod = Rod.from_limb(candidate, nodes)
-        chain = PolylineKinematics(rod.rest_lengths, list(rod.segments))
-        return np.asarray(chain.tip(angles) - tip)
+        return np.asarray(PolylineKinematics.of_rod(rod).tip(angles) - tip)
 
     def candidate(x: Array) -> Limb:
-        return with_geometry(limb, x[: len(prior)], float(x[-1]) if several else None)
+        return with_geometry(limb, x[:count], float(x[-1]) if several else None, float(x[count]))
 
     def residual(x: Array) -> Array:
         data = weight * difference(candidate(x)).ravel()
@@ -92,20 +96,24 @@ def fit_geometry(limb: Limb, log: CalibrationLog, nodes: int = NODES) -> Geometr
     return GeometryFit(
         lengths=np.array([segment.length for segment in found.segments]),
         connector=found.connector_length,
+        base=found.base_length,
         uncertainty=np.sqrt(np.diag(covariance)),
         residual_before=_distance(difference(limb)),
         residual=_distance(difference(found)),
     )
 
 
-def with_geometry(limb: Limb, lengths: Array, connector: float | None) -> Limb:
-    """Return the limb with these lengths (M,) and connector [m]; None keeps the old."""
+def with_geometry(
+    limb: Limb, lengths: Array, connector: float | None = None, base: float | None = None
+) -> Limb:
+    """Return the limb with these lengths (M,), connector and base [m]; None keeps the old."""
     segments = tuple(
         replace(segment, length=float(length))
         for segment, length in zip(limb.segments, lengths, strict=True)
     )
     kept = limb.connector_length if connector is None else connector
-    return replace(limb, segments=segments, connector_length=kept)
+    start = limb.base_length if base is None else base
+    return replace(limb, segments=segments, connector_length=kept, base_length=start)
 
 
 def _distance(difference: Array) -> float:

@@ -44,6 +44,9 @@ TERMS = (
     Term("rest_angle", "rad", 0.02, -0.6, 0.6, math.inf, "linear"),
     Term("gain_asymmetry", "-", 0.03, -0.4, 0.4, 0.1, "asymmetry"),
     Term("pressure_stiffening", "1/Pa", 3e-6, -2e-5, 3e-5, 1e-5, "stiffening"),
+    Term("cubic", "1/rad²", 0.05, -0.2, 0.5, 0.05, "cubic"),
+    Term("coupling_before", "-", 0.03, -0.4, 0.4, 0.05, "coupling"),
+    Term("coupling_after", "-", 0.03, -0.4, 0.4, 0.05, "coupling"),
     Term("friction_pressure", "Pa", 300.0, 0.0, 4000.0, 800.0, "friction"),
     Term("friction_angle", "rad", 0.1, 0.02, 0.8, 0.1, "friction"),
     Term("creep_pressure", "Pa/rad", 500.0, 0.0, 5000.0, 1000.0, "creep"),
@@ -52,11 +55,11 @@ TERMS = (
     Term("log_stiffness", "-", 0.2, -1.2, 1.2, 0.3, "dynamics", step=0.02),
     Term("log_damping", "-", 0.5, -3.0, 3.0, 0.5, "dynamics", shared=True, step=0.1),
 )
-"""Unknowns of each segment. The last two are relative to the prior's, as natural logarithms. "
-"Damping
-by the air and the plate is one number for the limb: it cannot be told apart by segments."""
+"""Unknowns of each segment. The last two are relative to the prior's, as natural logarithms.
+Damping by the air and the plate is one number for the limb: it cannot be told apart by segments.
+"""
 
-GROUPS = ("asymmetry", "stiffening", "friction", "creep", "dynamics")
+GROUPS = ("asymmetry", "stiffening", "cubic", "coupling", "friction", "creep", "dynamics")
 """Model terms that may be left out, in the order in which they are explained."""
 _INDEX = {term.name: index for index, term in enumerate(TERMS)}
 
@@ -72,6 +75,9 @@ def start_values(limb: Limb) -> Array:
                 segment.rest_curvature * segment.length,
                 segment.gain_asymmetry,
                 segment.pressure_stiffening,
+                segment.cubic_stiffness / (segment.bending_stiffness * segment.length**2),
+                segment.coupling_before,
+                segment.coupling_after,
                 segment.friction_moment / gain or 200.0,
                 segment.friction_curvature * segment.length or 0.1,
                 segment.creep_stiffness / (gain * segment.length) or 400.0,
@@ -109,12 +115,21 @@ def _segment(prior: Segment, value: dict[str, float]) -> Segment:
         rest_curvature=float(value["rest_angle"] / prior.length),
         gain_asymmetry=float(value["gain_asymmetry"]),
         pressure_stiffening=float(value["pressure_stiffening"]),
-        cubic_stiffness=0.0,
+        cubic_stiffness=float(value["cubic"] * stiffness * prior.length**2),
+        coupling_before=float(value["coupling_before"]),
+        coupling_after=float(value["coupling_after"]),
         friction_moment=float(friction),
         friction_curvature=float(value["friction_angle"] / prior.length) if friction else 0.0,
         creep_stiffness=float(creep * prior.length),
         creep_time=float(value["creep_time"]) if creep else 0.0,
     )
+
+
+def exists(segment: int, term: int, segment_count: int) -> bool:
+    """Return whether a segment has a term: the neighbour that it asks for, a shared one once."""
+    if TERMS[term].shared or TERMS[term].name == "coupling_before":
+        return (segment == 0) if TERMS[term].shared else segment > 0
+    return TERMS[term].name != "coupling_after" or segment < segment_count - 1
 
 
 def column(name: str) -> int:
@@ -128,6 +143,9 @@ def without(values: Array, groups: frozenset[str]) -> Array:
     for name, group in (
         ("gain_asymmetry", "asymmetry"),
         ("pressure_stiffening", "stiffening"),
+        ("cubic", "cubic"),
+        ("coupling_before", "coupling"),
+        ("coupling_after", "coupling"),
         ("friction_pressure", "friction"),
         ("creep_pressure", "creep"),
         ("log_stiffness", "dynamics"),

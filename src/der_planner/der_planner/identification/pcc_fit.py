@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from der_planner.actuation import effective_pressure
+from der_planner.actuation import effective_pressure, resting_bend
 from der_planner.identification.prepare import Prepared
 from der_planner.limb import Limb, Segment
 from der_planner.pcc import Pcc
@@ -39,8 +39,9 @@ def fit_pcc(limb: Limb, prepared: Prepared, offset: Array) -> tuple[tuple[Segmen
     Returns:
         The segments for the PCC model, and its root mean square errors (M,) [rad].
     """
-    time, bend = prepared.log.time, prepared.bend
-    effective = effective_pressure(limb, time, prepared.pressure - offset, bend)
+    time = prepared.log.time
+    pressure = prepared.pressure - offset
+    effective = effective_pressure(limb, time, pressure, resting_bend(limb, time, pressure))
     middle = 0.5 * (effective[1:] + effective[:-1])
     held = np.repeat(middle[:, None, :], STEPS, axis=1)
     period = float(time[1] - time[0])
@@ -80,7 +81,7 @@ def fit_pcc(limb: Limb, prepared: Prepared, offset: Array) -> tuple[tuple[Segmen
 def segments_of(limb: Limb, x: Array) -> tuple[Segment, ...]:
     """Return the segments with stiffness × e^x, material damping and damping × e^x put in place.
 
-    Gain, friction and creep scale with the stiffness: the statics stay as they are.
+    Cubic term, gain, friction and creep scale with the stiffness: the statics stay as they are.
     """
     count = limb.segment_count
     result = []
@@ -90,6 +91,7 @@ def segments_of(limb: Limb, x: Array) -> tuple[Segment, ...]:
             replace(
                 segment,
                 bending_stiffness=segment.bending_stiffness * factor,
+                cubic_stiffness=segment.cubic_stiffness * factor,
                 moment_gain=segment.moment_gain * factor,
                 friction_moment=segment.friction_moment * factor,
                 creep_stiffness=segment.creep_stiffness * factor,

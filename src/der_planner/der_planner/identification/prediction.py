@@ -1,11 +1,16 @@
-"""The rod's bend angles along a log, and their exact derivatives by every unknown."""
+"""The rod's bend angles along the pressures of a log, and their derivatives by every unknown.
+
+Friction and creep see the slow part of the predicted bend, never the measured one: what is left of
+a measured angle would come back through them and take the blame off them. So a fit minimises just
+the error with which the limb is predicted afterwards.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.actuation import dahl, effective_pressure, maxwell
+from der_planner.actuation import effective_pressure, resting_bend
 from der_planner.identification.parameters import TERMS, column, put, to_limb
 from der_planner.limb import Limb
 from der_planner.rod import Rod, Trajectory
@@ -16,24 +21,23 @@ NODES = 13
 """Of the rod in a fit: its statics do not depend on it, its first two frequencies by 2 %."""
 SUBSTEPS = 1
 """Integrator steps of 50 ms: see the convergence on the page of the identification."""
+_NUDGE = 1e-3
+"""Of an unknown in its scale, for the slope of the effective pressure."""
 
 
 class RodPrediction:
-    """Predicts bend angles along measured pressures, with friction and creep along measured bends.
+    """Predicts bend angles open loop along measured pressures.
 
     Args:
         prior: geometry, masses and everything that is not an unknown.
         time: (K,) regular [s].
         pressure: (K, M) measured differential pressures [Pa], without gaps.
-        bend_angle: (K, M) smoothed measured bend angles [rad], without gaps: what the memory saw.
         nodes: of the rod.
     """
 
-    def __init__(
-        self, prior: Limb, time: Array, pressure: Array, bend_angle: Array, nodes: int = NODES
-    ) -> None:
+    def __init__(self, prior: Limb, time: Array, pressure: Array, nodes: int = NODES) -> None:
         self._prior, self._time, self._nodes = prior, time, nodes
-        self._pressure, self._bend = pressure, bend_angle
+        self._pressure = pressure
         self._period = float(time[1] - time[0])
 
     def angles(self, values: Array) -> Array:
@@ -54,31 +58,37 @@ class RodPrediction:
             values: (M, T) unknowns.
             wanted: (segment, term) of each of the P unknowns.
 
-        What enters through the effective pressure goes through the rod's exact tangent; stiffness
-        and damping, which change the rod itself, are differences of two simulations.
+        What acts as a pressure goes through the rod's exact tangent; stiffness and damping, which
+        change the rod itself, are differences of two simulations.
         """
         rod, trajectory = self._simulate(to_limb(self._prior, values), linearise=True)
         angles = bend_of(rod, trajectory.q)
-        start = _start_derivatives(rod, self.effective(values)[0])
+        effective = self.effective(values)
+        start = _start_derivatives(rod, effective[0])
         result = np.empty((*angles.shape, len(wanted)))
         for place, (segment, term) in enumerate(wanted):
             if TERMS[term].group == "dynamics":
                 result[:, :, place] = self._difference(values, segment, term, angles)
                 continue
-            change = np.zeros_like(angles)
-            change[:, segment] = self._pressure_derivative(values, segment, term)
-            shift = start[:, segment] * change[0, segment]
+            change = self._pressure_change(values, segment, term)
+            change[:, segment] += self._moment_change(
+                values[segment], term, effective[:, segment], angles[:, segment]
+            )
+            shift = start @ change[0]
             result[:, :, place] = _bend_tangent(rod, trajectory, _mid(change), shift)
         return angles, result
 
     def effective(self, values: Array) -> Array:
         """Return the effective pressures (K, M) [Pa] of the unknowns (M, T)."""
-        limb = to_limb(self._prior, values)
-        return effective_pressure(limb, self._time, self._pressure, self._bend)
+        return self._effective(to_limb(self._prior, values))
+
+    def _effective(self, limb: Limb) -> Array:
+        bend = resting_bend(limb, self._time, self._pressure)
+        return effective_pressure(limb, self._time, self._pressure, bend)
 
     def _simulate(self, limb: Limb, linearise: bool = False) -> tuple[Rod, Trajectory]:
         rod = Rod.from_limb(limb, self._nodes)
-        effective = effective_pressure(limb, self._time, self._pressure, self._bend)
+        effective = self._effective(limb)
         trajectory = rod.simulate(
             rod.equilibrium(effective[0]),
             _mid(effective),
@@ -96,34 +106,35 @@ class RodPrediction:
         changed: Array = (self.angles(moved) - angles) / step
         return changed
 
-    def _pressure_derivative(self, values: Array, segment: int, term: int) -> Array:
-        """Return ∂(equivalent effective pressure)/∂unknown (K,) of one segment."""
-        name, row = TERMS[term].name, values[segment]
-        u = self._pressure[:, segment]
-        bend = self._bend[:, segment]
-        stiffer = 1.0 + row[column("pressure_stiffening")] * np.abs(u)
-        if name in ("gain", "rest_angle"):
-            # A rest angle is a constant moment; a larger gain scales the moment.
-            effective = self.effective(values)[:, segment]
-            numerator = effective if name == "gain" else np.ones_like(u)
-            return np.asarray(numerator / row[column("gain")])
-        if name == "gain_asymmetry":
-            return np.asarray(np.abs(u) / stiffer)
-        if name == "pressure_stiffening":
-            return np.asarray(-self.effective(values)[:, segment] * np.abs(u) / stiffer)
-        if name == "friction_pressure":
-            return np.asarray(-dahl(bend, row[column("friction_angle")]) / stiffer)
-        if name == "creep_pressure":
-            return np.asarray(-maxwell(self._time, bend, row[column("creep_time")]) / stiffer)
-        step = 0.01 * row[term]
-        if name == "friction_angle":
-            change = dahl(bend, row[term] + step) - dahl(bend, row[term] - step)
-            strength = row[column("friction_pressure")]
-        else:
-            change = maxwell(self._time, bend, row[term] + step)
-            change = change - maxwell(self._time, bend, row[term] - step)
-            strength = row[column("creep_pressure")]
-        return np.asarray(-strength * change / (2.0 * step) / stiffer)
+    def _pressure_change(self, values: Array, segment: int, term: int) -> Array:
+        """Return ∂(effective pressures)/∂unknown (K, M), by a difference of the closed form."""
+        value, kind = float(values[segment, term]), TERMS[term]
+        nudge = _NUDGE * kind.scale
+        ends = (max(value - nudge, kind.low), min(value + nudge, kind.high))
+        pressures = []
+        for end in ends:
+            moved = values.copy()
+            put(moved, segment, term, end)
+            pressures.append(self.effective(moved))
+        slope: Array = (pressures[1] - pressures[0]) / (ends[1] - ends[0])
+        return slope
+
+    @staticmethod
+    def _moment_change(row: Array, term: int, effective: Array, angle: Array) -> Array:
+        """Return, as a pressure (K,), what an unknown does to the moments of the rod itself.
+
+        A larger gain scales the moment, a rest angle shifts the elastic one, a cubic term adds to
+        it: EI/L (φ + c φ³) with φ = θ − rest.
+        """
+        name, gain = TERMS[term].name, row[column("gain")]
+        bent = angle - row[column("rest_angle")]
+        if name == "gain":
+            return np.asarray(effective / gain)
+        if name == "rest_angle":
+            return np.asarray((1.0 + 3.0 * row[column("cubic")] * bent**2) / gain)
+        if name == "cubic":
+            return np.asarray(-(bent**3) / gain)
+        return np.zeros_like(effective)
 
 
 def bend_of(rod: Rod, q: Array) -> Array:

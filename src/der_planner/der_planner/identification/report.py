@@ -136,10 +136,10 @@ class FitReport:
             for length, deviation in zip(geometry.lengths, geometry.uncertainty, strict=False)
         )
         return [
-            f"lengths: {lengths} mm, connector {1e3 * geometry.connector:.1f} mm; tips within "
+            f"lengths: {lengths} mm, connector {1e3 * geometry.connector:.1f} mm, stiff base "
+            f"{1e3 * geometry.base:.1f} mm; tips within "
             f"{1e3 * geometry.residual:.2f} mm of an evenly bent rod at the measured angles "
-            f"(with the "
-            f"prior's lengths {1e3 * geometry.residual_before:.2f} mm)"
+            f"(with the prior's lengths {1e3 * geometry.residual_before:.2f} mm)"
         ]
 
 
@@ -149,6 +149,7 @@ def _readable(item: Unknown) -> tuple[float, float, str]:
         "rad/Pa": (math.degrees(1.0) * 100.0, "deg/hPa"),
         "rad": (math.degrees(1.0), "deg"),
         "1/Pa": (1e6, "% per 10 kPa"),
+        "1/rad²": (100.0 * math.radians(45.0) ** 2, "% at 45 deg"),
         "Pa": (0.01, "hPa"),
         "Pa/rad": (0.01 * math.radians(45.0), "hPa at 45 deg"),
     }.get(item.unit, (1.0, item.unit))

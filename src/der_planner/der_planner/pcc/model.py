@@ -44,6 +44,7 @@ class Pcc:
         self.limb = limb
         self.segment_count = limb.segment_count
         self.lengths = np.array([s.length for s in segments])
+        self.base = float(limb.base_length)
         self.connector = float(limb.connector_length)
         self.masses = np.array([s.mass_per_length * s.length for s in segments])
         self.damping = np.array([s.damping for s in segments])
@@ -88,14 +89,14 @@ class Pcc:
         steps = headings * self.lengths * _arc(angles)
         between = np.exp(1j * turned) * self.connector
         between[..., -1] = 0.0
-        ends = np.cumsum(steps, axis=-1) + np.cumsum(between, axis=-1) - between
+        ends = self.base + np.cumsum(steps, axis=-1) + np.cumsum(between, axis=-1) - between
         return ends[..., -1], ends, headings
 
     def curve(self, bend_angles: ArrayLike, points_per_segment: int = 12) -> Vector:
         """Return points (P, 2) [m] of the centreline from clamp to tip for one configuration."""
         q = self._check("bend_angles", bend_angles)
-        position, heading = 0j, 1 + 0j
-        points = [position]
+        position, heading = complex(self.base), 1 + 0j
+        points = [0j, position] if self.base else [0j]
         for j, angle in enumerate(q):
             if j:
                 position += heading * self.connector

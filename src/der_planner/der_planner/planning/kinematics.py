@@ -5,6 +5,7 @@ Both answer the same four questions, so that every planner can be given either.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from der_planner.limb import Limb
 from der_planner.pcc import Pcc
+from der_planner.rod import Rod
 
 Vector = NDArray[np.float64]
 
@@ -40,15 +42,24 @@ class PolylineKinematics:
     Args:
         rest_lengths: (N-1,) edges [m].
         segments: (first node, node count) of each segment.
+        base: x of the first node [m], behind which the limb is straight and stiff.
     """
 
-    def __init__(self, rest_lengths: ArrayLike, segments: list[tuple[int, int]]) -> None:
+    def __init__(
+        self, rest_lengths: ArrayLike, segments: Sequence[tuple[int, int]], base: float = 0.0
+    ) -> None:
+        self.base = base
         self.rest_lengths = np.asarray(rest_lengths, dtype=float)
         self.segment_count = len(segments)
         edges = np.arange(len(self.rest_lengths))[:, None]
         first = np.array([first for first, _ in segments])
         turns = np.array([count - 2 for _, count in segments])
         self.turning = np.clip((edges - first) / turns, 0.0, 1.0)
+
+    @classmethod
+    def of_rod(cls, rod: Rod) -> PolylineKinematics:
+        """Return the kinematics of a rod's own edges."""
+        return cls(rod.rest_lengths, rod.segments, rod.mesh.base)
 
     def _edges(self, bend_angles: ArrayLike) -> NDArray[np.complex128]:
         heading = np.asarray(bend_angles, dtype=float) @ self.turning.T
@@ -57,7 +68,7 @@ class PolylineKinematics:
 
     def tip(self, bend_angles: ArrayLike) -> Vector:
         """Return the tip (..., 2) [m] for bend angles (..., M) [rad]."""
-        end = self._edges(bend_angles).sum(axis=-1)
+        end = self.base + self._edges(bend_angles).sum(axis=-1)
         return np.stack([end.real, end.imag], axis=-1)
 
     def tip_jacobians(self, bend_angles: ArrayLike) -> Vector:
@@ -66,13 +77,19 @@ class PolylineKinematics:
         return np.stack([columns.real, columns.imag], axis=-2)
 
     def curve(self, bend_angles: ArrayLike) -> Vector:
-        """Return the nodes (N, 2) [m] of one configuration (M,) [rad]."""
-        nodes = np.concatenate([[0], np.cumsum(self._edges(bend_angles))])
-        return np.column_stack([nodes.real, nodes.imag])
+        """Return the clamp and the nodes (P, 2) [m] of one configuration (M,) [rad]."""
+        nodes = self.nodes(bend_angles)
+        return np.concatenate([np.zeros((1, 2)), nodes]) if self.base else nodes
 
     def nodes(self, bend_angles: ArrayLike) -> Vector:
         """Return the nodes (..., N, 2) [m] for bend angles (..., M) [rad]."""
-        return _points(self._edges(bend_angles))
+        return self._placed(self._edges(bend_angles))
+
+    def _placed(self, edges: NDArray[np.complex128]) -> Vector:
+        """Return the nodes (..., N, 2) [m] of edges (..., N-1) from the base on."""
+        nodes = _points(edges)
+        nodes[..., 0] += self.base
+        return nodes
 
     def edge_normals(self, bend_angles: ArrayLike) -> Vector:
         """Return the left normals of the edges (..., N-1, 2), unit vectors."""
@@ -95,7 +112,7 @@ class PolylineKinematics:
         spin = np.asarray(rates) @ self.turning.T
         twirl = np.asarray(accelerations) @ self.turning.T
         return (
-            _points(edges),
+            self._placed(edges),
             _points(1j * spin * edges),
             _points((1j * twirl - spin**2) * edges),
         )

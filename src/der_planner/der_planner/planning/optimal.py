@@ -85,14 +85,9 @@ class Actuation:
         self._remembered = int(np.ceil((self.air.delay + 25 * slowest) / CONTROL_PERIOD))
         middle = (np.arange(count * substeps, dtype=np.float64) + 0.5) * (CONTROL_PERIOD / substeps)
         bend = sample_spline(spline, middle)[0]
-        self._memory = np.column_stack(
-            [
-                actuation.memory_pressure(segment, middle, bend[:, j])
-                for j, segment in enumerate(limb.segments)
-            ]
-        ).reshape(count, substeps, -1)
-        self._asymmetry = np.array([s.gain_asymmetry for s in limb.segments])
-        self._stiffening = np.array([s.pressure_stiffening for s in limb.segments])
+        memory = actuation.memory_pressures(limb, middle, bend)
+        self._memory = memory.reshape(count, substeps, -1)
+        self._limb = limb
 
     def effective(self, command: Vector, first: int) -> tuple[Vector, Vector]:
         """Return effective pressures (W, S, M) [Pa] from setpoint ``first`` on, and dw/dp (W, M).
@@ -107,10 +102,7 @@ class Actuation:
             self.air, command[begin:], CONTROL_PERIOD, self.substeps, before
         )[first - begin :]
         memory = self._memory[first : len(command)]
-        side = np.sign(chambers)
-        stiffer = 1 + self._stiffening * np.abs(chambers)
-        effective = (chambers * (1 + self._asymmetry * side) - memory) / stiffer
-        slope = (1 + self._asymmetry * side - self._stiffening * side * effective) / stiffer
+        effective, slope = actuation.without_memory(self._limb, chambers, memory)
         return effective, slope.mean(axis=1)
 
     def pulse(self, inputs: int) -> Vector:

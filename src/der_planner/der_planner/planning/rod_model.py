@@ -38,7 +38,7 @@ class RodModel:
     def __init__(self, limb: Limb, nodes: int = NODES) -> None:
         self.limb = limb
         self.rod = Rod.from_limb(limb, nodes)
-        self.kinematics = PolylineKinematics(self.rod.rest_lengths, list(self.rod.segments))
+        self.kinematics = PolylineKinematics.of_rod(self.rod)
         self.rest = self.rod.equilibrium(np.zeros(limb.segment_count))
         first = [first for first, _ in self.rod.segments]
         self._moment_gain = self.rod.input_gain * self.rod.rest_lengths[first]

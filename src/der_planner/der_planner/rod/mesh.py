@@ -34,6 +34,7 @@ class Mesh:
         clamped: indices into q that do not move.
         segments: ((first node, node count), …).
         gain: (M,) Λ [N/Pa].
+        base: x of node 0.
     """
 
     rest: Array
@@ -52,6 +53,7 @@ class Mesh:
     clamped: NDArray[np.int64]
     segments: tuple[tuple[int, int], ...]
     gain: Array
+    base: float = 0.0
 
     @property
     def nodes(self) -> int:
@@ -273,6 +275,7 @@ def limb_mesh(limb: Limb, nodes: int, clamp: str) -> Mesh:
         clamped=clamped_indices(clamp, (), nodes),
         segments=pairs,
         gain=gain,
+        base=limb.base_length,
     )
 
 

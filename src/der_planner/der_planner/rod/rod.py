@@ -123,7 +123,8 @@ class Rod:
         """Build the rod of a limb. "auto" is planar ("xy") unless gravity leaves the plane.
 
         Each segment gets edges of one length; one connector edge between two segments belongs to
-        neither. A `connector_length` of zero centres a regular edge on the boundary instead.
+        neither. A `connector_length` of zero centres a regular edge on the boundary instead. Node 0
+        sits at the end of the stiff `base_length`.
         """
         if plane == "auto":
             plane = "xy" if limb.gravity[2] == 0.0 else None
@@ -148,7 +149,7 @@ class Rod:
     def straight_state(self) -> RodState:
         """Return the straight, unloaded, resting state."""
         q = np.zeros(4 * self.nodes - 1)
-        q[0::4] = np.append(0.0, np.cumsum(self.rest_lengths))
+        q[0::4] = self.mesh.base + np.append(0.0, np.cumsum(self.rest_lengths))
         directors = np.tile([0.0, 1.0, 0.0], (self.nodes - 1, 1))
         return RodState(q, np.zeros_like(q), directors, np.zeros(self.nodes))
 

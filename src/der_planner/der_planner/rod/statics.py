@@ -95,8 +95,9 @@ def even_bend(angles: Array, mesh: Mesh) -> tuple[Array, Array]:
     step = mesh.rest[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
     turned = np.stack([-step[:, 1], step[:, 0]], axis=1)
     q = np.zeros(4 * nodes - 1)
+    q[0::4] = mesh.base
     tangent = np.zeros((4 * nodes - 1, len(angles)))
     for axis in range(2):
-        q[4 + axis :: 4] = np.cumsum(step[:, axis])
+        q[4 + axis :: 4] += np.cumsum(step[:, axis])
         tangent[4 + axis :: 4] = np.cumsum(turned[:, axis, None] * direction_by_angle, axis=0)
     return q, tangent

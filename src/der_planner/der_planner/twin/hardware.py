@@ -6,7 +6,7 @@ topic, a file or a log that a planner reads.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -44,6 +44,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "fitting_mass": (0.004, 0.010),  # [kg] of the connector and of the tip, with tags
     "mass_per_length": (0.95, 1.05),  # × 1.066 kg/m
     "drag": (0.4, 0.7),  # [1/s] mass-proportional damping
+    "coupling": (-0.05, 0.05),  # moment by the other segment's pressure, over that of its own
 }
 """Uniform ranges of every number that a seed draws."""
 
@@ -66,6 +67,7 @@ class SegmentHardware:
         friction_curvature: change of curvature over which the friction turns round [1/m].
         friction_exponent, friction_share: n and β of its Bouc-Wen law.
         creep_stiffness, creep_time: Maxwell branches, fast, middle and slow [N·m²], [s].
+        coupling: moment by the neighbours' differential pressure over that of its own [-].
         wander, wander_time: standard deviation [1/m] and correlation time [s] of the rest
             curvature.
     """
@@ -85,6 +87,7 @@ class SegmentHardware:
     creep_time: tuple[float, float, float]
     wander: float
     wander_time: float
+    coupling: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -150,7 +153,7 @@ def draw(seed: int) -> Hardware:
                 wander_time=of("wander_time"),
             )
         )
-    return Hardware(
+    hardware = Hardware(
         segments=tuple(segments),
         base_fitting=base,
         connector=connector,
@@ -160,3 +163,5 @@ def draw(seed: int) -> Hardware:
         mass_per_length=1.066 * of("mass_per_length"),
         drag=of("drag"),
     )
+    coupled = tuple(replace(segment, coupling=of("coupling")) for segment in segments)
+    return replace(hardware, segments=coupled)

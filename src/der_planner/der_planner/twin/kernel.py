@@ -16,6 +16,7 @@ from elastica.rod.cosserat_rod import (
     _compute_bending_twist_strains,
     _compute_internal_forces,
     _compute_internal_torques,
+    _compute_shear_stretch_strains,
     _update_accelerations,
 )
 from elastica.rod.data_structures import overload_operator_kinematic_numba
@@ -23,6 +24,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+
+VISCOUS_TIME = 1e-4
+"""τ of the material's own damping [s], a loss factor ω τ of 0.02 at the lowest axial mode (37 Hz)
+and of 0.4 at the mesh's highest. Without it nothing stops those modes, and what trembles does not
+rub: their ringing would take most of the friction away."""
 
 
 class RodArrays(NamedTuple):
@@ -65,8 +71,10 @@ class RodArrays(NamedTuple):
 class Material(NamedTuple):
     """The bending law at each vertex (K,): parameters, then the state that it remembers.
 
-    moment = stiffness (κ − rest) + cubic (κ − rest)³ + friction_moment z + Σ creep_stiffness q −
-    active
+    moment = stiffness (κ − rest + τ κ̇) + cubic (κ − rest)³ + friction_moment z +
+    Σ creep_stiffness q − active
+
+    and at each element (E,) the strain at which its stretch is at rest.
     """
 
     flexible_share: Array  # flexible length at a vertex over its Voronoi length
@@ -83,6 +91,17 @@ class Material(NamedTuple):
     curvature: Array  # state: κ at the last step [1/m]
     friction: Array  # state: z in −1 … 1
     creep: Array  # state: q (3, K) [1/m]
+    rest_stretch: Array  # (E,) strain at rest [-]
+
+
+class Ramp(NamedTuple):
+    """What the chambers change in each of the next steps, until they hold their new pressure."""
+
+    steps: int
+    active: Array  # (K,) [N·m] a step
+    stiffness: Array  # (K,) [N·m²] a step
+    rest: Array  # (K,) [1/m] a step
+    rest_stretch: Array  # (E,) a step
 
 
 @njit(cache=True)
@@ -105,7 +124,7 @@ def bending_law(material: Material, kappa: Array, couple: Array, dt: float) -> N
         material.friction[k] = min(1.0, max(-1.0, z))
         strain = curvature - material.rest[k]
         moment = (
-            material.stiffness[k] * strain
+            material.stiffness[k] * (strain + VISCOUS_TIME * change / dt)
             + material.cubic[k] * strain**3
             + material.friction_moment[k] * material.friction[k]
             - material.active[k]
@@ -121,12 +140,15 @@ def bending_law(material: Material, kappa: Array, couple: Array, dt: float) -> N
 
 
 @njit(cache=True)
-def advance(rod: RodArrays, material: Material, steps: int, dt: float, drag: float) -> None:
+def advance(
+    rod: RodArrays, material: Material, ramp: Ramp, steps: int, dt: float, drag: float
+) -> None:
     """Advance the limb by ``steps`` position Verlet steps of ``dt`` [s].
 
     Args:
         rod: changed in place; its first element is clamped.
         material: changed in place.
+        ramp: how the material changes with the pressures from the first step on.
         steps: number of steps.
         dt: [s] below the stability limit of the stiffest mode.
         drag: mass-proportional damping [1/s], integrated exactly.
@@ -134,7 +156,13 @@ def advance(rod: RodArrays, material: Material, steps: int, dt: float, drag: flo
     keep = np.exp(-drag * dt)
     vertices = rod.kappa.shape[1]
     moment = np.zeros(vertices)
-    for _ in range(steps):
+    strain = rod.sigma.copy()
+    for step in range(steps):
+        if step < ramp.steps:
+            material.active[:] += ramp.active
+            material.stiffness[:] += ramp.stiffness
+            material.rest[:] += ramp.rest
+            material.rest_stretch[:] += ramp.rest_stretch
         overload_operator_kinematic_numba(
             0.5 * dt, rod.position, rod.directors, rod.velocity, rod.omega
         )
@@ -143,6 +171,7 @@ def advance(rod: RodArrays, material: Material, steps: int, dt: float, drag: flo
         for k in range(vertices):
             # PyElastica's couple is B (κ − κ_rest): this rest curvature makes it the law's moment.
             rod.rest_kappa[0, k] = rod.kappa[0, k] - moment[k] / rod.bend_matrix[0, 0, k]
+        _damp_strains(rod, material, strain, dt)
         _compute_internal_forces(
             rod.position,
             rod.volume,
@@ -197,6 +226,29 @@ def advance(rod: RodArrays, material: Material, steps: int, dt: float, drag: flo
         overload_operator_kinematic_numba(
             0.5 * dt, rod.position, rod.directors, rod.velocity, rod.omega
         )
+
+
+@njit(cache=True)
+def _damp_strains(rod: RodArrays, material: Material, before: Array, dt: float) -> None:
+    """Set the rest strains so that stress = S (σ − rest + τ σ̇); ``before`` (3, E) becomes σ."""
+    _compute_shear_stretch_strains(
+        rod.position,
+        rod.volume,
+        rod.lengths,
+        rod.tangents,
+        rod.radius,
+        rod.rest_lengths,
+        rod.rest_voronoi_lengths,
+        rod.dilatation,
+        rod.voronoi_dilatation,
+        rod.directors,
+        rod.sigma,
+    )
+    for i in range(3):
+        for k in range(before.shape[1]):
+            rod.rest_sigma[i, k] = VISCOUS_TIME * (before[i, k] - rod.sigma[i, k]) / dt
+            before[i, k] = rod.sigma[i, k]
+    rod.rest_sigma[2, :] += material.rest_stretch
 
 
 @njit(cache=True)

@@ -10,7 +10,7 @@ from elastica import CosseratRod
 from numpy.typing import NDArray
 
 from der_planner.twin.hardware import Hardware, draw
-from der_planner.twin.kernel import Material, RodArrays, advance
+from der_planner.twin.kernel import Material, Ramp, RodArrays, advance
 
 Array = NDArray[np.float64]
 
@@ -18,6 +18,8 @@ ATMOSPHERE = 101_325.0
 """Absolute pressure outside the chambers [Pa]."""
 TIME_STEP = 2e-4
 """Explicit step [s]; stable for 0.3 ms as well (see the page of the twin)."""
+RAMP = 0.01
+"""Time in which new chamber pressures reach the limb [s], on a straight line: a jump would ring."""
 ELEMENTS_PER_SEGMENT = 8
 AXIAL_STIFFNESS = 1380.0
 """EA [N] of the silicone tube, which fits its bending stiffness only with a thin wall."""
@@ -101,7 +103,7 @@ class LimbTwin:
         return angles
 
     def step(self, chamber_pressure: Array, duration: float) -> None:
-        """Advance the limb under constant chamber pressures.
+        """Advance the limb under constant chamber pressures, which it feels after `RAMP`.
 
         The explicit step is fixed: a remainder shorter than it is kept for the next call.
 
@@ -113,11 +115,12 @@ class LimbTwin:
         Raises:
             TwinError: the pressures have another shape, are not finite or above 2 bar gauge.
         """
-        self._apply(chamber_pressure, duration)
+        target = self._target(chamber_pressure, duration)
         self._carry += duration
         steps = int(self._carry / TIME_STEP + 1e-9)
         self._carry -= steps * TIME_STEP
-        advance(self._arrays, self._material, steps, TIME_STEP, self._hardware.drag)
+        ramp = self._ramp(target, min(steps, round(RAMP / TIME_STEP)))
+        advance(self._arrays, self._material, ramp, steps, TIME_STEP, self._hardware.drag)
         self.time += steps * TIME_STEP
         if not np.isfinite(self._rod.position_collection[0, -1]):
             raise TwinError(f"the simulated limb became unstable at t = {self.time:.3f} s")
@@ -160,7 +163,8 @@ class LimbTwin:
         speed = np.sum(self._rod.velocity_collection**2, axis=0)
         return float(0.5 * self._rod.mass @ speed)
 
-    def _apply(self, chamber_pressure: Array, duration: float) -> None:
+    def _target(self, chamber_pressure: Array, duration: float) -> dict[str, Array]:
+        """Return what the material shall be under these pressures, by the fields of `Ramp`."""
         pressure = np.asarray(chamber_pressure, dtype=float)
         if pressure.shape != (2 * self.segment_count,):
             raise TwinError(
@@ -172,7 +176,12 @@ class LimbTwin:
                 f"chamber pressures must be absolute, in Pa and within 2 bar of the atmosphere "
                 f"({self.atmosphere:.0f} Pa): got {pressure}"
             )
+        names = ("active", "stiffness", "rest", "rest_stretch")
+        target = {name: getattr(self._material, name).copy() for name in names}
+        differential = np.concatenate([[0.0], gauge[0::2] - gauge[1::2], [0.0]])
         for index, segment in enumerate(self._hardware.segments):
+            neighbours = differential[index] + differential[index + 2]
+            crossing = segment.coupling * 0.5 * sum(segment.chamber_gain)
             fade = math.exp(-duration / segment.wander_time)
             kick = segment.wander * math.sqrt(1.0 - fade * fade)
             self._wander[index] = fade * self._wander[index] + kick * float(
@@ -180,21 +189,32 @@ class LimbTwin:
             )
             left, right = gauge[2 * index], gauge[2 * index + 1]
             here = self._vertex_segment == index
-            self._material.active[here] = (
-                segment.chamber_gain[0] * left - segment.chamber_gain[1] * right
+            target["active"][here] = (
+                segment.chamber_gain[0] * left
+                - segment.chamber_gain[1] * right
+                + crossing * neighbours
             )
-            self._material.stiffness[here] = segment.bending_stiffness * (
+            target["stiffness"][here] = segment.bending_stiffness * (
                 1.0 + segment.pressure_stiffening * (left + right)
             )
-            self._material.rest[here] = segment.rest_curvature + self._wander[index]
-            self._rod.rest_sigma[2, self._element_segment == index] = segment.elongation * (
+            target["rest"][here] = segment.rest_curvature + self._wander[index]
+            target["rest_stretch"][self._element_segment == index] = segment.elongation * (
                 left + right
             )
+        return target
+
+    def _ramp(self, target: dict[str, Array], steps: int) -> Ramp:
+        each = {
+            name: (value - getattr(self._material, name)) / max(steps, 1)
+            for name, value in target.items()
+        }
+        return Ramp(steps=steps, **each)
 
     def _settle(self) -> None:
         rest = np.full(2 * self.segment_count, self.atmosphere)
-        self._apply(rest, 0.0)
-        advance(self._arrays, self._material, int(2.0 / TIME_STEP), TIME_STEP, 8.0)
+        steps = int(2.0 / TIME_STEP)
+        ramp = self._ramp(self._target(rest, 0.0), steps // 4)
+        advance(self._arrays, self._material, ramp, steps, TIME_STEP, 8.0)
         self._rod.velocity_collection[:] = 0.0
         self._rod.omega_collection[:] = 0.0
         self._material.creep[:] = 0.0
@@ -296,6 +316,7 @@ class LimbTwin:
             curvature=np.zeros(count),
             friction=np.zeros(count),
             creep=np.zeros((3, count)),
+            rest_stretch=np.zeros(len(owner)),
         )
 
     def _collect(self) -> None:

@@ -103,6 +103,4 @@ def split(differential: Array) -> Array:
 def _advance(pneumatics: Pneumatics, twin: LimbTwin, duration: float, fine_step: float) -> None:
     count = max(1, int(np.ceil(duration / fine_step - 1e-9)))
     for _ in range(count):
-        before = pneumatics.pressure
-        after = pneumatics.step(duration / count)
-        twin.step(0.5 * (before + after), duration / count)
+        twin.step(pneumatics.step(duration / count), duration / count)
