@@ -1,5 +1,7 @@
 """Inverse kinematics: the inverse of the forward, branches, the singular straight pose, reach."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -17,7 +19,7 @@ CHAIN = RodModel(LIMB).kinematics
 def polyline(count):
     limb = Limb("many", LIMB.segments[:1] * count, LIMB.pneumatics)
     rod = Rod.from_limb(limb, 10 * count + 1)
-    return PolylineKinematics(rod.rest_lengths, list(rod.segments))
+    return PolylineKinematics.of_rod(rod)
 
 
 @pytest.mark.parametrize("kinematics", [ARCS, CHAIN], ids=["arcs", "rod"])
@@ -39,6 +41,27 @@ def test_the_chain_is_the_rods_evenly_bent_configuration():
         S = CHAIN.tangents(angles)
         np.testing.assert_allclose(S[..., 0].T, tangents[0::4], atol=1e-13)
         np.testing.assert_allclose(S[..., 1].T, tangents[1::4], atol=1e-13)
+
+
+def test_a_stiff_base_moves_the_limb_along_x():
+    based = replace(LIMB, base_length=7e-3)
+    model, rod = RodModel(based), Rod.from_limb(based, 21)
+    angles = [0.9, -0.4]
+    q, _ = rod.configuration_from_bend_angles(angles)
+    np.testing.assert_allclose(model.kinematics.nodes(angles), rod.positions(q)[:, :2], atol=1e-14)
+    for with_base, without in ((model.kinematics, CHAIN), (ArcKinematics(based), ARCS)):
+        np.testing.assert_allclose(
+            with_base.tip(angles), without.tip(angles) + np.array([7e-3, 0.0])
+        )
+        curve = with_base.curve(angles)
+        np.testing.assert_allclose(curve[[0, 1]], [[0.0, 0.0], [7e-3, 0.0]], atol=1e-15)
+        np.testing.assert_allclose(curve[-1], with_base.tip(angles), atol=1e-14)
+    pressure = np.array([8000.0, -5000.0])
+    tips = [
+        robot.positions(robot.equilibrium(pressure))[-1] for robot in (rod, Rod.from_limb(LIMB, 21))
+    ]
+    np.testing.assert_allclose(tips[0] - tips[1], [7e-3, 0.0, 0.0], atol=1e-9)
+    assert based.length == pytest.approx(LIMB.length + 7e-3)
 
 
 def test_velocity_and_acceleration_of_the_chain_are_derivatives():
