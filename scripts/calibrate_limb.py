@@ -46,6 +46,7 @@ from der_planner.identification import (  # noqa: E402
 from der_planner.identification.offline import AMPLITUDE  # noqa: E402
 from der_planner.identification.parameters import GROUPS  # noqa: E402
 from der_planner.identification.plots import plot_prediction  # noqa: E402
+from der_planner.identification.prepare import prepare  # noqa: E402
 from der_planner.limb import Limb, LimbError  # noqa: E402
 from orchestrator.errors import GraphError, NodeError  # noqa: E402
 from orchestrator.interrupts import interrupt_once  # noqa: E402
@@ -89,7 +90,14 @@ def _arguments() -> argparse.Namespace:
         help=f"model terms to fit, of {', '.join(GROUPS)}; 'none' for gain and rest angle alone",
     )
     parser.add_argument("--longest-gap", type=float, default=1.0, help="in the log, bridged [s]")
-    parser.add_argument("--held-out", type=Path, help="bag or table to predict, not to fit")
+    parser.add_argument(
+        "--held-out",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="FILE",
+        help="bags or tables to predict, not to fit",
+    )
     parser.add_argument("--out", type=Path, default=Path("limb.yaml"), help="limb file to write")
     parser.add_argument("--report", type=Path, help="folder for report.txt and prediction.png")
     given = parser.parse_args()
@@ -122,7 +130,7 @@ def main() -> int:
         log = _obtain(prior, given)
         terms = () if given.terms == "none" else given.terms.split(",")
         limb, report = fit(prior, log, terms=terms, longest_gap=given.longest_gap)
-        held_out = _read(given.held_out, given.columns) if given.held_out else None
+        held_out = [_read(path, given.columns) for path in given.held_out]
         _conclude(limb, report, log, held_out, given)
     except OptionError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -208,12 +216,12 @@ def _conclude(
     limb: Limb,
     report: FitReport,
     log: CalibrationLog,
-    held_out: CalibrationLog | None,
+    held_out: list[CalibrationLog],
     given: argparse.Namespace,
 ) -> None:
     text = report.text()
-    if held_out is not None:
-        text += "\n" + _held_out_text(limb, held_out)
+    for unseen in held_out:
+        text += "\n" + _held_out_text(limb, unseen, given.longest_gap)
     print(text)
     given.out.parent.mkdir(parents=True, exist_ok=True)
     limb.to_yaml(given.out)
@@ -221,14 +229,12 @@ def _conclude(
     if given.report:
         given.report.mkdir(parents=True, exist_ok=True)
         (given.report / "report.txt").write_text(text + "\n")
-        plot_prediction(limb, log, given.report / "prediction.png", held_out)
+        plot_prediction(limb, log, given.report / "prediction.png", *held_out[:1])
         print(f"report: {given.report}")
 
 
-def _held_out_text(limb: Limb, log: CalibrationLog) -> str:
-    from der_planner.identification.prepare import prepare  # noqa: PLC0415
-
-    prepared = prepare(log, limb)
+def _held_out_text(limb: Limb, log: CalibrationLog, longest_gap: float) -> str:
+    prepared = prepare(log, limb, longest_gap=longest_gap, to_fit=False)
     lines = [f"held out: {log.source}"]
     for model in ("der", "pcc"):
         predicted = predict(limb, prepared.log.time, prepared.pressure, model)
@@ -236,7 +242,8 @@ def _held_out_text(limb: Limb, log: CalibrationLog) -> str:
         span = np.degrees(np.ptp(prepared.bend, axis=0))
         rms = np.sqrt(np.nanmean(error**2, axis=0))
         parts = [
-            f"segment {index} {value:.2f}° ({100 * value / width:.1f} % of its range)"
+            f"segment {index} {value:.2f}° ({100 * value / width:.1f} % of its range of "
+            f"{width:.1f}°)"
             for index, (value, width) in enumerate(zip(rms, span, strict=True))
         ]
         lines.append(f"  {model}: " + ", ".join(parts))

@@ -156,6 +156,22 @@ def test_lag_of_the_air_is_recovered():
     np.testing.assert_allclose(found.offset, 7.0, atol=3.0)
 
 
+def test_a_run_that_moves_one_segment_can_be_checked(fitted):
+    limb, _ = fitted
+    time = 0.05 * np.arange(600)
+    pressure = 6000.0 * np.stack([np.sin(time / 3), np.zeros_like(time)], axis=1)
+    truth = predict(hidden_limb(), time, pressure)
+    log = CalibrationLog(time, pressure, pressure, truth.bend_angles, truth.tip)
+    with pytest.raises(LogError, match="input 1 was not excited"):
+        fit(limb, log)
+    verdict = check(limb, log)
+    assert verdict.fits
+    assert np.isnan(verdict.gain_change[1])
+    assert abs(verdict.gain_change[0]) < 0.05
+    assert any("segment 1 hardly moved" in finding for finding in verdict.findings)
+    assert "not shown" in verdict.text()
+
+
 def test_lengths_are_recovered_from_tips():
     limb = with_geometry(Limb.default(), np.array([0.1195, 0.1235]), 6e-3, 5e-3)
     rod = Rod.from_limb(limb, 21)

@@ -7,6 +7,8 @@ from der_planner.identification import ColumnMap, calibrate_twin, fit, predict, 
 from der_planner.identification.excitation import PERIOD, Excitation
 from der_planner.identification.offline import record_twin
 from der_planner.limb import Limb
+from der_planner.twin.hardware import draw
+from der_planner.twin.truth import known_values
 
 REAL = ColumnMap(
     time="t",
@@ -35,6 +37,23 @@ def test_twin_is_predicted_after_one_calibration():
     assert error.max() < 0.08
     default = predict(Limb.default(), log.time, log.measured_differential)
     assert error.mean() < 0.5 * np.linalg.norm(default.tip - log.tip, axis=1).mean() / limb.length
+
+
+@pytest.mark.slow
+def test_what_the_twin_knows_is_recovered_within_the_stated_uncertainty():
+    distances = {}
+    for seed in (2, 4):
+        _, report = calibrate_twin(seed, Limb.default())
+        for name, known in known_values(draw(seed)).items():
+            found = report.value(name)
+            deviation = np.hypot(found.deviation, known.spread)
+            distances[seed, name] = abs(found.value - known.value) / deviation
+    assert len(distances) == 36
+    # Two thirds within one deviation, nineteen of twenty within two, if errors were all noise.
+    values = np.array(list(distances.values()))
+    assert np.mean(values < 1.0) > 0.5, distances
+    assert np.mean(values < 2.0) > 0.8, distances
+    assert values.max() < 5.0, distances
 
 
 @pytest.mark.slow

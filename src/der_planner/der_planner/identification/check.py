@@ -22,6 +22,8 @@ REST_DRIFT = math.radians(1.5)
 ERROR_GROWTH = 2.5
 """Growth of the error over the calibration's own that does."""
 LEAST_ERROR = math.radians(0.4)
+LEAST_MOTION = math.radians(3.0)
+"""Predicted range of motion from which on a gain can be told [rad]."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,8 @@ class Check:
         findings: sentences; empty where all is well.
         error: (M,) root mean square open-loop error of the bend angles [rad].
         tip_error: mean distance of predicted and measured tips [m]; NaN without tips.
-        gain_change: (M,) measured over predicted range of motion, less one.
+        gain_change: (M,) measured over predicted range of motion, less one; NaN for a segment that
+            hardly moved.
         rest_change: (M,) mean of measured less predicted, at the gain that fits best [rad].
     """
 
@@ -50,9 +53,10 @@ class Check:
         for index, (error, gain, rest) in enumerate(
             zip(self.error, self.gain_change, self.rest_change, strict=True)
         ):
+            change = f"{100 * gain:+.1f} %" if math.isfinite(gain) else "not shown"
             lines.append(
                 f"segment {index}: open-loop error rms {math.degrees(error):.2f}°, gain "
-                f"{100 * gain:+.1f} %, rest angle {math.degrees(rest):+.2f}°"
+                f"{change}, rest angle {math.degrees(rest):+.2f}°"
             )
         if math.isfinite(self.tip_error):
             lines.append(f"tip: mean error {1e3 * self.tip_error:.2f} mm")
@@ -69,20 +73,28 @@ def check(limb: Limb, log: CalibrationLog) -> Check:
     Raises:
         LogError: the log cannot be used, see `prepare`.
     """
-    prepared = prepare(log, limb)
+    prepared = prepare(log, limb, to_fit=False)
     rows = prepared.usable
     predicted = predict(limb, prepared.log.time, prepared.pressure)
     measured = prepared.log.bend_angles
     error = np.sqrt(np.nanmean((measured - predicted.bend_angles) ** 2, axis=0))
     gains, rests = np.empty(len(error)), np.empty(len(error))
+    still: list[str] = []
     for index in range(len(error)):
-        slope, offset = np.polyfit(predicted.bend_angles[rows, index], measured[rows, index], 1)
+        expected, seen = predicted.bend_angles[rows, index], measured[rows, index]
+        if np.ptp(expected) < LEAST_MOTION:
+            gains[index], rests[index] = math.nan, np.mean(seen - expected)
+            still.append(f"segment {index} hardly moved in this run: its gain is not checked")
+            continue
+        slope, offset = np.polyfit(expected, seen, 1)
         gains[index], rests[index] = slope - 1.0, offset
     distance = np.linalg.norm(prepared.log.tip - predicted.tip, axis=1)
     tip_error = float(np.nanmean(distance)) if np.isfinite(distance).any() else math.nan
     findings = [*prepared.warnings, *_drift(limb, error, gains, rests)]
     drifted = len(findings) > len(prepared.warnings)
-    findings += _range(limb, prepared.pressure[rows], np.stack([bridge(c) for c in measured.T], 1))
+    findings += still + _range(
+        limb, prepared.pressure[rows], np.stack([bridge(c) for c in measured.T], 1)
+    )
     return Check(not drifted, tuple(findings), error, tip_error, gains, rests)
 
 

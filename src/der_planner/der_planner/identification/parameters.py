@@ -49,7 +49,7 @@ TERMS = (
     Term("coupling_after", "-", 0.03, -0.4, 0.4, 0.05, "coupling"),
     Term("friction_pressure", "Pa", 300.0, 0.0, 4000.0, 800.0, "friction"),
     Term("friction_angle", "rad", 0.1, 0.02, 0.8, 0.1, "friction"),
-    Term("creep_pressure", "Pa/rad", 500.0, 0.0, 5000.0, 1000.0, "creep"),
+    Term("creep_pressure", "Pa/rad", 500.0, 0.0, 15000.0, 2000.0, "creep"),
     Term("creep_time", "s", 15.0, 3.0, 120.0, 15.0, "creep"),
     Term("material_damping", "s", 0.01, 0.0, 0.1, 0.02, "dynamics", step=2e-3),
     Term("log_stiffness", "-", 0.2, -1.2, 1.2, 0.3, "dynamics", step=0.02),

@@ -22,6 +22,9 @@ LONGEST_GAP = 1.0
 LEAST_EXCITATION = 1000.0
 """Standard deviation of an input below which nothing can be told of it [Pa]."""
 LEAST_VALID = 0.5
+"""Share of a log to fit to in which the tags must be seen."""
+LEAST_SEEN = 0.05
+"""Share of a log to predict in which they must be."""
 _WRONG_WAY = (
     "segment {index} bends the wrong way: positive differential pressure must bend toward +y; "
     "swap the two chambers or the sign in the column map"
@@ -48,7 +51,12 @@ class Prepared:
 
 
 def prepare(
-    log: CalibrationLog, limb: Limb, period: float = PERIOD, longest_gap: float = LONGEST_GAP
+    log: CalibrationLog,
+    limb: Limb,
+    period: float = PERIOD,
+    longest_gap: float = LONGEST_GAP,
+    *,
+    to_fit: bool = True,
 ) -> Prepared:
     """Resample and check a log.
 
@@ -57,10 +65,13 @@ def prepare(
         limb: that it should belong to.
         period: of the grid [s].
         longest_gap: between two rows that a straight line may bridge [s].
+        to_fit: the log must tell every parameter; a run that is only predicted need not move every
+            segment.
 
     Raises:
-        LogError: another number of segments, an input without excitation, too few tags, or
-            pressures that contradict the commands (a wrong column map).
+        LogError: another number of segments, too few tags or no pressures; with ``to_fit`` an input
+            without excitation as well, or pressures that contradict the commands or the bends (a
+            wrong column map).
     """
     if log.segment_count != limb.segment_count:
         raise LogError(
@@ -71,41 +82,53 @@ def prepare(
     grid = log.resampled(period, longest_gap)
     warnings: list[str] = []
     valid = np.all(np.isfinite(grid.bend_angles), axis=1)
-    if valid.mean() < LEAST_VALID:
+    least = LEAST_VALID if to_fit else LEAST_SEEN
+    if valid.mean() < least:
         raise LogError(
             f"the tags were seen in {100 * valid.mean():.0f} % of the log only, "
-            f"{100 * LEAST_VALID:.0f} % are needed: check light, focus and the tag map"
+            f"{100 * least:.0f} % are needed: check light, focus and the tag map"
         )
     if valid.mean() < 0.98:
         warnings.append(f"tags lost in {100 * (1 - valid.mean()):.1f} % of the log")
-    pressure = _pressures(grid, limb, warnings)
-    _check_excitation(pressure, warnings)
-    _check_saturation(pressure, limb, warnings)
+    pressure = _pressures(grid, least)
     bend = np.stack([bridge(column) for column in grid.bend_angles.T], axis=1)
-    _check_match(pressure, bend, warnings)
+    if to_fit:
+        _check_units(pressure, limb)
+        _check_commands(grid, warnings)
+        _check_excitation(pressure, warnings)
+        _check_saturation(pressure, limb, warnings)
+        _check_match(pressure, bend, warnings)
     count = min(SMOOTHING, len(bend) - (len(bend) + 1) % 2)
     bend = np.asarray(savgol_filter(bend, count, 2, axis=0))
     return Prepared(grid, pressure, bend, valid, tuple(warnings))
 
 
-def _pressures(log: CalibrationLog, limb: Limb, warnings: list[str]) -> Array:
+def _pressures(log: CalibrationLog, least: float) -> Array:
+    """Return the measured pressures (K, M) [Pa] with gaps bridged."""
     measured = log.measured_differential
     known = np.isfinite(measured)
     for index in range(measured.shape[1]):
         share = known[:, index].mean()
-        if share < 0.5:
+        if share < least:
             raise LogError(
                 f"pressure {index} was measured in {100 * share:.0f} % of the log only: the fit "
                 f"needs "
                 "the board's telemetry"
             )
-    pressure = np.stack([bridge(column) for column in measured.T], axis=1)
+    return np.stack([bridge(column) for column in measured.T], axis=1)
+
+
+def _check_units(pressure: Array, limb: Limb) -> None:
     largest = np.nanmax(np.abs(pressure))
     if largest > 20.0 * limb.pneumatics.pressure_limit or largest < 100.0:
         raise LogError(
             f"the largest measured differential pressure is {largest:.3g} Pa, the limb's limit "
             f"{limb.pneumatics.pressure_limit:.0f} Pa: check the units of the log"
         )
+
+
+def _check_commands(log: CalibrationLog, warnings: list[str]) -> None:
+    measured = log.measured_differential
     for index, (command, column) in enumerate(
         zip(log.commanded_differential.T, measured.T, strict=True)
     ):
@@ -122,7 +145,6 @@ def _pressures(log: CalibrationLog, limb: Limb, warnings: list[str]) -> Array:
             warnings.append(
                 f"measured pressure {index} follows its command loosely ({agreement:.2f})"
             )
-    return pressure
 
 
 def _check_excitation(pressure: Array, warnings: list[str]) -> None:
