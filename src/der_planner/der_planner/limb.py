@@ -19,6 +19,8 @@ import yaml
 from numpy.typing import NDArray
 
 SCHEMA_VERSION = 1
+VENT_REFERENCE = 10e3
+"""Gauge pressure [Pa] for which `Pneumatics.vent_rate` is given."""
 DEFAULT_LIMB_FILE = Path(__file__).resolve().parent / "data" / "default_limb.yaml"
 
 
@@ -88,6 +90,10 @@ class Pneumatics:
         delay: dead time from command to the first change in the chamber [s].
         minimum_supply: least absolute supply pressure that the board needs [Pa].
         vent_time_constant: lag while |differential pressure| falls [s]; 0 = as `time_constant`.
+        vent_rate: rate at which a chamber at `VENT_REFERENCE` falls with its outlet wide open
+            [Pa/s]; 0 = outlets never hold a chamber up.
+        vent_exponent: the rate grows with this power of the chamber's gauge pressure [-]: 1/2 is an
+            orifice, 1 a tube (one exponential); two thirds were seen on a real limb.
     """
 
     pressure_limit: float
@@ -97,6 +103,8 @@ class Pneumatics:
     delay: float = 0.0
     minimum_supply: float = 0.0
     vent_time_constant: float = 0.0
+    vent_rate: float = 0.0
+    vent_exponent: float = 2.0 / 3.0
 
 
 @dataclass(frozen=True)
@@ -153,6 +161,11 @@ class Limb:
                 f"pcc_segments has {len(self.pcc_segments)} entries, segments {len(self.segments)}"
             )
         _check_numbers(self.pneumatics, "pneumatics", may_be_zero=_PNEUMATICS_MAY_BE_ZERO)
+        if self.pneumatics.vent_exponent > 1.0:
+            raise LimbError(
+                "pneumatics.vent_exponent must be 1 (a tube) or less, got "
+                f"{self.pneumatics.vent_exponent}"
+            )
         for key in ("connector_length", "base_length"):
             length = getattr(self, key)
             if not (math.isfinite(length) and length >= 0):
@@ -257,6 +270,7 @@ _UNITS = """\
 # gain_asymmetry [-]; pressure_stiffening [1/Pa]; friction_moment [N m]; friction_curvature [1/m];
 # creep_stiffness [N m^2]; creep_time [s]; coupling_before, coupling_after [-];
 # slew_limit, fill_rate [Pa/s]; time_constant, vent_time_constant, delay [s];
+# vent_rate [Pa/s, of a chamber at 10 kPa; 0: no limit]; vent_exponent [-];
 # minimum_supply [Pa, absolute];
 # gravity [m/s^2]; calibrated.differential_pressure [Pa]; calibrated.bend_angle [rad].
 """
@@ -276,7 +290,7 @@ _MAY_BE_ZERO = {
     "creep_stiffness",
     "creep_time",
 }
-_PNEUMATICS_MAY_BE_ZERO = {"delay", "minimum_supply", "vent_time_constant"}
+_PNEUMATICS_MAY_BE_ZERO = {"delay", "minimum_supply", "vent_time_constant", "vent_rate"}
 
 
 def _check_memory(segment: Segment, where: str) -> None:

@@ -1,25 +1,32 @@
-"""From commanded to measured pressure: lags, dead time, fill rate, offset."""
+"""From commanded to measured pressure: lags, dead time, venting, fill rate, offset."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from der_planner.identification.log import CalibrationLog, LogError
-from der_planner.limb import Limb
+from der_planner.limb import Limb, Pneumatics
 from der_planner.planning.pneumatics import chamber_pressures
 
 Array = NDArray[np.float64]
 
 SMOOTH_RATE = 6000.0
-"""Commands that change faster than this [Pa/s] are steps: their flow is choked, not a lag."""
+"""Commands that rise faster than this [Pa/s] are steps: their flow is choked, not a lag."""
 STEP_MEMORY = 3.0
-"""Time after a step that the lag is not fitted to [s]."""
-_LOWEST = (0.005, 0.005, 0.0)
-_HIGHEST = (1.5, 1.5, 1.9)
+"""Time after such a step that nothing is fitted to [s]."""
+SHOWN = 0.25
+"""Relative standard deviation up to which a log is said to show how fast chambers are vented."""
+_SUBSTEPS = 2
+_LOWEST = (0.005, 0.005, 0.0, 300.0, 0.3)
+_HIGHEST = (1.5, 1.5, 1.9, 60e3, 1.0)
+_NAMES = ("time_constant", "vent_time_constant", "delay", "vent_rate", "vent_exponent")
+_START = (0.2, 0.2, 0.05, 5000.0, 0.7)
+_STEP = (2e-3, 2e-3, 2e-3, 20.0, 2e-3)
+_SCALE = (0.1, 0.1, 0.1, 1000.0, 0.1)
 
 
 @dataclass(frozen=True)
@@ -31,8 +38,13 @@ class AirFit:
         delay: dead time [s].
         fill_rate: largest rate of a filling chamber [Pa/s]; NaN without a step.
         offset: (M,) measured less commanded pressure at rest [Pa].
-        residual: root mean square of measured less predicted along smooth commands [Pa].
+        residual: root mean square of measured less predicted along smooth commands and, where
+            venting is shown, after steps down [Pa].
         uncertainty: (3,) standard deviations of the two lags and the dead time [s].
+        vent_rate: rate at which a chamber at 10 kPa falls at the most [Pa/s]; NaN where the log
+            does not show it.
+        vent_exponent: its growth with the pressure [-]; NaN where the log does not show it.
+        vent_uncertainty: (2,) standard deviations of the two.
     """
 
     fill_lag: float
@@ -42,10 +54,16 @@ class AirFit:
     offset: Array
     residual: float
     uncertainty: Array
+    vent_rate: float = float("nan")
+    vent_exponent: float = float("nan")
+    vent_uncertainty: Array = field(default_factory=lambda: np.full(2, np.nan))
 
 
 def fit_air(log: CalibrationLog, period: float) -> AirFit:
-    """Fit the chambers' lag to a log on a regular grid of ``period`` [s].
+    """Fit the chambers' lag and venting to a log on a regular grid of ``period`` [s].
+
+    The law is that of `der_planner.planning.pneumatics`. A log whose chambers always follow their
+    commands shows the lag alone; venting is then left open.
 
     Raises:
         LogError: the commands hold no smooth motion, or pressures were not measured.
@@ -55,57 +73,98 @@ def fit_air(log: CalibrationLog, period: float) -> AirFit:
     rest = measured[: vented.size][vented]
     offset = np.nanmean(rest, axis=0) if len(rest) else np.zeros(command.shape[1])
     offset = np.nan_to_num(offset)
-    rows = _smooth_rows(command, period) & np.isfinite(measured)
-    rows &= np.abs(measured - offset) > 0.0
+    known = np.isfinite(measured) & (np.abs(measured - offset) > 0.0)
+    smooth = known & _after_no_step(command, period)
     moving = np.abs(np.gradient(command, period, axis=0)) > 200.0
-    if np.count_nonzero(rows & moving) < 3.0 / period:
+    if np.count_nonzero(smooth & moving) < 3.0 / period:
         raise LogError(
             "the commands hold less than 3 s of smooth motion: the chambers' lag cannot be told; "
             "record the calibration run, or a plan"
         )
+    falling = known & _after_no_step(np.abs(command), period, rising=True)
+    found = _solve(command, measured - offset, falling, period, len(_START))
+    if not _shown(found):
+        found = _solve(command, measured - offset, smooth, period, 3)
+    venting = found.x.size > 3
+    return AirFit(
+        fill_lag=float(found.x[0]),
+        vent_lag=float(found.x[1]),
+        delay=float(found.x[2]),
+        fill_rate=_fill_rate(command, measured, period),
+        offset=offset,
+        residual=found.spread,
+        uncertainty=found.deviation[:3],
+        vent_rate=float(found.x[3]) if venting else float("nan"),
+        vent_exponent=float(found.x[4]) if venting else float("nan"),
+        vent_uncertainty=found.deviation[3:] if venting else np.full(2, np.nan),
+    )
+
+
+@dataclass(frozen=True)
+class _Solution:
+    x: Array
+    deviation: Array
+    spread: float
+
+
+def _solve(
+    command: Array, measured: Array, rows: NDArray[np.bool_], period: float, count: int
+) -> _Solution:
+    """Fit the first ``count`` of lags, dead time, vent rate and exponent to rows of a log."""
 
     def residual(x: Array) -> Array:
-        air = replace(
-            Limb.default().pneumatics,
-            time_constant=x[0],
-            vent_time_constant=x[1],
-            delay=x[2],
-        )
-        middle = chamber_pressures(air, command, period, 2)[:, 0]
-        # The middle of the first half period is a quarter of a period after the instant.
-        instants = np.arange(len(command)) * period
-        predicted = np.stack(
-            [np.interp(instants, instants + 0.25 * period, column) for column in middle.T], axis=1
-        )
-        difference: Array = (predicted + offset - measured)[rows]
+        difference: Array = (predict_air(_air(x), command, period) - measured)[rows]
         return difference
+
+    def jacobian(x: Array) -> Array:
+        # Steps of their own size: a dead time of nearly zero would get none from a relative one.
+        base = residual(x)
+        moved = [residual(x + step) for step in np.diag(_STEP[:count])]
+        slopes: Array = (np.stack(moved, axis=1) - base[:, None]) / np.asarray(_STEP[:count])
+        return slopes
 
     solution = least_squares(
         residual,
-        (0.2, 0.2, 0.05),
-        bounds=(_LOWEST, _HIGHEST),
+        _START[:count],
+        jac=jacobian,
+        bounds=(_LOWEST[:count], _HIGHEST[:count]),
         loss="soft_l1",
         f_scale=50.0,
-        x_scale=(0.1, 0.1, 0.1),
-        diff_step=(1e-2, 1e-2, 1e-2),
+        x_scale=_SCALE[:count],
     )
-    remaining = residual(solution.x)
-    spread = float(np.sqrt(np.mean(remaining**2)))
-    jacobian = np.asarray(solution.jac)
-    covariance = np.linalg.pinv(jacobian.T @ jacobian) * spread**2 / period
-    return AirFit(
-        fill_lag=float(solution.x[0]),
-        vent_lag=float(solution.x[1]),
-        delay=float(solution.x[2]),
-        fill_rate=_fill_rate(command, measured, period),
-        offset=offset,
-        residual=spread,
-        uncertainty=np.sqrt(np.diag(covariance)),
-    )
+    spread = float(np.sqrt(np.mean(residual(solution.x) ** 2)))
+    scale = np.asarray(_SCALE[:count])
+    # In units of their own: the pseudo-inverse would take seconds beside pascals for nothing.
+    slopes = jacobian(solution.x) * scale
+    covariance = np.linalg.pinv(slopes.T @ slopes, hermitian=True) * spread**2 / period
+    return _Solution(np.asarray(solution.x), np.sqrt(np.diag(covariance)) * scale, spread)
 
 
-def _smooth_rows(command: Array, period: float) -> NDArray[np.bool_]:
-    jump = np.abs(np.diff(command, axis=0, prepend=command[:1])) > SMOOTH_RATE * period
+def _air(x: Array) -> Pneumatics:
+    """Return the law for lags, dead time and, if they are there, vent rate and exponent."""
+    values = dict(zip(_NAMES, (float(value) for value in x), strict=False))
+    return replace(Limb.default().pneumatics, **{"vent_rate": 0.0, **values})
+
+
+def _shown(solution: _Solution) -> bool:
+    """Tell whether a log shows how fast chambers are vented: known well, and inside its bounds."""
+    rate, deviation = solution.x[3], solution.deviation[3]
+    return bool(0.0 < deviation < SHOWN * rate and _LOWEST[3] < 0.9 * rate < 0.8 * _HIGHEST[3])
+
+
+def predict_air(air: Pneumatics, command: Array, period: float) -> Array:
+    """Return differential pressures (K, M) [Pa] at the instants of held commands (K, M) [Pa]."""
+    middle = chamber_pressures(air, command, period, _SUBSTEPS)[:, 0]
+    # The middle of the first substep comes half a substep after the instant.
+    instants = np.arange(len(command)) * period
+    late = instants + 0.5 * period / _SUBSTEPS
+    return np.stack([np.interp(instants, late, column) for column in middle.T], axis=1)
+
+
+def _after_no_step(command: Array, period: float, rising: bool = False) -> NDArray[np.bool_]:
+    """Tell rows (K, M) with no step just before them; ``rising`` counts only steps up."""
+    change = np.diff(command, axis=0, prepend=command[:1])
+    jump = (change if rising else np.abs(change)) > SMOOTH_RATE * period
     count = round(STEP_MEMORY / period)
     recent = np.cumsum(jump, axis=0)
     before = np.concatenate([np.zeros((count, command.shape[1])), recent])[: len(recent)]

@@ -37,7 +37,7 @@ ANGLE_ERROR = np.deg2rad(0.3)
 """Error of a predicted bend angle that is taken for granted [rad]; the residual replaces it."""
 CORRELATION = 20.0
 """Rows over which an error of the model stays the same (1 s)."""
-MOST_EVALUATIONS = 10
+MOST_EVALUATIONS = 25
 """Of model and derivatives; what still moves by then moves less than its uncertainty."""
 STRONG = 0.9
 """|correlation| above which two unknowns are said to be told only together."""
@@ -160,6 +160,7 @@ class _Problem:
             xtol=1e-3,
             ftol=1e-4,
             max_nfev=MOST_EVALUATIONS,
+            x_scale="jac",
         )
         values = self._values(solution.x)
         return values, self._jacobian(solution.x)
@@ -293,6 +294,10 @@ def _finish(
             delay=air.delay,
             fill_rate=air.fill_rate if np.isfinite(air.fill_rate) else pneumatics.fill_rate,
         )
+        if np.isfinite(air.vent_rate):
+            pneumatics = replace(
+                pneumatics, vent_rate=air.vent_rate, vent_exponent=air.vent_exponent
+            )
     rows = prepared.usable
     error = np.degrees(np.sqrt(np.nanmean(remaining**2, axis=0)))
     return replace(

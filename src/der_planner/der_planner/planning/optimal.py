@@ -31,7 +31,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from der_planner import actuation
 from der_planner.limb import Limb
-from der_planner.planning import pneumatics
+from der_planner.planning import chambers, pneumatics
 from der_planner.planning.motions import CONTROL_PERIOD, Reference, sample_spline
 from der_planner.planning.quadratic import Band, solve_limited
 from der_planner.planning.rod_model import RodModel
@@ -47,6 +47,9 @@ class Settings:
     Attributes:
         smoothness: √λ, tip error that a unit second difference is worth [m/Pa].
         nearness: √μ, tip error that a unit deviation from the warm start is worth [m/Pa].
+        nearness_vented: the same for a limb whose chambers are vented slowly [m/Pa]: close to the
+            straight pose the tip hardly tells the segments apart, and what one of them is asked
+            for in vain must not be taken from the other.
         window: setpoints that are solved together.
         settled: setpoints of a window that are kept; the rest is solved again.
         iterations: Gauss-Newton steps a window at most.
@@ -57,6 +60,7 @@ class Settings:
 
     smoothness: float = 2e-7
     nearness: float = 1e-8
+    nearness_vented: float = 3e-7
     window: int = 100
     settled: int = 75
     iterations: int = 6
@@ -82,11 +86,12 @@ class Actuation:
         self.substeps = substeps
         self.initial = initial
         slowest = max(self.air.time_constant, self.air.vent_time_constant)
-        self._remembered = int(np.ceil((self.air.delay + 25 * slowest) / CONTROL_PERIOD))
+        memory = self.air.delay + 25 * slowest + chambers.vent_memory(self.air)
+        self._remembered = int(np.ceil(memory / CONTROL_PERIOD))
         middle = (np.arange(count * substeps, dtype=np.float64) + 0.5) * (CONTROL_PERIOD / substeps)
         bend = sample_spline(spline, middle)[0]
-        memory = actuation.memory_pressures(limb, middle, bend)
-        self._memory = memory.reshape(count, substeps, -1)
+        taken = actuation.memory_pressures(limb, middle, bend)
+        self._memory = taken.reshape(count, substeps, -1)
         self._limb = limb
 
     def effective(self, command: Vector, first: int) -> tuple[Vector, Vector]:
@@ -96,14 +101,28 @@ class Actuation:
             command: (first + W, M) commands from the beginning [Pa].
             first: of the window.
         """
+        response, _, begin = self._respond(command, first)
+        pressure = response.pressure.reshape(-1, self.substeps, command.shape[1])
+        held = pressure[first - begin :]
+        memory = self._memory[first : len(command)]
+        effective, slope = actuation.without_memory(self._limb, held, memory)
+        return effective, slope.mean(axis=1)
+
+    def _respond(self, command: Vector, first: int) -> tuple[chambers.Response, Vector, int]:
+        """Return what chambers do from a setpoint on that no longer matters, from which, and it."""
         begin = max(0, first - self._remembered)
         before = command[begin - 1] if begin else self.initial
-        chambers = pneumatics.chamber_pressures(
+        response = chambers.respond(
             self.air, command[begin:], CONTROL_PERIOD, self.substeps, before
-        )[first - begin :]
-        memory = self._memory[first : len(command)]
-        effective, slope = actuation.without_memory(self._limb, chambers, memory)
-        return effective, slope.mean(axis=1)
+        )
+        return response, before, begin
+
+    def spread(self, command: Vector, first: int) -> Vector:
+        """Return ∂(mean chamber pressure of a period)/∂command (W, W, M) of a window."""
+        response, before, begin = self._respond(command, first)
+        return chambers.sensitivity(
+            self.air, response, before, CONTROL_PERIOD, self.substeps, first - begin
+        )
 
     def pulse(self, inputs: int) -> Vector:
         """Return the chamber pressure (R, M) in the steps after one setpoint is raised by 1 Pa."""
@@ -178,6 +197,8 @@ class Optimiser:
     ) -> None:
         self.model = model
         self.settings = settings or Settings()
+        vented = model.limb.pneumatics.vent_rate > 0
+        self.nearness = self.settings.nearness_vented if vented else self.settings.nearness
         self.target = np.concatenate([reference.tip[1:], reference.tip[-1:]])
         self.warm = warm
         count, inputs = warm.shape
@@ -265,12 +286,19 @@ class Optimiser:
         )
         if motion.linearisation is None:
             raise AssertionError("a linearised motion has a linearisation")
-        sensitivity = motion.linearisation.sensitivity(self._pulse)[1:, :2] * slope
+        if self.actuation.air.vent_rate > 0:
+            # Where an outlet holds a chamber up, its command moves nothing: no two pulses alike.
+            held = motion.linearisation.sensitivity()[1:, :2] * slope
+            spread = self.actuation.spread(command[:last], first)
+            products = np.moveaxis(held, 3, 0) @ np.moveaxis(spread, 2, 0)[:, None]
+            sensitivity = np.moveaxis(products, 0, 3)
+        else:
+            sensitivity = motion.linearisation.sensitivity(self._pulse)[1:, :2] * slope
         size, inputs = last - first, command.shape[1]
         J = sensitivity.reshape(2 * size, size * inputs)
         second = _second_difference(size)
         weight = self.settings.smoothness**2 * second.T @ second
-        weight[np.diag_indices(size)] += self.settings.nearness**2 + damping**2
+        weight[np.diag_indices(size)] += self.nearness**2 + damping**2
         return Quadratic(J, J.T @ J + np.kron(weight, np.eye(inputs)))
 
     def _deviation(self, command: Vector, first: int, last: int) -> Vector:
@@ -283,7 +311,7 @@ class Optimiser:
     def _roughness(self, command: Vector, first: int, last: int) -> float:
         deviation = self._deviation(command, first, last)
         bends = np.diff(deviation, 2, axis=0)
-        smooth, near = self.settings.smoothness, self.settings.nearness
+        smooth, near = self.settings.smoothness, self.nearness
         return float(smooth**2 * (bends**2).sum() + near**2 * (deviation[2:] ** 2).sum())
 
     def _pull(self, command: Vector, first: int, last: int) -> Vector:
@@ -291,7 +319,7 @@ class Optimiser:
         deviation = self._deviation(command, first, last)
         second = _second_difference(last - first)
         rough = self.settings.smoothness**2 * second.T @ np.diff(deviation, 2, axis=0)
-        pull: Vector = rough + self.settings.nearness**2 * deviation[2:]
+        pull: Vector = rough + self.nearness**2 * deviation[2:]
         return pull.ravel()
 
     def _band(self, command: Vector, first: int, last: int) -> Band:

@@ -36,6 +36,8 @@ _STRAIGHT = 1e-3
 """A limb that rests within this bend [rad] of straight starts there."""
 _NOTABLE_CUT = 20.0
 """Cuts by limits are worth a warning from here on [Pa]."""
+_NOTABLE_OPPOSITE = 1000.0
+"""So much pressure in the opposite chamber, to make up for slow venting, is worth one [Pa]."""
 _NOTABLE_ERROR = 5e-4
 """What the limits leave is worth a warning from here on [m]."""
 
@@ -123,19 +125,20 @@ def _solve(
 ) -> _Solved:
     """Return commands that keep the limits, and what the model expects of them."""
     air = physics.limb.pneumatics
-    if method == "optimal" and isinstance(physics, RodModel):
-        wanted = feedforward(physics, spline, reference, "projected")
+    optimal = method == "optimal" and isinstance(physics, RodModel)
+    time, effective, bend = balance(physics, spline, reference, "projected" if optimal else method)
+    wanted = pneumatics.commands(physics.limb, time, effective, bend, CONTROL_PERIOD)
+    if optimal and isinstance(physics, RodModel):
         solver = Optimiser(physics, spline, reference, wanted, SUBSTEPS)
         # Matrices of a few hundred rows: more threads only get into other processes' way.
         with _THREADS.limit(limits=1, user_api="blas"):
             outcome = solver.run(lambda share: report(0.4 + 0.6 * share))
         commands, tip, said = outcome.commands, outcome.tip, ""
-        missed = float(np.linalg.norm(tip - reference.tip, axis=1).mean())
+        missed = _mean_distance(tip, reference)
         if outcome.limited and missed > _NOTABLE_ERROR:
             said = f"the limits leave a mean error of {missed * 1000:.1f} mm on the model itself"
         details: dict[str, float] = {"steps": outcome.steps, "limited_windows": outcome.limited}
     else:
-        wanted = feedforward(physics, spline, reference, method)
         before = None if reference.start is None else reference.start.pressure
         commands, cut = pneumatics.within_limits(wanted, air, CONTROL_PERIOD, before)
         tip = predict(physics, spline, commands, reference.start)
@@ -143,7 +146,10 @@ def _solve(
             f"limits cut the wanted pressures by up to {cut:.0f} Pa" if cut > _NOTABLE_CUT else ""
         )
         details = {}
-    warnings = [f"{said}: {_excess(physics.limb, wanted)}"] if said else []
+    slow = pneumatics.slow_venting(physics.limb, time, effective, bend)
+    warnings = _vent_warnings(slow, _mean_distance(tip, reference))
+    if said and not (optimal and warnings):
+        warnings.insert(0, f"{said}: {_excess(physics.limb, wanted)}")
     return _Solved(commands, tip, warnings, details)
 
 
@@ -176,13 +182,20 @@ def feedforward(
     physics: PlanningModel, spline: BSpline, reference: Reference, method: str
 ) -> Vector:
     """Return the commands (K, M) [Pa] that a balance of forces asks for, before any limit."""
+    time, effective, bend = balance(physics, spline, reference, method)
+    return pneumatics.commands(physics.limb, time, effective, bend, CONTROL_PERIOD)
+
+
+def balance(
+    physics: PlanningModel, spline: BSpline, reference: Reference, method: str
+) -> tuple[Vector, Vector, Vector]:
+    """Return instants (F,) [s], wanted effective pressures (F, M) [Pa] and bend angles (F, M)."""
     ahead = CONTROL_PERIOD + physics.limb.pneumatics.delay
     count = int(np.ceil((reference.duration + ahead) / CONTROL_PERIOD * _FINE - 1e-6)) + 1
     fine = np.arange(count, dtype=np.float64) * (CONTROL_PERIOD / _FINE)
     fine[-1] = reference.duration + ahead
     effective = physics.pressures(method, spline, fine)
-    bend = sample_spline(spline, fine)[0]
-    return pneumatics.commands(physics.limb, fine, effective, bend, CONTROL_PERIOD)
+    return fine, effective, sample_spline(spline, fine)[0]
 
 
 def predict(
@@ -215,6 +228,22 @@ def _calibration_warnings(limb: Limb, bend: Vector) -> list[str]:
             f"its calibration covered {np.degrees(seen[j]):.0f}"
         )
     return said
+
+
+def _mean_distance(tip: Vector, reference: Reference) -> float:
+    return float(np.linalg.norm(tip - reference.tip, axis=1).mean())
+
+
+def _vent_warnings(slow: pneumatics.SlowVenting | None, missed: float) -> list[str]:
+    if slow is None or slow.opposite < _NOTABLE_OPPOSITE:
+        return []
+    left = f", which leaves {missed * 1000:.1f} mm of mean error on the model itself"
+    return [
+        f"pressure {slow.index} should fall by {slow.wanted:.0f} Pa/s at {slow.time:.1f} s, where "
+        f"its chamber is vented by {slow.possible:.0f} Pa/s: the opposite chamber is filled by up "
+        f"to {slow.opposite:.0f} Pa to make up for it{left if missed > _NOTABLE_ERROR else ''}; "
+        "a longer period or a smaller amplitude needs less"
+    ]
 
 
 def _excess(limb: Limb, wanted: Vector) -> str:

@@ -1,28 +1,38 @@
 """What lies between a command and the pressure that the linear model feels, as the planners see it.
 
-A command is held for one control period. The chambers follow it after a dead time with a
-first-order lag, one time constant while |pressure| rises and another while it falls. What they
+A command is held for one control period; the chambers follow it as `der_planner.planning.chambers`
+says. The differential pressure is one chamber's less the other's, so that a chamber that its outlet
+leaves behind can be made up for: a command of the other sign fills its neighbour. What the chambers
 hold becomes the *effective* pressure of `der_planner.actuation`: unequal chambers, stiffening,
 friction and creep along a known bend.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from der_planner import actuation
-from der_planner.limb import Limb, Pneumatics
+from der_planner.limb import VENT_REFERENCE, Limb, Pneumatics
+from der_planner.planning.chambers import respond, vent_speed, vented
 
 Vector = NDArray[np.float64]
+
+
+_SHARES_BEFORE = (0.0, 0.2, 0.4, 0.6, 0.8)
+"""Shares of a ramp that may come before the jump that it replaces."""
 
 
 def commands(limb: Limb, time: Vector, effective: Vector, bend: Vector, period: float) -> Vector:
     """Return the commands (K, M) [Pa] that make the limb feel effective pressures.
 
-    The inverse of hold, dead time and lag: what is wanted in the middle of a held period, led by
-    the lag.
+    The inverse of hold, dead time, lag and venting: what is wanted in the middle of a held period,
+    led by the lag. Where a chamber cannot fall as fast, its neighbour is filled by the difference;
+    on the way from one chamber to the other the command may do as it likes, since neither listens:
+    it takes its slew limit evenly before and after the jump.
 
     Args:
         limb: calibrated limb.
@@ -32,14 +42,127 @@ def commands(limb: Limb, time: Vector, effective: Vector, bend: Vector, period: 
         period: of the commands [s].
     """
     pressure = actuation.differential_pressure(limb, time, effective, bend)
-    slope = np.gradient(pressure, time, axis=0)
     air = limb.pneumatics
-    vent = air.vent_time_constant or air.time_constant
-    lag = np.where(pressure * slope >= 0, air.time_constant, vent)
-    led = pressure + lag * slope
+    fill, vent = air.time_constant, air.vent_time_constant or air.time_constant
+    if air.vent_rate > 0:
+        chambers, second = _hold_pairs(
+            np.ascontiguousarray(pressure), np.diff(time), vent, vent_speed(air), air.vent_exponent
+        )
+        slope = np.gradient(chambers, time, axis=1)
+        pair = np.maximum(chambers + np.where(slope >= 0, fill, vent) * slope, 0.0)
+        led = np.where(second, -pair[1], pair[0])
+    else:
+        slope = np.gradient(pressure, time, axis=0)
+        led = pressure + np.where(pressure * slope >= 0, fill, vent) * slope
     last = time[-1] - period - air.delay
     instants = np.arange(round(last / period) + 1) * period + period / 2 + air.delay
-    return np.column_stack([np.interp(instants, time, column) for column in led.T])
+    wanted = np.column_stack([np.interp(instants, time, column) for column in led.T])
+    return _drawn_out(air, wanted, period, time, pressure) if air.vent_rate > 0 else wanted
+
+
+def _drawn_out(
+    air: Pneumatics, command: Vector, period: float, time: Vector, pressure: Vector
+) -> Vector:
+    """Return commands (K, M) [Pa] within the slew limit that bring the wanted pressures about best.
+
+    A jump becomes a ramp, and how much of the ramp comes before the jump is tried out on the air.
+    """
+    instants = (np.arange(len(command)) + 0.5) * period
+    wanted = np.column_stack([np.interp(instants, time, column) for column in pressure.T])
+    step = air.slew_limit * period
+    best, least = command, np.full(command.shape[1], np.inf)
+    for share in _SHARES_BEFORE:
+        ramps = _limit_slew(_advanced(command, step, share), np.zeros(command.shape[1]), step)
+        held = chamber_pressures(air, ramps, period, 2, pressure[0]).mean(axis=1)
+        missed = ((held - wanted) ** 2).sum(axis=0)
+        best, least = np.where(missed < least, ramps, best), np.minimum(missed, least)
+    return best
+
+
+@njit(cache=True, nogil=True)
+def _advanced(command: Vector, step: float, share: float) -> Vector:
+    """Return commands whose jumps come earlier by a share of the ramp that they will become."""
+    result = command.copy()
+    for m in range(command.shape[1]):
+        for k in range(1, command.shape[0]):
+            jump = command[k, m] - command[k - 1, m]
+            if abs(jump) > 2.0 * step:
+                begin = max(0, k - int(share * abs(jump) / step))
+                result[begin:k, m] = command[k, m]
+    return result
+
+
+@dataclass(frozen=True)
+class SlowVenting:
+    """Where a motion wants one pressure to fall faster than its chamber is vented.
+
+    Attributes:
+        index: of the pressure.
+        time: when it falls fastest beyond the chamber's own fall [s].
+        wanted: rate at which it should fall then [Pa/s].
+        possible: rate at which the chamber falls then [Pa/s].
+        opposite: the most that the opposite chamber has to hold against the slow one [Pa].
+    """
+
+    index: int
+    time: float
+    wanted: float
+    possible: float
+    opposite: float
+
+
+def slow_venting(limb: Limb, time: Vector, effective: Vector, bend: Vector) -> SlowVenting | None:
+    """Return the worst of the pressures that should fall too fast, None if outlets never matter.
+
+    Args:
+        limb: calibrated limb.
+        time: (F,) rising instants [s].
+        effective: (F, M) wanted effective pressures [Pa].
+        bend: (F, M) bend angles along the motion [rad].
+    """
+    air = limb.pneumatics
+    if air.vent_rate == 0:
+        return None
+    pressure = actuation.differential_pressure(limb, time, effective, bend)
+    vent = air.vent_time_constant or air.time_constant
+    chambers, _ = _hold_pairs(
+        np.ascontiguousarray(pressure), np.diff(time), vent, vent_speed(air), air.vent_exponent
+    )
+    both = np.minimum(chambers[0], chambers[1])
+    j = int(np.argmax(both.max(axis=0)))
+    fall = -np.gradient(np.abs(pressure[:, j]), time)
+    held = np.maximum(chambers[0, :, j], chambers[1, :, j])
+    possible = air.vent_rate * (held / VENT_REFERENCE) ** air.vent_exponent
+    k = int(np.argmax(fall - possible))
+    return SlowVenting(
+        j, float(time[k]), float(fall[k]), float(possible[k]), float(both[:, j].max())
+    )
+
+
+@njit(cache=True, nogil=True)
+def _hold_pairs(
+    wanted: Vector, steps: Vector, vent: float, rate: float, exponent: float
+) -> tuple[Vector, NDArray[np.bool_]]:
+    """Return the least pressures (2, F, M) of the chambers whose difference is wanted.
+
+    Also which chamber the command has to fill (F, M): the second, or the first.
+    """
+    count, inputs = wanted.shape
+    chambers = np.empty((2, count, inputs))
+    second = np.zeros((count, inputs), dtype=np.bool_)
+    for m in range(inputs):
+        left, right = max(wanted[0, m], 0.0), max(-wanted[0, m], 0.0)
+        for k in range(count):
+            if k > 0:
+                h = steps[k - 1]
+                keep = np.exp(-h / vent)
+                left = max(keep * left, vented(left, rate * h, exponent))
+                right = max(keep * right, vented(right, rate * h, exponent))
+            gap = wanted[k, m] + right - left
+            second[k, m] = gap < 0.0
+            left, right = left + max(gap, 0.0), right + max(-gap, 0.0)
+            chambers[0, k, m], chambers[1, k, m] = left, right
+    return chambers, second
 
 
 def chamber_pressures(
@@ -52,38 +175,15 @@ def chamber_pressures(
     """Return the chambers' differential pressures (K, S, M) [Pa] in the middle of each substep.
 
     Args:
-        air: lag and dead time.
+        air: lag, dead time and venting.
         command: (K, M) [Pa], each held for ``period`` [s].
         period: [s].
         substeps: S.
         initial: (M,) pressure at the first command, and the command before it; vented if None.
     """
-    commands_ = np.ascontiguousarray(command, dtype=float)
-    start = np.zeros(commands_.shape[1]) if initial is None else np.array(initial, dtype=float)
-    delay = air.delay / period * substeps
-    held = np.repeat(commands_, substeps, axis=0)
-    if delay > 0:
-        whole, part = int(delay), delay - int(delay)
-        padded = np.concatenate([np.tile(start, (whole + 1, 1)), held])
-        held = (1 - part) * padded[1 : len(held) + 1] + part * padded[: len(held)]
-    vent = air.vent_time_constant or air.time_constant
-    pressure = _lag(held, start, period / substeps, air.time_constant, vent)
-    shaped: Vector = pressure.reshape(len(commands_), substeps, commands_.shape[1])
+    response = respond(air, command, period, substeps, initial)
+    shaped: Vector = response.pressure.reshape(-1, substeps, response.pressure.shape[1])
     return shaped
-
-
-@njit(cache=True, nogil=True)
-def _lag(command: Vector, start: Vector, h: float, fill: float, vent: float) -> Vector:
-    result = np.empty_like(command)
-    for m in range(command.shape[1]):
-        state = start[m]
-        for k in range(command.shape[0]):
-            goal = command[k, m]
-            falling = abs(goal) < abs(state) and goal * state >= 0
-            tau = vent if falling else fill
-            result[k, m] = goal + (state - goal) * np.exp(-0.5 * h / tau)
-            state = goal + (state - goal) * np.exp(-h / tau)
-    return result
 
 
 def within_limits(
