@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 
 from der_planner.identification import CalibrationLog, LogError, check, fit, predict
-from der_planner.identification.air import fit_air
 from der_planner.identification.excitation import calibration_run, steps, sweep, waves
 from der_planner.identification.geometry import fit_geometry, with_geometry
 from der_planner.identification.parameters import TERMS, exists, put, start_values
 from der_planner.identification.prediction import RodPrediction
 from der_planner.limb import Limb
 from der_planner.planning.kinematics import PolylineKinematics
-from der_planner.planning.pneumatics import chamber_pressures
 from der_planner.rod import Rod
 
 NOISE = np.deg2rad(0.1)
@@ -138,38 +136,6 @@ def test_a_limb_that_fits_passes_the_check_and_a_changed_one_does_not(fitted):
     assert not verdict.fits
     assert any("gain of segment 0" in finding for finding in verdict.findings)
     assert not any("gain of segment 1" in finding for finding in verdict.findings)
-
-
-def test_lag_of_the_air_is_recovered():
-    limb = Limb.default()
-    air = replace(limb.pneumatics, time_constant=0.32, vent_time_constant=0.14, delay=0.0)
-    command = waves(12_000.0, 2, 60.0)
-    held = chamber_pressures(air, command, 0.05, 4)
-    middle = (np.arange(4) + 0.5) / 4 * 0.05
-    fine = (0.05 * np.arange(len(command))[:, None] + middle).ravel()
-    grid = 0.05 * np.arange(len(command))
-    measured = np.stack([np.interp(grid, fine, held[:, :, j].ravel()) for j in range(2)], 1) + 7.0
-    zeros = np.zeros((len(grid), 2))
-    found = fit_air(CalibrationLog(grid, command, measured, zeros, zeros), 0.05)
-    assert found.fill_lag + found.delay == pytest.approx(0.32, abs=0.02)
-    assert found.vent_lag + found.delay == pytest.approx(0.14, abs=0.02)
-    np.testing.assert_allclose(found.offset, 7.0, atol=3.0)
-
-
-def test_a_run_that_moves_one_segment_can_be_checked(fitted):
-    limb, _ = fitted
-    time = 0.05 * np.arange(600)
-    pressure = 6000.0 * np.stack([np.sin(time / 3), np.zeros_like(time)], axis=1)
-    truth = predict(hidden_limb(), time, pressure)
-    log = CalibrationLog(time, pressure, pressure, truth.bend_angles, truth.tip)
-    with pytest.raises(LogError, match="input 1 was not excited"):
-        fit(limb, log)
-    verdict = check(limb, log)
-    assert verdict.fits
-    assert np.isnan(verdict.gain_change[1])
-    assert abs(verdict.gain_change[0]) < 0.05
-    assert any("segment 1 hardly moved" in finding for finding in verdict.findings)
-    assert "not shown" in verdict.text()
 
 
 def test_lengths_are_recovered_from_tips():

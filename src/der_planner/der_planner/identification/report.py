@@ -122,17 +122,17 @@ class FitReport:
         # A run without fast steps never shows how fast a chamber fills.
         seen = np.isfinite(air.fill_rate)
         rate = f"{air.fill_rate:.0f} Pa/s" if seen else "not shown by this run, kept"
-        venting = "not shown by this run, kept"
+        venting = "how slowly chambers are venting: not shown by this run, kept"
         if math.isfinite(air.vent_rate):
             speed, exponent = air.vent_uncertainty
             venting = (
-                f"{air.vent_rate:.0f} ± {speed:.0f} Pa/s at 10 kPa, with the pressure to the power "
-                f"{air.vent_exponent:.2f} ± {exponent:.2f}"
+                f"a vented chamber falls by at most {air.vent_rate:.0f} ± {speed:.0f} Pa/s at "
+                f"10 kPa, with the pressure to the power {air.vent_exponent:.2f} ± {exponent:.2f}"
             )
         return [
             f"air: lag {air.fill_lag:.3f} s filling, {air.vent_lag:.3f} s venting, dead time "
             f"{air.delay:.3f} s, fill rate {rate}, residual {air.residual:.0f} Pa",
-            f"air: a vented chamber falls by at most {venting}",
+            f"air: {venting}",
         ]
 
     def _geometry_lines(self) -> list[str]:

@@ -21,7 +21,6 @@ from der_planner.planning.chambers import respond, vent_speed, vented
 
 Vector = NDArray[np.float64]
 
-
 _SHARES_BEFORE = (0.0, 0.2, 0.4, 0.6, 0.8)
 """Shares of a ramp that may come before the jump that it replaces."""
 
@@ -32,7 +31,7 @@ def commands(limb: Limb, time: Vector, effective: Vector, bend: Vector, period: 
     The inverse of hold, dead time, lag and venting: what is wanted in the middle of a held period,
     led by the lag. Where a chamber cannot fall as fast, its neighbour is filled by the difference;
     on the way from one chamber to the other the command may do as it likes, since neither listens:
-    it takes its slew limit evenly before and after the jump.
+    a jump becomes a ramp at the slew limit that begins ahead of it.
 
     Args:
         limb: calibrated limb.
@@ -72,7 +71,7 @@ def _drawn_out(
     step = air.slew_limit * period
     best, least = command, np.full(command.shape[1], np.inf)
     for share in _SHARES_BEFORE:
-        ramps = _limit_slew(_advanced(command, step, share), np.zeros(command.shape[1]), step)
+        ramps = _limit_slew(_advanced(command, step, share), command[0], step)
         held = chamber_pressures(air, ramps, period, 2, pressure[0]).mean(axis=1)
         missed = ((held - wanted) ** 2).sum(axis=0)
         best, least = np.where(missed < least, ramps, best), np.minimum(missed, least)

@@ -1,0 +1,125 @@
+"""The chambers' law from logs: known ones, and the emulated board, which has another."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from der_planner.identification import CalibrationLog
+from der_planner.identification.air import AirFit, fit_air, predict_air
+from der_planner.identification.excitation import PERIOD, calibration_run, steps, waves
+from der_planner.identification.report import FitReport
+from der_planner.limb import Limb, Pneumatics
+from der_planner.planning.pneumatics import chamber_pressures
+from der_planner.twin.offline import split
+from pressure_driver.emulator import pneumatics as emulator
+
+AIR = replace(Limb.default().pneumatics, time_constant=0.3, vent_time_constant=0.12, delay=0.04)
+
+
+def log_of(command: np.ndarray, measured: np.ndarray) -> CalibrationLog:
+    blind = np.zeros_like(command)
+    time = PERIOD * np.arange(len(command))
+    return CalibrationLog(time, command, measured, blind, np.zeros((len(time), 2)))
+
+
+def synthetic_log(air: Pneumatics, command: np.ndarray, noise: float = 5.0) -> CalibrationLog:
+    """Pressures at the instants of the commands, by substeps ten times finer than the fit's."""
+    held = chamber_pressures(air, command, PERIOD, 20)
+    before = np.concatenate([np.zeros((1, command.shape[1])), held[:-1, -1]])
+    measured = 0.5 * (before + held[:, 0])
+    return log_of(command, measured + noise * np.random.default_rng(0).normal(size=command.shape))
+
+
+def emulated_log(seed: int, command: np.ndarray) -> CalibrationLog:
+    board = emulator.Pneumatics(command.shape[1], seed)
+    measured = np.empty_like(command)
+    for k, setpoint in enumerate(command):
+        pressure = board.pressure
+        measured[k] = pressure[0::2] - pressure[1::2]
+        board.command(board.atmosphere + split(setpoint))
+        board.step(PERIOD)
+    return log_of(command, measured)
+
+
+def law(found: AirFit) -> Pneumatics:
+    values = {"vent_rate": found.vent_rate, "vent_exponent": found.vent_exponent}
+    return replace(
+        Limb.default().pneumatics,
+        time_constant=found.fill_lag,
+        vent_time_constant=found.vent_lag,
+        delay=found.delay,
+        **(values if np.isfinite(found.vent_rate) else {}),
+    )
+
+
+def test_lag_of_the_air_is_recovered():
+    air = replace(AIR, time_constant=0.32, vent_time_constant=0.14, delay=0.0)
+    command = waves(12_000.0, 2, 60.0)
+    log = synthetic_log(air, command, noise=0.0)
+    found = fit_air(replace(log, measured_differential=log.measured_differential + 7.0), PERIOD)
+    assert found.fill_lag + found.delay == pytest.approx(0.32, abs=0.02)
+    assert found.vent_lag + found.delay == pytest.approx(0.14, abs=0.02)
+    np.testing.assert_allclose(found.offset, 7.0, atol=3.0)
+    assert np.isnan(found.vent_rate), "no outlet held a chamber up"
+
+
+@pytest.mark.parametrize(("rate", "exponent"), [(4200.0, 0.55), (5300.0, 2 / 3), (6500.0, 0.9)])
+def test_law_of_venting_is_recovered_within_its_uncertainty(rate, exponent):
+    air = replace(AIR, vent_rate=rate, vent_exponent=exponent)
+    command = np.concatenate([waves(14_000.0, 2, 40.0), steps(7_000.0)])
+    found = fit_air(synthetic_log(air, command), PERIOD)
+    of_rate, of_exponent = found.vent_uncertainty
+    assert abs(found.vent_rate - rate) < 4 * of_rate + 0.01 * rate
+    assert abs(found.vent_exponent - exponent) < 4 * of_exponent + 0.01
+    assert of_rate < 0.02 * rate
+    assert found.fill_lag + found.delay == pytest.approx(0.34, abs=0.02)
+
+
+def test_a_log_that_never_waits_for_an_outlet_leaves_venting_open():
+    air = replace(AIR, vent_rate=5300.0)
+    slow = waves(1_500.0, 2, 300.0)
+    found = fit_air(synthetic_log(air, slow), PERIOD)
+    assert np.isnan(found.vent_rate)
+    assert np.isnan(found.vent_exponent)
+    assert found.fill_lag + found.delay == pytest.approx(0.34, abs=0.1)
+
+
+@pytest.mark.parametrize("quick", [True, False])
+def test_a_vented_step_of_the_emulated_board_is_predicted(quick):
+    """Whose law has chambers of their own, dead bands and coupled neighbours besides."""
+    amplitude = 0.7 * Limb.default().pneumatics.pressure_limit
+    run = calibration_run(amplitude, quick=quick).differential_pressure
+    found = fit_air(emulated_log(4, run), PERIOD)
+    assert found.vent_exponent == pytest.approx(emulator.VENT_EXPONENT, abs=0.06)
+    command = np.zeros((240, 2))
+    command[20:120] = (7_000.0, -14_000.0)
+    measured = emulated_log(4, command).measured_differential
+    falling = slice(122, None)
+    missed = {
+        name: np.abs(predict_air(air, command, PERIOD) - measured)[falling].max(axis=0)
+        for name, air in {
+            "law": law(found),
+            "lag": replace(law(found), vent_rate=0.0),
+            "exponential": replace(law(found), vent_exponent=1.0),
+        }.items()
+    }
+    assert np.all(missed["law"] < 0.07 * np.array([7_000.0, 14_000.0]))
+    assert np.all(missed["law"] < 0.15 * missed["lag"])
+    assert np.all(missed["law"] < 0.6 * missed["exponential"])
+
+
+def report_of(air: AirFit) -> FitReport:
+    none = np.zeros(0)
+    return FitReport("", (), none, (), (), air, None, none, none, none, none, 1.0, 1, 1, 1.0)
+
+
+def test_the_report_says_how_fast_chambers_vent_or_that_it_does_not_know():
+    shown = AirFit(0.3, 0.1, 0.0, 9000.0, np.zeros(2), 40.0, np.zeros(3), 5300.0, 0.66)
+    shown = replace(shown, vent_uncertainty=np.array([31.0, 0.02]))
+    text = report_of(shown).text()
+    assert "5300 ± 31 Pa/s at 10 kPa" in text
+    assert "0.66 ± 0.02" in text
+    open_ = AirFit(0.3, 0.1, 0.0, 9000.0, np.zeros(2), 40.0, np.zeros(3))
+    assert "falls by" not in report_of(open_).text()
+    assert "venting: not shown by this run, kept" in report_of(open_).text()
