@@ -33,17 +33,24 @@ def calibrate(out: Path, excitation: Path, *arguments: str) -> subprocess.Comple
     )
 
 
-def test_the_graph_calibrates_as_one_process_does(tmp_path: Path):
-    from der_planner.identification import Excitation, read_bag, write_excitation
+def short_run(folder: Path, duration: float = 18.0) -> tuple[Path, np.ndarray]:
+    """Write slow waves between two rests; return the file and the pressures (K, 2) [Pa]."""
+    from der_planner.identification import Excitation, write_excitation
     from der_planner.identification.excitation import PERIOD, waves
+
+    rest = np.zeros((20, 2))
+    pressure = np.concatenate([rest, waves(10_000.0, 2, duration), rest])
+    path = folder / "excitation.csv"
+    write_excitation(Excitation(PERIOD * np.arange(len(pressure)), pressure, ()), path)
+    return path, pressure
+
+
+def test_the_graph_calibrates_as_one_process_does(tmp_path: Path):
+    from der_planner.identification import read_bag
     from der_planner.limb import Limb
     from der_planner.recording.reader import BagReader
 
-    rest = np.zeros((20, 2))
-    pressure = np.concatenate([rest, waves(10_000.0, 2, duration=18.0), rest])
-    time = PERIOD * np.arange(len(pressure))
-    excitation = tmp_path / "excitation.csv"
-    write_excitation(Excitation(time, pressure, ()), excitation)
+    excitation, pressure = short_run(tmp_path)
 
     # A first guess far from the twin, so that only the data can bring both files together.
     guess = Limb.default()
@@ -77,6 +84,23 @@ def test_the_graph_calibrates_as_one_process_does(tmp_path: Path):
     wrong = np.array([segment.moment_gain for segment in segments])
     assert np.all(np.abs(gains[1] / wrong - 1.0) > 0.15)
     np.testing.assert_allclose(gains[0], gains[1], rtol=0.08)
+
+
+def test_a_rig_is_calibrated_and_left_vented(graph, rig: Path, tmp_path: Path):
+    from der_planner.identification import read_bag
+    from der_planner.limb import Limb
+
+    excitation, pressure = short_run(tmp_path, duration=10.0)
+    out, folder = tmp_path / "rig_limb.yaml", tmp_path / "run"
+    run = calibrate(out, excitation, "--graph", "--hardware", str(rig), "--folder", str(folder))
+    assert run.returncode == 0, run.stderr
+    assert "the hardware at" in run.stderr
+    assert all(process.alive for process in graph.processes), "the rig is not the calibration's"
+    log = read_bag(folder / "bag")
+    assert np.abs(log.measured_differential[-1]).max() < 0.1 * np.abs(pressure).max()
+    found, prior = Limb.from_yaml(out), Limb.default()
+    assert found.provenance["prior"] == prior.name
+    assert np.all(np.abs(found.static_gain / prior.static_gain - 1.0) < 0.5)
 
 
 @pytest.mark.parametrize(

@@ -194,25 +194,7 @@ def test_two_graphs_do_not_mix(experiment, graph):
     assert "another graph is running in this ROS domain (node 'board_emulator')" in run.errors
 
 
-RIG = """
-driver: {{port: {port}, protocol: ezloop}}
-remap: {{camera/image_raw: /overhead/image, camera/camera_info: /overhead/info}}
-limb: {limb}
-"""
-
-
-def test_a_rig_file_takes_the_place_of_the_twin(experiment, graph, tmp_path: Path):
-    # To the experiment, a board on another process's port and a camera under another name are
-    # hardware.
-    port = tmp_path / "board"
-    graph.start("pressure_driver", "board_emulator", port_link=str(port))
-    graph.start("der_planner", "limb_twin")
-    overhead = {"camera/image_raw": "/overhead/image", "camera/camera_info": "/overhead/info"}
-    graph.start("apriltag_tracker", "synthetic_camera", remap=overhead)
-    graph.client.wait_ready(["board_emulator", "limb_twin"])
-    rig = tmp_path / "rig.yaml"
-    limb = ROOT / "src/der_planner/der_planner/data/default_limb.yaml"
-    rig.write_text(RIG.format(port=port, limb=limb))
+def test_a_rig_file_takes_the_place_of_the_twin(experiment, graph, rig: Path):
     run = experiment("--hardware", str(rig), "--models", "der")
     assert run.finish() == 0, run.errors
     document = json.loads((run.out / "results.json").read_text())

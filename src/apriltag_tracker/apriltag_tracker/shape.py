@@ -72,9 +72,10 @@ class LimbEstimate:
         tip_covariance: (2, 2) m², repeatability.
         tip_systematic: (2, 2) m², what averaging does not remove: survey, height, mounting.
         tip_heading: [rad].
-        bend_angle: (M,) rad, by constant curvature.
+        bend_angle: (M,) rad, heading at the end of each segment less that at its start, of the
+            smooth fit: a limb with stiff fittings is no arc, and arcs would mix the segments' bends.
         bend_angle_sigma: (M,) rad.
-        curvature: (M,) 1/m, of the parts of each segment that bend.
+        curvature: (M,) 1/m, of the parts of each segment that bend, by constant curvature.
         elongation: length over length at rest.
         residual: RMS distance of the tags from the constant-curvature shape [m].
         curve: (n, 2) m, base to tip.
@@ -289,22 +290,23 @@ class ShapeFitter:
         systematic += undetermined @ undetermined.T
         # A tip that may be far to the side is also nearer: the second order of a long arc.
         systematic += (np.sum(undetermined**2) / self._smooth.ends[-1]) ** 2 * np.eye(2)
-        bends = arcs.parameters[4 : 4 + self._constant.segments]
-        bending = self._constant.active
-        bend_gain = arcs.gain[4:]
-        variance = np.zeros(self._constant.segments)
+        # The corrections of a segment integrate to nothing: its mean curvature is its bend.
+        means = slice(4, 4 + self._smooth.segments)
+        bending = self._smooth.active
+        bend_gain = fit.gain[means]
+        variance = np.zeros(self._smooth.segments)
         for i, tag in enumerate(tags):
             spread = tag.covariance + np.diag(self._mounting**2)
             variance += np.einsum("pj,jk,pk->p", bend_gain[:, i], spread, bend_gain[:, i])
-        variance += np.sum(arcs.left_open[4:] ** 2, axis=1)
+        variance += np.sum(fit.left_open[means] ** 2, axis=1)
         return LimbEstimate(
             tip=curve[-1, :2],
             tip_covariance=noise,
             tip_systematic=systematic,
             tip_heading=float(curve[-1, 2]),
-            bend_angle=bends * bending,
+            bend_angle=fit.parameters[means] * bending,
             bend_angle_sigma=np.sqrt(variance) * bending,
-            curvature=bends,
+            curvature=arcs.parameters[4:],
             elongation=1.0 + float(fit.parameters[3]),
             residual=float(np.sqrt(np.mean(np.sum(arcs.residuals[:, :2] ** 2, axis=1)))),
             curve=curve[:, :2],

@@ -153,6 +153,18 @@ def test_friction_leaves_a_loop_that_an_elastic_limb_has_not():
     assert loop(LimbTwin(hardware=replace(plain(), drag=4.0))) < np.deg2rad(0.4)
 
 
+def test_pressures_in_small_steps_do_not_shake_the_friction_loose():
+    # What trembles does not rub: ringing of undamped modes would keep friction from its full value.
+    twin = LimbTwin(1)
+    for step in range(400):
+        share = step // 2 * 2 / 400  # a board that tells its pressures every 20 ms
+        level = 14_000.0 * np.sin(0.5 * np.pi * share) ** 2
+        twin.step(REST + np.array([level, 0.0, 0.0, 0.0]), 0.01)
+    first = twin._vertex_segment == 0
+    assert twin._material.friction[first].min() > 0.8
+    assert twin._material.friction[first].mean() > 0.9
+
+
 def test_creep_goes_on_after_the_step():
     calm = replace(plain(), drag=6.0)
     creeping = replace(

@@ -18,8 +18,9 @@ ATMOSPHERE = 101_325.0
 """Absolute pressure outside the chambers [Pa]."""
 TIME_STEP = 2e-4
 """Explicit step [s]; stable for 0.3 ms as well (see the page of the twin)."""
-RAMP = 0.01
-"""Time in which new chamber pressures reach the limb [s], on a straight line: a jump would ring."""
+RAMP = 0.02
+"""Time in which new chamber pressures reach the limb [s], on a straight line: a jump would ring. The
+board tells its pressures once in that time."""
 ELEMENTS_PER_SEGMENT = 8
 AXIAL_STIFFNESS = 1380.0
 """EA [N] of the silicone tube, which fits its bending stiffness only with a thin wall."""
@@ -72,6 +73,8 @@ class LimbTwin:
         self.atmosphere = float(atmosphere)
         self.time = 0.0
         self._carry = 0.0
+        self._pressure = np.full(2 * self.segment_count, self.atmosphere)
+        self._ramp_left = 0
         self._wander_noise = np.random.default_rng([7_919, seed, run])
         self._build()
         self._wander = np.array([s.wander for s in self._hardware.segments])
@@ -119,7 +122,8 @@ class LimbTwin:
         self._carry += duration
         steps = int(self._carry / TIME_STEP + 1e-9)
         self._carry -= steps * TIME_STEP
-        ramp = self._ramp(target, min(steps, round(RAMP / TIME_STEP)))
+        ramp = self._ramp(target, self._ramp_left or steps)
+        self._ramp_left = max(0, self._ramp_left - steps)
         advance(self._arrays, self._material, ramp, steps, TIME_STEP, self._hardware.drag)
         self.time += steps * TIME_STEP
         if not np.isfinite(self._rod.position_collection[0, -1]):
@@ -176,6 +180,9 @@ class LimbTwin:
                 f"chamber pressures must be absolute, in Pa and within 2 bar of the atmosphere "
                 f"({self.atmosphere:.0f} Pa): got {pressure}"
             )
+        if not np.array_equal(pressure, self._pressure):
+            self._pressure = pressure.copy()
+            self._ramp_left = round(RAMP / TIME_STEP)
         names = ("active", "stiffness", "rest", "rest_stretch")
         target = {name: getattr(self._material, name).copy() for name in names}
         differential = np.concatenate([[0.0], gauge[0::2] - gauge[1::2], [0.0]])
