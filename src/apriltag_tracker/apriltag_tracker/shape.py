@@ -73,7 +73,7 @@ class LimbEstimate:
         tip_systematic: (2, 2) m², what averaging does not remove: survey, height, mounting.
         tip_heading: [rad].
         bend_angle: (M,) rad, heading at the end of each segment less that at its start, of the
-            smooth fit: a limb with stiff fittings is no arc, and arcs would mix the segments' bends.
+            smooth fit: a limb with stiff fittings is no arc, arcs would mix the segments' bends.
         bend_angle_sigma: (M,) rad.
         curvature: (M,) 1/m, of the parts of each segment that bend, by constant curvature.
         elongation: length over length at rest.

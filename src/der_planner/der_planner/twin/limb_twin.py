@@ -19,8 +19,8 @@ ATMOSPHERE = 101_325.0
 TIME_STEP = 2e-4
 """Explicit step [s]; stable for 0.3 ms as well (see the page of the twin)."""
 RAMP = 0.02
-"""Time in which new chamber pressures reach the limb [s], on a straight line: a jump would ring. The
-board tells its pressures once in that time."""
+"""Time in which new chamber pressures reach the limb [s], on a straight line: a jump would ring.
+The board tells its pressures once in that time."""
 ELEMENTS_PER_SEGMENT = 8
 AXIAL_STIFFNESS = 1380.0
 """EA [N] of the silicone tube, which fits its bending stiffness only with a thin wall."""
