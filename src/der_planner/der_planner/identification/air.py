@@ -18,8 +18,11 @@ SMOOTH_RATE = 6000.0
 """Commands that rise faster than this [Pa/s] are steps: their flow is choked, not a lag."""
 STEP_MEMORY = 3.0
 """Time after such a step that nothing is fitted to [s]."""
-SHOWN = 0.25
-"""Relative standard deviation up to which a log is said to show how fast chambers are vented."""
+SHOWN = (0.25, 0.15)
+"""Standard deviations up to which a log is said to show how fast chambers are vented: of the rate,
+relative, and of the exponent."""
+BETTER = 0.7
+"""Share of the residual of lags alone that slow venting may leave to be believed."""
 _SUBSTEPS = 2
 _LOWEST = (0.005, 0.005, 0.0, 300.0, 0.3)
 _HIGHEST = (1.5, 1.5, 1.9, 60e3, 1.0)
@@ -83,9 +86,10 @@ def fit_air(log: CalibrationLog, period: float) -> AirFit:
         )
     falling = known & _after_no_step(np.abs(command), period, rising=True)
     found = _solve(command, measured - offset, falling, period, len(_START))
-    if not _shown(found):
-        found = _solve(command, measured - offset, smooth, period, 3)
-    venting = found.x.size > 3
+    lags = _solve(command, measured - offset, smooth, period, 3)
+    without = (predict_air(_air(lags.x), command, period) + offset - measured)[falling]
+    venting = _shown(found) and found.spread < BETTER * float(np.sqrt(np.mean(without**2)))
+    found = found if venting else lags
     return AirFit(
         fill_lag=float(found.x[0]),
         vent_lag=float(found.x[1]),
@@ -118,9 +122,11 @@ def _solve(
 
     def jacobian(x: Array) -> Array:
         # Steps of their own size: a dead time of nearly zero would get none from a relative one.
+        ahead = x + np.asarray(_STEP[:count]) <= np.asarray(_HIGHEST[:count])
+        steps = np.where(ahead, 1.0, -1.0) * _STEP[:count]
         base = residual(x)
-        moved = [residual(x + step) for step in np.diag(_STEP[:count])]
-        slopes: Array = (np.stack(moved, axis=1) - base[:, None]) / np.asarray(_STEP[:count])
+        moved = [residual(x + step) for step in np.diag(steps)]
+        slopes: Array = (np.stack(moved, axis=1) - base[:, None]) / steps
         return slopes
 
     solution = least_squares(
@@ -147,9 +153,10 @@ def _air(x: Array) -> Pneumatics:
 
 
 def _shown(solution: _Solution) -> bool:
-    """Tell whether a log shows how fast chambers are vented: known well, and inside its bounds."""
-    rate, deviation = solution.x[3], solution.deviation[3]
-    return bool(0.0 < deviation < SHOWN * rate and _LOWEST[3] < 0.9 * rate < 0.8 * _HIGHEST[3])
+    """Tell whether rate and exponent of venting are known well, the rate inside its bounds."""
+    rate, of_rate, of_exponent = solution.x[3], *solution.deviation[3:]
+    known = 0.0 < of_rate < SHOWN[0] * rate and 0.0 < of_exponent < SHOWN[1]
+    return bool(known and _LOWEST[3] < 0.9 * rate < 0.8 * _HIGHEST[3])
 
 
 def predict_air(air: Pneumatics, command: Array, period: float) -> Array:

@@ -7,7 +7,7 @@ faster than its outlet lets it:
     dp/dt ≥ −R (p / p_ref)ⁿ        R `vent_rate`, n `vent_exponent`, p_ref `VENT_REFERENCE`
 
 Between an orifice (n = 1/2) and a tube (n = 1, one exponential) lie the logs of a real limb: 0.65,
-with a ninth of the error that an exponential leaves.
+with a tenth of the error that an exponential leaves.
 """
 
 from __future__ import annotations
