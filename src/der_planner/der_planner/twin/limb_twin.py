@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 ATMOSPHERE = 101_325.0
 """Absolute pressure outside the chambers [Pa]."""
 TIME_STEP = 2e-4
-"""Explicit step [s]; stable for 0.3 ms as well (see the page of the twin)."""
+"""Explicit step [s]; stable for 0.25 ms as well (see the page of the twin)."""
 RAMP = 0.02
 """Time in which new chamber pressures reach the limb [s], on a straight line: a jump would ring.
 The board tells its pressures once in that time."""
