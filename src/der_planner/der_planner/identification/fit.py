@@ -174,7 +174,11 @@ class _Problem:
         remaining = self.remaining(values)
         error = float(np.sqrt(np.nanmean(remaining**2)))
         # Neighbouring errors are alike: as many independent ones as the residual's memory leaves.
-        factor = (error / ANGLE_ERROR) ** 2 * correlation_length(remaining) / CORRELATION
+        length = correlation_length(remaining)
+        factor = (error / ANGLE_ERROR) ** 2 * length / CORRELATION
+        # A fit of P unknowns takes as many of them out of its residual.
+        independent = np.count_nonzero(np.isfinite(remaining)) / length
+        factor *= independent / max(independent - len(self._wanted), 0.2 * independent)
         data = jacobian[: -int(self._known.sum()) or None]
         information = data.T @ data / max(factor, 1e-6)
         prior = np.where(self._known, self._scale / self._spread, 0.0)
