@@ -99,25 +99,47 @@ def fit(
     if "dynamics" in problem.groups:
         pcc_segments, pcc_residual = fit_pcc(found, prepared, offset)
         found = replace(found, pcc_segments=pcc_segments)
-    report = FitReport(
+    report = _report(
+        log, prepared, unknowns, correlation, remaining, air=air, geometry=lengths,
+        pcc_residual=pcc_residual, evaluations=problem.evaluations,
+        fit_time=clock.perf_counter() - begin, warnings=tuple(warnings),
+    )  # fmt: skip
+    return found, report
+
+
+def _report(
+    log: CalibrationLog,
+    prepared: Prepared,
+    unknowns: tuple[Unknown, ...],
+    correlation: Array,
+    remaining: Array,
+    *,
+    air: AirFit | None,
+    geometry: GeometryFit | None,
+    pcc_residual: Array,
+    evaluations: int,
+    fit_time: float,
+    warnings: tuple[str, ...],
+) -> FitReport:
+    """Return what the data say; ``remaining`` (K, M) is measured less predicted [rad]."""
+    return FitReport(
         source=log.source,
         unknowns=unknowns,
         correlation=correlation,
         strongly_correlated=_pairs(unknowns, correlation),
         untold=tuple(u.name for u in unknowns if u.untold),
         air=air,
-        geometry=lengths,
+        geometry=geometry,
         residual=np.sqrt(np.nanmean(remaining**2, axis=0)),
         largest=np.nanmax(np.abs(remaining), axis=0),
         pcc_residual=pcc_residual,
         span=np.ptp(prepared.bend[prepared.usable], axis=0),
         duration=float(prepared.log.time[-1] - prepared.log.time[0]),
         rows=int(prepared.usable.sum()),
-        evaluations=problem.evaluations,
-        fit_time=clock.perf_counter() - begin,
-        warnings=tuple(warnings),
+        evaluations=evaluations,
+        fit_time=fit_time,
+        warnings=warnings,
     )
-    return found, report
 
 
 class _Problem:
