@@ -59,7 +59,9 @@ def test_what_the_twin_knows_is_recovered_within_the_stated_uncertainty():
 def test_real_limb_is_fitted(shared_data):
     folder = shared_data / "real_limb"
     log = read_csv(folder / "A_calibration.csv", REAL)
-    limb, report = fit(Limb.default(), log, longest_gap=10.0)
+    # The log is too slow to tell creep and dynamics apart from the rest.
+    terms = ("asymmetry", "stiffening", "coupling", "friction")
+    limb, report = fit(Limb.default(), log, terms=terms, longest_gap=10.0)
     assert np.degrees(report.residual).max() < 1.0
     gains = np.degrees(limb.static_gain) * 100
     assert 0.22 < gains[1] < gains[0] < 0.50 or gains[1] == pytest.approx(0.21, abs=0.02)
