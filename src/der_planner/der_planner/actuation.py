@@ -156,6 +156,14 @@ def maxwell(time: Array, strain: Array, relaxation: float) -> Array:
     return q
 
 
+def slow_effective_pressure(limb: Limb, time: ArrayLike, differential: ArrayLike) -> Array:
+    """Return effective pressures (K, M) [Pa] of chamber pressures (K, M) [Pa] alone.
+
+    Friction and creep see the bend of `resting_bend`: what swings around it hardly changes them.
+    """
+    return effective_pressure(limb, time, differential, resting_bend(limb, time, differential))
+
+
 def resting_bend(limb: Limb, time: ArrayLike, differential: ArrayLike) -> Array:
     """Return the bend angles (K, M) [rad] of a slow motion under chamber pressures (K, M) [Pa].
 
@@ -252,7 +260,6 @@ def lead(limb: Limb, time: ArrayLike, differential: ArrayLike, largest_step: flo
     times = np.asarray(time, dtype=float)
     wanted = np.asarray(differential, dtype=float)
     air = limb.pneumatics
-    vent = air.vent_time_constant or air.time_constant
     result = np.empty_like(wanted)
     half = 0.5 * largest_step
     for index in range(wanted.shape[1]):
@@ -261,7 +268,7 @@ def lead(limb: Limb, time: ArrayLike, differential: ArrayLike, largest_step: flo
         value = np.interp(ahead, times, column)
         slope = np.interp(ahead + half, times, column) - np.interp(ahead - half, times, column)
         slope /= largest_step
-        lag = np.where(value * slope >= 0, air.time_constant, vent)
+        lag = np.where(value * slope >= 0, air.time_constant, air.vent_lag)
         result[:, index] = value + lag * slope
     limit = air.pressure_limit
     clipped: Array = np.clip(result, -limit, limit)

@@ -106,6 +106,11 @@ class Pneumatics:
     vent_rate: float = 0.0
     vent_exponent: float = 2.0 / 3.0
 
+    @property
+    def vent_lag(self) -> float:
+        """First-order lag while |differential pressure| falls [s]."""
+        return self.vent_time_constant or self.time_constant
+
 
 @dataclass(frozen=True)
 class CalibratedRange:

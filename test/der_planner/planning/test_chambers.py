@@ -8,6 +8,7 @@ import pytest
 from der_planner.limb import VENT_REFERENCE, Limb, LimbError
 from der_planner.planning import METHODS, Motion, plan, planner, pneumatics
 from der_planner.planning.chambers import respond, sensitivity, vent_memory
+from der_planner.planning.motions import CONTROL_PERIOD
 from der_planner.planning.optimal import Optimiser
 from der_planner.planning.rod_model import RodModel
 
@@ -168,7 +169,9 @@ def test_gauss_newton_agrees_with_finite_differences_where_chambers_are_limited(
     model = RodModel(limb)
     reference = Motion.named("asynchronous", period=6.0, cycles=1).reference(limb)
     spline = model.configuration(reference)
-    warm = planner.feedforward(model, spline, reference, "projected")
+    warm = pneumatics.commands(
+        model.limb, *planner.balance(model, spline, reference, "projected"), CONTROL_PERIOD
+    )
     solver = Optimiser(model, spline, reference, warm, planner.SUBSTEPS)
     quadratic = solver._linearise(warm, solver.start, 0, 100, 0.0)
     time = np.arange(100) * 0.05

@@ -6,6 +6,7 @@ from scipy.optimize import minimize
 
 from der_planner.limb import Limb
 from der_planner.planning import Motion, PlanningError, plan, planner, pneumatics
+from der_planner.planning.motions import CONTROL_PERIOD
 from der_planner.planning.optimal import Optimiser, Settings
 from der_planner.planning.quadratic import Band, solve_limited
 from der_planner.planning.receding import RecedingHorizon
@@ -18,7 +19,9 @@ def solver_for(limb, motion, **settings):
     model = RodModel(limb)
     reference = motion.reference(limb)
     spline = model.configuration(reference)
-    warm = planner.feedforward(model, spline, reference, "projected")
+    warm = pneumatics.commands(
+        model.limb, *planner.balance(model, spline, reference, "projected"), CONTROL_PERIOD
+    )
     return Optimiser(model, spline, reference, warm, planner.SUBSTEPS, Settings(**settings))
 
 

@@ -127,8 +127,10 @@ def _segment(prior: Segment, value: dict[str, float]) -> Segment:
 
 def exists(segment: int, term: int, segment_count: int) -> bool:
     """Return whether a segment has a term: the neighbour that it asks for, a shared one once."""
-    if TERMS[term].shared or TERMS[term].name == "coupling_before":
-        return (segment == 0) if TERMS[term].shared else segment > 0
+    if TERMS[term].shared:
+        return segment == 0
+    if TERMS[term].name == "coupling_before":
+        return segment > 0
     return TERMS[term].name != "coupling_after" or segment < segment_count - 1
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from der_planner.actuation import effective_pressure, resting_bend
+from der_planner.actuation import slow_effective_pressure
 from der_planner.identification.prepare import Prepared
 from der_planner.limb import Limb, Segment
 from der_planner.pcc import Pcc
@@ -41,7 +41,7 @@ def fit_pcc(limb: Limb, prepared: Prepared, offset: Array) -> tuple[tuple[Segmen
     """
     time = prepared.log.time
     pressure = prepared.pressure - offset
-    effective = effective_pressure(limb, time, pressure, resting_bend(limb, time, pressure))
+    effective = slow_effective_pressure(limb, time, pressure)
     middle = 0.5 * (effective[1:] + effective[:-1])
     held = np.repeat(middle[:, None, :], STEPS, axis=1)
     period = float(time[1] - time[0])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.actuation import effective_pressure, resting_bend
+from der_planner.actuation import slow_effective_pressure
 from der_planner.identification.prediction import bend_of
 from der_planner.limb import Limb
 from der_planner.pcc import Pcc
@@ -51,9 +51,7 @@ def predict(
     """
     seen = limb.for_model(model)
     period = float(time[1] - time[0])
-    # Friction and creep along the slow part of the bend: what swings around it hardly changes them.
-    slow = resting_bend(seen, time, differential_pressure)
-    effective = effective_pressure(seen, time, differential_pressure, slow)
+    effective = slow_effective_pressure(seen, time, differential_pressure)
     return Prediction(*_simulate(seen, effective, period, model))
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.actuation import effective_pressure, resting_bend
+from der_planner.actuation import slow_effective_pressure
 from der_planner.identification.parameters import TERMS, column, put, to_limb
 from der_planner.limb import Limb
 from der_planner.rod import Rod, Trajectory
@@ -42,12 +42,12 @@ class RodPrediction:
 
     def angles(self, values: Array) -> Array:
         """Return predicted bend angles (K, M) [rad] for the unknowns (M, T)."""
-        rod, trajectory = self._simulate(to_limb(self._prior, values))
+        rod, trajectory, _ = self._simulate(to_limb(self._prior, values))
         return bend_of(rod, trajectory.q)
 
     def tip(self, limb: Limb) -> Array:
         """Return predicted tips (K, 2) [m] of a limb."""
-        _, trajectory = self._simulate(limb)
+        _, trajectory, _ = self._simulate(limb)
         tip: Array = trajectory.tip[:, :2]
         return tip
 
@@ -61,9 +61,9 @@ class RodPrediction:
         What acts as a pressure goes through the rod's exact tangent; stiffness and damping, which
         change the rod itself, are differences of two simulations.
         """
-        rod, trajectory = self._simulate(to_limb(self._prior, values), linearise=True)
+        limb = to_limb(self._prior, values)
+        rod, trajectory, effective = self._simulate(limb, linearise=True)
         angles = bend_of(rod, trajectory.q)
-        effective = self.effective(values)
         start = _start_derivatives(rod, effective[0])
         result = np.empty((*angles.shape, len(wanted)))
         for place, (segment, term) in enumerate(wanted):
@@ -80,15 +80,13 @@ class RodPrediction:
 
     def effective(self, values: Array) -> Array:
         """Return the effective pressures (K, M) [Pa] of the unknowns (M, T)."""
-        return self._effective(to_limb(self._prior, values))
+        limb = to_limb(self._prior, values)
+        return slow_effective_pressure(limb, self._time, self._pressure)
 
-    def _effective(self, limb: Limb) -> Array:
-        bend = resting_bend(limb, self._time, self._pressure)
-        return effective_pressure(limb, self._time, self._pressure, bend)
-
-    def _simulate(self, limb: Limb, linearise: bool = False) -> tuple[Rod, Trajectory]:
+    def _simulate(self, limb: Limb, linearise: bool = False) -> tuple[Rod, Trajectory, Array]:
+        """Return the rod, its motion and the effective pressures (K, M) that drove it [Pa]."""
         rod = Rod.from_limb(limb, self._nodes)
-        effective = self._effective(limb)
+        effective = slow_effective_pressure(limb, self._time, self._pressure)
         trajectory = rod.simulate(
             rod.equilibrium(effective[0]),
             _mid(effective),
@@ -97,7 +95,7 @@ class RodPrediction:
             linearise=linearise,
             outputs=_outputs(rod) if linearise else None,
         )
-        return rod, trajectory
+        return rod, trajectory, effective
 
     def _difference(self, values: Array, segment: int, term: int, angles: Array) -> Array:
         step = TERMS[term].step

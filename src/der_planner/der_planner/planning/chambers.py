@@ -62,13 +62,12 @@ def respond(
     commands_ = np.ascontiguousarray(command, dtype=float)
     start = np.zeros(commands_.shape[1]) if initial is None else np.array(initial, dtype=float)
     held = _pair(_delayed(commands_, start, air.delay / period * substeps, substeps))
-    vent = air.vent_time_constant or air.time_constant
     middle, pair = _follow(
         held,
         _pair(start),
         period / substeps,
         air.time_constant,
-        vent,
+        air.vent_lag,
         vent_speed(air),
         air.vent_exponent,
     )
@@ -177,7 +176,7 @@ def sensitivity(
         response.held,
         period / substeps,
         air.time_constant,
-        air.vent_time_constant or air.time_constant,
+        air.vent_lag,
         vent_speed(air),
         air.vent_exponent,
     )

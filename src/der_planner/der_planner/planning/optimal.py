@@ -127,7 +127,7 @@ class Actuation:
     def pulse(self, inputs: int) -> Vector:
         """Return the chamber pressure (R, M) in the steps after one setpoint is raised by 1 Pa."""
         air, size = self.air, self.substeps
-        mean = 0.5 * (air.time_constant + (air.vent_time_constant or air.time_constant))
+        mean = 0.5 * (air.time_constant + air.vent_lag)
         reach = int(np.ceil((air.delay + 12 * mean) / CONTROL_PERIOD)) + 1
         command = np.zeros((reach, 1))
         command[0] = 1.0

@@ -29,7 +29,7 @@ _THREADS = ThreadpoolController()
 SUBSTEPS = 5
 """Integrator steps a control period: 10 ms."""
 _FINE = 2
-"""Points of the feedforward's grid a control period."""
+"""Points of the balance's grid a control period."""
 
 
 _STRAIGHT = 1e-3
@@ -176,14 +176,6 @@ def choose_method(model: str, method: str) -> str:
             f"the model '{model}' has no method '{method}': choose {', '.join(METHODS[model])}"
         )
     return chosen
-
-
-def feedforward(
-    physics: PlanningModel, spline: BSpline, reference: Reference, method: str
-) -> Vector:
-    """Return the commands (K, M) [Pa] that a balance of forces asks for, before any limit."""
-    time, effective, bend = balance(physics, spline, reference, method)
-    return pneumatics.commands(physics.limb, time, effective, bend, CONTROL_PERIOD)
 
 
 def balance(

@@ -42,7 +42,7 @@ def commands(limb: Limb, time: Vector, effective: Vector, bend: Vector, period: 
     """
     pressure = actuation.differential_pressure(limb, time, effective, bend)
     air = limb.pneumatics
-    fill, vent = air.time_constant, air.vent_time_constant or air.time_constant
+    fill, vent = air.time_constant, air.vent_lag
     if air.vent_rate > 0:
         chambers, second = _hold_pairs(
             np.ascontiguousarray(pressure), np.diff(time), vent, vent_speed(air), air.vent_exponent
@@ -123,9 +123,12 @@ def slow_venting(limb: Limb, time: Vector, effective: Vector, bend: Vector) -> S
     if air.vent_rate == 0:
         return None
     pressure = actuation.differential_pressure(limb, time, effective, bend)
-    vent = air.vent_time_constant or air.time_constant
     chambers, _ = _hold_pairs(
-        np.ascontiguousarray(pressure), np.diff(time), vent, vent_speed(air), air.vent_exponent
+        np.ascontiguousarray(pressure),
+        np.diff(time),
+        air.vent_lag,
+        vent_speed(air),
+        air.vent_exponent,
     )
     both = np.minimum(chambers[0], chambers[1])
     j = int(np.argmax(both.max(axis=0)))

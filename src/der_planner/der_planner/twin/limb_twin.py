@@ -119,6 +119,9 @@ class LimbTwin:
             TwinError: the pressures have another shape, are not finite or above 2 bar gauge.
         """
         target = self._target(chamber_pressure, duration)
+        if not np.array_equal(chamber_pressure, self._pressure):
+            self._pressure = np.array(chamber_pressure, dtype=float)
+            self._ramp_left = round(RAMP / TIME_STEP)
         self._carry += duration
         steps = int(self._carry / TIME_STEP + 1e-9)
         self._carry -= steps * TIME_STEP
@@ -180,9 +183,6 @@ class LimbTwin:
                 f"chamber pressures must be absolute, in Pa and within 2 bar of the atmosphere "
                 f"({self.atmosphere:.0f} Pa): got {pressure}"
             )
-        if not np.array_equal(pressure, self._pressure):
-            self._pressure = pressure.copy()
-            self._ramp_left = round(RAMP / TIME_STEP)
         names = ("active", "stiffness", "rest", "rest_stretch")
         target = {name: getattr(self._material, name).copy() for name in names}
         differential = np.concatenate([[0.0], gauge[0::2] - gauge[1::2], [0.0]])
