@@ -11,7 +11,7 @@ setup(
     name=PACKAGE,
     version="0.1.0",
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
-    package_data={PACKAGE: ["py.typed", "data/*"]},
+    package_data={PACKAGE: ["py.typed", "data/*", "page/static/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
@@ -31,7 +31,7 @@ setup(
         "piqp",
         "threadpoolctl",
     ],
-    extras_require={"test": ["pytest"]},
+    extras_require={"page": ["nicegui==3.18.*"], "test": ["pytest"]},
     zip_safe=False,
     maintainer="DER planner maintainers",
     maintainer_email="maintainers@example.org",
@@ -42,6 +42,7 @@ setup(
             "planner = der_planner.nodes.planner:main",
             "recorder = der_planner.nodes.recorder:main",
             "limb_twin = der_planner.nodes.limb_twin:main",
+            "page = der_planner.page.node:main",
         ],
     },
 )
