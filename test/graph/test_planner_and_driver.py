@@ -45,7 +45,7 @@ class Rig:
     def command(self, plan_id):
         self.commands.publish(
             MotionCommand(
-                motion="same_direction", amplitude=0.4, period=20.0, cycles=1, plan_id=plan_id
+                motion="same_direction", amplitude=0.6, period=20.0, cycles=1, plan_id=plan_id
             )
         )
 
@@ -147,6 +147,7 @@ def test_a_fault_of_the_driver_ends_the_plan_with_its_reason(rig):
 def test_the_next_motion_may_begin_while_the_driver_ramps_down_after_the_last(rig):
     rig.arm()
     rig.play("one")
+    rig.wait(lambda: abs(rig.states[-1].commanded_differential[0]) > 4000.0, "pressure")
     rig.client.call("planner/stop")
     rig.wait(lambda: rig.states[-1].mode == PressureState.VENTING, "the ramp down")
     rig.play("two")

@@ -72,9 +72,7 @@ def _foreign_files(node: Node, arguments: Sequence[str] | None) -> Iterator[str]
 def parameter_files(arguments: Sequence[str]) -> list[str]:
     """Return the files that the command line gives as ``--params-file``."""
     return [
-        following
-        for word, following in itertools.pairwise(arguments)
-        if word == "--params-file"
+        following for word, following in itertools.pairwise(arguments) if word == "--params-file"
     ]
 
 

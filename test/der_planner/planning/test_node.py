@@ -1,5 +1,7 @@
 """The planner node as a process: plans, streams, hands over, stops, refuses with a reason."""
 
+import subprocess
+
 import numpy as np
 import pytest
 
@@ -222,7 +224,7 @@ def test_a_bad_command_leaves_the_plan_that_plays_alone(planner):
 
 
 def test_setpoints_offer_liveliness_and_reach_plain_subscribers_and_publishers(planner):
-    """A subscriber that asks for it is told of a killed planner; `ros2 topic pub` is still heard."""
+    """Who asks for it is told of a killed planner; a publisher of plain QoS is still heard."""
     import signal
 
     from rclpy.duration import Duration
@@ -248,7 +250,7 @@ def test_setpoints_offer_liveliness_and_reach_plain_subscribers_and_publishers(p
     )
     node.client.wait_for(lambda: 1 in alive, 30.0, "a live planner")
     by_hand = node.client.node.create_publisher(PressureSetpoint, topics.PRESSURE_SETPOINT, 10)
-    node.client.wait_for(lambda: by_hand.get_subscription_count(), 30.0, "the plain subscriber")
+    node.client.wait_for(by_hand.get_subscription_count, 30.0, "the plain subscriber")
     assert by_hand.get_subscription_count() == 1  # not the one that asks for more than is offered
     node.command(plan_id="killed")
     node.client.wait_for(lambda: node.received("killed"), 60.0, "setpoints")
@@ -268,9 +270,7 @@ def test_the_action_tells_how_it_goes_and_how_it_ended(planner):
     heard = []
 
     def play(motion="asynchronous", plan_id=""):
-        command = MotionCommand(
-            motion=motion, amplitude=0.3, period=3.0, cycles=1, plan_id=plan_id
-        )
+        command = MotionCommand(motion=motion, amplitude=0.3, period=3.0, cycles=1, plan_id=plan_id)
         sent = action.send_goal_async(
             PlayMotion.Goal(command=command), lambda message: heard.append(message.feedback)
         )
@@ -308,6 +308,8 @@ def test_the_action_tells_how_it_goes_and_how_it_ended(planner):
 
 
 def test_what_no_parameter_took_is_said(planner, graph, tmp_path):
+    from der_planner.experiment.processes import find_executable
+
     file = tmp_path / "planner.yaml"
     file.write_text("/lab7/planner:\n  ros__parameters: {nodes: 31}\n")
     node = planner(defualt_model="pcc")
@@ -315,9 +317,20 @@ def test_what_no_parameter_took_is_said(planner, graph, tmp_path):
     log = node.process.log.read_text()
     assert "'defualt_model' is set, but /limb/planner has none: did you mean 'default_mod" in log
     assert "driver_timeout" not in log
-    process = graph.start("der_planner", "planner", "foreign", files=[file])
-    graph.client.wait_for(
-        lambda: "nothing under /lab7/planner is for /limb/planner" in process.log.read_text(),
-        60.0,
-        "the warning",
-    )
+    command = [str(find_executable("der_planner", "planner")), "--ros-args"]
+    with (
+        (tmp_path / "foreign.log").open("w+") as log,
+        subprocess.Popen([*command, "--params-file", str(file)], stdout=log, stderr=log) as process,
+    ):
+        try:
+            graph.client.wait_for(
+                lambda: (
+                    "nothing under /lab7/planner is for /limb/planner"
+                    in (tmp_path / "foreign.log").read_text()
+                ),
+                60.0,
+                "the warning",
+            )
+        finally:
+            process.terminate()
+        assert process.wait(30.0) == 0

@@ -241,17 +241,19 @@ class PlannerNode(Node):
                 return
             try:
                 self._plan(request)
+                failure = ""
             except Cancelled:
                 self.get_logger().info(f"plan {request.plan_id} was cancelled")
+                failure = ""
             except Obstructed as error:
-                self._refuse(request.plan_id, f"planned, but not played: {error.args[0].reason}")
+                failure = f"planned, but not played: {error.args[0].reason}"
             except Exception as error:  # every failure becomes a refusal with its reason
-                if not request.cancelled.is_set():
-                    self._refuse(request.plan_id, str(error) or type(error).__name__)
-            finally:
-                with self._lock:
-                    if self._request is request:
-                        self._request = None
+                failure = str(error) or type(error).__name__
+            with self._lock:
+                if self._request is request:
+                    self._request = None
+            if failure and not request.cancelled.is_set():
+                self._refuse(request.plan_id, failure)
 
     def _warm_up(self) -> None:
         """Compile every kernel before the node says that it is ready."""
