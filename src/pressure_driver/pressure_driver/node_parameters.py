@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from limb_interfaces.overrides import check_overrides
 from limb_interfaces.parameters import ParameterError, declare
 from pressure_driver.core import CoreSettings
 from pressure_driver.grid import NANOSECONDS
@@ -78,6 +79,8 @@ def read_parameters(node: Node) -> DriverOptions:
         command_validity=float(validity),
     )
     _check_together(core)
+    # A misspelt limit must not leave the default in force.
+    check_overrides(node, refuse=True)
     return DriverOptions(
         str(port), str(protocol), int(baud_rate), int(priority), bool(cmd_u_t), core
     )
