@@ -56,7 +56,7 @@ class Rig:
         graph.start("pressure_driver", "board_emulator", port_link=link)
         self.client.wait_ready(["board_emulator"])
         self.driver = graph.start("pressure_driver", "pressure_driver", port=link)
-        self.page = graph.start("der_planner", "page", port=port)
+        self.page = graph.start("der_planner", "page", port=port, on_lost_operator="vent")
         self.client.wait_ready(["pressure_driver", "page"])
 
     def open(self) -> Any:
@@ -120,7 +120,10 @@ def test_one_arms_and_everybody_vents(rig: Rig) -> None:
     rig.wait_mode(PressureState.DISARMED, PressureState.VENTING)
     rig.wait(lambda: "Vented" in first.find_element("id", "notice").text, "the driver's answer")
 
-    first.get("about:blank")
+    rig.wait_mode(PressureState.DISARMED)
+    arm(rig, first)
+    first.get("about:blank")  # the parameter on_lost_operator asks for a vent
+    rig.wait_mode(PressureState.DISARMED)
     rig.wait(lambda: enabled(second, "take"), "the desk to be free again")
     hosts = {urlsplit(url).netloc for url in requested(second)}
     assert hosts == {urlsplit(rig.url).netloc}

@@ -38,6 +38,7 @@ from der_planner.page.server import PageServer, Parts
 from der_planner.page.situation import DriverState, LimbView, NodeStatus, Situation
 from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
+from limb_interfaces.overrides import check_overrides
 from limb_interfaces.parameters import declare
 from limb_interfaces.runner import run_node
 from limb_interfaces.stamps import nanoseconds
@@ -60,6 +61,8 @@ class PageNode(Node):
         super().__init__("page", namespace=topics.NAMESPACE)
         self.fatal_error = ""
         binding = self._read_parameters()
+        # A misspelt name of a protection must not leave the page without it.
+        check_overrides(self, refuse=True)
         binding.check()
         self._service_clients = {
             service: self.create_client(Trigger, path) for service, path in PATHS.items()
