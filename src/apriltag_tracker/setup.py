@@ -26,8 +26,8 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "apriltag_tracker = apriltag_tracker.node:main",
-            "synthetic_camera = apriltag_tracker.synthetic.node:main",
+            "apriltag_tracker = apriltag_tracker.entry:apriltag_tracker",
+            "synthetic_camera = apriltag_tracker.entry:synthetic_camera",
         ],
     },
 )

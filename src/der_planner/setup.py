@@ -39,9 +39,9 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "planner = der_planner.nodes.planner:main",
-            "recorder = der_planner.nodes.recorder:main",
-            "limb_twin = der_planner.nodes.limb_twin:main",
+            "planner = der_planner.nodes.entry:planner",
+            "recorder = der_planner.nodes.entry:recorder",
+            "limb_twin = der_planner.nodes.entry:limb_twin",
         ],
     },
 )

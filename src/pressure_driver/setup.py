@@ -26,8 +26,8 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "pressure_driver = pressure_driver.node:main",
-            "board_emulator = pressure_driver.emulator.node:main",
+            "pressure_driver = pressure_driver.entry:pressure_driver",
+            "board_emulator = pressure_driver.entry:board_emulator",
         ],
     },
 )
