@@ -75,6 +75,12 @@ def _arguments() -> argparse.Namespace:
         type=Path,
         help="with --graph: for bag, logs and report (default: calibrations/ and the time)",
     )
+    parser.add_argument(
+        "--namespace",
+        default="",
+        metavar="NAME",
+        help="of the limb, where a bag holds several",
+    )
     parser.add_argument("--columns", type=Path, help="YAML map of the table's columns")
     parser.add_argument("--prior", type=Path, help="limb file to start from (default: built in)")
     parser.add_argument("--seed", type=int, default=0, help="of the twin (default: 0)")
@@ -125,7 +131,7 @@ def main() -> int:
         log = _obtain(prior, given)
         terms = () if given.terms == "none" else given.terms.split(",")
         limb, report = fit(prior, log, terms=terms, longest_gap=given.longest_gap)
-        held_out = [_read(path, given.columns) for path in given.held_out]
+        held_out = [_read(path, given) for path in given.held_out]
         _conclude(limb, report, log, held_out, given)
     except OptionError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -150,7 +156,7 @@ def _obtain(prior: Limb, given: argparse.Namespace) -> CalibrationLog:
     if given.graph:
         return read_bag(_play_on_graph(prior, given))
     if not given.offline:
-        return _read(given.bag or given.csv, given.columns)
+        return _read(given.bag or given.csv, given)
     limit = prior.pneumatics.pressure_limit
     run = within_limits(_excitation(prior, limit, given), limit, math.inf)
     print(f"playing {run.duration:.0f} s on the twin of seed {given.seed} …", file=sys.stderr)
@@ -199,12 +205,12 @@ def _play_on_graph(prior: Limb, given: argparse.Namespace) -> Path:
     return bag
 
 
-def _read(path: Path, columns: Path | None) -> CalibrationLog:
+def _read(path: Path, given: argparse.Namespace) -> CalibrationLog:
     if path.suffix == ".csv":
-        if columns is None:
+        if given.columns is None:
             raise LogError(f"{path} needs --columns FILE")
-        return read_csv(path, ColumnMap.from_yaml(columns))
-    return read_bag(path)
+        return read_csv(path, ColumnMap.from_yaml(given.columns))
+    return read_bag(path, given.namespace)
 
 
 def _conclude(
