@@ -40,10 +40,14 @@ def run_node(create: Callable[[], Node], arguments: Sequence[str] | None = None)
     """
     stop = threading.Event()
     transport.use_large_messages()
-    rclpy.init(
-        args=list(arguments) if arguments is not None else None,
-        signal_handler_options=SignalHandlerOptions.NO,
-    )
+    try:
+        rclpy.init(
+            args=list(arguments) if arguments is not None else None,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+    except Exception as error:  # e.g. a parameter file that is not there
+        _complain(None, error)
+        return 1
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     node: Node | None = None

@@ -96,7 +96,9 @@ def lab_log(path, rest_from, rest_to):
     resting = (time >= rest_from) & (time < rest_to)
     command = np.where(resting, 0.09, 50.0 + 40.0 * np.sin(time))
     drive = np.where(resting, 0.0, command)
-    lines = [f"{t:.1f},{u:.3f},{1002 + d:.3f},1000" for t, u, d in zip(time, command, drive)]
+    lines = [
+        f"{t:.1f},{u:.3f},{1002 + d:.3f},1000" for t, u, d in zip(time, command, drive, strict=True)
+    ]
     path.write_text("\n".join(["t,u,a,b", *lines]) + "\n")
     return path
 

@@ -132,7 +132,9 @@ def test_what_cannot_be_done_is_refused_with_a_reason(planner):
     for x in (0.2, 0.5):
         path.poses.append(PoseStamped(pose=Pose(position=Point(x=x, y=0.1))))
     node.paths.publish(path)
-    node.client.wait_for(lambda: "no pressure reaches it" in node.state()["reason"], 60.0, "a refusal")
+    node.client.wait_for(
+        lambda: "no pressure reaches it" in node.state()["reason"], 60.0, "a refusal"
+    )
     path.header.frame_id = "map"
     node.paths.publish(path)
     node.client.wait_for(lambda: "frame 'map'" in node.state()["reason"], 60.0, "a refusal")

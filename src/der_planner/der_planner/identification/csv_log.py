@@ -124,8 +124,8 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
         rest = _rest(time, command, columns.rest_until)
         if not rest.any():
             raise LogError(
-                f"{path} has no row at rest: its commands never come within {100 * REST_SHARE:.0f} % "
-                "of their largest to zero. Leave rest_until out of the column map if the chambers' "
+                f"{path} has no row at rest: its commands never come within "
+                f"{100 * REST_SHARE:.0f} % of their largest to zero. Leave rest_until out of the column map if the chambers' "
                 "sensors have no offset"
             )
         measured = measured - np.nanmean(measured[rest], axis=0)
@@ -169,11 +169,14 @@ def _rest(time: Array, command: Array, rest_until: float | str) -> NDArray[np.bo
     rest = np.zeros(len(time), dtype=bool)
     stretches = [
         # Chambers that were filled before need a while to be at rest.
-        np.flatnonzero(time[first:end] >= (time[first] + VENTING_TIME if first else -np.inf)) + first
+        np.flatnonzero(time[first:end] >= (time[first] + VENTING_TIME if first else -np.inf))
+        + first
         for first, end in edges.reshape(-1, 2)
     ]
     if stretches:
-        rest[max(stretches, key=lambda rows: float(np.ptp(time[rows])) if len(rows) else -1.0)] = True
+        rest[max(stretches, key=lambda rows: float(np.ptp(time[rows])) if len(rows) else -1.0)] = (
+            True
+        )
     return rest
 
 
