@@ -46,10 +46,14 @@ def run_node(create: Callable[[], Node], arguments: Sequence[str] | None = None)
     transport.use_large_messages()
     for number in END_SIGNALS:
         signal.signal(number, lambda *_: stop.set())
-    rclpy.init(
-        args=list(arguments) if arguments is not None else None,
-        signal_handler_options=SignalHandlerOptions.NO,
-    )
+    try:
+        rclpy.init(
+            args=list(arguments) if arguments is not None else None,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+    except Exception as error:  # e.g. a parameter file that is not there
+        _complain(None, error)
+        return 1
     node: Node | None = None
     exit_code = 0
     try:
