@@ -116,6 +116,7 @@ def test_a_command_is_stamped_with_its_first_byte():
 def test_the_board_reaches_what_it_is_told(protocol):
     board = EmulatedBoard(board_protocol(protocol), Pneumatics(2, 5), 5)
     host = host_protocol(protocol)
+    board.receive(host.start(), 0)
     data, _ = host.setpoint([8000.0, -3000.0], board.atmosphere, 9.0)
     (command,), _ = board.receive(data, 0)
     wire = np.array(command.pressure)

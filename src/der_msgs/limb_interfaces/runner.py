@@ -14,6 +14,8 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from limb_interfaces import transport
+
 
 class ClosableNode(Protocol):
     """A node that leaves hardware and files in order when it ends."""
@@ -37,6 +39,7 @@ def run_node(create: Callable[[], Node], arguments: Sequence[str] | None = None)
         0 after SIGINT or SIGTERM, 1 after an error.
     """
     stop = threading.Event()
+    transport.use_large_messages()
     rclpy.init(
         args=list(arguments) if arguments is not None else None,
         signal_handler_options=SignalHandlerOptions.NO,

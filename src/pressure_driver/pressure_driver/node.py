@@ -22,6 +22,7 @@ from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
 from pressure_driver.admission import Origin
 from pressure_driver.core import DriverCore, Snapshot
 from pressure_driver.grid import TickGrid
+from pressure_driver.guardian_client import GuardianClient
 from pressure_driver.link import SerialLink
 from pressure_driver.node_parameters import read_parameters
 from pressure_driver.node_services import EmergencyServices
@@ -55,6 +56,10 @@ class PressureDriver(Node):
         self._core = DriverCore(
             protocol, options.core, notify=self._on_tick, log=self._log_from_thread
         )
+        guarded = options.guardian == "on" or (
+            options.guardian == "auto" and not protocol.has_watchdog
+        )
+        self._guardian = GuardianClient(options.real_time_priority) if guarded else None
         self._link = SerialLink(
             options.port,
             options.baud_rate or protocol.baud_rate,
@@ -62,6 +67,7 @@ class PressureDriver(Node):
             self._core,
             options.real_time_priority,
             lambda text: self._log_from_thread(text, True),
+            self._guardian,
         )
         self._state_publisher = self.create_publisher(
             PressureState, topics.PRESSURE_STATE, qos.STATES
@@ -200,10 +206,16 @@ class PressureDriver(Node):
             "clock_steps": self._link.grid.clock_steps,
             "reconnects": self._link.reconnects,
             "real_time_priority": self._link.real_time,
+            "guardian": self._guardian_state(),
         }
         values.update(self._punctuality())
         level, text = self._judge(snapshot, obstacles)
         return Health(level, text, values)
+
+    def _guardian_state(self) -> str:
+        if self._guardian is None:
+            return "none: the board's own watchdog" if self._core.protocol.has_watchdog else "none"
+        return f"process {self._guardian.process_id}"
 
     def _punctuality(self) -> dict[str, object]:
         """Return how late the last minute's ticks began, and were with the operating system."""
@@ -229,6 +241,8 @@ class PressureDriver(Node):
         return "ok", snapshot.mode.name
 
     def _watch_threads(self) -> None:
+        if self._guardian is not None:
+            self._guardian.executor_lives()
         for what, error in (
             ("serial thread", self._link.error),
             ("thread of arm and vent", self._emergency.error),
@@ -258,6 +272,12 @@ class PressureDriver(Node):
         self._publish_ticks()
         if not ended:
             raise RuntimeError(f"the thread of {self._link.port} did not end; check the valves")
+        if not self._link.vented_at_end:
+            alone = " (a board with a watchdog vents by itself)"
+            raise RuntimeError(
+                f"the board on {self._link.port} cannot be reached and may hold its pressures"
+                f"{alone if self._core.protocol.has_watchdog else ''}: close the air supply"
+            )
         self.get_logger().info("vented and closed")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from limb_interfaces.overrides import check_overrides
 from limb_interfaces.parameters import ParameterError, declare
 from pressure_driver.core import CoreSettings
 from pressure_driver.grid import NANOSECONDS
@@ -26,6 +27,7 @@ class DriverOptions:
     baud_rate: int
     real_time_priority: int
     accept_cmd_u_t: bool
+    guardian: str
     core: CoreSettings
 
 
@@ -68,6 +70,13 @@ def read_parameters(node: Node) -> DriverOptions:
         False,
         "also take std_msgs/Float64MultiArray in hPa on cmd_u_t, in force at once",
     )
+    guardian = declare(
+        node,
+        "guardian",
+        "auto",
+        "a process that vents if the driver dies or hangs; auto: for boards without a watchdog",
+        choices=("auto", "on", "off"),
+    )
     core = CoreSettings(
         schedule=_schedule_limits(number),
         monitor=_monitor_limits(node, number),
@@ -78,8 +87,10 @@ def read_parameters(node: Node) -> DriverOptions:
         command_validity=float(validity),
     )
     _check_together(core)
+    # A misspelt limit must not leave the default in force.
+    check_overrides(node, refuse=True)
     return DriverOptions(
-        str(port), str(protocol), int(baud_rate), int(priority), bool(cmd_u_t), core
+        str(port), str(protocol), int(baud_rate), int(priority), bool(cmd_u_t), str(guardian), core
     )
 
 

@@ -119,7 +119,7 @@ class SafetyMachine:
         self._latched = False
         self.schedule.clear()
         self.monitor.reset_following(now)
-        self._command_nothing()
+        self.command_nothing()
         self._enter(Mode.ARMED)
         return True, "armed"
 
@@ -186,9 +186,10 @@ class SafetyMachine:
         """Forget every setpoint, and refuse the rest of their plans from now on."""
         self._spent.spend()
         self.schedule.clear()
-        self._command_nothing()
+        self.command_nothing()
 
-    def _command_nothing(self) -> None:
+    def command_nothing(self) -> None:
+        """Note that the vent command goes out: what is commanded next starts from zero."""
         self.differential = self._target = self._zero
 
     # ------------------------------------------------------------------------------- ticks
@@ -203,7 +204,7 @@ class SafetyMachine:
         sample = self.schedule.sample(tick, self.differential)
         self._look_for_faults(now)
         if self.mode in (Mode.DISARMED, Mode.FAULT):
-            self._command_nothing()
+            self.command_nothing()
             return Action(self._zero, dump=True)
         if self._latched:
             return self._vent_latched(now)
@@ -252,7 +253,7 @@ class SafetyMachine:
         largest = max(abs(value) for value in self.differential)
         step = self.limits.vent_rate * self.schedule.period / NANOSECONDS
         if largest <= step:
-            self._command_nothing()
+            self.command_nothing()
             if not self.schedule.waiting:
                 self.schedule.clear()
             self._enter(Mode.ARMED)
@@ -261,7 +262,7 @@ class SafetyMachine:
             self.differential = tuple(value * share for value in self.differential)
 
     def _vent_latched(self, now: float) -> Action:
-        self._command_nothing()
+        self.command_nothing()
         if self.monitor.vented():
             self._latched = False
             self._enter(Mode.DISARMED)
