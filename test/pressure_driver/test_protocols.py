@@ -305,6 +305,7 @@ def test_a_million_bytes_into_the_boards_decoder(name, kind):
     sound = host_stream(name)
     stream = random_bytes(11) if kind == "random" else mutated(sound, 12)
     board = board_protocol(name)
+    board.decode(host_protocol(name).start())
     commands = decode_all(board, stream, np.random.default_rng(13))
     setpoints = [c.pressure for c in commands if c.kind == "setpoint"]
     if name == "native":

@@ -33,7 +33,7 @@ STANDARD_ATMOSPHERE = 101_325.0
 LARGEST_CLOCK_STEP = 0.3
 """[s] between two ticks, above slewing and late wakes, that means the wall clock was set."""
 IDENTITY_RETRY = 1.0
-"""[s] after which a board that has not introduced itself, or confirmed its settings, is asked again."""
+"""[s] after which a board that has not introduced or set itself up is greeted again."""
 ECHO_TIMEOUT = 1.0
 """[s] without an echo of any command, on boards that echo: the board takes no commands."""
 

@@ -2,8 +2,8 @@
 
 It is started by `pressure_driver.guardian_client` beside the driver of a board without a watchdog,
 by its path and with nothing but the standard library, so that it runs within some hundredths of a
-second and hardly anything in it can fail. The driver goes on writing to the port itself; the guardian
-holds a second descriptor of the open port and does not use it before the driver has failed.
+second and hardly anything in it can fail. The driver goes on writing to the port itself; the
+guardian holds a second descriptor of the open port, which it does not use while the driver lives.
 
 Messages come over a socket that keeps their bounds (one letter, then contents):
 
@@ -172,7 +172,7 @@ class Guardian:
 
 
 def main() -> int:
-    """Guard: ``guardian.py SOCKET DRIVER PRIORITY`` (descriptor, process id, real-time priority)."""
+    """Guard: ``guardian.py SOCKET DRIVER PRIORITY``: descriptor, process id, real-time priority."""
     for number in _IGNORED:
         signal.signal(number, signal.SIG_IGN)
     descriptor, driver, priority = map(int, sys.argv[1:4])

@@ -56,7 +56,7 @@ class PressureDriver(Node):
         self._core = DriverCore(
             protocol, options.core, notify=self._on_tick, log=self._log_from_thread
         )
-        guarded = options.guardian == "on" or (
+        guarded = options.guardian == "always" or (
             options.guardian == "auto" and not protocol.has_watchdog
         )
         self._guardian = GuardianClient(options.real_time_priority) if guarded else None

@@ -75,7 +75,7 @@ def read_parameters(node: Node) -> DriverOptions:
         "guardian",
         "auto",
         "a process that vents if the driver dies or hangs; auto: for boards without a watchdog",
-        choices=("auto", "on", "off"),
+        choices=("auto", "always", "never"),
     )
     core = CoreSettings(
         schedule=_schedule_limits(number),
