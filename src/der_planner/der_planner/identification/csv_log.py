@@ -125,8 +125,8 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
         if not rest.any():
             raise LogError(
                 f"{path} has no row at rest: its commands never come within "
-                f"{100 * REST_SHARE:.0f} % of their largest to zero. Leave rest_until out of the column map if the chambers' "
-                "sensors have no offset"
+                f"{100 * REST_SHARE:.0f} % of their largest to zero. Leave rest_until out of the "
+                "column map if the chambers' sensors have no offset"
             )
         measured = measured - np.nanmean(measured[rest], axis=0)
     if columns.tags:
