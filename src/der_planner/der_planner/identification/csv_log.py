@@ -125,8 +125,8 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
         if not rest.any():
             raise LogError(
                 f"{path} has no row at rest: its commands never come within "
-                f"{100 * REST_SHARE:.0f} % of their largest to zero. Leave rest_until out of the column map if the chambers' "
-                "sensors have no offset"
+                f"{100 * REST_SHARE:.0f} % of their largest to zero. Leave rest_until out of the "
+                "column map if the chambers' sensors have no offset"
             )
         measured = measured - np.nanmean(measured[rest], axis=0)
     if columns.tags:
@@ -162,9 +162,11 @@ def _rest(time: Array, command: Array, rest_until: float | str) -> NDArray[np.bo
     if isinstance(rest_until, str) and rest_until != "auto":
         raise LogError(f"rest_until is '{rest_until}': give a time in s, or auto")
     size = np.abs(command).max(axis=1)
-    near = size <= REST_SHARE * np.nanmax(size)
-    if not isinstance(rest_until, str) and (early := near & (time < rest_until)).any():
-        return early
+    near: NDArray[np.bool_] = size <= REST_SHARE * np.nanmax(size)
+    if not isinstance(rest_until, str):
+        early: NDArray[np.bool_] = near & (time < rest_until)
+        if early.any():
+            return early
     edges = np.flatnonzero(np.diff(near.astype(int), prepend=0, append=0))
     rest = np.zeros(len(time), dtype=bool)
     stretches = [
