@@ -102,7 +102,11 @@ def _arguments() -> argparse.Namespace:
     )
     parser.add_argument("--out", type=Path, default=Path("limb.yaml"), help="limb file to write")
     parser.add_argument("--report", type=Path, help="folder for report.txt and prediction.png")
-    given = parser.parse_args()
+    return _checked(parser, parser.parse_args())
+
+
+def _checked(parser: argparse.ArgumentParser, given: argparse.Namespace) -> argparse.Namespace:
+    """Return the arguments with their defaults; ends the program where they do not go together."""
     if given.csv and not given.columns:
         parser.error("--csv needs --columns FILE")
     for name in ("hardware", "folder"):

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import tempfile
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from nav_msgs.msg import Path as PathMessage
 from der_msgs.msg import MotionCommand, PressurePlan, PressureState
 from der_planner.experiment.client import GraphClient
 from der_planner.experiment.errors import GraphError, NodeError
+from der_planner.experiment.node_specs import STOP_ORDER, NodeSpec, node_specs
 from der_planner.experiment.options import Hardware, Options, Trial
 from der_planner.experiment.processes import NodeProcess
 from der_planner.experiment.progress import Progress
@@ -28,26 +28,6 @@ from limb_interfaces import qos, stamps, topics
 PLAN_TIMEOUT = 120.0
 VENTED_PRESSURE = 1000.0
 """Differential pressure below which a limb counts as vented [Pa]."""
-STOP_ORDER = (
-    "planner",
-    "apriltag_tracker",
-    "synthetic_camera",
-    "limb_twin",
-    "recorder",
-    "pressure_driver",
-    "board_emulator",
-)
-TWIN_NODES = ("board_emulator", "limb_twin", "synthetic_camera")
-"""Nodes that stand in for the hardware."""
-
-
-@dataclass(frozen=True)
-class NodeSpec:
-    """What is needed to start one node."""
-
-    package: str
-    executable: str
-    parameters: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -85,50 +65,6 @@ class GraphRun:
     real_time_factor: float
     duration: float
     plan_id: str = ""
-
-
-def node_specs(
-    port: str,
-    bag: Path,
-    metadata: dict[str, Any],
-    *,
-    seed: int = 0,
-    hardware: Hardware | None = None,
-    planner: dict[str, Any] | None = None,
-    record_images: bool = False,
-) -> list[NodeSpec]:
-    """Return the nodes of a run in the order in which they start.
-
-    Args:
-        port: where the emulated board appears.
-        bag: folder that the recorder makes.
-        metadata: stored in the bag.
-        seed: of the twin.
-        hardware: in place of the twin.
-        planner: parameters of the planner; None for a graph without one.
-        record_images: whether the bag holds the raw images, too.
-    """
-    rig = hardware or Hardware()
-    driver = {"port": port, "protocol": "ezloop", **rig.driver}
-    recorder = {
-        "output": str(bag),
-        "metadata": json.dumps(metadata),
-        "record_images": record_images,
-        **rig.recorder,
-    }
-    specs = [
-        NodeSpec("pressure_driver", "board_emulator", {"port_link": port, "seed": seed}),
-        NodeSpec("pressure_driver", "pressure_driver", driver),
-        NodeSpec("der_planner", "limb_twin", {"seed": seed}),
-        NodeSpec("apriltag_tracker", "synthetic_camera", {"seed": seed}),
-        NodeSpec("apriltag_tracker", "apriltag_tracker", dict(rig.tracker)),
-    ]
-    if hardware is not None:
-        specs = [spec for spec in specs if spec.executable not in TWIN_NODES]
-    if planner is not None:
-        specs.append(NodeSpec("der_planner", "planner", {**planner, **rig.planner}))
-    specs.append(NodeSpec("der_planner", "recorder", recorder))
-    return specs
 
 
 class GraphPlayer(ABC):

@@ -158,7 +158,13 @@ def parser() -> argparse.ArgumentParser:
         epilog="Without options: Case 2 (same_direction), DER and PCC, one trial each, on the twin",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
-    what = result.add_argument_group("what is played")
+    _add_motions(result.add_argument_group("what is played"))
+    _add_stage(result.add_argument_group("on what"))
+    _add_manner(result.add_argument_group("how"))
+    return result
+
+
+def _add_motions(what: argparse._ArgumentGroup) -> None:
     what.add_argument(
         "--motions",
         nargs="+",
@@ -185,7 +191,9 @@ def parser() -> argparse.ArgumentParser:
     )
     what.add_argument("--period", type=float, default=DEFAULT_PERIOD, help="of one cycle [s]")
     what.add_argument("--cycles", type=int, default=DEFAULT_CYCLES, help="cycles of the motion")
-    where = result.add_argument_group("on what")
+
+
+def _add_stage(where: argparse._ArgumentGroup) -> None:
     where.add_argument(
         "--limb",
         type=Path,
@@ -209,7 +217,9 @@ def parser() -> argparse.ArgumentParser:
         metavar="FILE",
         help="a real valve board and camera instead of the twin",
     )
-    how = result.add_argument_group("how")
+
+
+def _add_manner(how: argparse._ArgumentGroup) -> None:
     how.add_argument(
         "--offline", action="store_true", help="without ROS, in one process, faster than real time"
     )
@@ -223,7 +233,6 @@ def parser() -> argparse.ArgumentParser:
     how.add_argument("--record-images", action="store_true", help="raw images into the bags, too")
     how.add_argument("--no-report", action="store_true", help="skip the HTML report at the end")
     how.add_argument("--dry-run", action="store_true", help="say what would be done, start nothing")
-    return result
 
 
 def parse(arguments: Sequence[str]) -> Options:
