@@ -26,9 +26,9 @@ import numpy as np  # noqa: E402
 from matplotlib.axes import Axes  # noqa: E402
 
 from der_planner.limb import Limb  # noqa: E402
+from der_planner.model.bending import ArcKinematics  # noqa: E402
 from der_planner.planning import METHODS, Motion, Plan, plan  # noqa: E402
 from der_planner.planning.inverse import angle_limits, solutions  # noqa: E402
-from der_planner.planning.kinematics import ArcKinematics  # noqa: E402
 
 DPI = 68
 FOLDER = workspace.ROOT / "src" / "der_planner" / "doc"

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.identification.log import CalibrationLog, LogError
+from der_planner.model.series import CONTROL_PERIOD, interpolate
 from der_planner.recording.reader import BagError, BagReader
 
 Array = NDArray[np.float64]
@@ -15,7 +16,6 @@ Array = NDArray[np.float64]
 PRESSURE_TYPE = "der_msgs/msg/PressureState"
 STATE_TYPE = "der_msgs/msg/LimbState"
 TRUTH = "ground_truth"
-PERIOD = 0.05
 LONGEST_GAP = 0.25
 """Between two messages that a straight line may bridge [s]."""
 
@@ -69,14 +69,14 @@ def _merge(
     end = min(pressures[-1][0], states[-1][0])
     if end - start < 1.0:
         raise LogError(f"in {source} pressures and limb states do not overlap: check the clocks")
-    grid = np.arange(start, end, PERIOD)
+    grid = np.arange(start, end, CONTROL_PERIOD)
 
     def column(rows: list[tuple[float, list[float], list[float]]], place: int) -> Array:
         instants = np.array([row[0] for row in rows])
         values = np.array([row[place] for row in rows], dtype=float)
         order = np.argsort(instants, kind="stable")
         instants, values = instants[order], values[order]
-        result = np.stack([np.interp(grid, instants, part) for part in values.T], axis=1)
+        result = interpolate(grid, instants, values)
         after = np.clip(np.searchsorted(instants, grid), 1, len(instants) - 1)
         result[instants[after] - instants[after - 1] > LONGEST_GAP] = np.nan
         return result
