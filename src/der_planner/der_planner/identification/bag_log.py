@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from der_planner.identification.log import CalibrationLog, LogError
 from der_planner.model.series import CONTROL_PERIOD, interpolate
-from der_planner.recording.reader import BagError, BagReader
+from der_planner.runs.recording.reader import BagError, BagReader
 
 Array = NDArray[np.float64]
 
