@@ -41,7 +41,7 @@ CORRELATION = 20.0
 MOST_EVALUATIONS = 25
 """Of model and derivatives; what still moves by then moves less than its uncertainty."""
 STRONG = 0.9
-"""|correlation| above which two unknowns are said to be told only together."""
+"""|correlation| above which two unknowns are reported as a pair that the log cannot tell apart."""
 UNTOLD = 0.8
 """Share of its prior spread that must be left of an unknown that the data say nothing about."""
 
