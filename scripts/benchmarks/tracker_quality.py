@@ -1,7 +1,8 @@
 """Tags found, corner errors and how honest the covariance is, on pictures by brute force.
 
-The C library reads the same pictures in the same run. NEES / 8 is the squared error of a tag's corners
-in units of the covariance that the tracker states, per number: 1 is honest, above is overconfident.
+The C library reads the same pictures in the same run. NEES / 8 is the squared error of a tag's
+corners in units of the covariance that the tracker states, per number: 1 is honest, above is
+overconfident.
 """
 
 from __future__ import annotations
@@ -156,7 +157,7 @@ def measure_fast_limb(frames: int) -> dict[str, float]:
         "fast_limb_tip_p99_mm": float(np.percentile(off, 99)),
         "fast_limb_valid_percent": 100.0 * len(errors) / frames,
     }
-    print("\nA limb whose tip goes at 2.2 m/s, 3 ms of exposure, 30 pictures a second")
+    print("\nA limb whose tip goes at 2.2 m/s, 3 ms of exposure, 30 pictures a second", flush=True)
     for key, value in result.items():
         print(f"  {key:42s} {value:9.3f}")
     return result

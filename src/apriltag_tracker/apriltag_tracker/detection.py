@@ -30,7 +30,7 @@ _LINES_ALONE = 0.15
 """Standard deviation that lines have where the whole pattern could not be fitted [px]."""
 
 _EXPLAINED = 0.93
-_WRONG_BUT_NEAR = 8
+_WRONG_BUT_NEAR = 5
 _DIM = 60.0
 _THRESHOLD, _FAINT_THRESHOLD = 7.0, 3.0
 """By how much a pixel must be darker than its surroundings to be black [grey levels]."""
