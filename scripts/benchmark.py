@@ -1,69 +1,9 @@
 #!/usr/bin/env python3
-"""Measure time and memory of one part or all, beside a peer where there is one.
+"""Measure time and memory of the parts."""
 
-python3 scripts/benchmark.py rod
-python3 scripts/benchmark.py all --json figures.json
-"""
-
-from __future__ import annotations
-
-import argparse
-import importlib
-import json
-import os
-import platform
 import sys
-import time
-from pathlib import Path
 
 import workspace
 
-workspace.enter()
-
-PARTS = ("rod", "planning", "driver", "tracker", "recorder", "identification")
-
-
-def machine() -> dict[str, str | int]:
-    """Describe the machine that the figures belong to."""
-    model = platform.processor()
-    for line in Path("/proc/cpuinfo").read_text().splitlines():
-        if line.startswith("model name"):
-            model = line.split(":", 1)[1].strip()
-            break
-    return {
-        "processor": model,
-        "cores": os.cpu_count() or 0,
-        "system": platform.platform(),
-        "python": platform.python_version(),
-        "date": time.strftime("%Y-%m-%d"),
-        "load_average_1min": f"{os.getloadavg()[0]:.2f}",
-    }
-
-
-def main() -> int:
-    """Run the command line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument(
-        "parts",
-        nargs="+",
-        choices=(*PARTS, "all"),
-        metavar="PART",
-        help=f"of {', '.join(PARTS)}; or all",
-    )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write every figure here, too")
-    parser.add_argument("--quick", action="store_true", help="fewer sizes and repetitions")
-    options = parser.parse_args()
-    parts = PARTS if "all" in options.parts else options.parts
-    where = machine()
-    print(", ".join(f"{key} {value}" for key, value in where.items()))
-    figures: dict[str, object] = {"machine": where}
-    for part in parts:
-        print(f"\n== {part}", flush=True)
-        figures[part] = importlib.import_module(f"benchmarks.{part}").run(options.quick)
-        if options.json is not None:
-            options.json.write_text(json.dumps(figures, indent=1))
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(workspace.run("benchmarks.command"))

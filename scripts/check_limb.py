@@ -1,57 +1,9 @@
 #!/usr/bin/env python3
-"""Say from any later run whether a limb file still fits.
+"""Say from a later run whether a limb file still fits."""
 
-    python3 scripts/check_limb.py out/bags/same_direction_der_1 --limb my_limb.yaml
-    python3 scripts/check_limb.py log.csv --columns columns.yaml --limb my_limb.yaml
-
-Predicts the run open loop from its measured pressures. Exit code 0: it fits; 3: calibrate again;
-1: the run or the file cannot be used.
-"""
-
-from __future__ import annotations
-
-import argparse
 import sys
-from pathlib import Path
 
 import workspace
 
-workspace.enter()
-
-from der_planner.identification import (  # noqa: E402
-    ColumnMap,
-    LogError,
-    check,
-    read_bag,
-    read_csv,
-)
-from der_planner.limb import Limb, LimbError  # noqa: E402
-
-
-def main() -> int:
-    """Run the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("run", type=Path, metavar="BAG", help="bag of the run, or a CSV table")
-    parser.add_argument("--limb", type=Path, required=True, help="limb file to check")
-    parser.add_argument("--columns", type=Path, help="YAML map of the table's columns")
-    given = parser.parse_args()
-    try:
-        limb = Limb.from_yaml(given.limb)
-        if given.run.suffix == ".csv":
-            if given.columns is None:
-                parser.error("a table needs --columns FILE")
-            log = read_csv(given.run, ColumnMap.from_yaml(given.columns))
-        else:
-            log = read_bag(given.run)
-        verdict = check(limb, log)
-    except (LogError, LimbError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    print(verdict.text())
-    return 0 if verdict.fits else 3
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(workspace.run("der_planner.commands.check_limb"))

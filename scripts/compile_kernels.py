@@ -10,21 +10,18 @@ import sys
 import time
 from dataclasses import replace
 
-import workspace
+import numpy as np
 
-workspace.enter()
+from apriltag_tracker.pipeline import LimbTracker
+from apriltag_tracker.synthetic.camera import CameraModel, SyntheticCamera
+from apriltag_tracker.synthetic.shapes import constant_curvature
+from apriltag_tracker.tag_map import TagMap
+from der_planner.limb import Limb
+from der_planner.planning import METHODS, Motion, plan
+from der_planner.twin.offline import play
+from workspace_setup.basics import ROOT
 
-import numpy as np  # noqa: E402
-
-from apriltag_tracker.pipeline import LimbTracker  # noqa: E402
-from apriltag_tracker.synthetic.camera import CameraModel, SyntheticCamera  # noqa: E402
-from apriltag_tracker.synthetic.shapes import constant_curvature  # noqa: E402
-from apriltag_tracker.tag_map import TagMap  # noqa: E402
-from der_planner.limb import Limb  # noqa: E402
-from der_planner.planning import METHODS, Motion, plan  # noqa: E402
-from der_planner.twin.offline import play  # noqa: E402
-
-CONFIG = workspace.ROOT / "src" / "apriltag_tracker" / "config"
+CONFIG = ROOT / "src" / "apriltag_tracker" / "config"
 
 
 def _track() -> None:

@@ -1,74 +1,9 @@
 #!/usr/bin/env python3
-"""Print sheets in true size: the tags of a tag map, or a board to calibrate the camera with.
+"""Print sheets of tags or a calibration board in true size."""
 
-python3 scripts/make_tags.py tags --out sheets/
-python3 scripts/make_tags.py board --paper letter --out sheets/
-"""
-
-from __future__ import annotations
-
-import argparse
 import sys
-from pathlib import Path
 
 import workspace
 
-workspace.enter()
-
-from apriltag_tracker.sheets import (  # noqa: E402
-    PAPERS,
-    Page,
-    SheetError,
-    board_page,
-    tag_pages,
-    write_pdf,
-    write_svg,
-)
-from apriltag_tracker.tag_map import TagMap, TagMapError  # noqa: E402
-from calibration_board import add_board_arguments, given_board  # noqa: E402
-
-DEFAULT_MAP = workspace.ROOT / "src" / "apriltag_tracker" / "config" / "tags.yaml"
-
-
-def _write(pages: list[Page], name: str, options: argparse.Namespace) -> None:
-    options.out.mkdir(parents=True, exist_ok=True)
-    if options.format == "pdf":
-        path = options.out / f"{name}.pdf"
-        write_pdf(pages, path)
-        print(path)
-        return
-    for number, page in enumerate(pages, 1):
-        path = options.out / (f"{name}_{number}.svg" if len(pages) > 1 else f"{name}.svg")
-        write_svg(page, path)
-        print(path)
-
-
-def main() -> int:
-    """Run the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    what = parser.add_subparsers(dest="what", required=True)
-    common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("--paper", choices=sorted(PAPERS), default="a4")
-    common.add_argument("--format", choices=("pdf", "svg"), default="pdf")
-    common.add_argument("--out", type=Path, default=Path("sheets"), metavar="DIR")
-    tags = what.add_parser("tags", parents=[common], help="every tag of a tag map")
-    tags.add_argument("--tag-map", type=Path, default=DEFAULT_MAP, metavar="FILE")
-    board = what.add_parser("board", parents=[common], help="a calibration board")
-    add_board_arguments(board)
-    options = parser.parse_args()
-    try:
-        if options.what == "tags":
-            _write(tag_pages(TagMap.from_yaml(options.tag_map), options.paper), "tags", options)
-        else:
-            _write([board_page(given_board(options), options.paper)], "board", options)
-    except (TagMapError, SheetError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    print("Print at 100 % (no 'fit to page') and check the 100 mm line with a ruler.")
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(workspace.run("apriltag_tracker.commands.make_tags"))

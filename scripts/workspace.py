@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import fcntl
+import importlib
 import os
 import shutil
 import sys
@@ -27,7 +28,7 @@ from workspace_setup.building import build, compile_kernels
 from workspace_setup.environment import environment
 from workspace_setup.python_packages import install_venv, venv_is_complete, write_lock
 
-__all__ = ["APT_ROS", "PACKAGES", "ROOT", "SetupError", "ensure", "enter", "environment"]
+__all__ = ["APT_ROS", "PACKAGES", "ROOT", "SetupError", "ensure", "enter", "environment", "run"]
 
 
 @contextlib.contextmanager
@@ -66,6 +67,16 @@ def enter() -> None:
         sys.exit(f"error: {error}")
     python = str(VENV / "bin" / "python")
     os.execve(python, [python, *sys.argv], inside)
+
+
+def run(module: str) -> int:
+    """Run ``main()`` of a module inside the workspace; return the exit code.
+
+    What is installed in the workspace can be imported only inside it, so an entry point names its
+    module instead of importing it.
+    """
+    enter()
+    return int(importlib.import_module(module).main())
 
 
 def main() -> int:

@@ -30,7 +30,7 @@ class Graph:
     """
 
     def __init__(self, folder: Path, domain_id: int) -> None:
-        from orchestrator.client import GraphClient
+        from der_planner.experiment.client import GraphClient
 
         self.domain_id = domain_id
         self.folder = folder
@@ -39,7 +39,7 @@ class Graph:
 
     def start(self, package: str, executable: str, name: str = "", remap=None, **parameters):
         """Start a node as ``ros2 run`` would; returns its `NodeProcess`."""
-        from orchestrator.processes import NodeProcess
+        from der_planner.experiment.processes import NodeProcess
 
         environment = {**os.environ, "ROS_DOMAIN_ID": str(self.domain_id)}
         process = NodeProcess(

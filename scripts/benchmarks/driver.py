@@ -22,10 +22,10 @@ from der_msgs.msg import (
     PressureSetpoint,
     PressureState,
 )
+from der_planner.experiment.client import GraphClient
+from der_planner.experiment.processes import NodeProcess
 from limb_interfaces import qos, topics
 from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
-from orchestrator.client import GraphClient
-from orchestrator.processes import NodeProcess
 
 PERIOD = 50_000_000
 LATE = 10e-3

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from der_msgs.msg import ChamberPressures, LimbState
+from der_planner.experiment.client import GraphClient
+from der_planner.experiment.processes import NodeProcess
 from limb_interfaces import qos, topics
 from limb_interfaces.stamps import nanoseconds
-from orchestrator.client import GraphClient
-from orchestrator.processes import NodeProcess
 
 
 def measure_graph(seconds: float) -> dict[str, float]:

@@ -1,37 +1,29 @@
-#!/usr/bin/env python3
 """Draw the pictures of the planning page.
 
-python3 scripts/figures/planning.py
+python3 scripts/draw_figures.py planning
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
 
-import workspace
-
-workspace.enter()
-
-import matplotlib  # noqa: E402
+from der_planner.limb import Limb
+from der_planner.planning import METHODS, Motion, Plan, plan
+from der_planner.planning.inverse import angle_limits, solutions
+from der_planner.planning.kinematics import ArcKinematics
+from workspace_setup.basics import ROOT
 
 matplotlib.use("Agg")
 
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
-from matplotlib.axes import Axes  # noqa: E402
-
-from der_planner.limb import Limb  # noqa: E402
-from der_planner.planning import METHODS, Motion, Plan, plan  # noqa: E402
-from der_planner.planning.inverse import angle_limits, solutions  # noqa: E402
-from der_planner.planning.kinematics import ArcKinematics  # noqa: E402
-
 DPI = 68
-FOLDER = workspace.ROOT / "src" / "der_planner" / "doc"
+FOLDER = ROOT / "src" / "der_planner" / "doc"
 CASES = ("asynchronous", "same_direction", "opposite_direction")
 COLORS = {
     ("der", "paper"): "tab:orange",
@@ -146,7 +138,3 @@ def main() -> int:
         draw(path)
         print(f"{path} ({path.stat().st_size // 1000} kB)")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,33 +1,25 @@
-#!/usr/bin/env python3
 """Draw the checks of the rod that src/der_planner/doc/rod.md shows.
 
-python3 scripts/figures/rod.py [FOLDER]
+python3 scripts/draw_figures.py rod [FOLDER]
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
 
-import workspace
-
-workspace.enter()
-
-import matplotlib  # noqa: E402
+from benchmarks.rod import cantilever, run_elastica
+from der_planner.limb import Limb
+from der_planner.rod import Rod, RodState
+from workspace_setup.basics import ROOT
 
 matplotlib.use("Agg")
 
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
-
-from benchmarks.rod import cantilever, run_elastica  # noqa: E402
-from der_planner.limb import Limb  # noqa: E402
-from der_planner.rod import Rod, RodState  # noqa: E402
-
-FOLDER = workspace.ROOT / "src" / "der_planner" / "doc"
+FOLDER = ROOT / "src" / "der_planner" / "doc"
 ELASTICA_TIP_MM = 66.3753  # exact inextensible elastica, see test_statics
 
 
@@ -180,7 +172,3 @@ def main() -> int:
     for draw in (statics, theorem, dynamics, stability):
         draw(folder)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

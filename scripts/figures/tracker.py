@@ -1,44 +1,36 @@
-#!/usr/bin/env python3
 """Draw the pictures of src/apriltag_tracker/README.md.
 
 python3 scripts/benchmark.py tracker --json figures.json
-python3 scripts/figures/tracker.py --figures figures.json
+python3 scripts/draw_figures.py tracker --figures figures.json
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+import cv2
+import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
 
-import workspace
-
-workspace.enter()
-
-import cv2  # noqa: E402
-import matplotlib  # noqa: E402
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
-
-from apriltag_tracker.overlay import draw_observation  # noqa: E402
-from apriltag_tracker.pipeline import LimbTracker  # noqa: E402
-from apriltag_tracker.synthetic.camera import (  # noqa: E402
+from apriltag_tracker.overlay import draw_observation
+from apriltag_tracker.pipeline import LimbTracker
+from apriltag_tracker.synthetic.camera import (
     CameraModel,
     Optics,
     Shape,
     SyntheticCamera,
 )
-from apriltag_tracker.tag_map import TagMap  # noqa: E402
-from benchmarks.tracker_pictures import CONDITIONS  # noqa: E402
-from der_planner.twin import LimbTwin  # noqa: E402
+from apriltag_tracker.tag_map import TagMap
+from benchmarks.tracker_pictures import CONDITIONS
+from der_planner.twin import LimbTwin
+from workspace_setup.basics import ROOT
 
-PACKAGE = workspace.ROOT / "src" / "apriltag_tracker"
+matplotlib.use("Agg")
+
+PACKAGE = ROOT / "src" / "apriltag_tracker"
 DETECTORS = {
     "ours": "this package",
     "c_decimate_1": "AprilTag 3 C library, quad_decimate=1",
@@ -98,7 +90,3 @@ def main() -> int:
         figures = json.loads(options.figures.read_text())["tracker"]
         draw_accuracy(figures, options.out / "accuracy.png")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

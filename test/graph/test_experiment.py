@@ -112,7 +112,7 @@ def experiment(tmp_path: Path) -> Iterator:
 
 def last_board_command(bag: Path) -> np.ndarray:
     """Return the differential pressures [Pa] that the board was told last, as the bag has it."""
-    from der_planner.recording.reader import BagReader
+    from der_planner.runs.recording.reader import BagReader
 
     last = None
     with BagReader(bag) as reader:

@@ -7,7 +7,7 @@ import pytest
 
 @pytest.fixture(scope="module")
 def parse():
-    from orchestrator.options import parse
+    from der_planner.experiment.options import parse
 
     return parse
 
@@ -24,14 +24,14 @@ def parse():
     ],
 )
 def test_a_bad_option_is_refused_by_its_name(parse, arguments, named):
-    from orchestrator.options import OptionError
+    from der_planner.experiment.options import OptionError
 
     with pytest.raises(OptionError, match=named):
         parse(arguments)
 
 
 def test_hardware_without_its_serial_device_is_refused(parse, tmp_path: Path):
-    from orchestrator.options import OptionError
+    from der_planner.experiment.options import OptionError
 
     rig = tmp_path / "rig.yaml"
     rig.write_text("driver: {port: /dev/serial/by-id/no-such-board}\nlimb: limb.yaml\n")
@@ -59,8 +59,8 @@ def test_pcc_is_always_planned_by_its_own_method(parse):
 
 
 def test_a_stopped_experiment_goes_on_and_refuses_other_options(parse, tmp_path: Path):
-    from orchestrator.ledger import Ledger
-    from orchestrator.options import OptionError
+    from der_planner.experiment.ledger import Ledger
+    from der_planner.experiment.options import OptionError
 
     arguments = ["--out", str(tmp_path), "--trials", "2"]
     options = parse(arguments)

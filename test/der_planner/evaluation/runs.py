@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from bags import SECOND, START, spec, store
 
-from der_planner.evaluation import Description, RunSeries
-from der_planner.recording.layout import RUN_KEY
-from der_planner.recording.writer import BagWriter
+from der_planner.runs.evaluation import Description, RunSeries
+from der_planner.runs.recording.layout import RUN_KEY
+from der_planner.runs.recording.writer import BagWriter
 
 PERIOD, CYCLES = 4.0, 2
 TIMES = np.arange(0.0, PERIOD * CYCLES + 1.0 + 1e-9, 0.05)

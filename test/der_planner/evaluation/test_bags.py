@@ -8,9 +8,9 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from runs import FRAMES, TIMES, BagOfRun, reference
 
-from der_planner.evaluation import EvaluationError, evaluate_bag, evaluate_run, load_run
-from der_planner.recording.layout import RUN_KEY
-from der_planner.recording.writer import BagWriter
+from der_planner.runs.evaluation import EvaluationError, evaluate_bag, evaluate_run, load_run
+from der_planner.runs.recording.layout import RUN_KEY
+from der_planner.runs.recording.writer import BagWriter
 
 OFFSET = np.array([0.003, -0.004])
 

@@ -3,8 +3,8 @@
 import numpy as np
 from runs import FRAMES, reference, series
 
-from der_planner.evaluation import plot_error, plot_tip
-from der_planner.evaluation.figures import mean_error
+from der_planner.runs.evaluation import plot_error, plot_tip
+from der_planner.runs.evaluation.figures import mean_error
 
 
 def test_mean_error_over_trials_ignores_gaps():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from runs import CYCLES, FRAMES, PERIOD, TIMES, reference, series
 
-from der_planner.evaluation import (
+from der_planner.runs.evaluation import (
     Description,
     EvaluationError,
     RunResult,

@@ -15,7 +15,7 @@ from bags import spec
 from rosbags.typesys import get_types_from_msg
 from runs import FRAMES, TIMES, BagOfRun, reference, series
 
-from der_planner.evaluation import (
+from der_planner.runs.evaluation import (
     EvaluationError,
     compare,
     evaluate_bags,
@@ -23,9 +23,9 @@ from der_planner.evaluation import (
     load_run,
     write_report,
 )
-from der_planner.evaluation.overlay import plot_shapes, write_video
-from der_planner.evaluation.snapshots import fit_projection, gray, take_snapshots
-from der_planner.recording.definitions import find_definition
+from der_planner.runs.evaluation.overlay import plot_shapes, write_video
+from der_planner.runs.evaluation.snapshots import fit_projection, gray, take_snapshots
+from der_planner.runs.recording.definitions import find_definition
 
 CAMERA = np.array([[300.0, 0.0, 158.0], [0.0, 305.0, 121.0], [0.0, 0.0, 1.0]])
 DISTORTION = np.array([-0.12, 0.03, 0.001, -0.0005, 0.0])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from runs import FRAMES, reference, series
 
-from der_planner.evaluation import (
+from der_planner.runs.evaluation import (
     compare,
     csv_table,
     evaluate_run,
@@ -19,8 +19,8 @@ from der_planner.evaluation import (
     summarise,
     write_results,
 )
-from der_planner.evaluation.selfcheck import check_board
-from der_planner.evaluation.series import BoardLog
+from der_planner.runs.evaluation.selfcheck import check_board
+from der_planner.runs.evaluation.series import BoardLog
 
 
 def result(error: float, model="der", trial=0, **changes):

@@ -159,7 +159,7 @@ def test_a_path_is_planned_and_a_new_command_takes_over_without_a_jump(planner):
 
 
 def test_start_and_stop(planner):
-    from orchestrator.errors import GraphError
+    from der_planner.experiment.errors import GraphError
 
     node = planner(auto_start=False)
     with pytest.raises(GraphError, match="no plan yet"):

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from der_planner.recording.definitions import find_definition
-from der_planner.recording.layout import OfferedQos, TopicSpec
+from der_planner.runs.recording.definitions import find_definition
+from der_planner.runs.recording.layout import OfferedQos, TopicSpec
 
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND

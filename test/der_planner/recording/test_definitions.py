@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from der_planner.recording.definitions import (
+from der_planner.runs.recording.definitions import (
     DefinitionError,
     find_definition,
     installed_prefixes,

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from bags import read_texts
 
-from der_planner.recording.reader import BagReader
-from der_planner.recording.recover import recover_bag
+from der_planner.runs.recording.reader import BagReader
+from der_planner.runs.recording.recover import recover_bag
 
 pytestmark = pytest.mark.graph
 SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"
@@ -115,7 +115,7 @@ def test_records_the_graph_between_start_and_stop(graph, tmp_path: Path):
 
 
 def test_second_start_into_the_same_folder_is_refused(graph, tmp_path: Path):
-    from orchestrator.errors import GraphError
+    from der_planner.experiment.errors import GraphError
 
     start(graph, output=str(tmp_path / "run"))
     graph.client.call("recorder/start")

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 from bags import SECOND, START, TEXT, spec, string
 
-from der_planner.recording.reader import BagError, BagReader
-from der_planner.recording.replay import ReplaySettings, replay
-from der_planner.recording.writer import BagWriter
+from der_planner.runs.recording.reader import BagError, BagReader
+from der_planner.runs.recording.replay import ReplaySettings, replay
+from der_planner.runs.recording.writer import BagWriter
 
 
 class Stage:

@@ -5,9 +5,9 @@ from pathlib import Path
 
 from bags import START, TEXT, read_texts, spec, string
 
-from der_planner.recording.reader import BagReader
-from der_planner.recording.session import RecordingSession
-from der_planner.recording.writer import BagWriter
+from der_planner.runs.recording.reader import BagReader
+from der_planner.runs.recording.session import RecordingSession
+from der_planner.runs.recording.writer import BagWriter
 
 TALK = "/talk"
 

@@ -15,12 +15,12 @@ from bags import SECOND, START, TEXT, read_texts, spec, string
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
-from der_planner.recording import writer as writer_module
-from der_planner.recording.layout import METADATA_FILE, RUN_KEY
-from der_planner.recording.reader import BagError, BagReader
-from der_planner.recording.recover import recover_bag
-from der_planner.recording.scan import RecoverError
-from der_planner.recording.writer import BagWriteError, BagWriter
+from der_planner.runs.recording import writer as writer_module
+from der_planner.runs.recording.layout import METADATA_FILE, RUN_KEY
+from der_planner.runs.recording.reader import BagError, BagReader
+from der_planner.runs.recording.recover import recover_bag
+from der_planner.runs.recording.scan import RecoverError
+from der_planner.runs.recording.writer import BagWriteError, BagWriter
 
 
 def fill(bag: BagWriter, count: int, step: int = SECOND // 10, first: int = 0) -> None:
@@ -142,7 +142,7 @@ KILLED = """
     sys.path.insert(0, {here!r})
     from pathlib import Path
     from bags import START, SECOND, TEXT, spec, string
-    from der_planner.recording.writer import BagWriter
+    from der_planner.runs.recording.writer import BagWriter
     bag = BagWriter(Path({folder!r}), {{"run": '{{"seed": 4}}'}}, compression={compression!r})
     bag.add_topic(spec("/talk", TEXT))
     for index in range(100):
@@ -244,7 +244,7 @@ FULL_DISK = """
     sys.path.insert(0, {here!r})
     from pathlib import Path
     from bags import START, SECOND, TEXT, spec, string
-    from der_planner.recording.writer import BagWriter, BagWriteError
+    from der_planner.runs.recording.writer import BagWriter, BagWriteError
     resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, resource.RLIM_INFINITY))
     bag = BagWriter(Path({folder!r}), compression="none", chunk_size=4_000)
     bag.add_topic(spec("/talk", TEXT))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.identification.log import CalibrationLog, LogError
-from der_planner.recording.reader import BagError, BagReader
+from der_planner.runs.recording.reader import BagError, BagReader
 
 Array = NDArray[np.float64]
 

@@ -1,0 +1,17 @@
+#!/usr/bin/env python3
+"""Draw the pictures of the documentation pages.
+
+python3 scripts/draw_figures.py {planning,rod,tracker} [arguments]
+"""
+
+import sys
+
+import workspace
+
+PAGES = ("planning", "rod", "tracker")
+
+if __name__ == "__main__":
+    if len(sys.argv) < 2 or sys.argv[1] not in PAGES:
+        sys.exit(f"usage: draw_figures.py {{{','.join(PAGES)}}} [arguments]")
+    workspace.enter()
+    sys.exit(workspace.run(f"figures.{sys.argv.pop(1)}"))

@@ -1,0 +1,245 @@
+"""Identify a limb: run or read a calibration, fit, and write a limb file that every node takes.
+
+    python3 scripts/calibrate_limb.py --offline --seed 3 --out my_twin.yaml
+    python3 scripts/calibrate_limb.py --graph --seed 3 --out my_twin.yaml
+    python3 scripts/calibrate_limb.py --graph --hardware my_rig.yaml --out my_limb.yaml
+    python3 scripts/calibrate_limb.py --bag calibrations/DATE/bag --out my_limb.yaml
+    python3 scripts/calibrate_limb.py --csv log.csv --columns columns.yaml --out my_limb.yaml
+
+--offline plays the calibration on the twin in one process, in seconds. --graph plays it in real
+time on the running graph, on the twin or the hardware, records a bag, vents, and fits to the bag:
+about three minutes. A bag is any recorded run that excites every input; `--excitation FILE.csv`
+writes the pressures of the calibration run, and `--play FILE.csv` plays such a file instead.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from der_planner.experiment.errors import GraphError, NodeError
+from der_planner.experiment.interrupts import interrupt_once
+from der_planner.experiment.options import Hardware, OptionError
+from der_planner.experiment.progress import Progress
+from der_planner.identification import (
+    CalibrationLog,
+    ColumnMap,
+    Excitation,
+    FitReport,
+    LogError,
+    calibration_run,
+    fit,
+    predict,
+    read_bag,
+    read_csv,
+    read_excitation,
+    record_twin,
+    within_limits,
+    write_excitation,
+)
+from der_planner.identification.offline import AMPLITUDE
+from der_planner.identification.parameters import GROUPS
+from der_planner.identification.plots import plot_prediction
+from der_planner.identification.prepare import prepare
+from der_planner.limb import Limb, LimbError
+from pressure_driver.schedule import ScheduleLimits
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument("--offline", action="store_true", help="calibrate the twin of --seed")
+    source.add_argument(
+        "--graph", action="store_true", help="play on the running graph, record a bag and fit to it"
+    )
+    source.add_argument("--bag", type=Path, help="fit to a recorded run")
+    source.add_argument("--csv", type=Path, help="fit to a table; needs --columns")
+    source.add_argument(
+        "--excitation", type=Path, metavar="FILE", help="write the run's pressures as CSV and stop"
+    )
+    parser.add_argument(
+        "--hardware", type=Path, metavar="FILE", help="with --graph: in place of the twin"
+    )
+    parser.add_argument(
+        "--play", type=Path, metavar="FILE", help="pressures to play, a table as of --excitation"
+    )
+    parser.add_argument(
+        "--folder",
+        type=Path,
+        help="with --graph: for bag, logs and report (default: calibrations/ and the time)",
+    )
+    parser.add_argument("--columns", type=Path, help="YAML map of the table's columns")
+    parser.add_argument("--prior", type=Path, help="limb file to start from (default: built in)")
+    parser.add_argument("--seed", type=int, default=0, help="of the twin (default: 0)")
+    parser.add_argument("--quick", action="store_true", help="90 s instead of 200 s of excitation")
+    parser.add_argument(
+        "--terms",
+        default=",".join(GROUPS),
+        help=f"model terms to fit, of {', '.join(GROUPS)}; 'none' for gain and rest angle alone",
+    )
+    parser.add_argument("--longest-gap", type=float, default=1.0, help="in the log, bridged [s]")
+    parser.add_argument(
+        "--held-out",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="FILE",
+        help="bags or tables to predict, not to fit",
+    )
+    parser.add_argument("--out", type=Path, default=Path("limb.yaml"), help="limb file to write")
+    parser.add_argument("--report", type=Path, help="folder for report.txt and prediction.png")
+    given = parser.parse_args()
+    if given.csv and not given.columns:
+        parser.error("--csv needs --columns FILE")
+    for name in ("hardware", "folder"):
+        if getattr(given, name) and not given.graph:
+            parser.error(f"--{name} goes with --graph")
+    if given.play and not (given.graph or given.offline):
+        parser.error("--play goes with --graph or --offline")
+    if not 0 <= given.seed < 2**31:
+        parser.error(f"--seed is {given.seed}: choose 0 to {2**31 - 1}")
+    if given.graph:
+        stamp = time.strftime("%Y-%m-%d_%H-%M-%S")
+        given.folder = (given.folder or Path("calibrations") / stamp).resolve()
+        given.report = given.report or given.folder / "report"
+    return given
+
+
+def main() -> int:
+    """Run the command line: 0 when a limb file was written, 1 after an error, 2 for bad options."""
+    given = _arguments()
+    try:
+        prior = Limb.from_yaml(given.prior) if given.prior else Limb.default()
+        if given.excitation:
+            run = _excitation(prior, prior.pneumatics.pressure_limit, given)
+            write_excitation(run, given.excitation)
+            print(f"{run.duration:.0f} s of excitation in {given.excitation}")
+            return 0
+        log = _obtain(prior, given)
+        terms = () if given.terms == "none" else given.terms.split(",")
+        limb, report = fit(prior, log, terms=terms, longest_gap=given.longest_gap)
+        held_out = [_read(path, given.columns) for path in given.held_out]
+        _conclude(limb, report, log, held_out, given)
+    except OptionError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except (LogError, LimbError, GraphError, NodeError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt as error:
+        print(f"stopped by {error or 'SIGINT'}; no limb file was written", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _excitation(prior: Limb, pressure_limit: float, given: argparse.Namespace) -> Excitation:
+    if given.play:
+        return read_excitation(given.play, prior.segment_count)
+    return calibration_run(AMPLITUDE * pressure_limit, prior.segment_count, given.quick)
+
+
+def _obtain(prior: Limb, given: argparse.Namespace) -> CalibrationLog:
+    """Play or read the log to fit to."""
+    if given.graph:
+        return read_bag(_play_on_graph(prior, given))
+    if not given.offline:
+        return _read(given.bag or given.csv, given.columns)
+    limit = prior.pneumatics.pressure_limit
+    run = within_limits(_excitation(prior, limit, given), limit, math.inf)
+    print(f"playing {run.duration:.0f} s on the twin of seed {given.seed} …", file=sys.stderr)
+    return record_twin(given.seed, run)
+
+
+def _play_on_graph(prior: Limb, given: argparse.Namespace) -> Path:
+    """Play the calibration on the twin's nodes or the hardware; return the bag."""
+    # ROS is imported only by who needs it.
+    from der_planner.experiment.calibration import GraphCalibration  # noqa: PLC0415
+
+    interrupt_once()
+    progress = Progress()
+    hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
+    driver = hardware.driver if hardware else {}
+    defaults = ScheduleLimits()
+    count = int(driver.get("segment_count", defaults.segment_count))
+    if count != prior.segment_count:
+        raise OptionError(
+            f"the driver's segment_count is {count}, the limb '{prior.name}' has "
+            f"{prior.segment_count}: give the limb's --prior, or set it in the hardware file"
+        )
+    limit = min(
+        prior.pneumatics.pressure_limit,
+        float(driver.get("pressure_limit", defaults.pressure_limit)),
+    )
+    # Steps may be faster than the limb's own slew_limit, which is for plans: they show how the air
+    # follows. The driver's limit holds for every setpoint.
+    slew = float(driver.get("slew_limit", defaults.slew_limit))
+    run = within_limits(_excitation(prior, limit, given), limit, slew)
+    stage = f"the hardware at {driver['port']}" if hardware else f"the twin of seed {given.seed}"
+    progress.say(f"playing {run.duration:.0f} s on {stage}, into {given.folder}")
+    metadata = {
+        "motion": "calibration",
+        "stage": stage,
+        "seed": None if hardware else given.seed,
+        "largest_pressure_Pa": float(np.abs(run.differential_pressure).max()),
+        "parts": [list(part) for part in run.parts],
+        "prior": prior.name,
+    }
+    player = GraphCalibration(
+        run, given.folder, metadata, progress, seed=given.seed, hardware=hardware
+    )
+    bag = player.play().bag
+    progress.say(f"bag: {bag}")
+    return bag
+
+
+def _read(path: Path, columns: Path | None) -> CalibrationLog:
+    if path.suffix == ".csv":
+        if columns is None:
+            raise LogError(f"{path} needs --columns FILE")
+        return read_csv(path, ColumnMap.from_yaml(columns))
+    return read_bag(path)
+
+
+def _conclude(
+    limb: Limb,
+    report: FitReport,
+    log: CalibrationLog,
+    held_out: list[CalibrationLog],
+    given: argparse.Namespace,
+) -> None:
+    text = report.text()
+    for unseen in held_out:
+        text += "\n" + _held_out_text(limb, unseen, given.longest_gap)
+    print(text)
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    limb.to_yaml(given.out)
+    print(f"limb file: {given.out}")
+    if given.report:
+        given.report.mkdir(parents=True, exist_ok=True)
+        (given.report / "report.txt").write_text(text + "\n")
+        plot_prediction(limb, log, given.report / "prediction.png", *held_out[:1])
+        print(f"report: {given.report}")
+
+
+def _held_out_text(limb: Limb, log: CalibrationLog, longest_gap: float) -> str:
+    prepared = prepare(log, limb, longest_gap=longest_gap, to_fit=False)
+    lines = [f"held out: {log.source}"]
+    for model in ("der", "pcc"):
+        predicted = predict(limb, prepared.log.time, prepared.pressure, model)
+        error = np.degrees(predicted.bend_angles - prepared.log.bend_angles)
+        span = np.degrees(np.ptp(prepared.bend, axis=0))
+        rms = np.sqrt(np.nanmean(error**2, axis=0))
+        parts = [
+            f"segment {index} {value:.2f}° ({100 * value / width:.1f} % of its range of "
+            f"{width:.1f}°)"
+            for index, (value, width) in enumerate(zip(rms, span, strict=True))
+        ]
+        lines.append(f"  {model}: " + ", ".join(parts))
+    return "\n".join(lines)

@@ -1,0 +1,256 @@
+"""Publish a recorded bag again, with /clock, so that nodes can be run on what was recorded.
+
+python3 scripts/replay_bag.py BAG --topics /limb/camera/image_raw /limb/camera/camera_info
+python3 scripts/replay_bag.py BAG --rate 0 --step-by /limb/camera/image_raw=/limb/state
+
+Nodes that should live in recorded time need the parameter use_sim_time:=true. With --step-by each
+message of the first topic is followed by nothing until the message of the same stamp is on the
+second, so no image is lost however slow the receiver is, and the answers are the same each time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from rclpy.duration import Duration
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rosgraph_msgs.msg import Clock
+
+from der_planner.runs.recording.reader import (
+    BagError,
+    BagReader,
+    RawMessage,
+    RecordedTopic,
+)
+from der_planner.runs.recording.replay import (
+    NANOSECONDS,
+    ReplaySettings,
+    choose_topics,
+    replay,
+)
+
+ATTEMPTS = 3
+SETTLE = 0.3
+"""Time [s] for a receiver's callback after the first message of a topic that nothing answers."""
+
+
+def stamp_of(data: bytes) -> bytes:
+    """Return the stamp of a serialized message that begins with a std_msgs/Header, as it is."""
+    return bytes(data[4:12])
+
+
+def message_class(type_name: str) -> Any:
+    """Return the class of a message type.
+
+    Raises:
+        BagError: its package is not installed here.
+    """
+    package, _, name = type_name.split("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), name)
+    except (ImportError, AttributeError) as error:
+        raise BagError(
+            f"cannot publish {type_name}: {error}. Source the workspace of {package}, or leave its "
+            "topics out with --exclude"
+        ) from error
+
+
+class GraphOutput:
+    """Publishes on the graph; waits for answers where asked to.
+
+    Args:
+        node: that publishes.
+        topics: recorded topics by the name to publish on.
+        show_clock: publish /clock.
+        step_by: name to publish on that waits for answers, or empty.
+        answer: topic of the answers.
+        patience: longest wait for one answer [s]; then the message is sent again, at most twice.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        topics: dict[str, RecordedTopic],
+        show_clock: bool,
+        step_by: str = "",
+        answer: str = "",
+        patience: float = 3.0,
+    ) -> None:
+        self.unanswered = 0
+        self._patience = patience
+        self._step_by = step_by
+        self._begun: set[str] = set()
+        self._answers: set[bytes] = set()
+        self._answered = threading.Condition()
+        self._publishers: dict[str, Publisher] = {
+            name: node.create_publisher(message_class(topic.type_name), name, _profile(topic))
+            for name, topic in topics.items()
+        }
+        self._clock = node.create_publisher(Clock, "/clock", 10) if show_clock else None
+        if step_by:
+            self._subscription = node.create_subscription(
+                self._type_of_answer(node, answer),
+                answer,
+                self._on_answer,
+                QoSProfile(depth=100),
+                raw=True,
+            )
+
+    def _type_of_answer(self, node: Node, answer: str) -> Any:
+        deadline = time.monotonic() + 20.0
+        while time.monotonic() < deadline:
+            for name, types in node.get_topic_names_and_types():
+                if name == answer:
+                    return message_class(types[0])
+            time.sleep(0.05)
+        raise BagError(f"nothing publishes {answer}: start the node that answers first")
+
+    def wait_for_receivers(self, seconds: float) -> None:
+        """Wait until every topic has a subscriber, at most so long."""
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            if all(p.get_subscription_count() for p in self._publishers.values()):
+                return
+            time.sleep(0.02)
+
+    def _on_answer(self, data: bytes) -> None:
+        with self._answered:
+            self._answers.add(stamp_of(data))
+            self._answered.notify_all()
+
+    def publish(self, topic: str, message: RawMessage) -> None:
+        """Publish one message, and wait for its answer where the topic is stepped by."""
+        if topic != self._step_by:
+            self._publishers[topic].publish(message.data)
+            if self._step_by and topic not in self._begun:
+                # E.g. the camera's calibration: it must be taken before the first image comes.
+                self._begun.add(topic)
+                self._publishers[topic].wait_for_all_acked(Duration(seconds=1))
+                time.sleep(SETTLE)
+            return
+        stamp = stamp_of(message.data)
+        with self._answered:
+            self._answers.clear()
+            for _ in range(ATTEMPTS):
+                self._publishers[topic].publish(message.data)
+                if self._answered.wait_for(lambda: stamp in self._answers, self._patience):
+                    return
+        self.unanswered += 1
+
+    def show_time(self, now: int) -> None:
+        """Publish recorded time."""
+        if self._clock is not None:
+            message = Clock()
+            message.clock.sec, message.clock.nanosec = divmod(now, NANOSECONDS)
+            self._clock.publish(message)
+
+
+def _profile(topic: RecordedTopic) -> QoSProfile:
+    reliable, best = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
+    latched, volatile = DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE
+    return QoSProfile(
+        depth=100,
+        reliability=reliable if topic.reliable else best,
+        durability=latched if topic.latched else volatile,
+    )
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("bag", type=Path, metavar="BAG", help="folder, .mcap or .db3 file")
+    parser.add_argument("--rate", type=float, default=1.0, help="0: as fast as possible")
+    parser.add_argument("--from", dest="start", type=float, default=0.0, metavar="S")
+    parser.add_argument("--to", dest="stop", type=float, default=None, metavar="S")
+    parser.add_argument("--topics", nargs="+", default=[], metavar="TOPIC", help="only these")
+    parser.add_argument("--exclude", nargs="+", default=[], metavar="TOPIC")
+    parser.add_argument("--remap", nargs="+", default=[], metavar="OLD=NEW")
+    parser.add_argument("--no-clock", action="store_true", help="do not publish /clock")
+    parser.add_argument("--step-by", default="", metavar="TOPIC=ANSWER", help="wait for answers")
+    parser.add_argument(
+        "--wait", type=float, default=3.0, metavar="S", help="for subscribers before the start"
+    )
+    return parser.parse_args()
+
+
+def _pairs(values: list[str], what: str) -> dict[str, str]:
+    for value in values:
+        if value.count("=") != 1:
+            raise BagError(f"{what} '{value}' is not of the form A=B")
+    return dict(value.split("=") for value in values)
+
+
+def _run(options: argparse.Namespace, stop: threading.Event) -> int:
+    settings = ReplaySettings(
+        rate=options.rate,
+        start=options.start,
+        stop=options.stop,
+        topics=options.topics,
+        exclude=options.exclude,
+        remap=_pairs(options.remap, "--remap"),
+    )
+
+    def pause(seconds: float) -> None:
+        stop.wait(seconds)
+
+    stepping = _pairs([options.step_by] if options.step_by else [], "--step-by")
+    with BagReader(options.bag) as bag:
+        topics = choose_topics(bag, settings)
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+        node = rclpy.create_node("replay_bag")
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        spinner = threading.Thread(target=executor.spin, daemon=True)
+        spinner.start()
+        try:
+            step_by, answer = next(iter(stepping.items()), ("", ""))
+            output = GraphOutput(node, topics, not options.no_clock, step_by, answer)
+            output.wait_for_receivers(options.wait)
+            count = replay(
+                bag,
+                settings,
+                output,
+                sleep=pause,
+                progress=_show if sys.stderr.isatty() else None,
+                keep_going=lambda: not stop.is_set(),
+            )
+            time.sleep(0.2)  # the last messages leave the process
+        finally:
+            executor.shutdown()
+            spinner.join(5.0)  # a thread that still waits in rcl would abort the process
+            node.destroy_node()
+            rclpy.try_shutdown()
+    print(f"published {count} messages of {len(topics)} topics")
+    if output.unanswered:
+        print(f"error: {output.unanswered} messages got no answer", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _show(played: float, length: float) -> None:
+    print(f"\r  {played:7.1f} of {length:.1f} s", end="", file=sys.stderr, flush=True)
+
+
+def main() -> int:
+    """Run the command line."""
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    try:
+        return _run(_arguments(), stop)
+    except BagError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1

@@ -1,0 +1,214 @@
+"""A client of the graph: what the orchestrator and the tests see of it and ask of it."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from std_srvs.srv import Trigger
+
+from der_planner.experiment.errors import GraphError
+from der_planner.experiment.processes import NodeProcess
+from limb_interfaces import qos, topics
+
+READY = (DiagnosticStatus.OK, DiagnosticStatus.WARN)
+
+
+@dataclass(frozen=True)
+class Patience:
+    """How long a node may take to get ready [s], by what it says of itself.
+
+    Attributes:
+        silent: while it says nothing.
+        waiting: while it says that it waits for something, e.g. for its kernels to compile at the
+            first start on a machine.
+        failing: while it says that something is wrong.
+    """
+
+    silent: float = 120.0
+    waiting: float = 90.0
+    failing: float = 25.0
+
+    def of(self, status: DiagnosticStatus | None) -> float:
+        """Return the patience with a node of this status."""
+        if status is None:
+            return self.silent
+        return self.failing if status.level == DiagnosticStatus.ERROR else self.waiting
+
+
+PATIENCE = Patience()
+
+
+class GraphClient:
+    """A node of its own context that keeps the newest message of each watched topic.
+
+    Nothing runs in the background: callbacks are served while one of the waiting methods runs, and
+    all of them watch the processes given to `watch` and raise when one of them has died.
+
+    Args:
+        name: of the node.
+        domain_id: ROS domain; the environment's if None.
+    """
+
+    def __init__(self, name: str = "orchestrator", domain_id: int | None = None) -> None:
+        self._context = Context()
+        rclpy.init(context=self._context, domain_id=domain_id, args=[])
+        self.node = Node(
+            name, namespace=topics.NAMESPACE, context=self._context, use_global_arguments=False
+        )
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self._clients: dict[str, Any] = {}
+        self._processes: list[NodeProcess] = []
+        self.diagnostics: dict[str, DiagnosticStatus] = {}
+        self.newest: dict[str, Any] = {}
+        self.node.create_subscription(
+            DiagnosticArray, topics.DIAGNOSTICS, self._keep_diagnostics, qos.STATES
+        )
+
+    def __enter__(self) -> GraphClient:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave the graph."""
+        with contextlib.suppress(Exception):
+            self._executor.shutdown()
+            self.node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+
+    def _keep_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self.diagnostics[status.name.rsplit("/", 1)[-1]] = status
+
+    def watch(self, processes: Iterable[NodeProcess]) -> None:
+        """Raise from every waiting method as soon as one of these processes has ended."""
+        self._processes = list(processes)
+
+    def subscribe(
+        self,
+        kind: type,
+        topic: str,
+        profile: QoSProfile,
+        callback: Callable[[Any], None] | None = None,
+    ) -> None:
+        """Keep a topic's newest message in ``newest[topic]``; pass each to ``callback``."""
+
+        def keep(message: Any) -> None:
+            self.newest[topic] = message
+            if callback is not None:
+                callback(message)
+
+        self.node.create_subscription(kind, topic, keep, profile)
+
+    def spin(self, seconds: float) -> None:
+        """Serve callbacks for a while."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=min(left, 0.05))
+
+    def wait_for(
+        self,
+        condition: Callable[[], Any],
+        timeout: float,
+        what: str,
+        progress: Callable[[float], None] | None = None,
+    ) -> Any:
+        """Serve callbacks until ``condition()`` is true, and return its value.
+
+        Args:
+            condition: looked at after every callback.
+            timeout: [s].
+            what: completes the sentence "waited … s for …".
+            progress: called about ten times a second with the seconds waited.
+
+        Raises:
+            GraphError: the time is over.
+            NodeError: a watched process has ended.
+        """
+        begin = time.monotonic()
+        shown = begin
+        while not (value := condition()):
+            for process in self._processes:
+                process.check()
+            now = time.monotonic()
+            if now - begin > timeout:
+                raise GraphError(f"waited {timeout:.0f} s for {what}")
+            if progress is not None and now - shown > 0.1:
+                progress(now - begin)
+                shown = now
+            self._executor.spin_once(timeout_sec=0.05)
+        return value
+
+    def wait_ready(self, names: Iterable[str], patience: Patience = PATIENCE) -> None:
+        """Wait until the diagnostics of all these nodes are ok or warning.
+
+        Raises:
+            GraphError: names the node that is not ready and what it says.
+            NodeError: a watched process has ended.
+        """
+        unready = {name: time.monotonic() for name in names}
+
+        def all_ready() -> bool:
+            for name, since in list(unready.items()):
+                status = self.diagnostics.get(name)
+                if status is not None and status.level in READY:
+                    del unready[name]
+                    continue
+                limit = patience.of(status)
+                if time.monotonic() - since > limit:
+                    said = status.message if status is not None else "nothing"
+                    raise GraphError(
+                        f"node '{name}' was not ready within {limit:.0f} s; it says: {said}"
+                    )
+            return not unready
+
+        self.wait_for(all_ready, patience.silent + 10.0, "the nodes")
+
+    def diagnostic_values(self, name: str) -> dict[str, str]:
+        """Return the key-value pairs of a node's newest diagnostics, empty before the first."""
+        status = self.diagnostics.get(name)
+        return {} if status is None else {pair.key: pair.value for pair in status.values}
+
+    def call(self, service: str, timeout: float = 5.0) -> str:
+        """Call a std_srvs/Trigger service, e.g. ``pressure_driver/arm``; return its message.
+
+        Raises:
+            GraphError: there is no such service, no answer, or the answer is a refusal.
+        """
+        if service not in self._clients:
+            self._clients[service] = self.node.create_client(Trigger, service)
+        client = self._clients[service]
+        self.wait_for(client.service_is_ready, timeout, f"the service {service}")
+        future = client.call_async(Trigger.Request())
+        self.wait_for(future.done, timeout, f"an answer of the service {service}")
+        answer = future.result()
+        if not answer.success:
+            raise GraphError(f"{service} was refused: {answer.message}")
+        return str(answer.message)
+
+    def other_nodes(self, seconds: float = 1.0) -> list[str]:
+        """Return the other nodes of the graph's namespace, after listening for a while."""
+        self.spin(seconds)
+        found = self.node.get_node_names_and_namespaces()
+        own = self.node.get_name()
+        return sorted(
+            name for name, space in found if space == f"/{topics.NAMESPACE}" and name != own
+        )

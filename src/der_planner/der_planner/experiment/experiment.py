@@ -1,0 +1,144 @@
+"""A whole experiment: calibrate each twin, play every trial, evaluate, write the results."""
+
+from __future__ import annotations
+
+import math
+import platform
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+from der_planner.experiment import results
+from der_planner.experiment.ledger import Ledger
+from der_planner.experiment.options import OptionError, Options, Trial
+from der_planner.experiment.progress import Progress
+from der_planner.limb import Limb, LimbError
+
+
+def run(options: Options) -> None:
+    """Play what the options say and leave results.json, figures, bags and logs in the folder.
+
+    Raises:
+        OptionError: the limb file is not usable, or the folder holds another experiment.
+        GraphError, NodeError: a trial failed; finished trials stay finished.
+    """
+    progress = Progress()
+    limb = _check_limb(options)
+    trials = options.plan_of_trials()
+    ledger = Ledger(options)
+    left = [trial for trial in trials if ledger.finished(trial) is None]
+    if options.dry_run:
+        _describe(options, trials, left, limb, progress)
+        return
+    options.out.mkdir(parents=True, exist_ok=True)
+    progress.say(
+        f"{len(left)} of {len(trials)} trials to play on {_stage(options)}, into {options.out}"
+    )
+    for place, trial in enumerate(trials, start=1):
+        if trial not in left:
+            continue
+        progress.say(
+            f"[{place}/{len(trials)}] {trial.motion}, {trial.model} {trial.method}, "
+            f"trial {trial.number} (seed {trial.seed})"
+        )
+        ledger.record(trial, _play(trial, options, progress))
+    kept = [(trial, ledger.finished(trial) or {}) for trial in trials]
+    results.conclude(options, kept, progress)
+
+
+def _check_limb(options: Options) -> Limb:
+    try:
+        return Limb.from_yaml(options.limb) if options.limb is not None else Limb.default()
+    except LimbError as error:
+        raise OptionError(str(error)) from error
+
+
+def _stage(options: Options) -> str:
+    if options.hardware is not None:
+        return f"the hardware at {options.hardware.driver['port']}"
+    return "the twin, offline" if options.offline else "the twin"
+
+
+def _describe(
+    options: Options, trials: list[Trial], left: list[Trial], limb: Limb, progress: Progress
+) -> None:
+    """Say what would be done."""
+    each = options.period * options.cycles
+    progress.say(f"limb: {limb.name}, {limb.segment_count} segments, {limb.length:.3f} m")
+    progress.say(f"stage: {_stage(options)}")
+    if options.hardware is not None:
+        for node in ("driver", "tracker", "planner", "recorder"):
+            progress.say(f"  {node}: {getattr(options.hardware, node) or 'defaults'}")
+        progress.say(f"  remapped: {options.hardware.remap or 'nothing'}")
+    progress.say(f"into: {options.out}")
+    for trial in trials:
+        state = "to play" if trial in left else "done"
+        progress.say(f"  {trial.name}  seed {trial.seed}  {state}")
+    progress.say(f"{len(left)} trials of {each:.0f} s motion each; nothing was started")
+
+
+def _play(trial: Trial, options: Options, progress: Progress) -> dict[str, Any]:
+    limb = _limb_file(trial, options, progress)
+    metadata = _metadata(trial, options, limb)
+    if options.offline:
+        # ROS-free: the other branch is imported only where it is used.
+        from der_planner.experiment.offline_run import play_offline  # noqa: PLC0415
+
+        return play_offline(trial, options, limb, metadata)
+    from der_planner.experiment.graph_run import GraphTrial  # noqa: PLC0415
+
+    played = GraphTrial(trial, options, limb, metadata, progress).play()
+    return {
+        "bag": str(played.bag.relative_to(options.out)),
+        "cpu_percent": {name: round(value, 1) for name, value in played.cpu_percent.items()},
+        "twin_real_time_factor": None
+        if math.isnan(played.real_time_factor)
+        else round(played.real_time_factor, 3),
+    }
+
+
+def _limb_file(trial: Trial, options: Options, progress: Progress) -> Path | None:
+    """Return the limb file to plan with; the twin of a new seed is calibrated first."""
+    if not options.calibrate:
+        return options.limb
+    path = options.out / "limbs" / f"seed_{trial.seed}.yaml"
+    if path.exists():
+        return path
+    from der_planner.identification import calibrate_twin  # noqa: PLC0415
+
+    progress.say(f"  calibrating on the twin of seed {trial.seed}")
+    begin = time.monotonic()
+    limb, _ = calibrate_twin(trial.seed, Limb.default())
+    path.parent.mkdir(parents=True, exist_ok=True)
+    limb.to_yaml(path)
+    progress.say(f"  calibrated in {time.monotonic() - begin:.1f} s: {path}")
+    return path
+
+
+def _metadata(trial: Trial, options: Options, limb: Path | None) -> dict[str, Any]:
+    return {
+        "motion": trial.motion,
+        "model": trial.model,
+        "method": trial.method,
+        "trial": trial.number,
+        "seed": trial.seed,
+        "amplitude_rad": options.amplitude,
+        "period_s": options.period,
+        "cycles": options.cycles,
+        "limb": str(limb) if limb else "default",
+        "stage": _stage(options),
+        "commit": _commit(),
+        "python": platform.python_version(),
+        "machine": platform.node(),
+    }
+
+
+def _commit() -> str:
+    result = subprocess.run(
+        ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return result.stdout.strip() or "unknown"

@@ -1,0 +1,366 @@
+"""One run of the graph: start the nodes, play something, vent, stop, keep the bag."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import tempfile
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from der_msgs.msg import MotionCommand, PressurePlan, PressureState
+from der_planner.experiment.client import GraphClient
+from der_planner.experiment.errors import GraphError, NodeError
+from der_planner.experiment.options import Hardware, Options, Trial
+from der_planner.experiment.processes import NodeProcess
+from der_planner.experiment.progress import Progress
+from limb_interfaces import qos, stamps, topics
+
+PLAN_TIMEOUT = 120.0
+VENTED_PRESSURE = 1000.0
+"""Differential pressure below which a limb counts as vented [Pa]."""
+STOP_ORDER = (
+    "planner",
+    "apriltag_tracker",
+    "synthetic_camera",
+    "limb_twin",
+    "recorder",
+    "pressure_driver",
+    "board_emulator",
+)
+TWIN_NODES = ("board_emulator", "limb_twin", "synthetic_camera")
+"""Nodes that stand in for the hardware."""
+
+
+@dataclass(frozen=True)
+class NodeSpec:
+    """What is needed to start one node."""
+
+    package: str
+    executable: str
+    parameters: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Playing:
+    """What the graph plays, from when to when.
+
+    Attributes:
+        begin: ROS time at which the first setpoint takes effect [s].
+        length: from the first setpoint to the last [s].
+        feed: called at least every 50 ms until the end; publishes what is due, if the orchestrator
+            is the one who publishes.
+    """
+
+    begin: float
+    length: float
+    feed: Callable[[], None] = lambda: None
+
+
+@dataclass(frozen=True)
+class GraphRun:
+    """What a run left behind.
+
+    Attributes:
+        bag: folder of the bag.
+        cpu_percent: CPU use of each process while the motion played, in per cent of one core.
+        real_time_factor: simulated over real seconds of the twin; NaN on hardware.
+        duration: of the played motion [s].
+    """
+
+    bag: Path
+    cpu_percent: dict[str, float]
+    real_time_factor: float
+    duration: float
+
+
+def node_specs(
+    port: str,
+    bag: Path,
+    metadata: dict[str, Any],
+    *,
+    seed: int = 0,
+    hardware: Hardware | None = None,
+    planner: dict[str, Any] | None = None,
+    record_images: bool = False,
+) -> list[NodeSpec]:
+    """Return the nodes of a run in the order in which they start.
+
+    Args:
+        port: where the emulated board appears.
+        bag: folder that the recorder makes.
+        metadata: stored in the bag.
+        seed: of the twin.
+        hardware: in place of the twin.
+        planner: parameters of the planner; None for a graph without one.
+        record_images: whether the bag holds the raw images, too.
+    """
+    rig = hardware or Hardware()
+    driver = {"port": port, "protocol": "ezloop", **rig.driver}
+    recorder = {
+        "output": str(bag),
+        "metadata": json.dumps(metadata),
+        "record_images": record_images,
+        **rig.recorder,
+    }
+    specs = [
+        NodeSpec("pressure_driver", "board_emulator", {"port_link": port, "seed": seed}),
+        NodeSpec("pressure_driver", "pressure_driver", driver),
+        NodeSpec("der_planner", "limb_twin", {"seed": seed}),
+        NodeSpec("apriltag_tracker", "synthetic_camera", {"seed": seed}),
+        NodeSpec("apriltag_tracker", "apriltag_tracker", dict(rig.tracker)),
+    ]
+    if hardware is not None:
+        specs = [spec for spec in specs if spec.executable not in TWIN_NODES]
+    if planner is not None:
+        specs.append(NodeSpec("der_planner", "planner", {**planner, **rig.planner}))
+    specs.append(NodeSpec("der_planner", "recorder", recorder))
+    return specs
+
+
+class GraphPlayer(ABC):
+    """Plays something on the graph; whatever happens, the limb is vented and every node stopped.
+
+    Args:
+        logs: folder of the nodes' logs.
+        hardware: in place of the twin, or None.
+        progress: shows what happens.
+    """
+
+    def __init__(self, logs: Path, hardware: Hardware | None, progress: Progress) -> None:
+        self._logs = logs
+        self._hardware = hardware
+        self._remap = hardware.remap if hardware is not None else None
+        self._progress = progress
+        self._processes: dict[str, NodeProcess] = {}
+        self._driver_spec: NodeSpec | None = None
+
+    @abstractmethod
+    def _specs(self, port: str) -> list[NodeSpec]:
+        """Return the nodes in the order in which they start."""
+
+    @abstractmethod
+    def _begin(self, client: GraphClient) -> Playing:
+        """Arrange what is played; the recorder runs and the driver is armed."""
+
+    def play(self) -> GraphRun:
+        """Start the graph, play and stop everything, whatever happens on the way.
+
+        Raises:
+            GraphError: a node is not ready, the planner refuses, the driver reports a fault.
+            NodeError: a node cannot be started or has died.
+        """
+        with tempfile.TemporaryDirectory(prefix="der_limb_") as folder, GraphClient() as client:
+            port = str(Path(folder) / "board")
+            specs = self._specs(port)
+            self._refuse_second_graph(client, specs)
+            self._join(client)
+            with self._everything_stops(client):
+                self._start(client, specs, port)
+                return self._record(client)
+
+    def _join(self, client: GraphClient) -> None:
+        """Subscribe and advertise, before the nodes start."""
+        client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES)
+
+    def _refuse_second_graph(self, client: GraphClient, specs: list[NodeSpec]) -> None:
+        others = set(client.other_nodes()) & {spec.executable for spec in specs}
+        if others:
+            raise GraphError(
+                f"another graph is running in this ROS domain (node '{min(others)}'): stop it, or "
+                "set ROS_DOMAIN_ID to another number for one of them"
+            )
+
+    def _start(self, client: GraphClient, specs: list[NodeSpec], port: str) -> None:
+        begin = time.monotonic()
+        self._progress.say(f"  starting {', '.join(spec.executable for spec in specs)}")
+        for spec in specs:
+            process = NodeProcess(
+                spec.package, spec.executable, spec.parameters, self._logs, self._remap
+            )
+            self._processes[spec.executable] = process
+            if spec.executable == "pressure_driver":
+                self._driver_spec = spec
+            client.watch(self._processes.values())
+            if spec.executable == "board_emulator":
+                client.wait_for(lambda: os.path.exists(port), 60.0, "the emulated board's port")
+        client.wait_ready(self._processes)
+        self._progress.say(f"  ready after {time.monotonic() - begin:.1f} s")
+
+    def _record(self, client: GraphClient) -> GraphRun:
+        bag = Path(client.call("recorder/start"))
+        client.call("pressure_driver/arm")
+        playing = self._begin(client)
+        before = {name: process.measure_cpu() for name, process in self._processes.items()}
+        begin = time.monotonic()
+        self._await_end(client, playing)
+        wall = time.monotonic() - begin
+        cpu = {
+            name: 100.0 * (process.measure_cpu() - before[name]) / wall
+            for name, process in self._processes.items()
+        }
+        factor = client.diagnostic_values("limb_twin").get("real_time_factor", "nan")
+        self._vent(client)
+        client.call("recorder/stop", timeout=20.0)
+        return GraphRun(bag, cpu, float(factor), playing.length)
+
+    def _await_end(self, client: GraphClient, playing: Playing) -> None:
+        length = playing.length
+
+        def played() -> float:
+            return float(client.node.get_clock().now().nanoseconds * 1e-9 - playing.begin)
+
+        def finished() -> bool:
+            state = client.newest.get(topics.PRESSURE_STATE)
+            if state is not None and state.mode == PressureState.FAULT:
+                raise GraphError(f"the driver vented: {'; '.join(state.faults) or 'fault'}")
+            playing.feed()
+            return played() >= length
+
+        client.wait_for(
+            finished,
+            length + 30.0,
+            "the end of the motion",
+            lambda _: self._progress.bar(played(), length, "played"),
+        )
+        self._progress.bar(length, length, "played")
+
+    def _vent(self, client: GraphClient) -> None:
+        client.call("pressure_driver/vent")
+        client.newest.pop(topics.PRESSURE_STATE, None)
+
+        def vented() -> bool:
+            state = client.newest.get(topics.PRESSURE_STATE)
+            measured = state.measured_differential if state is not None else []
+            return bool(measured) and all(abs(value) < VENTED_PRESSURE for value in measured)
+
+        client.wait_for(vented, 15.0, "the chambers to vent")
+
+    def _vent_whatever_happened(self, client: GraphClient) -> None:
+        """Vent after an error; a dead driver is started again, since boards have no watchdog."""
+        driver = self._processes.get("pressure_driver")
+        if driver is None or self._driver_spec is None:
+            return
+        self._progress.say("  venting the limb")
+        client.watch(())
+        try:
+            if not driver.alive:
+                spec = self._driver_spec
+                client.diagnostics.pop(spec.executable, None)
+                driver = NodeProcess(
+                    spec.package,
+                    spec.executable,
+                    spec.parameters,
+                    self._logs,
+                    self._remap,
+                    name="pressure_driver_restarted",
+                )
+                self._processes["pressure_driver"] = driver
+                client.watch([driver])
+                client.wait_ready([spec.executable])
+            self._vent(client)
+        except (GraphError, NodeError) as error:
+            self._progress.say(
+                f"  WARNING: the limb may still be under pressure ({error}); close its air supply"
+            )
+        client.watch(())
+
+    @contextlib.contextmanager
+    def _everything_stops(self, client: GraphClient) -> Iterator[None]:
+        """Stop every node at the end; after an error or an interrupt, vent first."""
+        try:
+            yield
+        except BaseException:
+            self._vent_whatever_happened(client)
+            self._stop_all()
+            raise
+        client.watch(())
+        codes = self._stop_all()
+        failed = {name: code for name, code in codes.items() if code != 0}
+        if failed:
+            name, code = next(iter(failed.items()))
+            process = self._processes[name]
+            raise NodeError(
+                f"node '{name}' ended with exit code {code}. Its last words:\n"
+                f"{process.last_words()}\nThe whole log: {process.log}"
+            )
+
+    def _stop_all(self) -> dict[str, int]:
+        order = [name for name in STOP_ORDER if name in self._processes]
+        return {name: self._processes[name].stop() for name in order}
+
+
+class GraphTrial(GraphPlayer):
+    """Runs one trial of a planned motion; use `play`.
+
+    Args:
+        trial, options: what to play.
+        limb: limb file for the planner, or None for the default limb.
+        metadata: stored in the bag.
+        progress: shows what happens.
+    """
+
+    def __init__(
+        self,
+        trial: Trial,
+        options: Options,
+        limb: Path | None,
+        metadata: dict[str, Any],
+        progress: Progress,
+    ) -> None:
+        super().__init__(options.out / "logs" / trial.name, options.hardware, progress)
+        self._trial = trial
+        self._options = options
+        self._limb = limb
+        self._metadata = metadata
+
+    def _specs(self, port: str) -> list[NodeSpec]:
+        return node_specs(
+            port,
+            self._options.out / "bags" / self._trial.name,
+            self._metadata,
+            seed=self._trial.seed,
+            hardware=self._hardware,
+            planner={"limb_file": str(self._limb) if self._limb else ""},
+            record_images=self._options.record_images,
+        )
+
+    def _join(self, client: GraphClient) -> None:
+        super()._join(client)
+        client.subscribe(PressurePlan, topics.PLAN, qos.LATCHED)
+
+    def _begin(self, client: GraphClient) -> Playing:
+        publisher = client.node.create_publisher(MotionCommand, topics.COMMAND, qos.COMMANDS)
+        client.wait_for(publisher.get_subscription_count, 10.0, "the planner to listen")
+        publisher.publish(self._command())
+        plan = client.wait_for(lambda: self._plan_or_refusal(client), PLAN_TIMEOUT, "the plan")
+        self._progress.say(
+            f"  planned in {plan.solve_time:.2f} s, "
+            f"predicted error {plan.predicted_error * 100:.2f} cm"
+        )
+        return Playing(stamps.seconds(plan.header.stamp), float(plan.time[-1]))
+
+    def _command(self) -> MotionCommand:
+        return MotionCommand(
+            motion=self._trial.motion,
+            model=self._trial.model,
+            method=self._trial.method,
+            amplitude=self._options.amplitude,
+            period=self._options.period,
+            cycles=self._options.cycles,
+            plan_id=self._trial.name,
+        )
+
+    def _plan_or_refusal(self, client: GraphClient) -> PressurePlan | None:
+        plan = client.newest.get(topics.PLAN)
+        if plan is not None and plan.plan_id == self._trial.name:
+            return plan
+        said = client.diagnostic_values("planner")
+        if said.get("state") == "refused":
+            raise GraphError(f"the planner refused: {said.get('reason', 'no reason given')}")
+        return None

@@ -1,0 +1,84 @@
+"""One trial in this process: plan, play on the simulated pneumatics and limb, keep the arrays."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from der_planner.experiment.errors import GraphError
+from der_planner.experiment.options import Options, Trial
+from der_planner.limb import Limb
+from der_planner.planning import Motion, PlanningError, plan
+from der_planner.runs.evaluation import Description, RunSeries
+from der_planner.twin.offline import play
+
+
+def play_offline(
+    trial: Trial, options: Options, limb: Path | None, metadata: dict[str, Any]
+) -> dict[str, Any]:
+    """Plan, play and keep one trial; the error is against the twin's true tip, not an image's.
+
+    Raises:
+        GraphError: the motion cannot be planned; with the planner's reason.
+    """
+    robot = Limb.from_yaml(limb) if limb is not None else Limb.default()
+    try:
+        motion = Motion.named(
+            trial.motion,
+            amplitude=options.amplitude,
+            period=options.period,
+            cycles=options.cycles,
+        )
+        planned = plan(robot, motion, model=trial.model, method=trial.method)
+    except PlanningError as error:
+        raise GraphError(f"the planner refused: {error}") from error
+    played = play(planned.time, planned.differential_pressure, seed=trial.seed)
+    path = options.out / "runs" / f"{trial.name}.npz"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(
+        path,
+        metadata=json.dumps(metadata),
+        time=planned.time,
+        tip_reference=planned.tip_reference,
+        tip_predicted=planned.tip_predicted,
+        differential_pressure=planned.differential_pressure,
+        measured_differential=played.measured_differential,
+        tip=played.tip,
+    )
+    return {
+        "arrays": str(path.relative_to(options.out)),
+        "solve_time_s": planned.solve_time,
+        "predicted_error_m": planned.predicted_error,
+    }
+
+
+def load_arrays(path: Path) -> RunSeries:
+    """Read a run that `play_offline` kept."""
+    with np.load(path) as kept:
+        about = json.loads(str(kept["metadata"]))
+        return RunSeries.from_arrays(
+            Description(
+                motion=about["motion"],
+                model=about["model"],
+                method=about["method"],
+                trial=about["trial"],
+                seed=about["seed"],
+                amplitude=about["amplitude_rad"],
+                period=about["period_s"],
+                cycles=about["cycles"],
+                limb=about["limb"],
+                bag=str(path),
+                extra=about,
+            ),
+            time=kept["time"],
+            tip=kept["tip"],
+            reference_time=kept["time"],
+            tip_reference=kept["tip_reference"],
+            tip_predicted=kept["tip_predicted"],
+            pressure_time=kept["time"],
+            commanded=kept["differential_pressure"],
+            measured=kept["measured_differential"],
+        )

@@ -1,0 +1,1 @@
+"""Recorded runs: bags written, read and repaired (`recording`), and their errors (`evaluation`)."""

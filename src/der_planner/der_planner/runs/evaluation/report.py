@@ -1,0 +1,283 @@
+"""A page of the results that opens from disk, and the table and figures for a paper beside it."""
+
+from __future__ import annotations
+
+import base64
+import html
+import math
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from der_planner.runs.evaluation.figures import plot_error, plot_pressures, plot_tip
+from der_planner.runs.evaluation.metrics import RunResult
+from der_planner.runs.evaluation.overlay import plot_shapes
+from der_planner.runs.evaluation.results import write_results
+from der_planner.runs.evaluation.series import RunSeries
+from der_planner.runs.evaluation.statistics import Comparison, Summary, compare, summarise
+from der_planner.runs.evaluation.table import (
+    CASE,
+    csv_table,
+    format_comparison,
+    format_value,
+    latex_table,
+    markdown_table,
+)
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem;
+       color: #1a1a1a; background: #fff; }
+h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2rem; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 0.87rem; }
+th, td { padding: 0.25rem 0.7rem; text-align: right; border-bottom: 1px solid #ddd;
+         white-space: nowrap; }
+th { border-bottom: 1.5px solid #333; } td.name, th.name { text-align: left; }
+img { max-width: 100%; height: auto; } figure { margin: 1rem 0; }
+figcaption, .small { font-size: 0.85rem; color: #555; }
+.problem { color: #a33a00; white-space: normal; text-align: left; }
+"""
+
+_CAPTIONS = {
+    "error": "Tip error over time: mean over trials, shaded one standard deviation.",
+    "tip": "Measured tip against the reference: path in the plane, x and y over time.",
+    "shapes": "Planned and measured limb, over the camera's frames where these were recorded.",
+    "pressures": "Differential pressures, commanded and measured; first trial of each model.",
+}
+
+_DEFINITIONS = """
+<p>r̄ is the tip reference of the plan, interpolated linearly at the stamp of each image; r is the
+tip that the tracker measured in that image. E is the mean of |r − r̄| over the valid images of the
+window, E<sub>x</sub> and E<sub>y</sub> are the means of |x − x̄| and |y − ȳ|. The table shows mean ±
+sample standard deviation of these over trials, and the largest |r − r̄| of any trial. Times come
+from stamps; nothing is shifted. The split fits r(t) ≈ g r̄(t − τ) + b: lag τ, gains g, bias b, and
+the RMS error that is left when lag, then bias, then gain are taken out.</p>
+"""
+
+
+@dataclass(frozen=True)
+class Report:
+    """What was written: the page, and everything beside it."""
+
+    page: Path
+    files: tuple[Path, ...]
+
+
+def write_report(
+    runs: Sequence[RunSeries],
+    results: Sequence[RunResult],
+    folder: Path,
+    *,
+    title: str = "Tracking errors",
+    drawn: Sequence[Path] = (),
+    progress: Callable[[str], None] | None = None,
+) -> Report:
+    """Write page, tables and figures into a folder.
+
+    Args:
+        runs: for the figures, in the order of the results.
+        results: of the same runs.
+        folder: made if missing; receives ``report.html``, ``results.json``, ``table.md``,
+            ``table.csv``, ``table.tex`` and each figure as PDF and PNG.
+        title: of the page.
+        drawn: files of figures of the same runs that exist already; they are copied.
+        progress: called with what is being made.
+
+    Returns:
+        The written files.
+
+    Raises:
+        BagError: a bag cannot be read again for its frames.
+    """
+    say = progress or (lambda _: None)
+    folder = Path(folder)
+    files = [write_results(results, folder)]
+    rows, comparisons = summarise(results), compare(results)
+    for name, text in (
+        ("table.md", markdown_table(rows)),
+        ("table.csv", csv_table(rows)),
+        ("table.tex", latex_table(rows)),
+    ):
+        files.append(folder / name)
+        files[-1].write_text(text, encoding="utf-8")
+    figures: dict[str, Path] = {}
+    for name, plot in (
+        ("error", plot_error),
+        ("tip", plot_tip),
+        ("shapes", plot_shapes),
+        ("pressures", plot_pressures),
+    ):
+        ready = [path for path in drawn if path.stem == name]
+        if ready:
+            written = [Path(shutil.copy(path, folder)) for path in ready]
+        else:
+            say(f"figure {name}")
+            written = plot(runs, folder)
+        files += written
+        pictures = [path for path in written if path.suffix == ".png"]
+        if pictures:
+            figures[name] = pictures[0]
+    page = folder / "report.html"
+    page.write_text(_page(title, results, rows, comparisons, figures), encoding="utf-8")
+    return Report(page, (*files, page))
+
+
+def _page(
+    title: str,
+    results: Sequence[RunResult],
+    rows: Sequence[Summary],
+    comparisons: Sequence[Comparison],
+    figures: dict[str, Path],
+) -> str:
+    sections = [
+        f"<h1>{html.escape(title)}</h1>",
+        _summary_table(rows),
+        "".join(f"<p>{html.escape(format_comparison(entry))}</p>" for entry in comparisons),
+        *(_figure(name, path) for name, path in figures.items()),
+        "<h2>Every run</h2>",
+        _run_table(results),
+        _checks_table(results),
+        "<h2>Definitions</h2>",
+        _DEFINITIONS,
+        "<h2>Where the numbers come from</h2>",
+        _provenance(results),
+    ]
+    body = "\n".join(section for section in sections if section)
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head>\n"
+        f"<body>\n{body}\n</body></html>\n"
+    )
+
+
+def _figure(name: str, path: Path) -> str:
+    data = base64.b64encode(path.read_bytes()).decode("ascii")
+    caption = _CAPTIONS[name]
+    return (
+        f'<figure><img alt="{html.escape(caption)}" src="data:image/png;base64,{data}">'
+        f"<figcaption>{html.escape(caption)}</figcaption></figure>"
+    )
+
+
+def _table(header: Sequence[str], lines: Sequence[Sequence[str]], names: int) -> str:
+    """Return a table whose first columns hold names and whose cells are HTML already."""
+
+    def cells(values: Sequence[str], tag: str) -> str:
+        marks = [f'<{tag} class="name">' if i < names else f"<{tag}>" for i in range(len(values))]
+        return "".join(f"{m}{value}</{tag}>" for m, value in zip(marks, values, strict=True))
+
+    body = "".join(f"<tr>{cells(line, 'td')}</tr>" for line in lines)
+    return (
+        f'<div class="wide"><table><thead><tr>{cells(header, "th")}</tr></thead>'
+        f"<tbody>{body}</tbody></table></div>"
+    )
+
+
+def _summary_table(rows: Sequence[Summary]) -> str:
+    lines = [
+        [
+            html.escape(CASE.get(row.motion, row.motion)),
+            html.escape(row.model.upper()),
+            html.escape(row.method),
+            str(row.trials),
+            format_value(row.mean_error_m, row.std_error_m),
+            format_value(row.mean_error_x_m, row.std_error_x_m),
+            format_value(row.mean_error_y_m, row.std_error_y_m),
+            f"{row.max_error_m * 100:.2f}",
+            _number(row.predicted_error_m, 100),
+        ]
+        for row in rows
+    ]
+    header = [
+        *("case", "model", "method", "trials", "E [cm]", "E<sub>x</sub> [cm]"),
+        *("E<sub>y</sub> [cm]", "max [cm]", "predicted E [cm]"),
+    ]
+    return _table(header, lines, names=3)
+
+
+def _number(value: float, scale: float = 1.0, digits: int = 2) -> str:
+    return "–" if math.isnan(value) else f"{value * scale:.{digits}f}"
+
+
+def _run_table(results: Sequence[RunResult]) -> str:
+    lines = []
+    for run in results:
+        problems = "; ".join(run.problems)
+        lines.append(
+            [
+                html.escape(f"{run.motion} {run.model} {run.method}"),
+                str(run.trial),
+                str(run.seed),
+                _number(run.mean_error_m, 100),
+                _number(run.max_error_m, 100),
+                f"{math.floor(run.valid_fraction * 1000) / 10:.1f} %",
+                str(run.dropped_frames),
+                _number(run.lag_s, 1, 3),
+                f"{_number(run.gain_x)}, {_number(run.gain_y)}",
+                f"{_number(run.bias_x_m, 100)}, {_number(run.bias_y_m, 100)}",
+                " → ".join(
+                    _number(value, 100)
+                    for value in (
+                        run.rms_error_m,
+                        run.rms_without_lag_m,
+                        run.rms_without_bias_m,
+                        run.rms_without_gain_m,
+                    )
+                ),
+                ", ".join(_number(value, 1e-3) for value in run.pressure_rms_error_pa) or "–",
+                f'<span class="problem">{html.escape(problems)}</span>' if problems else "",
+            ]
+        )
+    header = [
+        *("run", "trial", "seed", "E [cm]", "max [cm]", "valid", "images missing", "lag [s]"),
+        *("gain x, y", "bias x, y [cm]", "RMS [cm] without lag, bias, gain"),
+        *("pressure RMS [kPa]", "problems"),
+    ]
+    return _table(header, lines, names=1)
+
+
+def _checks_table(results: Sequence[RunResult]) -> str:
+    checked = [run for run in results if run.checks]
+    if not checked:
+        return ""
+    lines = [
+        [
+            html.escape(f"{run.motion} {run.model}"),
+            str(run.trial),
+            _number(run.checks.get("tracker_rms_m", math.nan), 1000, 3),
+            _count(run, "board_setpoints"),
+            _count(run, "board_lost"),
+            _count(run, "board_out_of_order"),
+            _number(run.checks.get("board_lateness_p50_s", math.nan), 1000),
+            _number(run.checks.get("board_lateness_p99_s", math.nan), 1000),
+            _number(run.checks.get("board_lateness_max_s", math.nan), 1000),
+        ]
+        for run in checked
+    ]
+    header = [
+        *("run", "trial", "tracker RMS [mm]", "setpoints", "lost", "out of order"),
+        *("late p50 [ms]", "p99 [ms]", "max [ms]"),
+    ]
+    return "<h2>Instruments</h2>" + _table(header, lines, names=1)
+
+
+def _count(run: RunResult, name: str) -> str:
+    value = run.checks.get(name)
+    return "–" if value is None else f"{value:.0f}"
+
+
+def _provenance(results: Sequence[RunResult]) -> str:
+    """List what the runs say of themselves: one line where all agree, else every value."""
+    keys = sorted({key for run in results for key in run.extra})
+    lines = []
+    for key in keys:
+        values = list(dict.fromkeys(str(run.extra.get(key, "–")) for run in results))
+        lines.append([html.escape(key), html.escape(", ".join(values))])
+    for run in results:
+        if run.bag:
+            lines.append(
+                [f"bag of {html.escape(f'{run.model} {run.trial}')}", html.escape(run.bag)]
+            )
+    return _table(["", ""], lines, names=2)
