@@ -7,9 +7,9 @@ from limb_interfaces.entry import run_module
 
 def apriltag_tracker() -> int:
     """Run the tracker."""
-    return run_module("apriltag_tracker.node")
+    return int(run_module("apriltag_tracker.node"))
 
 
 def synthetic_camera() -> int:
     """Run the synthetic camera."""
-    return run_module("apriltag_tracker.synthetic.node")
+    return int(run_module("apriltag_tracker.synthetic.node"))

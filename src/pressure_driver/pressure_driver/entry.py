@@ -7,9 +7,9 @@ from limb_interfaces.entry import run_module
 
 def pressure_driver() -> int:
     """Run the driver."""
-    return run_module("pressure_driver.node")
+    return int(run_module("pressure_driver.node"))
 
 
 def board_emulator() -> int:
     """Run the emulated board."""
-    return run_module("pressure_driver.emulator.node")
+    return int(run_module("pressure_driver.emulator.node"))
