@@ -55,19 +55,20 @@ say(f"guardian {guardian.process_id}")
 while not core.arm()[0]:
     guardian.executor_lives()
     time.sleep(0.01)
-index = 0
+index = armings = 0
 while not stop.is_set():
     if executor_blocked.is_set():
         time.sleep(3600.0)
     guardian.executor_lives()
     index += 1
     stamp = (time.time_ns() // 50_000_000 + 2) * 50_000_000
-    core.offer(Setpoint(stamp, (3000.0, -2000.0), "p", index), time.time_ns())
+    core.offer(Setpoint(stamp, (3000.0, -2000.0), f"plan {armings}", index), time.time_ns())
     if core.snapshot().faults:
         say("faults " + "; ".join(core.snapshot().faults))
         while not core.arm()[0] and not stop.is_set():
             guardian.executor_lives()
             time.sleep(0.02)
+        armings += 1
     time.sleep(0.05)
 link.close()
 sys.exit(0 if link.vented_at_end else 1)

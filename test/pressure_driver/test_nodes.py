@@ -108,13 +108,14 @@ class Bench:
     def play(self, count, shape):
         """Publish setpoints 0.2 s ahead in real time; return stamp -> differential pressures."""
         start = (time.time_ns() // PERIOD + 8) * PERIOD
+        plan_id = uuid.uuid4().hex  # a plan belongs to one arming
         wanted = {}
         for index in range(count):
             stamp = start + index * PERIOD
             while time.time_ns() < stamp - 200_000_000:
                 self.client.spin(0.004)
             message = PressureSetpoint(
-                plan_id="test", index=index, differential_pressure=list(shape(index))
+                plan_id=plan_id, index=index, differential_pressure=list(shape(index))
             )
             message.header.stamp = stamp_from_nanoseconds(stamp)
             self.publisher.publish(message)
@@ -304,10 +305,10 @@ from pressure_driver.node import PressureDriver
 from limb_interfaces.runner import run_node
 
 class Crashing(PressureDriver):
-    def _on_setpoint(self, message):
+    def _on_setpoint(self, message, info):
         if message.plan_id == "crash":
             raise RuntimeError("a callback failed")
-        super()._on_setpoint(message)
+        super()._on_setpoint(message, info)
 
 raise SystemExit(run_node(Crashing))
 """

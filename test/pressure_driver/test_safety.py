@@ -114,7 +114,7 @@ def test_over_pressure_needs_two_readings_in_a_row(simulate):
     sim.core.received(b"[MPR]: 1400.00 1013.00 1013.00 1013.00\n" * 2)
     sim.tick()
     assert sim.mode is Mode.FAULT
-    assert "over-pressure: chamber 0" in sim.faults[0]
+    assert "over-pressure in chamber 0" in sim.faults[0]
 
 
 @pytest.mark.parametrize("protocol", NAMES)

@@ -14,6 +14,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from limb_interfaces import transport
 from limb_interfaces.entry import END_SIGNALS
 
 
@@ -42,12 +43,17 @@ def run_node(create: Callable[[], Node], arguments: Sequence[str] | None = None)
         0 after one of these signals, 1 after an error.
     """
     stop = threading.Event()
+    transport.use_large_messages()
     for number in END_SIGNALS:
         signal.signal(number, lambda *_: stop.set())
-    rclpy.init(
-        args=list(arguments) if arguments is not None else None,
-        signal_handler_options=SignalHandlerOptions.NO,
-    )
+    try:
+        rclpy.init(
+            args=list(arguments) if arguments is not None else None,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+    except Exception as error:  # e.g. a parameter file that is not there
+        _complain(None, error)
+        return 1
     node: Node | None = None
     exit_code = 0
     try:

@@ -18,7 +18,7 @@ GRID = 50_000_000
 """Setpoints are stamped on multiples of this [ns]."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Schedule:
     """A plan with the instant at which its first setpoint takes effect.
 
