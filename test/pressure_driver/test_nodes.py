@@ -382,7 +382,7 @@ def test_what_cannot_work_is_refused_at_the_start(graph, bench):
 
 def start_on_terminal(run):
     """Start the driver in the foreground of a pseudo-terminal of its own, as in a window."""
-    from orchestrator.processes import find_executable
+    from der_planner.experiment.processes import find_executable
 
     command = [str(find_executable("pressure_driver", "pressure_driver")), "--ros-args"]
     for name, value in run.parameters.items():

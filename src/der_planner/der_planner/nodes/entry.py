@@ -7,14 +7,14 @@ from limb_interfaces.entry import run_module
 
 def planner() -> int:
     """Run the planner."""
-    return run_module("der_planner.nodes.planner")
+    return int(run_module("der_planner.nodes.planner"))
 
 
 def recorder() -> int:
     """Run the recorder."""
-    return run_module("der_planner.nodes.recorder")
+    return int(run_module("der_planner.nodes.recorder"))
 
 
 def limb_twin() -> int:
     """Run the twin of the limb."""
-    return run_module("der_planner.nodes.limb_twin")
+    return int(run_module("der_planner.nodes.limb_twin"))
