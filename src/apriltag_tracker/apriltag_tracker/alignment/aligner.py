@@ -92,7 +92,7 @@ class Aligner:
                 return known[0]
         plain = self._fit(image, tag, corners, blur, None)
         if plain is None:
-            return None
+            return self._from_all_sides(image, tag, corners)
         best, alike = plain
         if alike < _SMEARED:
             return best
@@ -118,11 +118,11 @@ class Aligner:
     def _from_all_sides(
         self, image: NDArray[np.uint8], tag: int, corners: NDArray[np.float64]
     ) -> Alignment | None:
-        """Try smears in four directions of half a turn; the best fit counts."""
+        """Try smears in eight directions of half a turn; the best fit counts."""
         best: Alignment | None = None
         length = 1.6 * _cell(corners)
-        for k in range(4):
-            angle = k * math.pi / 4.0
+        for k in range(8):
+            angle = k * math.pi / 8.0
             smear = length * np.array([math.cos(angle), math.sin(angle)])
             found = self._fit(image, tag, corners, USUAL_BLUR, smear)
             if found is not None and (best is None or found[0].residual < best.residual):
