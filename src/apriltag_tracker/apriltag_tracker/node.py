@@ -37,6 +37,8 @@ from apriltag_tracker.tracking import TrackingOptions
 from der_msgs.msg import LimbState, TagDetection, TagDetectionArray
 from limb_interfaces import qos, stamps, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
+from limb_interfaces.gaps import StampGaps
+from limb_interfaces.overrides import check_overrides
 from limb_interfaces.parameters import declare
 from limb_interfaces.runner import run_node
 
@@ -100,7 +102,9 @@ class TrackerNode(Node):
                 )
             ),
         )
+        check_overrides(self)
         self._warm_up()
+        self._gaps = StampGaps()
         self._tracker: LimbTracker | None = None
         self._last_stamp = -1
         self._level = ""
@@ -262,6 +266,7 @@ class TrackerNode(Node):
             self._monitor.repeated += 1
             return
         self._last_stamp = stamps.nanoseconds(stamp)
+        self._gaps.take(self._last_stamp)
         if self._tracker is None:
             self._fail(stamp, self._monitor.calibration_problem or NO_CALIBRATION)
             return
@@ -348,7 +353,9 @@ class TrackerNode(Node):
                 self.get_logger().info(report.message)
             else:
                 self.get_logger().warning(report.message)
-        return Health(report.level, report.message, report.values)
+        return Health(
+            report.level, report.message, {**report.values, "images_missed": self._gaps.missed}
+        )
 
 
 def _tag_message(placed: PlacedTag) -> TagDetection:

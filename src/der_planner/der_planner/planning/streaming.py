@@ -19,7 +19,7 @@ GRID = round(CONTROL_PERIOD * 1e9)
 """Setpoints are stamped on multiples of this [ns]."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Schedule:
     """A plan with the instant at which its first setpoint takes effect.
 

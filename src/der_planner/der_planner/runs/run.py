@@ -1,6 +1,6 @@
 """What was measured and asked for in one run, as arrays: the input of every metric.
 
-A bag becomes a `RunSeries` in `extract`; runs without a bag (offline ones, logs of other tools)
+A bag becomes a `RunSeries` in `series`; runs without a bag (offline ones, logs of other tools)
 build it from their arrays with `RunSeries.from_arrays`.
 """
 
@@ -36,6 +36,7 @@ class Description:
         cycles: of the motion.
         limb: name of the limb file.
         bag: path of the bag, empty for a run without.
+        namespace: of the limb's topics in the bag, e.g. ``/limb``; empty for a run without a bag.
         extra: everything else that the recorder was told (versions, commit, machine …).
     """
 
@@ -49,6 +50,7 @@ class Description:
     cycles: int = 0
     limb: str = ""
     bag: str = ""
+    namespace: str = ""
     extra: Mapping[str, Any] = field(default_factory=dict)
 
     @property

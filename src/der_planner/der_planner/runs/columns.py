@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.runs.evaluation.series import Array
+from der_planner.runs.run import Array
 
 
 class Columns:
@@ -25,6 +25,11 @@ class Columns:
 
     def __len__(self) -> int:
         return len(self._stamps)
+
+    @property
+    def width(self) -> int:
+        """Numbers in a row; 0 before the first row that is not empty."""
+        return self._width
 
     def append(self, stamp: int, values: Sequence[float] | Array) -> None:
         """Add a row."""
