@@ -21,6 +21,7 @@ from der_planner.runs.series import (
 )
 
 Array = NDArray[np.float64]
+
 LONGEST_GAP = 0.25
 """Between two messages that a straight line may bridge [s]."""
 LEAST = 10
