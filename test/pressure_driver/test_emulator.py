@@ -116,6 +116,7 @@ def test_a_command_is_stamped_with_its_first_byte():
 def test_the_board_reaches_what_it_is_told(protocol):
     board = EmulatedBoard(board_protocol(protocol), Pneumatics(2, 5), 5)
     host = host_protocol(protocol)
+    board.receive(host.start(), 0)
     data, _ = host.setpoint([8000.0, -3000.0], board.atmosphere, 9.0)
     (command,), _ = board.receive(data, 0)
     wire = np.array(command.pressure)
@@ -242,3 +243,13 @@ def test_the_port_does_not_overwrite_a_file(tmp_path):
     with pytest.raises(FileExistsError, match="port_link"):
         EmulatedPort(str(tmp_path / "board"), 0)
     assert (tmp_path / "board").read_text() == "precious"
+
+
+def test_a_second_emulator_leaves_the_first_one_its_link(tmp_path):
+    first = EmulatedPort(str(tmp_path / "board"), 0)
+    device = (tmp_path / "board").resolve()
+    with pytest.raises(FileExistsError, match="another emulator serves"):
+        EmulatedPort(str(tmp_path / "board"), 0)
+    assert (tmp_path / "board").resolve() == device
+    first.close()
+    EmulatedPort(str(tmp_path / "board"), 0).close()

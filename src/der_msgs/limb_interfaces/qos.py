@@ -1,8 +1,10 @@
 """The QoS profiles of the graph, in one place and by the role of the topic."""
 
+from rclpy.duration import Duration
 from rclpy.qos import (
     DurabilityPolicy,
     HistoryPolicy,
+    LivelinessPolicy,
     QoSProfile,
     ReliabilityPolicy,
     qos_profile_sensor_data,
@@ -17,6 +19,18 @@ SETPOINTS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE
 )
 """Timed setpoints: deep enough for five seconds at 20 Hz."""
+
+SETPOINT_STREAM = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=100,
+    reliability=ReliabilityPolicy.RELIABLE,
+    deadline=Duration(seconds=0.2),
+    liveliness=LivelinessPolicy.AUTOMATIC,
+    liveliness_lease_duration=Duration(seconds=1),
+)
+"""What the planner offers on the setpoints' topic: while a plan is played the next one comes within
+four ticks, and a publisher that has died is known to be gone after a second. It is only offered: a
+subscriber that requested it would match no publisher of plain QoS, such as ``ros2 topic pub``."""
 
 STATES = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=20, reliability=ReliabilityPolicy.RELIABLE

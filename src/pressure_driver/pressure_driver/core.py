@@ -12,18 +12,20 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from pressure_driver.monitor import Monitor, MonitorLimits, chamber_gauge
+from pressure_driver.admission import Origin
+from pressure_driver.monitor import MonitorLimits, TelemetryMonitor, chamber_gauge
 from pressure_driver.protocols.base import (
     BoardIdentity,
     BoardReport,
+    BoardReset,
     BoardText,
     Echo,
     Event,
     HostProtocol,
     Telemetry,
 )
-from pressure_driver.safety import Mode, SafetyLimits, SafetyMachine
-from pressure_driver.schedule import Counters, Schedule, ScheduleLimits, Setpoint, Verdict
+from pressure_driver.safety import LIVE, Mode, SafetyLimits, SafetyMachine
+from pressure_driver.schedule import Counters, ScheduleLimits, Setpoint, SetpointSchedule, Verdict
 
 STANDARD_ATMOSPHERE = 101_325.0
 """[Pa] on the wire until the room's has been measured; only vent commands are sent before."""
@@ -31,7 +33,34 @@ STANDARD_ATMOSPHERE = 101_325.0
 LARGEST_CLOCK_STEP = 0.3
 """[s] between two ticks, above slewing and late wakes, that means the wall clock was set."""
 IDENTITY_RETRY = 1.0
-"""[s] after which a board that has not introduced itself is asked again."""
+"""[s] after which a board that has not introduced or set itself up is greeted again."""
+ECHO_TIMEOUT = 1.0
+"""[s] without an echo of any command, on boards that echo: the board takes no commands."""
+
+
+class LogAllowance:
+    """How many texts of the board may still be logged: some at once, a few a second for ever.
+
+    Args:
+        burst: texts at once, such as those of a boot.
+        rate: [1/s] of the allowance that comes back.
+    """
+
+    def __init__(self, burst: int = 30, rate: float = 3.0) -> None:
+        self.withheld = 0
+        """Texts that were not logged."""
+        self._burst, self._rate = float(burst), rate
+        self._left, self._asked_at = float(burst), 0.0
+
+    def allows(self, now: float) -> bool:
+        """Tell whether one more may be logged now (steady clock [s])."""
+        self._left = min(self._burst, self._left + (now - self._asked_at) * self._rate)
+        self._asked_at = now
+        if self._left < 1.0:
+            self.withheld += 1
+            return False
+        self._left -= 1.0
+        return True
 
 
 @dataclass(frozen=True)
@@ -96,15 +125,24 @@ class DriverCore:
         self._notify = notify
         self._log = log
         self._lock = threading.RLock()
-        self._schedule = Schedule(settings.schedule, settings.period, settings.interpolate)
-        self._monitor = Monitor(protocol.chamber_count, settings.monitor, settings.atmosphere)
+        self._schedule = SetpointSchedule(settings.schedule, settings.period, settings.interpolate)
+        self._monitor = TelemetryMonitor(
+            protocol.chamber_count, settings.monitor, settings.atmosphere, protocol.reports_supply
+        )
         self._machine = SafetyMachine(self._schedule, self._monitor, settings.safety)
         self._last_tick = 0
         self._last_mode = Mode.DISARMED
         self._awaiting_echo: deque[tuple[int | None, float]] = deque(maxlen=64)
         self._round_trip = float("nan")
         self._pending_number: int | None = None
+        self._board_log = LogAllowance()
+        self._limited_noted = 0
+        self._was_limited = False
         self._asked_at = 0.0
+        self._identity_problem = ""
+        self._echo_awaited_since: float | None = None
+        self.venting = True
+        """Whether the bytes of the last tick were the vent command."""
         self._clock_offset = 0.0
         self.last_text = ""
         """What the board has said last in plain words."""
@@ -125,10 +163,16 @@ class DriverCore:
             self._note_mode()
             return result
 
-    def offer(self, setpoint: Setpoint, wall: int) -> Verdict:
-        """Take a setpoint; ``wall`` is the wall clock now in ns."""
+    def offer(self, setpoint: Setpoint, wall: int, origin: Origin | None = None) -> Verdict:
+        """Take a setpoint.
+
+        Args:
+            setpoint: stamp 0 means now.
+            wall: [ns] wall clock.
+            origin: where it came from; None inside one program.
+        """
         with self._lock:
-            return self._machine.offer(setpoint, wall)
+            return self._machine.offer(setpoint, wall, self._steady(), origin)
 
     def obstacles(self) -> list[str]:
         """Return what forbids arming now."""
@@ -144,6 +188,21 @@ class DriverCore:
     def last_refusal(self) -> str:
         """Why the last setpoint that was not accepted was not."""
         return self._schedule.reason
+
+    @property
+    def foreign_setpoints(self) -> int:
+        """Setpoints that were refused since another publisher was being played."""
+        return self._machine.sources.refused
+
+    @property
+    def limited_ticks(self) -> int:
+        """Ticks at which the slew limit held the output back."""
+        return self._machine.limited_ticks
+
+    @property
+    def unlogged_texts(self) -> int:
+        """Texts of the board that came too fast for the log."""
+        return self._board_log.withheld
 
     @property
     def waiting(self) -> int:
@@ -180,8 +239,10 @@ class DriverCore:
             self.protocol.reset()
             self._monitor.forget()
             self._awaiting_echo.clear()
+            self._echo_awaited_since = None
             self._machine.link_fault = ""
             self._forget_identity()
+            self._watch_board(self._steady())
             return self.protocol.start() + self._vent_bytes()
 
     def tick(self, instant: int) -> bytes:
@@ -190,8 +251,11 @@ class DriverCore:
             now = self._steady()
             self._watch_wall_clock(instant, now)
             self._last_tick = instant
+            self._watch_board(now)
             action = self._machine.tick(instant, now)
-            if action.dump:
+            self.venting = action.dump or bool(self.protocol.unsettled)
+            if self.venting:
+                self._machine.command_nothing()
                 return self._ask_identity(now) + self._vent_bytes()
             data, self._pending_number = self.protocol.setpoint(
                 action.differential, self._wire_atmosphere(), self.settings.command_validity
@@ -214,15 +278,23 @@ class DriverCore:
             now = self._steady()
             self._monitor.command(self._machine.differential, now)
             self._awaiting_echo.append((self._pending_number, now))
+            if self._echo_awaited_since is None:
+                self._echo_awaited_since = now
             self._note_mode()
+            self._note_limit()
         self._notify()
 
     def received(self, data: bytes) -> None:
         """Decode what the board has sent."""
         with self._lock:
             now = self._steady()
-            for event in self.protocol.decode(data):
+            rejected = self.protocol.rejected
+            events = self.protocol.decode(data)
+            for event in events:
                 self._take(event, now)
+            readings = sum(isinstance(event, Telemetry) for event in events)
+            self._monitor.note_quality(readings, self.protocol.rejected - rejected, now)
+            self._watch_board(now)
 
     def lost(self, reason: str) -> None:
         """The port is gone: everything that was armed faults."""
@@ -236,20 +308,60 @@ class DriverCore:
         with self._lock:
             return self._vent_bytes()
 
+    def emergency(self) -> bytes:
+        """Return the vent command for the guardian, complete after any half-sent bytes."""
+        with self._lock:
+            return self.protocol.separator + self.protocol.vent(self._wire_atmosphere())[0]
+
+    def failed(self, reason: str) -> None:
+        """Go to FAULT for a reason beside port and board."""
+        with self._lock:
+            self._machine.fail(reason)
+            self._note_mode()
+
+    @property
+    def separator(self) -> bytes:
+        """What ends half-sent bytes."""
+        return self.protocol.separator
+
+    def _watch_board(self, now: float) -> None:
+        """Find out whether the board is set up, reports, and takes commands."""
+        if self._monitor.telemetry_faults(now):
+            self.protocol.doubt()
+        since = self._echo_awaited_since
+        stalled = self.protocol.echoes and since is not None and now - since > ECHO_TIMEOUT
+        silence = f"the board has not answered a command for {ECHO_TIMEOUT:g} s" if stalled else ""
+        if silence and self._machine.mode in LIVE:
+            self._machine.fail(silence)
+        problems = (self._identity_problem, self.protocol.unsettled, silence)
+        self._machine.board_obstacle = next(filter(None, problems), "")
+
+    def _take_reset(self, reset: BoardReset, now: float) -> None:
+        """Set the board up anew; what was being played must not be played on."""
+        self._log(f"the board has been reset: {reset.sign}", True)
+        self._monitor.forget()
+        self._forget_identity()
+        self._asked_at = now - IDENTITY_RETRY
+        if self._machine.mode in LIVE:
+            self._machine.fail(f"the board has been reset: {reset.sign}")
+
     def _forget_identity(self) -> None:
         self.identity = None
         self._asked_at = self._steady()
         if self.protocol.introduces_itself:
-            self._machine.board_obstacle = "the board has not introduced itself yet"
+            self._identity_problem = "the board has not introduced itself yet"
 
     def _ask_identity(self, now: float) -> bytes:
         """Return the greeting again while it has not been answered; a board may boot slowly."""
-        if self.identity is not None or not self.protocol.introduces_itself:
+        if not (self.protocol.unsettled or self._identity_missing()):
             return b""
         if now - self._asked_at < IDENTITY_RETRY:
             return b""
         self._asked_at = now
         return self.protocol.start()
+
+    def _identity_missing(self) -> bool:
+        return self.protocol.introduces_itself and self.identity is None
 
     def _check_identity(self, identity: BoardIdentity) -> None:
         """Refuse to arm a board that is not the one which the parameters describe."""
@@ -266,7 +378,7 @@ class DriverCore:
                 f"the board reaches {identity.largest_pressure:.0f} Pa, less than 'pressure_limit' "
                 f"({limit:.0f} Pa): lower the parameter"
             )
-        self._machine.board_obstacle = problem
+        self._identity_problem = problem
 
     def _wire_atmosphere(self) -> float:
         return self._monitor.atmosphere if self._monitor.rest_known() else STANDARD_ATMOSPHERE
@@ -283,20 +395,30 @@ class DriverCore:
         elif isinstance(event, Echo):
             self._take_echo(event, now)
         elif isinstance(event, BoardReport):
-            self._log(f"board: {event.text}", True)
+            self._log_board(event.text, True, now)
             if event.fatal:
-                self._machine.fail(f"board reports: {event.text}")
+                self._machine.fail(f"board reports {event.text}")
+        elif isinstance(event, BoardReset):
+            self._take_reset(event, now)
         elif isinstance(event, BoardIdentity):
             self._check_identity(event)
         elif isinstance(event, BoardText):
             self.last_text = event.text
-            self._log(f"board: {event.text}", False)
+            self._log_board(event.text, False, now)
+
+    def _log_board(self, text: str, warning: bool, now: float) -> None:
+        """Log what the board says, unless it talks too much: a log must never hold up a vent."""
+        if self._board_log.allows(now):
+            self._log(f"board: {text}", warning)
+        elif self._board_log.withheld == 1:
+            self._log("the board sends text faster than it is logged: the rest is counted", True)
 
     def _take_echo(self, echo: Echo, now: float) -> None:
         """Measure the round trip; an echo without a number is that of the newest command."""
         if echo.sequence is None and self._awaiting_echo:
             self._round_trip = now - self._awaiting_echo[-1][1]
             self._awaiting_echo.clear()
+            self._echo_awaited_since = None
         # A status that left the board before the newest command came echoes an older one: the
         # newest goes on waiting for its own.
         if echo.sequence not in [number for number, _ in self._awaiting_echo]:
@@ -305,7 +427,16 @@ class DriverCore:
             number, sent = self._awaiting_echo.popleft()
             if number == echo.sequence:
                 self._round_trip = now - sent
+                self._echo_awaited_since = now if self._awaiting_echo else None
                 return
+
+    def _note_limit(self) -> None:
+        """Say when the slew limit begins to hold the output back."""
+        limited = self._machine.limited_ticks
+        if limited > self._limited_noted and not self._was_limited:
+            self._log("the slew limit holds the output back: it follows the setpoints late", True)
+        self._was_limited = limited > self._limited_noted
+        self._limited_noted = limited
 
     def _note_mode(self) -> None:
         mode = self._machine.mode

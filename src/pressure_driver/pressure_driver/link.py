@@ -2,43 +2,49 @@
 
 The thread waits for bytes from the board and for the next tick of the grid, whichever comes first.
 At a tick it asks the state machine what to send and writes it; nothing else ever touches the port.
-After an unplug it keeps ticking (so that the state machine stays alive), looks for the port with a
-growing delay, and vents as soon as it is back.
+After an unplug it keeps ticking (so that the state machine stays alive), watches for the port's
+name to come back, opens it (again and again with a growing delay if that fails), and vents at once.
+Beside the ticks it shows the guardian, if there is one, that it lives.
 """
 
 from __future__ import annotations
 
 import contextlib
-import errno
-import fcntl
 import os
 import select
-import termios
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from pathlib import Path
 from typing import Protocol
 
 import serial
-from serial.tools import list_ports
 
 from pressure_driver.grid import NANOSECONDS, TickGrid
+from pressure_driver.guardian_client import GuardianClient, GuardianError
+from pressure_driver.ports import (
+    PortError,
+    open_port,
+    open_port_when_free,
+    release_port,
+    stable_name,
+)
 from pressure_driver.realtime import prefer_thread
 
 FIRST_RETRY = 0.1
 """[s] after a lost port until it is looked for again."""
 LAST_RETRY = 2.0
 """[s] between looks after a long absence."""
-STABLE_NAMES = Path("/dev/serial/by-id")
-"""Where the system keeps names of ports that survive re-plugging."""
+LONGEST_WAIT = 0.03
+"""[s] after which the thread turns at the latest: to look for a lost port, to show life."""
+UNREAD_TIME = 1.0
+"""[s] that bytes may wait in the port's output queue until the board counts as not reading."""
 VENT_REPEATS = 3
 """How often the vent command is sent at the end: there may be no checksum, and no second chance."""
-
-
-class PortError(RuntimeError):
-    """The serial port cannot be used; the message names it, the cause and the remedy."""
+LAST_WORDS_TIME = 0.5
+"""[s] that the operating system may take to send them."""
+GUARDIAN_STARTS = 3
+"""Guardians that may fail in one run of the driver before the driver gives up."""
 
 
 class LinkClient(Protocol):
@@ -62,57 +68,19 @@ class LinkClient(Protocol):
     def farewell(self) -> bytes:
         """Return the vent command, for the end and for urgent requests."""
 
+    def emergency(self) -> bytes:
+        """Return the vent command for the guardian to keep, complete after any half-sent bytes."""
 
-def available_ports() -> list[str]:
-    """Return the serial ports of this machine, by their stable names where there are any."""
-    by_id = sorted(map(str, STABLE_NAMES.iterdir())) if STABLE_NAMES.is_dir() else []
-    known = {os.path.realpath(path) for path in by_id}
-    others = [port.device for port in list_ports.comports() if port.device not in known]
-    emulated = sorted(str(path) for path in Path("/tmp").glob("der_limb_board_*"))
-    return by_id + sorted(others) + emulated
+    def failed(self, reason: str) -> None:
+        """Something beside the port has failed without which the limb must not be driven."""
 
+    @property
+    def separator(self) -> bytes:
+        """What ends half-sent bytes."""
 
-def stable_name(port: str) -> str:
-    """Return the by-id name of a port, which survives re-plugging, or the name itself."""
-    if STABLE_NAMES.is_dir():
-        for path in sorted(STABLE_NAMES.iterdir()):
-            if os.path.realpath(path) == os.path.realpath(port):
-                return str(path)
-    return port
-
-
-def _explain(port: str, error: Exception) -> str:
-    """Return a sentence with the cause and the remedy of a port that does not open."""
-    number = getattr(error, "errno", None)
-    ports = ", ".join(available_ports()) or "none"
-    if not Path(port).exists() or number == errno.ENOENT:
-        return (
-            f"no serial device {port}; ports that exist: {ports}. Plug the board in, or set the "
-            "parameter 'port'"
-        )
-    if number in (errno.EAGAIN, errno.EBUSY, errno.EWOULDBLOCK) or "lock" in str(error).lower():
-        return (
-            f"serial port {port} is in use by another program; find it with 'fuser -v {port}', "
-            f"close it, or set the parameter 'port' (ports that exist: {ports})"
-        )
-    if number in (errno.EACCES, errno.EPERM):
-        return f"no permission to open {port}: sudo usermod -a -G dialout $USER, then log in again"
-    return f"cannot open serial port {port}: {error}; ports that exist: {ports}"
-
-
-def open_port(port: str, baud_rate: int) -> serial.Serial:
-    """Open a serial port for this program alone.
-
-    Raises:
-        PortError: it does not exist, is in use, or may not be opened.
-    """
-    try:
-        device = serial.Serial(port, baud_rate, timeout=0, write_timeout=0.05, exclusive=True)
-    except (serial.SerialException, OSError, ValueError) as error:
-        raise PortError(_explain(port, error)) from error
-    with contextlib.suppress(OSError):
-        fcntl.ioctl(device.fileno(), termios.TIOCEXCL)
-    return device
+    @property
+    def venting(self) -> bool:
+        """Whether the last tick's bytes were the vent command."""
 
 
 class SerialLink:
@@ -126,6 +94,7 @@ class SerialLink:
         real_time_priority: SCHED_FIFO priority for the thread, 0 for none; refused quietly where
             the user has no right to it (see `real_time`).
         log: takes a sentence for the log.
+        guardian: of a board without a watchdog; it is started and ended together with the port.
     """
 
     def __init__(
@@ -136,6 +105,7 @@ class SerialLink:
         client: LinkClient,
         real_time_priority: int = 0,
         log: Callable[[str], None] = lambda _: None,
+        guardian: GuardianClient | None = None,
     ) -> None:
         self.port = stable_name(port)
         self.baud_rate = baud_rate
@@ -152,14 +122,21 @@ class SerialLink:
         """[s] from the instant of each of the last ticks to the thread's waking for it."""
         self.hand_over: deque[float] = deque(maxlen=1200)
         """[s] from the instant of each of the last ticks to the end of the write to the port."""
+        self.vented_at_end = False
+        """Whether the vent commands at the end have left this computer."""
         self._client = client
+        self._guardian = guardian
+        self._guardian_failures = 0
         self._priority = real_time_priority
         self._log = log
         self._device: serial.Serial | None = None
         self._bytes_waiting: select.epoll | None = None
         self._unsent = b""
+        self._drained_at = 0.0
+        self._was_venting = False
         self._retry_delay = FIRST_RETRY
         self._retry_at = 0.0
+        self._name_exists = True
         self._stop = False
         self._urgent = False
         self._wake_read, self._wake_write = os.pipe()
@@ -169,10 +146,18 @@ class SerialLink:
     def start(self) -> None:
         """Open the port and start the thread.
 
+        A port in use is waited for: the guardian of a killed driver vents for some seconds.
+
         Raises:
             PortError: the port cannot be opened.
+            GuardianError: there is to be a guardian, and it cannot be started.
         """
-        self._device = open_port(self.port, self.baud_rate)
+        self._device = open_port_when_free(self.port, self.baud_rate)
+        try:
+            self._arm_guardian()
+        except GuardianError:
+            release_port(self._device)
+            raise
         self._thread.start()
 
     def urge(self) -> None:
@@ -180,7 +165,7 @@ class SerialLink:
         self._urgent = True
         self._wake()
 
-    def close(self, timeout: float = 2.0) -> bool:
+    def close(self, timeout: float = 4.0) -> bool:
         """Vent the board, close the port and end the thread.
 
         Returns:
@@ -211,9 +196,9 @@ class SerialLink:
 
     def _turn(self) -> None:
         """Wait for bytes or the tick, and serve what came."""
-        if self._device is None and time.monotonic() >= self._retry_at:
-            self._reopen()
-        delay = max(self.grid.delay(time.time_ns()), 0.0)
+        if self._device is None:
+            self._look_for_port()
+        delay = min(max(self.grid.delay(time.time_ns()), 0.0), LONGEST_WAIT)
         watched = [self._wake_read]
         if self._bytes_waiting is not None:
             watched.append(self._bytes_waiting.fileno())
@@ -221,7 +206,7 @@ class SerialLink:
         wall = time.time_ns()
         instant = self.grid.take(wall, time.monotonic_ns())
         if instant is not None:
-            self._write(self._client.tick(instant))
+            self._send_tick(instant)
             self.lateness.append((wall - instant) / NANOSECONDS)
             self.hand_over.append((time.time_ns() - instant) / NANOSECONDS)
             self._client.sent(instant)
@@ -229,9 +214,45 @@ class SerialLink:
             os.read(self._wake_read, 64)
             if self._urgent:
                 self._urgent = False
-                self._write(self._client.farewell())
+                self._drop_unsent()
+                self._write(self._client.separator + self._client.farewell())
         if self._bytes_waiting is not None and self._bytes_waiting.fileno() in readable:
             self._read()
+        self._show_life()
+
+    def _send_tick(self, instant: int) -> None:
+        """Write the tick's command; the first vent command overtakes what waits to be sent."""
+        data = self._client.tick(instant)
+        venting = self._client.venting
+        if venting and not self._was_venting:
+            self._drop_unsent()
+            data = self._client.separator + data
+        self._was_venting = venting
+        self._watch_queue()
+        self._write(data)
+
+    def _watch_queue(self) -> None:
+        """Lose the port if what has been written stays where it is: the board does not read."""
+        if self._device is None:
+            return
+        now = time.monotonic()
+        waiting = len(self._unsent)
+        with contextlib.suppress(OSError):
+            waiting += self._device.out_waiting
+        if not waiting:
+            self._drained_at = now
+        elif now - self._drained_at > UNREAD_TIME:
+            self._lose(
+                f"the board on {self.port} does not read: {waiting} bytes have been waiting for "
+                f"{UNREAD_TIME:g} s"
+            )
+
+    def _drop_unsent(self) -> None:
+        """Throw away what waits to be sent; a frame may be cut, so a separator must follow."""
+        self._unsent = b""
+        if self._device is not None:
+            with contextlib.suppress(Exception):
+                self._device.reset_output_buffer()
 
     def _read(self) -> None:
         """Take the bytes that are there; none means that the device has gone."""
@@ -243,6 +264,8 @@ class SerialLink:
         except (serial.SerialException, OSError) as error:
             self._lose(f"reading from {self.port} failed: {error}")
             return
+        if data:
+            self._retry_delay = FIRST_RETRY
         self.bytes_received += len(data)
         self._client.received(data)
 
@@ -266,7 +289,7 @@ class SerialLink:
         self.bytes_sent += count
         self._unsent = pending[count:]
         if count < left_over:
-            self._lose(f"{self.port} takes no bytes")
+            self._lose(f"{self.port} takes no bytes: the board does not read")
 
     def _opened(self) -> None:
         assert self._device is not None
@@ -275,7 +298,7 @@ class SerialLink:
         self._bytes_waiting = select.epoll()
         self._bytes_waiting.register(self._device.fileno(), select.EPOLLIN | select.EPOLLET)
         self.connected = True
-        self._retry_delay = FIRST_RETRY
+        self._drained_at = time.monotonic()
         self._write(self._client.opening())
 
     def _lose(self, reason: str) -> None:
@@ -284,45 +307,112 @@ class SerialLink:
             self._bytes_waiting.close()
             self._bytes_waiting = None
         if self._device is not None:
-            with contextlib.suppress(Exception):
-                self._device.close()
+            release_port(self._device)
         self._device = None
+        if self._guardian is not None:
+            self._guardian.port_lost()
         self._unsent = b""
         self.connected = False
+        self._name_exists = os.path.exists(self.port)
         self._retry_at = time.monotonic() + self._retry_delay
         self._log(reason)
         self._client.lost(f"serial link lost: {reason}")
 
+    def _look_for_port(self) -> None:
+        """Open the port as soon as its name is there again; if it does not open, later again."""
+        exists = os.path.exists(self.port)
+        if exists and not self._name_exists:
+            self._retry_at, self._retry_delay = 0.0, FIRST_RETRY
+        self._name_exists = exists
+        if exists and time.monotonic() >= self._retry_at:
+            self._reopen()
+
     def _reopen(self) -> None:
+        self._retry_delay = min(self._retry_delay * 1.6, LAST_RETRY)
+        self._retry_at = time.monotonic() + self._retry_delay
         try:
             self._device = open_port(self.port, self.baud_rate)
         except PortError:
-            self._retry_delay = min(self._retry_delay * 1.6, LAST_RETRY)
-            self._retry_at = time.monotonic() + self._retry_delay
             return
+        self._arm_guardian()
         self.reconnects += 1
         self._log(f"{self.port} is back")
         self._opened()
 
+    # --------------------------------------------------------------------------- the guardian
+
+    def _arm_guardian(self) -> None:
+        """Hand the open port to the guardian, starting one if there is none."""
+        if self._guardian is None or self._device is None:
+            return
+        vent, port = self._client.emergency(), self._device.fileno()
+        if self._guardian.running:
+            self._guardian.hand_over(vent, port)
+        else:
+            self._guardian.start(vent, port)
+
+    def _show_life(self) -> None:
+        """Tell the guardian that the thread lives; replace a guardian that does not live itself.
+
+        Raises:
+            GuardianError: several guardians have failed, or another one cannot be started.
+        """
+        if self._guardian is None or not self._guardian.running:
+            return
+        try:
+            self._guardian.beat()
+            if self._guardian.wants_vent():
+                self._guardian.renew(self._client.emergency())
+        except GuardianError as error:
+            self._guardian_failures += 1
+            self._client.failed(f"{error}: nothing would vent the limb if the driver died")
+            self._log(f"{error}; another one is started")
+            if self._guardian_failures >= GUARDIAN_STARTS:
+                raise
+            self._guardian.discard()
+            self._arm_guardian()
+
+    # ------------------------------------------------------------------------------- the end
+
     def _say_goodbye(self) -> None:
         """Send the vent command, wait until it is on the wire, and close."""
-        device = self._device
-        if device is None:
-            return
-        with contextlib.suppress(Exception):
-            farewell = self._unsent + self._client.farewell() * VENT_REPEATS
-            device.write(farewell)
-            self.bytes_sent += len(farewell)
-            deadline = time.monotonic() + 0.5
-            while device.out_waiting and time.monotonic() < deadline:
-                time.sleep(0.002)
-            # The last bytes may still be in the port's hardware buffer.
-            time.sleep(64 * 10 / self.baud_rate)
-        with contextlib.suppress(Exception):
-            fcntl.ioctl(device.fileno(), termios.TIOCNXCL)
-        with contextlib.suppress(Exception):
-            device.close()
+        if self._device is None and self._name_exists:
+            with contextlib.suppress(Exception):
+                self._device = open_port(self.port, self.baud_rate)
+        if self._device is not None:
+            with contextlib.suppress(Exception):
+                self.vented_at_end = self._send_last_words(self._device)
+            release_port(self._device)
         if self._bytes_waiting is not None:
             self._bytes_waiting.close()
         self._device = self._bytes_waiting = None
         self.connected = False
+        if self._guardian is not None:
+            self._guardian.end()
+
+    def _send_last_words(self, device: serial.Serial) -> bool:
+        """Return whether the vent commands have left the operating system in time."""
+        self._drop_unsent()
+        farewell = self._client.separator + self._client.farewell() * VENT_REPEATS
+        deadline = time.monotonic() + LAST_WORDS_TIME
+        while farewell or device.out_waiting:
+            if time.monotonic() > deadline:
+                return False
+            self._keep_guardian_calm()
+            with contextlib.suppress(BlockingIOError):
+                count = os.write(device.fileno(), farewell)
+                self.bytes_sent += count
+                farewell = farewell[count:]
+            time.sleep(0.002)
+        # The last bytes may still be in the port's hardware buffer.
+        deadline = time.monotonic() + 64 * 10 / self.baud_rate
+        while time.monotonic() < deadline:
+            self._keep_guardian_calm()
+            time.sleep(0.002)
+        return True
+
+    def _keep_guardian_calm(self) -> None:
+        """Show a sign of life at the end, when a guardian that has failed is not replaced."""
+        if self._guardian is not None and self._guardian.running:
+            with contextlib.suppress(GuardianError):
+                self._guardian.beat()

@@ -48,7 +48,14 @@ def series(
 class BagOfRun:
     """Writes the messages of one run into a bag, with rosbags' serializer."""
 
-    def __init__(self, folder: Path, writer: BagWriter | None = None, run: str = "{}") -> None:
+    def __init__(
+        self,
+        folder: Path,
+        writer: BagWriter | None = None,
+        run: str = "{}",
+        namespace: str = "/limb",
+    ) -> None:
+        self.namespace = namespace
         self.types = store()
         self.bag = writer or BagWriter(folder, {RUN_KEY: run})
         self.start = START + 7 * SECOND
@@ -65,6 +72,7 @@ class BagOfRun:
         )
 
     def write(self, topic: str, kind: str, seconds: float, latched: bool = False, **fields) -> None:
+        topic = topic.replace("/limb", self.namespace, 1)
         name = f"der_msgs/msg/{kind}"
         message = self.types.types[name](header=self.header(seconds), **fields)
         self.bag.add_topic(spec(topic, name, latched))

@@ -8,7 +8,19 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from runs import FRAMES, TIMES, BagOfRun, reference
 
-from der_planner.runs.evaluation import EvaluationError, evaluate_bag, evaluate_run, load_run
+from der_planner.identification import LogError, read_bag
+from der_planner.runs.evaluation import (
+    EvaluationError,
+    csv_table,
+    evaluate_bag,
+    evaluate_bags,
+    evaluate_run,
+    format_table,
+    latex_table,
+    load_run,
+    markdown_table,
+    summarise,
+)
 from der_planner.runs.recording.layout import RUN_KEY
 from der_planner.runs.recording.writer import BagWriter
 
@@ -154,3 +166,68 @@ def test_the_plan_that_was_played_is_chosen(tmp_path: Path):
     assert load_run(tmp_path / "run", plan_id="rejected").description.model == "pcc"
     with pytest.raises(EvaluationError, match="only p, rejected"):
         load_run(tmp_path / "run", plan_id="none")
+
+
+def two_limbs(folder: Path, **offsets) -> None:
+    """Write one bag with runs of ``/limb`` and ``/lab2``, each with its own constant error [m].
+
+    A limb without an offset has a plan and setpoints, but its camera saw nothing.
+    """
+    first = BagOfRun(folder)
+    limbs = {"limb": first, "lab2": BagOfRun(folder, first.bag, namespace="/lab2")}
+    for name, bag in limbs.items():
+        bag.plan(plan_id=name)
+        for index in range(len(TIMES)):
+            bag.setpoint(index, [0.0, 0.0], plan_id=name)
+            bag.pressure(TIMES[index], [100.0, 100.0], [200.0, 300.0])
+        for when in FRAMES if name in offsets else ():
+            bag.state(when, reference(when)[0] + [0.0, offsets[name]])
+            bag.state(when, reference(when)[0], topic="/limb/twin/ground_truth")
+    first.bag.close()
+
+
+def test_two_limbs_in_one_bag_are_evaluated_apart(tmp_path: Path):
+    two_limbs(tmp_path / "run", limb=0.002, lab2=0.008)
+    found = evaluate_bags([tmp_path / "run"], workers=1)
+    errors = {entry.result.namespace: entry.result.mean_error_m for entry in found}
+    assert errors == {
+        "/limb": pytest.approx(0.002, abs=5e-5),
+        "/lab2": pytest.approx(0.008, abs=5e-5),
+    }
+    checks = {entry.result.namespace: entry.result.checks["tracker_rms_m"] for entry in found}
+    assert checks["/limb"] == pytest.approx(0.002, abs=5e-5)
+    assert checks["/lab2"] == pytest.approx(0.008, abs=5e-5)
+    rows = summarise([entry.result for entry in found])
+    assert [row.trials for row in rows] == [1, 1]
+    for text in (format_table(rows), markdown_table(rows), csv_table(rows), latex_table(rows)):
+        assert "/limb" in text
+        assert "/lab2" in text.replace("\\_", "_")
+
+
+def test_a_plan_never_meets_the_state_of_another_limb(tmp_path: Path):
+    two_limbs(tmp_path / "run", lab2=0.008)
+    (seen,) = [entry for entry in evaluate_bags([tmp_path / "run"], workers=1) if entry.result]
+    assert seen.result.namespace == "/lab2"
+    (blind,) = [entry for entry in evaluate_bags([tmp_path / "run"], workers=1) if entry.error]
+    assert "/limb: no limb state was recorded" in blind.error
+    assert "/lab2 are another limb's" in blind.error
+
+
+def test_a_run_among_several_limbs_is_named(tmp_path: Path):
+    two_limbs(tmp_path / "run", limb=0.002, lab2=0.008)
+    with pytest.raises(EvaluationError, match=r"several limbs, /lab2, /limb: name one"):
+        load_run(tmp_path / "run")
+    assert load_run(tmp_path / "run", namespace="/lab2").description.namespace == "/lab2"
+    assert load_run(tmp_path / "run", plan_id="lab2").description.namespace == "/lab2"
+    with pytest.raises(EvaluationError, match=r"no limb /lab3, only /lab2, /limb"):
+        load_run(tmp_path / "run", namespace="/lab3")
+
+
+def test_a_calibration_takes_one_limb_of_a_bag(tmp_path: Path):
+    two_limbs(tmp_path / "run", limb=0.002, lab2=0.008)
+    with pytest.raises(LogError, match=r"several limbs, /lab2, /limb: name one with --namespace"):
+        read_bag(tmp_path / "run")
+    log = read_bag(tmp_path / "run", namespace="/lab2")
+    instants = log.time + TIMES[0]
+    assert np.nanmax(np.abs(log.tip - reference(instants) - [0.0, 0.008])) < 1e-3
+    assert np.allclose(log.measured_differential, [200.0, 300.0])

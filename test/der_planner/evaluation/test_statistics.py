@@ -20,7 +20,7 @@ from der_planner.runs.evaluation import (
     write_results,
 )
 from der_planner.runs.evaluation.selfcheck import check_board
-from der_planner.runs.evaluation.series import BoardLog
+from der_planner.runs.run import BoardLog
 
 
 def result(error: float, model="der", trial=0, **changes):

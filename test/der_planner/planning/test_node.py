@@ -1,5 +1,7 @@
 """The planner node as a process: plans, streams, hands over, stops, refuses with a reason."""
 
+import subprocess
+
 import numpy as np
 import pytest
 
@@ -50,6 +52,9 @@ def planner(graph):
 
         def state(self):
             return self.client.diagnostic_values("planner")
+
+        def wait_reason(self, reason):
+            self.client.wait_for(lambda: reason in self.state().get("reason", ""), 60.0, reason)
 
         def wait_plan(self, plan_id):
             return self.client.wait_for(
@@ -127,7 +132,9 @@ def test_what_cannot_be_done_is_refused_with_a_reason(planner):
     for x in (0.2, 0.5):
         path.poses.append(PoseStamped(pose=Pose(position=Point(x=x, y=0.1))))
     node.paths.publish(path)
-    node.client.wait_for(lambda: "mm from what" in node.state()["reason"], 60.0, "a refusal")
+    node.client.wait_for(
+        lambda: "no pressure reaches it" in node.state()["reason"], 60.0, "a refusal"
+    )
     path.header.frame_id = "map"
     node.paths.publish(path)
     node.client.wait_for(lambda: "frame 'map'" in node.state()["reason"], 60.0, "a refusal")
@@ -186,3 +193,146 @@ def test_a_bad_limb_file_ends_the_node_with_its_name(graph, tmp_path):
     graph.client.wait_for(lambda: not process.alive, 60.0, "the node to give up")
     assert process.stop() != 0
     assert "limb.yaml" in process.last_words()
+
+
+@pytest.mark.parametrize(("offset", "reason"), [(-1.7e9, "s ago"), (2.2e8, "s ahead")])
+def test_a_start_in_another_epoch_is_refused(planner, offset, reason):
+    from std_msgs.msg import Header
+
+    from limb_interfaces.stamps import stamp_from_nanoseconds
+
+    node = planner()
+    now = node.client.node.get_clock().now().nanoseconds
+    wrong = stamp_from_nanoseconds(now + round(offset * 1e9))
+    node.command(plan_id="wrong", header=Header(stamp=wrong))
+    node.wait_reason(reason)
+    assert node.state()["state"] == "refused"
+    assert not node.setpoints
+
+
+def test_a_bad_command_leaves_the_plan_that_plays_alone(planner):
+    node = planner()
+    node.command(plan_id="good")
+    node.client.wait_for(lambda: node.received("good"), 60.0, "setpoints")
+    node.command("jump", plan_id="bad")
+    node.client.wait_for(lambda: node.state()["last_refusal"], 60.0, "the refusal")
+    assert (node.state()["state"], node.state()["plan_id"]) == ("streaming", "good")
+    assert "'jump' is unknown" in node.client.diagnostics["planner"].message
+    assert node.wait_state("done")["plan_id"] == "good"
+    node.process.stop()
+    log = node.process.log.read_text()
+    for words in ("plan good accepted", "plan good started", "plan good finished after"):
+        assert words in log
+
+
+def test_setpoints_offer_liveliness_and_reach_plain_subscribers_and_publishers(planner):
+    """Who asks for it is told of a killed planner; a publisher of plain QoS is still heard."""
+    import signal
+
+    from rclpy.duration import Duration
+    from rclpy.event_handler import SubscriptionEventCallbacks
+    from rclpy.qos import QoSProfile
+
+    from der_msgs.msg import PressureSetpoint
+    from limb_interfaces import topics
+
+    node = planner()
+    alive = []
+    asks = QoSProfile(
+        depth=10, deadline=Duration(seconds=1), liveliness_lease_duration=Duration(seconds=2)
+    )
+    node.client.node.create_subscription(
+        PressureSetpoint,
+        topics.PRESSURE_SETPOINT,
+        lambda _: None,
+        asks,
+        event_callbacks=SubscriptionEventCallbacks(
+            liveliness=lambda status: alive.append(status.alive_count)
+        ),
+    )
+    node.client.wait_for(lambda: 1 in alive, 30.0, "a live planner")
+    by_hand = node.client.node.create_publisher(PressureSetpoint, topics.PRESSURE_SETPOINT, 10)
+    node.client.wait_for(by_hand.get_subscription_count, 30.0, "the plain subscriber")
+    assert by_hand.get_subscription_count() == 1  # not the one that asks for more than is offered
+    node.command(plan_id="killed")
+    node.client.wait_for(lambda: node.received("killed"), 60.0, "setpoints")
+    node.process.signal(signal.SIGKILL)
+    node.client.wait_for(lambda: alive[-1] == 0, 30.0, "word of the planner's death")
+
+
+def test_the_action_tells_how_it_goes_and_how_it_ended(planner):
+    from rclpy.action import ActionClient
+
+    from der_msgs.action import PlayMotion
+    from der_msgs.msg import MotionCommand
+
+    node = planner()
+    action = ActionClient(node.client.node, PlayMotion, "planner/play_motion")
+    node.client.wait_for(action.server_is_ready, 30.0, "the action")
+    heard = []
+
+    def play(motion="asynchronous", plan_id=""):
+        command = MotionCommand(motion=motion, amplitude=0.3, period=3.0, cycles=1, plan_id=plan_id)
+        sent = action.send_goal_async(
+            PlayMotion.Goal(command=command), lambda message: heard.append(message.feedback)
+        )
+        node.client.wait_for(sent.done, 30.0, "the goal to be accepted")
+        return sent.result(), sent.result().get_result_async()
+
+    def result_of(future):
+        node.client.wait_for(future.done, 60.0, "the result")
+        return future.result()
+
+    _, refused = play("jump")
+    answer = result_of(refused)
+    assert answer.result.outcome == "refused"
+    assert "'jump' is unknown" in answer.result.reason
+
+    _, whole = play(plan_id="whole")
+    answer = result_of(whole)
+    assert (answer.result.outcome, answer.result.plan_id) == ("finished", "whole")
+    assert np.isnan(answer.result.tip_error)  # nothing tracks the tip here
+    told = [feedback.progress for feedback in heard if feedback.state == "streaming"]
+    assert told == sorted(told)
+    assert told[-1] > 0.9
+
+    handle, cut = play(plan_id="cut")
+    node.client.wait_for(lambda: node.received("cut"), 60.0, "setpoints")
+    handle.cancel_goal_async()
+    assert result_of(cut).result.outcome == "stopped"
+    assert len(node.received("cut")) < len(node.wait_plan("cut").time)
+
+    _, old = play(plan_id="old")
+    node.client.wait_for(lambda: node.received("old"), 60.0, "setpoints")
+    _, new = play("same_direction", plan_id="new")
+    assert result_of(old).result.outcome == "replaced"
+    assert result_of(new).result.outcome == "finished"
+
+
+def test_what_no_parameter_took_is_said(planner, graph, tmp_path):
+    from der_planner.experiment.processes import find_executable
+
+    file = tmp_path / "of_another_limb.yaml"
+    file.write_text("/lab7/planner:\n  ros__parameters: {nodes: 31}\n")
+    node = planner(defualt_model="pcc")
+    node.process.stop()
+    log = node.process.log.read_text()
+    assert "'defualt_model' is set, but /limb/planner has none: did you mean 'default_mod" in log
+    assert "driver_timeout" not in log
+    command = [str(find_executable("der_planner", "planner")), "--ros-args"]
+    with (
+        (tmp_path / "foreign.log").open("w+") as log,
+        subprocess.Popen([*command, "--params-file", str(file)], stdout=log, stderr=log) as process,
+    ):
+        try:
+            graph.client.wait_for(
+                lambda: (
+                    "nothing under /lab7/planner is for /limb/planner"
+                    in (tmp_path / "foreign.log").read_text()
+                ),
+                60.0,
+                "the warning",
+            )
+        finally:
+            process.terminate()
+        assert process.wait(30.0) == 0

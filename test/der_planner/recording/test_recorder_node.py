@@ -211,6 +211,11 @@ def test_replay_publishes_the_recorded_bytes(graph, tmp_path: Path):
         graph.client.wait_for(lambda: len(heard) == 10, 60.0, "the replay")
         assert replay.wait(30.0) == 0
     assert heard == [f"word {index}" for index in range(10)]
+    late = subprocess.run(
+        [*command, "--from", "1000"], env=environment, capture_output=True, text=True, check=False
+    )
+    assert late.returncode == 1
+    assert "nothing was published" in late.stderr
 
 
 def test_recorded_images_give_the_same_states_at_every_replay(graph, tmp_path: Path):
@@ -293,3 +298,45 @@ def track(graph, folder: Path, name: str) -> list[tuple]:
     graph.client.spin(0.5)
     tracker.stop()
     return list(states)
+
+
+def test_a_recorder_with_another_name_has_its_parameters_and_its_own_services(graph, tmp_path):
+    """Its parameter services are rclpy's, made with the node; `ros2 param list` asks them."""
+    from rcl_interfaces.srv import ListParameters
+
+    graph.start(
+        "der_planner",
+        "recorder",
+        "second",
+        {"__node": "rec2"},
+        output=str(tmp_path / "run"),
+        recrod_images=True,
+    )
+    graph.client.wait_ready(["rec2"])
+    client = graph.client.node.create_client(ListParameters, "rec2/list_parameters")
+    graph.client.wait_for(client.service_is_ready, 30.0, "the parameter services")
+    future = client.call_async(ListParameters.Request())
+    graph.client.wait_for(future.done, 10.0, "the parameters")
+    assert {"output", "record_images", "topics"} <= set(future.result().result.names)
+    assert graph.client.call("rec2/start") == str(tmp_path / "run")
+    graph.client.call("rec2/stop")
+    log = (tmp_path / "second.log").read_text()
+    assert "'recrod_images' is set, but /limb/rec2 has none: did you mean 'record_images'?" in log
+
+
+def test_states_that_never_arrived_are_counted_from_the_stamps(graph, tmp_path):
+    from der_msgs.msg import LimbState
+    from limb_interfaces import qos, stamps, topics
+
+    start(graph, output=str(tmp_path / "run"), autostart=True)
+    states = graph.client.node.create_publisher(LimbState, topics.LIMB_STATE, qos.STATES)
+    graph.client.wait_for(states.get_subscription_count, 30.0, "the recorder")
+    for index in range(60):
+        if index % 3 == 2 or index < 10:  # as if two of three were lost on the way
+            message = LimbState()
+            message.header.stamp = stamps.stamp_from_nanoseconds(10**15 + index * 33_333_333)
+            states.publish(message)
+            graph.client.spin(0.01)
+    graph.client.wait_for(lambda: value(graph, "missed"), 30.0, "the count")
+    graph.client.wait_for(lambda: value(graph, "missed") == "/limb/state: 33", 30.0, "all of them")
+    assert "never arrived" in graph.client.diagnostics["recorder"].message

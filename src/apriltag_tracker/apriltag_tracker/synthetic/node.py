@@ -25,6 +25,7 @@ from apriltag_tracker.tag_map import TagMap
 from der_msgs.msg import LimbShape
 from limb_interfaces import qos, stamps, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
+from limb_interfaces.overrides import check_overrides
 from limb_interfaces.parameters import declare
 from limb_interfaces.runner import run_node
 
@@ -70,6 +71,7 @@ class SyntheticCameraNode(Node):
                 "mounting_angle_error", 0.0, "how far limb tags are turned, in rad", 0.3
             ),
         )
+        check_overrides(self)
         tags = TagMap.from_yaml(str(tag_map))
         self._camera = SyntheticCamera(
             CameraModel.from_yaml(str(camera)), tags, optics, errors, int(seed)

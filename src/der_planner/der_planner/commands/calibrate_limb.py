@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
+from der_planner.commands.outputs import OutputError, check_file, check_folder
 from der_planner.experiment.errors import GraphError, NodeError
 from der_planner.experiment.interrupts import interrupt_once
 from der_planner.experiment.options import Hardware, OptionError
@@ -75,6 +76,12 @@ def _arguments() -> argparse.Namespace:
         type=Path,
         help="with --graph: for bag, logs and report (default: calibrations/ and the time)",
     )
+    parser.add_argument(
+        "--namespace",
+        default="",
+        metavar="NAME",
+        help="of the limb, where a bag holds several",
+    )
     parser.add_argument("--columns", type=Path, help="YAML map of the table's columns")
     parser.add_argument("--prior", type=Path, help="limb file to start from (default: built in)")
     parser.add_argument("--seed", type=int, default=0, help="of the twin (default: 0)")
@@ -95,7 +102,11 @@ def _arguments() -> argparse.Namespace:
     )
     parser.add_argument("--out", type=Path, default=Path("limb.yaml"), help="limb file to write")
     parser.add_argument("--report", type=Path, help="folder for report.txt and prediction.png")
-    given = parser.parse_args()
+    return _checked(parser, parser.parse_args())
+
+
+def _checked(parser: argparse.ArgumentParser, given: argparse.Namespace) -> argparse.Namespace:
+    """Return the arguments with their defaults; ends the program where they do not go together."""
     if given.csv and not given.columns:
         parser.error("--csv needs --columns FILE")
     for name in ("hardware", "folder"):
@@ -116,6 +127,7 @@ def main() -> int:
     """Run the command line: 0 when a limb file was written, 1 after an error, 2 for bad options."""
     given = _arguments()
     try:
+        _check_outputs(given)
         prior = Limb.from_yaml(given.prior) if given.prior else Limb.default()
         if given.excitation:
             run = _excitation(prior, prior.pneumatics.pressure_limit, given)
@@ -125,18 +137,29 @@ def main() -> int:
         log = _obtain(prior, given)
         terms = () if given.terms == "none" else given.terms.split(",")
         limb, report = fit(prior, log, terms=terms, longest_gap=given.longest_gap)
-        held_out = [_read(path, given.columns) for path in given.held_out]
+        held_out = [_read(path, given) for path in given.held_out]
         _conclude(limb, report, log, held_out, given)
-    except OptionError as error:
+    except (OptionError, OutputError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except (LogError, LimbError, GraphError, NodeError) as error:
+    except (LogError, LimbError, GraphError, NodeError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as error:
         print(f"stopped by {error or 'SIGINT'}; no limb file was written", file=sys.stderr)
         return 130
     return 0
+
+
+def _check_outputs(given: argparse.Namespace) -> None:
+    """Refuse what cannot be written before anything is played or fitted."""
+    if given.excitation:
+        check_file(given.excitation, "--excitation")
+        return
+    check_file(given.out)
+    for name in ("folder", "report"):
+        if getattr(given, name):
+            check_folder(getattr(given, name), f"--{name}")
 
 
 def _excitation(prior: Limb, pressure_limit: float, given: argparse.Namespace) -> Excitation:
@@ -150,7 +173,7 @@ def _obtain(prior: Limb, given: argparse.Namespace) -> CalibrationLog:
     if given.graph:
         return read_bag(_play_on_graph(prior, given))
     if not given.offline:
-        return _read(given.bag or given.csv, given.columns)
+        return _read(given.bag or given.csv, given)
     limit = prior.pneumatics.pressure_limit
     run = within_limits(_excitation(prior, limit, given), limit, math.inf)
     print(f"playing {run.duration:.0f} s on the twin of seed {given.seed} …", file=sys.stderr)
@@ -199,12 +222,12 @@ def _play_on_graph(prior: Limb, given: argparse.Namespace) -> Path:
     return bag
 
 
-def _read(path: Path, columns: Path | None) -> CalibrationLog:
+def _read(path: Path, given: argparse.Namespace) -> CalibrationLog:
     if path.suffix == ".csv":
-        if columns is None:
+        if given.columns is None:
             raise LogError(f"{path} needs --columns FILE")
-        return read_csv(path, ColumnMap.from_yaml(columns))
-    return read_bag(path)
+        return read_csv(path, ColumnMap.from_yaml(given.columns))
+    return read_bag(path, given.namespace)
 
 
 def _conclude(

@@ -31,6 +31,12 @@ def main() -> int:
     parser.add_argument("run", type=Path, metavar="BAG", help="bag of the run, or a CSV table")
     parser.add_argument("--limb", type=Path, required=True, help="limb file to check")
     parser.add_argument("--columns", type=Path, help="YAML map of the table's columns")
+    parser.add_argument(
+        "--namespace",
+        default="",
+        metavar="NAME",
+        help="of the limb, where a bag holds several",
+    )
     given = parser.parse_args()
     try:
         limb = Limb.from_yaml(given.limb)
@@ -39,7 +45,7 @@ def main() -> int:
                 parser.error("a table needs --columns FILE")
             log = read_csv(given.run, ColumnMap.from_yaml(given.columns))
         else:
-            log = read_bag(given.run)
+            log = read_bag(given.run, given.namespace)
         verdict = check(limb, log)
     except (LogError, LimbError) as error:
         print(f"error: {error}", file=sys.stderr)

@@ -65,7 +65,10 @@ def _load(folder: Path, trial: Trial, entry: dict[str, Any]) -> RunSeries:
     if place is None:
         raise GraphError(f"nothing was kept of {trial.name}: remove trials/{trial.name}.json")
     try:
-        return load_run(folder / place) if "bag" in entry else load_arrays(folder / place)
+        if "bag" in entry:
+            # The bag may hold other limbs of the same ROS domain: the plan's id names ours.
+            return load_run(folder / place, plan_id=entry.get("plan_id", trial.name))
+        return load_arrays(folder / place)
     except (BagError, EvaluationError, OSError, json.JSONDecodeError) as error:
         raise GraphError(
             f"cannot evaluate {trial.name}: {error}. Remove {folder}/trials/{trial.name}.json to "

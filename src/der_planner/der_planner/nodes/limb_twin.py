@@ -18,6 +18,7 @@ from der_planner.twin import LimbTwin, TwinError
 from der_planner.twin.realtime import RealTimeLoop
 from limb_interfaces import parameters, qos, stamps, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
+from limb_interfaces.overrides import check_overrides
 from limb_interfaces.runner import run_node
 
 SILENCE = 1.0
@@ -43,6 +44,7 @@ class LimbTwinNode(Node):
                 self, "rate", 30.0, "shapes published per second [Hz]", at_least=1.0, at_most=120.0
             )
         )
+        check_overrides(self)
         self._twin = LimbTwin(seed, run)
         self._lock = threading.Lock()
         self._pressures: np.ndarray | None = None

@@ -2,52 +2,56 @@
 
 from __future__ import annotations
 
-import functools
 import queue
 import sys
 import threading
-import uuid
-from dataclasses import dataclass, field
+import time
+from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-from geometry_msgs.msg import Point, PointStamped
+from geometry_msgs.msg import PointStamped
 from nav_msgs.msg import Path as PathMessage
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from der_msgs.msg import MotionCommand, PressurePlan, PressureSetpoint
-from der_planner.limb import Limb
+from der_msgs.msg import MotionCommand, PressurePlan, PressureSetpoint, PressureState
+from der_planner.nodes import planner_messages
+from der_planner.nodes.driver_watch import DriverWatch, Ending
+from der_planner.nodes.planner_action import MotionAction
 from der_planner.nodes.planner_markers import limb_marker, path_markers
-from der_planner.planning import METHODS, Motion, PathLimits, Plan, Start, choose_method, plan
-from der_planner.planning.inverse import BRANCHES
-from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD
-from der_planner.planning.streaming import GRID, Player, Schedule, first_stamp
+from der_planner.nodes.planner_parameters import read_parameters
+from der_planner.nodes.planner_requests import Request, from_command, from_path, new_plan_id
+from der_planner.nodes.planner_stage import Stage
+from der_planner.planning import METHODS, Motion, Plan, Start, plan
+from der_planner.planning.streaming import GRID, Schedule, first_stamp
 from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
-from limb_interfaces.parameters import declare
+from limb_interfaces.overrides import check_overrides
 from limb_interfaces.runner import run_node
-from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
+from limb_interfaces.stamps import NANOSECONDS
 
 _MARGIN = 100_000_000
 """A plan starts this much [ns] after the earliest instant, so that its message travels first."""
-
-
-@dataclass
-class Request:
-    """One thing to plan: what was asked for, and whether it is still wanted."""
-
-    plan_id: str
-    motion: Motion
-    model: str
-    method: str
-    start: int
-    cancelled: threading.Event = field(default_factory=threading.Event)
+_ARMING_PATIENCE = 0.5
+"""[s] for the state of a driver that was armed just now to arrive."""
+_LEVELS = {
+    "starting": "stale",
+    "error": "error",
+    "failed": "error",
+    "fault": "error",
+    "lost": "error",
+    "refused": "warning",
+    "vented": "warning",
+}
 
 
 class Cancelled(Exception):  # noqa: N818 - not an error
     """A newer command or `stop` made this plan useless."""
+
+
+class Obstructed(Exception):  # noqa: N818 - not an error
+    """The driver takes no setpoints; the argument is the `Ending`."""
 
 
 class PlannerNode(Node):
@@ -55,129 +59,104 @@ class PlannerNode(Node):
 
     def __init__(self) -> None:
         super().__init__("planner", namespace=topics.NAMESPACE)
-        self._read_parameters()
+        self._options = read_parameters(self)
+        check_overrides(self)
         self._lock = threading.Lock()
         self._state, self._plan_id, self._reason, self._progress = "starting", "", "", 0.0
+        self._last_refusal = ""
         self._request: Request | None = None
         self._newest: tuple[str, Plan] | None = None
         self._work: queue.SimpleQueue[Request | None] = queue.SimpleQueue()
         self._plans = self.create_publisher(PressurePlan, topics.PLAN, qos.LATCHED)
         self._setpoints = self.create_publisher(
-            PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS
+            PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINT_STREAM
         )
         self._references = self.create_publisher(PointStamped, topics.TIP_REFERENCE, qos.STATES)
         self._markers = self.create_publisher(MarkerArray, topics.SHAPE_MARKERS, qos.STATES)
         self._diagnostics = DiagnosticsPublisher(self, self._health)
-        self._player = Player(self._now, self._send, self._finished, self._lead)
+        self._driver = DriverWatch(time.monotonic, self._options.driver_timeout)
+        self._stage = Stage(self, self._driver, self._now, self._options.lead)
+        self._action = MotionAction(self, self._take_command, self._stop_plan, self._stage.find)
         self._planning = threading.Thread(target=self._run, name="planning", daemon=True)
         self._planning.start()
+        self.create_subscription(
+            PressureState, topics.PRESSURE_STATE, self._stage.take_state, qos.STATES
+        )
         self.create_subscription(MotionCommand, topics.COMMAND, self._on_command, qos.COMMANDS)
         self.create_subscription(PathMessage, topics.PATH, self._on_path, qos.COMMANDS)
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
         self.create_timer(0.1, self._show)
 
-    def _read_parameters(self) -> None:
-        read = functools.partial(declare, self)
-        limb_file = str(read("limb_file", "", "limb file (YAML); empty: the default limb"))
-        self._limb = Limb.from_yaml(limb_file) if limb_file else Limb.default()
-        self._model = str(
-            read("default_model", "der", "model for paths and for commands that name none",
-                 choices=tuple(METHODS))
-        )  # fmt: skip
-        self._method = str(
-            read("default_method", "", "method of the rod where none is named; empty: the best",
-                 choices=("", *METHODS["der"]))
-        )  # fmt: skip
-        self._nodes = int(read("nodes", 21, "nodes of the rod", at_least=6, at_most=201))  # type: ignore[arg-type]
-        lead = read("lead_time", 0.2, "time between sending a setpoint and its stamp [s]",
-                    at_least=0.05, at_most=2.0)  # fmt: skip
-        self._lead = round(float(lead) * 1e9)  # type: ignore[arg-type]
-        self._auto_start = bool(read("auto_start", True, "play a plan as soon as it is ready"))
-        self._branch = str(
-            read("branch", "", "side of the fold for paths and shapes; empty: the least pressure",
-                 choices=("", *BRANCHES))
-        )  # fmt: skip
-        self._limits = PathLimits(
-            float(read("path_speed", 0.03, "speed along a path without times [m/s]",
-                       at_least=1e-3, at_most=1.0)),  # type: ignore[arg-type]
-            float(read("path_acceleration", 0.05, "acceleration along and across it [m/s^2]",
-                       at_least=1e-3, at_most=10.0)),  # type: ignore[arg-type]
-        )  # fmt: skip
-
     # What comes in -------------------------------------------------------------------------
 
     def _on_command(self, message: MotionCommand) -> None:
-        plan_id = message.plan_id or uuid.uuid4().hex[:8]
+        self._take_command(message, lambda _: None)
+
+    def _take_command(self, message: MotionCommand, begin: Callable[[str], None]) -> None:
+        """Plan a command or refuse it; ``begin`` is told the plan's id before either."""
+        wanted = message.plan_id
+        if not wanted or self._is_busy(wanted):
+            message.plan_id = new_plan_id()
+        begin(message.plan_id)
         try:
-            model = message.model or self._model
-            motion = Motion.named(
-                message.motion,
-                amplitude=message.amplitude or DEFAULT_AMPLITUDE,
-                period=message.period or DEFAULT_PERIOD,
-                cycles=message.cycles or DEFAULT_CYCLES,
-                branch=self._branch,
-            )
-            method = self._choose_method(model, message.method)
+            if wanted and message.plan_id != wanted:
+                raise ValueError(
+                    f"plan '{wanted}' is being planned or played: name another, or none"
+                )
+            if self._stage.is_spent(wanted):
+                raise ValueError(
+                    f"plan '{wanted}' was ended by the driver, which takes no more of it: give the "
+                    "command another plan_id, or none"
+                )
+            request = from_command(message, self._options, self._now())
         except ValueError as error:
-            self._refuse(plan_id, str(error))
+            self._refuse(message.plan_id, str(error))
             return
-        start = nanoseconds(message.header.stamp)
-        self._accept(Request(plan_id, motion, model, method, start))
+        self._accept(request)
+
+    def _is_busy(self, plan_id: str) -> bool:
+        """Tell whether a plan of this id is being planned or played."""
+        with self._stage.lock:
+            request = self._request
+            planned = request is not None and request.plan_id == plan_id
+            return planned or self._stage.find(plan_id) is not None
 
     def _on_path(self, message: PathMessage) -> None:
-        plan_id = uuid.uuid4().hex[:8]
-        frame = message.header.frame_id
+        plan_id = new_plan_id()
         try:
-            if frame not in ("", topics.BASE_FRAME):
-                raise ValueError(
-                    f"the path is in frame '{frame}': send it in '{topics.BASE_FRAME}'"
-                )
-            tip = np.array([(p.pose.position.x, p.pose.position.y) for p in message.poses])
-            stamps = [nanoseconds(pose.header.stamp) for pose in message.poses]
-            time = (np.array(stamps) - stamps[0]) * 1e-9 if any(stamps) else None
-            motion = Motion.from_tip_path(
-                time, tip.reshape(-1, 2), branch=self._branch, limits=self._limits
-            )
-            method = self._choose_method(self._model, "")
+            request = from_path(message, plan_id, self._options, self._now())
         except (ValueError, IndexError) as error:
             self._refuse(plan_id, str(error))
             return
-        start = nanoseconds(message.header.stamp)
-        self._accept(Request(plan_id, motion, self._model, method, start))
-
-    def _choose_method(self, model: str, method: str) -> str:
-        return choose_method(model, method or (self._method if model == "der" else ""))
+        self._accept(request)
 
     def _on_start(self, _: Any, response: Any) -> Any:
         """Play the newest plan, again if it was played before."""
         with self._lock:
             newest = self._newest
-        position = self._player.position
-        response.success = newest is not None and position is None
+        position = self._stage.position
+        obstacle = self._driver.obstacle()
         if newest is None:
             response.message = "no plan yet: publish a command first"
-            return response
-        if position is not None:
+        elif position is not None:
             response.message = f"plan {position[0].plan_id} is being played: call stop first"
-            return response
-        if newest[1].reference.start is not None:
-            response.success = False
+        elif newest[1].reference.start is not None:
             response.message = (
                 f"plan {newest[0]} began in another motion: publish its command again"
             )
-            return response
-        schedule = self._play(*newest, start=0)
-        response.message = f"plan {schedule.plan_id} starts at {schedule.start * 1e-9:.2f} s"
+        elif obstacle is not None:
+            response.message = obstacle.reason
+        else:
+            plan_id, result = newest
+            schedule = self._play(self._stage.unspent(plan_id), result, start=0)
+            response.success = True
+            response.message = f"plan {schedule.plan_id} starts at {schedule.start * 1e-9:.2f} s"
         return response
 
     def _on_stop(self, _: Any, response: Any) -> Any:
         """Cancel planning and streaming; the driver holds, then vents."""
-        with self._lock:
-            planning = self._request is not None
-            if self._request is not None:
-                self._request.cancelled.set()
-        playing = self._player.stop()
+        planning, playing = self._end_all("stopped", "the service stop was called")
         self._set("idle", reason="stopped by the service stop")
         response.success = True
         response.message = {
@@ -188,20 +167,71 @@ class PlannerNode(Node):
         }[(planning, playing)]
         return response
 
+    def _stop_plan(self, plan_id: str) -> None:
+        """Stop as the service does, if this plan is still planned or played."""
+        with self._stage.lock:
+            if self._is_busy(plan_id):
+                self._end_all("stopped", "the action was cancelled")
+                self._set("idle", reason="stopped by a cancelled action")
+
+    # Ends ----------------------------------------------------------------------------------
+
+    def _end_all(self, outcome: str, reason: str) -> tuple[bool, bool]:
+        """Cancel planning, stop streaming; tell whether there was either."""
+        with self._stage.lock:
+            request = self._request
+            if request is not None:
+                request.cancelled.set()
+            playing = self._stage.stop(outcome, reason)
+        if request is not None:
+            self._action.end(request.plan_id, outcome, reason)
+        return request is not None, playing
+
+    def abandoned(self, plan_id: str, ending: Ending) -> None:
+        """Everything was stopped because of the driver: plan nothing to go on with either."""
+        self._end_all(ending.outcome, ending.reason)
+        self._set(ending.outcome, plan_id, reason=ending.reason)
+        self._diagnostics.publish()
+
+    def ended(self, schedule: Schedule, outcome: str, reason: str) -> None:
+        """Log how the playing of a plan ended, and tell who asked for it."""
+        with self._lock:
+            current = self._plan_id == schedule.plan_id and self._state == "streaming"
+        if outcome == "finished" and current:
+            self._set("done", schedule.plan_id, progress=1.0)
+        text = f"plan {schedule.plan_id} {outcome} after {self._stage.share(schedule)}"
+        if outcome in ("vented", "fault", "lost"):
+            self.get_logger().error(f"{text}: {reason}")
+        else:
+            self.get_logger().info(f"{text}: {reason}" if reason else text)
+        self._action.end(schedule.plan_id, outcome, reason)
+
+    def _refuse(self, plan_id: str, reason: str) -> None:
+        """Refuse a plan; what is being planned or played meanwhile stays the state of the node."""
+        self.get_logger().warning(f"plan {plan_id} refused: {reason}")
+        with self._lock:
+            self._last_refusal = f"plan {plan_id}: {reason}"
+            planned = self._request is not None and self._request.plan_id != plan_id
+        if not planned and not self._stage.busy:
+            self._set("refused", plan_id, reason=reason)
+        self._action.end(plan_id, "refused", reason)
+        self._diagnostics.publish()
+
     # Planning ------------------------------------------------------------------------------
 
     def _accept(self, request: Request) -> None:
         with self._lock:
-            if self._request is not None:
-                self._request.cancelled.set()
-            self._request = request
+            replaced, self._request = self._request, request
+            self._last_refusal = ""
+        if replaced is not None:
+            replaced.cancelled.set()
+            self._action.end(replaced.plan_id, "replaced", f"by plan {request.plan_id}")
+        self.get_logger().info(
+            f"plan {request.plan_id} accepted: {request.motion.name}, {request.model} "
+            f"{request.method}"
+        )
         self._set("planning", request.plan_id, progress=0.0)
         self._work.put(request)
-
-    def _refuse(self, plan_id: str, reason: str) -> None:
-        self.get_logger().warning(f"plan {plan_id} refused: {reason}")
-        self._set("refused", plan_id, reason=reason)
-        self._diagnostics.publish()
 
     def _run(self) -> None:
         self._warm_up()
@@ -211,15 +241,19 @@ class PlannerNode(Node):
                 return
             try:
                 self._plan(request)
+                failure = ""
             except Cancelled:
                 self.get_logger().info(f"plan {request.plan_id} was cancelled")
+                failure = ""
+            except Obstructed as error:
+                failure = f"planned, but not played: {error.args[0].reason}"
             except Exception as error:  # every failure becomes a refusal with its reason
-                if not request.cancelled.is_set():
-                    self._refuse(request.plan_id, str(error) or type(error).__name__)
-            finally:
-                with self._lock:
-                    if self._request is request:
-                        self._request = None
+                failure = str(error) or type(error).__name__
+            with self._lock:
+                if self._request is request:
+                    self._request = None
+            if failure and not request.cancelled.is_set():
+                self._refuse(request.plan_id, failure)
 
     def _warm_up(self) -> None:
         """Compile every kernel before the node says that it is ready."""
@@ -227,7 +261,7 @@ class PlannerNode(Node):
             quick = Motion.named("asynchronous", amplitude=0.1, period=2.0, cycles=1)
             for model, methods in METHODS.items():
                 for method in methods:
-                    plan(self._limb, quick, model, method, nodes=self._nodes)
+                    plan(self._options.limb, quick, model, method, nodes=self._options.nodes)
         except Exception as error:
             self.get_logger().error(f"the limb cannot be planned for: {error}")
             self._set("error", reason=str(error))
@@ -249,80 +283,68 @@ class PlannerNode(Node):
             progress(0.0)
             stamp, start = self._hand_over(request.start, allowance)
             result = plan(
-                self._limb, request.motion, request.model, request.method, nodes=self._nodes,
-                start=start, progress=progress,
+                self._options.limb, request.motion, request.model, request.method,
+                nodes=self._options.nodes, start=start, progress=progress,
             )  # fmt: skip
             progress(1.0)
-            if start is None or stamp - self._lead > self._now():
+            if start is None or stamp - self._options.lead > self._now():
                 break
             allowance = 2 * round(result.solve_time * 1e9) + _MARGIN
         for warning in result.warnings:
             self.get_logger().warning(f"plan {request.plan_id}: {warning}")
         with self._lock:
             self._newest = (request.plan_id, result)
-        if self._auto_start:
-            self._play(request.plan_id, result, stamp if start is not None else request.start)
+        if self._options.auto_start:
+            obstacle = self._driver.wait(_ARMING_PATIENCE)
+            if obstacle is not None:
+                raise Obstructed(obstacle)
+            begin = stamp if start is not None else request.start
+            self._play(request.plan_id, result, begin, request.cancelled)
         else:
             self._publish_plan(Schedule(request.plan_id, result, 0))
             self._set("done", request.plan_id, reason="waits for the service start", progress=1.0)
 
     def _hand_over(self, wanted: int, allowance: int) -> tuple[int, Start | None]:
         """Return when a plan of now can take over, and where the limb is then; None: at rest."""
-        stamp = first_stamp(self._now() + allowance, self._lead, wanted)
-        position = self._player.position
+        stamp = first_stamp(self._now() + allowance, self._options.lead, wanted)
+        position = self._stage.position
         return stamp, None if position is None else position[0].leave(stamp)
 
     # Streaming -----------------------------------------------------------------------------
 
-    def _play(self, plan_id: str, result: Plan, start: int) -> Schedule:
-        earliest = first_stamp(self._now() + (_MARGIN if start == 0 else 0), self._lead, start)
-        position = self._player.position
-        if position is not None and result.reference.start is None:
-            earliest = max(earliest, position[0].stamp(position[0].count))
-        schedule = Schedule(plan_id, result, earliest)
-        self._set("streaming", plan_id, reason="; ".join(result.warnings), progress=0.0)
+    def _play(
+        self, plan_id: str, result: Plan, start: int, cancelled: threading.Event | None = None
+    ) -> Schedule:
+        with self._stage.lock:
+            if cancelled is not None and cancelled.is_set():
+                raise Cancelled
+            return self._stage.play(plan_id, result, start)
+
+    def scheduled(self, schedule: Schedule) -> None:
+        """A plan has its instant: publish it before its first setpoint."""
+        result = schedule.plan
+        self._set("streaming", schedule.plan_id, reason="; ".join(result.warnings), progress=0.0)
         self._publish_plan(schedule)
-        self._player.play(schedule)
-        return schedule
+        ahead = (schedule.start - self._now()) / NANOSECONDS
+        self.get_logger().info(
+            f"plan {schedule.plan_id} planned in {result.solve_time:.2f} s: {schedule.count} "
+            f"setpoints over {result.time[-1]:.1f} s, the first in {ahead:.2f} s"
+        )
+
+    def send(self, schedule: Schedule, index: int) -> None:
+        """Publish one setpoint and where the tip should be at its instant."""
+        if index == 0:
+            self.get_logger().info(f"plan {schedule.plan_id} started")
+        self._setpoints.publish(planner_messages.setpoint_message(schedule, index))
+        self._references.publish(planner_messages.reference_message(schedule, index))
+        self._progress = (index + 1) / schedule.count
+
+    def _publish_plan(self, schedule: Schedule) -> None:
+        self._plans.publish(planner_messages.plan_message(schedule))
+        self._markers.publish(path_markers(schedule.plan, self.get_clock().now().to_msg()))
 
     def _now(self) -> int:
         return int(self.get_clock().now().nanoseconds)
-
-    def _send(self, schedule: Schedule, index: int) -> None:
-        stamp = stamp_from_nanoseconds(schedule.stamp(index))
-        setpoint = PressureSetpoint(plan_id=schedule.plan_id, index=index)
-        setpoint.header.stamp = stamp
-        setpoint.header.frame_id = topics.BASE_FRAME
-        setpoint.differential_pressure = schedule.plan.differential_pressure[index].tolist()
-        self._setpoints.publish(setpoint)
-        x, y = schedule.plan.tip_reference[index]
-        reference = PointStamped(point=Point(x=float(x), y=float(y)))
-        reference.header = setpoint.header
-        self._references.publish(reference)
-        self._progress = (index + 1) / schedule.count
-
-    def _finished(self, schedule: Schedule) -> None:
-        with self._lock:
-            current = self._plan_id == schedule.plan_id and self._state == "streaming"
-        if current:
-            self._set("done", schedule.plan_id, progress=1.0)
-
-    def _publish_plan(self, schedule: Schedule) -> None:
-        result = schedule.plan
-        message = PressurePlan(
-            plan_id=schedule.plan_id, motion=result.motion, model=result.model,
-            method=result.method, amplitude=result.amplitude, period=result.period,
-            cycles=result.cycles, limb=result.limb.name, segment_count=result.limb.segment_count,
-            time=result.time.tolist(),
-            differential_pressure=result.differential_pressure.ravel().tolist(),
-            tip_reference=result.tip_reference.ravel().tolist(),
-            tip_predicted=result.tip_predicted.ravel().tolist(),
-            solve_time=result.solve_time, predicted_error=result.predicted_error,
-        )  # fmt: skip
-        message.header.stamp = stamp_from_nanoseconds(schedule.start)
-        message.header.frame_id = topics.BASE_FRAME
-        self._plans.publish(message)
-        self._markers.publish(path_markers(result, self.get_clock().now().to_msg()))
 
     # What it says of itself ----------------------------------------------------------------
 
@@ -340,12 +362,15 @@ class PlannerNode(Node):
 
     def _health(self) -> Health:
         with self._lock:
+            state, reason, refusal = self._state, self._reason, self._last_refusal
             values = {
-                "state": self._state,
+                "state": state,
                 "plan_id": self._plan_id,
-                "reason": self._reason,
+                "reason": reason,
+                "last_refusal": refusal,
                 "progress": f"{self._progress:.3f}",
-                "limb": self._limb.name,
+                "limb": self._options.limb.name,
+                "driver": self._driver.mode or "not heard",
             }
             newest = self._newest
         if newest is not None:
@@ -353,31 +378,33 @@ class PlannerNode(Node):
             values["pressure_margin_pa"] = f"{newest[1].pressure_margin:.0f}"
             values["slew_margin_pa_per_s"] = f"{newest[1].slew_margin:.0f}"
             values["solve_time_s"] = f"{newest[1].solve_time:.3f}"
-        if self._state == "starting":
+        if state == "starting":
             return Health("stale", "waiting for the models to compile", values)
-        if self._state == "error":
-            return Health("error", self._reason, values)
-        if self._state == "refused":
-            return Health("warning", f"refused: {self._reason}", values)
-        level = "warning" if self._state == "streaming" and self._reason else "ok"
-        return Health(level, self._reason or self._state, values)
+        if state in _LEVELS:
+            return Health(_LEVELS[state], f"{state}: {reason}", values)
+        if refusal:
+            return Health("warning", f"{state}; refused {refusal}", values)
+        level = "warning" if state == "streaming" and reason else "ok"
+        return Health(level, reason or state, values)
 
     def _show(self) -> None:
-        """Publish the reference limb of the setpoint in force, ten times a second."""
-        position = self._player.position
+        """Ten times a second: end what is over, tell who asked, show the reference limb."""
+        self._stage.end_what_is_over()
+        with self._lock:
+            plan_id, state, progress = self._plan_id, self._state, self._progress
+        self._action.tell(plan_id, state, progress)
+        position = self._stage.position
         if position is None:
             return
         schedule, index = position
-        index = max(0, index - 1 - self._lead // GRID)
+        index = max(0, index - 1 - self._options.lead // GRID)
         stamp = self.get_clock().now().to_msg()
         self._markers.publish(limb_marker(schedule.plan, index, stamp))
 
     def close(self) -> None:
         """Stop streaming and planning; called once before the node goes."""
-        with self._lock:
-            if self._request is not None:
-                self._request.cancelled.set()
-        self._player.close()
+        self._end_all("stopped", "the planner was ended")
+        self._stage.close()
         self._work.put(None)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import re
+import struct
 import sys
 import time
 from functools import partial
@@ -24,10 +25,19 @@ from der_planner.runs.recording.session import RecordingSession
 from der_planner.runs.recording.writer import COMPRESSIONS, BagWriteError, BagWriter
 from limb_interfaces import parameters, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
+from limb_interfaces.gaps import StampGaps
+from limb_interfaces.overrides import check_overrides
 from limb_interfaces.runner import run_node
+from limb_interfaces.stamps import NANOSECONDS
 
 IMAGE_TYPE = "sensor_msgs/msg/Image"
-MARK_TOPIC = "recorder/mark"
+REGULAR_TYPES = (
+    IMAGE_TYPE,
+    "der_msgs/msg/LimbState",
+    "der_msgs/msg/PressureState",
+    "der_msgs/msg/TagDetectionArray",
+)
+"""Streams of a steady rate, of which the stamps tell what did not arrive."""
 DEPTH = 200
 IMAGE_DEPTH = 30
 
@@ -38,6 +48,8 @@ class Recorder(Node):
     def __init__(self) -> None:
         super().__init__("recorder", namespace=topics.NAMESPACE)
         self._declare_parameters()
+        check_overrides(self)
+        self._gaps: dict[str, StampGaps] = {}
         self._session: RecordingSession | None = None
         self._last_failure = ""
         self._subscriptions_by_topic: dict[str, tuple[Subscription, tuple[OfferedQos, ...]]] = {}
@@ -45,12 +57,10 @@ class Recorder(Node):
         self._latched: dict[str, tuple[int, bytes]] = {}
         self._refused: dict[str, str] = {}
         self._marks = 0
-        self._services = [
-            self.create_service(Trigger, "recorder/start", self._on_start),
-            self.create_service(Trigger, "recorder/stop", self._on_stop),
-            self.create_service(SetBool, "recorder/pause", self._on_pause),
-            self.create_service(Trigger, "recorder/mark", self._on_mark),
-        ]
+        self.create_service(Trigger, "~/start", self._on_start)
+        self.create_service(Trigger, "~/stop", self._on_stop)
+        self.create_service(SetBool, "~/pause", self._on_pause)
+        self.create_service(Trigger, "~/mark", self._on_mark)
         self._discover()
         self._discovery = self.create_timer(0.25, self._discover)
         self._diagnostics = DiagnosticsPublisher(self, self._health)
@@ -193,6 +203,8 @@ class Recorder(Node):
             spec = self._specs[name]
             if spec.latched:
                 self._latched[name] = (sent, data)
+            if spec.type_name in REGULAR_TYPES:
+                self._gaps.setdefault(name, StampGaps()).take(leading_stamp(data))
             if self._session is not None:
                 self._session.put(spec, arrived, sent, data)
 
@@ -225,6 +237,7 @@ class Recorder(Node):
         )
         self._last_failure = ""
         self._marks = 0
+        self._gaps.clear()
         self._discover()
         now = self._now()
         for name, (sent, data) in self._latched.items():
@@ -290,7 +303,7 @@ class Recorder(Node):
             return response
         self._marks += 1
         label = self._parameter("mark_label") or f"mark {self._marks}"
-        name = f"{self.get_namespace().rstrip('/')}/{MARK_TOPIC}"
+        name = f"{self.get_fully_qualified_name()}/mark"
         definition = find_definition("std_msgs/msg/String")
         spec = TopicSpec(
             name, definition.name, definition.text, definition.type_hash, (OfferedQos(),)
@@ -305,6 +318,7 @@ class Recorder(Node):
     def _health(self) -> Health:
         values: dict[str, object] = {
             "topics": len(self._subscriptions_by_topic),
+            "missed": "; ".join(f"{k}: {v.missed}" for k, v in self._gaps.items() if v.missed),
             "not_recorded": "; ".join(f"{k}: {v}" for k, v in self._refused.items()),
         }
         if self._session is None:
@@ -326,6 +340,8 @@ class Recorder(Node):
         if status.dropped:
             lost = f"{status.dropped} messages dropped: the disk is too slow for what is recorded"
             return Health("warning", lost, values)
+        if values["missed"]:
+            return Health("warning", f"messages that never arrived, {values['missed']}", values)
         return Health("ok", f"{values['state']} into {status.folder}", values)
 
 
@@ -341,6 +357,13 @@ def offered_qos(endpoints: list[TopicEndpointInfo]) -> tuple[OfferedQos, ...]:
         for info in endpoints
     }
     return tuple(sorted(found, key=repr))
+
+
+def leading_stamp(data: bytes) -> int:
+    """Return the stamp [ns] of a serialized message whose first field is a std_msgs/Header."""
+    little = data[1] & 1
+    sec, nanosec = struct.unpack_from("<iI" if little else ">iI", data, 4)
+    return int(sec * NANOSECONDS + nanosec)
 
 
 def _is_latched(offered: tuple[OfferedQos, ...]) -> bool:

@@ -54,6 +54,7 @@ class EmulatedBoard:
         self._vented = True
         self._expired = False
         self._unsaid = b""
+        self._dead_for = 0.0
         self.atmosphere = 0.0
         """[Pa] what the board takes for the room's pressure, measured when it boots."""
         self.boot()
@@ -63,8 +64,15 @@ class EmulatedBoard:
         self._vent()
         self._expired = False
         self._sequence = 0
+        self._time = 0.0
         self.atmosphere = float(np.mean(self.pneumatics.pressure + self._offset))
         return self.protocol.boot(self.atmosphere)
+
+    def restart(self, seconds: float) -> None:
+        """Lose power for a moment: vented, deaf and mute for ``seconds``, then `boot`."""
+        self._vent()
+        self._unsaid = b""
+        self._dead_for = seconds
 
     def set_faults(self, faults: Faults) -> None:
         """Have these faults from now on, and no others."""
@@ -91,6 +99,8 @@ class EmulatedBoard:
         Returns:
             The commands that became complete, and what the board answers.
         """
+        if self._dead_for > 0.0:
+            return [], b""
         if self.faults.drop > 0.0 and self._generator.random() < self.faults.drop:
             return [], b""
         data = self.faults.damage(data, self._generator)
@@ -128,7 +138,7 @@ class EmulatedBoard:
         return command.pressure
 
     def _execute(self, command: BoardCommand) -> bytes:
-        if command.sequence is not None:
+        if command.sequence is not None and not self.faults.echoless:
             self._sequence = command.sequence
         if command.kind == "vent":
             self._vent()
@@ -138,7 +148,7 @@ class EmulatedBoard:
             self._expired = False
             if command.valid_for is not None:
                 self._valid_until = self._time + command.valid_for
-        return self.protocol.reply(command, self.reading())
+        return b"" if self.faults.echoless else self.protocol.reply(command, self.reading())
 
     def _vent(self) -> None:
         self._target = np.full(self.pneumatics.chamber_count, self.pneumatics.atmosphere)
@@ -170,6 +180,10 @@ class EmulatedBoard:
     def step(self, duration: float) -> NDArray[np.float64]:
         """Let time pass and return the true chamber pressures (2M,) [Pa] absolute."""
         self._time += duration
+        if self._dead_for > 0.0:
+            self._dead_for -= duration
+            if self._dead_for <= 0.0:
+                self._unsaid = self.boot()
         if self._valid_until is not None and self._time > self._valid_until:
             self._vent()
             self._expired = True
@@ -192,6 +206,8 @@ class EmulatedBoard:
 
     def telemetry(self) -> bytes:
         """Return the bytes of one report; nothing while muted."""
+        if self._dead_for > 0.0:
+            return b""
         report, self._unsaid = self._unsaid + self.protocol.telemetry(self.reading()), b""
         if self.faults.mute:
             return b""

@@ -13,6 +13,8 @@ WORDS = {
     "delay": "delay:SECONDS (telemetry is held back)",
     "mute": "mute (no telemetry)",
     "deaf": "deaf (every command is ignored)",
+    "echoless": "echoless (commands are executed and not repeated)",
+    "reset": "reset[:SECONDS] (the board loses power for SECONDS, 0.2 if not given)",
     "stick": "stick:CHAMBER (its valves stop moving)",
     "leak": "leak:CHAMBER[:RATE] (a hole drains it at RATE 1/s, 3 if not given)",
     "runaway": "runaway:CHAMBER (its inlet valve stays open)",
@@ -40,6 +42,8 @@ class Faults:
     delay: float = 0.0
     mute: bool = False
     deaf: bool = False
+    echoless: bool = False
+    reset: float | None = None
     stuck: tuple[int, ...] = ()
     leaks: dict[int, float] = field(default_factory=dict)
     runaway: tuple[int, ...] = ()
@@ -62,7 +66,8 @@ class Faults:
             numbers = [float(argument) for argument in arguments]
         except ValueError:
             numbers = [float("nan")]
-        wanted = {"mute": (0, 0), "deaf": (0, 0), "leak": (1, 2), "unplug": (0, 1)}
+        wanted = dict.fromkeys(("mute", "deaf", "echoless"), (0, 0))
+        wanted |= {"leak": (1, 2), "unplug": (0, 1), "reset": (0, 1)}
         low, high = wanted.get(word, (1, 1))
         well_formed = low <= len(numbers) <= high and all(number >= 0.0 for number in numbers)
         if word not in WORDS or not well_formed:
@@ -78,8 +83,10 @@ class Faults:
     def _set(self, word: str, numbers: list[float]) -> None:
         if word in ("drop", "corrupt", "delay", "supply"):
             setattr(self, word, numbers[0])
-        elif word in ("mute", "deaf"):
+        elif word in ("mute", "deaf", "echoless"):
             setattr(self, word, True)
+        elif word == "reset":
+            self.reset = numbers[0] if numbers else 0.2
         elif word == "stick":
             self.stuck += (int(numbers[0]),)
         elif word == "runaway":

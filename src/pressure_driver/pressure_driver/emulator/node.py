@@ -11,6 +11,7 @@ from rclpy.parameter import Parameter
 from der_msgs.msg import ChamberPressures
 from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
+from limb_interfaces.overrides import check_overrides
 from limb_interfaces.parameters import declare
 from limb_interfaces.runner import run_node
 from limb_interfaces.stamps import stamp_from_nanoseconds
@@ -30,6 +31,7 @@ class BoardEmulator(Node):
         super().__init__("board_emulator", namespace=topics.NAMESPACE)
         self.fatal_error = ""
         self._declare()
+        check_overrides(self)
         segment_count, seed = self._value("segment_count"), self._value("seed")
         pneumatics = Pneumatics(segment_count, seed)
         protocol = board_protocol(self._value("protocol"), 2 * segment_count)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import pty
 import tty
@@ -14,6 +15,8 @@ from pressure_driver.emulator.tap import LineTap
 
 BITS_PER_BYTE = 10
 """Start bit, eight data bits, stop bit."""
+LONGEST_READ = 5_000_000
+"""[ns] between a wake and the end of its read, above which the bytes are of unknown age."""
 
 
 class EmulatedPort:
@@ -27,7 +30,8 @@ class EmulatedPort:
         baud_rate: [baud] of both directions; 0 for a line without delay.
 
     Raises:
-        FileExistsError: something that is not a symbolic link stands at ``link``.
+        FileExistsError: another emulator serves ``link``, or something that is not a symbolic link
+            stands there.
     """
 
     def __init__(self, link: str, baud_rate: int) -> None:
@@ -39,7 +43,20 @@ class EmulatedPort:
         self._incoming: deque[tuple[int, int, bytes]] = deque()
         self._line_free = 0
         self.host_present = False
+        self._claim()
         self.plug()
+
+    def _claim(self) -> None:
+        """Keep other emulators from this link; the kernel lets go of it with the process."""
+        self._claim_path = self.link.with_name(f"{self.link.name}.lock")
+        self._claim_file = os.open(self._claim_path, os.O_CREAT | os.O_RDWR, 0o644)
+        try:
+            fcntl.flock(self._claim_file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(self._claim_file)
+            raise FileExistsError(
+                f"another emulator serves {self.link}: stop it, or set the parameter 'port_link'"
+            ) from None
 
     def plug(self) -> None:
         """Appear, under the stable name."""
@@ -110,7 +127,11 @@ class EmulatedPort:
             self.host_present = False
             self._outgoing.clear()
             return False
-        arrival = now if announced or clock is None else clock()
+        arrival = now
+        if clock is not None:
+            after = clock()
+            # If this thread was kept waiting since, bytes may have come after the announced ones.
+            arrival = now if announced and after - now < LONGEST_READ else after
         first = max(arrival, self._line_free)
         self._line_free = first + len(data) * self._byte_time
         self._incoming.append((self._line_free, first, data))
@@ -163,3 +184,6 @@ class EmulatedPort:
     def close(self) -> None:
         """Remove the port for good."""
         self.unplug()
+        with contextlib.suppress(OSError):
+            self._claim_path.unlink()
+            os.close(self._claim_file)

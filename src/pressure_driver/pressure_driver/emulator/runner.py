@@ -123,6 +123,8 @@ class BoardRunner:
 
     def _apply(self, faults: Faults, now: int) -> None:
         self.board.set_faults(faults)
+        if faults.reset is not None:
+            self.board.restart(faults.reset)
         if faults.unplugged:
             self.port.unplug()
             self._replug_at = None

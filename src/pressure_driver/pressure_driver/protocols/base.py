@@ -41,6 +41,14 @@ class BoardReport:
 
 
 @dataclass(frozen=True)
+class BoardReset:
+    """The board has started again: it is vented and has forgotten its settings."""
+
+    sign: str
+    """From what this is concluded; of a few fixed texts."""
+
+
+@dataclass(frozen=True)
 class BoardText:
     """Free text of the board: boot messages, warnings."""
 
@@ -59,7 +67,7 @@ class BoardIdentity:
     firmware: str
 
 
-Event = Telemetry | Echo | BoardReport | BoardText | BoardIdentity
+Event = Telemetry | Echo | BoardReport | BoardReset | BoardText | BoardIdentity
 
 
 class HostProtocol(ABC):
@@ -80,6 +88,10 @@ class HostProtocol(ABC):
     has_watchdog: ClassVar[bool] = False
     introduces_itself: ClassVar[bool] = False
     """Whether the board answers `start` with a `BoardIdentity`."""
+    separator: ClassVar[bytes] = b"\n"
+    """What makes the board drop or finish whatever was sent by halves."""
+    echoes: ClassVar[bool] = False
+    """Whether the board repeats every command (`Echo`)."""
     assumed_atmosphere: float = 101_325.0
     """[Pa] added to the reports of boards that only know gauge pressures."""
 
@@ -89,6 +101,11 @@ class HostProtocol(ABC):
         self.chamber_count = chamber_count
         self.rejected = 0
         """Frames or lines that were damaged and thrown away."""
+        self.unsettled = ""
+        """Why no pressure may be commanded yet, though the board talks; empty if it may."""
+
+    def doubt(self) -> None:  # noqa: B027 - most boards have no settings
+        """Trust no setting of the board any more, as after it has been silent."""
 
     @abstractmethod
     def start(self) -> bytes:

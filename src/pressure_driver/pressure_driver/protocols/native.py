@@ -6,6 +6,7 @@ The specification, for authors of firmware and with test vectors, is a page of t
 from __future__ import annotations
 
 import struct
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -16,6 +17,7 @@ from pressure_driver.protocols.base import (
     BoardProtocol,
     BoardReading,
     BoardReport,
+    BoardReset,
     Echo,
     Event,
     HostProtocol,
@@ -116,6 +118,8 @@ class NativeHost(HostProtocol):
     reports_supply = True
     has_watchdog = True
     introduces_itself = True
+    separator = b"\0"
+    echoes = True
 
     def __init__(self, chamber_count: int = 4) -> None:
         super().__init__(chamber_count)
@@ -123,9 +127,13 @@ class NativeHost(HostProtocol):
             raise ValueError(f"a native frame carries at most 32 chambers, got {chamber_count}")
         self._frames = _Frames()
         self._sequence = 0
+        self._board_time: int | None = None
+        self._pressurising: deque[int] = deque(maxlen=128)
 
     def _next(self) -> int:
         self._sequence = (self._sequence + 1) & 0xFFFF
+        if self._sequence in self._pressurising:
+            self._pressurising.remove(self._sequence)  # of 65536 commands ago
         return self._sequence
 
     def start(self) -> bytes:
@@ -153,6 +161,8 @@ class NativeHost(HostProtocol):
                 raise ValueError(f"a difference of {difference} Pa does not fit a native frame")
             body += struct.pack("<ii", round(max(difference, 0.0)), round(max(-difference, 0.0)))
         sequence = self._next()
+        if any(body[SETPOINT_HEAD.size :]):
+            self._pressurising.append(sequence)
         return encode(FrameType.SETPOINT, sequence, body), sequence
 
     def vent(self, atmosphere: float) -> tuple[bytes, int | None]:  # noqa: ARG002
@@ -196,7 +206,7 @@ class NativeHost(HostProtocol):
         count = self.chamber_count
         if len(body) != STATUS_HEAD.size + 5 * count:
             return []
-        _, echo, flags, atmosphere, supply = STATUS_HEAD.unpack_from(body)
+        time, echo, flags, atmosphere, supply = STATUS_HEAD.unpack_from(body)
         gauges = struct.unpack_from(f"<{count}i", body, STATUS_HEAD.size)
         valves = body[STATUS_HEAD.size + 4 * count :]
         if max(map(abs, gauges)) > LARGEST_GAUGE or atmosphere > LARGEST_GAUGE:
@@ -210,11 +220,30 @@ class NativeHost(HostProtocol):
             ),
             supply_pressure=float(supply) if flags & StatusFlag.SUPPLY_KNOWN else None,
         )
-        return [telemetry, Echo(echo)]
+        return [*self._look_for_reset(time), telemetry, Echo(echo), *self._look_at(flags, echo)]
+
+    def _look_for_reset(self, time: int) -> list[Event]:
+        """Compare the board's clock, which counts ms modulo 2^32, with that of the last STATUS."""
+        last, self._board_time = self._board_time, time
+        if last is None or (time - last) & 0xFFFFFFFF < 0x80000000:
+            return []
+        return [BoardReset("its clock has gone back")]
+
+    def _look_at(self, flags: int, echo: int) -> list[Event]:
+        """Say whether the board has let go of pressures that it has been told to hold."""
+        if echo not in self._pressurising:
+            return []
+        if flags & StatusFlag.EXPIRED:
+            return [BoardReport("expired: no setpoint has come in time, it has vented", fatal=True)]
+        if flags & StatusFlag.VENTED:
+            return [BoardReport("vented, though pressures are commanded", fatal=True)]
+        return []
 
     def reset(self) -> None:
-        """Forget a half-received frame."""
+        """Forget a half-received frame, and the board's clock."""
         self._frames.reset()
+        self._board_time = None
+        self._pressurising.clear()
 
 
 class NativeBoard(BoardProtocol):

@@ -12,12 +12,10 @@ Example::
 
 from der_planner.runs.evaluation.alignment import Settings, Split, error_series, split_error
 from der_planner.runs.evaluation.batch import Evaluated, evaluate_bags
-from der_planner.runs.evaluation.extract import load_run
 from der_planner.runs.evaluation.figures import plot_error, plot_pressures, plot_tip
 from der_planner.runs.evaluation.metrics import RunResult, evaluate_bag, evaluate_run
 from der_planner.runs.evaluation.report import Report, write_report
 from der_planner.runs.evaluation.results import read_results, results_document, write_results
-from der_planner.runs.evaluation.series import Description, EvaluationError, RunSeries, Stream
 from der_planner.runs.evaluation.statistics import Comparison, Summary, compare, summarise
 from der_planner.runs.evaluation.table import (
     csv_table,
@@ -27,6 +25,8 @@ from der_planner.runs.evaluation.table import (
     markdown_table,
 )
 from der_planner.runs.recording.reader import BagError
+from der_planner.runs.run import Description, EvaluationError, RunSeries, Stream
+from der_planner.runs.series import load_run
 
 __all__ = [
     "BagError",

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from der_planner.runs.evaluation.selfcheck import interpolate
-from der_planner.runs.evaluation.series import Array, EvaluationError, RunSeries, Stream
+from der_planner.runs.run import Array, EvaluationError, RunSeries, Stream
 
 LARGEST_LAG = 1.0
 """Bound of the estimated lag [s]."""

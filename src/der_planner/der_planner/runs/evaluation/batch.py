@@ -10,10 +10,10 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from der_planner.runs.evaluation.alignment import Settings
-from der_planner.runs.evaluation.extract import load_run
 from der_planner.runs.evaluation.metrics import RunResult, evaluate_run
-from der_planner.runs.evaluation.series import EvaluationError, RunSeries
 from der_planner.runs.recording.reader import BagError
+from der_planner.runs.run import EvaluationError, RunSeries
+from der_planner.runs.series import read_record, run_of
 
 WORTH_WHILE = 64 << 20
 """Bags of fewer bytes in total are read by one process."""
@@ -21,7 +21,7 @@ WORTH_WHILE = 64 << 20
 
 @dataclass(frozen=True)
 class Evaluated:
-    """One bag: its run and result, or the reason why there is none."""
+    """One limb of one bag: its run and result, or the reason why there is none."""
 
     path: Path
     run: RunSeries | None = None
@@ -46,18 +46,19 @@ def evaluate_bags(
         progress: called with the number done, the number of bags and the last one's path.
 
     Returns:
-        One entry per path, in the order given.
+        One entry per limb that has a plan, in the order of the paths; one with the reason for a
+        bag without any.
     """
     chosen = settings or Settings()
     workers = min(workers or _worth_while(paths), len(paths))
     if workers <= 1:
         found = []
         for count, path in enumerate(paths, start=1):
-            found.append(_evaluate(path, chosen))
+            found += _evaluate(path, chosen)
             if progress is not None:
                 progress(count, len(paths), path)
         return found
-    done: dict[Path, Evaluated] = {}
+    done: dict[Path, list[Evaluated]] = {}
     # Forking a process that already runs threads (ROS, BLAS) can deadlock.
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         waiting = {pool.submit(_evaluate, path, chosen): path for path in paths}
@@ -66,7 +67,7 @@ def evaluate_bags(
             done[path] = future.result()
             if progress is not None:
                 progress(count, len(paths), path)
-    return [done[path] for path in paths]
+    return [entry for path in paths for entry in done[path]]
 
 
 def _worth_while(paths: Sequence[Path]) -> int:
@@ -76,9 +77,16 @@ def _worth_while(paths: Sequence[Path]) -> int:
     return os.cpu_count() or 1 if size > WORTH_WHILE else 1
 
 
-def _evaluate(path: Path, settings: Settings) -> Evaluated:
+def _evaluate(path: Path, settings: Settings) -> list[Evaluated]:
     try:
-        run = load_run(path)
-        return Evaluated(path, run, evaluate_run(run, settings))
-    except (BagError, EvaluationError, OSError) as error:
-        return Evaluated(path, error=str(error))
+        record = read_record(path)
+    except (BagError, OSError) as error:
+        return [Evaluated(path, error=str(error))]
+    found = []
+    for namespace in sorted(record.played or record.limbs) or [""]:
+        try:
+            run = run_of(record, namespace)
+            found.append(Evaluated(path, run, evaluate_run(run, settings)))
+        except (BagError, EvaluationError, OSError) as error:
+            found.append(Evaluated(path, error=str(error)))
+    return found

@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 
 from der_planner.runs.evaluation import style
 from der_planner.runs.evaluation.alignment import error_series
-from der_planner.runs.evaluation.series import Array, RunSeries, Stream
 from der_planner.runs.evaluation.table import CASE
+from der_planner.runs.run import Array, RunSeries, Stream
 
 FORMATS = ("png", "pdf")
 CM = 100.0
@@ -28,10 +28,15 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def by_motion(runs: Sequence[RunSeries]) -> dict[str, list[RunSeries]]:
-    """Return the runs of each motion."""
+    """Return the runs of each motion, and of each limb where there are several, by their title."""
+    several = len({run.description.namespace for run in runs} - {""}) > 1
     found: dict[str, list[RunSeries]] = {}
     for run in runs:
-        found.setdefault(run.description.motion, []).append(run)
+        about = run.description
+        title = f"Case {CASE[about.motion]}" if about.motion in CASE else about.motion
+        if several:
+            title += f", {about.namespace}"
+        found.setdefault(title, []).append(run)
     return found
 
 
@@ -52,15 +57,15 @@ def plot_tip(
     with style.paper_style():
         figure = new_figure(style.PAGE, 2.1 * len(motions))
         axes = figure.subplots(len(motions), 3, squeeze=False)
-        for row, (motion, members) in zip(axes, motions.items(), strict=True):
-            _draw_tip_row(row, motion, members)
+        for row, (title, members) in zip(axes, motions.items(), strict=True):
+            _draw_tip_row(row, title, members)
         handles, labels = axes[0][0].get_legend_handles_labels()
         unique = dict(zip(labels, handles, strict=True))
         figure.legend(unique.values(), unique.keys(), loc="outside upper center", ncols=4)
         return style.save(figure, folder, "tip", formats)
 
 
-def _draw_tip_row(row: Sequence[Axes], motion: str, runs: Sequence[RunSeries]) -> None:
+def _draw_tip_row(row: Sequence[Axes], title: str, runs: Sequence[RunSeries]) -> None:
     plane, over_x, over_y = row
     for index, run in enumerate(runs):
         model = run.description.model
@@ -82,7 +87,7 @@ def _draw_tip_row(row: Sequence[Axes], motion: str, runs: Sequence[RunSeries]) -
     over_x.plot(reference.time, value[:, 0], **black)
     over_y.plot(reference.time, value[:, 1], **black)
     plane.set_aspect("equal", adjustable="datalim")
-    plane.set(xlabel="x [cm]", ylabel="y [cm]", title=f"Case {CASE.get(motion, motion)}")
+    plane.set(xlabel="x [cm]", ylabel="y [cm]", title=title)
     over_x.set(xlabel="time [s]", ylabel="x [cm]")
     over_y.set(xlabel="time [s]", ylabel="y [cm]")
 
@@ -102,7 +107,7 @@ def plot_error(
         wide = style.PAGE if len(motions) > 1 else style.COLUMN
         figure = new_figure(wide, 2.2)
         axes = figure.subplots(1, len(motions), squeeze=False, sharey=True)[0]
-        for axis, (motion, members) in zip(axes, motions.items(), strict=True):
+        for axis, (title, members) in zip(axes, motions.items(), strict=True):
             for index, (label, same) in enumerate(_by_model(members).items()):
                 time, mean, deviation = mean_error(same)
                 model = same[0].description.model
@@ -114,7 +119,7 @@ def plot_error(
                 axis.fill_between(
                     time, low * CM, (mean + deviation) * CM, color=look, alpha=0.2, lw=0
                 )
-            axis.set(xlabel="time [s]", title=f"Case {CASE.get(motion, motion)}")
+            axis.set(xlabel="time [s]", title=title)
             axis.set_ylim(bottom=0.0)
         axes[0].set_ylabel("tip error [cm]")
         handles = {
@@ -177,12 +182,12 @@ def plot_pressures(
     with style.paper_style():
         figure = new_figure(style.PAGE, 1.9 * len(motions))
         axes = figure.subplots(len(motions), segments, squeeze=False, sharex="row")
-        for row, (motion, members) in zip(axes, motions.items(), strict=True):
+        for row, (title, members) in zip(axes, motions.items(), strict=True):
             for index, (label, same) in enumerate(_by_model(members).items()):
                 _draw_pressures(row, same[0], label, style.colour(same[0].description.model, index))
             for segment, axis in enumerate(row):
                 axis.set(xlabel="time [s]", ylabel=f"Δp, segment {segment + 1} [kPa]")
-            row[0].set_title(f"Case {CASE.get(motion, motion)}")
+            row[0].set_title(title)
         handles, labels = axes[0][0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=4)
         return style.save(figure, folder, "pressures", formats)

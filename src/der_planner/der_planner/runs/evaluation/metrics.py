@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from der_planner.runs.evaluation.alignment import Settings, error_series, split_error, window
-from der_planner.runs.evaluation.extract import load_run
 from der_planner.runs.evaluation.selfcheck import check_board, check_tracker, interpolate
-from der_planner.runs.evaluation.series import Array, RunSeries
+from der_planner.runs.run import Array, RunSeries
+from der_planner.runs.series import load_run
 
 GAP = 0.5
 """Longest time without a valid image [s] that leaves a run fit for comparison."""
@@ -59,6 +59,7 @@ class RunResult:
     period_s: float = 0.0
     cycles: int = 0
     limb: str = ""
+    namespace: str = ""
     lag_s: float = float("nan")
     gain_x: float = float("nan")
     gain_y: float = float("nan")
@@ -155,6 +156,7 @@ def evaluate_run(run: RunSeries, settings: Settings | None = None) -> RunResult:
         period_s=about.period,
         cycles=about.cycles,
         limb=about.limb,
+        namespace=about.namespace,
         lag_s=split.lag,
         gain_x=split.gain_x,
         gain_y=split.gain_y,

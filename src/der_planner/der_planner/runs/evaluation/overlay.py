@@ -11,9 +11,7 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from der_planner.runs.evaluation import style
-from der_planner.runs.evaluation.extract import NANOSECONDS, STATE_TYPE
 from der_planner.runs.evaluation.figures import CM, FORMATS, by_motion, new_figure
-from der_planner.runs.evaluation.series import Array, EvaluationError, RunSeries
 from der_planner.runs.evaluation.snapshots import (
     IMAGE_TYPE,
     Projection,
@@ -25,8 +23,9 @@ from der_planner.runs.evaluation.snapshots import (
     take_snapshots,
     topics_of,
 )
-from der_planner.runs.evaluation.table import CASE
 from der_planner.runs.recording.reader import BagReader
+from der_planner.runs.run import Array, EvaluationError, RunSeries
+from der_planner.runs.series import NANOSECONDS, STATE_TYPE
 
 INSTANTS = 5
 
@@ -53,9 +52,9 @@ def plot_shapes(
     with style.paper_style():
         figure = new_figure(style.PAGE, 0.4 + 1.6 * len(motions))
         axes = figure.subplots(len(motions), INSTANTS, squeeze=False)
-        for row, (motion, members) in zip(axes, motions.items(), strict=True):
+        for row, (title, members) in zip(axes, motions.items(), strict=True):
             _draw_row(row, members)
-            row[0].set_ylabel(f"Case {CASE.get(motion, motion)}")
+            row[0].set_ylabel(title)
         handles = {
             label: handle
             for axis in axes.flat
@@ -145,7 +144,11 @@ def write_video(
     if project is None:
         raise EvaluationError(f"{run.description.bag}: no camera calibration or too few limb tags")
     with BagReader(run.description.bag) as bag:
-        images, states = topics_of(bag, IMAGE_TYPE)[:1], topics_of(bag, STATE_TYPE)[:1]
+        space = run.description.namespace
+        images, states = (
+            topics_of(bag, IMAGE_TYPE, space)[:1],
+            topics_of(bag, STATE_TYPE, space)[:1],
+        )
         if not images:
             raise EvaluationError(
                 f"{run.description.bag}: holds no images; record them with record_images:=true"

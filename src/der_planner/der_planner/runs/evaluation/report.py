@@ -14,7 +14,6 @@ from der_planner.runs.evaluation.figures import plot_error, plot_pressures, plot
 from der_planner.runs.evaluation.metrics import RunResult
 from der_planner.runs.evaluation.overlay import plot_shapes
 from der_planner.runs.evaluation.results import write_results
-from der_planner.runs.evaluation.series import RunSeries
 from der_planner.runs.evaluation.statistics import Comparison, Summary, compare, summarise
 from der_planner.runs.evaluation.table import (
     CASE,
@@ -23,7 +22,9 @@ from der_planner.runs.evaluation.table import (
     format_value,
     latex_table,
     markdown_table,
+    shows_namespace,
 )
+from der_planner.runs.run import RunSeries
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem;
@@ -176,8 +177,10 @@ def _table(header: Sequence[str], lines: Sequence[Sequence[str]], names: int) ->
 
 
 def _summary_table(rows: Sequence[Summary]) -> str:
+    several = shows_namespace(rows)
     lines = [
         [
+            *([html.escape(row.namespace)] if several else []),
             html.escape(CASE.get(row.motion, row.motion)),
             html.escape(row.model.upper()),
             html.escape(row.method),
@@ -191,23 +194,29 @@ def _summary_table(rows: Sequence[Summary]) -> str:
         for row in rows
     ]
     header = [
+        *(["limb"] if several else []),
         *("case", "model", "method", "trials", "E [cm]", "E<sub>x</sub> [cm]"),
         *("E<sub>y</sub> [cm]", "max [cm]", "predicted E [cm]"),
     ]
-    return _table(header, lines, names=3)
+    return _table(header, lines, names=4 if several else 3)
 
 
 def _number(value: float, scale: float = 1.0, digits: int = 2) -> str:
     return "–" if math.isnan(value) else f"{value * scale:.{digits}f}"
 
 
+def _run_name(run: RunResult, several: bool, method: str = "") -> str:
+    return f"{run.namespace if several else ''} {run.motion} {run.model} {method}".strip()
+
+
 def _run_table(results: Sequence[RunResult]) -> str:
     lines = []
+    several = shows_namespace(results)
     for run in results:
         problems = "; ".join(run.problems)
         lines.append(
             [
-                html.escape(f"{run.motion} {run.model} {run.method}"),
+                html.escape(_run_name(run, several, run.method)),
                 str(run.trial),
                 str(run.seed),
                 _number(run.mean_error_m, 100),
@@ -242,9 +251,10 @@ def _checks_table(results: Sequence[RunResult]) -> str:
     checked = [run for run in results if run.checks]
     if not checked:
         return ""
+    several = shows_namespace(results)
     lines = [
         [
-            html.escape(f"{run.motion} {run.model}"),
+            html.escape(_run_name(run, several)),
             str(run.trial),
             _number(run.checks.get("tracker_rms_m", math.nan), 1000, 3),
             _count(run, "board_setpoints"),

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.runs.evaluation.series import Array, BoardLog, Stream
+from der_planner.runs.run import Array, BoardLog, Stream
 
 ROUNDING = 160.0
 """Largest difference [Pa] of a setpoint and its command: both chambers are rounded to 1 hPa."""

@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.runs.evaluation.extract import NANOSECONDS, STATE_TYPE, TRUTH_SUFFIX
-from der_planner.runs.evaluation.series import Array, RunSeries
 from der_planner.runs.recording.reader import BagReader
+from der_planner.runs.run import Array, RunSeries
+from der_planner.runs.series import NANOSECONDS, PLAN_TYPE, STATE_TYPE, TRUTH_SUFFIX, namespace_of
 
 IMAGE_TYPE = "sensor_msgs/msg/Image"
 CAMERA_TYPE = "sensor_msgs/msg/CameraInfo"
@@ -86,24 +86,43 @@ def take_snapshots(run: RunSeries, times: Sequence[float]) -> list[Snapshot]:
         BagError: the bag cannot be read.
     """
     with BagReader(run.description.bag) as bag:
-        return [_snapshot(bag, run.origin, time) for time in times]
+        return [_snapshot(bag, run, time) for time in times]
 
 
-def topics_of(bag: BagReader, type_name: str) -> list[str]:
-    """Return the topics of a type that come from the rig, neither simulated truth nor drawings."""
-    return [
+def topics_of(bag: BagReader, type_name: str, namespace: str) -> list[str]:
+    """Return the topics of a type that belong to a limb, neither simulated truth nor drawings.
+
+    Args:
+        bag: open.
+        type_name: ``package/msg/Name``.
+        namespace: of the limb. Where it has no such topic, those that lie in no limb's namespace
+            are returned: a camera of the rig may have a name of its own.
+    """
+    limbs = {
+        namespace_of(topic.name)
+        for topic in bag.topics.values()
+        if topic.type_name in (PLAN_TYPE, STATE_TYPE)
+    }
+    named = [
         topic.name
         for topic in bag.topics.values()
         if topic.type_name == type_name
         and not topic.name.endswith((TRUTH_SUFFIX, "image_annotated"))
     ]
+    own = [name for name in named if _lies_in(name, namespace)]
+    return own or [name for name in named if not any(_lies_in(name, limb) for limb in limbs)]
 
 
-def _snapshot(bag: BagReader, origin: int, time: float) -> Snapshot:
-    when = origin + round(time * NANOSECONDS)
+def _lies_in(topic: str, namespace: str) -> bool:
+    return topic.startswith(namespace.rstrip("/") + "/")
+
+
+def _snapshot(bag: BagReader, run: RunSeries, time: float) -> Snapshot:
+    space = run.description.namespace
+    when = run.origin + round(time * NANOSECONDS)
     window = (when - round(MARGIN * NANOSECONDS), when + round(MARGIN * NANOSECONDS))
-    states, images = topics_of(bag, STATE_TYPE)[:1], topics_of(bag, IMAGE_TYPE)[:1]
-    markers = topics_of(bag, MARKERS_TYPE)[:1]
+    states, images = topics_of(bag, STATE_TYPE, space)[:1], topics_of(bag, IMAGE_TYPE, space)[:1]
+    markers = topics_of(bag, MARKERS_TYPE, space)[:1]
     nearest: dict[str, tuple[int, Any]] = {}
     for topic, _, message in bag.messages([*states, *images, *markers], *window):
         stamp = stamp_of(message)
@@ -173,7 +192,8 @@ def fit_projection(run: RunSeries, seconds: float = 60.0) -> Projection | None:
         None where the bag lacks the camera's calibration or has too few tags.
     """
     with BagReader(run.description.bag) as bag:
-        cameras, tags = topics_of(bag, CAMERA_TYPE)[:1], topics_of(bag, TAGS_TYPE)[:1]
+        space = run.description.namespace
+        cameras, tags = topics_of(bag, CAMERA_TYPE, space)[:1], topics_of(bag, TAGS_TYPE, space)[:1]
         info: Any = None
         pixels: list[list[float]] = []
         plane: list[list[float]] = []

@@ -5,14 +5,15 @@ Only runs that can be compared are compared; the others are left out and the rea
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.stats import bootstrap
 
 from der_planner.runs.evaluation.metrics import RunResult, json_value
-from der_planner.runs.evaluation.series import Array
+from der_planner.runs.run import Array
 
 RESAMPLES = 10_000
 CONFIDENCE = 0.95
@@ -42,6 +43,7 @@ class Summary:
     valid_fraction: float
     predicted_error_m: float
     problems: tuple[str, ...] = ()
+    namespace: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Return what ``results.json`` holds."""
@@ -62,6 +64,7 @@ class Comparison:
         trials: (of the model, of the baseline).
         confidence: of the interval.
         refused: why there is no figure; empty where there is one.
+        namespace: of the limb, where the runs are of several; else empty.
     """
 
     motion: str
@@ -75,35 +78,40 @@ class Comparison:
     trials: tuple[int, int] = (0, 0)
     confidence: float = CONFIDENCE
     refused: str = ""
+    namespace: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Return what ``results.json`` holds."""
         return {key: json_value(value) for key, value in asdict(self).items()}
 
 
-Key = tuple[str, str, str]
+Key = tuple[str, str, str, str]
 
 
 def group(results: Sequence[RunResult]) -> dict[Key, list[RunResult]]:
-    """Return the runs by (motion, model, method), in the order in which they first appear."""
+    """Return the runs by (namespace, motion, model, method), in the order of their first run.
+
+    The namespace is the same for all where the runs name one only: a run without a bag has none.
+    """
+    named = sorted({result.namespace for result in results} - {""})
+    only = named[0] if len(named) == 1 else ""
     found: dict[Key, list[RunResult]] = {}
     for result in results:
-        found.setdefault((result.motion, result.model, result.method), []).append(result)
+        key = (result.namespace or only, result.motion, result.model, result.method)
+        found.setdefault(key, []).append(result)
     return found
 
 
 def summarise(results: Sequence[RunResult]) -> list[Summary]:
-    """Return one row per motion, model and method: mean and deviation over trials.
+    """Return one row per limb, motion, model and method: mean and deviation over trials.
 
     Runs with problems count as well: they happened. The row names them.
     """
-    rows = []
-    for (motion, model, method), runs in group(results).items():
-        rows.append(_summary(motion, model, method, runs))
-    return rows
+    return [_summary(key, runs) for key, runs in group(results).items()]
 
 
-def _summary(motion: str, model: str, method: str, runs: Sequence[RunResult]) -> Summary:
+def _summary(key: Key, runs: Sequence[RunResult]) -> Summary:
+    namespace, motion, model, method = key
     errors = np.array([[r.mean_error_m, r.mean_error_x_m, r.mean_error_y_m] for r in runs])
     mean = errors.mean(axis=0)
     deviation = errors.std(axis=0, ddof=1) if len(runs) > 1 else np.full(3, np.nan)
@@ -122,6 +130,7 @@ def _summary(motion: str, model: str, method: str, runs: Sequence[RunResult]) ->
         valid_fraction=float(np.mean([run.valid_fraction for run in runs])),
         predicted_error_m=float(np.mean([run.predicted_error_m for run in runs])),
         problems=tuple(f"trial {run.trial}: {text}" for run in runs for text in run.problems),
+        namespace=namespace,
     )
 
 
@@ -138,26 +147,29 @@ class _Side:
 
 
 def compare(results: Sequence[RunResult], baseline: str = "pcc") -> list[Comparison]:
-    """Compare every model with the baseline, motion by motion.
+    """Compare every model with the baseline, motion by motion and limb by limb.
 
     Args:
         results: of all runs.
         baseline: name of the model to compare with.
 
     Returns:
-        One comparison per motion and (model, method) against each method of the baseline. A pair
-        whose runs followed different references, or were not played to the end, is refused.
+        One comparison per limb, motion and (model, method) against each method of the baseline.
+        A pair whose runs followed different references, or were not played to the end, is refused.
     """
     groups = group(results)
+    several = len({namespace for namespace, *_ in groups}) > 1
     found = []
-    for (motion, model, method), runs in groups.items():
+    for (namespace, motion, model, method), runs in groups.items():
         if model == baseline:
             continue
-        for (other_motion, other_model, other_method), others in groups.items():
-            if other_motion == motion and other_model == baseline:
+        for (other_namespace, other_motion, other_model, other_method), others in groups.items():
+            same = (other_namespace, other_motion) == (namespace, motion)
+            if same and other_model == baseline:
                 one = _Side(f"{model} {method}".strip(), runs)
                 two = _Side(f"{other_model} {other_method}".strip(), others)
-                found.append(_compare(motion, one, two))
+                comparison = _compare(motion, one, two)
+                found.append(replace(comparison, namespace=namespace if several else ""))
     return found
 
 
@@ -208,9 +220,9 @@ def _compare(motion: str, one: _Side, two: _Side) -> Comparison:
     pairs = _pairs(one.runs, two.runs)
     difference = float(two.errors.mean() - one.errors.mean())
     low, high = (
-        _bootstrap_paired(pairs)
+        _bootstrap([pairs], _mean)
         if pairs is not None
-        else _bootstrap_two_samples(one.errors, two.errors)
+        else _bootstrap([one.errors, two.errors], _difference_of_means)
     )
     return Comparison(
         motion,
@@ -235,24 +247,29 @@ def _pairs(one: list[RunResult], two: list[RunResult]) -> Array | None:
     return np.array([second[seed] - first[seed] for seed in sorted(first)])
 
 
-def _bootstrap_paired(differences: Array) -> tuple[float, float]:
-    if len(differences) < 2:
+def _bootstrap(samples: Sequence[Array], statistic: Callable[..., Any]) -> tuple[float, float]:
+    """Return the percentile interval of a statistic of samples that were drawn independently [m].
+
+    NaN where a sample has fewer than two values. The seed is fixed: the same runs give the same
+    interval.
+    """
+    if min(len(sample) for sample in samples) < 2:
         return float("nan"), float("nan")
-    random = np.random.default_rng(SEED)
-    picks = random.integers(0, len(differences), (RESAMPLES, len(differences)))
-    return _interval(differences[picks].mean(axis=1))
+    found = bootstrap(
+        samples,
+        statistic,
+        n_resamples=RESAMPLES,
+        confidence_level=CONFIDENCE,
+        method="percentile",
+        vectorized=True,
+        rng=np.random.default_rng(SEED),
+    )
+    return float(found.confidence_interval.low), float(found.confidence_interval.high)
 
 
-def _bootstrap_two_samples(one: Array, two: Array) -> tuple[float, float]:
-    if len(one) < 2 or len(two) < 2:
-        return float("nan"), float("nan")
-    random = np.random.default_rng(SEED)
-    first = one[random.integers(0, len(one), (RESAMPLES, len(one)))].mean(axis=1)
-    second = two[random.integers(0, len(two), (RESAMPLES, len(two)))].mean(axis=1)
-    return _interval(second - first)
+def _mean(sample: Array, axis: int = -1) -> Array:
+    return np.asarray(np.mean(sample, axis=axis))
 
 
-def _interval(means: Array) -> tuple[float, float]:
-    tail = (1.0 - CONFIDENCE) / 2.0
-    low, high = np.quantile(means, [tail, 1.0 - tail])
-    return float(low), float(high)
+def _difference_of_means(one: Array, two: Array, axis: int = -1) -> Array:
+    return np.asarray(np.mean(two, axis=axis) - np.mean(one, axis=axis))

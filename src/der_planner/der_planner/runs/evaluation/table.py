@@ -7,6 +7,7 @@ import io
 import math
 from collections.abc import Sequence
 
+from der_planner.runs.evaluation.metrics import RunResult
 from der_planner.runs.evaluation.statistics import Comparison, Summary
 
 CASE = {
@@ -34,6 +35,18 @@ def format_value(mean: float, deviation: float) -> str:
     return f"{mean * 100:.2f} ± {deviation * 100:.2f}"
 
 
+def shows_namespace(rows: Sequence[Summary] | Sequence[RunResult]) -> bool:
+    """Tell whether a table needs a column that tells limbs apart."""
+    return len({row.namespace for row in rows} - {""}) > 1
+
+
+def _lines(rows: Sequence[Summary]) -> list[list[str]]:
+    """Return the header and the rows of a table as text."""
+    several = shows_namespace(rows)
+    header = [*(["limb"] if several else []), *_HEADER]
+    return [header, *([*([row.namespace] if several else []), *_cells(row)] for row in rows)]
+
+
 def _cells(row: Summary) -> list[str]:
     return [
         CASE.get(row.motion, row.motion),
@@ -50,21 +63,21 @@ def _cells(row: Summary) -> list[str]:
 
 def format_table(rows: Sequence[Summary], comparisons: Sequence[Comparison] = ()) -> str:
     """Return the table for a terminal, then one line for each comparison."""
-    cells = [list(_HEADER), *(_cells(row) for row in rows)]
-    widths = [max(len(line[column]) for line in cells) for column in range(len(_HEADER))]
+    cells = _lines(rows)
+    widths = [max(len(line[column]) for line in cells) for column in range(len(cells[0]))]
     lines = [
         "  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip()
         for line in cells
     ]
     lines.insert(1, "  ".join("-" * width for width in widths))
     lines += [format_comparison(comparison) for comparison in comparisons]
-    lines += [f"note: {row.motion} {row.model}: {text}" for row in rows for text in row.problems]
+    lines += [f"note: {_named(row)} {row.model}: {text}" for row in rows for text in row.problems]
     return "\n".join(lines)
 
 
 def format_comparison(comparison: Comparison) -> str:
     """Return one sentence that a reader can quote."""
-    who = f"{comparison.motion}: {comparison.model} against {comparison.baseline}"
+    who = f"{_named(comparison)}: {comparison.model} against {comparison.baseline}"
     if comparison.refused:
         return f"{who}: not compared, {comparison.refused}"
     text = f"{who}: {abs(comparison.difference_m) * 100:.2f} cm "
@@ -78,10 +91,15 @@ def format_comparison(comparison: Comparison) -> str:
     )
 
 
+def _named(entry: Summary | Comparison) -> str:
+    return f"{entry.namespace} {entry.motion}".strip()
+
+
 def markdown_table(rows: Sequence[Summary]) -> str:
     """Return the table as Markdown."""
-    lines = ["| " + " | ".join(_HEADER) + " |", "|" + " --- |" * len(_HEADER)]
-    lines += ["| " + " | ".join(_cells(row)) + " |" for row in rows]
+    header, *cells = _lines(rows)
+    lines = ["| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
+    lines += ["| " + " | ".join(line) + " |" for line in cells]
     return "\n".join(lines) + "\n"
 
 
@@ -90,7 +108,7 @@ def csv_table(rows: Sequence[Summary]) -> str:
     names = [
         "motion", "model", "method", "trials", "mean_error_m", "mean_error_x_m", "mean_error_y_m",
         "std_error_m", "std_error_x_m", "std_error_y_m", "max_error_m", "valid_fraction",
-        "predicted_error_m",
+        "predicted_error_m", "namespace",
     ]  # fmt: skip
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -109,12 +127,15 @@ def latex_table(rows: Sequence[Summary]) -> str:
         r"Case & Model & $E$ [cm] & $E_x$ [cm] & $E_y$ [cm] & max [cm] \\",
         r"\midrule",
     ]
-    last = None
+    several = shows_namespace(rows)
+    last = ""
     for row in rows:
-        if last is not None and row.motion != last:
+        name = CASE.get(row.motion, row.motion)
+        name = f"{name}, {row.namespace}" if several else name
+        if last and name != last:
             lines.append(r"\addlinespace")
-        case = CASE.get(row.motion, row.motion) if row.motion != last else ""
-        last = row.motion
+        case = name if name != last else ""
+        last = name
         numbers = [
             _latex_value(row.mean_error_m, row.std_error_m),
             _latex_value(row.mean_error_x_m, row.std_error_x_m),

@@ -1,0 +1,71 @@
+"""Every parameter of the planner node, declared once with unit, range and meaning."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+from rclpy.node import Node
+
+from der_planner.limb import Limb
+from der_planner.planning import METHODS, PathLimits
+from der_planner.planning.inverse import BRANCHES
+from limb_interfaces.parameters import declare
+
+
+@dataclass(frozen=True)
+class PlannerOptions:
+    """The node's parameters, checked; times in ns where they meet stamps, else in s."""
+
+    limb: Limb
+    model: str
+    method: str
+    nodes: int
+    lead: int
+    auto_start: bool
+    branch: str
+    limits: PathLimits
+    driver_timeout: float
+
+
+def read_parameters(node: Node) -> PlannerOptions:
+    """Declare and check the planner's parameters.
+
+    Raises:
+        ParameterError: a value is out of range; names it.
+        LimbError: the limb file cannot be used.
+    """
+    read: Any = functools.partial(declare, node)
+    limb_file = str(read("limb_file", "", "limb file (YAML); empty: the default limb"))
+    return PlannerOptions(
+        limb=Limb.from_yaml(limb_file) if limb_file else Limb.default(),
+        model=str(
+            read("default_model", "der", "model for paths and for commands that name none",
+                 choices=tuple(METHODS))
+        ),
+        method=str(
+            read("default_method", "", "method of the rod where none is named; empty: the best",
+                 choices=("", *METHODS["der"]))
+        ),
+        nodes=int(read("nodes", 21, "nodes of the rod", at_least=6, at_most=201)),
+        lead=round(
+            1e9 * read("lead_time", 0.2, "time between sending a setpoint and its stamp [s]",
+                       at_least=0.05, at_most=2.0)
+        ),
+        auto_start=bool(read("auto_start", True, "play a plan as soon as it is ready")),
+        branch=str(
+            read("branch", "", "side of the fold for paths and shapes; empty: the least pressure",
+                 choices=("", *BRANCHES))
+        ),
+        limits=PathLimits(
+            float(read("path_speed", 0.03, "speed along a path without times [m/s]",
+                       at_least=1e-3, at_most=1.0)),
+            float(read("path_acceleration", 0.05, "acceleration along and across it [m/s^2]",
+                       at_least=1e-3, at_most=10.0)),
+        ),
+        driver_timeout=float(
+            read("driver_timeout", 1.0, "silence of the driver [s] after which it counts as dead",
+                 at_least=0.2, at_most=60.0)
+        ),
+    )  # fmt: skip

@@ -1,0 +1,103 @@
+"""From messages that ask for a motion to what is to be planned; what makes no sense is refused."""
+
+from __future__ import annotations
+
+import threading
+import uuid
+from dataclasses import dataclass, field
+
+import numpy as np
+from nav_msgs.msg import Path as PathMessage
+
+from der_msgs.msg import MotionCommand
+from der_planner.nodes.planner_parameters import PlannerOptions
+from der_planner.planning import Motion, choose_method
+from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD
+from limb_interfaces import topics
+from limb_interfaces.stamps import NANOSECONDS, nanoseconds
+
+OLDEST_STAMP = 10
+"""A start further back than this [s] is a mistake; a shorter delay is travel and typing."""
+FURTHEST_STAMP = 600
+"""A start that lies further ahead than this [s] is a mistake: another clock, or another epoch."""
+
+
+@dataclass
+class Request:
+    """One thing to plan: what was asked for, and whether it is still wanted."""
+
+    plan_id: str
+    motion: Motion
+    model: str
+    method: str
+    start: int
+    cancelled: threading.Event = field(default_factory=threading.Event)
+
+
+def new_plan_id() -> str:
+    """Return a name for a plan that was given none."""
+    return uuid.uuid4().hex[:8]
+
+
+def start_of(stamp: int, now: int) -> int:
+    """Check the instant at which a motion is to start.
+
+    Args:
+        stamp: [ns] ROS time; 0: as soon as possible.
+        now: [ns] ROS time.
+
+    Raises:
+        ValueError: it lies too far back or ahead to be meant; says how far.
+    """
+    if stamp == 0:
+        return 0
+    ahead = (stamp - now) / NANOSECONDS
+    if -OLDEST_STAMP <= ahead <= FURTHEST_STAMP:
+        return stamp
+    where = f"{ahead:.0f} s ahead" if ahead > 0 else f"{-ahead:.0f} s ago"
+    raise ValueError(
+        f"the motion is stamped to start {where}: the stamp may lie {OLDEST_STAMP} s back to "
+        f"{FURTHEST_STAMP} s ahead, and 0 starts as soon as the plan is ready"
+    )
+
+
+def from_command(message: MotionCommand, options: PlannerOptions, now: int) -> Request:
+    """Return what a command asks for; its plan id is the message's.
+
+    Raises:
+        ValueError: a field has a value that cannot be planned; names it.
+    """
+    model = message.model or options.model
+    motion = Motion.named(
+        message.motion,
+        amplitude=message.amplitude or DEFAULT_AMPLITUDE,
+        period=message.period or DEFAULT_PERIOD,
+        cycles=message.cycles or DEFAULT_CYCLES,
+        branch=options.branch,
+    )
+    method = _method(model, message.method, options)
+    start = start_of(nanoseconds(message.header.stamp), now)
+    return Request(message.plan_id, motion, model, method, start)
+
+
+def from_path(message: PathMessage, plan_id: str, options: PlannerOptions, now: int) -> Request:
+    """Return what a path asks for.
+
+    Raises:
+        ValueError: the path is in another frame, too short, or cannot be timed.
+    """
+    frame = message.header.frame_id
+    if frame not in ("", topics.BASE_FRAME):
+        raise ValueError(f"the path is in frame '{frame}': send it in '{topics.BASE_FRAME}'")
+    tip = np.array([(p.pose.position.x, p.pose.position.y) for p in message.poses])
+    stamps = [nanoseconds(pose.header.stamp) for pose in message.poses]
+    time = (np.array(stamps) - stamps[0]) * 1e-9 if any(stamps) else None
+    motion = Motion.from_tip_path(
+        time, tip.reshape(-1, 2), branch=options.branch, limits=options.limits
+    )
+    start = start_of(nanoseconds(message.header.stamp), now)
+    return Request(plan_id, motion, options.model, _method(options.model, "", options), start)
+
+
+def _method(model: str, method: str, options: PlannerOptions) -> str:
+    return choose_method(model, method or (options.method if model == "der" else ""))

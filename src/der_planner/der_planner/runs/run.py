@@ -1,0 +1,194 @@
+"""What was measured and asked for in one run, as arrays: the input of every metric.
+
+A bag becomes a `RunSeries` in `series`; runs without a bag (offline ones, logs of other tools)
+build it from their arrays with `RunSeries.from_arrays`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+class EvaluationError(ValueError):
+    """A run cannot be evaluated; the message names the run and what it lacks."""
+
+
+def _empty(*shape: int) -> Array:
+    return np.empty(shape)
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a run was.
+
+    Attributes:
+        motion, model, method: of the plan.
+        trial, seed: of the experiment; -1 where unknown.
+        amplitude: [rad], 0 for a path.
+        period: of one cycle [s], 0 for a path.
+        cycles: of the motion.
+        limb: name of the limb file.
+        bag: path of the bag, empty for a run without.
+        namespace: of the limb's topics in the bag, e.g. ``/limb``; empty for a run without a bag.
+        extra: everything else that the recorder was told (versions, commit, machine …).
+    """
+
+    motion: str
+    model: str
+    method: str = ""
+    trial: int = -1
+    seed: int = -1
+    amplitude: float = 0.0
+    period: float = 0.0
+    cycles: int = 0
+    limb: str = ""
+    bag: str = ""
+    namespace: str = ""
+    extra: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def title(self) -> str:
+        """Return a name for messages."""
+        return self.bag or f"{self.motion} {self.model} trial {self.trial}"
+
+
+@dataclass(frozen=True)
+class Stream:
+    """A sampled quantity: time (N,) [s] since the first setpoint, value (N, …)."""
+
+    time: Array
+    value: Array
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+@dataclass(frozen=True)
+class BoardLog:
+    """Setpoints as planned and commands as the board received them (twin only).
+
+    Attributes:
+        setpoint_time: (S,) instant at which each takes effect [s] since the first setpoint.
+        setpoint: (S, M) differential pressure [Pa].
+        command_time: (C,) arrival of the first byte of each command [s], same origin.
+        command: (C, M) differential pressure that the command asks for [Pa].
+    """
+
+    setpoint_time: Array
+    setpoint: Array
+    command_time: Array
+    command: Array
+
+
+@dataclass(frozen=True)
+class RunSeries:
+    """One run. Time 0 is the instant of the first setpoint, by stamps.
+
+    Attributes:
+        description: what was run.
+        reference: tip asked for (K, 2) [m] at the setpoints' times.
+        predicted: tip that the model expects (K, 2) [m]; may be empty.
+        tip: measured tip (F, 2) [m] at the images' stamps, NaN where the tracker found no limb.
+        bend_angle: measured (F, M) [rad]; may be empty.
+        commanded, measured: differential pressures (P, M) [Pa]; may be empty.
+        truth: simulated tip (T, 2) [m]; only in bags of the twin.
+        board: only in bags of the twin.
+        faults: reasons that the driver gave during the motion.
+        finished: the motion was played to its last setpoint.
+        origin: ROS time of the first setpoint [ns]; 0 for a run without a bag.
+    """
+
+    description: Description
+    reference: Stream
+    predicted: Stream
+    tip: Stream
+    bend_angle: Stream = field(default_factory=lambda: Stream(_empty(0), _empty(0, 0)))
+    commanded: Stream = field(default_factory=lambda: Stream(_empty(0), _empty(0, 0)))
+    measured: Stream = field(default_factory=lambda: Stream(_empty(0), _empty(0, 0)))
+    truth: Stream | None = None
+    board: BoardLog | None = None
+    faults: tuple[str, ...] = ()
+    finished: bool = True
+    origin: int = 0
+
+    @classmethod
+    def from_arrays(
+        cls,
+        description: Description,
+        *,
+        time: ArrayLike,
+        tip: ArrayLike,
+        reference_time: ArrayLike,
+        tip_reference: ArrayLike,
+        tip_predicted: ArrayLike | None = None,
+        pressure_time: ArrayLike | None = None,
+        commanded: ArrayLike | None = None,
+        measured: ArrayLike | None = None,
+    ) -> RunSeries:
+        """Build a run from arrays.
+
+        Args:
+            description: what was run.
+            time: (F,) of the measured tip [s], 0 at the first setpoint.
+            tip: (F, 2) measured [m], NaN where unknown.
+            reference_time: (K,) of the setpoints [s], rising from 0.
+            tip_reference: (K, 2) [m].
+            tip_predicted: (K, 2) [m].
+            pressure_time: (P,) [s].
+            commanded: (P, M) differential pressures [Pa].
+            measured: (P, M) differential pressures [Pa].
+
+        Raises:
+            EvaluationError: shapes do not fit or times do not rise; the message says which.
+        """
+        clock = _times(time, "time", description)
+        setpoints = _times(reference_time, "reference_time", description)
+        reference = _rows(tip_reference, len(setpoints), "tip_reference", description)
+        predicted = (
+            Stream(setpoints, _rows(tip_predicted, len(setpoints), "tip_predicted", description))
+            if tip_predicted is not None
+            else Stream(_empty(0), _empty(0, 2))
+        )
+        pressures = {name: Stream(_empty(0), _empty(0, 0)) for name in ("commanded", "measured")}
+        if pressure_time is not None:
+            ticks = _times(pressure_time, "pressure_time", description)
+            for name, value in (("commanded", commanded), ("measured", measured)):
+                if value is not None:
+                    rows = _rows(value, len(ticks), name, description, columns=None)
+                    pressures[name] = Stream(ticks, rows)
+        return cls(
+            description=description,
+            reference=Stream(setpoints, reference),
+            predicted=predicted,
+            tip=Stream(clock, _rows(tip, len(clock), "tip", description)),
+            commanded=pressures["commanded"],
+            measured=pressures["measured"],
+        )
+
+
+def _times(value: ArrayLike, name: str, description: Description) -> Array:
+    array = np.asarray(value, dtype=float)
+    if array.ndim != 1 or len(array) < 2 or not np.all(np.diff(array) > 0):
+        raise EvaluationError(
+            f"{description.title}: {name} must be two or more rising times, got shape {array.shape}"
+        )
+    return array
+
+
+def _rows(
+    value: ArrayLike, count: int, name: str, description: Description, columns: int | None = 2
+) -> Array:
+    array = np.asarray(value, dtype=float)
+    if array.ndim != 2 or len(array) != count or (columns and array.shape[1] != columns):
+        wanted = f"({count}, {columns or 'M'})"
+        raise EvaluationError(
+            f"{description.title}: {name} must have shape {wanted}, got {array.shape}"
+        )
+    return array

@@ -1,0 +1,73 @@
+"""The Python half of the contract: gaps in stamps, parameter files, the transport of images."""
+
+import numpy as np
+import pytest
+
+from limb_interfaces import transport
+from limb_interfaces.gaps import StampGaps
+from limb_interfaces.overrides import key_matches, node_keys, parameter_files
+
+PERIOD = 33_333_333
+
+
+def missed(stamps, **options):
+    gaps = StampGaps(**options)
+    for stamp in stamps:
+        gaps.take(int(stamp))
+    return gaps.missed
+
+
+@pytest.mark.parametrize("kept", [1.0, 0.5, 0.25])
+def test_missed_messages_are_counted_however_many_are_lost(kept):
+    random = np.random.default_rng(7)
+    sent = 10**15 + PERIOD * np.arange(3000) + random.normal(0.0, 1e6, 3000).round()
+    arrived = sent[random.random(3000) < kept]
+    inside = round((arrived[-1] - arrived[0]) / PERIOD) + 1
+    assert missed(arrived) == pytest.approx(inside - len(arrived), rel=0.03, abs=0)
+
+
+def test_pauses_replays_and_messages_without_stamp_are_no_gaps():
+    stream = [10**15 + index * PERIOD for index in range(50)]
+    later = [stamp + 60 * 10**9 for stamp in stream]
+    assert missed([*stream, *later, *stream, 0, 0]) == 0
+
+
+@pytest.mark.parametrize(
+    ("key", "name", "fits"),
+    [
+        ("/limb/planner", "/limb/planner", True),
+        ("/limb/planner", "/lab2/planner", False),
+        ("/**/planner", "/lab2/planner", True),
+        ("/**/planner", "/planner", True),
+        ("/**", "/a/b/c", True),
+        ("/*/planner", "/lab2/planner", True),
+        ("/*/planner", "/a/b/planner", False),
+        ("/planner", "/limb/planner", False),
+    ],
+)
+def test_keys_of_parameter_files(key, name, fits):
+    assert key_matches(key, name) == fits
+
+
+def test_nodes_of_a_parameter_file_and_files_of_a_command_line():
+    content = {
+        "/limb": {"planner": {"ros__parameters": {"a": 1}}},
+        "recorder": {"ros__parameters": {}},
+    }
+    assert list(node_keys(content)) == ["/limb/planner", "/recorder"]
+    line = ["node", "--ros-args", "--params-file", "a.yaml", "-p", "b:=1", "--params-file", "c"]
+    assert parameter_files(line) == ["a.yaml", "c"]
+
+
+def test_the_images_transport_is_set_unless_somebody_did(tmp_path, monkeypatch):
+    profile = tmp_path / transport.PROFILE
+    for name in ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"/nowhere:{tmp_path}")
+    assert transport.use_large_messages() is None
+    profile.parent.mkdir(parents=True)
+    profile.write_text("<profiles/>")
+    assert transport.use_large_messages() == profile
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", "mine.xml")
+    assert transport.use_large_messages() is None
