@@ -227,6 +227,9 @@ class SerialLink:
         if venting and not self._was_venting:
             self._drop_unsent()
             data = self._client.separator + data
+        if self._was_venting and not venting:
+            self._was_venting = False
+            self._show_life()  # before pressures leave, so that the guardian is strict from now on
         self._was_venting = venting
         self._watch_queue()
         self._write(data)
@@ -360,7 +363,7 @@ class SerialLink:
         if self._guardian is None or not self._guardian.running:
             return
         try:
-            self._guardian.beat()
+            self._guardian.beat(self._was_venting)
             if self._guardian.wants_vent():
                 self._guardian.renew(self._client.emergency())
         except GuardianError as error:
