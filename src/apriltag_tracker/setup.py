@@ -1,6 +1,7 @@
 """Install `apriltag_tracker` as an ament_python package."""
 
 from pathlib import Path
+from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
@@ -9,7 +10,7 @@ config = sorted(str(path) for path in Path("config").glob("*.*"))
 
 setup(
     name=PACKAGE,
-    version="0.1.0",
+    version=ElementTree.parse("package.xml").findtext("version"),
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
     package_data={PACKAGE: ["py.typed"]},
     data_files=[
@@ -26,8 +27,8 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "apriltag_tracker = apriltag_tracker.node:main",
-            "synthetic_camera = apriltag_tracker.synthetic.node:main",
+            "apriltag_tracker = apriltag_tracker.entry:apriltag_tracker",
+            "synthetic_camera = apriltag_tracker.entry:synthetic_camera",
         ],
     },
 )

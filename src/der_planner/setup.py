@@ -1,6 +1,7 @@
 """Install `der_planner` as an ament_python package."""
 
 from pathlib import Path
+from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
@@ -9,7 +10,7 @@ config = sorted(str(path) for path in Path("config").glob("*.*"))
 
 setup(
     name=PACKAGE,
-    version="0.1.0",
+    version=ElementTree.parse("package.xml").findtext("version"),
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
     package_data={PACKAGE: ["py.typed", "data/*", "page/static/*"]},
     data_files=[
@@ -39,10 +40,10 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "planner = der_planner.nodes.planner:main",
-            "recorder = der_planner.nodes.recorder:main",
-            "limb_twin = der_planner.nodes.limb_twin:main",
-            "page = der_planner.page.node:main",
+            "planner = der_planner.nodes.entry:planner",
+            "recorder = der_planner.nodes.entry:recorder",
+            "limb_twin = der_planner.nodes.entry:limb_twin",
+            "page = der_planner.nodes.entry:page",
         ],
     },
 )

@@ -1,6 +1,7 @@
 """Install `pressure_driver` as an ament_python package."""
 
 from pathlib import Path
+from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
@@ -9,7 +10,7 @@ config = sorted(str(path) for path in Path("config").glob("*.*"))
 
 setup(
     name=PACKAGE,
-    version="0.1.0",
+    version=ElementTree.parse("package.xml").findtext("version"),
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
     package_data={PACKAGE: ["py.typed"]},
     data_files=[
@@ -26,8 +27,8 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "pressure_driver = pressure_driver.node:main",
-            "board_emulator = pressure_driver.emulator.node:main",
+            "pressure_driver = pressure_driver.entry:pressure_driver",
+            "board_emulator = pressure_driver.entry:board_emulator",
         ],
     },
 )

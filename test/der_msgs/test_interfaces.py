@@ -1,4 +1,4 @@
-"""The Python half of the contract: gaps in stamps, keys of parameter files, the images' transport."""
+"""The Python half of the contract: gaps in stamps, parameter files, the transport of images."""
 
 import numpy as np
 import pytest

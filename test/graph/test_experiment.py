@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from der_planner.runs.evaluation import load_run
+
 ROOT = Path(__file__).resolve().parent.parent.parent
 TWIN_NODES = {
     "board_emulator",
@@ -145,6 +147,23 @@ def test_a_run_of_both_models_ends_in_a_table_and_leaves_nothing_behind(experime
     assert again.finish() == 0, again.errors
     assert "0 of 2 trials to play" in again.errors
     assert time.monotonic() - begin < 60
+
+
+def test_a_path_is_drawn_on_the_graph_as_it_is_in_the_file(experiment, tmp_path: Path):
+    file = tmp_path / "arc.csv"
+    points = np.array(
+        [[0.20, 0.10], [0.198, 0.104], [0.196, 0.108], [0.194, 0.112], [0.192, 0.116]]
+    )
+    rows = [f"{1000 * i}, {100 * x:.2f}, {100 * y:.2f}" for i, (x, y) in enumerate(points)]
+    file.write_text("\n".join(["time [ms], x [cm], y [cm]", *rows]))
+    run = experiment("--path", str(file), "--models", "der")
+    assert run.finish() == 0, run.errors
+    (result,) = json.loads((run.out / "results.json").read_text())["runs"]
+    assert (result["motion"], result["model"], result["method"]) == ("arc", "der", "paper")
+    assert result["problems"] == []
+    reference = load_run(run.out / result["bag"]).reference
+    for point in points:
+        assert np.linalg.norm(reference.value - point, axis=1).min() < 1e-3
 
 
 @pytest.mark.parametrize("victim", ["apriltag_tracker", "pressure_driver"])

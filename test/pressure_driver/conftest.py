@@ -36,6 +36,7 @@ class Simulation:
         self.sent = []
         self.received = []
         self.modes = []
+        self.armings = 0
         self._receive(self.core.opening())
 
     @property
@@ -114,11 +115,17 @@ class Simulation:
         """Wait until the driver may be armed, and arm it."""
         self.run_until(lambda: not self.core.obstacles())
         assert self.core.arm() == (True, "armed")
+        self.armings += 1
 
-    def offer(self, differential, ahead=0.2, plan_id="plan", index=0):
-        """Offer a setpoint whose stamp lies on the grid, ``ahead`` seconds from now."""
+    def offer(self, differential, ahead=0.2, plan_id="", index=0, revision=0, origin=None):
+        """Offer a setpoint whose stamp lies on the grid, ``ahead`` seconds from now.
+
+        Without a name, the plan is that of the last arming.
+        """
         stamp = self.wall + round(ahead * 1e9 / PERIOD) * PERIOD
-        return self.core.offer(Setpoint(stamp, tuple(differential), plan_id, index), self.wall)
+        plan = plan_id or f"plan of arming {self.armings}"
+        item = Setpoint(stamp, tuple(differential), plan, index, revision)
+        return self.core.offer(item, self.wall, origin)
 
     def stream(
         self, seconds, shape=lambda t: (8_000.0 * np.sin(t) ** 2, -4_000.0 * np.sin(t) ** 2)

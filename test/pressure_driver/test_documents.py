@@ -26,7 +26,7 @@ def test_the_parameter_file_holds_the_defaults():
     settings = CoreSettings()
     for group in (settings.schedule, settings.monitor, settings.safety):
         for name, default in vars(group).items():
-            if name not in ("capacity", "rest_time", "rest_spread"):
+            if name not in ("capacity", "rest_time", "rest_spread", "rest_drift"):
                 assert values.pop(name) == default, name
     assert values.pop("rate") == 1e9 / settings.period
     assert values.pop("command_validity") == settings.command_validity

@@ -243,3 +243,13 @@ def test_the_port_does_not_overwrite_a_file(tmp_path):
     with pytest.raises(FileExistsError, match="port_link"):
         EmulatedPort(str(tmp_path / "board"), 0)
     assert (tmp_path / "board").read_text() == "precious"
+
+
+def test_a_second_emulator_leaves_the_first_one_its_link(tmp_path):
+    first = EmulatedPort(str(tmp_path / "board"), 0)
+    device = (tmp_path / "board").resolve()
+    with pytest.raises(FileExistsError, match="another emulator serves"):
+        EmulatedPort(str(tmp_path / "board"), 0)
+    assert (tmp_path / "board").resolve() == device
+    first.close()
+    EmulatedPort(str(tmp_path / "board"), 0).close()

@@ -4,12 +4,13 @@ import itertools
 import os
 import re
 import select
+import termios
 import threading
 import time
 
 import pytest
 
-from pressure_driver import link
+from pressure_driver import link, ports
 from pressure_driver.core import CoreSettings, DriverCore
 from pressure_driver.emulator.board import EmulatedBoard
 from pressure_driver.emulator.faults import Faults
@@ -17,8 +18,9 @@ from pressure_driver.emulator.pneumatics import Pneumatics
 from pressure_driver.emulator.port import EmulatedPort
 from pressure_driver.emulator.runner import BoardRunner
 from pressure_driver.grid import TickGrid
-from pressure_driver.link import PortError, SerialLink, open_port
+from pressure_driver.link import SerialLink
 from pressure_driver.monitor import MonitorLimits
+from pressure_driver.ports import PortError, open_port
 from pressure_driver.protocols import board_protocol, host_protocol
 from pressure_driver.realtime import prefer_thread
 from pressure_driver.safety import Mode
@@ -119,6 +121,7 @@ def test_setpoints_arrive_in_order_not_before_their_stamps(rig):
 def test_closing_puts_vent_on_the_wire(rig):
     rig.pressurise()
     assert rig.link.close()
+    assert rig.link.vented_at_end
     wait_for(lambda: differences(rig.commands)[-3:] == [0.0] * 3)
     wait_for(lambda: not rig.pressurised())
     wait_for(lambda: not rig.port.host_present)
@@ -235,14 +238,14 @@ def test_a_port_is_kept_by_its_stable_name(tmp_path, monkeypatch):
     other.touch()
     stable = tmp_path / "by-id" / "usb-Arduino_Mega-if00"
     stable.symlink_to(device)
-    monkeypatch.setattr(link, "STABLE_NAMES", tmp_path / "by-id")
-    assert link.stable_name(str(device)) == str(stable)
-    assert link.stable_name(str(stable)) == str(stable)
-    assert link.stable_name(str(other)) == str(other)
-    assert str(stable) in link.available_ports()
+    monkeypatch.setattr(ports, "STABLE_NAMES", tmp_path / "by-id")
+    assert ports.stable_name(str(device)) == str(stable)
+    assert ports.stable_name(str(stable)) == str(stable)
+    assert ports.stable_name(str(other)) == str(other)
+    assert str(stable) in ports.available_ports()
 
 
-def test_a_lost_port_is_looked_for_with_growing_delays(rig, monkeypatch):
+def test_a_port_that_does_not_open_is_tried_with_growing_delays(rig, monkeypatch):
     looks = []
 
     def fails(*_):
@@ -251,18 +254,84 @@ def test_a_lost_port_is_looked_for_with_growing_delays(rig, monkeypatch):
 
     monkeypatch.setattr(link, "FIRST_RETRY", 0.02)
     monkeypatch.setattr(link, "LAST_RETRY", 0.2)
-    rig.link._retry_delay = 0.02
     monkeypatch.setattr(link, "open_port", fails)
-    rig.have("unplug")
+    rig.have("unplug:0.2")
     wait_for(lambda: len(looks) >= 10)
     gaps = [b - a for a, b in itertools.pairwise(looks)]
     # A gap is the delay or longer, since the thread also waits for its ticks.
     for count, gap in enumerate(gaps):
-        assert gap >= min(0.02 * 1.6 ** (count + 1), 0.2) - 0.005
+        assert gap >= min(0.02 * 1.6 ** (count + 1), 0.2) - 0.005, gaps
     assert rig.link.reconnects == 0
     monkeypatch.undo()
     rig.have()
     wait_for(lambda: rig.link.reconnects == 1)
+
+
+def test_a_replugged_board_is_vented_promptly_however_long_it_was_away(rig):
+    """The name of the port is watched: no delay grows while it is not there."""
+    took = []
+    for away in (0.3, 2.5, 0.1):
+        rig.arm()
+        rig.play(3)
+        rig.have("unplug")
+        wait_for(lambda: rig.mode is Mode.FAULT)
+        time.sleep(away)
+        count = len(rig.commands)
+        back = time.time_ns()
+        rig.have()
+        wait_for(lambda seen=count: len(rig.commands) > seen)
+        assert differences(rig.commands[count:])[0] == 0.0
+        took.append((rig.commands[count].stamp - back) / 1e9)
+    assert min(took) < 0.25, took
+    assert took[1] < 1.0, took
+
+
+def test_a_port_that_takes_no_bytes_is_a_fault_and_old_setpoints_are_not_sent_afterwards(rig):
+    """Output is held back by the terminal itself, as by a board whose USB does not fetch bytes."""
+    rig.pressurise()
+    terminal = os.open(os.path.realpath(rig.port.link), os.O_RDWR | os.O_NOCTTY)
+    try:
+        termios.tcflow(terminal, termios.TCOOFF)
+        count = len(rig.commands)
+        begin = time.monotonic()
+        rig.play(4)
+        wait_for(lambda: rig.mode is Mode.FAULT)
+        assert time.monotonic() - begin < 2.0
+        assert "does not read" in rig.core.snapshot().faults[0]
+        termios.tcflow(terminal, termios.TCOON)
+    finally:
+        os.close(terminal)
+    wait_for(lambda: len(rig.commands) > count + 5)
+    # What was on its way when the terminal was stopped may still come; nothing from later.
+    assert set(differences(rig.commands[count + 1 :])) == {0.0}
+    wait_for(lambda: not rig.pressurised())
+
+
+def test_a_vent_overtakes_what_the_board_has_not_read_yet(rig):
+    """The board stops reading, but goes on reporting, while setpoints are written for it."""
+    rig.pressurise()
+    reading = threading.Event()
+    real, rig.port.read = rig.port.read, lambda *arguments: reading.is_set() and real(*arguments)
+    # Far more than the kernel hands on at once, so that most of it still waits to be delivered.
+    stale = b"<1050.00,1010.00,1010.00,1010.00>\n" * 300
+    rig.link._write(stale)
+    before = len(rig.commands)
+    rig.core.vent()
+    rig.link.urge()
+    wait_for(lambda: rig.core.snapshot().mode in (Mode.VENTING, Mode.FAULT))
+    time.sleep(0.1)
+    reading.set()
+    wait_for(lambda: len(rig.commands) > before and differences(rig.commands)[-1] == 0.0)
+    assert sum(value != 0.0 for value in differences(rig.commands[before:])) < 150
+    wait_for(lambda: not rig.pressurised())
+
+
+def test_without_the_board_the_end_is_no_vent(rig):
+    rig.pressurise()
+    rig.have("unplug")
+    wait_for(lambda: rig.mode is Mode.FAULT)
+    assert rig.link.close()
+    assert not rig.link.vented_at_end
 
 
 def test_telemetry_that_comes_too_late_is_no_telemetry(rig):

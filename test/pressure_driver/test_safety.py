@@ -59,7 +59,7 @@ FAULTS = {
     "supply low": ("supply:105000", "supply too low", 0.8),
     "supply high": ("supply:300000", "supply too high", 0.8),
     "valve stays open": ("runaway:1", "over-pressure|chamber 1 does not follow", 6.0),
-    "board is deaf": ("deaf", "does not follow|expired", 6.0),
+    "board is deaf": ("deaf", "does not follow|expired|has not answered", 6.0),
 }
 
 
@@ -114,7 +114,7 @@ def test_over_pressure_needs_two_readings_in_a_row(simulate):
     sim.core.received(b"[MPR]: 1400.00 1013.00 1013.00 1013.00\n" * 2)
     sim.tick()
     assert sim.mode is Mode.FAULT
-    assert "over-pressure: chamber 0" in sim.faults[0]
+    assert "over-pressure in chamber 0" in sim.faults[0]
 
 
 @pytest.mark.parametrize("protocol", NAMES)
@@ -178,6 +178,7 @@ def test_a_board_with_other_chambers_or_less_range_cannot_be_armed(simulate):
     assert not success
     assert "reaches 20000 Pa" in text
     sim.core._check_identity(replace(sim.core.identity, chamber_count=6, largest_pressure=3e4))
+    sim.tick()
     assert "6 chambers" in sim.core.arm()[1]
 
 

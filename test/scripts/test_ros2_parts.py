@@ -213,3 +213,18 @@ def test_qos_of_the_command_line(arguments: str, expected):
         assert profile is None
     else:
         assert (profile.reliability.name, profile.durability.name, profile.depth) == expected
+
+
+def test_interfaces_are_shown_as_their_authors_wrote_them():
+    from ros2_verbs.cli import CommandError
+    from ros2_verbs.interface import definition
+
+    folder = Path(__file__).resolve().parents[2] / "src" / "der_msgs"
+    for kind, name in (("msg", "MotionCommand"), ("action", "PlayMotion")):
+        text = (folder / kind / f"{name}.{kind}").read_text()
+        assert definition(f"der_msgs/{kind}/{name}") == text
+    assert "bool success" in definition("std_srvs/srv/Trigger")
+    with pytest.raises(CommandError, match="Unknown interface"):
+        definition("der_msgs/msg/Nothing")
+    with pytest.raises(CommandError, match="is no interface"):
+        definition("MotionCommand")

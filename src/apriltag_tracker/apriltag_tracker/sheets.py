@@ -39,6 +39,10 @@ class Page:
     labels: list[tuple[float, float, float, str]] = field(default_factory=list)
 
 
+BOARD_MARKERS = 100
+"""In OpenCV's dictionary DICT_4X4_100."""
+
+
 @dataclass(frozen=True)
 class BoardLayout:
     """A ChArUco board: squares across and down, their edge and that of the markers [m]."""
@@ -49,7 +53,25 @@ class BoardLayout:
     marker: float = 0.018
 
     def board(self) -> Any:
-        """Return OpenCV's board."""
+        """Return OpenCV's board.
+
+        Raises:
+            SheetError: there are too few squares, or the markers do not fit into them.
+        """
+        if min(self.columns, self.rows) < 2:
+            raise SheetError(
+                f"a board of {self.columns} x {self.rows} squares: take 2 or more each way"
+            )
+        if not 0.0 < self.marker < self.square:
+            raise SheetError(
+                f"markers of {1e3 * self.marker:g} mm do not fit into squares of "
+                f"{1e3 * self.square:g} mm"
+            )
+        if self.columns * self.rows // 2 > BOARD_MARKERS:
+            raise SheetError(
+                f"a board of {self.columns} x {self.rows} squares needs more than the "
+                f"{BOARD_MARKERS} markers there are: take fewer squares"
+            )
         return cv2.aruco.CharucoBoard(
             (self.columns, self.rows),
             self.square,

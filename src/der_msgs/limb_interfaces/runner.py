@@ -15,6 +15,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from limb_interfaces import transport
+from limb_interfaces.entry import END_SIGNALS
 
 
 class ClosableNode(Protocol):
@@ -25,7 +26,10 @@ class ClosableNode(Protocol):
 
 
 def run_node(create: Callable[[], Node], arguments: Sequence[str] | None = None) -> int:
-    """Create a node, spin it until SIGINT or SIGTERM, close it, and return the exit code.
+    r"""Create a node, spin it until a signal ends it, close it, and return the exit code.
+
+    The signals are those of `limb_interfaces.entry.END_SIGNALS`: Ctrl-C, SIGTERM, a terminal that
+    was closed (a dropped ssh, too) and Ctrl-\ end a node in the same order.
 
     A node with a ``close`` method has it called while its publishers still work, whatever ended
     the spinning: a signal, an exception in a callback, or the end of the context. A node that
@@ -36,16 +40,20 @@ def run_node(create: Callable[[], Node], arguments: Sequence[str] | None = None)
         arguments: command line, `sys.argv` if None.
 
     Returns:
-        0 after SIGINT or SIGTERM, 1 after an error.
+        0 after one of these signals, 1 after an error.
     """
     stop = threading.Event()
     transport.use_large_messages()
-    rclpy.init(
-        args=list(arguments) if arguments is not None else None,
-        signal_handler_options=SignalHandlerOptions.NO,
-    )
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in END_SIGNALS:
         signal.signal(number, lambda *_: stop.set())
+    try:
+        rclpy.init(
+            args=list(arguments) if arguments is not None else None,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+    except Exception as error:  # e.g. a parameter file that is not there
+        _complain(None, error)
+        return 1
     node: Node | None = None
     exit_code = 0
     try:
@@ -72,7 +80,8 @@ def _complain(node: Node | None, error: Exception) -> None:
     text = str(error) or type(error).__name__
     if node is not None:
         node.get_logger().fatal(text)
-    print(f"error: {text}", file=sys.stderr, flush=True)
+    with contextlib.suppress(OSError):  # the terminal may have been closed
+        print(f"error: {text}", file=sys.stderr, flush=True)
 
 
 def _close(node: Node | None) -> int:

@@ -12,7 +12,8 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from pressure_driver.monitor import Monitor, MonitorLimits, chamber_gauge
+from pressure_driver.admission import Origin
+from pressure_driver.monitor import MonitorLimits, TelemetryMonitor, chamber_gauge
 from pressure_driver.protocols.base import (
     BoardIdentity,
     BoardReport,
@@ -24,7 +25,7 @@ from pressure_driver.protocols.base import (
     Telemetry,
 )
 from pressure_driver.safety import LIVE, Mode, SafetyLimits, SafetyMachine
-from pressure_driver.schedule import Counters, Schedule, ScheduleLimits, Setpoint, Verdict
+from pressure_driver.schedule import Counters, ScheduleLimits, Setpoint, SetpointSchedule, Verdict
 
 STANDARD_ATMOSPHERE = 101_325.0
 """[Pa] on the wire until the room's has been measured; only vent commands are sent before."""
@@ -32,9 +33,34 @@ STANDARD_ATMOSPHERE = 101_325.0
 LARGEST_CLOCK_STEP = 0.3
 """[s] between two ticks, above slewing and late wakes, that means the wall clock was set."""
 IDENTITY_RETRY = 1.0
-"""[s] after which a board that has not introduced itself, or confirmed its settings, is asked again."""
+"""[s] after which a board that has not introduced or set itself up is greeted again."""
 ECHO_TIMEOUT = 1.0
 """[s] without an echo of any command, on boards that echo: the board takes no commands."""
+
+
+class LogAllowance:
+    """How many texts of the board may still be logged: some at once, a few a second for ever.
+
+    Args:
+        burst: texts at once, such as those of a boot.
+        rate: [1/s] of the allowance that comes back.
+    """
+
+    def __init__(self, burst: int = 30, rate: float = 3.0) -> None:
+        self.withheld = 0
+        """Texts that were not logged."""
+        self._burst, self._rate = float(burst), rate
+        self._left, self._asked_at = float(burst), 0.0
+
+    def allows(self, now: float) -> bool:
+        """Tell whether one more may be logged now (steady clock [s])."""
+        self._left = min(self._burst, self._left + (now - self._asked_at) * self._rate)
+        self._asked_at = now
+        if self._left < 1.0:
+            self.withheld += 1
+            return False
+        self._left -= 1.0
+        return True
 
 
 @dataclass(frozen=True)
@@ -99,14 +125,19 @@ class DriverCore:
         self._notify = notify
         self._log = log
         self._lock = threading.RLock()
-        self._schedule = Schedule(settings.schedule, settings.period, settings.interpolate)
-        self._monitor = Monitor(protocol.chamber_count, settings.monitor, settings.atmosphere)
+        self._schedule = SetpointSchedule(settings.schedule, settings.period, settings.interpolate)
+        self._monitor = TelemetryMonitor(
+            protocol.chamber_count, settings.monitor, settings.atmosphere, protocol.reports_supply
+        )
         self._machine = SafetyMachine(self._schedule, self._monitor, settings.safety)
         self._last_tick = 0
         self._last_mode = Mode.DISARMED
         self._awaiting_echo: deque[tuple[int | None, float]] = deque(maxlen=64)
         self._round_trip = float("nan")
         self._pending_number: int | None = None
+        self._board_log = LogAllowance()
+        self._limited_noted = 0
+        self._was_limited = False
         self._asked_at = 0.0
         self._identity_problem = ""
         self._echo_awaited_since: float | None = None
@@ -132,10 +163,16 @@ class DriverCore:
             self._note_mode()
             return result
 
-    def offer(self, setpoint: Setpoint, wall: int) -> Verdict:
-        """Take a setpoint; ``wall`` is the wall clock now in ns."""
+    def offer(self, setpoint: Setpoint, wall: int, origin: Origin | None = None) -> Verdict:
+        """Take a setpoint.
+
+        Args:
+            setpoint: stamp 0 means now.
+            wall: [ns] wall clock.
+            origin: where it came from; None inside one program.
+        """
         with self._lock:
-            return self._machine.offer(setpoint, wall)
+            return self._machine.offer(setpoint, wall, self._steady(), origin)
 
     def obstacles(self) -> list[str]:
         """Return what forbids arming now."""
@@ -151,6 +188,21 @@ class DriverCore:
     def last_refusal(self) -> str:
         """Why the last setpoint that was not accepted was not."""
         return self._schedule.reason
+
+    @property
+    def foreign_setpoints(self) -> int:
+        """Setpoints that were refused since another publisher was being played."""
+        return self._machine.sources.refused
+
+    @property
+    def limited_ticks(self) -> int:
+        """Ticks at which the slew limit held the output back."""
+        return self._machine.limited_ticks
+
+    @property
+    def unlogged_texts(self) -> int:
+        """Texts of the board that came too fast for the log."""
+        return self._board_log.withheld
 
     @property
     def waiting(self) -> int:
@@ -203,6 +255,7 @@ class DriverCore:
             action = self._machine.tick(instant, now)
             self.venting = action.dump or bool(self.protocol.unsettled)
             if self.venting:
+                self._machine.command_nothing()
                 return self._ask_identity(now) + self._vent_bytes()
             data, self._pending_number = self.protocol.setpoint(
                 action.differential, self._wire_atmosphere(), self.settings.command_validity
@@ -228,14 +281,19 @@ class DriverCore:
             if self._echo_awaited_since is None:
                 self._echo_awaited_since = now
             self._note_mode()
+            self._note_limit()
         self._notify()
 
     def received(self, data: bytes) -> None:
         """Decode what the board has sent."""
         with self._lock:
             now = self._steady()
-            for event in self.protocol.decode(data):
+            rejected = self.protocol.rejected
+            events = self.protocol.decode(data)
+            for event in events:
                 self._take(event, now)
+            readings = sum(isinstance(event, Telemetry) for event in events)
+            self._monitor.note_quality(readings, self.protocol.rejected - rejected, now)
             self._watch_board(now)
 
     def lost(self, reason: str) -> None:
@@ -337,16 +395,23 @@ class DriverCore:
         elif isinstance(event, Echo):
             self._take_echo(event, now)
         elif isinstance(event, BoardReport):
-            self._log(f"board: {event.text}", True)
+            self._log_board(event.text, True, now)
             if event.fatal:
-                self._machine.fail(f"board reports: {event.text}")
+                self._machine.fail(f"board reports {event.text}")
         elif isinstance(event, BoardReset):
             self._take_reset(event, now)
         elif isinstance(event, BoardIdentity):
             self._check_identity(event)
         elif isinstance(event, BoardText):
             self.last_text = event.text
-            self._log(f"board: {event.text}", False)
+            self._log_board(event.text, False, now)
+
+    def _log_board(self, text: str, warning: bool, now: float) -> None:
+        """Log what the board says, unless it talks too much: a log must never hold up a vent."""
+        if self._board_log.allows(now):
+            self._log(f"board: {text}", warning)
+        elif self._board_log.withheld == 1:
+            self._log("the board sends text faster than it is logged: the rest is counted", True)
 
     def _take_echo(self, echo: Echo, now: float) -> None:
         """Measure the round trip; an echo without a number is that of the newest command."""
@@ -364,6 +429,14 @@ class DriverCore:
                 self._round_trip = now - sent
                 self._echo_awaited_since = now if self._awaiting_echo else None
                 return
+
+    def _note_limit(self) -> None:
+        """Say when the slew limit begins to hold the output back."""
+        limited = self._machine.limited_ticks
+        if limited > self._limited_noted and not self._was_limited:
+            self._log("the slew limit holds the output back: it follows the setpoints late", True)
+        self._was_limited = limited > self._limited_noted
+        self._limited_noted = limited
 
     def _note_mode(self) -> None:
         mode = self._machine.mode

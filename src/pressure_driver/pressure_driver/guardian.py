@@ -2,8 +2,8 @@
 
 It is started by `pressure_driver.guardian_client` beside the driver of a board without a watchdog,
 by its path and with nothing but the standard library, so that it runs within some hundredths of a
-second and hardly anything in it can fail. The driver goes on writing to the port itself; the guardian
-holds a second descriptor of the open port and does not use it before the driver has failed.
+second and hardly anything in it can fail. The driver goes on writing to the port itself; the
+guardian holds a second descriptor of the open port, which it does not use while the driver lives.
 
 Messages come over a socket that keeps their bounds (one letter, then contents):
 
@@ -12,12 +12,14 @@ Messages come over a socket that keeps their bounds (one letter, then contents):
 ``V`` a newer vent command
 ``L`` the port is lost: close the descriptor, so that the device can come back under its name
 ``.`` a sign of life; it is answered with the same letter
+``~`` a sign of life while nothing but the vent command is sent; answered with ``.``
 ``G`` the driver has vented the board and ends: close everything and end with exit code 0
 ===== =========================================================================================
 
-If no sign of life comes for `HEARTBEAT_TIMEOUT`, or the socket closes without a ``G``, the guardian
-kills the driver (one that hangs must not wake up later and write old pressures), throws away what
-waits in the port's output queue, sends the vent command for `VENT_TIME`, and ends with exit code 1.
+If no sign of life comes for `HEARTBEAT_TIMEOUT` (after a ``~`` for `VENTED_TIMEOUT`), or the socket
+closes without a ``G``, the guardian kills the driver (one that hangs must not wake up and write
+old pressures), throws away what waits in the port's output queue, sends the vent command for
+`VENT_TIME`, and ends with exit code 1.
 It has a session of its own and ignores the signals by which people and terminals end programs.
 """
 
@@ -35,6 +37,8 @@ import time
 
 HEARTBEAT_TIMEOUT = 0.22
 """[s] without a sign of life. The rest of the promised 0.3 s is for the kill and the first vent."""
+VENTED_TIMEOUT = 2.0
+"""[s] without a sign of life while the board is being vented anyway: a pause costs nothing then."""
 LATE_WAKE = 0.05
 """[s] The guardian woke up this much too late: the whole machine stood still, the driver too."""
 END_TIMEOUT = 0.04
@@ -80,7 +84,8 @@ class Guardian:
 
     def _listen(self) -> str:
         """Serve messages; return why the driver counts as failed, or nothing after a goodbye."""
-        deadline = time.monotonic() + HEARTBEAT_TIMEOUT
+        allowed = HEARTBEAT_TIMEOUT
+        deadline = time.monotonic() + allowed
         while True:
             planned = max(deadline - time.monotonic(), 0.0)
             begin = time.monotonic()
@@ -89,7 +94,7 @@ class Guardian:
                 if now - begin > planned + LATE_WAKE:
                     deadline = now + LATE_WAKE
                     continue
-                return f"no sign of life from the driver for {HEARTBEAT_TIMEOUT:g} s"
+                return f"no sign of life from the driver for {allowed:g} s"
             message, descriptors = self._receive()
             if not message:
                 return "the driver has ended without a goodbye"
@@ -97,7 +102,9 @@ class Guardian:
                 return ""
             self._take(message, descriptors)
             # Whatever comes is a sign of life; one that has waited here counts from now on.
-            deadline = time.monotonic() + HEARTBEAT_TIMEOUT
+            if message in (b".", b"~"):
+                allowed = VENTED_TIMEOUT if message == b"~" else HEARTBEAT_TIMEOUT
+            deadline = time.monotonic() + allowed
 
     def _receive(self) -> tuple[bytes, list[int]]:
         try:
@@ -108,7 +115,7 @@ class Guardian:
 
     def _take(self, message: bytes, descriptors: list[int]) -> None:
         kind, contents = message[:1], message[1:]
-        if kind == b".":
+        if kind in b".~":
             with contextlib.suppress(OSError):
                 self._channel.send(b".", socket.MSG_DONTWAIT)
         if kind in b"PV":
@@ -172,7 +179,7 @@ class Guardian:
 
 
 def main() -> int:
-    """Guard: ``guardian.py SOCKET DRIVER PRIORITY`` (descriptor, process id, real-time priority)."""
+    """Guard: ``guardian.py SOCKET DRIVER PRIORITY``: descriptor, process id, real-time priority."""
     for number in _IGNORED:
         signal.signal(number, signal.SIG_IGN)
     descriptor, driver, priority = map(int, sys.argv[1:4])

@@ -36,7 +36,7 @@ FIRST_RETRY = 0.1
 LAST_RETRY = 2.0
 """[s] between looks after a long absence."""
 LONGEST_WAIT = 0.03
-"""[s] after which the thread turns at the latest: to look for a lost port, to show that it lives."""
+"""[s] after which the thread turns at the latest: to look for a lost port, to show life."""
 UNREAD_TIME = 1.0
 """[s] that bytes may wait in the port's output queue until the board counts as not reading."""
 VENT_REPEATS = 3
@@ -146,7 +146,7 @@ class SerialLink:
     def start(self) -> None:
         """Open the port and start the thread.
 
-        A port in use is waited for: the guardian of a driver that was killed vents for some seconds.
+        A port in use is waited for: the guardian of a killed driver vents for some seconds.
 
         Raises:
             PortError: the port cannot be opened.
@@ -227,6 +227,9 @@ class SerialLink:
         if venting and not self._was_venting:
             self._drop_unsent()
             data = self._client.separator + data
+        if self._was_venting and not venting:
+            self._was_venting = False
+            self._show_life()  # before pressures leave, so that the guardian is strict from now on
         self._was_venting = venting
         self._watch_queue()
         self._write(data)
@@ -360,7 +363,7 @@ class SerialLink:
         if self._guardian is None or not self._guardian.running:
             return
         try:
-            self._guardian.beat()
+            self._guardian.beat(self._was_venting)
             if self._guardian.wants_vent():
                 self._guardian.renew(self._client.emergency())
         except GuardianError as error:

@@ -6,9 +6,12 @@ import math
 import time
 from collections import deque
 
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import QoSSubscriptionMatchedInfo, SubscriptionEventCallbacks
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from std_msgs.msg import Float64MultiArray
-from std_srvs.srv import Trigger
 
 from der_msgs.msg import PressureSetpoint, PressureState
 from limb_interfaces import qos, topics
@@ -16,17 +19,22 @@ from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.parameters import ParameterError
 from limb_interfaces.runner import run_node
 from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
+from pressure_driver.admission import Origin
 from pressure_driver.core import DriverCore, Snapshot
 from pressure_driver.grid import TickGrid
 from pressure_driver.guardian_client import GuardianClient
 from pressure_driver.link import SerialLink
 from pressure_driver.node_parameters import read_parameters
+from pressure_driver.node_services import EmergencyServices
 from pressure_driver.protocols import host_protocol
 from pressure_driver.realtime import prepare_process
 from pressure_driver.safety import Mode
 from pressure_driver.schedule import Setpoint, Verdict
 
 PASCAL_PER_HECTOPASCAL = 100.0
+CMD_U_T = "cmd_u_t"
+MOST_LINES = 20
+"""Lines of the log that one callback writes: whatever else waits has its turn in between."""
 
 
 class PressureDriver(Node):
@@ -43,12 +51,12 @@ class PressureDriver(Node):
         self._options = options
         protocol = host_protocol(options.protocol, 2 * options.core.schedule.segment_count)
         self._ticks: deque[Snapshot] = deque(maxlen=100)
-        self._log_lines: deque[tuple[str, bool]] = deque(maxlen=1000)
+        self._log_lines: deque[tuple[str, bool]] = deque(maxlen=200)
         self._guard = self.create_guard_condition(self._publish_ticks)
         self._core = DriverCore(
             protocol, options.core, notify=self._on_tick, log=self._log_from_thread
         )
-        guarded = options.guardian == "on" or (
+        guarded = options.guardian == "always" or (
             options.guardian == "auto" and not protocol.has_watchdog
         )
         self._guardian = GuardianClient(options.real_time_priority) if guarded else None
@@ -64,52 +72,73 @@ class PressureDriver(Node):
         self._state_publisher = self.create_publisher(
             PressureState, topics.PRESSURE_STATE, qos.STATES
         )
+        self._setpoint_topic = self.resolve_topic_name(topics.PRESSURE_SETPOINT)
         self.create_subscription(
-            PressureSetpoint, topics.PRESSURE_SETPOINT, self._on_setpoint, qos.SETPOINTS
+            PressureSetpoint,
+            topics.PRESSURE_SETPOINT,
+            self._on_setpoint,
+            qos.SETPOINTS,
+            event_callbacks=SubscriptionEventCallbacks(matched=self._on_publishers),
         )
         if options.accept_cmd_u_t:
-            self.create_subscription(Float64MultiArray, "cmd_u_t", self._on_cmd_u_t, qos.SETPOINTS)
-        self.create_service(Trigger, "~/arm", self._on_arm)
-        self.create_service(Trigger, "~/vent", self._on_vent)
+            self.create_subscription(Float64MultiArray, CMD_U_T, self._on_cmd_u_t, qos.SETPOINTS)
+        self._emergency = EmergencyServices(self, self._vent, self._core.arm)
         self._diagnostics = DiagnosticsPublisher(self, self._report, hardware_id=self._link.port)
-        self.create_timer(0.2, self._watch_link)
+        self.create_timer(0.2, self._watch_threads, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.add_on_set_parameters_callback(self._refuse_simulated_time)
         prepare_process(options.real_time_priority)
         self._link.start()
+        self._emergency.start()
         self.get_logger().info(
             f"{protocol.name} board on {self._link.port}: vented, waiting for `arm`"
         )
 
     # ------------------------------------------------------------------------------ inputs
 
-    def _on_setpoint(self, message: PressureSetpoint) -> None:
+    def _on_setpoint(self, message: PressureSetpoint, info: dict[str, int]) -> None:
         setpoint = Setpoint(
             stamp=nanoseconds(message.header.stamp),
             differential=tuple(message.differential_pressure),
             plan_id=message.plan_id,
             index=message.index,
+            revision=message.revision,
         )
-        self._offer(setpoint)
+        self._offer(setpoint, self._setpoint_topic, info)
 
-    def _on_cmd_u_t(self, message: Float64MultiArray) -> None:
+    def _on_cmd_u_t(self, message: Float64MultiArray, info: dict[str, int]) -> None:
         """Untimed differences in hPa, as labs publish them from MATLAB."""
         differential = tuple(value * PASCAL_PER_HECTOPASCAL for value in message.data)
-        self._offer(Setpoint(stamp=0, differential=differential, plan_id="cmd_u_t"))
+        self._offer(Setpoint(stamp=0, differential=differential), CMD_U_T, info)
 
-    def _offer(self, setpoint: Setpoint) -> None:
-        verdict = self._core.offer(setpoint, time.time_ns())
+    def _offer(self, setpoint: Setpoint, topic: str, info: dict[str, int]) -> None:
+        number = info["publication_sequence_number"]
+        alone = self.count_publishers(topic) <= 1
+        verdict = self._core.offer(setpoint, time.time_ns(), Origin(topic, number, alone))
         if verdict is not Verdict.ACCEPTED:
             self.get_logger().warning(
                 f"{verdict.value}: {self._core.last_refusal}", throttle_duration_sec=1.0
             )
 
-    def _on_arm(self, _: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
-        answer.success, answer.message = self._core.arm()
-        return answer
+    def _on_publishers(self, change: QoSSubscriptionMatchedInfo) -> None:
+        if change.current_count_change < 0 and self._core.snapshot().mode is Mode.TRACKING:
+            self.get_logger().warning(
+                f"a publisher of {self._setpoint_topic} has gone while setpoints are played; "
+                f"{change.current_count} left",
+                throttle_duration_sec=1.0,
+            )
 
-    def _on_vent(self, _: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
-        answer.success, answer.message = self._core.vent()
+    def _vent(self) -> tuple[bool, str]:
+        answer = self._core.vent()
         self._link.urge()
         return answer
+
+    def _refuse_simulated_time(self, parameters: list[Parameter]) -> SetParametersResult:
+        for parameter in parameters:
+            if parameter.name == "use_sim_time" and parameter.value:
+                return SetParametersResult(
+                    successful=False, reason="'use_sim_time': the driver moves air in real time"
+                )
+        return SetParametersResult(successful=True)
 
     # ----------------------------------------------------------------------------- outputs
 
@@ -120,7 +149,7 @@ class PressureDriver(Node):
 
     def _publish_ticks(self) -> None:
         self._write_log()
-        while self._ticks:
+        for _ in range(len(self._ticks)):
             self._state_publisher.publish(self._state_message(self._ticks.popleft()))
 
     def _state_message(self, snapshot: Snapshot) -> PressureState:
@@ -169,6 +198,10 @@ class PressureDriver(Node):
             "damaged_frames": protocol.rejected,
             "setpoints_waiting": self._core.waiting,
             "setpoints_superseded": snapshot.counters.superseded,
+            "setpoints_missing": snapshot.counters.missing,
+            "setpoints_of_other_publishers": self._core.foreign_setpoints,
+            "ticks_held_back_by_slew_limit": self._core.limited_ticks,
+            "board_texts_not_logged": self._core.unlogged_texts,
             "ticks_missed": self._link.grid.missed,
             "clock_steps": self._link.grid.clock_steps,
             "reconnects": self._link.reconnects,
@@ -207,12 +240,15 @@ class PressureDriver(Node):
             return "warning", f"{snapshot.mode.name}; {self._core.protocol.name}: " + weaknesses[0]
         return "ok", snapshot.mode.name
 
-    def _watch_link(self) -> None:
+    def _watch_threads(self) -> None:
         if self._guardian is not None:
             self._guardian.executor_lives()
-        if self._link.error is not None:
-            error = self._link.error
-            self.fatal_error = f"the serial thread ended: {type(error).__name__}: {error}"
+        for what, error in (
+            ("serial thread", self._link.error),
+            ("thread of arm and vent", self._emergency.error),
+        ):
+            if error is not None:
+                self.fatal_error = f"the {what} ended: {type(error).__name__}: {error}"
 
     def _log_from_thread(self, text: str, warning: bool) -> None:
         """Leave the writing to the executor: the port's thread has a clock to keep."""
@@ -220,7 +256,7 @@ class PressureDriver(Node):
         self._guard.trigger()
 
     def _write_log(self) -> None:
-        while self._log_lines:
+        for _ in range(min(len(self._log_lines), MOST_LINES)):
             text, warning = self._log_lines.popleft()
             # Two calls in two lines: rclpy remembers one severity for each place in the code.
             if warning:
@@ -232,6 +268,7 @@ class PressureDriver(Node):
         """Vent the board and release the port."""
         self._core.vent()
         ended = self._link.close()
+        self._emergency.close()
         self._publish_ticks()
         if not ended:
             raise RuntimeError(f"the thread of {self._link.port} did not end; check the valves")

@@ -75,11 +75,11 @@ def read_parameters(node: Node) -> DriverOptions:
         "guardian",
         "auto",
         "a process that vents if the driver dies or hangs; auto: for boards without a watchdog",
-        choices=("auto", "on", "off"),
+        choices=("auto", "always", "never"),
     )
     core = CoreSettings(
         schedule=_schedule_limits(number),
-        monitor=_monitor_limits(number),
+        monitor=_monitor_limits(node, number),
         safety=_safety_limits(number),
         period=round(NANOSECONDS / rate),
         interpolate=interpolation == "linear",
@@ -101,13 +101,13 @@ def _schedule_limits(number: Any) -> ScheduleLimits:
             "pressure_limit", 24_000.0, "[Pa] largest differential pressure", 0.0, 100_000.0
         ),
         slew_limit=number(
-            "slew_limit", 200_000.0, "[Pa/s] from one setpoint to the next", 1.0, 1e7
+            "slew_limit", 200_000.0, "[Pa/s] of setpoints and of what is commanded", 1.0, 1e7
         ),
         horizon=number("horizon", 10.0, "[s] a setpoint's stamp may lie ahead", 0.1, 3600.0),
     )
 
 
-def _monitor_limits(number: Any) -> MonitorLimits:
+def _monitor_limits(node: Node, number: Any) -> MonitorLimits:
     default = MonitorLimits()
     return MonitorLimits(
         telemetry_timeout=number(
@@ -124,6 +124,14 @@ def _monitor_limits(number: Any) -> MonitorLimits:
         ),
         supply_time=number(
             "supply_time", default.supply_time, "[s] the supply may be outside", 0.0, 60.0
+        ),
+        supply_required=bool(
+            declare(
+                node,
+                "supply_required",
+                default.supply_required,
+                "arm only with a fresh reading of the supply, where the protocol tells it",
+            )
         ),
         follow_tolerance=number(
             "follow_tolerance",

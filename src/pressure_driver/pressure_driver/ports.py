@@ -1,4 +1,4 @@
-"""Serial ports of this machine: which there are, under which name to keep one, and how to open it."""
+"""Serial ports of this machine: which there are, by which name to keep one, how to open it."""
 
 from __future__ import annotations
 

@@ -20,8 +20,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 
-from pressure_driver.monitor import Monitor
-from pressure_driver.schedule import NANOSECONDS, Sample, Schedule, Setpoint, Verdict
+from pressure_driver.admission import Origin, SourceGate, SpentPlans
+from pressure_driver.monitor import TelemetryMonitor
+from pressure_driver.schedule import NANOSECONDS, Sample, Setpoint, SetpointSchedule, Verdict
 
 
 class Mode(IntEnum):
@@ -59,6 +60,8 @@ class Action:
     """Send the vent command instead."""
 
 
+MOST_FAULTS = 16
+"""Reasons that are kept; more would only be more of the same."""
 LIVE = (Mode.ARMED, Mode.TRACKING, Mode.HOLDING, Mode.VENTING)
 
 
@@ -71,7 +74,9 @@ class SafetyMachine:
         limits: of the state machine.
     """
 
-    def __init__(self, schedule: Schedule, monitor: Monitor, limits: SafetyLimits) -> None:
+    def __init__(
+        self, schedule: SetpointSchedule, monitor: TelemetryMonitor, limits: SafetyLimits
+    ) -> None:
         self.schedule = schedule
         self.monitor = monitor
         self.limits = limits
@@ -85,6 +90,11 @@ class SafetyMachine:
         self._zero = (0.0,) * schedule.limits.segment_count
         self.differential = self._zero
         """(M,) [Pa] commanded at the last tick."""
+        self.sources = SourceGate()
+        self.limited_ticks = 0
+        """Ticks at which the output was held back by the slew limit."""
+        self._spent = SpentPlans()
+        self._target = self._zero
         self._latched = False
         self._vent_since = 0.0
         self._fresh_at = 0.0
@@ -109,7 +119,7 @@ class SafetyMachine:
         self._latched = False
         self.schedule.clear()
         self.monitor.reset_following(now)
-        self.differential = self._zero
+        self.command_nothing()
         self._enter(Mode.ARMED)
         return True, "armed"
 
@@ -123,19 +133,17 @@ class SafetyMachine:
         found = monitor.telemetry_faults(now)
         if found:
             return found
-        found = monitor.overpressure_faults() + monitor.supply_faults(now)
-        if not monitor.rest_known():
-            found.append(
-                "the rest pressures are not measured yet: chambers must be vented and steady"
-            )
+        found = monitor.overpressure_faults() + monitor.supply_obstacles(now)
+        found += monitor.reading_faults(now)
+        if problem := monitor.rest_problem():
+            found.append(problem)
         elif not monitor.vented():
             found.append("the chambers are not vented yet: " + monitor.describe_gauge())
         return found
 
     def vent(self, now: float) -> tuple[bool, str]:
         """Open everything at once and stay so until armed again. Works in every state."""
-        self.schedule.clear()
-        self.differential = self._zero
+        self._drop_plans()
         if self.mode is Mode.FAULT:
             return True, "venting; the fault stays until it is armed again"
         if self.mode is Mode.DISARMED:
@@ -145,20 +153,44 @@ class SafetyMachine:
         self._enter(Mode.VENTING)
         return True, "venting; call arm to go on"
 
-    def offer(self, setpoint: Setpoint, wall: int) -> Verdict:
+    def offer(
+        self, setpoint: Setpoint, wall: int, now: float, origin: Origin | None = None
+    ) -> Verdict:
         """Take a setpoint.
 
         Args:
             setpoint: stamp 0 means now.
             wall: [ns] wall clock.
+            now: [s] steady clock.
+            origin: where it came from; None inside one program.
         """
+        schedule, plan = self.schedule, setpoint.plan_id
         if self.mode not in LIVE or self._latched:
-            return self.schedule.refuse(f"setpoints are refused while {self.mode.name}: arm first")
-        return self.schedule.offer(setpoint, wall, self.differential)
+            self._spent.hear(plan, now)
+            self._spent.spend()
+            return schedule.refuse(f"setpoints are refused while {self.mode.name}: arm first")
+        reason = self._spent.refuse(plan, now)
+        if not reason and origin is not None:
+            reason = self.sources.refuse(origin, now)
+        if reason:
+            name = f" of '{plan}'" if plan else ""
+            return schedule.refuse(f"setpoint {setpoint.index}{name}: {reason}")
+        self._spent.hear(plan, now)
+        return schedule.offer(setpoint, wall, self.differential)
 
     def fail(self, reason: str) -> None:
         """Go to FAULT for a reason from outside (the line, the board's own report)."""
         self._fault([reason])
+
+    def _drop_plans(self) -> None:
+        """Forget every setpoint, and refuse the rest of their plans from now on."""
+        self._spent.spend()
+        self.schedule.clear()
+        self.command_nothing()
+
+    def command_nothing(self) -> None:
+        """Note that the vent command goes out: what is commanded next starts from zero."""
+        self.differential = self._target = self._zero
 
     # ------------------------------------------------------------------------------- ticks
 
@@ -169,10 +201,10 @@ class SafetyMachine:
             tick: [ns] wall time of the tick, on the grid.
             now: [s] steady clock.
         """
-        sample = self.schedule.sample(tick)
+        sample = self.schedule.sample(tick, self.differential)
         self._look_for_faults(now)
         if self.mode in (Mode.DISARMED, Mode.FAULT):
-            self.differential = self._zero
+            self.command_nothing()
             return Action(self._zero, dump=True)
         if self._latched:
             return self._vent_latched(now)
@@ -186,10 +218,11 @@ class SafetyMachine:
         back must not keep a limb under pressure.
         """
         if sample is not None and sample.fresh:
-            self.differential = sample.differential
+            self._target = sample.differential
             self._fresh_at = now
             self._enter(Mode.TRACKING)
-            return
+        if self.mode is Mode.TRACKING:
+            self._approach_target()
         silence = now - self._fresh_at
         if self.mode is Mode.TRACKING and silence > self.limits.setpoint_timeout:
             self._enter(Mode.HOLDING)
@@ -200,12 +233,27 @@ class SafetyMachine:
         if self.mode is Mode.VENTING:
             self._ramp_down()
 
+    def _approach_target(self) -> None:
+        """Move what is commanded to what is wanted, by no more than the slew limit allows a tick.
+
+        The step is taken from what was commanded last, whatever brought it there.
+        """
+        step = self.schedule.limits.slew_limit * self.schedule.period / NANOSECONDS
+        step *= 1.0 + 1e-9  # a plan at the limit is not beyond it for the sake of rounding
+        moved = tuple(
+            min(max(wanted, last - step), last + step)
+            for wanted, last in zip(self._target, self.differential, strict=True)
+        )
+        if moved != self._target:
+            self.limited_ticks += 1
+        self.differential = moved
+
     def _ramp_down(self) -> None:
         """One step of the ramp; all segments arrive together, so that the limb keeps its shape."""
         largest = max(abs(value) for value in self.differential)
         step = self.limits.vent_rate * self.schedule.period / NANOSECONDS
         if largest <= step:
-            self.differential = self._zero
+            self.command_nothing()
             if not self.schedule.waiting:
                 self.schedule.clear()
             self._enter(Mode.ARMED)
@@ -214,14 +262,14 @@ class SafetyMachine:
             self.differential = tuple(value * share for value in self.differential)
 
     def _vent_latched(self, now: float) -> Action:
-        self.differential = self._zero
+        self.command_nothing()
         if self.monitor.vented():
             self._latched = False
             self._enter(Mode.DISARMED)
         elif now - self._vent_since > self.limits.vent_timeout:
             self._fault(
                 [
-                    f"not vented {now - self._vent_since:.1f} s after `vent`: "
+                    f"not vented within {self.limits.vent_timeout:g} s of `vent`: "
                     + self.monitor.describe_gauge()
                 ]
             )
@@ -233,16 +281,32 @@ class SafetyMachine:
         if self.mode in LIVE:
             # Without a port there is no telemetry either: one cause, one reason.
             silent = [self.link_fault] if self.link_fault else monitor.telemetry_faults(now)
-            found += silent + monitor.supply_faults(now)
-        if found and self.mode is not Mode.FAULT:
+            found += silent + monitor.supply_faults(now) + monitor.reading_faults(now)
+            found += monitor.below_rest_faults(now)
+        elif self.mode is Mode.FAULT:
+            if self.link_fault:
+                found.append(self.link_fault)
+            elif monitor.heard:
+                found += monitor.telemetry_faults(now) + monitor.supply_faults(now)
+                found += monitor.reading_faults(now)
+        if found:
             self._fault(found)
 
     def _fault(self, reasons: list[str]) -> None:
-        self.faults = self.faults + [reason for reason in reasons if reason not in self.faults]
+        """Vent; a reason that differs from one already known only in its numbers is not added."""
+        known = {_subject(reason) for reason in self.faults}
+        for reason in reasons:
+            if _subject(reason) not in known and len(self.faults) < MOST_FAULTS:
+                known.add(_subject(reason))
+                self.faults = [*self.faults, reason]
         self._latched = False
-        self.differential = self._zero
-        self.schedule.clear()
+        self._drop_plans()
         self._enter(Mode.FAULT)
 
     def _enter(self, mode: Mode) -> None:
         self.mode = mode
+
+
+def _subject(reason: str) -> str:
+    """Return what a fault is about: its text up to the colon, behind which numbers stand."""
+    return reason.partition(":")[0]

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import bisect
 import math
+from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import NamedTuple
 
 NANOSECONDS = 1_000_000_000
+REMEMBERED_PLANS = 256
+"""Plans that have been replaced and are still known as such."""
 
 
 class Verdict(Enum):
@@ -35,6 +38,8 @@ class Setpoint:
     """(M,) [Pa]."""
     plan_id: str = ""
     index: int = 0
+    revision: int = 0
+    """Replaces a lower one of the same plan, index and stamp."""
 
 
 class Sample(NamedTuple):
@@ -58,7 +63,9 @@ class Counters:
     duplicate: int = 0
     refused: int = 0
     superseded: int = 0
-    """Accepted, but replaced by a new plan or by a later one within the same tick."""
+    """Accepted, but replaced by a new plan, by a revision or by a later one in the same tick."""
+    missing: int = 0
+    """Places of a plan, counted by `index`, that were not there when a later one took effect."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +84,7 @@ class ScheduleLimits:
 
 
 @dataclass
-class Schedule:
+class SetpointSchedule:
     """A buffer of timed setpoints with zero-order hold or linear interpolation.
 
     Args:
@@ -97,7 +104,7 @@ class Schedule:
         self._waiting: list[Setpoint] = []
         self._current: Setpoint | None = None
         self._last_tick = -(2**62)
-        self._replaced: set[str] = set()
+        self._replaced: deque[str] = deque(maxlen=REMEMBERED_PLANS)
 
     @property
     def waiting(self) -> int:
@@ -153,7 +160,7 @@ class Schedule:
         if untimed:
             # "Now" is the next tick, whatever the grid has already done.
             stamp = max(self._tick_of(now), self._last_tick + self.period)
-            setpoint = Setpoint(stamp, setpoint.differential, setpoint.plan_id, setpoint.index)
+            setpoint = replace(setpoint, stamp=stamp)
         ahead = (setpoint.stamp - now) / NANOSECONDS
         if ahead > self.limits.horizon:
             return Verdict.REFUSED, (f"{ahead:.2f} s ahead, the limit is {self.limits.horizon:g} s")
@@ -179,8 +186,14 @@ class Schedule:
         place = self._place(setpoint.stamp)
         same_stamp = place < len(self._waiting) and self._waiting[place].stamp == setpoint.stamp
         replaces = not self._belongs(setpoint)
+        revises = False
         if same_stamp and not replaces and not untimed:
-            return Verdict.DUPLICATE, "another one has the same stamp"
+            there = self._waiting[place]
+            revises = there.index == setpoint.index and setpoint.revision > there.revision
+            if not revises:
+                return Verdict.DUPLICATE, (
+                    f"setpoint {there.index}, revision {there.revision}, has the same stamp"
+                )
         if setpoint.plan_id in self._replaced:
             return Verdict.REFUSED, "this plan has been replaced by a newer one"
         if len(self._waiting) >= self.limits.capacity and not replaces:
@@ -188,6 +201,10 @@ class Schedule:
         before = self._waiting[place - 1] if place else None
         following = place + 1 if same_stamp else place
         after = None if replaces or following >= len(self._waiting) else self._waiting[following]
+        if revises:
+            after = (
+                None  # the next one is about to be revised as well; the output is limited anyway
+            )
         if problem := self._slew_problem(before, setpoint, held) or (
             self._slew_problem(setpoint, after, held) if after else ""
         ):
@@ -212,7 +229,7 @@ class Schedule:
         self.counters.superseded += len(self._waiting) - place
         del self._waiting[place:]
         if newest is not None and newest.plan_id:
-            self._replaced.add(newest.plan_id)
+            self._replaced.append(newest.plan_id)
 
     def _belongs(self, setpoint: Setpoint) -> bool:
         """Tell whether the newest known setpoint is of the same plan."""
@@ -238,11 +255,14 @@ class Schedule:
         """Return the first tick at or after a stamp."""
         return -(-stamp // self.period) * self.period
 
-    def sample(self, tick: int) -> Sample | None:
+    def sample(self, tick: int, held: Sequence[float] = ()) -> Sample | None:
         """Bring into force what is due at a tick.
 
         Args:
             tick: [ns]; ticks must not go backward (see `forget_ticks`).
+            held: (M,) [Pa] what was commanded at the last tick. Interpolation goes on from there,
+                so that pressures which were let down or limited meanwhile do not come back at
+                once. Empty: the last setpoint's.
 
         Returns:
             What to command, or None before the first setpoint.
@@ -250,6 +270,9 @@ class Schedule:
         self._last_tick = max(self._last_tick, tick)
         due = 0
         while due < len(self._waiting) and self._waiting[due].stamp <= tick:
+            self._count_missing(
+                self._waiting[due - 1] if due else self._current, self._waiting[due]
+            )
             due += 1
         if due:
             self._current = self._waiting[due - 1]
@@ -261,13 +284,21 @@ class Schedule:
             return None
         if not (self.interpolate and self._waiting):
             return Sample(current, current.differential, fresh=bool(due))
+        if due or not held:
+            begin, start = current.stamp, current.differential
+        else:
+            begin, start = tick - self.period, tuple(held)
         following = self._waiting[0]
-        share = (tick - current.stamp) / (following.stamp - current.stamp)
+        share = (tick - begin) / (following.stamp - begin)
         moved = tuple(
-            a + share * (b - a)
-            for a, b in zip(current.differential, following.differential, strict=True)
+            a + share * (b - a) for a, b in zip(start, following.differential, strict=True)
         )
         return Sample(current, moved, fresh=True)
+
+    def _count_missing(self, before: Setpoint | None, after: Setpoint) -> None:
+        """Count the places of one plan that are not there between two setpoints in force."""
+        if before is not None and before.plan_id and before.plan_id == after.plan_id:
+            self.counters.missing += max(after.index - before.index - 1, 0)
 
     def forget_ticks(self) -> None:
         """Accept earlier stamps again, as after the wall clock was set back."""

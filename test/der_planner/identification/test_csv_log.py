@@ -88,3 +88,31 @@ def test_damaged_tables_are_refused(tmp_path):
     path.write_text("t,u\n")
     with pytest.raises(LogError, match="fewer than two rows"):
         read_csv(path, ColumnMap(**COLUMNS))
+
+
+def lab_log(path, rest_from, rest_to):
+    """A log that rests nearly, and only from one time to another; sensors read 2 hPa apart."""
+    time = np.arange(0.0, 60.0, 0.1)
+    resting = (time >= rest_from) & (time < rest_to)
+    command = np.where(resting, 0.09, 50.0 + 40.0 * np.sin(time))
+    drive = np.where(resting, 0.0, command)
+    lines = [
+        f"{t:.1f},{u:.3f},{1002 + d:.3f},1000" for t, u, d in zip(time, command, drive, strict=True)
+    ]
+    path.write_text("\n".join(["t,u,a,b", *lines]) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("rest_until", [10.0, "auto"])
+def test_each_log_finds_its_own_rest_even_if_it_is_not_exactly_zero(tmp_path, rest_until):
+    """One map serves a log that rests first and one that rests last, at 0.09 hPa."""
+    columns = ColumnMap("t", ("u",), ("a", "b"), ("u",), pressure_unit="hPa", rest_until=rest_until)
+    for name, begin, end in (("first", 0.0, 12.0), ("last", 45.0, 60.0)):
+        log = read_csv(lab_log(tmp_path / f"{name}.csv", begin, end), columns)
+        resting = (log.time > begin) & (log.time < end)
+        np.testing.assert_allclose(log.measured_differential[resting], 0.0, atol=1e-6)
+    with pytest.raises(LogError, match="no row at rest: its commands never come"):
+        read_csv(lab_log(tmp_path / "never.csv", 70.0, 80.0), columns)
+    wrong = ColumnMap("t", ("u",), ("a", "b"), ("u",), rest_until="soon")
+    with pytest.raises(LogError, match="rest_until is 'soon'"):
+        read_csv(tmp_path / "first.csv", wrong)

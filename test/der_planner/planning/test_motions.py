@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from der_planner.limb import Limb
+from der_planner.model.bending import ArcKinematics
 from der_planner.planning import NAMES, Motion, PathLimits, PlanningError, UnreachableError
-from der_planner.planning.kinematics import ArcKinematics
 from der_planner.planning.motions import JOINT_MOTIONS
 from der_planner.planning.paths import TipPath
 
@@ -107,6 +107,11 @@ def test_csv_paths(tmp_path):
     assert np.linalg.norm(reference.tip - [0.195, 0.11], axis=1).min() < 1e-4
     file.write_text("x,y\n0.20,0.10\n0.19,0.12\n")
     assert Motion.from_csv(file).reference(LIMB).duration > 2.0
+    for header in ("t_ms, x [cm], y [mm]", "time [ms], x (cm), y_mm, remark"):
+        file.write_text(f"{header}\n0, 20, 100, start\n1000, 19.5, 110,\n\n2000, 19, 120, end\n")
+        path = Motion.from_csv(file).path
+        np.testing.assert_allclose(path.time, [0.0, 1.0, 2.0])
+        np.testing.assert_allclose(path.tip, [[0.2, 0.1], [0.195, 0.11], [0.19, 0.12]])
 
 
 @pytest.mark.parametrize(
@@ -117,7 +122,8 @@ def test_csv_paths(tmp_path):
         ("x,y\n0.2,0.1\n0.2\n", "line 3: column 'y' is not a number"),
         ("time,x,y\n0,0.2,0.1\n0,0.2,0.11\n", "times of a tip path must increase: point 1"),
         ("x,y\n0.2,0.1\n", "two or more points"),
-        ("x,y\n0.2,0.1\nnan,0.1\n", "point 1 of the tip path is not finite"),
+        ("x,y\n0.2,0.1\nnan,0.1\n", "line 3: column 'x' is not a number: 'nan'; correct or remove"),
+        ("x [inch],y\n0.2,0.1\n", r"line 1: column 'x \[inch\]' has the unit inch: use m, cm, mm"),
         ("x,y\n0.2,0.1\n0.2,0.1\n", "all points of the tip path coincide"),
         ("", "no column 'x'"),
     ],

@@ -132,7 +132,9 @@ def test_what_cannot_be_done_is_refused_with_a_reason(planner):
     for x in (0.2, 0.5):
         path.poses.append(PoseStamped(pose=Pose(position=Point(x=x, y=0.1))))
     node.paths.publish(path)
-    node.client.wait_for(lambda: "mm from what" in node.state()["reason"], 60.0, "a refusal")
+    node.client.wait_for(
+        lambda: "no pressure reaches it" in node.state()["reason"], 60.0, "a refusal"
+    )
     path.header.frame_id = "map"
     node.paths.publish(path)
     node.client.wait_for(lambda: "frame 'map'" in node.state()["reason"], 60.0, "a refusal")
@@ -310,7 +312,7 @@ def test_the_action_tells_how_it_goes_and_how_it_ended(planner):
 def test_what_no_parameter_took_is_said(planner, graph, tmp_path):
     from der_planner.experiment.processes import find_executable
 
-    file = tmp_path / "planner.yaml"
+    file = tmp_path / "of_another_limb.yaml"
     file.write_text("/lab7/planner:\n  ros__parameters: {nodes: 31}\n")
     node = planner(defualt_model="pcc")
     node.process.stop()

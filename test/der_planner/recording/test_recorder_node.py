@@ -211,6 +211,11 @@ def test_replay_publishes_the_recorded_bytes(graph, tmp_path: Path):
         graph.client.wait_for(lambda: len(heard) == 10, 60.0, "the replay")
         assert replay.wait(30.0) == 0
     assert heard == [f"word {index}" for index in range(10)]
+    late = subprocess.run(
+        [*command, "--from", "1000"], env=environment, capture_output=True, text=True, check=False
+    )
+    assert late.returncode == 1
+    assert "nothing was published" in late.stderr
 
 
 def test_recorded_images_give_the_same_states_at_every_replay(graph, tmp_path: Path):

@@ -60,7 +60,7 @@ def main() -> int:
             _write(tag_pages(TagMap.from_yaml(options.tag_map), options.paper), "tags", options)
         else:
             _write([board_page(given_board(options), options.paper)], "board", options)
-    except (TagMapError, SheetError) as error:
+    except (TagMapError, SheetError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     print("Print at 100 % (no 'fit to page') and check the 100 mm line with a ruler.")

@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
+from der_planner.commands.outputs import OutputError, check_file, check_folder
 from der_planner.experiment.errors import GraphError, NodeError
 from der_planner.experiment.interrupts import interrupt_once
 from der_planner.experiment.options import Hardware, OptionError
@@ -101,7 +102,11 @@ def _arguments() -> argparse.Namespace:
     )
     parser.add_argument("--out", type=Path, default=Path("limb.yaml"), help="limb file to write")
     parser.add_argument("--report", type=Path, help="folder for report.txt and prediction.png")
-    given = parser.parse_args()
+    return _checked(parser, parser.parse_args())
+
+
+def _checked(parser: argparse.ArgumentParser, given: argparse.Namespace) -> argparse.Namespace:
+    """Return the arguments with their defaults; ends the program where they do not go together."""
     if given.csv and not given.columns:
         parser.error("--csv needs --columns FILE")
     for name in ("hardware", "folder"):
@@ -122,6 +127,7 @@ def main() -> int:
     """Run the command line: 0 when a limb file was written, 1 after an error, 2 for bad options."""
     given = _arguments()
     try:
+        _check_outputs(given)
         prior = Limb.from_yaml(given.prior) if given.prior else Limb.default()
         if given.excitation:
             run = _excitation(prior, prior.pneumatics.pressure_limit, given)
@@ -133,16 +139,27 @@ def main() -> int:
         limb, report = fit(prior, log, terms=terms, longest_gap=given.longest_gap)
         held_out = [_read(path, given) for path in given.held_out]
         _conclude(limb, report, log, held_out, given)
-    except OptionError as error:
+    except (OptionError, OutputError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except (LogError, LimbError, GraphError, NodeError) as error:
+    except (LogError, LimbError, GraphError, NodeError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as error:
         print(f"stopped by {error or 'SIGINT'}; no limb file was written", file=sys.stderr)
         return 130
     return 0
+
+
+def _check_outputs(given: argparse.Namespace) -> None:
+    """Refuse what cannot be written before anything is played or fitted."""
+    if given.excitation:
+        check_file(given.excitation, "--excitation")
+        return
+    check_file(given.out)
+    for name in ("folder", "report"):
+        if getattr(given, name):
+            check_folder(getattr(given, name), f"--{name}")
 
 
 def _excitation(prior: Limb, pressure_limit: float, given: argparse.Namespace) -> Excitation:

@@ -13,6 +13,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from der_planner.commands.outputs import OutputError, check_file, check_folder
 from der_planner.runs.evaluation import (
     BagError,
     EvaluationError,
@@ -55,7 +56,19 @@ def _arguments() -> argparse.Namespace:
         help="estimate a constant lag of each run and take it out before computing E",
     )
     parser.add_argument("--workers", type=int, default=0, help="processes (default: all cores)")
-    return parser.parse_args()
+    options = parser.parse_args()
+    if options.workers < 0:
+        parser.error(f"--workers is {options.workers}: give 1 or more, or 0 for all cores")
+    return options
+
+
+def _check_outputs(options: argparse.Namespace) -> None:
+    """Refuse what cannot be written before the bags are read."""
+    for name in ("report", "results"):
+        if getattr(options, name) is not None:
+            check_folder(getattr(options, name), f"--{name}")
+    if options.video is not None:
+        check_file(options.video, "--video")
 
 
 def expand(paths: list[Path]) -> list[Path]:
@@ -82,6 +95,11 @@ def _show_step(text: str) -> None:
 def main() -> int:
     """Run the command line; 0 when every bag was evaluated, 1 otherwise."""
     options = _arguments()
+    try:
+        _check_outputs(options)
+    except OutputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     settings = Settings(window=options.window, remove_lag=options.remove_lag)
     bags = expand(options.bags)
     found = evaluate_bags(bags, settings, workers=options.workers, progress=_show)

@@ -234,6 +234,13 @@ def _run(options: argparse.Namespace, stop: threading.Event) -> int:
             node.destroy_node()
             rclpy.try_shutdown()
     print(f"published {count} messages of {len(topics)} topics")
+    if count == 0 and not stop.is_set():
+        print(
+            "error: nothing was published: no message of the chosen topics lies between --from and "
+            "--to (seconds from the bag's first message)",
+            file=sys.stderr,
+        )
+        return 1
     if output.unanswered:
         print(f"error: {output.unanswered} messages got no answer", file=sys.stderr)
         return 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import platform
 import subprocess
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ def run(options: Options) -> None:
     if options.dry_run:
         _describe(options, trials, left, limb, progress)
         return
-    options.out.mkdir(parents=True, exist_ok=True)
+    _make_folder(options.out)
     progress.say(
         f"{len(left)} of {len(trials)} trials to play on {_stage(options)}, into {options.out}"
     )
@@ -45,6 +46,22 @@ def run(options: Options) -> None:
         ledger.record(trial, _play(trial, options, progress))
     kept = [(trial, ledger.finished(trial) or {}) for trial in trials]
     results.conclude(options, kept, progress)
+
+
+def _make_folder(path: Path) -> None:
+    """Make the folder of the experiment and see that files can be written there.
+
+    Raises:
+        OptionError: they cannot.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        raise OptionError(
+            f"cannot write into --out {path}: {error.strerror}; choose another folder"
+        ) from error
 
 
 def _check_limb(options: Options) -> Limb:
@@ -64,7 +81,6 @@ def _describe(
     options: Options, trials: list[Trial], left: list[Trial], limb: Limb, progress: Progress
 ) -> None:
     """Say what would be done."""
-    each = options.period * options.cycles
     progress.say(f"limb: {limb.name}, {limb.segment_count} segments, {limb.length:.3f} m")
     progress.say(f"stage: {_stage(options)}")
     if options.hardware is not None:
@@ -75,6 +91,10 @@ def _describe(
     for trial in trials:
         state = "to play" if trial in left else "done"
         progress.say(f"  {trial.name}  seed {trial.seed}  {state}")
+    if options.path is not None:
+        progress.say(f"{len(left)} trials along {options.path}; nothing was started")
+        return
+    each = options.period * options.cycles
     progress.say(f"{len(left)} trials of {each:.0f} s motion each; nothing was started")
 
 
@@ -91,6 +111,7 @@ def _play(trial: Trial, options: Options, progress: Progress) -> dict[str, Any]:
     played = GraphTrial(trial, options, limb, metadata, progress).play()
     return {
         "bag": str(played.bag.relative_to(options.out)),
+        "plan_id": played.plan_id,
         "cpu_percent": {name: round(value, 1) for name, value in played.cpu_percent.items()},
         "twin_real_time_factor": None
         if math.isnan(played.real_time_factor)
@@ -126,6 +147,7 @@ def _metadata(trial: Trial, options: Options, limb: Path | None) -> dict[str, An
         "amplitude_rad": options.amplitude,
         "period_s": options.period,
         "cycles": options.cycles,
+        **({"path": str(options.path)} if options.path is not None else {}),
         "limb": str(limb) if limb else "default",
         "stage": _stage(options),
         "commit": _commit(),

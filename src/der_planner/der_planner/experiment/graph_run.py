@@ -3,47 +3,31 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import tempfile
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Path as PathMessage
 
 from der_msgs.msg import MotionCommand, PressurePlan, PressureState
 from der_planner.experiment.client import GraphClient
 from der_planner.experiment.errors import GraphError, NodeError
+from der_planner.experiment.node_specs import STOP_ORDER, NodeSpec, node_specs
 from der_planner.experiment.options import Hardware, Options, Trial
 from der_planner.experiment.processes import NodeProcess
 from der_planner.experiment.progress import Progress
+from der_planner.planning import paths
 from limb_interfaces import qos, stamps, topics
 
 PLAN_TIMEOUT = 120.0
 VENTED_PRESSURE = 1000.0
 """Differential pressure below which a limb counts as vented [Pa]."""
-STOP_ORDER = (
-    "planner",
-    "apriltag_tracker",
-    "synthetic_camera",
-    "limb_twin",
-    "recorder",
-    "pressure_driver",
-    "board_emulator",
-)
-TWIN_NODES = ("board_emulator", "limb_twin", "synthetic_camera")
-"""Nodes that stand in for the hardware."""
-
-
-@dataclass(frozen=True)
-class NodeSpec:
-    """What is needed to start one node."""
-
-    package: str
-    executable: str
-    parameters: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -55,11 +39,13 @@ class Playing:
         length: from the first setpoint to the last [s].
         feed: called at least every 50 ms until the end; publishes what is due, if the orchestrator
             is the one who publishes.
+        plan_id: of the plan, if there is one.
     """
 
     begin: float
     length: float
     feed: Callable[[], None] = lambda: None
+    plan_id: str = ""
 
 
 @dataclass(frozen=True)
@@ -71,56 +57,14 @@ class GraphRun:
         cpu_percent: CPU use of each process while the motion played, in per cent of one core.
         real_time_factor: simulated over real seconds of the twin; NaN on hardware.
         duration: of the played motion [s].
+        plan_id: of the plan that was played; empty for pressures without a plan.
     """
 
     bag: Path
     cpu_percent: dict[str, float]
     real_time_factor: float
     duration: float
-
-
-def node_specs(
-    port: str,
-    bag: Path,
-    metadata: dict[str, Any],
-    *,
-    seed: int = 0,
-    hardware: Hardware | None = None,
-    planner: dict[str, Any] | None = None,
-    record_images: bool = False,
-) -> list[NodeSpec]:
-    """Return the nodes of a run in the order in which they start.
-
-    Args:
-        port: where the emulated board appears.
-        bag: folder that the recorder makes.
-        metadata: stored in the bag.
-        seed: of the twin.
-        hardware: in place of the twin.
-        planner: parameters of the planner; None for a graph without one.
-        record_images: whether the bag holds the raw images, too.
-    """
-    rig = hardware or Hardware()
-    driver = {"port": port, "protocol": "ezloop", **rig.driver}
-    recorder = {
-        "output": str(bag),
-        "metadata": json.dumps(metadata),
-        "record_images": record_images,
-        **rig.recorder,
-    }
-    specs = [
-        NodeSpec("pressure_driver", "board_emulator", {"port_link": port, "seed": seed}),
-        NodeSpec("pressure_driver", "pressure_driver", driver),
-        NodeSpec("der_planner", "limb_twin", {"seed": seed}),
-        NodeSpec("apriltag_tracker", "synthetic_camera", {"seed": seed}),
-        NodeSpec("apriltag_tracker", "apriltag_tracker", dict(rig.tracker)),
-    ]
-    if hardware is not None:
-        specs = [spec for spec in specs if spec.executable not in TWIN_NODES]
-    if planner is not None:
-        specs.append(NodeSpec("der_planner", "planner", {**planner, **rig.planner}))
-    specs.append(NodeSpec("der_planner", "recorder", recorder))
-    return specs
+    plan_id: str = ""
 
 
 class GraphPlayer(ABC):
@@ -207,7 +151,7 @@ class GraphPlayer(ABC):
         factor = client.diagnostic_values("limb_twin").get("real_time_factor", "nan")
         self._vent(client)
         client.call("recorder/stop", timeout=20.0)
-        return GraphRun(bag, cpu, float(factor), playing.length)
+        return GraphRun(bag, cpu, float(factor), playing.length, playing.plan_id)
 
     def _await_end(self, client: GraphClient, playing: Playing) -> None:
         length = playing.length
@@ -326,24 +270,58 @@ class GraphTrial(GraphPlayer):
             self._metadata,
             seed=self._trial.seed,
             hardware=self._hardware,
-            planner={"limb_file": str(self._limb) if self._limb else ""},
+            planner=self._planner_parameters(),
             record_images=self._options.record_images,
         )
+
+    def _planner_parameters(self) -> dict[str, Any]:
+        parameters: dict[str, Any] = {"limb_file": str(self._limb) if self._limb else ""}
+        if self._options.path is not None:
+            # A path names no model: it gets the planner's defaults.
+            parameters["default_model"] = self._trial.model
+            if self._trial.model == "der":
+                parameters["default_method"] = self._trial.method
+        return parameters
 
     def _join(self, client: GraphClient) -> None:
         super()._join(client)
         client.subscribe(PressurePlan, topics.PLAN, qos.LATCHED)
 
     def _begin(self, client: GraphClient) -> Playing:
-        publisher = client.node.create_publisher(MotionCommand, topics.COMMAND, qos.COMMANDS)
-        client.wait_for(publisher.get_subscription_count, 10.0, "the planner to listen")
-        publisher.publish(self._command())
+        drawn = self._options.path
+        kind, topic = (PathMessage, topics.PATH) if drawn else (MotionCommand, topics.COMMAND)
+        publisher = client.node.create_publisher(kind, topic, qos.COMMANDS)
+        # The recorder may listen, too.
+        client.wait_for(lambda: self._planner_listens(client, topic), 10.0, "the planner to listen")
+        client.newest.pop(topics.PLAN, None)
+        publisher.publish(self._path(drawn) if drawn else self._command())
         plan = client.wait_for(lambda: self._plan_or_refusal(client), PLAN_TIMEOUT, "the plan")
         self._progress.say(
             f"  planned in {plan.solve_time:.2f} s, "
             f"predicted error {plan.predicted_error * 100:.2f} cm"
         )
-        return Playing(stamps.seconds(plan.header.stamp), float(plan.time[-1]))
+        return Playing(
+            stamps.seconds(plan.header.stamp), float(plan.time[-1]), plan_id=plan.plan_id
+        )
+
+    def _planner_listens(self, client: GraphClient, topic: str) -> bool:
+        found = client.node.get_subscriptions_info_by_topic(client.node.resolve_topic_name(topic))
+        return any(info.node_name == "planner" for info in found)
+
+    def _path(self, file: Path) -> PathMessage:
+        """Return the path in a file; stamps are relative, all zero for a path without times."""
+        time, tip = paths.read_csv(file)
+        message = PathMessage()
+        message.header.frame_id = topics.BASE_FRAME
+        for index, (x, y) in enumerate(tip):
+            pose = PoseStamped()
+            pose.header.frame_id = topics.BASE_FRAME
+            if time is not None:
+                since = round((float(time[index]) - float(time[0])) * stamps.NANOSECONDS)
+                pose.header.stamp = stamps.stamp_from_nanoseconds(since)
+            pose.pose.position.x, pose.pose.position.y = float(x), float(y)
+            message.poses.append(pose)
+        return message
 
     def _command(self) -> MotionCommand:
         return MotionCommand(
@@ -358,7 +336,8 @@ class GraphTrial(GraphPlayer):
 
     def _plan_or_refusal(self, client: GraphClient) -> PressurePlan | None:
         plan = client.newest.get(topics.PLAN)
-        if plan is not None and plan.plan_id == self._trial.name:
+        named = self._options.path is None
+        if plan is not None and (plan.plan_id == self._trial.name or not named):
             return plan
         said = client.diagnostic_values("planner")
         if said.get("state") == "refused":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from pathlib import Path
 from typing import Any
 
 from der_planner.experiment.options import OptionError, Options, Trial
@@ -33,7 +34,7 @@ class Ledger:
         kept = json.loads(path.read_text())
         wanted = {**self._settings, "seed": trial.seed}
         for key, value in wanted.items():
-            if kept["settings"].get(key) != value:
+            if kept["settings"].get(key, "") != value:
                 raise OptionError(
                     f"{path.parent.parent} holds {trial.name} with {key} = "
                     f"{kept['settings'].get(key)}, not {value}: choose another --out"
@@ -51,13 +52,17 @@ class Ledger:
 
 
 def _settings(options: Options) -> dict[str, Any]:
-    limb = options.limb.read_bytes() if options.limb is not None else b""
     return {
         "amplitude": options.amplitude,
         "period": options.period,
         "cycles": options.cycles,
-        "limb_sha256": hashlib.sha256(limb).hexdigest() if limb else "",
+        "limb_sha256": _digest(options.limb),
+        "path_sha256": _digest(options.path),
         "calibrate": options.calibrate,
         "offline": options.offline,
         "hardware": options.hardware.driver.get("port") if options.hardware else "",
     }
+
+
+def _digest(path: Path | None) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path is not None else ""

@@ -11,7 +11,7 @@ import numpy as np
 from der_planner.experiment.errors import GraphError
 from der_planner.experiment.options import Options, Trial
 from der_planner.limb import Limb
-from der_planner.planning import Motion, PlanningError, plan
+from der_planner.planning import PlanningError, plan
 from der_planner.runs.evaluation import Description, RunSeries
 from der_planner.twin.offline import play
 
@@ -26,12 +26,7 @@ def play_offline(
     """
     robot = Limb.from_yaml(limb) if limb is not None else Limb.default()
     try:
-        motion = Motion.named(
-            trial.motion,
-            amplitude=options.amplitude,
-            period=options.period,
-            cycles=options.cycles,
-        )
+        motion = options.motion(trial.motion)
         planned = plan(robot, motion, model=trial.model, method=trial.method)
     except PlanningError as error:
         raise GraphError(f"the planner refused: {error}") from error

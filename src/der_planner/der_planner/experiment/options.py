@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import re
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -12,10 +13,19 @@ from typing import Any
 
 import yaml
 
-MOTIONS = ("asynchronous", "same_direction", "opposite_direction")
-MODELS = ("der", "pcc")
-METHODS = ("paper", "projected", "optimal")
-DEFAULT_AMPLITUDE = 0.7853981633974483
+from der_planner.planning import METHODS as METHODS_BY_MODEL
+from der_planner.planning import Motion, PlanningError
+from der_planner.planning.motions import (
+    DEFAULT_AMPLITUDE,
+    DEFAULT_CYCLES,
+    DEFAULT_PERIOD,
+    JOINT_MOTIONS,
+)
+from der_planner.planning.motions import NAMES as MOTIONS
+
+MODELS = tuple(METHODS_BY_MODEL)
+METHODS = METHODS_BY_MODEL["der"]
+DEFAULT_MOTIONS = ("same_direction",)
 
 
 class OptionError(ValueError):
@@ -27,7 +37,8 @@ class Trial:
     """One run of one motion under one model.
 
     Attributes:
-        motion, model, method: names, see MOTIONS, MODELS, METHODS.
+        motion: one of MOTIONS, or the name of the file of a path.
+        model, method: names, see MODELS, METHODS.
         number: of the trial, from 1.
         seed: of the twin; the same for every motion and model of a trial.
     """
@@ -111,6 +122,17 @@ class Options:
     dry_run: bool
     record_images: bool
     report: bool
+    path: Path | None = None
+
+    def motion(self, name: str) -> Motion:
+        """Return the motion of a trial.
+
+        Raises:
+            PlanningError: the path's file has changed and cannot be read any more.
+        """
+        if self.path is not None:
+            return Motion.from_csv(self.path)
+        return Motion.named(name, amplitude=self.amplitude, period=self.period, cycles=self.cycles)
 
     def plan_of_trials(self) -> list[Trial]:
         """Return every trial in the order in which they are played."""
@@ -136,13 +158,26 @@ def parser() -> argparse.ArgumentParser:
         epilog="Without options: Case 2 (same_direction), DER and PCC, one trial each, on the twin",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
-    what = result.add_argument_group("what is played")
+    _add_motions(result.add_argument_group("what is played"))
+    _add_stage(result.add_argument_group("on what"))
+    _add_manner(result.add_argument_group("how"))
+    return result
+
+
+def _add_motions(what: argparse._ArgumentGroup) -> None:
     what.add_argument(
         "--motions",
         nargs="+",
-        default=["same_direction"],
         metavar="MOTION",
-        help=f"of {', '.join(MOTIONS)}; or all",
+        help=f"of {', '.join(MOTIONS)}; all: the first three, which are the paper's (default: "
+        f"{' '.join(DEFAULT_MOTIONS)})",
+    )
+    what.add_argument(
+        "--path",
+        type=Path,
+        metavar="FILE.csv",
+        help="draw this path with the tip, in place of --motions: columns x, y and, if timed, "
+        "time, with units as in 'time [s], x [cm], y [cm]' (default units: s and m)",
     )
     what.add_argument(
         "--models", nargs="+", default=list(MODELS), metavar="MODEL", help=f"of {', '.join(MODELS)}"
@@ -154,9 +189,11 @@ def parser() -> argparse.ArgumentParser:
     what.add_argument(
         "--amplitude", type=float, default=DEFAULT_AMPLITUDE, help="largest bend of a segment [rad]"
     )
-    what.add_argument("--period", type=float, default=20.0, help="of one cycle [s]")
-    what.add_argument("--cycles", type=int, default=2, help="cycles of the motion")
-    where = result.add_argument_group("on what")
+    what.add_argument("--period", type=float, default=DEFAULT_PERIOD, help="of one cycle [s]")
+    what.add_argument("--cycles", type=int, default=DEFAULT_CYCLES, help="cycles of the motion")
+
+
+def _add_stage(where: argparse._ArgumentGroup) -> None:
     where.add_argument(
         "--limb",
         type=Path,
@@ -180,7 +217,9 @@ def parser() -> argparse.ArgumentParser:
         metavar="FILE",
         help="a real valve board and camera instead of the twin",
     )
-    how = result.add_argument_group("how")
+
+
+def _add_manner(how: argparse._ArgumentGroup) -> None:
     how.add_argument(
         "--offline", action="store_true", help="without ROS, in one process, faster than real time"
     )
@@ -194,7 +233,6 @@ def parser() -> argparse.ArgumentParser:
     how.add_argument("--record-images", action="store_true", help="raw images into the bags, too")
     how.add_argument("--no-report", action="store_true", help="skip the HTML report at the end")
     how.add_argument("--dry-run", action="store_true", help="say what would be done, start nothing")
-    return result
 
 
 def parse(arguments: Sequence[str]) -> Options:
@@ -205,9 +243,10 @@ def parse(arguments: Sequence[str]) -> Options:
         SystemExit: after --help, or when argparse itself refuses.
     """
     given = parser().parse_args(arguments)
-    motions = MOTIONS if given.motions == ["all"] else tuple(dict.fromkeys(given.motions))
+    motions = _motions(given)
     models = tuple(dict.fromkeys(given.models))
-    _check_names("motion", motions, (*MOTIONS, "all"))
+    if given.path is None:
+        _check_names("motion", motions, (*MOTIONS, "all"))
     _check_names("model", models, MODELS)
     _check_names("method", (given.method,), METHODS)
     for name, least, most in (
@@ -231,9 +270,10 @@ def parse(arguments: Sequence[str]) -> Options:
         models=models,
         method=given.method,
         trials=given.trials,
-        amplitude=given.amplitude,
-        period=given.period,
-        cycles=given.cycles,
+        # A path has neither: the plan says so in the same way.
+        amplitude=given.amplitude if given.path is None else 0.0,
+        period=given.period if given.path is None else 0.0,
+        cycles=given.cycles if given.path is None else 1,
         limb=limb,
         calibrate=limb is None and not given.no_calibration,
         seed=given.seed,
@@ -243,7 +283,26 @@ def parse(arguments: Sequence[str]) -> Options:
         dry_run=given.dry_run,
         record_images=given.record_images,
         report=not given.no_report,
+        path=given.path.resolve() if given.path is not None else None,
     )
+
+
+def _motions(given: argparse.Namespace) -> tuple[str, ...]:
+    """Return the names of the motions; of a path, the name of its file.
+
+    Raises:
+        OptionError: the path cannot be read, or motions are asked for beside it.
+    """
+    if given.path is None:
+        named = given.motions or DEFAULT_MOTIONS
+        return JOINT_MOTIONS if list(named) == ["all"] else tuple(dict.fromkeys(named))
+    if given.motions:
+        raise OptionError("--path is drawn in place of --motions: give one of the two")
+    try:
+        Motion.from_csv(given.path)
+    except PlanningError as error:
+        raise OptionError(f"--path: {error}") from error
+    return (re.sub(r"[^A-Za-z0-9-]+", "_", given.path.stem).strip("_") or "path",)
 
 
 def _timestamped() -> Path:

@@ -67,7 +67,7 @@ def _load(folder: Path, trial: Trial, entry: dict[str, Any]) -> RunSeries:
     try:
         if "bag" in entry:
             # The bag may hold other limbs of the same ROS domain: the plan's id names ours.
-            return load_run(folder / place, plan_id=trial.name)
+            return load_run(folder / place, plan_id=entry.get("plan_id", trial.name))
         return load_arrays(folder / place)
     except (BagError, EvaluationError, OSError, json.JSONDecodeError) as error:
         raise GraphError(

@@ -19,6 +19,10 @@ Array = NDArray[np.float64]
 PRESSURE_UNITS = {"Pa": 1.0, "hPa": 100.0, "kPa": 1000.0, "psi": 6894.757}
 ANGLE_UNITS = {"rad": 1.0, "deg": np.pi / 180.0}
 LENGTH_UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
+REST_SHARE = 0.02
+"""Commands below this share of the log's largest one count as rest."""
+VENTING_TIME = 5.0
+"""Time [s] that chambers need to be at rest after they were filled."""
 
 
 @dataclass(frozen=True)
@@ -34,8 +38,9 @@ class ColumnMap:
         tags: columns that repeat their last value, all of them, when a tag is lost; empty: never.
         pressure_unit, angle_unit, length_unit: see `PRESSURE_UNITS`, `ANGLE_UNITS`, `LENGTH_UNITS`.
         angle_factor: bend angle per listed angle: 2 for chord angles, −1 for the other sign.
-        rest_until: rows before this time [s] with zero commands give the sensors' offsets and are
-            the zero of the pressures; 0 keeps them as they are.
+        rest_until: rows at rest before this time [s] give the sensors' offsets and are the zero of
+            the pressures; a log that does not rest then, and every log with the word ``auto``, has
+            its longest rest looked for; 0 keeps the pressures as they are.
         ignore: (first, last) [s] stretches to leave out.
     """
 
@@ -49,7 +54,7 @@ class ColumnMap:
     angle_unit: str = "rad"
     length_unit: str = "m"
     angle_factor: float = 1.0
-    rest_until: float = 0.0
+    rest_until: float | str = 0.0
     ignore: tuple[tuple[float, float], ...] = ()
 
     @classmethod
@@ -115,11 +120,13 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
     angles = pick(columns.angles)
     tip = pick(columns.tip) if columns.tip else np.full((len(time), 2), np.nan)
     measured = chambers[:, 0::2] - chambers[:, 1::2]
-    if columns.rest_until > 0:
-        rest = (time < columns.rest_until) & np.all(command == 0, axis=1)
+    if columns.rest_until != 0:
+        rest = _rest(time, command, columns.rest_until)
         if not rest.any():
             raise LogError(
-                f"{path} has no row at rest before {columns.rest_until} s: see rest_until"
+                f"{path} has no row at rest: its commands never come within "
+                f"{100 * REST_SHARE:.0f} % of their largest to zero. Leave rest_until out of the "
+                "column map if the chambers' sensors have no offset"
             )
         measured = measured - np.nanmean(measured[rest], axis=0)
     if columns.tags:
@@ -137,6 +144,42 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
         tip=length * tip[keep],
         source=Path(path).name,
     )
+
+
+def _rest(time: Array, command: Array, rest_until: float | str) -> NDArray[np.bool_]:
+    """Return which rows are at rest.
+
+    A board's command seldom rests at exactly zero: what counts is its share of the largest one.
+
+    Args:
+        time: (K,) [s].
+        command: (K, M) in any unit.
+        rest_until: [s], or ``auto``.
+
+    Raises:
+        LogError: it is neither.
+    """
+    if isinstance(rest_until, str) and rest_until != "auto":
+        raise LogError(f"rest_until is '{rest_until}': give a time in s, or auto")
+    size = np.abs(command).max(axis=1)
+    near: NDArray[np.bool_] = size <= REST_SHARE * np.nanmax(size)
+    if not isinstance(rest_until, str):
+        early: NDArray[np.bool_] = near & (time < rest_until)
+        if early.any():
+            return early
+    edges = np.flatnonzero(np.diff(near.astype(int), prepend=0, append=0))
+    rest = np.zeros(len(time), dtype=bool)
+    stretches = [
+        # Chambers that were filled before need a while to be at rest.
+        np.flatnonzero(time[first:end] >= (time[first] + VENTING_TIME if first else -np.inf))
+        + first
+        for first, end in edges.reshape(-1, 2)
+    ]
+    if stretches:
+        rest[max(stretches, key=lambda rows: float(np.ptp(time[rows])) if len(rows) else -1.0)] = (
+            True
+        )
+    return rest
 
 
 def _unit(name: str, known: Mapping[str, float], key: str) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,9 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import PchipInterpolator, make_interp_spline
 
+from der_planner.model.series import interpolate
 from der_planner.planning.errors import PlanningError
 
-Vector = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 LONGEST = 3600.0
 _SOFTNESS = 0.2
@@ -43,8 +45,8 @@ class TipPath:
         exact: take straight lines between the points (polygons) instead of a smooth curve.
     """
 
-    time: Vector
-    tip: Vector
+    time: Array
+    tip: Array
     exact: bool = False
 
     @classmethod
@@ -92,17 +94,17 @@ class TipPath:
         """From the first to the last point [s]."""
         return float(self.time[-1])
 
-    def resample(self, step: float) -> tuple[Vector, Vector]:
+    def resample(self, step: float) -> tuple[Array, Array]:
         """Return instants about ``step`` apart and the points (K, 2) there."""
         instants = np.linspace(0.0, self.duration, max(8, round(self.duration / step) + 1))
         if self.exact or len(self.time) < 4:
-            points = np.column_stack([np.interp(instants, self.time, axis) for axis in self.tip.T])
+            points = interpolate(instants, self.time, self.tip)
         else:
             points = make_interp_spline(self.time, self.tip, k=3)(instants)
         return instants, points
 
 
-def time_path(points: Vector, limits: PathLimits) -> TipPath:
+def time_path(points: Array, limits: PathLimits) -> TipPath:
     """Time a path: rest at both ends, no faster than the limits along and across it.
 
     The curve is a spline over its chord length; the speed profile is the largest that keeps the
@@ -151,7 +153,7 @@ def time_path(points: Vector, limits: PathLimits) -> TipPath:
     return TipPath(instants, spline(along))
 
 
-def polygon(corners: Vector, period: float) -> TipPath:
+def polygon(corners: Array, period: float) -> TipPath:
     """Return the timed path along straight lines that rests at every corner.
 
     Each side takes a share of the period in proportion to its length, with a quintic from rest to
@@ -170,37 +172,41 @@ def polygon(corners: Vector, period: float) -> TipPath:
     return TipPath(np.concatenate(times), np.concatenate(points), exact=True)
 
 
-def _smoothed(values: Vector, window: int) -> Vector:
+def _smoothed(values: Array, window: int) -> Array:
     """Return a running mean over 2 window + 1 samples, longer by as much: from rest to rest."""
     width = 2 * window + 1
     padded = np.concatenate([np.full(width - 1, values[0]), values, np.full(width - 1, values[-1])])
     total = np.concatenate([[0.0], np.cumsum(padded)])
-    mean: Vector = (total[width:] - total[:-width]) / width
+    mean: Array = (total[width:] - total[:-width]) / width
     return mean
 
 
-def read_csv(path: str | Path) -> tuple[Vector | None, Vector]:
-    """Read a tip path: a header with x and y [m], and time [s] if the path is timed.
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "s": 1.0, "ms": 0.001}
+_HEADER = re.compile(r"(time|t|x|y)\s*(?:[\[(_/ ]\s*(\w+)\s*[\])]?)?")
+
+
+def read_csv(path: str | Path) -> tuple[Array | None, Array]:
+    """Read a tip path: columns x and y, and time if the path is timed.
+
+    The first line names the columns, with a unit where it is not m or s: ``x [cm]``, ``x_mm``.
+
+    Returns:
+        Times (P,) [s], None for a path without; points (P, 2) in `limb_base` [m].
 
     Raises:
-        PlanningError: no such file, no such column, not a number; the message names line and
-            column.
+        PlanningError: no such file, no such column or unit, not a number; the message names the
+            line and the column.
     """
     try:
-        with Path(path).open(newline="") as stream:
-            reader = csv.DictReader(stream, skipinitialspace=True)
-            columns = [name.strip().lower() for name in reader.fieldnames or []]
-            missing = [name for name in ("x", "y") if name not in columns]
-            if missing:
-                raise PlanningError(
-                    f"{path} has no column '{missing[0]}': the first line must name x, y "
-                    f"and, for a timed path, time; it names {columns or 'nothing'}"
-                )
+        with Path(path).open(newline="", encoding="utf-8-sig") as stream:
+            reader = csv.reader(stream, skipinitialspace=True)
+            columns = _columns(next(reader, []), path)
             wanted = ["time", "x", "y"] if "time" in columns else ["x", "y"]
-            rows = []
-            for row in reader:
-                named = {(key or "").strip().lower(): value for key, value in row.items()}
-                rows.append([_number(named[name], name, path, reader.line_num) for name in wanted])
+            rows = [
+                [_number(row, *columns[name], name, path, reader.line_num) for name in wanted]
+                for row in reader
+                if any(cell.strip() for cell in row)
+            ]
     except OSError as error:
         raise PlanningError(f"cannot read tip path {path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -209,10 +215,43 @@ def read_csv(path: str | Path) -> tuple[Vector | None, Vector]:
     return (table[:, 0] if len(wanted) == 3 else None), table[:, -2:]
 
 
-def _number(text: object, column: str, path: str | Path, line: int) -> float:
-    try:
-        return float(str(text))
-    except ValueError:
+def _columns(header: list[str], path: str | Path) -> dict[str, tuple[int, float]]:
+    """Return place and factor to SI of each column that the first line of a file names."""
+    found: dict[str, tuple[int, float]] = {}
+    for place, text in enumerate(header):
+        match = _HEADER.fullmatch(text.strip().lower())
+        if match is None:
+            continue
+        name = "time" if match[1] == "t" else match[1]
+        known = ("s", "ms") if name == "time" else ("m", "cm", "mm")
+        unit = match[2] or known[0]
+        if unit not in known:
+            raise PlanningError(
+                f"{path}, line 1: column '{text.strip()}' has the unit {unit}: use "
+                f"{', '.join(known)}, as in '{name} [{known[-1]}]'"
+            )
+        found[name] = (place, UNITS[unit])
+    missing = [name for name in ("x", "y") if name not in found]
+    if missing:
         raise PlanningError(
-            f"{path}, line {line}: column '{column}' is not a number: {text!r}"
-        ) from None
+            f"{path} has no column '{missing[0]}': the first line must name x, y "
+            f"and, for a timed path, time, as in 'time [s], x [m], y [m]'; it names "
+            f"{[text.strip() for text in header] or 'nothing'}"
+        )
+    return found
+
+
+def _number(
+    row: list[str], place: int, factor: float, column: str, path: str | Path, line: int
+) -> float:
+    text = row[place] if place < len(row) else ""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise PlanningError(
+            f"{path}, line {line}: column '{column}' is not a number: {text!r}; correct or "
+            "remove the line"
+        )
+    return value * factor

@@ -362,8 +362,10 @@ def _board(limb: LimbRecord, setpoints: _Setpoints, origin: int) -> BoardLog | N
 def _describe(plan: Any, record: BagRecord, namespace: str) -> Description:
     known = {"motion", "model", "method", "trial", "seed", "limb"}
     run = record.run
+    # A plan along a path is named "path"; the recorder was told which one.
+    drawn = plan.motion in ("", "path")
     return Description(
-        motion=plan.motion or run.get("motion", ""),
+        motion=(run.get("motion") if drawn else "") or plan.motion,
         model=plan.model or run.get("model", ""),
         method=plan.method or run.get("method", ""),
         trial=int(run.get("trial", -1)),

@@ -15,6 +15,8 @@ from pressure_driver.emulator.tap import LineTap
 
 BITS_PER_BYTE = 10
 """Start bit, eight data bits, stop bit."""
+LONGEST_READ = 5_000_000
+"""[ns] between a wake and the end of its read, above which the bytes are of unknown age."""
 
 
 class EmulatedPort:
@@ -125,7 +127,11 @@ class EmulatedPort:
             self.host_present = False
             self._outgoing.clear()
             return False
-        arrival = now if announced or clock is None else clock()
+        arrival = now
+        if clock is not None:
+            after = clock()
+            # If this thread was kept waiting since, bytes may have come after the announced ones.
+            arrival = now if announced and after - now < LONGEST_READ else after
         first = max(arrival, self._line_free)
         self._line_free = first + len(data) * self._byte_time
         self._incoming.append((self._line_free, first, data))

@@ -104,7 +104,7 @@ class HostProtocol(ABC):
         self.unsettled = ""
         """Why no pressure may be commanded yet, though the board talks; empty if it may."""
 
-    def doubt(self) -> None:
+    def doubt(self) -> None:  # noqa: B027 - most boards have no settings
         """Trust no setting of the board any more, as after it has been silent."""
 
     @abstractmethod

@@ -68,7 +68,7 @@ class CtrlpHost(LineHost):
     def __init__(self, chamber_count: int = 4) -> None:
         super().__init__(chamber_count)
         self.unsettled = _UNITS_UNKNOWN
-        self._times: deque[int] = deque(maxlen=3)
+        self._times: deque[int] = deque(maxlen=4)
 
     def doubt(self) -> None:
         """Have the units confirmed again before the next setpoint."""
@@ -119,14 +119,14 @@ class CtrlpHost(LineHost):
         return events
 
     def _clock_went_back(self) -> bool:
-        """Tell whether the last two reports are older than the one before.
+        """Tell whether the last two reports are older than each of the two before.
 
-        Two, since one may be a damaged number: nothing protects the digits.
+        Two and two, since one may be a damaged number: nothing protects the digits.
         """
-        if len(self._times) < 3:
+        if len(self._times) < 4:
             return False
-        before, second, last = self._times
-        return second <= last < before
+        first, second, third, last = self._times
+        return third <= last < min(first, second)
 
     def _parse(self, line: str) -> Event | None:
         if line.startswith("_"):

@@ -36,11 +36,10 @@ from pressure_driver.protocols.lines import LineHost
 PASCAL_PER_HECTOPASCAL = 100.0
 LARGEST_WIRE_VALUE = 1250.0
 """[hPa] The board ignores a command that has more."""
-PLAUSIBLE_PRESSURE = (300.0, 4000.0)
-"""[hPa] A chamber or reservoir reading outside is a damaged line."""
 
 _WORD = re.compile(r"[A-Za-z]{3}")
-_NUMBER = re.compile(r"-?\d{1,6}(?:\.\d{1,6})?")
+_NUMBER = re.compile(r"-?\d{1,6}(?:\.\d{1,6})?|-?nan|-?inf", re.IGNORECASE)
+"""A plain decimal, or what firmware prints for a sensor that is broken: the driver judges that."""
 
 
 def _numbers(text: str, separator: str | None) -> list[float] | None:
@@ -106,10 +105,11 @@ class EzloopHost(LineHost):
             return None if damaged else self._take_text(line)
         values = _numbers(rest.strip(), None)
         expected = 1 if tag == "[RPR]" else self.chamber_count
-        low, high = (0.0, 1.0) if tag == "[VAL]" else PLAUSIBLE_PRESSURE
-        if values is None or len(values) != expected or not all(low <= v <= high for v in values):
+        if values is None or len(values) != expected:
             return None
         if tag == "[VAL]":
+            if not all(0.0 <= value <= 1.0 for value in values):
+                return None
             return Telemetry(valve_opening=tuple(values))
         self._reporting = True
         pascals = tuple(value * PASCAL_PER_HECTOPASCAL for value in values)
@@ -176,7 +176,7 @@ class EzloopBoard(BoardProtocol):
         values = _numbers(body, ",")
         if values is None or len(values) != self.chamber_count:
             return None
-        if any(value > LARGEST_WIRE_VALUE for value in values):
+        if not all(math.isfinite(value) and value <= LARGEST_WIRE_VALUE for value in values):
             return None
         pressure = tuple(value * PASCAL_PER_HECTOPASCAL for value in values)
         return BoardCommand("setpoint", self._start, pressure=pressure)

@@ -2,25 +2,13 @@
 
 from __future__ import annotations
 
+import binascii
+
 from pressure_driver.protocols.pieces import StreamCutter
 
-POLYNOMIAL = 0x1021
 INITIAL = 0xFFFF
 FULL_BLOCK = 254
 """Bytes without a zero that one length byte can announce; a full block implies no zero."""
-
-
-def _table() -> tuple[int, ...]:
-    entries = []
-    for byte in range(256):
-        value = byte << 8
-        for _ in range(8):
-            value = (value << 1) ^ (POLYNOMIAL if value & 0x8000 else 0)
-        entries.append(value & 0xFFFF)
-    return tuple(entries)
-
-
-_TABLE = _table()
 
 
 def crc16(data: bytes) -> int:
@@ -28,10 +16,7 @@ def crc16(data: bytes) -> int:
 
     Check value: ``crc16(b"123456789") == 0x29B1``.
     """
-    value = INITIAL
-    for byte in data:
-        value = (value << 8 & 0xFFFF) ^ _TABLE[value >> 8 ^ byte]
-    return value
+    return binascii.crc_hqx(data, INITIAL)
 
 
 def stuff(data: bytes) -> bytes:

@@ -272,6 +272,6 @@ def parse_run(custom_data: dict[str, str]) -> dict[str, Any]:
     """Return the run's description (the recorder's parameter ``metadata``); empty if none."""
     try:
         value = json.loads(custom_data.get(RUN_KEY, "") or "{}")
-    except json.JSONDecodeError:
+    except (json.JSONDecodeError, TypeError):  # no JSON, or no text at all
         return {}
     return value if isinstance(value, dict) else {}

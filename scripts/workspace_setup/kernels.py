@@ -1,0 +1,56 @@
+"""Compile the kernels of planner, twin, camera and tracker, so that no node starts cold.
+
+Called once by the set-up, through scripts/compile_kernels.py. A kernel that is changed later is
+compiled again by what uses it first. Unlike the rest of this folder it needs the workspace.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from apriltag_tracker.pipeline import LimbTracker
+from apriltag_tracker.synthetic.camera import CameraModel, SyntheticCamera
+from apriltag_tracker.synthetic.shapes import constant_curvature
+from apriltag_tracker.tag_map import TagMap
+from der_planner.limb import Limb
+from der_planner.planning import METHODS, Motion, plan
+from der_planner.twin.offline import play
+from workspace_setup.basics import ROOT
+
+CONFIG = ROOT / "src" / "apriltag_tracker" / "config"
+
+
+def _track() -> None:
+    tags = TagMap.from_yaml(CONFIG / "tags.yaml")
+    model = CameraModel.from_yaml(CONFIG / "synthetic_camera.yaml")
+    straight = constant_curvature(tags.segment_lengths, [0.0] * len(tags.segment_lengths))
+    picture = SyntheticCamera(model, tags).frame(straight).image
+    tracker = LimbTracker(tags, model.intrinsics)
+    # The first image is searched in full, the next by regions.
+    for stamp in (0.0, 0.03):
+        tracker.observe(picture, stamp)
+
+
+def main() -> int:
+    """Use every kernel once and say how long each part took."""
+    limb = Limb.default()
+    # A calibrated limb's chambers are vented slowly: that takes kernels of its own.
+    limb = replace(limb, pneumatics=replace(limb.pneumatics, vent_rate=5000.0))
+    quick = Motion.named("asynchronous", amplitude=0.1, period=2.0, cycles=1)
+    parts = {
+        f"planner {model} {method}": lambda model=model, method=method: plan(
+            limb, quick, model, method
+        )
+        for model, methods in METHODS.items()
+        for method in methods
+    }
+    parts["twin"] = lambda: play(np.array([0.0, 0.05]), np.zeros((2, 2)))
+    parts["camera and tracker"] = _track
+    for name, use in parts.items():
+        begin = time.monotonic()
+        use()
+        print(f"{name}: {time.monotonic() - begin:.1f} s", flush=True)
+    return 0

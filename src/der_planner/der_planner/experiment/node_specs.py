@@ -1,0 +1,75 @@
+"""Which nodes a run consists of, with which parameters, and in which order they stop."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from der_planner.experiment.options import Hardware
+
+STOP_ORDER = (
+    "planner",
+    "apriltag_tracker",
+    "synthetic_camera",
+    "limb_twin",
+    "recorder",
+    "pressure_driver",
+    "board_emulator",
+)
+TWIN_NODES = ("board_emulator", "limb_twin", "synthetic_camera")
+"""Nodes that stand in for the hardware."""
+
+
+@dataclass(frozen=True)
+class NodeSpec:
+    """What is needed to start one node."""
+
+    package: str
+    executable: str
+    parameters: dict[str, Any] = field(default_factory=dict)
+
+
+def node_specs(
+    port: str,
+    bag: Path,
+    metadata: dict[str, Any],
+    *,
+    seed: int = 0,
+    hardware: Hardware | None = None,
+    planner: dict[str, Any] | None = None,
+    record_images: bool = False,
+) -> list[NodeSpec]:
+    """Return the nodes of a run in the order in which they start.
+
+    Args:
+        port: where the emulated board appears.
+        bag: folder that the recorder makes.
+        metadata: stored in the bag.
+        seed: of the twin.
+        hardware: in place of the twin.
+        planner: parameters of the planner; None for a graph without one.
+        record_images: whether the bag holds the raw images, too.
+    """
+    rig = hardware or Hardware()
+    driver = {"port": port, "protocol": "ezloop", **rig.driver}
+    recorder = {
+        "output": str(bag),
+        "metadata": json.dumps(metadata),
+        "record_images": record_images,
+        **rig.recorder,
+    }
+    specs = [
+        NodeSpec("pressure_driver", "board_emulator", {"port_link": port, "seed": seed}),
+        NodeSpec("pressure_driver", "pressure_driver", driver),
+        NodeSpec("der_planner", "limb_twin", {"seed": seed}),
+        NodeSpec("apriltag_tracker", "synthetic_camera", {"seed": seed}),
+        NodeSpec("apriltag_tracker", "apriltag_tracker", dict(rig.tracker)),
+    ]
+    if hardware is not None:
+        specs = [spec for spec in specs if spec.executable not in TWIN_NODES]
+    if planner is not None:
+        specs.append(NodeSpec("der_planner", "planner", {**planner, **rig.planner}))
+    specs.append(NodeSpec("der_planner", "recorder", recorder))
+    return specs

@@ -1,0 +1,118 @@
+"""The rod's bend angles along the pressures of a log, and their derivatives by every unknown.
+
+Friction and creep act along the bend at rest that the pressures give, never along the measured one.
+So a fit minimises the same open-loop error with which the limb is predicted afterwards; with the
+measured bend inside the model, an error of friction would partly cancel itself in the residual.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from der_planner.identification.parameters import TERMS, column, put, to_limb
+from der_planner.limb import Limb
+from der_planner.model.material import slow_effective_pressure
+from der_planner.model.response import Response, RodModel, simulate
+
+Array = NDArray[np.float64]
+
+NODES = 13
+"""Of the rod in a fit: its statics do not depend on it, its first two frequencies by 2 %."""
+SUBSTEPS = 1
+"""Integrator steps of 50 ms: see the convergence on the page of the identification."""
+_NUDGE = 1e-3
+"""Of an unknown in its scale, for the slope of the effective pressure."""
+
+
+class RodAngles:
+    """Predicts bend angles open loop along measured pressures.
+
+    Args:
+        prior: geometry, masses and everything that is not an unknown.
+        time: (K,) regular [s].
+        pressure: (K, M) measured differential pressures [Pa], without gaps.
+        nodes: of the rod.
+    """
+
+    def __init__(self, prior: Limb, time: Array, pressure: Array, nodes: int = NODES) -> None:
+        self._prior, self._time, self._nodes = prior, time, nodes
+        self._pressure = pressure
+        self._period = float(time[1] - time[0])
+
+    def angles(self, values: Array) -> Array:
+        """Return predicted bend angles (K, M) [rad] for the unknowns (M, T)."""
+        return self._simulate(RodModel(to_limb(self._prior, values), self._nodes)).bend_angles
+
+    def derivatives(self, values: Array, wanted: list[tuple[int, int]]) -> tuple[Array, Array]:
+        """Return angles (K, M) and their derivatives (K, M, P) by P unknowns.
+
+        Args:
+            values: (M, T) unknowns.
+            wanted: (segment, term) of each of the P unknowns.
+
+        What acts as a pressure goes through the rod's exact tangent; stiffness and damping, which
+        change the rod itself, are differences of two simulations.
+        """
+        model = RodModel(to_limb(self._prior, values), self._nodes)
+        response = self._simulate(model, linearise=True)
+        angles, effective = response.bend_angles, self.effective(values)
+        assert response.derivative is not None
+        result = np.empty((*angles.shape, len(wanted)))
+        for place, (segment, term) in enumerate(wanted):
+            if TERMS[term].group == "dynamics":
+                result[:, :, place] = self._difference(values, segment, term, angles)
+                continue
+            change = self._pressure_change(values, segment, term)
+            change[:, segment] += self._moment_change(
+                values[segment], term, effective[:, segment], angles[:, segment]
+            )
+            result[:, :, place] = response.derivative.by_effective(change)[1]
+        return angles, result
+
+    def effective(self, values: Array) -> Array:
+        """Return the effective pressures (K, M) [Pa] of the unknowns (M, T)."""
+        limb = to_limb(self._prior, values)
+        return slow_effective_pressure(limb, self._time, self._pressure)
+
+    def _simulate(self, model: RodModel, linearise: bool = False) -> Response:
+        return simulate(
+            model, self._time, pressures=self._pressure, steps=SUBSTEPS, linearise=linearise
+        )
+
+    def _difference(self, values: Array, segment: int, term: int, angles: Array) -> Array:
+        step = TERMS[term].step
+        moved = values.copy()
+        put(moved, segment, term, float(values[segment, term]) + step)
+        changed: Array = (self.angles(moved) - angles) / step
+        return changed
+
+    def _pressure_change(self, values: Array, segment: int, term: int) -> Array:
+        """Return ∂(effective pressures)/∂unknown (K, M), by a difference of the closed form."""
+        value, kind = float(values[segment, term]), TERMS[term]
+        nudge = _NUDGE * kind.scale
+        ends = (max(value - nudge, kind.low), min(value + nudge, kind.high))
+        pressures = []
+        for end in ends:
+            moved = values.copy()
+            put(moved, segment, term, end)
+            pressures.append(self.effective(moved))
+        slope: Array = (pressures[1] - pressures[0]) / (ends[1] - ends[0])
+        return slope
+
+    @staticmethod
+    def _moment_change(row: Array, term: int, effective: Array, angle: Array) -> Array:
+        """Return, as a pressure (K,), what an unknown does to the moments of the rod itself.
+
+        A larger gain scales the moment, a rest angle shifts the elastic one, a cubic term adds to
+        it: EI/L (φ + c φ³) with φ = θ − rest.
+        """
+        name, gain = TERMS[term].name, row[column("gain")]
+        bent = angle - row[column("rest_angle")]
+        if name == "gain":
+            return np.asarray(effective / gain)
+        if name == "rest_angle":
+            return np.asarray((1.0 + 3.0 * row[column("cubic")] * bent**2) / gain)
+        if name == "cubic":
+            return np.asarray(-(bent**3) / gain)
+        return np.zeros_like(effective)

@@ -1,0 +1,101 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from apriltag_tracker.camera import project
+from apriltag_tracker.image_watch import ImageWatch
+from apriltag_tracker.overlay import draw_observation
+from apriltag_tracker.pipeline import LimbObservation, LimbTracker
+
+
+class Clock:
+    def __init__(self):
+        self.now = 100.0
+
+    def __call__(self):
+        return self.now
+
+
+@pytest.fixture
+def clock():
+    return Clock()
+
+
+@pytest.fixture
+def tracker(tags, model):
+    return LimbTracker(tags, model.intrinsics)
+
+
+def test_waiting_is_stale_and_names_who_is_missing(clock):
+    watch = ImageWatch("/limb/camera/image_raw", True, clock)
+    report = watch.report(None)
+    assert report.level == "stale"
+    assert "/limb/camera/image_raw" in report.message
+    assert "start the camera" in report.message
+
+
+def test_lost_images_name_the_profile(clock):
+    watch = ImageWatch("/limb/camera/image_raw", True, clock)
+    clock.now += 5.0
+    report = watch.report(None, publishers=1)
+    assert "FASTRTPS_DEFAULT_PROFILES_FILE" in report.message
+
+
+def test_images_without_calibration_are_an_error(clock):
+    watch = ImageWatch("topic", True, clock)
+    watch.arrived()
+    assert watch.report(None).level == "error"
+    assert "calibrate_camera" in watch.report(None).message
+    watch.calibration_problem = "the camera is not calibrated"
+    assert watch.report(None).message == "the camera is not calibrated"
+
+
+def test_a_stream_that_stops_is_an_error(clock, tracker, camera, swing):
+    watch = ImageWatch("topic", True, clock)
+    for k in range(5):
+        clock.now += 0.1
+        watch.arrived()
+        frame = camera.frame(swing.shape(0.0))
+        watch.observed(tracker.observe(frame.image, float(k)), 0.004, 0.002)
+    report = watch.report(tracker, 1)
+    assert report.level == "ok"
+    assert report.values["rate_hz"] == "10.0"
+    assert report.values["latency_ms_median"] == "4.00"
+    assert report.values["processing_ms_p99"] == "2.00"
+    clock.now += 3.0
+    assert watch.report(tracker, 1).level == "error"
+
+
+def test_problems_come_before_the_state(clock, tracker):
+    watch = ImageWatch("topic", True, clock)
+    watch.arrived()
+    watch.failed_with("unknown encoding")
+    assert watch.report(tracker).message == "unknown encoding"
+    watch.observed(LimbObservation((), None, "no limb tag in the image"), 0.0, 0.0)
+    report = watch.report(tracker)
+    assert (report.level, report.message) == ("error", "no limb tag in the image")
+    assert report.values["states_invalid"] == 1
+    assert report.values["images_failed"] == 1
+
+
+def test_a_silent_device_is_an_error_at_once(clock):
+    watch = ImageWatch("/dev/video0", False, clock)
+    watch.image_problem = "the camera /dev/video0 gives no images: was it unplugged?"
+    report = watch.report(None)
+    assert report.level == "error"
+    assert "unplugged" in report.message
+
+
+def test_the_annotated_picture_marks_the_tip(tracker, camera, swing):
+    shape = swing.shape(0.2)
+    frame = camera.frame(shape)
+    observation = tracker.observe(frame.image, 0.0)
+    picture = draw_observation(frame.image, observation, tracker)
+    assert picture.shape == (*frame.image.shape, 3)
+    tip = np.array([[*shape.points[-1], tracker.tags.limb[0].height]])
+    x, y = np.round(project(tracker.intrinsics, tracker.world.pose, tip)[0]).astype(int)
+    around = picture[y - 9 : y + 10, x - 9 : x + 10].astype(int)
+    assert np.ptp(around, axis=2).max() > 60  # colour in a grey picture
+    empty = draw_observation(frame.image, LimbObservation((), None, ""), tracker)
+    assert np.ptp(empty.astype(int), axis=2).max() == 0

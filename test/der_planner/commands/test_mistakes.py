@@ -1,0 +1,78 @@
+"""Mistakes on command lines end with a sentence and an exit code, never with a traceback."""
+
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from der_planner.experiment.processes import find_executable
+from der_planner.runs.recording.layout import RUN_KEY
+from der_planner.runs.recording.scan import parse_run
+
+SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"
+
+
+@pytest.fixture
+def call(monkeypatch, capsys, tmp_path):
+    """Run a command's main; BUSY in its arguments is a path below a file."""
+    (tmp_path / "file").write_text("in the way")
+
+    def run(module, *arguments):
+        busy = str(tmp_path / "file" / "out")
+        line = [busy if word == "BUSY" else word for word in arguments]
+        monkeypatch.setattr(sys, "argv", [module, *line])
+        try:
+            code = importlib.import_module(module).main()
+        except SystemExit as error:
+            code = error.code
+        return code, capsys.readouterr().err
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("module", "arguments", "code", "words"),
+    [
+        ("der_planner.commands.evaluate", ["b", "--workers", "-1"], 2, "--workers is -1"),
+        ("der_planner.commands.evaluate", ["b", "--report", "BUSY"], 2, "cannot be made"),
+        ("der_planner.commands.evaluate", ["b", "--video", "BUSY"], 2, "cannot be made"),
+        ("der_planner.commands.calibrate_limb", ["--offline", "--out", "BUSY"], 2, "no folder"),
+        ("der_planner.commands.calibrate_limb", ["--offline", "--out", "."], 2, "is a folder"),
+        ("der_planner.commands.calibrate_limb", ["--excitation", "BUSY"], 2, "no folder"),
+        ("apriltag_tracker.commands.make_tags", ["board", "--out", "BUSY"], 1, "out"),
+        ("apriltag_tracker.commands.make_tags", ["board", "--columns", "1"], 1, "2 or more"),
+        ("apriltag_tracker.commands.make_tags", ["board", "--marker", "0.03"], 1, "do not fit"),
+    ],
+)
+def test_mistakes_are_said_before_any_work_is_done(call, module, arguments, code, words):
+    found, said = call(module, *arguments)
+    assert found == code
+    assert "error: " in said
+    assert words in said
+
+
+def test_metadata_that_is_no_json_text_is_no_description():
+    for value in ("{broken", 5, {"motion": "circle"}, "[1]"):
+        assert parse_run({RUN_KEY: value}) == {}
+
+
+def test_a_missing_parameter_file_is_named_by_the_node():
+    node = str(find_executable("der_planner", "planner"))
+    ended = subprocess.run(
+        [node, "--ros-args", "--params-file", "/nowhere/planner.yaml"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.returncode == 1
+    assert "/nowhere/planner.yaml" in ended.stderr
+    assert "Traceback" not in ended.stderr
+
+
+def test_help_of_the_kernels_compiles_nothing():
+    line = [sys.executable, str(SCRIPTS / "compile_kernels.py"), "--help"]
+    ended = subprocess.run(line, capture_output=True, text=True, check=False, timeout=60)
+    assert ended.returncode == 0
+    assert "usage: compile_kernels.py" in ended.stdout

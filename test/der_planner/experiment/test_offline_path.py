@@ -1,0 +1,48 @@
+"""A path is drawn offline: from the file to the report."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from der_planner.experiment.errors import GraphError
+from der_planner.experiment.experiment import run
+from der_planner.experiment.options import parse
+
+
+def write_arc(file: Path, scale: float = 1.0) -> None:
+    """Write a timed arc at the reach of the default limb, in cm."""
+    angle = np.linspace(0.46, 0.56, 13)
+    rows = [
+        f"{time:.2f}, {22.4 * scale * np.cos(a):.4f}, {22.4 * scale * np.sin(a):.4f}"
+        for time, a in zip(np.linspace(0, 6, 13), angle, strict=True)
+    ]
+    file.write_text("\n".join(["time [s], x [cm], y [cm]", *rows]) + "\n")
+
+
+@pytest.mark.slow
+def test_a_path_is_drawn_and_reported(tmp_path: Path):
+    file = tmp_path / "arc.csv"
+    write_arc(file)
+    out = tmp_path / "out"
+    arguments = ["--offline", "--no-calibration", "--models", "pcc", "--path", str(file)]
+    run(parse([*arguments, "--out", str(out)]))
+    (result,) = json.loads((out / "results.json").read_text())["runs"]
+    assert (result["motion"], result["model"], result["cycles"]) == ("arc", "pcc", 1)
+    assert 0.0 < result["mean_error_m"] < 0.05
+    played = np.load(out / "runs" / "arc_pcc_paper_trial1.npz")
+    start, end = 0.224 * np.array([[np.cos(a), np.sin(a)] for a in (0.46, 0.56)])
+    for point in (start, end):
+        assert np.linalg.norm(played["tip_reference"] - point, axis=1).min() < 1e-3
+    page = (out / "report" / "report.html").read_text()
+    assert "arc" in page
+    assert str(file) in page
+
+
+def test_an_unreachable_path_says_where(tmp_path: Path):
+    file = tmp_path / "far.csv"
+    write_arc(file, scale=2.0)
+    options = parse(["--offline", "--no-calibration", "--path", str(file), "--out", str(tmp_path)])
+    with pytest.raises(GraphError, match=r"point \(0\.40\d+, 0\.19\d+\) m at t = 0\.00 s"):
+        run(options)

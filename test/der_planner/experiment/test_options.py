@@ -1,0 +1,101 @@
+"""The experiment's command line: what is refused, and what order trials are played in."""
+
+from pathlib import Path
+
+import pytest
+
+from der_planner.experiment.experiment import run
+from der_planner.experiment.ledger import Ledger
+from der_planner.experiment.options import OptionError, parse
+from der_planner.planning.motions import NAMES
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--motions", "sideways"], "sideways"),
+        (["--models", "der", "cosserat"], "cosserat"),
+        (["--method", "guess"], "guess"),
+        (["--trials", "0"], "--trials"),
+        (["--period", "0.1"], "--period"),
+        (["--hardware", "/nowhere/rig.yaml"], "/nowhere/rig.yaml"),
+    ],
+)
+def test_a_bad_option_is_refused_by_its_name(arguments, named):
+    with pytest.raises(OptionError, match=named):
+        parse(arguments)
+
+
+def test_hardware_without_its_serial_device_is_refused(tmp_path: Path):
+    rig = tmp_path / "rig.yaml"
+    rig.write_text("driver: {port: /dev/serial/by-id/no-such-board}\nlimb: limb.yaml\n")
+    with pytest.raises(OptionError, match="no-such-board"):
+        parse(["--hardware", str(rig)])
+    rig.write_text("pump: {}\n")
+    with pytest.raises(OptionError, match="unknown key 'pump'"):
+        parse(["--hardware", str(rig)])
+
+
+def test_trials_share_seeds_between_models_and_differ_between_trials():
+    trials = parse(["--motions", "all", "--trials", "2", "--seed", "7"]).plan_of_trials()
+    assert len(trials) == 3 * 2 * 2
+    assert {trial.seed for trial in trials if trial.number == 1} == {7}
+    assert {trial.seed for trial in trials if trial.number == 2} == {8}
+    assert len({trial.name for trial in trials}) == len(trials)
+
+
+def test_pcc_is_always_planned_by_its_own_method():
+    trials = parse(["--method", "optimal"]).plan_of_trials()
+    assert [(trial.model, trial.method) for trial in trials] == [
+        ("der", "optimal"),
+        ("pcc", "paper"),
+    ]
+
+
+def test_a_stopped_experiment_goes_on_and_refuses_other_options(tmp_path: Path):
+    arguments = ["--out", str(tmp_path), "--trials", "2"]
+    options = parse(arguments)
+    first, second = options.plan_of_trials()[:2]
+    Ledger(options).record(first, {"bag": "somewhere"})
+    again = Ledger(parse(arguments))
+    assert again.finished(first) == {"bag": "somewhere"}
+    assert again.finished(second) is None
+    with pytest.raises(OptionError, match=r"period = 20\.0, not 6\.0"):
+        Ledger(parse([*arguments, "--period", "6"])).finished(first)
+
+
+def test_every_motion_of_the_planner_is_taken():
+    motions = parse(["--motions", *NAMES]).motions
+    assert motions == NAMES
+    assert {"circle", "figure_eight", "line", "star"} < set(motions)
+
+
+def test_a_path_is_refused_with_its_line_and_the_remedy(tmp_path: Path):
+    file = tmp_path / "my path.csv"
+    file.write_text("time [s], x [cm], y [cm]\n0, 20, 10\n1, here, 11\n")
+    with pytest.raises(OptionError, match=r"line 3: column 'x' is not a number: 'here'; correct"):
+        parse(["--path", str(file)])
+    file.write_text("time [s], x [cm], y [cm]\n0, 20, 10\n1, 19.5, 11\n")
+    assert parse(["--path", str(file)]).plan_of_trials()[0].name == "my_path_der_optimal_trial1"
+    with pytest.raises(OptionError, match="give one of the two"):
+        parse(["--path", str(file), "--motions", "star"])
+
+
+def test_another_path_of_the_same_name_is_not_taken_for_done(tmp_path: Path):
+    file = tmp_path / "curve.csv"
+    file.write_text("x,y\n0.20,0.10\n0.19,0.12\n")
+    arguments = ["--path", str(file), "--out", str(tmp_path)]
+    options = parse(arguments)
+    trial = options.plan_of_trials()[0]
+    Ledger(options).record(trial, {"arrays": "somewhere"})
+    assert Ledger(parse(arguments)).finished(trial) == {"arrays": "somewhere"}
+    file.write_text("x,y\n0.20,0.10\n0.18,0.12\n")
+    with pytest.raises(OptionError, match="path_sha256"):
+        Ledger(parse(arguments)).finished(trial)
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_anything_starts(tmp_path: Path):
+    file = tmp_path / "taken"
+    file.write_text("not a folder")
+    with pytest.raises(OptionError, match=rf"cannot write into --out {file}.*another folder"):
+        run(parse(["--offline", "--out", str(file)]))

@@ -1,0 +1,136 @@
+"""Unequal chambers, stiffening, friction and creep as pressures."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from der_planner.limb import Limb, LimbError
+from der_planner.model import material
+
+
+def rubbing(**changes: float) -> Limb:
+    limb = Limb.default()
+    segments = tuple(
+        replace(
+            s,
+            gain_asymmetry=0.05,
+            pressure_stiffening=5e-6,
+            friction_moment=400 * s.moment_gain,
+            friction_curvature=0.1 / s.length,
+            creep_stiffness=500 * s.moment_gain * s.length,
+            creep_time=8.0,
+            rest_curvature=0.2,
+            coupling_before=0.04,
+            coupling_after=-0.03,
+            **changes,
+        )
+        for s in limb.segments
+    )
+    return replace(limb, segments=segments)
+
+
+TIME = np.arange(600) * 0.05
+BEND = 0.6 * np.stack([np.sin(TIME / 3), np.cos(TIME / 2) - 1], axis=1)
+WANTED = 11_000.0 * np.stack([np.sin(TIME / 3), np.sin(TIME / 5)], axis=1)
+
+
+def test_differential_and_effective_pressure_are_inverse():
+    limb = rubbing()
+    given = material.differential_pressure(limb, TIME, WANTED, BEND)
+    np.testing.assert_allclose(
+        material.effective_pressure(limb, TIME, given, BEND), WANTED, atol=1e-8
+    )
+    assert np.abs(given - WANTED).max() > 300.0
+
+
+def test_a_plain_limb_feels_what_its_chambers_hold():
+    np.testing.assert_array_equal(
+        material.effective_pressure(Limb.default(), TIME, WANTED, BEND), WANTED
+    )
+
+
+def test_friction_saturates_closes_its_loops_and_does_not_depend_on_rate():
+    angle = np.concatenate(
+        [np.linspace(0, 2, 400), np.linspace(2, -2, 800), np.linspace(-2, 2, 800)]
+    )
+    z = material.dahl(angle, 0.1)
+    assert np.abs(z).max() <= 1.0
+    assert z[399] == pytest.approx(1.0, abs=1e-6)
+    assert z[1199] == pytest.approx(-1.0, abs=1e-6)
+    np.testing.assert_allclose(z[-1], z[399], atol=1e-6)
+    np.testing.assert_allclose(material.dahl(angle[::4], 0.1)[-1], z[-1], atol=1e-6)
+    # half way round after 0.1 ln 2 from saturation
+    turned = material.dahl(np.array([0.0, 5.0, 5.0 - 0.1 * np.log(2)]), 0.1)
+    assert turned[-1] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_creep_relaxes_exponentially():
+    time = np.linspace(0, 20, 401)
+    strain = np.where(time > 0, 1.0, 0.0)
+    q = material.maxwell(time, strain, 4.0)
+    np.testing.assert_allclose(q[1:], q[1] * np.exp(-(time[1:] - time[1]) / 4.0), rtol=1e-12)
+
+
+def test_resting_bend_is_where_moment_and_effective_pressure_agree():
+    cubic = 0.3
+    limb = rubbing()
+    stiffer = [
+        replace(s, cubic_stiffness=cubic * s.bending_stiffness * s.length**2) for s in limb.segments
+    ]
+    limb = replace(limb, segments=tuple(stiffer))
+    bend = material.resting_bend(limb, TIME, WANTED)
+    effective = material.effective_pressure(limb, TIME, WANTED, bend)
+    bent = bend - np.array([s.rest_curvature * s.length for s in limb.segments])
+    held = bent + cubic * bent**3
+    np.testing.assert_allclose(held[1:], (limb.static_gain * effective)[1:], atol=1e-9)
+
+
+def test_coupling_adds_the_share_of_the_neighbours_pressure():
+    limb = Limb.default()
+    first, second = limb.segments
+    coupled = replace(
+        limb,
+        segments=(replace(first, coupling_after=0.04), replace(second, coupling_before=-0.02)),
+    )
+    felt = material.effective_pressure(coupled, TIME, WANTED, BEND)
+    expected = WANTED + WANTED[:, ::-1] * [0.04, -0.02]
+    np.testing.assert_allclose(felt, expected, rtol=1e-12)
+    alone = replace(limb, segments=(replace(first, coupling_before=0.04), second))
+    np.testing.assert_array_equal(material.effective_pressure(alone, TIME, WANTED, BEND), WANTED)
+    with pytest.raises(LimbError, match="coupling_after"):
+        replace(limb, segments=(replace(first, coupling_after=0.6), second))
+
+
+def test_too_much_stiffening_is_refused_by_its_name():
+    limb = rubbing()
+    segments = tuple(replace(s, pressure_stiffening=1e-4) for s in limb.segments)
+    with pytest.raises(ValueError, match="pressure_stiffening"):
+        material.differential_pressure(replace(limb, segments=segments), TIME, WANTED, BEND)
+
+
+def test_limb_file_keeps_everything(tmp_path):
+    limb = rubbing()
+    limb = replace(limb, pcc_segments=tuple(replace(s, damping=2.0) for s in limb.segments))
+    limb.to_yaml(tmp_path / "limb.yaml")
+    again = Limb.from_yaml(tmp_path / "limb.yaml")
+    assert again == limb
+    assert again.for_model("pcc").segments == limb.pcc_segments
+    assert again.for_model("der") == again
+    with pytest.raises(LimbError, match="model"):
+        again.for_model("arc")
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"friction_moment": 0.1}, "friction_curvature"),
+        ({"creep_stiffness": 0.1}, "creep_time"),
+        ({"gain_asymmetry": 1.5}, "gain_asymmetry"),
+        ({"friction_moment": -1.0}, "friction_moment"),
+    ],
+)
+def test_impossible_segments_are_refused(change, match):
+    limb = Limb.default()
+    with pytest.raises(LimbError, match=match):
+        replace(limb, segments=(replace(limb.segments[0], **change), limb.segments[1]))

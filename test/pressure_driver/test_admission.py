@@ -1,0 +1,300 @@
+"""Whose setpoints are taken, and in which arming; what goes out is limited at every tick."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from pressure_driver.admission import RELEASE_TIME, REMEMBERED_PLANS, Origin, SpentPlans
+from pressure_driver.safety import Mode, SafetyLimits
+from pressure_driver.schedule import REMEMBERED_PLANS as REPLACED_PLANS
+from pressure_driver.schedule import ScheduleLimits, Setpoint, SetpointSchedule, Verdict
+
+TICK = 50_000_000
+STEP = 10_000.0
+"""[Pa] that the default slew limit allows a tick."""
+
+
+def outputs(sim, ticks):
+    """Run and return what was commanded at each tick (K, 2) [Pa], with what was before."""
+    found = [sim.core.snapshot().commanded_differential]
+    for _ in range(ticks):
+        sim.tick()
+        found.append(sim.core.snapshot().commanded_differential)
+    return np.array(found)
+
+
+def steepest(commanded):
+    return np.abs(np.diff(commanded, axis=0)).max()
+
+
+# ----------------------------------------------------------------------- a plan and its arming
+
+
+@pytest.mark.parametrize("end", ["vent", "fault"])
+def test_a_plan_that_streams_on_through_a_vent_is_refused_after_the_next_arming(simulate, end):
+    sim = simulate()
+    sim.arm()
+    sim.stream(1.0, lambda t: (4_000.0 * t, 0.0))
+    if end == "vent":
+        sim.core.vent()
+    else:
+        sim.core.lost("pulled")
+        sim.tick()
+        sim.core.opening()
+    rest = iter(range(20, 100_000))
+    while not sim.core.arm()[0]:
+        assert sim.offer((9_000.0, 0.0), plan_id="plan of arming 1", index=next(rest)) is (
+            Verdict.REFUSED
+        )
+        sim.tick()
+    for _ in range(40):
+        verdict = sim.offer((9_000.0, 0.0), plan_id="plan of arming 1", index=next(rest))
+        assert verdict is Verdict.REFUSED
+        assert "before the driver was armed" in sim.core.last_refusal
+        sim.tick()
+        assert sim.is_vent(sim.sent[-1])
+    assert sim.offer((1_000.0, 0.0), plan_id="new") is Verdict.ACCEPTED
+
+
+def test_the_rest_of_a_plan_that_had_ended_before_the_vent_is_refused_too(simulate):
+    sim = simulate()
+    sim.arm()
+    sim.stream(0.5, lambda t: (2_000.0 * t, 0.0))
+    sim.run_until(lambda: sim.mode is Mode.ARMED)
+    sim.core.vent()
+    sim.run_until(lambda: sim.core.arm()[0])
+    assert sim.offer((1_000.0, 0.0), plan_id="plan of arming 1", index=99) is Verdict.REFUSED
+
+
+def test_setpoints_without_a_plan_must_pause_after_a_vent(simulate):
+    sim = simulate()
+    sim.arm()
+
+    def typed():
+        return sim.core.offer(Setpoint(0, (3_000.0, 0.0)), sim.wall)
+
+    for _ in range(10):
+        assert typed() is Verdict.ACCEPTED
+        sim.tick()
+    sim.core.vent()
+    while not sim.core.arm()[0]:
+        assert typed() is Verdict.REFUSED
+        sim.tick()
+    for _ in range(60):
+        assert typed() is Verdict.REFUSED
+        assert "stop them" in sim.core.last_refusal
+        sim.tick()
+    sim.run(RELEASE_TIME + 0.05)
+    assert typed() is Verdict.ACCEPTED
+
+
+def test_what_is_remembered_is_bounded():
+    plans = SpentPlans()
+    for index in range(5 * REMEMBERED_PLANS):
+        plans.hear(f"plan {index}", 0.0)
+        plans.spend()
+    assert len(plans._spent) == REMEMBERED_PLANS
+    assert plans.refuse(f"plan {5 * REMEMBERED_PLANS - 1}", 0.0)
+    schedule = SetpointSchedule(ScheduleLimits())
+    for index in range(3 * REPLACED_PLANS):
+        schedule.offer(Setpoint(TICK, (0.0, 0.0), f"plan {index}"), 0, (0.0, 0.0))
+    assert len(schedule._replaced) == REPLACED_PLANS
+
+
+# ------------------------------------------------------------------------- one publisher at a time
+
+
+class Publisher:
+    """Counts its messages as the middleware does."""
+
+    def __init__(self, sim, value, first=1, alone=False, topic="/limb/pressure_setpoint"):
+        self.sim, self.value = sim, value
+        self.alone, self.topic = alone, topic
+        self.numbers = itertools.count(first)
+
+    def publish(self, plan_id=""):
+        origin = Origin(self.topic, next(self.numbers), self.alone)
+        item = Setpoint(0, (self.value, 0.0), plan_id)
+        return self.sim.core.offer(item, self.sim.wall, origin)
+
+
+@pytest.mark.parametrize("plan_id", ["", "same"])
+@pytest.mark.parametrize("first", [1, 9, 500])
+def test_a_second_publisher_is_refused_whatever_its_plan_is_called(simulate, plan_id, first):
+    sim = simulate()
+    sim.arm()
+    one, other = Publisher(sim, 4_000.0, 7), Publisher(sim, -4_000.0, first)
+    for _ in range(40):
+        assert one.publish(plan_id) is Verdict.ACCEPTED
+        assert other.publish(plan_id) is Verdict.REFUSED
+        assert "another publisher" in sim.core.last_refusal
+        sim.tick()
+        assert sim.core.snapshot().commanded_differential[0] >= 0.0
+    assert sim.core.foreign_setpoints == 40
+    # The first one ends: the second takes over after a pause.
+    while other.publish(plan_id) is Verdict.REFUSED:
+        sim.tick()
+        assert sim.time < 60e9
+    assert sim.core.snapshot().mode is not Mode.FAULT
+
+
+def test_two_publishers_that_count_in_step_are_both_refused(simulate):
+    sim = simulate()
+    sim.arm()
+    one, other = Publisher(sim, 4_000.0), Publisher(sim, -4_000.0)
+    verdicts = []
+    for index in range(60):
+        # Which of the two is first changes from tick to tick.
+        for publisher in (one, other) if index % 2 else (other, one):
+            verdicts.append(publisher.publish())
+        sim.tick()
+    assert verdicts[4:].count(Verdict.ACCEPTED) == 0
+    assert "two publishers" in sim.core.last_refusal
+    assert sim.mode is not Mode.TRACKING
+    sim.run(RELEASE_TIME + 0.05)
+    assert one.publish() is Verdict.ACCEPTED
+
+
+def test_a_lone_publisher_may_lose_messages_and_start_anew(simulate):
+    sim = simulate()
+    sim.arm()
+    for numbers in ([1, 2, 3], [7, 9], [1, 2]):
+        for number in numbers:
+            publisher = Publisher(sim, 1_000.0, number, alone=True)
+            assert publisher.publish() is Verdict.ACCEPTED
+            sim.tick()
+
+
+def test_another_topic_is_another_publisher(simulate):
+    sim = simulate()
+    sim.arm()
+    one = Publisher(sim, 1_000.0, alone=True)
+    other = Publisher(sim, 2_000.0, 2, alone=True, topic="cmd_u_t")
+    assert one.publish() is Verdict.ACCEPTED
+    assert other.publish() is Verdict.REFUSED
+
+
+# ----------------------------------------------------------------- the output moves by its limit
+
+
+def test_no_tick_moves_more_than_the_slew_limit_after_a_hold(simulate):
+    sim = simulate()
+    sim.arm()
+    sim.stream(1.0, lambda t: (min(40_000.0 * t, 24_000.0), 0.0))
+    sim.run_until(lambda: sim.mode is Mode.HOLDING)
+    # Each is far from the last one in time, as checked when it comes, and near in ticks.
+    for index, value in enumerate((14_000.0, 4_000.0, -6_000.0, -16_000.0, -24_000.0)):
+        sim.core.offer(
+            Setpoint(sim.wall + 4 * TICK - (4 - index), (value, 0.0), "down", index), sim.wall
+        )
+    commanded = outputs(sim, 12)
+    assert steepest(commanded) <= STEP * (1.0 + 1e-6)
+
+
+@pytest.mark.parametrize("interpolate", [False, True])
+def test_a_setpoint_that_waits_through_a_ramp_down_is_approached_and_counted(simulate, interpolate):
+    sim = simulate(interpolate=interpolate, safety=SafetyLimits(hold_time=0.1, vent_rate=50_000.0))
+    sim.arm()
+    sim.stream(1.0, lambda t: (min(40_000.0 * t, 24_000.0), 0.0))
+    assert sim.offer((24_000.0, 0.0), ahead=4.0, index=20) is Verdict.ACCEPTED
+    commanded = outputs(sim, 100)
+    assert steepest(commanded) <= STEP * (1.0 + 1e-6)
+    assert commanded[:, 0].max() == 24_000.0
+    if not interpolate:
+        assert 0.0 in commanded[:, 0], "let down while it waited"
+        assert sim.core.limited_ticks == 2
+
+
+def test_interpolation_goes_on_from_what_is_commanded_and_not_from_the_last_setpoint(simulate):
+    sim = simulate(interpolate=True)
+    sim.arm()
+    sim.stream(1.5, lambda t: (min(20_000.0 * t, 20_000.0), 0.0))
+    sim.run_until(lambda: sim.mode is Mode.VENTING)
+    sim.run(1.0)
+    before = sim.core.snapshot().commanded_differential[0]
+    assert 0.0 < before < 12_000.0
+    assert sim.offer((0.0, 0.0), ahead=0.5, plan_id="to zero") is Verdict.ACCEPTED
+    commanded = outputs(sim, 12)[:, 0]
+    assert commanded.max() <= before
+    assert np.all(np.diff(commanded) <= 0.0)
+    assert commanded[-1] == 0.0
+
+
+def test_the_first_setpoint_after_arming_is_approached_from_zero(simulate):
+    sim = simulate(schedule=ScheduleLimits(slew_limit=20_000.0))
+    sim.arm()
+    for index in range(1, 9):
+        assert sim.offer((1_000.0 * index, 0.0), 0.05 * index, index=index) is Verdict.ACCEPTED
+    # The first ones are lost on the way to the output, as when the thread is held up.
+    sim.time += 5 * TICK
+    commanded = outputs(sim, 20)
+    assert steepest(commanded) <= 1_000.0 * (1.0 + 1e-6)
+    assert commanded[-1, 0] > 0.0
+    assert sim.core.limited_ticks > 0
+
+
+def test_random_setpoints_never_step_the_output(simulate):
+    generator = np.random.default_rng(5)
+    for interpolate in (False, True):
+        sim = simulate(interpolate=interpolate, schedule=ScheduleLimits(slew_limit=60_000.0))
+        sim.arm()
+        commanded = []
+        for index in range(2_000):
+            if generator.random() < 0.15:
+                ahead = 0.05 * generator.integers(1, 60)
+                value = generator.uniform(-24e3, 24e3, 2)
+                plan = f"plan {generator.integers(0, 40)}"
+                sim.offer(value, ahead, plan, index)
+            sim.tick()
+            commanded.append(sim.core.snapshot().commanded_differential)
+            if sim.mode is Mode.FAULT:
+                break
+        live = np.array(commanded)
+        falls = np.abs(live[1:]) < np.abs(live[:-1])
+        moves = np.abs(np.diff(live, axis=0))
+        assert moves[~falls].max() <= 3_000.0 * (1.0 + 1e-6)
+
+
+# ------------------------------------------------------------------------- revisions and gaps
+
+
+def test_a_higher_revision_that_comes_in_time_replaces_the_earlier_one(simulate):
+    sim = simulate()
+    sim.arm()
+    assert sim.offer((1_000.0, 0.0), index=5) is Verdict.ACCEPTED
+    assert sim.offer((2_000.0, 0.0), index=5) is Verdict.DUPLICATE
+    assert sim.offer((3_000.0, 0.0), index=5, revision=2) is Verdict.ACCEPTED
+    assert sim.offer((4_000.0, 0.0), index=5, revision=1) is Verdict.DUPLICATE
+    assert "revision 2" in sim.core.last_refusal
+    assert sim.offer((5_000.0, 0.0), index=6, revision=3) is Verdict.DUPLICATE
+    stamp = sim.wall + 4 * TICK
+    sim.run(0.2)
+    assert sim.core.snapshot().setpoint.differential == (3_000.0, 0.0)
+    late = Setpoint(stamp, (6_000.0, 0.0), "plan of arming 1", 5, 3)
+    assert sim.core.offer(late, sim.wall) is Verdict.LATE
+    counters = sim.core.snapshot().counters
+    assert (counters.accepted, counters.executed, counters.superseded) == (2, 1, 1)
+
+
+def test_a_horizon_that_is_revised_at_every_tick_is_played_newest_first(simulate):
+    sim = simulate()
+    sim.arm()
+    start = sim.wall
+    for step in range(60):
+        for index in range(step + 1, step + 5):
+            value = (100.0 * index + 10.0 * (step + 1), 0.0)
+            item = Setpoint(start + index * TICK, value, "horizon", index, step)
+            assert sim.core.offer(item, sim.wall) is Verdict.ACCEPTED, sim.core.last_refusal
+        sim.tick()
+        assert sim.core.snapshot().commanded_differential[0] == 110.0 * (step + 1)
+    assert sim.core.snapshot().counters.missing == 0
+
+
+def test_gaps_in_the_index_are_counted(simulate):
+    sim = simulate()
+    sim.arm()
+    for index in (0, 1, 4, 5, 9):
+        sim.offer((100.0 * index, 0.0), 0.05 * (index + 1), index=index)
+    sim.run(0.6)
+    assert sim.core.snapshot().counters.missing == 5

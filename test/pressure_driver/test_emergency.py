@@ -1,0 +1,222 @@
+"""`vent` and the end of the process while a real board floods the line, and with many callers."""
+
+import contextlib
+import os
+import pty
+import signal
+import threading
+import time
+import tty
+
+import pytest
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from std_srvs.srv import Trigger
+
+from der_msgs.msg import PressureSetpoint, PressureState
+from limb_interfaces import qos, topics
+
+pytestmark = pytest.mark.graph
+
+BYTES_A_SECOND = 9_700
+"""Of text: a full line of 115200 baud, with the reports in between."""
+PROMPT = 2.0
+"""[s] for an answer or an end on a loaded machine; the flood used to hold them up for ever."""
+
+
+class FloodingBoard:
+    """A board of the ezloop language on a pseudo-terminal that may also send ``a`` without end.
+
+    Attributes:
+        received: (steady time [s], bytes) of what the driver has written.
+        flooding: send text as fast as the line carries it.
+    """
+
+    def __init__(self):
+        self.master, slave = pty.openpty()
+        tty.setraw(slave)
+        self.device = os.ttyname(slave)
+        self.slave = slave
+        os.set_blocking(self.master, False)
+        self.received = []
+        self.flooding = False
+        self.flood_bytes = 0
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self):
+        report = b"[MPR]: 1013.31 1013.02 1013.55 1013.90\r\n[RPR]: 1401.22\r\n"
+        last = report_at = time.monotonic()
+        while not self._end.wait(0.005):
+            now = time.monotonic()
+            with contextlib.suppress(BlockingIOError):
+                self.received.append((now, os.read(self.master, 4096)))
+            if now >= report_at:
+                self._say(report)
+                report_at = now + 0.05
+            if self.flooding:
+                self.flood_bytes += self._say(b"a\n" * round((now - last) * BYTES_A_SECOND / 2))
+            last = now
+
+    def _say(self, data):
+        try:
+            return os.write(self.master, data)
+        except BlockingIOError:
+            return 0
+
+    def asked(self, since):
+        """Return the differences [hPa] of the commands that came since a steady time."""
+        text = b"".join(data for at, data in self.received if at >= since).decode()
+        commands = [part.split(">")[0] for part in text.split("<")[1:] if ">" in part]
+        numbers = [[float(value) for value in part.split(",")] for part in commands]
+        return [round(values[0] - values[1], 1) for values in numbers]
+
+    def close(self):
+        self._end.set()
+        self._thread.join()
+        os.close(self.master)
+        os.close(self.slave)
+
+
+@pytest.fixture
+def board():
+    running = FloodingBoard()
+    yield running
+    running.close()
+
+
+class Driver:
+    """A running driver on that board, and what it publishes."""
+
+    def __init__(self, graph, board):
+        self.client, self.board, self.states = graph.client, board, []
+        self.client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES, self.states.append)
+        self.publisher = self.client.node.create_publisher(
+            PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS
+        )
+        # The board has no air: what it reads must not be judged.
+        self.process = graph.start(
+            "pressure_driver", "pressure_driver", port=board.device, follow_time=60.0
+        )
+        self.client.watch([self.process])
+        self.client.wait_ready(["pressure_driver"])
+        self.client.wait_for(self.publisher.get_subscription_count, 30.0, "the subscription")
+
+    def call(self, count, service):
+        """Call a service many times at once; return the futures."""
+        profile = QoSProfile(
+            history=HistoryPolicy.KEEP_LAST, depth=1000, reliability=ReliabilityPolicy.RELIABLE
+        )
+        caller = self.client.node.create_client(
+            Trigger, f"pressure_driver/{service}", qos_profile=profile
+        )
+        self.client.wait_for(caller.service_is_ready, 30.0, service)
+        return [caller.call_async(Trigger.Request()) for _ in range(count)]
+
+    def pressurise(self):
+        (answer,) = self.call(1, "arm")
+        self.client.wait_for(answer.done, 10.0, "an answer of arm")
+        assert answer.result().success, answer.result().message
+
+        def commanded():
+            self.publisher.publish(PressureSetpoint(differential_pressure=[3000.0, 0.0]))
+            self.client.spin(0.04)
+            return self.board.asked(time.monotonic() - 0.3)[-1:] == [30.0]
+
+        self.client.wait_for(commanded, 20.0, "pressure on the wire")
+
+
+def test_text_from_the_board_holds_up_neither_vent_nor_the_end(graph, board):
+    driver = Driver(graph, board)
+    driver.pressurise()
+    board.flooding = True
+    until = time.monotonic() + 3.0
+    while time.monotonic() < until:
+        driver.publisher.publish(PressureSetpoint(differential_pressure=[3000.0, 0.0]))
+        driver.client.spin(0.04)
+    assert board.flood_bytes > 2.0 * BYTES_A_SECOND, "the flood must have been read"
+    asked_at = time.monotonic()
+    (answer,) = driver.call(1, "vent")
+    driver.client.wait_for(answer.done, PROMPT, "an answer of vent")
+    assert answer.result().success
+    driver.client.wait_for(
+        lambda: board.asked(asked_at)[-1:] == [0.0], PROMPT, "the vent command on the wire"
+    )
+    driver.client.wait_for(
+        lambda: driver.states[-1].mode in (PressureState.VENTING, PressureState.DISARMED),
+        PROMPT,
+        "a state that says so",
+    )
+    driver.client.watch([])
+    driver.process.signal(signal.SIGINT)
+    driver.client.wait_for(lambda: not driver.process.alive, 3.0 * PROMPT, "the end on SIGINT")
+    assert driver.process.exit_code == 0
+    assert board.asked(asked_at)[-3:] == [0.0] * 3
+    log = driver.process.log.read_text()
+    assert log.count("board: a") < 200
+    assert "faster than it is logged" in log
+
+
+def test_a_hundred_calls_at_once_are_all_answered_and_vent_comes_first(graph, board):
+    driver = Driver(graph, board)
+    driver.pressurise()
+    arms = driver.call(99, "arm")
+    asked_at = time.monotonic()
+    (vent,) = driver.call(1, "vent")
+    answered_before = []
+    vent.add_done_callback(lambda _: answered_before.append(sum(f.done() for f in arms)))
+    driver.client.wait_for(lambda: board.asked(asked_at)[-1:] == [0.0], PROMPT, "vent on the wire")
+    driver.client.wait_for(
+        lambda: vent.done() and all(f.done() for f in arms), 30.0, "a hundred answers"
+    )
+    assert vent.result().success
+    # It overtakes those that wait; a few may have been served before it came.
+    assert answered_before[0] < 99
+    more = driver.call(100, "vent")
+    driver.client.wait_for(lambda: all(f.done() for f in more), 30.0, "a hundred answers")
+    assert all(f.result().success for f in more)
+
+
+def test_simulated_time_is_refused_while_it_runs(graph, board):
+    driver = Driver(graph, board)
+    node = driver.client.node
+    service = node.create_client(SetParameters, "pressure_driver/set_parameters")
+    driver.client.wait_for(service.service_is_ready, 30.0, "the parameter service")
+    value = ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=True)
+    future = service.call_async(
+        SetParameters.Request(parameters=[Parameter(name="use_sim_time", value=value)])
+    )
+    driver.client.wait_for(future.done, 10.0, "an answer")
+    assert not future.result().results[0].successful
+    assert "real time" in future.result().results[0].reason
+    driver.pressurise()
+
+
+def test_two_publishers_of_a_running_graph_are_not_mixed(graph, board):
+    driver = Driver(graph, board)
+    driver.pressurise()
+    other = driver.client.node.create_publisher(
+        PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS
+    )
+    driver.client.wait_for(other.get_subscription_count, 30.0, "the subscription")
+    begin = time.monotonic()
+    while time.monotonic() < begin + 3.0:
+        driver.publisher.publish(PressureSetpoint(differential_pressure=[3000.0, 0.0]))
+        other.publish(PressureSetpoint(differential_pressure=[-3000.0, 0.0]))
+        driver.client.spin(0.05)
+    assert min(board.asked(begin)) >= 0.0
+    driver.client.wait_for(
+        lambda: (
+            int(
+                driver.client.diagnostic_values("pressure_driver").get(
+                    "setpoints_of_other_publishers", 0
+                )
+            )
+            > 20
+        ),
+        10.0,
+        "the count of refused setpoints",
+    )
+    assert "another publisher" in driver.process.log.read_text()

@@ -1,0 +1,236 @@
+"""What the board says is doubted: supply, rest pressures, numbers that are none, floods of text."""
+
+import numpy as np
+import pytest
+
+from pressure_driver.core import LogAllowance
+from pressure_driver.monitor import MonitorLimits
+from pressure_driver.protocols import NAMES
+from pressure_driver.safety import MOST_FAULTS, Mode
+
+# ---------------------------------------------------------------------------------- supply
+
+
+def without(sim, tag):
+    """Have the board leave out the lines that begin with a tag."""
+    telemetry = sim.board.telemetry
+
+    def fewer():
+        return b"".join(x for x in telemetry().splitlines(keepends=True) if not x.startswith(tag))
+
+    sim.board.telemetry = fewer
+    return telemetry
+
+
+def test_arming_wants_a_reading_of_the_supply_where_the_protocol_tells_it(simulate):
+    sim = simulate()
+    telemetry = without(sim, b"[RPR]")
+    sim.run(4.0)
+    assert "has not told its supply" in sim.core.arm()[1]
+    sim.board.telemetry = telemetry
+    sim.tick()
+    assert sim.core.arm()[0]
+    # One that is not told any more is no reading either.
+    without(sim, b"[RPR]")
+    sim.run_until(lambda: sim.mode is Mode.FAULT, 1.5)
+    assert "no reading of the supply" in sim.faults[0]
+    assert "has not told its supply" in sim.core.arm()[1]
+
+
+def test_a_board_without_a_sensor_of_the_supply_needs_a_parameter(simulate):
+    sim = simulate(monitor=MonitorLimits(supply_required=False))
+    without(sim, b"[RPR]")
+    sim.arm()
+    sim.run(3.0)
+    assert sim.mode is Mode.ARMED
+
+
+@pytest.mark.parametrize("protocol", ["ezloop", "native"])
+@pytest.mark.parametrize("supply", [450_000.0, 900_000.0, 1_000.0])
+def test_an_implausible_supply_is_a_fault_and_forbids_arming(simulate, protocol, supply):
+    sim = simulate(protocol)
+    sim.arm()
+    sim.have(f"supply:{supply}")
+    sim.run_until(lambda: sim.mode is Mode.FAULT, 0.7)
+    assert "supply too" in sim.faults[0]
+    sim.run(3.0)
+    assert "supply too" in sim.core.arm()[1]
+    fresh = simulate(protocol)
+    fresh.have(f"supply:{supply}")
+    fresh.run(4.0)
+    assert "supply too" in fresh.core.arm()[1]
+
+
+def test_a_supply_that_is_not_a_number_is_a_fault(simulate):
+    sim = simulate()
+    sim.arm()
+    without(sim, b"[RPR]")
+    telemetry = sim.board.telemetry
+    sim.board.telemetry = lambda: telemetry() + b"[RPR]: nan\r\n"
+    sim.run_until(lambda: sim.mode is Mode.FAULT, 0.7)
+    assert "not a number" in sim.faults[0]
+
+
+# ------------------------------------------------------------------------------------- rest
+
+
+def trap(sim, gauge):
+    """Close every valve upon air."""
+    sim.board.pneumatics._gauge[:] = gauge
+    sim.have(*(f"stick:{chamber}" for chamber in range(4)))
+
+
+@pytest.mark.parametrize("protocol", NAMES)
+def test_air_trapped_in_all_chambers_is_not_taken_for_rest(simulate, protocol):
+    sim = simulate(protocol, seed=2)
+    trap(sim, 7_000.0)
+    sim.run(10.0)
+    success, text = sim.core.arm()
+    assert not success
+    assert "let trapped air out" in text
+    assert sim.gauge.min() > 6_900.0
+    # Once the valves open, the air goes and the zero is the room's.
+    sim.have()
+    sim.run_until(lambda: sim.core.arm()[0], 8.0)
+    assert sim.vented
+    # A ctrlp board tells gauge pressures only.
+    room = 101_325.0 if protocol == "ctrlp" else sim.board.pneumatics.atmosphere
+    assert sim.core.atmosphere == pytest.approx(room, abs=250.0)
+
+
+def test_with_the_rooms_pressure_given_less_trapped_air_is_seen_too(simulate):
+    room = simulate(seed=2).board.pneumatics.atmosphere
+    sim = simulate(seed=2, atmosphere=room + 100.0)
+    trap(sim, 1_500.0)
+    sim.run(10.0)
+    assert "not vented yet" in sim.core.arm()[1]
+
+
+def test_air_that_leaves_slowly_is_not_taken_for_rest(simulate):
+    """50 Pa/s: within the spread of steady readings, and not at rest."""
+    sim = simulate(seed=2)
+    trap(sim, 2_500.0)
+    for _ in range(200):
+        sim.board.pneumatics._gauge -= 2.5
+        sim.tick()
+        assert not sim.core.arm()[0]
+    sim.run_until(lambda: sim.core.arm()[0], 4.0)
+
+
+def test_chambers_that_disagree_are_not_at_rest(simulate):
+    sim = simulate()
+    sim.board.pneumatics._gauge[2] = 1_800.0
+    sim.have("stick:2")
+    sim.run(6.0)
+    assert "agree within" in sim.core.arm()[1]
+
+
+def test_rest_is_not_taken_again_from_chambers_that_rest_higher_than_before(simulate):
+    sim = simulate(seed=2)
+    sim.arm()
+    sim.core.vent()
+    sim.run_until(lambda: sim.mode is Mode.DISARMED)
+    before = sim.core.atmosphere
+    trap(sim, 2_000.0)
+    sim.run(6.0)
+    assert sim.core.atmosphere == pytest.approx(before, abs=20.0)
+    assert "not vented yet" in sim.core.arm()[1]
+
+
+def test_a_zero_that_was_trapped_air_shows_as_soon_as_it_escapes(simulate):
+    """Too little to be implausible: the limb must not be played on with a wrong zero."""
+    sim = simulate(seed=2)
+    trap(sim, 2_000.0)
+    sim.run_until(lambda: sim.core.arm()[0], 5.0)
+    sim.have()
+    sim.run_until(lambda: sim.mode is Mode.FAULT, 5.0)
+    assert "below its rest pressure" in sim.faults[0]
+    sim.run_until(lambda: sim.core.arm()[0], 8.0)
+    assert sim.core.atmosphere == pytest.approx(sim.board.pneumatics.atmosphere, abs=250.0)
+
+
+# ------------------------------------------------------------------- numbers that are none
+
+
+@pytest.mark.parametrize(("protocol", "word"), [("ezloop", b"nan"), ("ctrlp", b"nan")])
+def test_a_sensor_that_reads_nan_in_three_of_four_lines_is_a_fault(simulate, protocol, word):
+    sim = simulate(protocol)
+    sim.arm()
+    telemetry = sim.board.telemetry
+    count = iter(range(10**6))
+
+    def broken():
+        report = telemetry()
+        if next(count) % 4 == 0:
+            return report
+        lines = report.splitlines(keepends=True)
+        parts = lines[0].split()
+        separator = b" " if protocol == "ezloop" else b"\t"
+        lines[0] = separator.join([*parts[:-1], word]) + b"\r\n"
+        return b"".join(lines)
+
+    sim.board.telemetry = broken
+    sim.run_until(lambda: sim.mode is Mode.FAULT, 2.5)
+    assert "no plausible reading" in sim.faults[0] or "damaged telemetry" in sim.faults[0]
+    assert not sim.core.arm()[0]
+    sim.board.telemetry = telemetry
+    sim.run_until(lambda: sim.core.arm()[0], 5.0)
+
+
+def test_a_few_bad_readings_are_only_skipped(simulate):
+    sim = simulate()
+    sim.arm()
+    for _ in range(20):
+        sim.core.received(b"[MPR]: nan 1013.00 1013.00 1013.00\n")
+        sim.run(0.5)
+    assert sim.mode is Mode.ARMED
+    assert np.isfinite(sim.core.snapshot().measured_chamber).all()
+
+
+# --------------------------------------------------------------------------- faults and texts
+
+
+def test_a_further_fault_while_in_fault_is_added(simulate):
+    sim = simulate()
+    sim.arm()
+    sim.have("supply:300000")
+    sim.run_until(lambda: sim.mode is Mode.FAULT, 1.0)
+    assert len(sim.faults) == 1
+    sim.have("supply:300000", "mute")
+    sim.run(3.0)
+    assert len(sim.faults) == 2
+    assert "no telemetry" in sim.faults[1]
+    sim.core.lost("serial link lost: pulled")
+    sim.run(1.0)
+    assert sim.faults[2:] == ("serial link lost: pulled",)
+
+
+def test_faults_are_bounded(simulate):
+    sim = simulate()
+    sim.arm()
+    for index in range(1_000):
+        sim.core._machine.fail(f"board reports trouble {index}")
+    assert len(sim.faults) == MOST_FAULTS
+
+
+def test_text_of_the_board_is_logged_at_a_limited_rate(simulate):
+    sim = simulate()
+    logged = []
+    sim.core._log = lambda text, _: logged.append(text)
+    sim.arm()
+    logged.clear()
+    for _ in range(200):
+        sim.core.received(b"a\n" * 243)  # 9.7 kB/s
+        sim.tick()
+    texts = [text for text in logged if text == "board: a"]
+    assert 30 <= len(texts) <= 30 + 3 * 10 + 1
+    assert len(logged) == len(texts) + 1
+    assert sim.core.unlogged_texts == 200 * 243 - len(texts)
+    assert sim.mode is Mode.ARMED
+
+
+def test_the_allowance_for_texts_comes_back():
+    allowance = LogAllowance(burst=3, rate=1.0)
+    assert [allowance.allows(0.0) for _ in range(5)] == [True, True, True, False, False]
+    assert [allowance.allows(2.0) for _ in range(3)] == [True, True, False]
+    assert allowance.withheld == 3

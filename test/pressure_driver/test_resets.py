@@ -1,0 +1,143 @@
+"""Boards that start again, forget their settings, or stop answering while a limb is driven."""
+
+import numpy as np
+import pytest
+
+from pressure_driver.protocols import board_protocol, host_protocol
+from pressure_driver.protocols.base import BoardReport, BoardReset
+from pressure_driver.protocols.native import StatusFlag
+from pressure_driver.safety import Mode
+
+PERIOD = 0.05
+
+
+@pytest.mark.parametrize("protocol", ["ezloop", "ctrlp", "native"])
+@pytest.mark.parametrize("seconds", [0.1, 0.2, 0.4])
+def test_a_reset_of_the_board_is_a_fault_and_does_not_refill_the_limb(simulate, protocol, seconds):
+    sim = simulate(protocol)
+    sim.track()
+    sim.board.restart(seconds)
+    sim.stream(1.0, lambda _: (9_000.0, -5_000.0))
+    assert sim.mode is Mode.FAULT
+    assert "has been reset" in " ".join(sim.faults)
+    received = len(sim.received)
+    sim.stream(4.0)
+    assert sim.mode is Mode.FAULT
+    assert all(
+        np.ptp(np.reshape(c.pressure, (-1, 2)), axis=1).max() < 1.0 for c in sim.received[received:]
+    )
+    assert sim.vented
+    if protocol == "ezloop":
+        # It has taken the pressure that was left in its chambers for the room's: power it anew.
+        sim.board.restart(0.1)
+        sim.run(0.5)
+    # Once it is set up again, it can be armed again and reaches what it is told.
+    sim.track()
+    assert sim.gauge.max() > 5_000.0
+
+
+def test_a_ctrlp_board_that_boots_late_reports_and_gets_no_pressure_in_psi(simulate):
+    sim = simulate("ctrlp")
+    sim.board.restart(3.0)
+    sim.run(2.0)
+    assert "kPa" in sim.core.obstacles()[0]
+    sim.track()
+    assert sim.core.protocol.unsettled == ""
+    assert 4_000.0 < sim.gauge.max() < 12_000.0
+
+
+def test_without_the_echo_of_the_units_no_pressure_is_commanded(simulate):
+    sim = simulate("ctrlp")
+    sim.arm()
+    sim.core.protocol.doubt()
+    sim.have("echoless")
+    sim.offer((3_000.0, 0.0))
+    before = len(sim.sent)
+    sim.run(0.6)
+    assert all(sim.is_vent(data) for data in sim.sent[before:])
+    sim.run(1.0)
+    assert any(b"UNITS;1" in data for data in sim.sent[before:])
+
+
+@pytest.mark.parametrize("protocol", ["ctrlp", "native"])
+def test_echoes_that_stop_are_a_fault_within_two_seconds(simulate, protocol):
+    sim = simulate(protocol)
+    sim.track()
+    sim.have("echoless")
+    begin = sim.steady
+    for index in range(60):
+        sim.offer((2_000.0, -2_000.0), plan_id="on", index=index)
+        sim.tick()
+        if sim.mode is Mode.FAULT:
+            break
+    assert sim.mode is Mode.FAULT
+    assert sim.steady - begin < 2.0
+    assert "not answered" in " ".join(sim.faults)
+    assert "not answered" in " ".join(sim.core.obstacles())
+    sim.have()
+    sim.arm()
+
+
+def test_one_damaged_report_of_a_ctrlp_board_is_no_reset():
+    host = host_protocol("ctrlp")
+    host.unsettled = ""
+    line = "{}\t1\t0.000\t0.000\t0.000\t0.000\n"
+    for time in (10_000, 10_050, 2_100, 10_150, 90_200, 10_250, 10_300):
+        events = host.decode(line.format(time).encode())
+        assert not [e for e in events if isinstance(e, BoardReset)], time
+    host.decode(line.format(20).encode())
+    assert [e for e in host.decode(line.format(70).encode()) if isinstance(e, BoardReset)]
+    assert host.unsettled
+
+
+def test_echoes_and_warnings_of_a_ctrlp_board_are_no_reset():
+    host = host_protocol("ctrlp")
+    board = board_protocol("ctrlp")
+    from pressure_driver.protocols.base import BoardReading
+
+    reading = BoardReading(0.0, (101_325.0,) * 4, 101_325.0, (0.0,) * 4, 0.0)
+    answers = b"".join(
+        board.reply(command, reading)
+        for command in board.decode(host.start() * 2 + host.setpoint([1e3, 0.0], 0.0, 1.0)[0])
+    )
+    events = host.decode(answers + b"_UNREC: Unrecognized Command\n")
+    assert not [e for e in events if isinstance(e, BoardReset)]
+    assert host.unsettled == ""
+    assert [e for e in host.decode(b"_pressure controller\n") if isinstance(e, BoardReset)]
+
+
+@pytest.mark.parametrize("flag", [StatusFlag.VENTED, StatusFlag.EXPIRED])
+def test_a_native_board_that_has_vented_while_it_is_commanded_is_a_fault(simulate, flag):
+    """The FAULT frame may be lost: the flags of the next STATUS say it, too."""
+    sim = simulate("native")
+    sim.track()
+    assert not sim.faults
+    sim.board.step(0.3)  # no setpoint for longer than its validity: it vents
+    sim.board._unsaid = b""
+    reports = [
+        event
+        for event in sim.core.protocol.decode(sim.board.telemetry())
+        if isinstance(event, BoardReport)
+    ]
+    assert len(reports) == 1
+    assert reports[0].fatal
+    sim.core._take(reports[0], sim.steady)
+    assert sim.mode is Mode.FAULT
+
+
+def test_the_clock_of_a_native_board_may_overflow():
+    host, board = host_protocol("native"), board_protocol("native")
+    from pressure_driver.protocols.base import BoardReading
+
+    def status(milliseconds):
+        reading = BoardReading(
+            milliseconds / 1000.0, (101_325.0,) * 4, 101_325.0, (0.0,) * 4, 150_000.0
+        )
+        events = host.decode(board.telemetry(reading))
+        return [e for e in events if isinstance(e, BoardReset)]
+
+    assert not status(2**32 - 60)
+    assert not status(2**32 - 10)
+    assert not status(2**32 + 40)
+    assert not status(2**32 + 90_000)
+    assert status(50)
