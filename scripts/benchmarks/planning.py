@@ -14,6 +14,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 
 from der_planner.limb import Limb
+from der_planner.model.bending import ArcKinematics
+from der_planner.model.drive import STEPS
+from der_planner.model.response import simulate
 from der_planner.planning import (
     CONTROL_PERIOD,
     METHODS,
@@ -21,12 +24,10 @@ from der_planner.planning import (
     Plan,
     inverse,
     plan,
-    planner,
     rod_model,
 )
-from der_planner.planning.kinematics import ArcKinematics
-from der_planner.planning.receding import RecedingHorizon
-from der_planner.planning.rod_model import REFERENCE_PRIOR, RodModel
+from der_planner.planning.motions import sample_spline
+from der_planner.planning.rod_model import REFERENCE_PRIOR, PlanningRod
 
 CASES = ("asynchronous", "same_direction", "opposite_direction")
 METHODS_OF = [(model, method) for model, methods in METHODS.items() for method in methods]
@@ -44,7 +45,6 @@ def run(quick: bool) -> Figures:
     figures |= kinematics_and_gains()
     figures |= speed(quick)
     figures |= growth(quick)
-    figures |= replanning(quick)
     figures |= on_the_twin(quick)
     return figures
 
@@ -83,12 +83,12 @@ def predicted(quick: bool) -> Figures:
 def kinematics_and_gains() -> Figures:
     """How far the rod's polyline is from the arcs, what its fold costs, and what the gains do."""
     limb = Limb.default()
-    model = RodModel(limb)
+    model = PlanningRod(limb)
     opposite = np.radians([45.0, -45.0])
     gap = np.linalg.norm(model.kinematics.tip(opposite) - ArcKinematics(limb).tip(opposite))
     # With a short connector, as calibrations find it, the rod's fold lies across this motion.
     joined = dataclasses.replace(limb, connector_length=0.002)
-    kinematics = RodModel(joined).kinematics
+    kinematics = PlanningRod(joined).kinematics
     reference = Motion.named("asynchronous").reference(joined)
     figures: Figures = {"tip_arcs_to_polyline_at_45_and_-45_degrees_mm": float(gap) * 1e3}
     print(f"\nArcs and polyline at 45/-45 degrees: tips {gap * 1e3:.1f} mm apart")
@@ -185,34 +185,23 @@ def growth(quick: bool) -> Figures:
     return figures
 
 
-def replanning(quick: bool) -> Figures:
-    """Time of one replanning of the coming 2 s from a measured state."""
-    result = plan(Limb.default(), Motion.named("asynchronous", period=8.0), "der", "optimal")
-    horizon = RecedingHorizon(result)
-    rng = np.random.default_rng(0)
-    times = []
-    for k in range(0, 120, 4 if quick else 1):
-        state = result.bend_angles[k] + rng.normal(scale=0.01, size=2)
-        begin = time.perf_counter()
-        horizon.replan(k, state, np.zeros(2))
-        times.append(time.perf_counter() - begin)
-    middle, worst = float(np.median(times)) * 1e3, float(np.percentile(times, 99)) * 1e3
-    print(f"\nReplanning 2 s from a measured state: median {middle:.1f} ms, 99 % {worst:.1f} ms")
-    return {"replan_2s_median_ms": middle, "replan_2s_p99_ms": worst}
-
-
 def _rod_under(result: Plan, chambers: np.ndarray) -> np.ndarray:
     """Return the tip (K, 2) of the identified rod under the pressures that the chambers really had.
 
     Its distance from the played tip is the identification's part of the error: no open-loop plan on
     this model can do better but by luck.
     """
-    model = RodModel(result.limb)
+    model = PlanningRod(result.limb)
     spline = model.configuration(result.reference)
-    between = (chambers + np.vstack([chambers[1:], chambers[-1:]])) / 2
-    held = np.repeat(between[:, None], planner.SUBSTEPS, axis=1)
-    effective = planner.effective_pressures(result.limb, spline, held)
-    return model.simulate(effective, CONTROL_PERIOD, spline)
+    response = simulate(
+        model,
+        result.time,
+        pressures=chambers,
+        bend=lambda time: sample_spline(spline, time)[0],
+        start=model.state(spline(0.0), spline(0.0, 1)),
+        steps=STEPS,
+    )
+    return response.tip
 
 
 def on_the_twin(quick: bool) -> Figures:

@@ -30,6 +30,7 @@ from benchmarks.tracker_pictures import (
     swinging_limb,
     tag_field,
 )
+from benchmarks.tracker_quality import measure_fast_limb, measure_fixed_tags, measure_quality
 
 
 @dataclass
@@ -255,6 +256,9 @@ def run(quick: bool) -> dict[str, float | str]:
     cv2.setNumThreads(1)
     try:
         result: dict[str, float | str] = {"opencv": cv2.__version__}
+        result.update(measure_quality(1 if quick else 4))
+        result.update(measure_fixed_tags(4 if quick else 20))
+        result.update(measure_fast_limb(60 if quick else 300))
         result.update(measure_conditions(2 if quick else 6))
         scales: Sequence[tuple[float, str]] = ((1.0, "720p"), (1.5, "1080p"))
         for scale, name in scales:

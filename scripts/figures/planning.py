@@ -15,9 +15,9 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from der_planner.limb import Limb
+from der_planner.model.bending import ArcKinematics
 from der_planner.planning import METHODS, Motion, Plan, plan
 from der_planner.planning.inverse import angle_limits, solutions
-from der_planner.planning.kinematics import ArcKinematics
 from workspace_setup.basics import ROOT
 
 matplotlib.use("Agg")

@@ -151,6 +151,17 @@ def test_what_is_no_image_is_refused(detector, image):
         detector.detect(image)
 
 
+def test_an_empty_picture_is_refused(detector):
+    with pytest.raises(ValueError, match="empty"):
+        detector.detect(np.zeros((0, 640), np.uint8))
+
+
+@pytest.mark.parametrize("bits", [-1, 3])
+def test_more_forgiven_cells_than_are_safe_are_refused(bits):
+    with pytest.raises(ValueError, match="correct_bits"):
+        Detector(correct_bits=bits)
+
+
 def test_empty_and_saturated_images_have_no_tags(detector):
     for level in (0, 128, 255):
         assert detector.detect(np.full((480, 640), level, np.uint8)) == []

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from apriltag_tracker.encodings import ImageError, to_grey
+from apriltag_tracker.encodings import ImageError, ImageReader, to_grey
 from apriltag_tracker.sources import (
     DeviceSource,
     SourceError,
@@ -43,6 +43,44 @@ def test_sixteen_bits_keep_their_upper_byte(picture):
     assert np.array_equal(big, picture)
 
 
+@pytest.mark.parametrize(("bits", "shift"), [(10, 2), (12, 4), (14, 6)])
+def test_cameras_of_fewer_bits_than_their_words_are_as_bright(picture, bits, shift):
+    picture[0, 0] = 255
+    words = picture.astype("<u2") << shift
+    assert int(words.max()) < 1 << bits
+    assert np.array_equal(to_grey(words.tobytes(), 48, 64, 128, "mono16"), picture)
+
+
+def test_a_darker_image_of_the_same_camera_stays_dark(picture):
+    picture[0, 0] = 255
+    reader = ImageReader()
+    words = picture.astype("<u2") << 4
+    assert np.array_equal(reader.to_grey(words.tobytes(), 48, 64, 128, "mono16"), picture)
+    assert np.array_equal(
+        reader.to_grey((words >> 3).tobytes(), 48, 64, 128, "mono16"), picture >> 3
+    )
+
+
+@pytest.mark.parametrize("wide", [False, True])
+@pytest.mark.parametrize("first", ["rggb", "bggr", "gbrg", "grbg"])
+def test_bayer_patterns_give_the_grey_of_their_colours(first, wide):
+    colours = {"r": 200, "g": 120, "b": 40}
+    tile = np.array([colours[letter] for letter in first], dtype=np.uint16).reshape(2, 2)
+    mosaic = np.tile(tile, (24, 32))
+    data = (mosaic << 8 | 0xFF).astype("<u2") if wide else mosaic.astype(np.uint8)
+    name = f"bayer_{first}{16 if wide else 8}"
+    grey = to_grey(data.tobytes(), 48, 64, 128 if wide else 64, name)
+    expected = round(0.299 * 200 + 0.587 * 120 + 0.114 * 40)
+    assert np.abs(grey[2:-2, 2:-2].astype(int) - expected).max() <= 1
+
+
+@pytest.mark.parametrize("encoding", ["nv12", "nv21"])
+def test_planar_yuv_keeps_its_brightness(picture, encoding):
+    colour = np.full((24, 64), 128, dtype=np.uint8)
+    data = np.vstack([picture, colour]).tobytes()
+    assert np.array_equal(to_grey(data, 48, 64, 64, encoding), picture)
+
+
 @pytest.mark.parametrize(
     ("encoding", "order"),
     [("bgr8", [0, 1, 2]), ("rgb8", [2, 1, 0]), ("bgra8", [0, 1, 2, 0]), ("rgba8", [2, 1, 0, 0])],
@@ -63,7 +101,7 @@ def test_yuv_keeps_its_brightness(picture):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((b"x" * 3072, 48, 64, 64, "bayer_rggb8"), "unknown encoding 'bayer_rggb8'"),
+        ((b"x" * 3072, 48, 64, 64, "yuv422p"), "unknown encoding 'yuv422p'"),
         ((b"x" * 100, 48, 64, 64, "mono8"), "100 bytes"),
         ((b"x" * 3072, 48, 64, 60, "mono8"), "60 bytes a row"),
         ((b"", 0, 0, 0, "mono8"), "0 x 0"),

@@ -31,7 +31,9 @@ def test_a_moving_limb_is_tracked_as_well_as_it_is_detected(tags, camera, detect
 
 
 def test_a_tag_that_was_covered_comes_back_by_its_region(tags, camera, detector, swing):
-    options = TrackingOptions(full_search_period=100.0, missing_search_period=100.0)
+    options = TrackingOptions(
+        full_search_period=100.0, missing_search_period=100.0, absent_search_period=100.0
+    )
     tracker = TagTracker(tags.ids, detector, options)
     for k in range(12):
         time = k * PERIOD

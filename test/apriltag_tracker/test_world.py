@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from apriltag_tracker.camera import CameraPose, project
-from apriltag_tracker.detection import Tag
+from apriltag_tracker.tag import Tag
 from apriltag_tracker.world import WorldPose
 
 

@@ -19,9 +19,9 @@ from sensor_msgs.msg import CameraInfo, Image
 from visualization_msgs.msg import Marker, MarkerArray
 
 from apriltag_tracker.camera import CameraError, Intrinsics
-from apriltag_tracker.detection import Detector
-from apriltag_tracker.encodings import to_grey
-from apriltag_tracker.monitor import NO_CALIBRATION, Monitor
+from apriltag_tracker.detection import MOST_CORRECTED_BITS, Detector
+from apriltag_tracker.encodings import ImageReader
+from apriltag_tracker.image_watch import NO_CALIBRATION, ImageWatch
 from apriltag_tracker.overlay import draw_observation
 from apriltag_tracker.pipeline import (
     LimbObservation,
@@ -98,7 +98,7 @@ class TrackerNode(Node):
                     1,
                     "wrong bits of a code that are forgiven in a search",
                     at_least=0,
-                    at_most=3,
+                    at_most=MOST_CORRECTED_BITS,
                 )
             ),
         )
@@ -106,11 +106,12 @@ class TrackerNode(Node):
         self._warm_up()
         self._gaps = StampGaps()
         self._tracker: LimbTracker | None = None
+        self._reader = ImageReader()
         self._last_stamp = -1
         self._level = ""
         self._last_markers = 0.0
         self._image_topic = self.resolve_topic_name(topics.IMAGE)
-        self._monitor = Monitor(
+        self._watch = ImageWatch(
             self._image_topic if source == "topic" else source, is_topic=source == "topic"
         )
         self._make_topics()
@@ -161,6 +162,12 @@ class TrackerNode(Node):
                 TrackerOptions.reject_beyond,
                 "distance in m from the other tags' shape at which a tag is left out",
                 0.1,
+            ),
+            largest_tip_sigma=number(
+                "largest_tip_sigma",
+                TrackerOptions.largest_tip_sigma,
+                "standard deviation of the tip in m above which no tip is told",
+                1.0,
             ),
             uncertainty=Uncertainty(
                 survey=number(
@@ -214,13 +221,13 @@ class TrackerNode(Node):
                 message.width, message.height, message.k, message.d, message.distortion_model
             )
         except CameraError as error:
-            self._monitor.calibration_problem = str(error)
+            self._watch.calibration_problem = str(error)
             return
         self._use(intrinsics)
 
     def _use(self, intrinsics: Intrinsics) -> None:
         """Take a calibration; one that is like the present one changes nothing."""
-        self._monitor.calibration_problem = ""
+        self._watch.calibration_problem = ""
         now = self._tracker.intrinsics if self._tracker is not None else None
         if (
             now is not None
@@ -233,7 +240,7 @@ class TrackerNode(Node):
 
     def _on_image(self, message: Image) -> None:
         try:
-            gray = to_grey(
+            gray = self._reader.to_grey(
                 message.data,
                 message.height,
                 message.width,
@@ -242,7 +249,7 @@ class TrackerNode(Node):
                 bool(message.is_bigendian),
             )
         except ValueError as error:
-            self._monitor.arrived()
+            self._watch.arrived()
             self._fail(message.header.stamp, str(error))
             return
         self._take(gray, message.header.stamp)
@@ -252,7 +259,7 @@ class TrackerNode(Node):
         try:
             grabbed: Grabbed | None = self._source.read()
         except SourceError as error:
-            self._monitor.image_problem = str(error)
+            self._watch.image_problem = str(error)
             return
         if grabbed is not None:
             self._take(grabbed.gray, stamps.stamp_from_nanoseconds(grabbed.stamp))
@@ -260,15 +267,15 @@ class TrackerNode(Node):
     def _take(self, gray: NDArray[np.uint8], stamp: Time) -> None:
         """Process one image and publish what it says under its own stamp."""
         started = time.perf_counter()
-        self._monitor.arrived()
+        self._watch.arrived()
         if stamps.nanoseconds(stamp) == self._last_stamp:
             # The same picture again says nothing new.
-            self._monitor.repeated += 1
+            self._watch.repeated += 1
             return
         self._last_stamp = stamps.nanoseconds(stamp)
         self._gaps.take(self._last_stamp)
         if self._tracker is None:
-            self._fail(stamp, self._monitor.calibration_problem or NO_CALIBRATION)
+            self._fail(stamp, self._watch.calibration_problem or NO_CALIBRATION)
             return
         try:
             observation = self._tracker.observe(gray, stamps.seconds(stamp))
@@ -276,11 +283,11 @@ class TrackerNode(Node):
             self._fail(stamp, str(error))
             return
         latency = self._publish(observation, gray, stamp)
-        self._monitor.observed(observation, latency, time.perf_counter() - started)
+        self._watch.observed(observation, latency, time.perf_counter() - started)
 
     def _fail(self, stamp: Time, problem: str) -> None:
         """Say at once that this image gives no state, and why."""
-        self._monitor.failed_with(problem)
+        self._watch.failed_with(problem)
         self._states.publish(self._state(LimbObservation((), None, problem), stamp))
 
     # Output
@@ -346,7 +353,7 @@ class TrackerNode(Node):
 
     def _health(self) -> Health:
         publishers = self.count_publishers(self._image_topic) if self._source is None else 0
-        report = self._monitor.report(self._tracker, publishers)
+        report = self._watch.report(self._tracker, publishers)
         if report.level != self._level:
             self._level = report.level
             if report.level == "ok":

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apriltag_tracker.camera import CameraPose, Intrinsics
-from apriltag_tracker.detection import Detector, Tag, enlarged_tag
-from apriltag_tracker.plane import centreline_pose, locate
+from apriltag_tracker.detection import Detector, enlarged_tag
+from apriltag_tracker.plane import centreline_pose, locate, pose_moves
 from apriltag_tracker.shape import LimbEstimate, PlanarTag, ShapeFitter, ShapePrior
+from apriltag_tracker.tag import Tag
 from apriltag_tracker.tag_map import LimbTag, TagMap, WorldTag
 from apriltag_tracker.tracking import TagTracker, TrackingOptions
 from apriltag_tracker.world import WorldPose
@@ -45,6 +46,8 @@ class TrackerOptions:
         largest_misfit: RMS distance of a tag's corners from a square of its size [m, as a share of
             the size] above which it is not at the height it should be at.
         uncertainty: what averaging does not remove.
+        largest_tip_sigma: standard deviation of the tip, noise and systematic together, above which
+            it is not told [m].
         prior: how the limb may differ from ideal.
         tracking: when to search how.
     """
@@ -52,6 +55,7 @@ class TrackerOptions:
     bridge_frames: int = 5
     reject_beyond: float = 0.004
     largest_misfit: float = 0.06
+    largest_tip_sigma: float = 0.01
     uncertainty: Uncertainty = field(default_factory=Uncertainty)
     prior: ShapePrior = field(default_factory=ShapePrior)
     tracking: TrackingOptions = field(default_factory=TrackingOptions)
@@ -141,14 +145,19 @@ class LimbTracker:
             )
         found = self.tracker.track(gray, stamp)
         pose = self.world.update(found)
-        placed, planar, common = self._place(found, pose)
+        placed, planar, common, shared_noise = self._place(found, pose)
         if pose is None:
             return LimbObservation(placed, None, f"no camera pose: {self.world.problem}")
-        estimate = self.fitter.fit(planar, common) if planar else None
+        estimate = self.fitter.fit(planar, common, shared_noise) if planar else None
         if estimate is None:
             return self._bridge(placed, stamp, bool(planar))
-        self._bridged = 0
         self.misplaced += len(estimate.rejected)
+        sigma = estimate.tip_sigma
+        if sigma > self.options.largest_tip_sigma:
+            self._history.clear()
+            reason = f"the tip is known to {1e3 * sigma:.0f} mm only; {self._remark(estimate)}"
+            return LimbObservation(placed, None, reason)
+        self._bridged = 0
         if self._history and stamp <= self._history[-1][0]:
             self._history.clear()
         self._history = [*self._history[-1:], (stamp, estimate)]
@@ -156,11 +165,11 @@ class LimbTracker:
 
     def _place(
         self, found: Sequence[Tag], pose: CameraPose | None
-    ) -> tuple[tuple[PlacedTag, ...], list[PlanarTag], NDArray[np.float64]]:
-        """Place all tags on their planes; those of the limb also with their shared errors."""
+    ) -> tuple[tuple[PlacedTag, ...], list[PlanarTag], NDArray[np.float64], NDArray[np.float64]]:
+        """Place all tags on their planes; those of the limb also with shared errors and noise."""
         if pose is None or not found:
             placed = tuple(PlacedTag(tag, tag.id in self._limb_tags, None) for tag in found)
-            return placed, [], np.empty((0, 3, 0))
+            return placed, [], np.empty((0, 3, 0)), np.empty((0, 3, 0))
         flat = np.array([self._flat[tag.id] for tag in found])
         places, spreads, misfits = locate(
             np.array([tag.corners for tag in found]),
@@ -185,7 +194,9 @@ class LimbTracker:
             PlacedTag(tag, tag.id in self._limb_tags, place)
             for tag, place in zip(found, places, strict=True)
         )
-        return everywhere, planar, common
+        noise = pose_moves(places[used], flat[used, 0], flat[used, 1], pose)
+        root = np.linalg.cholesky(self.world.covariance + 1e-18 * np.eye(6))
+        return everywhere, planar, common, noise @ root
 
     def _common_errors(
         self, places: NDArray[np.float64], heights: NDArray[np.float64], pose: CameraPose

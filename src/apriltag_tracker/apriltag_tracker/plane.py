@@ -132,6 +132,52 @@ def locate(
     return places, spreads, misfits
 
 
+def pose_moves(
+    places: NDArray[np.float64],
+    heights: NDArray[np.float64],
+    sizes: NDArray[np.float64],
+    pose: CameraPose,
+) -> NDArray[np.float64]:
+    """Return how placed tags move with the camera's pose while their pixels stay.
+
+    A point X of the camera's frame that turns by ω and shifts by τ goes to X + ω × X + τ; what the
+    pixel shows on the plane moves so that the ray stays.
+
+    Args:
+        places: (n, 3) x, y [m], yaw [rad].
+        heights: (n,) m.
+        sizes: (n,) m.
+        pose: of the camera.
+
+    Returns:
+        (n, 3, 6) derivatives of x, y, yaw by ω [rad] and τ [m].
+    """
+    count = len(places)
+    cosine, sine = np.cos(places[:, 2]), np.sin(places[:, 2])
+    along = 0.5 * sizes[:, None] * np.stack([cosine, sine, np.zeros(count)], axis=1)
+    across = 0.5 * sizes[:, None] * np.stack([-sine, cosine, np.zeros(count)], axis=1)
+    centre = np.column_stack([places[:, :2], heights])
+    points = np.concatenate([centre, centre + along, centre + across])
+    seen = points @ pose.rotation.T + pose.translation
+    # Columns of ω × X are e × X; turned into limb_base.
+    shifts = np.empty((len(points), 3, 6))
+    for axis in range(3):
+        unit = np.zeros(3)
+        unit[axis] = 1.0
+        shifts[:, :, axis] = np.cross(unit, seen)
+        shifts[:, :, 3 + axis] = unit
+    shifts = np.einsum("ji,njk->nik", pose.rotation, shifts)
+    ray = seen @ pose.rotation
+    moved = ray[:, :2, None] * (shifts[:, 2:] / ray[:, 2, None, None]) - shifts[:, :2]
+    middle, right, up = moved[:count], moved[count : 2 * count], moved[2 * count :]
+    result = np.empty((count, 3, 6))
+    result[:, :2] = middle
+    turn_right = np.einsum("ni,nik->nk", across[:, :2], right - middle)
+    turn_up = np.einsum("ni,nik->nk", along[:, :2], up - middle)
+    result[:, 2] = 0.5 * (turn_right - turn_up) / (0.25 * sizes**2)[:, None]
+    return result
+
+
 def centreline_pose(place: NDArray[np.float64], tag: LimbTag) -> NDArray[np.float64]:
     """Take the mounting offset off a tag's pose: the centreline's pose at its arc length, (3,)."""
     along, across, turn = tag.offset

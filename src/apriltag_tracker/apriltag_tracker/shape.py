@@ -69,7 +69,7 @@ class LimbEstimate:
 
     Attributes:
         tip: (2,) m.
-        tip_covariance: (2, 2) m², repeatability.
+        tip_covariance: (2, 2) m², noise of this image's corners and of the camera's pose.
         tip_systematic: (2, 2) m², what averaging does not remove: survey, height, mounting.
         tip_heading: [rad].
         bend_angle: (M,) rad, heading at the end of each segment less that at its start, of the
@@ -95,6 +95,12 @@ class LimbEstimate:
     curve: NDArray[np.float64]
     tags_used: tuple[int, ...]
     rejected: dict[int, float] = field(default_factory=dict)
+
+    @property
+    def tip_sigma(self) -> float:
+        """Standard deviation of the tip in its least certain direction, of both parts [m]."""
+        both = self.tip_covariance + self.tip_systematic
+        return float(np.sqrt(np.linalg.eigvalsh(both)[-1]))
 
 
 @dataclass(frozen=True)
@@ -151,7 +157,10 @@ class ShapeFitter:
         self._last = np.zeros(self._smooth.size)
 
     def fit(
-        self, tags: Sequence[PlanarTag], common: NDArray[np.float64] | None = None
+        self,
+        tags: Sequence[PlanarTag],
+        common: NDArray[np.float64] | None = None,
+        shared_noise: NDArray[np.float64] | None = None,
     ) -> LimbEstimate | None:
         """Fit the limb to the tags of one image.
 
@@ -159,6 +168,7 @@ class ShapeFitter:
             tags: of the limb, each id once.
             common: (n, 3, k) how the tags' poses move with k systematic errors of one standard
                 deviation each (survey, heights), in the order of the tags.
+            shared_noise: (n, 3, k) the same for noise that all tags share, of the camera's pose.
 
         Returns:
             The estimate, or None if no tag, or no consistent set of tags, was left.
@@ -169,8 +179,11 @@ class ShapeFitter:
         fit = self._solve(self._smooth, kept, self._last)
         self._last = fit.parameters
         order = [i for i, tag in enumerate(tags) if tag.id not in rejected]
-        shared = None if common is None else common[order]
-        return self._estimate(fit, arcs, kept, rejected, shared)
+        shared = tuple(
+            np.zeros((len(order), PLACE, 1)) if moves is None else moves[order]
+            for moves in (common, shared_noise)
+        )
+        return self._estimate(fit, arcs, kept, rejected, shared[0], shared[1])
 
     def _consistent(
         self, tags: list[PlanarTag]
@@ -273,7 +286,8 @@ class ShapeFitter:
         arcs: _Fit,
         tags: Sequence[PlanarTag],
         rejected: dict[int, float],
-        common: NDArray[np.float64] | None,
+        common: NDArray[np.float64],
+        shared_noise: NDArray[np.float64],
     ) -> LimbEstimate:
         curve, slopes = self._outline.places(fit.parameters)
         noise = np.zeros((2, 2))
@@ -282,9 +296,10 @@ class ShapeFitter:
         for i, tag in enumerate(tags):
             noise += tip_gain[:, i] @ tag.covariance @ tip_gain[:, i].T
             systematic += (tip_gain[:, i] * self._mounting**2) @ tip_gain[:, i].T
-        if common is not None:
-            shared = np.einsum("inj,njk->ik", tip_gain, common)
-            systematic += shared @ shared.T
+        shared = np.einsum("inj,njk->ik", tip_gain, common)
+        systematic += shared @ shared.T
+        shared = np.einsum("inj,njk->ik", tip_gain, shared_noise)
+        noise += shared @ shared.T
         # What the tags do not determine, the prior leaves open.
         undetermined = slopes[-1, :2] @ fit.left_open
         systematic += undetermined @ undetermined.T

@@ -1,10 +1,11 @@
 """Tags from frame to frame: short searches where tags are expected, full searches now and then.
 
 A tag that was seen is looked for at its predicted corners by the line fit itself, and its code is
-read there, which costs tens of microseconds. What is not found like that is looked for in enlarged
-regions around the prediction, put together into one mosaic for one call of the detector, and once
-more with the mosaic sharpened and enlarged. A full search runs once a second, and when tags are
-missing.
+read there. A tag too smeared for lines is confirmed by its whole pattern, from the blur and smear
+it had. When one is missing, the whole image is searched at once, which costs less than a search
+around several predictions. What is still missing is looked for in regions around the predictions,
+put together into one mosaic, as it is and then sharpened and enlarged. While all tags are tracked,
+a full search runs once a second.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from apriltag_tracker.detection import Detector, Tag, grey
+from apriltag_tracker.detection import Detector, grey
+from apriltag_tracker.tag import Tag
 
 _TILE = 16
 """Tiles of the mosaic are padded to a multiple of this [px]."""
@@ -24,9 +26,9 @@ _TILE = 16
 
 @dataclass
 class _Track:
-    """What is known of one tag: the last corners and their velocity."""
+    """What is known of one tag: as it was seen last, and the velocity of its corners."""
 
-    corners: NDArray[np.float64]
+    tag: Tag
     velocity: NDArray[np.float64]
     stamp: float
     missed: int = 0
@@ -38,7 +40,10 @@ class TrackingOptions:
 
     Attributes:
         full_search_period: s between full searches while all tags are tracked.
-        missing_search_period: s between full searches while a tag of the map is missing.
+        missing_search_period: s between full searches while a tag is missing that was seen in one
+            of the last `keep_frames` frames.
+        absent_search_period: s between full searches while a tag of the map is missing for longer,
+            e.g. covered; these also look for tags of little contrast.
         search: how far the sides of a tag may be from their prediction [px].
         keep_frames: frames for which a lost tag is still looked for where it was.
         region_growth: half the side of a search region over half the diagonal of the tag; it grows
@@ -48,7 +53,8 @@ class TrackingOptions:
     """
 
     full_search_period: float = 1.0
-    missing_search_period: float = 0.1
+    missing_search_period: float = 0.0
+    absent_search_period: float = 0.1
     search: float = 3.0
     keep_frames: int = 8
     region_growth: float = 1.6
@@ -88,12 +94,12 @@ class TagTracker:
         self.options = options or TrackingOptions()
         self.counts = TrackingCounts()
         self._tracks: dict[int, _Track] = {}
-        self._last_full = -np.inf
+        self._last_full = self._last_thorough = -np.inf
 
     def reset(self) -> None:
         """Forget all tracks: the next frame is searched in full."""
         self._tracks.clear()
-        self._last_full = -np.inf
+        self._last_full = self._last_thorough = -np.inf
 
     def track(self, gray: NDArray[np.uint8], stamp: float) -> list[Tag]:
         """Find the tags of one frame.
@@ -114,21 +120,36 @@ class TagTracker:
         predicted = {tag: self._predict(track, stamp) for tag, track in self._tracks.items()}
         found = self._by_prediction(image, predicted)
         self.counts.tracked += len(found)
-        since = stamp - self._last_full
-        missing = self._wanted - found.keys()
-        period = self.options.missing_search_period if missing else self.options.full_search_period
-        if since >= period:
-            self._last_full = stamp
-            self.counts.full_searches += 1
-            self._merge(found, self._detector.detect(image), predicted)
-        elif lost := [tag for tag in predicted if tag not in found]:
+        self._search_in_full(image, stamp, found, predicted)
+        if lost := [tag for tag in predicted if tag not in found]:
             self._merge(found, self._by_regions(image, lost, predicted), predicted)
         self._remember(found, stamp)
         return [found[tag] for tag in sorted(found)]
 
+    def _search_in_full(
+        self,
+        image: NDArray[np.uint8],
+        stamp: float,
+        found: dict[int, Tag],
+        predicted: dict[int, NDArray[np.float64]],
+    ) -> None:
+        """Search the whole image if it is time to."""
+        options = self.options
+        absent = bool(self._wanted - found.keys() - predicted.keys())
+        thorough = absent and stamp - self._last_thorough >= options.absent_search_period
+        missing = any(tag not in found for tag in predicted)
+        period = options.missing_search_period if missing else options.full_search_period
+        if not thorough and stamp - self._last_full < period:
+            return
+        self._last_full = stamp
+        if thorough:
+            self._last_thorough = stamp
+        self.counts.full_searches += 1
+        self._merge(found, self._detector.detect(image, thorough), predicted)
+
     @staticmethod
     def _predict(track: _Track, stamp: float) -> NDArray[np.float64]:
-        return track.corners + track.velocity * (stamp - track.stamp)
+        return track.tag.corners + track.velocity * (stamp - track.stamp)
 
     def _by_prediction(
         self, image: NDArray[np.uint8], predicted: dict[int, NDArray[np.float64]]
@@ -138,7 +159,8 @@ class TagTracker:
             return {}
         quads = np.ascontiguousarray([predicted[tag] for tag in fresh])
         ids = np.array(fresh, dtype=np.int64)
-        tags = self._detector.confirm(image, ids, quads, self.options.search, "tracked")
+        before = {tag: self._tracks[tag].tag for tag in fresh}
+        tags = self._detector.confirm(image, ids, quads, self.options.search, "tracked", before)
         return {tag.id: tag for tag in tags}
 
     def _by_regions(
@@ -227,8 +249,8 @@ class TagTracker:
             track = self._tracks.get(tag_id)
             velocity = np.zeros((4, 2))
             if track is not None and stamp > track.stamp:
-                velocity = (tag.corners - track.corners) / (stamp - track.stamp)
-            self._tracks[tag_id] = _Track(tag.corners, velocity, stamp)
+                velocity = (tag.corners - track.tag.corners) / (stamp - track.stamp)
+            self._tracks[tag_id] = _Track(tag, velocity, stamp)
         for tag_id in [tag for tag in self._tracks if tag not in found]:
             track = self._tracks[tag_id]
             track.missed += 1

@@ -9,16 +9,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apriltag_tracker.camera import CameraError, CameraPose, Intrinsics, solve_pose
-from apriltag_tracker.detection import Tag
+from apriltag_tracker.tag import Tag
 from apriltag_tracker.tag_map import TagMap, WorldTag
 
 
 @dataclass
 class _Seen:
-    """Running mean of one fixed tag's corners."""
+    """Running mean of one fixed tag's corners and of their covariance in one frame."""
 
     corners: NDArray[np.float64]
+    covariance: NDArray[np.float64]
     count: int = 1
+
+    def add(self, tag: Tag, memory: int) -> None:
+        """Take one more frame."""
+        self.count = min(self.count + 1, memory)
+        self.corners += (tag.corners - self.corners) / self.count
+        self.covariance += (tag.covariance - self.covariance) / self.count
+
+
+_LASTING = 0.01
+"""Error of a corner that stays from frame to frame, so that averaging does not remove it [px]."""
 
 
 class WorldPose:
@@ -55,6 +66,8 @@ class WorldPose:
         self._frames = 0
         self._shifted = 0
         self.pose: CameraPose | None = None
+        self.covariance = np.zeros((6, 6))
+        """Of the pose: a rotation vector [rad] and a shift [m], both in the camera's frame."""
         self.residual = float("nan")
         """RMS reprojection error of the fixed tags in the present solution [px]."""
         self.bumps = 0
@@ -72,10 +85,9 @@ class WorldPose:
         for tag, _ in known:
             seen = self._seen.get(tag.id)
             if seen is None:
-                self._seen[tag.id] = _Seen(tag.corners.copy())
+                self._seen[tag.id] = _Seen(tag.corners.copy(), tag.covariance.copy())
             else:
-                seen.count = min(seen.count + 1, self._memory)
-                seen.corners += (tag.corners - seen.corners) / seen.count
+                seen.add(tag, self._memory)
         if known and (self._frames < 10 or self._frames % self._solve_every == 0):
             self._solve()
         if known:
@@ -133,6 +145,32 @@ class WorldPose:
             return
         self.pose, self.excluded, self.problem = pose, excluded, ""
         self.residual = float(np.sqrt(np.mean(residuals**2)))
+        self.covariance = self._pose_covariance(pose, ids, points)
+
+    def _pose_covariance(
+        self, pose: CameraPose, ids: Sequence[int], points: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Carry the noise of the averaged corners over to the pose that fits them best, (6, 6)."""
+        seen = points @ pose.rotation.T + pose.translation
+        slopes = np.zeros((len(points), 2, 6))
+        depth = seen[:, 2]
+        for axis in range(2):
+            # The lens bends little across a tag: the focal length is the slope of the pixels.
+            per_metre = self._intrinsics.matrix[axis, axis] / depth
+            by_point = np.zeros((len(points), 3))
+            by_point[:, axis] = per_metre
+            by_point[:, 2] = -per_metre * seen[:, axis] / depth
+            slopes[:, axis, :3] = np.cross(seen, by_point)
+            slopes[:, axis, 3:] = by_point
+        rows = slopes.reshape(-1, 6)
+        gain = np.linalg.pinv(rows)
+        result = np.zeros((6, 6))
+        for k, tag in enumerate(ids):
+            known = self._seen[tag]
+            spread = known.covariance / known.count + _LASTING**2 * np.eye(8)
+            part = gain[:, 8 * k : 8 * k + 8]
+            result += part @ spread @ part.T
+        return result
 
     def _best_without(self, ids: Sequence[int], entries: dict[int, WorldTag]) -> int:
         costs = []

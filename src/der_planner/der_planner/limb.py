@@ -53,9 +53,8 @@ class Segment:
             before and in the one after it, over that of its own pressure [-]: a tube that passes
             through, a wall that is shared.
 
-    The last eight are what `der_planner.actuation` turns into pressures; the rod and the PCC model
-    are driven by the effective pressure that remains. All zero: effective and differential are the
-    same.
+    The last eight are those of `der_planner.model.material`, which turns the differential pressure
+    into the effective one that drives the rod and the PCC model. All zero: the two are the same.
     """
 
     length: float

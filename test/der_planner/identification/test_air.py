@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from der_planner.identification import CalibrationLog
-from der_planner.identification.air import AirFit, fit_air, predict_air
+from der_planner.identification.air import AirFit, fit_air
 from der_planner.identification.excitation import PERIOD, calibration_run, steps, waves
 from der_planner.identification.report import FitReport
 from der_planner.limb import Limb, Pneumatics
-from der_planner.planning.pneumatics import chamber_pressures
-from der_planner.twin.offline import split
+from der_planner.model.air import chamber_pressures, pair_of, pressures_at_commands
 from pressure_driver.emulator import pneumatics as emulator
 
 AIR = replace(Limb.default().pneumatics, time_constant=0.3, vent_time_constant=0.12, delay=0.04)
@@ -37,7 +36,7 @@ def emulated_log(seed: int, command: np.ndarray) -> CalibrationLog:
     for k, setpoint in enumerate(command):
         pressure = board.pressure
         measured[k] = pressure[0::2] - pressure[1::2]
-        board.command(board.atmosphere + split(setpoint))
+        board.command(board.atmosphere + pair_of(setpoint).ravel())
         board.step(PERIOD)
     return log_of(command, measured)
 
@@ -97,7 +96,7 @@ def test_a_vented_step_of_the_emulated_board_is_predicted(quick):
     measured = emulated_log(4, command).measured_differential
     falling = slice(122, None)
     missed = {
-        name: np.abs(predict_air(air, command, PERIOD) - measured)[falling].max(axis=0)
+        name: np.abs(pressures_at_commands(air, command, PERIOD) - measured)[falling].max(axis=0)
         for name, air in {
             "law": law(found),
             "lag": replace(law(found), vent_rate=0.0),

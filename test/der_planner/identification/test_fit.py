@@ -9,9 +9,9 @@ from der_planner.identification import CalibrationLog, LogError, check, fit, pre
 from der_planner.identification.excitation import calibration_run, steps, sweep, waves
 from der_planner.identification.geometry import fit_geometry, with_geometry
 from der_planner.identification.parameters import TERMS, exists, put, start_values
-from der_planner.identification.prediction import RodPrediction
+from der_planner.identification.rod_angles import RodAngles
 from der_planner.limb import Limb
-from der_planner.planning.kinematics import PolylineKinematics
+from der_planner.model.bending import PolylineKinematics
 from der_planner.rod import Rod
 
 NOISE = np.deg2rad(0.1)
@@ -76,7 +76,7 @@ def fitted(log):
 def test_derivatives_agree_with_differences(log):
     rows = slice(0, 300)
     pressure = log.measured_differential[rows]
-    prediction = RodPrediction(Limb.default(), log.time[rows], pressure)
+    prediction = RodAngles(Limb.default(), log.time[rows], pressure)
     values = start_values(hidden_limb())
     wanted = [(i, k) for i in range(2) for k in range(len(TERMS)) if exists(i, k, 2)]
     _, exact = prediction.derivatives(values, wanted)

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from der_planner.limb import Limb
+from der_planner.model.bending import ArcKinematics, PolylineKinematics
 from der_planner.planning import inverse
-from der_planner.planning.kinematics import ArcKinematics, PolylineKinematics
-from der_planner.planning.rod_model import RodModel
+from der_planner.planning.rod_model import PlanningRod
 from der_planner.rod import Rod
 
 LIMB = Limb.default()
 ARCS = ArcKinematics(LIMB)
-CHAIN = RodModel(LIMB).kinematics
+CHAIN = PlanningRod(LIMB).kinematics
 
 
 def polyline(count):
@@ -45,7 +45,7 @@ def test_the_chain_is_the_rods_evenly_bent_configuration():
 
 def test_a_stiff_base_moves_the_limb_along_x():
     based = replace(LIMB, base_length=7e-3)
-    model, rod = RodModel(based), Rod.from_limb(based, 21)
+    model, rod = PlanningRod(based), Rod.from_limb(based, 21)
     angles = [0.9, -0.4]
     q, _ = rod.configuration_from_bend_angles(angles)
     np.testing.assert_allclose(model.kinematics.nodes(angles), rod.positions(q)[:, :2], atol=1e-14)

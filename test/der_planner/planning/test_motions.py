@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from der_planner.limb import Limb
+from der_planner.model.bending import ArcKinematics
 from der_planner.planning import NAMES, Motion, PathLimits, PlanningError, UnreachableError
-from der_planner.planning.kinematics import ArcKinematics
 from der_planner.planning.motions import JOINT_MOTIONS
 from der_planner.planning.paths import TipPath
 

@@ -1,28 +1,29 @@
-"""The optimal method: exact derivatives, the quadratic programme, windows, receding horizon."""
+"""The optimal method: exact derivatives, the quadratic programme, windows."""
 
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
 from der_planner.limb import Limb
-from der_planner.planning import Motion, PlanningError, plan, planner, pneumatics
-from der_planner.planning.motions import CONTROL_PERIOD
+from der_planner.model import commands
+from der_planner.model.drive import STEPS
+from der_planner.model.series import CONTROL_PERIOD
+from der_planner.planning import Motion, plan, planner
 from der_planner.planning.optimal import Optimiser, Settings
 from der_planner.planning.quadratic import Band, solve_limited
-from der_planner.planning.receding import RecedingHorizon
-from der_planner.planning.rod_model import RodModel
+from der_planner.planning.rod_model import PlanningRod
 
 LIMB = Limb.default()
 
 
 def solver_for(limb, motion, **settings):
-    model = RodModel(limb)
+    model = PlanningRod(limb)
     reference = motion.reference(limb)
     spline = model.configuration(reference)
-    warm = pneumatics.commands(
+    warm = commands.commands(
         model.limb, *planner.balance(model, spline, reference, "projected"), CONTROL_PERIOD
     )
-    return Optimiser(model, spline, reference, warm, planner.SUBSTEPS, Settings(**settings))
+    return Optimiser(model, spline, reference, warm, STEPS, Settings(**settings))
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +35,7 @@ def test_sensitivities_against_finite_differences(fast):
     command = fast.warm.copy()
     first, last = 0, 40
     state = fast.start
-    quadratic = fast._linearise(command, state, first, last, 0.0)
+    quadratic = fast._linearise(fast.drive.window(command[:last], first), state, 0.0)
     rng = np.random.default_rng(0)
     for _ in range(3):
         direction = rng.normal(size=(last - first, 2))
@@ -55,8 +56,8 @@ def test_gradient_of_the_cost_against_finite_differences(fast):
     first, last = 30, 60
     command = fast.warm + rng.normal(scale=30.0, size=fast.warm.shape)
     state = fast.model.rest
-    _, misses = fast._evaluate(command, state, first, last)
-    quadratic = fast._linearise(command, state, first, last, 0.0)
+    _, misses, _ = fast._evaluate(command, state, first, last)
+    quadratic = fast._linearise(fast.drive.window(command[:last], first), state, 0.0)
     gradient = quadratic.jacobian.T @ misses.ravel() + fast._pull(command, first, last)
     direction = rng.normal(size=(last - first, 2))
     ahead, behind = command.copy(), command.copy()
@@ -80,9 +81,9 @@ def test_windows_agree_with_one_window():
 def test_predicted_tip_is_the_one_the_rod_gives_again():
     motion = Motion.named("asynchronous", period=5.0, cycles=2)
     result = plan(LIMB, motion, "der", "optimal")
-    model = RodModel(LIMB)
+    model = PlanningRod(LIMB)
     spline = model.configuration(result.reference)
-    again = planner.predict(model, spline, result.differential_pressure)
+    again = planner.tip_under(model, spline, result.differential_pressure)
     np.testing.assert_allclose(result.tip_predicted, again, atol=1e-10)
 
 
@@ -126,52 +127,3 @@ def test_smoothness_makes_commands_smoother():
         return np.linalg.norm(np.diff(commands - warm, 2, axis=0))
 
     assert bends(smooth.commands) < 0.7 * bends(rough.commands)
-
-
-def test_replanning_brings_a_limb_back_that_was_pushed():
-    motion = Motion.named("same_direction", amplitude=0.5, period=6.0, cycles=1)
-    result = plan(LIMB, motion, "der", "optimal")
-    model = RodModel(LIMB)
-    rod, pushed = model.rod, 30
-
-    def run(closed):
-        horizon = RecedingHorizon(result)
-        errors, state = [], model.rest
-        angles = rod.bend_angles(state)
-        for k in range(90):
-            before, angles = angles, rod.bend_angles(state)
-            if k == pushed:
-                swing = model.state(angles, (angles - before) / 0.05 + [1.5, -1.0])
-                state = rod.state(state.q, swing.v, like=state)
-            if closed and k > pushed:
-                # The rates from the angles, as from a camera, would be those half a period ago.
-                edges = rod.bend_angles(state.q + 1e-4 * state.v) - angles
-                horizon.replan(k, angles, edges / 1e-4)
-            errors.append(np.linalg.norm(rod.tip(state)[:2] - result.tip_reference[k]))
-            chambers = pneumatics.chamber_pressures(
-                LIMB.pneumatics, horizon.commands[: k + 1], 0.05, planner.SUBSTEPS
-            )
-            state = rod.simulate(state, chambers[k:], 0.05, substeps=planner.SUBSTEPS).final
-        return np.array(errors), horizon.commands
-
-    open_loop, _ = run(closed=False)
-    closed_loop, commands = run(closed=True)
-    np.testing.assert_array_equal(closed_loop[: pushed + 1], open_loop[: pushed + 1])
-    assert open_loop[pushed + 10 :].max() > 5e-3
-    assert closed_loop[pushed + 10 :].mean() < 0.5 * open_loop[pushed + 10 :].mean()
-    steps = np.diff(commands[:90], axis=0, prepend=0.0)
-    assert np.abs(steps).max() <= LIMB.pneumatics.slew_limit * 0.05 + 1e-6
-
-
-def test_bad_replanning_is_named():
-    motion = Motion.named("same_direction", amplitude=0.3, period=4.0, cycles=1)
-    with pytest.raises(PlanningError, match="only plans of the rod"):
-        RecedingHorizon(plan(LIMB, motion, "pcc"))
-    result = plan(LIMB, motion, "der", "projected")
-    with pytest.raises(PlanningError, match="4 setpoints or more"):
-        RecedingHorizon(result, horizon=2)
-    horizon = RecedingHorizon(result)
-    with pytest.raises(PlanningError, match="setpoint 9999 is not one of"):
-        horizon.replan(9999, [0.0, 0.0], [0.0, 0.0])
-    with pytest.raises(PlanningError, match="2 finite bend angles"):
-        horizon.replan(3, [0.0, np.nan], [0.0, 0.0])

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from der_planner.limb import CalibratedRange, Limb
+from der_planner.model import commands
+from der_planner.model.air import chamber_pressures
 from der_planner.planning import (
     METHODS,
     Motion,
@@ -13,10 +15,9 @@ from der_planner.planning import (
     Start,
     UnreachableError,
     plan,
-    pneumatics,
 )
 from der_planner.planning.inverse import static_pressure
-from der_planner.planning.rod_model import RodModel
+from der_planner.planning.rod_model import PlanningRod
 
 LIMB = Limb.default()
 CASES = ("asynchronous", "same_direction", "opposite_direction")
@@ -56,7 +57,7 @@ FREE = changed(LIMB, {"slew_limit": 1e6, "pressure_limit": 1e5})
 
 @pytest.fixture(scope="module")
 def model():
-    return RodModel(UNEVEN)
+    return PlanningRod(UNEVEN)
 
 
 def full_force(model, k, q, v, a):
@@ -78,8 +79,8 @@ def full_force(model, k, q, v, a):
 def test_needed_forces_are_those_of_the_rod(model):
     rng = np.random.default_rng(1)
     q, v, a = rng.normal(size=(3, 4, 2))
-    force = model._needed_force(q, v, a)[:, 1:]
-    inputs = model._input_matrix(q)
+    force = model.balance._needed_force(q, v, a)[:, 1:]
+    inputs = model.balance._input_matrix(q)
     for k in range(4):
         state, exact = full_force(model, k, q, v, a)
         np.testing.assert_allclose(force[k].ravel(), exact, atol=1e-9 * np.abs(exact).max())
@@ -90,7 +91,7 @@ def test_needed_forces_are_those_of_the_rod(model):
 def test_projected_pressures_leave_no_virtual_work(model):
     rng = np.random.default_rng(2)
     q, v, a = rng.normal(size=(3, 4, 2))
-    pressures = model.projected_pressures(q, v, a)
+    pressures = model.balance.projected(q, v, a)
     for k in range(4):
         state, needed = full_force(model, k, q, v, a)
         supplied = model.rod.input_matrix(state)[model.rod.free] @ pressures[k]
@@ -102,7 +103,7 @@ def test_projected_pressures_leave_no_virtual_work(model):
 def test_paper_pressures_are_the_least_squares_solution(model):
     rng = np.random.default_rng(3)
     q, v, a = rng.normal(size=(3, 3, 2))
-    pressures = model.paper_pressures(q, v, a)
+    pressures = model.balance.paper(q, v, a)
     for k in range(3):
         state, needed = full_force(model, k, q, v, a)
         matrix = model.rod.input_matrix(state)[model.rod.free]
@@ -115,7 +116,7 @@ def test_at_rest_every_method_is_the_static_inversion(method, model):
     rng = np.random.default_rng(4)
     angles = rng.uniform(-1.0, 1.0, size=(5, 2))
     zero = np.zeros_like(angles)
-    solve = {"paper": model.paper_pressures, "projected": model.projected_pressures}[method]
+    solve = {"paper": model.balance.paper, "projected": model.balance.projected}[method]
     pressures = solve(angles, zero, zero)
     for wanted, pressure in zip(angles, pressures, strict=True):
         resting = model.rod.equilibrium(pressure)
@@ -124,23 +125,23 @@ def test_at_rest_every_method_is_the_static_inversion(method, model):
 
 @pytest.mark.parametrize("name", CASES)
 def test_paper_becomes_the_static_inversion_as_speed_goes_to_zero(name):
-    model = RodModel(LIMB)
+    model = PlanningRod(LIMB)
     gaps = []
     for period in (10.0, 20.0, 40.0):
         reference = Motion.named(name, period=period, cycles=1).reference(LIMB)
         q, v, a = reference.sample(reference.time)
-        moving = model.paper_pressures(q, v, a)
-        resting = model.paper_pressures(q, 0 * v, 0 * a)
+        moving = model.balance.paper(q, v, a)
+        resting = model.balance.paper(q, 0 * v, 0 * a)
         gaps.append(np.abs(moving - resting).max())
     # Inertia falls with the square of speed, damping with speed.
     assert gaps[0] > 1.8 * gaps[1] > 3.2 * gaps[2]
 
 
 def test_the_papers_gains_add_nothing_without_an_error_and_little_with_one():
-    model = RodModel(LIMB)
+    model = PlanningRod(LIMB)
     q = np.tile([0.3, 0.2], (40, 1))
     zero = np.zeros_like(q)
-    balance = model.paper_pressures(q[:1], zero[:1], zero[:1])[0]
+    balance = model.balance.paper(q[:1], zero[:1], zero[:1])[0]
     # The rolled rod starts straight, far from the reference: (B Λ)† sees only the few rows beside
     # the couples, so that a distributed error hardly comes back.
     away = model._paper_beside_the_model(q, zero, zero, 0.025)
@@ -302,7 +303,7 @@ def test_held_commands_reach_the_chambers_as_the_lag_says():
     air = changed(LIMB, {"delay": 0.02}).pneumatics
     command = np.zeros((40, 1))
     command[4:] = 1000.0
-    chambers = pneumatics.chamber_pressures(air, command, 0.05, 10)
+    chambers = chamber_pressures(air, command, 0.05, 10)
     time = ((np.arange(400) + 0.5) * 0.005).reshape(40, 10, 1) - 0.2 - 0.02
     exact = np.where(time > 0, 1000.0 * (1 - np.exp(-time / air.time_constant)), 0.0)
     np.testing.assert_allclose(chambers, exact, atol=1e-9)
@@ -313,8 +314,8 @@ def test_commands_invert_hold_lag_and_delay():
     fine = np.arange(401) * 0.025
     wanted = np.column_stack([4e3 * (1 - np.cos(fine)), 2e3 * np.sin(0.7 * fine) ** 2])
     bend = np.zeros_like(wanted)
-    command = pneumatics.commands(limb, fine, wanted, bend, 0.05)
-    chambers = pneumatics.chamber_pressures(limb.pneumatics, command, 0.05, 5)
+    command = commands.commands(limb, fine, wanted, bend, 0.05)
+    chambers = chamber_pressures(limb.pneumatics, command, 0.05, 5)
     middle = (np.arange(len(command) * 5) + 0.5) * 0.01
     exact = np.column_stack([np.interp(middle, fine, column) for column in wanted.T])
     assert np.abs(chambers.reshape(-1, 2) - exact)[50:].max() < 60.0
@@ -322,6 +323,6 @@ def test_commands_invert_hold_lag_and_delay():
 
 def test_static_pressure_holds_the_angles_of_the_rod():
     angles = np.array([0.5, -0.6])
-    rod = RodModel(LIMB).rod
+    rod = PlanningRod(LIMB).rod
     resting = rod.equilibrium(static_pressure(LIMB, angles))
     np.testing.assert_allclose(rod.bend_angles(resting), angles, rtol=2e-3)

@@ -8,10 +8,12 @@ from der_planner.rod import Rod, compile
 
 COUNT = """
 from der_planner.limb import Limb
-from der_planner.rod import Rod, planar_step_kernel, spatial_step_kernel
+from der_planner.rod import Rod
+from der_planner.rod.planar import step_kernel as planar
+from der_planner.rod.spatial import step_kernel as spatial
 for plane in ("xy", None):
     Rod.from_limb(Limb.default(), plane=plane).warm_up()
-kernels = (planar_step_kernel.simulate, planar_step_kernel.newton, spatial_step_kernel.simulate)
+kernels = (planar.simulate, planar.newton, spatial.simulate)
 print(sum(sum(kernel.stats.cache_misses.values()) for kernel in kernels))
 print(sum(sum(kernel.stats.cache_hits.values()) for kernel in kernels))
 """

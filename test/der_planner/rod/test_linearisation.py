@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from der_planner.limb import Limb
-from der_planner.rod import Rod
+from der_planner.rod import ConvergenceError, Rod, integration
 
 METHODS = ["sdirk2", "midpoint", "backward_euler"]
 
@@ -105,25 +105,34 @@ def test_it_needs_the_derivative_of_the_couples():
     assert difference > 1e-5
 
 
-@pytest.fixture(scope="module", params=METHODS)
+@pytest.fixture(
+    scope="module",
+    params=[
+        *(("planar", method) for method in METHODS),
+        *(("space", method) for method in METHODS),
+    ],
+    ids=" ".join,
+)
 def motion(request):
-    rod = limb_rod(material_damping=0.01)
+    kind, method = request.param
+    rod = limb_rod(material_damping=0.01) if kind == "planar" else spatial_rod()
     start = rod.equilibrium([1e3, -1e3])
     time = np.arange(30)[:, None] * 0.05
     u = 8e3 * np.sin(3 * time + [0.0, 1.0])
-    run = rod.simulate(start, u, 0.05, substeps=3, method=request.param, linearise=True)
-    return rod, start, u, request.param, run
+    run = rod.simulate(start, u, 0.05, substeps=3, method=method, linearise=True)
+    return rod, start, u, method, run
 
 
 def test_tangent_is_the_derivative_of_the_motion(motion):
     rod, start, u, method, run = motion
     change = np.random.default_rng(2).normal(size=u.shape) * 10
     predicted = run.linearisation.tangent(change)
+    outputs = run.linearisation.outputs
     ends = [
-        rod.simulate(start, u + sign * change, 0.05, substeps=3, method=method).tip
+        rod.simulate(start, u + sign * change, 0.05, substeps=3, method=method).q[:, outputs]
         for sign in (1, -1)
     ]
-    expected = (ends[0] - ends[1])[:, :2] / 2
+    expected = (ends[0] - ends[1]) / 2
     np.testing.assert_allclose(predicted, expected, atol=1e-5 * np.abs(expected).max())
 
 
@@ -133,13 +142,63 @@ def test_tangent_by_the_initial_state(motion):
     count = len(rod.free)
     dq, dv = random.normal(size=count) * 1e-6, random.normal(size=count) * 1e-5
     predicted = run.linearisation.tangent(np.zeros_like(u), (dq, dv))
+    outputs = run.linearisation.outputs
     ends = []
     for sign in (1, -1):
         q, v = start.q.copy(), start.v.copy()
         q[rod.free] += sign * dq
         v[rod.free] += sign * dv
-        ends.append(rod.simulate(rod.state(q, v), u, 0.05, substeps=3, method=method).tip)
-    expected = (ends[0] - ends[1])[:, :2] / 2
+        moved = rod.state(q, v, like=start)
+        ends.append(rod.simulate(moved, u, 0.05, substeps=3, method=method).q[:, outputs])
+    expected = (ends[0] - ends[1]) / 2
+    np.testing.assert_allclose(predicted, expected, atol=1e-5 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("kind", ["planar", "space"])
+def test_the_linearisation_of_a_cut_step_is_its_derivative(kind, monkeypatch):
+    """A jolt that a step of 0.1 s cannot follow, in space with fewer iterations than it takes."""
+    if kind == "space":
+        monkeypatch.setattr(integration, "_LIMIT", 12)
+    gravity = (0.3, -2.0, 0.0 if kind == "planar" else -2.0)
+    rod = Rod.from_limb(dataclasses.replace(Limb.default(), gravity=gravity))
+    start = rod.equilibrium([0.0, 0.0])
+    u = np.array([[1e3, 1e3], [1e5, -1e5], [2e3, 1e3], [0.0, 1e3]])
+    with pytest.raises(ConvergenceError, match=r"step 1 of 0\.1 s"):
+        rod.simulate(start, u, 0.1, method="backward_euler", halvings=0)
+    run = rod.simulate(start, u, 0.1, method="backward_euler", linearise=True)
+    solves = np.bincount(run.linearisation.solved.steps, minlength=4)
+    assert solves[0] == 1
+    assert solves[1] > 1
+    change = np.random.default_rng(8).normal(size=u.shape)
+    outputs = run.linearisation.outputs
+    ends = [
+        rod.simulate(start, u + sign * change, 0.1, method="backward_euler").q[:, outputs]
+        for sign in (1, -1)
+    ]
+    expected = (ends[0] - ends[1]) / 2
+    predicted = run.linearisation.tangent(change)
+    np.testing.assert_allclose(predicted, expected, atol=1e-4 * np.abs(expected).max())
+    weight = np.random.default_rng(9).normal(size=predicted.shape)
+    gradient = run.linearisation.adjoint(weight)
+    assert np.sum(gradient * change) == pytest.approx(np.sum(weight * predicted), rel=1e-8)
+    matrix = run.linearisation.sensitivity()
+    np.testing.assert_allclose(
+        np.einsum("kpjm,jm->kp", matrix, change), predicted, atol=1e-9 * np.abs(predicted).max()
+    )
+
+
+def test_an_angle_that_is_held_while_its_edge_moves():
+    """A held twist of the tip's edge: the frames turn below it, and the tangent knows."""
+    free = spatial_rod()
+    held = np.append(free.mesh.clamped, 4 * free.nodes - 5)
+    rod = Rod(dataclasses.replace(free.mesh, clamped=held))
+    start = rod.equilibrium([1e3, -1e3])
+    u = 8e3 * np.sin(3 * np.arange(20)[:, None] * 0.05 + [0.0, 1.0])
+    run = rod.simulate(start, u, 0.05, linearise=True)
+    change = np.random.default_rng(10).normal(size=u.shape) * 10
+    ends = [rod.simulate(start, u + sign * change, 0.05).tip for sign in (1, -1)]
+    expected = (ends[0] - ends[1]) / 2
+    predicted = run.linearisation.tangent(change)
     np.testing.assert_allclose(predicted, expected, atol=1e-5 * np.abs(expected).max())
 
 
@@ -147,7 +206,8 @@ def test_adjoint_is_the_transpose_of_the_tangent(motion):
     linearisation = motion[-1].linearisation
     random = np.random.default_rng(4)
     change = random.normal(size=(30, 3, 2))
-    weight = random.normal(size=(31, 2))
+    count = len(linearisation.outputs)
+    weight = random.normal(size=(31, count))
     gradient = linearisation.adjoint(weight, by_step=True)
     forward = np.sum(weight * linearisation.tangent(change))
     assert np.sum(gradient * change) == pytest.approx(forward, rel=1e-9)
@@ -157,7 +217,7 @@ def test_adjoint_is_the_transpose_of_the_tangent(motion):
 def test_sensitivity_is_the_matrix_of_the_tangent(motion):
     linearisation = motion[-1].linearisation
     matrix = linearisation.sensitivity()
-    assert matrix.shape == (31, 2, 30, 2)
+    assert matrix.shape == (31, len(linearisation.outputs), 30, 2)
     change = np.random.default_rng(5).normal(size=(30, 2))
     np.testing.assert_allclose(
         np.einsum("kpjm,jm->kp", matrix, change), linearisation.tangent(change), atol=1e-12
@@ -219,6 +279,34 @@ def test_parameter_tangent_is_the_derivative_by_a_parameter(option, value):
     ends = [r.simulate(start, u, 0.05, substeps=2).tip[:, :2] for r in (ahead, behind)]
     expected = (ends[0] - ends[1]) / 2
     assert np.abs(expected).max() > 1e-9
+    np.testing.assert_allclose(predicted, expected, atol=2e-4 * np.abs(expected).max())
+
+
+def test_parameter_tangent_in_space():
+    """Stiffness, gravity, damping and rest shape changed together, of a rod out of its plane."""
+    rod = spatial_rod()
+
+    def changed(size: float) -> Rod:
+        mesh = rod.mesh
+        return Rod(
+            dataclasses.replace(
+                mesh,
+                bend=mesh.bend * (1 + size),
+                twist=mesh.twist * (1 - 2 * size),
+                edge_mass=mesh.edge_mass * (1 + 0.5 * size),
+                viscous=mesh.viscous * (1 + 3 * size),
+                rest_kappa=mesh.rest_kappa * (1 - size),
+                rest_twist=mesh.rest_twist * (1 + size),
+                gravity=mesh.gravity * (1 + size),
+            )
+        )
+
+    start = rod.equilibrium([0.0, 0.0])
+    u = 8e3 * np.sin(3 * np.arange(30)[:, None] * 0.05 + [0.0, 1.0])
+    run = rod.simulate(start, u, 0.05, substeps=2, linearise=True)
+    predicted = rod.parameter_tangent(run, changed(1e-5))
+    ends = [changed(s).simulate(start, u, 0.05, substeps=2).tip for s in (1e-5, -1e-5)]
+    expected = (ends[0] - ends[1]) / 2
     np.testing.assert_allclose(predicted, expected, atol=2e-4 * np.abs(expected).max())
 
 

@@ -154,7 +154,8 @@ def test_friction_leaves_a_loop_that_an_elastic_limb_has_not():
 
 
 def test_pressures_in_small_steps_do_not_shake_the_friction_loose():
-    # What trembles does not rub: ringing of undamped modes would keep friction from its full value.
+    # Undamped modes would ring, reverse the bend all the time, and keep friction below its full
+    # value.
     twin = LimbTwin(1)
     for step in range(400):
         share = step // 2 * 2 / 400  # a board that tells its pressures every 20 ms

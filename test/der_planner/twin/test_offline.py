@@ -3,13 +3,16 @@
 import numpy as np
 import pytest
 
+from der_planner.model.air import pair_of
 from der_planner.twin import TwinError
-from der_planner.twin.offline import play, split
+from der_planner.twin.offline import play
 from pressure_driver.emulator.pneumatics import Pneumatics
 
 
 def test_each_differential_goes_into_one_chamber_of_its_pair():
-    np.testing.assert_array_equal(split(np.array([300.0, -20.0])), [300.0, 0.0, 0.0, 20.0])
+    np.testing.assert_array_equal(
+        pair_of(np.array([300.0, -20.0])).ravel(), [300.0, 0.0, 0.0, 20.0]
+    )
 
 
 def test_rows_are_what_was_before_the_setpoint():
@@ -34,7 +37,7 @@ def test_limb_feels_the_boards_pneumatics():
     expected = []
     for row in pressure:
         expected.append(air.pressure)
-        air.command(air.atmosphere + split(row))
+        air.command(air.atmosphere + pair_of(row).ravel())
         for _ in range(5):
             air.step(0.01)
     np.testing.assert_allclose(result.chamber_pressure, expected, rtol=1e-12)

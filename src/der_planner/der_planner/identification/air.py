@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 
 from der_planner.identification.log import CalibrationLog, LogError
 from der_planner.limb import Limb, Pneumatics
-from der_planner.planning.pneumatics import chamber_pressures
+from der_planner.model.air import pressures_at_commands
 
 Array = NDArray[np.float64]
 
@@ -23,7 +23,6 @@ SHOWN = (0.25, 0.15)
 relative, and of the exponent."""
 BETTER = 0.7
 """Share of the residual of lags alone that slow venting may leave to be believed."""
-_SUBSTEPS = 2
 _LOWEST = (0.005, 0.005, 0.0, 300.0, 0.3)
 _HIGHEST = (1.5, 1.5, 1.9, 60e3, 1.0)
 _NAMES = ("time_constant", "vent_time_constant", "delay", "vent_rate", "vent_exponent")
@@ -65,7 +64,7 @@ class AirFit:
 def fit_air(log: CalibrationLog, period: float) -> AirFit:
     """Fit the chambers' lag and venting to a log on a regular grid of ``period`` [s].
 
-    The law is that of `der_planner.planning.pneumatics`. A log whose chambers always follow their
+    The law is that of `der_planner.model.air`. A log whose chambers always follow their
     commands shows the lag alone; venting is then left open.
 
     Raises:
@@ -87,7 +86,7 @@ def fit_air(log: CalibrationLog, period: float) -> AirFit:
     falling = known & _after_no_step(np.abs(command), period, rising=True)
     found = _solve(command, measured - offset, falling, period, len(_START))
     lags = _solve(command, measured - offset, smooth, period, 3)
-    without = (predict_air(_air(lags.x), command, period) + offset - measured)[falling]
+    without = (pressures_at_commands(_air(lags.x), command, period) + offset - measured)[falling]
     venting = _shown(found) and found.spread < BETTER * float(np.sqrt(np.mean(without**2)))
     found = found if venting else lags
     return AirFit(
@@ -117,7 +116,7 @@ def _solve(
     """Fit the first ``count`` of lags, dead time, vent rate and exponent to rows of a log."""
 
     def residual(x: Array) -> Array:
-        difference: Array = (predict_air(_air(x), command, period) - measured)[rows]
+        difference: Array = (pressures_at_commands(_air(x), command, period) - measured)[rows]
         return difference
 
     def jacobian(x: Array) -> Array:
@@ -157,15 +156,6 @@ def _shown(solution: _Solution) -> bool:
     rate, of_rate, of_exponent = solution.x[3], *solution.deviation[3:]
     known = 0.0 < of_rate < SHOWN[0] * rate and 0.0 < of_exponent < SHOWN[1]
     return bool(known and _LOWEST[3] < 0.9 * rate < 0.8 * _HIGHEST[3])
-
-
-def predict_air(air: Pneumatics, command: Array, period: float) -> Array:
-    """Return differential pressures (K, M) [Pa] at the instants of held commands (K, M) [Pa]."""
-    middle = chamber_pressures(air, command, period, _SUBSTEPS)[:, 0]
-    # The middle of the first substep comes half a substep after the instant.
-    instants = np.arange(len(command)) * period
-    late = instants + 0.5 * period / _SUBSTEPS
-    return np.stack([np.interp(instants, late, column) for column in middle.T], axis=1)
 
 
 def _after_no_step(command: Array, period: float, rising: bool = False) -> NDArray[np.bool_]:

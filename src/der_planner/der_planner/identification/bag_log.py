@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.identification.log import CalibrationLog, LogError
+from der_planner.model.series import CONTROL_PERIOD, interpolate
 from der_planner.runs.recording.reader import BagError
 from der_planner.runs.run import Stream
 from der_planner.runs.series import (
@@ -21,7 +22,6 @@ from der_planner.runs.series import (
 
 Array = NDArray[np.float64]
 
-PERIOD = 0.05
 LONGEST_GAP = 0.25
 """Between two messages that a straight line may bridge [s]."""
 LEAST = 10
@@ -62,7 +62,7 @@ def read_bag(path: str | Path, namespace: str = "") -> CalibrationLog:
     end = min(measured.time[-1], angles.time[-1])
     if end - start < 1.0:
         raise LogError(f"in {path} pressures and limb states do not overlap: check the clocks")
-    grid = np.arange(start, end, PERIOD)
+    grid = np.arange(start, end, CONTROL_PERIOD)
     return CalibrationLog(
         time=grid - start,
         commanded_differential=_resampled(commanded, grid),
@@ -97,7 +97,7 @@ def _seen(samples: Stream) -> Stream:
 def _resampled(samples: Stream, grid: Array) -> Array:
     """Return the samples on a grid, linear in between, NaN in gaps longer than `LONGEST_GAP`."""
     instants = samples.time
-    result = np.stack([np.interp(grid, instants, part) for part in samples.value.T], axis=1)
+    result = interpolate(grid, instants, samples.value)
     after = np.clip(np.searchsorted(instants, grid), 1, len(instants) - 1)
     result[instants[after] - instants[after - 1] > LONGEST_GAP] = np.nan
     return result

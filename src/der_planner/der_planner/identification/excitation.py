@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.identification.log import LogError
+from der_planner.model.series import CONTROL_PERIOD as PERIOD
 
 Array = NDArray[np.float64]
 
-PERIOD = 0.05
-"""Of setpoints [s]."""
 SETTLED = 0.6
 """Share of a stair after which air and limb rest."""
 

@@ -25,11 +25,12 @@ from der_planner.identification.parameters import (
     without,
 )
 from der_planner.identification.pcc_fit import fit_pcc
-from der_planner.identification.prediction import NODES, RodPrediction
-from der_planner.identification.prepare import LONGEST_GAP, PERIOD, Prepared, prepare
+from der_planner.identification.prepare import LONGEST_GAP, Prepared, prepare
 from der_planner.identification.report import FitReport, Unknown
+from der_planner.identification.rod_angles import NODES, RodAngles
 from der_planner.identification.statics import static_gain
 from der_planner.limb import CalibratedRange, Limb
+from der_planner.model.series import CONTROL_PERIOD
 
 Array = NDArray[np.float64]
 
@@ -40,7 +41,7 @@ CORRELATION = 20.0
 MOST_EVALUATIONS = 25
 """Of model and derivatives; what still moves by then moves less than its uncertainty."""
 STRONG = 0.9
-"""|correlation| above which two unknowns are said to be told only together."""
+"""|correlation| above which two unknowns are reported as a pair that the log cannot tell apart."""
 UNTOLD = 0.8
 """Share of its prior spread that must be left of an unknown that the data say nothing about."""
 
@@ -160,7 +161,7 @@ class _Problem:
         self._scale = np.array([TERMS[index].scale for _, index in self._wanted])
         self._spread = np.array([TERMS[index].spread for _, index in self._wanted])
         self._known = np.isfinite(self._spread)
-        self._prediction = RodPrediction(limb, prepared.log.time, prepared.pressure - offset, nodes)
+        self._prediction = RodAngles(limb, prepared.log.time, prepared.pressure - offset, nodes)
         self._start = self._start_values(limb, prepared, offset)
         self._weight = 1.0 / (ANGLE_ERROR * np.sqrt(CORRELATION))
         self._cache: tuple[bytes, Array, Array] | None = None
@@ -292,7 +293,7 @@ def correlation_length(remaining: Array) -> float:
 
 def _try_air(prepared: Prepared, warnings: list[str]) -> AirFit | None:
     try:
-        return fit_air(prepared.log, PERIOD)
+        return fit_air(prepared.log, CONTROL_PERIOD)
     except LogError as error:
         warnings.append(f"the chambers' lag keeps its old value: {error}")
         return None

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from der_planner.identification.log import CalibrationLog
 from der_planner.limb import Limb
-from der_planner.planning.kinematics import PolylineKinematics
+from der_planner.model.bending import PolylineKinematics
 from der_planner.rod import Rod
 
 Array = NDArray[np.float64]

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from der_planner.actuation import slow_effective_pressure
 from der_planner.identification.prepare import Prepared
 from der_planner.limb import Limb, Segment
-from der_planner.pcc import Pcc
+from der_planner.model.material import slow_effective_pressure
+from der_planner.model.response import ArcModel, pressures_between
 
 Array = NDArray[np.float64]
 
@@ -42,16 +42,14 @@ def fit_pcc(limb: Limb, prepared: Prepared, offset: Array) -> tuple[tuple[Segmen
     time = prepared.log.time
     pressure = prepared.pressure - offset
     effective = slow_effective_pressure(limb, time, pressure)
-    middle = 0.5 * (effective[1:] + effective[:-1])
-    held = np.repeat(middle[:, None, :], STEPS, axis=1)
+    held = pressures_between(effective, STEPS)
     period = float(time[1] - time[0])
     count = limb.segment_count
     rows = prepared.usable
 
     def angles(x: Array) -> Array:
-        pcc = Pcc(replace(limb, segments=segments_of(limb, x)))
-        start = pcc.rest + pcc.gain * effective[0] / pcc.stiffness
-        return pcc.simulate(held, period / STEPS, angles=start)[0]
+        arcs = ArcModel(replace(limb, segments=segments_of(limb, x)))
+        return arcs.run(arcs.resting(effective[0]), held, period).bend_angles
 
     def residual(x: Array) -> Array:
         data = (angles(x) - prepared.log.bend_angles)[rows] / (ANGLE_ERROR * np.sqrt(CORRELATION))

@@ -10,6 +10,7 @@ from der_planner.identification.log import CalibrationLog
 from der_planner.identification.predict import predict
 from der_planner.identification.prepare import bridge
 from der_planner.limb import Limb
+from der_planner.model.series import CONTROL_PERIOD
 
 
 def plot_prediction(
@@ -31,7 +32,7 @@ def plot_prediction(
     FigureCanvasAgg(figure)
     axes = figure.subplots(2, len(logs), sharex="col", squeeze=False, height_ratios=(2, 1))
     for column, (title, one) in enumerate(logs):
-        grid = one.resampled(0.05)
+        grid = one.resampled(CONTROL_PERIOD)
         pressure = np.stack([bridge(part) for part in grid.measured_differential.T], axis=1)
         predicted = predict(limb, grid.time, pressure).bend_angles
         top, bottom = axes[0, column], axes[1, column]

@@ -10,11 +10,10 @@ from scipy.signal import savgol_filter
 
 from der_planner.identification.log import CalibrationLog, LogError
 from der_planner.limb import Limb
+from der_planner.model.series import CONTROL_PERIOD as PERIOD
 
 Array = NDArray[np.float64]
 
-PERIOD = 0.05
-"""Of the grid [s]."""
 SMOOTHING = 11
 """Rows of the filter through which friction sees the measured bend (0.5 s)."""
 LONGEST_GAP = 1.0

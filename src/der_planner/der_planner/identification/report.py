@@ -43,7 +43,7 @@ class FitReport:
         source: of the log.
         unknowns: (P,) with standard deviations.
         correlation: (P, P) of the unknowns.
-        strongly_correlated: pairs that the data tell only together.
+        strongly_correlated: pairs that the log cannot tell apart.
         untold: names of unknowns whose spread is the prior's still.
         air: fit of the chambers; None if the log has no smooth commands.
         geometry: fit of the lengths; None if the log has no tips.
@@ -111,7 +111,9 @@ class FitReport:
             )
         lines += self._air_lines() + self._geometry_lines()
         for first, second, value in self.strongly_correlated:
-            lines.append(f"told only together: {first} and {second} (correlation {value:+.2f})")
+            lines.append(
+                f"the log cannot tell {first} and {second} apart (correlation {value:+.2f})"
+            )
         lines += [f"warning: {warning}" for warning in self.warnings]
         return "\n".join(lines)
 

@@ -3,9 +3,10 @@
 `plan(limb, motion)` is the way in; `Motion.named` and `Motion.from_tip_path` make motions.
 """
 
+from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning.errors import PlanningError, UnreachableError
 from der_planner.planning.models import METHODS
-from der_planner.planning.motions import CONTROL_PERIOD, NAMES, Motion, Reference, Start
+from der_planner.planning.motions import NAMES, Motion, Reference, Start
 from der_planner.planning.paths import PathLimits
 from der_planner.planning.planner import DEFAULT_METHOD, choose_method, plan
 from der_planner.planning.result import Plan

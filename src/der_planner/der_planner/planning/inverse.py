@@ -17,10 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
 from der_planner.limb import Limb
+from der_planner.model.bending import Kinematics
+from der_planner.model.series import interpolate
 from der_planner.planning.errors import PlanningError, UnreachableError
-from der_planner.planning.kinematics import Kinematics
 
-Vector = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 TOLERANCE = 1e-3
 """Points missed by less than this [m] count as reached (the models' reach differs by less)."""
@@ -34,7 +35,7 @@ _LARGEST_STRIDE = 0.15
 
 def solve(
     kinematics: Kinematics, tip: ArrayLike, guess: ArrayLike, prior_weight: float = PRIOR_WEIGHT
-) -> tuple[Vector, Vector]:
+) -> tuple[Array, Array]:
     """Return bend angles (K, M) [rad] near the guess and the distances (K,) [m] that remain.
 
     Minimises |tip(θ) − r|² + w² |θ − guess|² for every point by Levenberg-Marquardt.
@@ -52,9 +53,9 @@ def solve(
     identity = np.eye(angles.shape[1])
     weight = prior_weight**2
 
-    def cost(theta: Vector) -> Vector:
+    def cost(theta: Array) -> Array:
         miss = kinematics.tip(theta) - target
-        total: Vector = (miss**2).sum(-1) + weight * ((theta - prior) ** 2).sum(-1)
+        total: Array = (miss**2).sum(-1) + weight * ((theta - prior) ** 2).sum(-1)
         return total
 
     present = cost(angles)
@@ -77,7 +78,7 @@ def solve(
     return angles, np.linalg.norm(kinematics.tip(angles) - target, axis=-1)
 
 
-def static_pressure(limb: Limb, bend_angles: ArrayLike) -> Vector:
+def static_pressure(limb: Limb, bend_angles: ArrayLike) -> Array:
     """Return the differential pressures (..., M) [Pa] that hold bend angles (..., M) [rad] at rest.
 
     moment = EI κ' + k₃ κ'³ = G u with κ' = θ/L − rest curvature; without gravity.
@@ -87,7 +88,7 @@ def static_pressure(limb: Limb, bend_angles: ArrayLike) -> Vector:
     curvature = curvature - np.array([s.rest_curvature for s in limb.segments])
     moment = np.array([s.bending_stiffness for s in limb.segments]) * curvature
     moment = moment + np.array([s.cubic_stiffness for s in limb.segments]) * curvature**3
-    pressure: Vector = moment / np.array([s.moment_gain for s in limb.segments])
+    pressure: Array = moment / np.array([s.moment_gain for s in limb.segments])
     return pressure
 
 
@@ -142,8 +143,8 @@ def distance_to_reach(
     low, high = angle_limits(limb)
     target = np.asarray(point, dtype=float)
 
-    def miss(theta: Vector) -> Vector:
-        difference: Vector = kinematics.tip(theta) - target
+    def miss(theta: Array) -> Array:
+        difference: Array = kinematics.tip(theta) - target
         return difference
 
     starts = [np.clip(np.asarray(guess, dtype=float), low, high)]
@@ -160,7 +161,7 @@ def distance_to_reach(
     return best
 
 
-def angle_limits(limb: Limb) -> tuple[Vector, Vector]:
+def angle_limits(limb: Limb) -> tuple[Array, Array]:
     """Return the least and largest bend angles (M,) [rad] that the pressure limit holds at rest."""
     limit = limb.pneumatics.pressure_limit
     bounds = []
@@ -180,7 +181,7 @@ def angle_limits(limb: Limb) -> tuple[Vector, Vector]:
     return low, high
 
 
-def _corner_shares(count: int) -> list[Vector]:
+def _corner_shares(count: int) -> list[Array]:
     grid = np.array([0.25, 0.75])
     if count > 4:
         return [np.full(count, share) for share in grid]
@@ -199,7 +200,7 @@ class Solution:
         pressure: largest |static differential pressure| [Pa].
     """
 
-    bend_angles: Vector
+    bend_angles: Array
     branch: str
     distance: float
     pressure: float
@@ -249,7 +250,7 @@ def solutions(limb: Limb, kinematics: Kinematics, point: ArrayLike) -> list[Solu
 
 def follow(
     limb: Limb, kinematics: Kinematics, time: ArrayLike, tip: ArrayLike, branch: str = ""
-) -> Vector:
+) -> Array:
     """Return bend angles (K, M) [rad] along a path, on one branch, by continuity.
 
     Args:
@@ -288,13 +289,13 @@ def follow(
         if stride == 1 or np.abs(np.diff(coarse, axis=0)).max(initial=0.0) < _LARGEST_STRIDE:
             break
     where = np.arange(len(points))
-    guesses = np.column_stack([np.interp(where, anchors, column) for column in coarse.T])
+    guesses = interpolate(where, anchors, coarse)
     angles, misses = solve(kinematics, points, guesses)
     check_reach(limb, kinematics, times, points, angles, misses)
     return angles
 
 
-def _continue(kinematics: Kinematics, points: Vector, start: Vector) -> Vector:
+def _continue(kinematics: Kinematics, points: Array, start: Array) -> Array:
     """Return bend angles (K, M) along points (K, 2), each from where the last two lead."""
     angles = np.zeros((len(points), len(start)))
     guess = start

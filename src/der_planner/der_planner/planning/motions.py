@@ -28,15 +28,14 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BSpline, make_interp_spline
 
 from der_planner.limb import Limb
+from der_planner.model.bending import ArcKinematics
+from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import paths, shapes
 from der_planner.planning.errors import PlanningError
 from der_planner.planning.inverse import follow
-from der_planner.planning.kinematics import ArcKinematics
 
-Vector = NDArray[np.float64]
+Array = NDArray[np.float64]
 
-CONTROL_PERIOD = 0.05
-"""Setpoints are 50 ms apart [s]."""
 JOINT_MOTIONS = ("asynchronous", "same_direction", "opposite_direction")
 NAMES = (*JOINT_MOTIONS, *shapes.NAMES)
 DEFAULT_AMPLITUDE = math.pi / 4
@@ -57,10 +56,10 @@ class Start:
         pressure: (M,) command in force [Pa].
     """
 
-    bend_angles: Vector
-    rate: Vector
-    acceleration: Vector
-    pressure: Vector
+    bend_angles: Array
+    rate: Array
+    acceleration: Array
+    pressure: Array
 
 
 @dataclass(frozen=True)
@@ -75,9 +74,9 @@ class Reference:
         start: where it begins, if not at rest.
     """
 
-    time: Vector
-    tip: Vector
-    bend_angles: Vector
+    time: Array
+    tip: Array
+    bend_angles: Array
     spline: BSpline
     start: Start | None = None
 
@@ -86,18 +85,18 @@ class Reference:
         """Instant of the last setpoint [s]."""
         return float(self.time[-1])
 
-    def sample(self, time: ArrayLike) -> tuple[Vector, Vector, Vector]:
+    def sample(self, time: ArrayLike) -> tuple[Array, Array, Array]:
         """Return q̄, its rate and acceleration (…, M) at instants, at rest outside the motion."""
         return sample_spline(self.spline, time)
 
 
-def sample_spline(spline: BSpline, time: ArrayLike) -> tuple[Vector, Vector, Vector]:
+def sample_spline(spline: BSpline, time: ArrayLike) -> tuple[Array, Array, Array]:
     """Return value, rate and acceleration of a spline; beyond its ends it rests."""
     instants = np.asarray(time, dtype=float)
     first, last = spline.t[spline.k], spline.t[-spline.k - 1]
     inside = ((instants >= first) & (instants <= last))[..., None]
     clipped = np.clip(instants, first, last)
-    value: Vector = spline(clipped)
+    value: Array = spline(clipped)
     return (
         value,
         np.where(inside, spline(clipped, 1), 0.0),
@@ -241,7 +240,7 @@ class Motion:
         sampled = sample_spline(spline, instants)[0]
         return Reference(instants, ArcKinematics(limb).tip(sampled), sampled, spline, start)
 
-    def _joint_motion(self, segments: int) -> tuple[Vector, Vector]:
+    def _joint_motion(self, segments: int) -> tuple[Array, Array]:
         total = self.cycles * self.period
         time = _fine_grid(total)
         place = np.arange(segments)
@@ -261,7 +260,7 @@ class Motion:
         back = quintic(closing, *state, 0 * state[0], 0 * state[0], 0 * state[0])
         return np.append(time, total + closing[1:]), np.concatenate([angles, back[1:]])
 
-    def _tip_motion(self, limb: Limb) -> tuple[Vector, Vector]:
+    def _tip_motion(self, limb: Limb) -> tuple[Array, Array]:
         kinematics = ArcKinematics(limb)
         path = self.path
         if path is None:
@@ -289,16 +288,14 @@ class Motion:
         )
 
 
-def smooth_step(x: ArrayLike) -> Vector:
+def smooth_step(x: ArrayLike) -> Array:
     """Return the quintic that goes from 0 to 1 with zero rate and acceleration at both ends."""
     t = np.clip(np.asarray(x, dtype=float), 0.0, 1.0)
-    step: Vector = t**3 * (10 + t * (6 * t - 15))
+    step: Array = t**3 * (10 + t * (6 * t - 15))
     return step
 
 
-def quintic(
-    time: Vector, x0: Vector, v0: Vector, a0: Vector, x1: Vector, v1: Vector, a1: Vector
-) -> Vector:
+def quintic(time: Array, x0: Array, v0: Array, a0: Array, x1: Array, v1: Array, a1: Array) -> Array:
     """Return (K, M) samples of the quintic between two states over the span of ``time`` (K,)."""
     span = float(time[-1])
     t = (time / span)[:, None]
@@ -310,11 +307,11 @@ def quintic(
     c3 = 10 * difference - 4 * slope + 0.5 * bow
     c4 = -15 * difference + 7 * slope - bow
     c5 = 6 * difference - 3 * slope + 0.5 * bow
-    result: Vector = start[0] + t * (start[1] + t * (0.5 * start[2] + t * (c3 + t * (c4 + t * c5))))
+    result: Array = start[0] + t * (start[1] + t * (0.5 * start[2] + t * (c3 + t * (c4 + t * c5))))
     return result
 
 
-def _led_in(limb: Limb, start: Start, time: Vector, angles: Vector) -> tuple[Vector, Vector]:
+def _led_in(limb: Limb, start: Start, time: Array, angles: Array) -> tuple[Array, Array]:
     """Return time and angles with the way from another motion to the straight pose before them."""
     zero = np.zeros(limb.segment_count)
     state = (start.bend_angles, start.rate, start.acceleration)
@@ -328,12 +325,12 @@ def _on_grid(span: float) -> float:
     return math.ceil(span / CONTROL_PERIOD - 1e-9) * CONTROL_PERIOD
 
 
-def _fine_grid(span: float) -> Vector:
+def _fine_grid(span: float) -> Array:
     """Return evenly spaced instants from 0 to span, about 10 ms apart."""
     return np.linspace(0.0, span, max(2, round(span / _GRID) + 1))
 
 
-def _travel_time(limb: Limb, state: tuple[Vector, Vector, Vector]) -> float:
+def _travel_time(limb: Limb, state: tuple[Array, Array, Array]) -> float:
     """Return how long the limb takes between rest and a state, at half of its slew limit [s]."""
     fastest = 0.5 * limb.pneumatics.slew_limit * limb.static_gain
     angle, rate, acceleration = (np.abs(part) for part in state)

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import PchipInterpolator, make_interp_spline
 
+from der_planner.model.series import interpolate
 from der_planner.planning.errors import PlanningError
 
-Vector = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 LONGEST = 3600.0
 _SOFTNESS = 0.2
@@ -44,8 +45,8 @@ class TipPath:
         exact: take straight lines between the points (polygons) instead of a smooth curve.
     """
 
-    time: Vector
-    tip: Vector
+    time: Array
+    tip: Array
     exact: bool = False
 
     @classmethod
@@ -93,17 +94,17 @@ class TipPath:
         """From the first to the last point [s]."""
         return float(self.time[-1])
 
-    def resample(self, step: float) -> tuple[Vector, Vector]:
+    def resample(self, step: float) -> tuple[Array, Array]:
         """Return instants about ``step`` apart and the points (K, 2) there."""
         instants = np.linspace(0.0, self.duration, max(8, round(self.duration / step) + 1))
         if self.exact or len(self.time) < 4:
-            points = np.column_stack([np.interp(instants, self.time, axis) for axis in self.tip.T])
+            points = interpolate(instants, self.time, self.tip)
         else:
             points = make_interp_spline(self.time, self.tip, k=3)(instants)
         return instants, points
 
 
-def time_path(points: Vector, limits: PathLimits) -> TipPath:
+def time_path(points: Array, limits: PathLimits) -> TipPath:
     """Time a path: rest at both ends, no faster than the limits along and across it.
 
     The curve is a spline over its chord length; the speed profile is the largest that keeps the
@@ -152,7 +153,7 @@ def time_path(points: Vector, limits: PathLimits) -> TipPath:
     return TipPath(instants, spline(along))
 
 
-def polygon(corners: Vector, period: float) -> TipPath:
+def polygon(corners: Array, period: float) -> TipPath:
     """Return the timed path along straight lines that rests at every corner.
 
     Each side takes a share of the period in proportion to its length, with a quintic from rest to
@@ -171,12 +172,12 @@ def polygon(corners: Vector, period: float) -> TipPath:
     return TipPath(np.concatenate(times), np.concatenate(points), exact=True)
 
 
-def _smoothed(values: Vector, window: int) -> Vector:
+def _smoothed(values: Array, window: int) -> Array:
     """Return a running mean over 2 window + 1 samples, longer by as much: from rest to rest."""
     width = 2 * window + 1
     padded = np.concatenate([np.full(width - 1, values[0]), values, np.full(width - 1, values[-1])])
     total = np.concatenate([[0.0], np.cumsum(padded)])
-    mean: Vector = (total[width:] - total[:-width]) / width
+    mean: Array = (total[width:] - total[:-width]) / width
     return mean
 
 
@@ -184,7 +185,7 @@ UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "s": 1.0, "ms": 0.001}
 _HEADER = re.compile(r"(time|t|x|y)\s*(?:[\[(_/ ]\s*(\w+)\s*[\])]?)?")
 
 
-def read_csv(path: str | Path) -> tuple[Vector | None, Vector]:
+def read_csv(path: str | Path) -> tuple[Array | None, Array]:
     """Read a tip path: columns x and y, and time if the path is timed.
 
     The first line names the columns, with a unit where it is not m or s: ``x [cm]``, ``x_mm``.

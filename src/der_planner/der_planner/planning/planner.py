@@ -11,23 +11,27 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from threadpoolctl import ThreadpoolController
 
-from der_planner import actuation
 from der_planner.limb import Limb
-from der_planner.planning import models, pneumatics
+from der_planner.model import air as air_law
+from der_planner.model.commands import commands as commands_for
+from der_planner.model.commands import within_limits
+from der_planner.model.drive import STEPS
+from der_planner.model.material import differential_pressure
+from der_planner.model.response import NODES, simulate
+from der_planner.model.series import CONTROL_PERIOD
+from der_planner.planning import models
 from der_planner.planning.errors import PlanningError
 from der_planner.planning.models import METHODS, PlanningModel
-from der_planner.planning.motions import CONTROL_PERIOD, Motion, Reference, Start, sample_spline
+from der_planner.planning.motions import Motion, Reference, Start, sample_spline
 from der_planner.planning.optimal import Optimiser
 from der_planner.planning.result import Plan
-from der_planner.planning.rod_model import NODES, RodModel
+from der_planner.planning.rod_model import PlanningRod
 from der_planner.rod import ConvergenceError
 
-Vector = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 DEFAULT_METHOD = {"der": "optimal", "pcc": "paper"}
 _THREADS = ThreadpoolController()
-SUBSTEPS = 5
-"""Integrator steps a control period: 10 ms."""
 _FINE = 2
 """Points of the balance's grid a control period."""
 
@@ -110,8 +114,8 @@ def plan(
 
 @dataclass(frozen=True)
 class _Solved:
-    commands: Vector
-    tip: Vector
+    commands: Array
+    tip: Array
     warnings: list[str]
     details: dict[str, float]
 
@@ -125,11 +129,11 @@ def _solve(
 ) -> _Solved:
     """Return commands that keep the limits, and what the model expects of them."""
     air = physics.limb.pneumatics
-    optimal = method == "optimal" and isinstance(physics, RodModel)
+    optimal = method == "optimal" and isinstance(physics, PlanningRod)
     time, effective, bend = balance(physics, spline, reference, "projected" if optimal else method)
-    wanted = pneumatics.commands(physics.limb, time, effective, bend, CONTROL_PERIOD)
-    if optimal and isinstance(physics, RodModel):
-        solver = Optimiser(physics, spline, reference, wanted, SUBSTEPS)
+    wanted = commands_for(physics.limb, time, effective, bend, CONTROL_PERIOD)
+    if optimal and isinstance(physics, PlanningRod):
+        solver = Optimiser(physics, spline, reference, wanted, STEPS)
         # Matrices of a few hundred rows: more threads only get into other processes' way.
         with _THREADS.limit(limits=1, user_api="blas"):
             outcome = solver.run(lambda share: report(0.4 + 0.6 * share))
@@ -140,13 +144,14 @@ def _solve(
         details: dict[str, float] = {"steps": outcome.steps, "limited_windows": outcome.limited}
     else:
         before = None if reference.start is None else reference.start.pressure
-        commands, cut = pneumatics.within_limits(wanted, air, CONTROL_PERIOD, before)
-        tip = predict(physics, spline, commands, reference.start)
+        commands, cut = within_limits(wanted, air, CONTROL_PERIOD, before)
+        tip = tip_under(physics, spline, commands, reference.start)
         said = (
             f"limits cut the wanted pressures by up to {cut:.0f} Pa" if cut > _NOTABLE_CUT else ""
         )
         details = {}
-    slow = pneumatics.slow_venting(physics.limb, time, effective, bend)
+    pressure = differential_pressure(physics.limb, time, effective, bend)
+    slow = air_law.slow_venting(air, time, pressure)
     warnings = _vent_warnings(slow, _mean_distance(tip, reference))
     if said and not (optimal and warnings):
         warnings.insert(0, f"{said}: {_excess(physics.limb, wanted)}")
@@ -180,7 +185,7 @@ def choose_method(model: str, method: str) -> str:
 
 def balance(
     physics: PlanningModel, spline: BSpline, reference: Reference, method: str
-) -> tuple[Vector, Vector, Vector]:
+) -> tuple[Array, Array, Array]:
     """Return instants (F,) [s], wanted effective pressures (F, M) [Pa] and bend angles (F, M)."""
     ahead = CONTROL_PERIOD + physics.limb.pneumatics.delay
     count = int(np.ceil((reference.duration + ahead) / CONTROL_PERIOD * _FINE - 1e-6)) + 1
@@ -190,27 +195,30 @@ def balance(
     return fine, effective, sample_spline(spline, fine)[0]
 
 
-def predict(
-    physics: PlanningModel, spline: BSpline, commands: Vector, start: Start | None = None
-) -> Vector:
-    """Return the tip (K, 2) [m] that the model expects under commands, with the chambers' lag."""
-    air = physics.limb.pneumatics
-    before = None if start is None else start.pressure
-    chambers = pneumatics.chamber_pressures(air, commands, CONTROL_PERIOD, SUBSTEPS, before)
-    effective = effective_pressures(physics.limb, spline, chambers)
-    return physics.simulate(effective, CONTROL_PERIOD, None if start is None else spline)
+def tip_under(
+    physics: PlanningModel, spline: BSpline, commands: Array, start: Start | None = None
+) -> Array:
+    """Return the tip (K, 2) [m] of a model at the instants of commands (K, M) [Pa].
+
+    Args:
+        physics: model of the limb.
+        spline: bend angles of the motion, along which friction and creep act [rad].
+        commands: (K, M) [Pa].
+        start: where the motion begins; None: at rest.
+    """
+    begin = None if start is None else physics.state(spline(0.0), spline(0.0, 1))
+    response = simulate(
+        physics,
+        np.arange(len(commands)) * CONTROL_PERIOD,
+        commands=commands,
+        bend=lambda time: sample_spline(spline, time)[0],
+        start=begin,
+        before=None if start is None else start.pressure,
+    )
+    return response.tip[:-1]
 
 
-def effective_pressures(limb: Limb, spline: BSpline, chambers: Vector) -> Vector:
-    """Return what the model feels, (K, S, M) [Pa], of chamber pressures along a known bend."""
-    count, substeps, inputs = chambers.shape
-    middle = (np.arange(count * substeps) + 0.5) * (CONTROL_PERIOD / substeps)
-    bend = sample_spline(spline, middle)[0]
-    flat = chambers.reshape(-1, inputs)
-    return actuation.effective_pressure(limb, middle, flat, bend).reshape(chambers.shape)
-
-
-def _calibration_warnings(limb: Limb, bend: Vector) -> list[str]:
+def _calibration_warnings(limb: Limb, bend: Array) -> list[str]:
     said = []
     seen = np.array(limb.calibrated.bend_angle)
     if seen.size == limb.segment_count and np.any(np.abs(bend).max(axis=0) > seen * 1.05):
@@ -222,11 +230,11 @@ def _calibration_warnings(limb: Limb, bend: Vector) -> list[str]:
     return said
 
 
-def _mean_distance(tip: Vector, reference: Reference) -> float:
+def _mean_distance(tip: Array, reference: Reference) -> float:
     return float(np.linalg.norm(tip - reference.tip, axis=1).mean())
 
 
-def _vent_warnings(slow: pneumatics.SlowVenting | None, missed: float) -> list[str]:
+def _vent_warnings(slow: air_law.SlowVenting | None, missed: float) -> list[str]:
     if slow is None or slow.opposite < _NOTABLE_OPPOSITE:
         return []
     left = f", which leaves {missed * 1000:.1f} mm of mean error on the model itself"
@@ -238,7 +246,7 @@ def _vent_warnings(slow: pneumatics.SlowVenting | None, missed: float) -> list[s
     ]
 
 
-def _excess(limb: Limb, wanted: Vector) -> str:
+def _excess(limb: Limb, wanted: Array) -> str:
     air = limb.pneumatics
     largest = float(np.abs(wanted).max())
     fastest = float(np.abs(np.diff(wanted, axis=0)).max(initial=0.0)) / CONTROL_PERIOD

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from der_planner.planning.errors import PlanningError
 
-Vector = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 _PRESSURE = 1e3
 """The solver works in kPa …"""
@@ -29,18 +29,18 @@ class Band:
         step: largest change from one command to the next [Pa].
     """
 
-    command: Vector
-    before: Vector
+    command: Array
+    before: Array
     limit: float
     step: float
 
-    def contains(self, change: Vector) -> bool:
+    def contains(self, change: Array) -> bool:
         """Tell whether the changed commands (W, M) keep the limits."""
         command = self.command + change
         steps = np.diff(np.vstack([self.before, command]), axis=0)
         return bool(np.abs(command).max() <= self.limit and np.abs(steps).max() <= self.step)
 
-    def cut(self, change: Vector) -> Vector:
+    def cut(self, change: Array) -> Array:
         """Return the change (W, M) with a solver's rounding errors cut off, command by command."""
         result = np.empty_like(change)
         last = self.before
@@ -51,7 +51,7 @@ class Band:
         return result
 
 
-def solve_limited(H: Vector, gradient: Vector, band: Band) -> Vector:
+def solve_limited(H: Array, gradient: Array, band: Band) -> Array:
     """Return the change δ (W, M) that minimises ½ δᵀHδ + gradientᵀδ within the band [Pa].
 
     Args:

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.limb import Limb
-from der_planner.planning.kinematics import Kinematics
+from der_planner.model.bending import Kinematics
 from der_planner.planning.motions import Reference
 
-Vector = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,11 @@ class Plan:
         details: numbers of the method: iterations, cost, Newton steps.
     """
 
-    time: Vector
-    differential_pressure: Vector
+    time: Array
+    differential_pressure: Array
     reference: Reference
-    tip_predicted: Vector
-    bend_angles: Vector
+    tip_predicted: Array
+    bend_angles: Array
     motion: str
     model: str
     method: str
@@ -51,18 +51,18 @@ class Plan:
     details: dict[str, float] = field(default_factory=dict)
 
     @property
-    def tip_reference(self) -> Vector:
+    def tip_reference(self) -> Array:
         """(K, 2) r̄ at the setpoints [m]."""
         return self.reference.tip
 
-    def curve(self, index: int) -> Vector:
+    def curve(self, index: int) -> Array:
         """Return the centreline (P, 2) [m] of the reference configuration at a setpoint."""
         return self.kinematics.curve(self.bend_angles[index])
 
     @property
-    def error(self) -> Vector:
+    def error(self) -> Array:
         """(K,) distance of the predicted from the reference tip [m]."""
-        distance: Vector = np.linalg.norm(self.tip_predicted - self.tip_reference, axis=1)
+        distance: Array = np.linalg.norm(self.tip_predicted - self.tip_reference, axis=1)
         return distance
 
     @property

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.planning.kinematics import Kinematics
+from der_planner.model.bending import Kinematics
 from der_planner.planning.paths import TipPath, polygon
 
-Vector = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 NAMES = ("circle", "figure_eight", "line", "star")
 
@@ -55,14 +55,14 @@ def draw(
     return TipPath(time, points)
 
 
-def _faded_phase(turns: Vector, cycles: int) -> Vector:
+def _faded_phase(turns: Array, cycles: int) -> Array:
     """Return the phase in turns: rate from 0 to 1 over a quarter turn, and back to 0 at the end."""
     fade = 0.25
     total = cycles + fade
 
-    def ramp(x: Vector) -> Vector:
+    def ramp(x: Array) -> Array:
         t = np.clip(x / fade, 0.0, 1.0)
-        area: Vector = fade * (2.5 * t**4 - 3 * t**5 + t**6)
+        area: Array = fade * (2.5 * t**4 - 3 * t**5 + t**6)
         return area
 
     start = np.where(turns < fade, ramp(turns), fade / 2 + (turns - fade))

@@ -11,10 +11,11 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning.motions import Start
 from der_planner.planning.result import Plan
 
-GRID = 50_000_000
+GRID = round(CONTROL_PERIOD * 1e9)
 """Setpoints are stamped on multiples of this [ns]."""
 
 

@@ -21,14 +21,14 @@ _FLAGS = {"contract", "reassoc", "nsz", "arcp"}  # NaN must stay visible: it end
 def drop_stale_caches() -> None:
     """Delete cached kernels if any kernel source is not the one that they were compiled from."""
     digest = hashlib.sha256()
-    for source in sorted(_FOLDER.glob("*_kernel.py")):
+    for source in sorted(_FOLDER.rglob("*_kernel.py")):
         digest.update(source.read_bytes())
     stamp = _FOLDER / "__pycache__" / "kernels.sha256"
     with contextlib.suppress(OSError):  # a read-only install: numba then caches elsewhere by itself
         if stamp.exists() and stamp.read_text() == digest.hexdigest():
             return
         stamp.parent.mkdir(exist_ok=True)
-        for index in stamp.parent.glob("*_kernel.*.nbi"):
+        for index in _FOLDER.rglob("__pycache__/*_kernel.*.nbi"):
             index.unlink(missing_ok=True)
         stamp.write_text(digest.hexdigest())
 
@@ -38,7 +38,21 @@ drop_stale_caches()
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function with a cache on disk, without the interpreter lock."""
+    return _compile(function)
+
+
+def inlined_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """As `kernel`, put into its callers: a call with tuples of arrays costs as much as its work."""
+    return _compile(function, inline="always")
+
+
+def parallel_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """As `kernel`, its `numba.prange` loops on all cores (`numba.set_num_threads` sets fewer)."""
+    return _compile(function, parallel=True)
+
+
+def _compile(function: Callable[..., Any], **options: bool | str) -> Callable[..., Any]:
     compiled: Callable[..., Any] = numba.njit(
-        cache=True, fastmath=_FLAGS, nogil=True, boundscheck=False, error_model="numpy"
+        cache=True, fastmath=_FLAGS, nogil=True, boundscheck=False, error_model="numpy", **options
     )(function)
     return compiled

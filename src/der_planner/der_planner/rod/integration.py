@@ -1,27 +1,26 @@
-"""Time integration: the methods, each a chain of backward Euler solves."""
+"""Time integration: each method is a chain of backward Euler solves; a step may be cut."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 
-from der_planner.rod.backend import Run, Solves
+from der_planner.rod.backend import Backend, Piece, Place
 from der_planner.rod.errors import ConvergenceError
-from der_planner.rod.mesh import array, require
-from der_planner.rod.planar import PlanarBackend
-from der_planner.rod.spatial import SpatialBackend
+from der_planner.rod.linearisation import Solved
+from der_planner.rod.mesh import require
 from der_planner.rod.state import Array, RodState
+from der_planner.rod.step_kernel import Record, Solver
 
 Method = Literal["sdirk2", "midpoint", "backward_euler"]
 
-# Each method is a chain of backward Euler solves over fraction·dt from (q, v), after each of which
-# the state goes on to (q, v) + e ((q', v') − (q, v)). e = 2 is the implicit midpoint rule; γ = 1 −
-# 1/√2 with e = (1 − γ)/γ, then 1, is Alexander's two-stage SDIRK: second order and L-stable.
-_LIMIT = 30  # Newton iterations of a step
+_LIMIT = 30  # Newton iterations of a solve
 _GAMMA = 1.0 - math.sqrt(0.5)
+# fraction of the step that a solve goes over, and e of each solve: see step_kernel
 _STAGES = {
     "backward_euler": (1.0, np.array([1.0])),
     "midpoint": (0.5, np.array([2.0])),
@@ -29,87 +28,161 @@ _STAGES = {
 }
 
 
-def stage_count(method: str) -> int:
-    """Return how many solves a step of this method takes."""
-    return len(_STAGES[method][1])
-
-
-def by_step(pressures: ArrayLike, substeps: int, segment_count: int) -> Array:
-    """Return pressures (K, M) or (K, substeps, M) as (K, substeps, M).
+def solver_of(method: str, dt: float, length: float, lever: float) -> Solver:
+    """Return how a method solves steps of dt [s] of a rod of this length [m].
 
     Raises:
-        ValueError: another shape, a value that is not finite, or no positive number of substeps.
+        ValueError: an unknown method.
     """
-    require(isinstance(substeps, (int, np.integer)) and substeps > 0, "substeps",
-            "an int of 1 or more", substeps)  # fmt: skip
-    given = np.asarray(pressures, dtype=np.float64)
-    require(given.ndim in (2, 3), "pressures", "(K, M) or (K, substeps, M)", given.shape)
-    intervals = given.shape[0]
-    if given.ndim == 2:
-        array(given, (intervals, segment_count), "pressures")
-        given = np.repeat(given[:, None, :], substeps, axis=1)
-    return array(given, (intervals, substeps, segment_count), "pressures")
+    require(method in _STAGES, "method", f"one of {sorted(_STAGES)}", method)
+    fraction, extrapolate = _STAGES[method]
+    return Solver(dt * fraction, extrapolate, 1e-10 * length, lever, _LIMIT)
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a simulation returned.
+
+    Attributes:
+        q: (K+1, 4N-1). v: likewise.
+        final: the last state.
+        iterations: Newton iterations of all steps.
+        solved: the linearisation, if asked for.
+    """
+
+    q: Array
+    v: Array
+    final: RodState
+    iterations: int
+    solved: Solved | None
+
+
+@dataclass
+class _Journey:
+    """A run under way: where it is and what it has gathered."""
+
+    place: Place
+    load: Array
+    linearise: bool
+    method: str
+    iterations: int = 0
+    records: list[Record] = field(default_factory=list)
+    rates: list[Array] = field(default_factory=list)
+    extrapolates: list[Array] = field(default_factory=list)
+    steps: list[NDArray[np.int64]] = field(default_factory=list)
 
 
 class Integrator:
-    """Runs a backend by one of the methods.
+    """Runs a backend by one of the methods."""
 
-    Args:
-        backend: of the rod.
-        tolerance: largest last Newton update [m].
-    """
-
-    def __init__(self, backend: PlanarBackend | SpatialBackend, tolerance: float) -> None:
+    def __init__(self, backend: Backend) -> None:
         self._backend = backend
-        self._tolerance = tolerance
+        self._length = float(backend.mesh.rest.sum())
 
     def run(
-        self,
-        state: RodState,
-        pressures: Array,
-        dt: float,
-        method: str,
-        load: Array,
-        linearise: bool = False,
-    ) -> Run:
+        self, state: RodState, pressures: Array, dt: float, method: str, load: Array,
+        linearise: bool = False, halvings: int = 0,
+    ) -> Run:  # fmt: skip
         """Run K intervals of S steps of dt under pressures (K, S, M) and load (4N-1,).
+
+        A step that does not converge is cut in two, its halves too, `halvings` times deep.
 
         Raises:
             ConvergenceError: with the step's index and the last good state.
         """
-        solves = self._solves(dt, method, load)
-        stages = len(solves.extrapolate)
-        if stages > 1:
-            pressures = np.repeat(pressures, stages, axis=1)
-        run = self._backend.simulate(state, pressures, solves, linearise)
-        if run.failed_iterations:
-            raise _failure(run, dt, method)
-        return run
+        backend = self._backend
+        solver = solver_of(method, dt, self._length, backend.lever)
+        intervals, steps, _ = pressures.shape
+        journey = _Journey(backend.place(state), load, linearise, method)
+        x = np.empty((intervals + 1, backend.size))
+        rate = np.empty((intervals + 1, backend.size))
+        x[0], rate[0] = journey.place.x, journey.place.v
+        begin = 0
+        while begin < intervals * steps:
+            piece = self._go(journey, (x, rate), pressures, begin, solver, None)
+            begin = piece.done
+            if not piece.failed_iterations:
+                break
+            interval, step = divmod(begin, steps)
+            self._cut(journey, pressures[interval, step], solver, halvings, halvings, begin, piece)
+            begin += 1
+            if step == steps - 1:
+                x[interval + 1], rate[interval + 1] = journey.place.x, journey.place.v
+        final = backend.state(journey.place, state)
+        return Run(
+            backend.restore(x, state.q), backend.restore(rate, state.v), final,
+            journey.iterations, _solved(journey, pressures) if linearise else None,
+        )  # fmt: skip
 
-    def linearise(
-        self, state: RodState, u: Array, dt: float, method: str, load: Array
-    ) -> tuple[Array, Array]:
-        """Return (A, B) of one step under pressures u (M,) and load (4N-1,).
+    def _go(
+        self, journey: _Journey, motion: tuple[Array, Array], pressures: Array, begin: int,
+        solver: Solver, step: int | None,
+    ) -> Piece:  # fmt: skip
+        """Run the kernel from `begin` until it fails or ends, and gather what it recorded.
 
-        Raises:
-            ConvergenceError: a solve failed.
+        The solves belong to the step `step`, or without it to the steps from `begin` on.
         """
-        run, matrices = self._backend.linearise(state, u, self._solves(dt, method, load))
-        if matrices is None:
-            raise _failure(run, dt, method)
-        return matrices
+        stages = len(solver.extrapolate)
+        left = pressures.shape[0] * pressures.shape[1] - begin
+        record = self._backend.new_record(left * stages if journey.linearise else 0)
+        piece = self._backend.simulate(
+            journey.place, motion, pressures, begin, solver, journey.load, record
+        )
+        journey.iterations += piece.iterations
+        done = piece.done - begin
+        if journey.linearise and done:
+            journey.records.append(Record(*(part[: done * stages] for part in record)))
+            journey.rates.append(np.full(done * stages, 1.0 / solver.h))
+            journey.extrapolates.append(np.tile(solver.extrapolate, done))
+            owners = np.arange(begin, piece.done) if step is None else np.full(done, step)
+            journey.steps.append(np.repeat(owners, stages))
+        return piece
 
-    def _solves(self, dt: float, method: str, load: Array) -> Solves:
-        require(method in _STAGES, "method", f"one of {sorted(_STAGES)}", method)
-        fraction, extrapolate = _STAGES[method]
-        return Solves(dt * fraction, extrapolate, load, self._tolerance, _LIMIT)
+    def _cut(
+        self, journey: _Journey, u: Array, solver: Solver, halvings: int, allowed: int, step: int,
+        piece: Piece,
+    ) -> None:  # fmt: skip
+        """Go over a step that failed in two halves, each of which may be cut again."""
+        if halvings < 1:
+            raise self._failure(journey, solver, allowed, step, piece)
+        half = solver._replace(h=0.5 * solver.h)
+        pressures = np.ascontiguousarray(np.broadcast_to(u, (1, 2, len(u))))
+        motion = np.empty((2, self._backend.size)), np.empty((2, self._backend.size))
+        begin = 0
+        while begin < 2:
+            part = self._go(journey, motion, pressures, begin, half, step)
+            begin = part.done
+            if part.failed_iterations:
+                self._cut(journey, u, half, halvings - 1, allowed, step, part)
+                begin += 1
+
+    def _failure(
+        self, journey: _Journey, solver: Solver, allowed: int, step: int, piece: Piece
+    ) -> ConvergenceError:
+        whole = solver.h / _STAGES[journey.method][0] * 2**allowed
+        parts = f", also in {2**allowed} parts" if allowed else ""
+        place = self._backend.state(journey.place, _no_state(self._backend.mesh.nodes))
+        return ConvergenceError(
+            f"step {step} of {whole:g} s ({journey.method}{parts}) did not converge in "
+            f"{piece.failed_iterations} Newton iterations "
+            f"(last update {piece.update:.3g} m): take a shorter step",
+            step=step, residual=piece.update, iterations=piece.failed_iterations, state=place,
+        )  # fmt: skip
 
 
-def _failure(run: Run, dt: float, method: str) -> ConvergenceError:
-    step = run.steps // stage_count(method)
-    return ConvergenceError(
-        f"step {step} of {dt:g} s ({method}) did not converge in "
-        f"{run.failed_iterations} Newton iterations "
-        f"(last update {run.update:.3g} m): take a shorter step",
-        step=step, residual=run.update, iterations=run.failed_iterations, state=run.final,
+def _no_state(nodes: int) -> RodState:
+    zero = np.zeros(4 * nodes - 1)
+    return RodState(zero, zero, np.tile([0.0, 1.0, 0.0], (nodes - 1, 1)), np.zeros(nodes))
+
+
+def _solved(journey: _Journey, pressures: Array) -> Solved:
+    """Join the pieces of a run's linearisation."""
+    if len(journey.records) == 1:
+        record = journey.records[0]
+    else:
+        record = Record(*(np.concatenate(parts) for parts in zip(*journey.records, strict=True)))
+    steps = np.concatenate(journey.steps)
+    return Solved(
+        record, np.concatenate(journey.rates), np.concatenate(journey.extrapolates), steps,
+        pressures.reshape(-1, pressures.shape[2])[steps], journey.load,
     )  # fmt: skip

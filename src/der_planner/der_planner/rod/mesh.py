@@ -135,6 +135,23 @@ def array(value: ArrayLike, shape: tuple[int, ...], name: str) -> Array:
     return result
 
 
+def by_step(pressures: ArrayLike, substeps: int, segment_count: int) -> Array:
+    """Return pressures (K, M) or (K, substeps, M) as (K, substeps, M).
+
+    Raises:
+        ValueError: another shape, a value that is not finite, or no positive number of substeps.
+    """
+    require(isinstance(substeps, (int, np.integer)) and substeps > 0, "substeps",
+            "an int of 1 or more", substeps)  # fmt: skip
+    given = np.asarray(pressures, dtype=np.float64)
+    require(given.ndim in (2, 3), "pressures", "(K, M) or (K, substeps, M)", given.shape)
+    intervals = given.shape[0]
+    if given.ndim == 2:
+        array(given, (intervals, segment_count), "pressures")
+        given = np.repeat(given[:, None, :], substeps, axis=1)
+    return array(given, (intervals, substeps, segment_count), "pressures")
+
+
 def check_segments(segments: Sequence[tuple[int, int]], nodes: int) -> tuple[tuple[int, int], ...]:
     """Return the segments; raise a ValueError if they leave the rod or share a node."""
     last = -1

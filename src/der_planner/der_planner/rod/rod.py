@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from der_planner.limb import Limb
-from der_planner.rod.errors import ConvergenceError
-from der_planner.rod.integration import Integrator, Method, by_step, stage_count
-from der_planner.rod.linearisation import Linearisation
-from der_planner.rod.mesh import Mesh, array, limb_mesh, positive, require, uniform_mesh
-from der_planner.rod.planar import PlanarBackend
-from der_planner.rod.spatial import SpatialBackend
+from der_planner.rod.integration import Integrator, Method
+from der_planner.rod.linearisation import linearisation_of, step_matrices
+from der_planner.rod.mesh import Mesh, array, by_step, limb_mesh, positive, require, uniform_mesh
+from der_planner.rod.planar.backend import PlanarBackend
+from der_planner.rod.spatial.backend import SpatialBackend
 from der_planner.rod.state import Array, RodState, Trajectory, positions_of
 from der_planner.rod.statics import even_bend, find_equilibrium, turning
 
@@ -54,7 +53,7 @@ class Rod:
         self.external_force = mesh.weight
         self._backend = PlanarBackend(mesh, plane) if plane else SpatialBackend(mesh)
         self.free = self._backend.free
-        self._integrator = Integrator(self._backend, 1e-10 * float(mesh.rest.sum()))
+        self._integrator = Integrator(self._backend)
         if plane:
             self._check_plane(self.external_force, "gravity")
 
@@ -134,8 +133,7 @@ class Rod:
         """Compile, or load from the cache, every kernel that this rod will call."""
         state = self.straight_state()
         still = np.zeros((1, self.segment_count))
-        planar = self.plane is not None
-        motion = self.simulate(state, still, 1e-3, linearise=planar)
+        motion = self.simulate(state, still, 1e-3, linearise=True)
         if motion.linearisation is not None:
             motion.linearisation.tangent(still)
             motion.linearisation.adjoint(np.zeros((2, len(motion.linearisation.outputs))))
@@ -192,14 +190,9 @@ class Rod:
         """
         pressures = array(u, (self.segment_count,), "u")[None, None, :]
         load = self._load(forces)
-        try:
-            return self._integrator.run(state, pressures, positive(dt, "dt"), method, load).final
-        except ConvergenceError:
-            if halvings < 1:
-                raise
-        for _ in range(2):
-            state = self.step(state, u, 0.5 * dt, method, forces=forces, halvings=halvings - 1)
-        return state
+        return self._integrator.run(
+            state, pressures, positive(dt, "dt"), method, load, halvings=halvings
+        ).final
 
     def simulate(
         self,
@@ -212,8 +205,12 @@ class Rod:
         forces: ArrayLike | None = None,
         linearise: bool = False,
         outputs: Sequence[int] | None = None,
+        halvings: int = 6,
     ) -> Trajectory:
         """Run K intervals of length dt in one compiled loop, each in `substeps` equal steps.
+
+        A step that does not converge is cut in two, and its halves again: a rod that is stiff or
+        fast for its step costs time. The linearisation is that of the steps as they were cut.
 
         Args:
             state: initial state.
@@ -226,21 +223,23 @@ class Rod:
                 has `.tangent(pressure change) -> output change`, `.adjoint(output weight) ->
                 gradient` and `.sensitivity(pulse=None)` (K+1, P, K, M), all compiled.
             outputs: (P,) indices into q of the outputs; default the tip's free coordinates.
+            halvings: how often a step may be cut in two; 0 means never.
 
         Raises:
-            ConvergenceError: with the step's index and the last good state.
+            ConvergenceError: a step did not converge, however short; with its index and the last
+                good state.
         """
         inputs = by_step(pressures, substeps, self.segment_count)
         intervals = inputs.shape[0]
         h = positive(dt, "dt") / substeps
-        run = self._integrator.run(state, inputs, h, method, self._load(forces), linearise)
+        load = self._load(forces)
+        run = self._integrator.run(state, inputs, h, method, load, linearise, halvings)
         linearisation = None
-        if run.factors is not None and run.stages is not None:
+        if run.solved is not None:
             wanted = self._output_indices(outputs)
-            linearisation = Linearisation(
-                intervals, substeps, stage_count(method), wanted, self.free, run.factors,
-                self._backend.rows(wanted), self._backend.free_rows, run.stages,
-            )  # fmt: skip
+            linearisation = linearisation_of(
+                self._backend, run.solved, (intervals, substeps), wanted, self._backend.rows(wanted)
+            )
         time = dt * np.arange(intervals + 1)
         return Trajectory(time, run.q, run.v, run.final, run.iterations, linearisation)
 
@@ -312,7 +311,7 @@ class Rod:
         small difference of one parameter this is the sensitivity to it, at the cost of one sweep.
 
         Args:
-            motion: of this rod, simulated with `linearise`; a planar rod.
+            motion: of this rod, simulated with `linearise`.
             other: a rod with the same nodes, segments and plane.
             start: change of q[free] and v[free] at the beginning, each (F,).
 
@@ -323,12 +322,15 @@ class Rod:
         mine, its = self._backend, other._backend
         same = (self.nodes, self.segments, self.plane) == (other.nodes, other.segments, other.plane)
         require(same, "other", "a rod with the same nodes, segments and plane", other.segments)
-        if linearisation is None or isinstance(mine, SpatialBackend):
-            raise ValueError("motion must be a planar rod's, simulated with linearise=True")
-        if isinstance(its, SpatialBackend):
-            raise AssertionError("a rod with a plane has a planar backend")
-        forcing = mine.residual_changes(its, linearisation.stage_states, linearisation.rate)
-        return linearisation.forced(forcing, start)
+        if linearisation is None:
+            raise ValueError("motion must be one simulated with linearise=True")
+        if isinstance(mine, PlanarBackend) and isinstance(its, PlanarBackend):  # noqa: SIM114 - types
+            forces = mine.residual_changes(its, linearisation.solved)
+        elif isinstance(mine, SpatialBackend) and isinstance(its, SpatialBackend):
+            forces = mine.residual_changes(its, linearisation.solved)
+        else:
+            raise AssertionError("rods with one plane have one kind of backend")
+        return linearisation.forced(forces, start)
 
     def linearise_step(
         self,
@@ -345,10 +347,13 @@ class Rod:
         derivative of B(q)u. In space φ counts from frames transported from those of `state` at the
         beginning and of the step's result at the end: what `Rod.state(q, like=…)` does.
         """
-        pressures = array(u, (self.segment_count,), "u")
-        return self._integrator.linearise(
-            state, pressures, positive(dt, "dt"), method, self._load(forces)
+        pressures = array(u, (self.segment_count,), "u")[None, None, :]
+        run = self._integrator.run(
+            state, pressures, positive(dt, "dt"), method, self._load(forces), linearise=True
         )
+        if run.solved is None:
+            raise AssertionError("a linearised run has its solves")
+        return step_matrices(self._backend, run.solved)
 
     def bend_angles(self, state: RodState | ArrayLike) -> Array:
         """Return (…, M) each segment's turning about +z from its first to its last edge [rad]."""

@@ -9,6 +9,7 @@ import numpy as np
 from der_planner.rod.errors import ConvergenceError
 from der_planner.rod.mesh import Mesh
 from der_planner.rod.state import Array, RodState, positions_of
+from der_planner.rod.step_kernel import Solver
 
 _LIMIT = 40
 _SMALLEST_PART = 1.0 / 4096.0
@@ -20,13 +21,13 @@ class StaticSolver(Protocol):
     mesh: Mesh
 
     def solve_static(
-        self, start: RodState, u: Array, load: Array, tolerance: float, limit: int
+        self, start: RodState, u: Array, load: Array, solver: Solver
     ) -> tuple[RodState, int, float]:
         """Solve the balance of forces; iterations are negative without convergence."""
         ...
 
 
-def find_equilibrium(solver: StaticSolver, start: RodState, u: Array, load: Array) -> RodState:
+def find_equilibrium(backend: StaticSolver, start: RodState, u: Array, load: Array) -> RodState:
     """Return the resting state under u (M,) [Pa] and load (4N-1,) [N], going there from `start`.
 
     Newton's method is tried on the whole load first. If it fails, the load is raised from zero in
@@ -35,8 +36,9 @@ def find_equilibrium(solver: StaticSolver, start: RodState, u: Array, load: Arra
     Raises:
         ConvergenceError: the parts became too small.
     """
-    tolerance = 1e-11 * float(solver.mesh.rest.sum())
-    state, iterations, update = solver.solve_static(start, u, load, tolerance, _LIMIT)
+    tolerance = 1e-11 * float(backend.mesh.rest.sum())
+    solver = Solver(h=1.0, extrapolate=np.ones(1), tolerance=tolerance, lever=0.0, limit=_LIMIT)
+    state, iterations, update = backend.solve_static(start, u, load, solver)
     if iterations > 0:
         return state
     state = RodState(start.q, 0.0 * start.v, start.directors, start.reference_twist)
@@ -45,9 +47,7 @@ def find_equilibrium(solver: StaticSolver, start: RodState, u: Array, load: Arra
     while reached < 1.0:
         target = min(1.0, reached + part)
         guess = state
-        trial, iterations, update = solver.solve_static(
-            guess, target * u, target * load, tolerance, _LIMIT
-        )
+        trial, iterations, update = backend.solve_static(guess, target * u, target * load, solver)
         spent += abs(iterations)
         if iterations > 0:
             state = trial

@@ -1,14 +1,60 @@
 """Compiled pieces of a time step that rods in a plane and in space share.
 
-A step solves M·rate·((x − x_n)·rate − v_n) + D·rate·(x − x_n) = F(x) for x; body is the tuple of
-mass, damping, load (n,) and of the fixed indices.
+A step is a chain of solves. One solve is a backward Euler step over h = 1/rate:
+
+    M rate (v − v_n) + D v = F(x),    v = rate (x − x_n),
+
+after which the state goes on to (x_n, v_n) + e ((x, v) − (x_n, v_n)): e = 1 is backward Euler, e
+= 2 over half a step the implicit midpoint rule, and γ, then 1, Alexander's SDIRK (Alexander,
+"Diagonally implicit Runge-Kutta methods for stiff O.D.E.'s", SIAM J. Numer. Anal. 14, 1977).
 """
 
 from __future__ import annotations
 
-from der_planner.rod.band_kernel import put
-from der_planner.rod.compile import kernel
-from der_planner.rod.state import Array, Arrays
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from der_planner.rod.banded_kernel import put
+from der_planner.rod.compile import inlined_kernel, kernel
+from der_planner.rod.state import Array
+
+
+class Body(NamedTuple):
+    """What moves: for the n kernel unknowns."""
+
+    mass: Array  # (n,) [kg, kg·m²]
+    damping: Array  # (n,) D [kg/s, kg·m²/s]
+    load: Array  # (n,) gravity and point forces [N]
+    fixed: NDArray[np.int64]  # indices of the unknowns that do not move
+
+
+class Solver(NamedTuple):
+    """How a step is solved."""
+
+    h: float  # time over which each solve goes [s]
+    extrapolate: Array  # (P,) e of each solve of a step
+    tolerance: float  # largest last Newton update [m]
+    lever: float  # an angle counts times this length as an update [m]
+    limit: int  # most Newton iterations of a solve
+
+
+class Record(NamedTuple):
+    """The linearisation of each solve, b being the half-bandwidth; empty where it is not kept.
+
+    One solve is J y = (M rate² + D rate) δq + M rate δv + `back` δq + `inputs` δu. In space the
+    angle of edge j, counted in the frames of the state that the solve leads to, is then larger by
+    gauge[j, :3]·δe' + gauge[j, 3:]·δe with the edge's change δe before and δe' after.
+    """
+
+    factors: Array  # (solves, n, 2b+1) J as L U
+    back: Array  # (solves or 0, n, 2b+1)
+    inputs: Array  # (solves, n, M) B(q)Λ [N/Pa]
+    gauge: Array  # (solves or 0, n_edges, 6) [rad/m]
+    states: Array  # (solves, 3, n) position, velocity, acceleration of the solution
+    frames: Array  # (solves or 0, n_edges, 6) tangent and director from which the solve began
+    twists: Array  # (solves or 0, n_nodes) reference twists there
 
 
 @kernel
@@ -16,7 +62,7 @@ def predict(
     x: Array, x_n: Array, v_n: Array, acceleration: Array, h: float, fixed: Array, far: float,
     angles: bool,
 ) -> None:  # fmt: skip
-    """Fill x with a guess of the step's end: the last acceleration goes on, unless it leads far.
+    """Fill x with a guess of the solution: the last acceleration goes on, unless it leads far.
 
     far [m]; with `angles` every fourth unknown is one, for which 0.5 rad is far.
     """
@@ -30,10 +76,10 @@ def predict(
         x[d] = x_n[d]
 
 
-@kernel
-def add_inertia(residual: Array, s: Array, v: Array, v_n: Array, rate: float, body: Arrays) -> None:
-    """Add inertia, mass-proportional damping and load to a residual and its derivative s."""
-    mass, damping, load, _ = body
+@inlined_kernel
+def add_inertia(residual: Array, s: Array, v: Array, v_n: Array, rate: float, body: Body) -> None:
+    """Add M rate (v − v_n) + D v − load to the residual, M rate² + D rate to its derivative s."""
+    mass, damping, load = body.mass, body.damping, body.load
     for k in range(residual.shape[0]):
         residual[k] += mass[k] * rate * (v[k] - v_n[k]) + damping[k] * v[k] - load[k]
         s[k, 0] += rate * (mass[k] * rate + damping[k])
@@ -43,9 +89,30 @@ def add_inertia(residual: Array, s: Array, v: Array, v_n: Array, rate: float, bo
 def go_on(
     x: Array, x_n: Array, v_n: Array, acceleration: Array, rate: float, extrapolate: float
 ) -> None:
-    """Move x_n, v_n to the step's end, `extrapolate` times the way to the solution x."""
+    """Move x_n, v_n to where a solve leads: `extrapolate` times the way to the solution x."""
     for d in range(x.shape[0]):
         velocity = (x[d] - x_n[d]) * rate
         acceleration[d] = (velocity - v_n[d]) * rate
         x_n[d] += extrapolate * (x[d] - x_n[d])
         v_n[d] += extrapolate * (velocity - v_n[d])
+
+
+@kernel
+def keep_state(slot: int, x: Array, x_n: Array, v_n: Array, rate: float, record: Record) -> None:
+    """Write position, velocity and acceleration of a solution into the record."""
+    for d in range(x.shape[0]):
+        velocity = (x[d] - x_n[d]) * rate
+        record.states[slot, 0, d] = x[d]
+        record.states[slot, 1, d] = velocity
+        record.states[slot, 2, d] = (velocity - v_n[d]) * rate
+
+
+@kernel
+def add_forces(change: Array, states: Array, ours: Body, other: Body) -> None:
+    """Add to change (n,) what body `ours` adds to a residual at states (3, n), less `other`'s."""
+    for d in range(change.shape[0]):
+        change[d] += (ours.mass[d] - other.mass[d]) * states[2, d]
+        change[d] += (ours.damping[d] - other.damping[d]) * states[1, d]
+        change[d] -= ours.load[d] - other.load[d]
+    for d in ours.fixed:
+        change[d] = 0.0

@@ -27,8 +27,8 @@ Array = NDArray[np.float64]
 
 VISCOUS_TIME = 1e-4
 """τ of the material's own damping [s], a loss factor ω τ of 0.02 at the lowest axial mode (37 Hz)
-and of 0.4 at the mesh's highest. Without it nothing stops those modes, and what trembles does not
-rub: their ringing would take most of the friction away."""
+and of 0.4 at the mesh's highest. Without it these modes would ring on, reverse the bend all the
+time, and so keep the friction far below its full moment."""
 
 
 class RodArrays(NamedTuple):

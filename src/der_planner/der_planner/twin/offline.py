@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from der_planner.model.air import pair_of
 from der_planner.twin.limb_twin import LimbTwin, TwinError
 from pressure_driver.emulator.pneumatics import Pneumatics
 
@@ -81,7 +82,7 @@ def play(
     _advance(pneumatics, twin, lead, fine_step)
     for k, setpoint in enumerate(wanted):
         tip[k], angles[k], chambers[k] = twin.tip, twin.bend_angles, pneumatics.pressure
-        pneumatics.command(pneumatics.atmosphere + split(setpoint))
+        pneumatics.command(pneumatics.atmosphere + pair_of(setpoint).ravel())
         if k + 1 < instants.size:
             _advance(pneumatics, twin, instants[k + 1] - instants[k], fine_step)
     return Playback(
@@ -92,12 +93,6 @@ def play(
         measured_differential=chambers[:, 0::2] - chambers[:, 1::2],
         chamber_pressure=chambers,
     )
-
-
-def split(differential: Array) -> Array:
-    """Return (2M,) gauge pressures [Pa]: one chamber of a pair has |u|, one is vented."""
-    pairs: Array = np.stack([np.maximum(differential, 0.0), np.maximum(-differential, 0.0)], axis=1)
-    return pairs.ravel()
 
 
 def _advance(pneumatics: Pneumatics, twin: LimbTwin, duration: float, fine_step: float) -> None:

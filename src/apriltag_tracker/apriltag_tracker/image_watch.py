@@ -26,7 +26,7 @@ class Report:
     values: dict[str, object]
 
 
-class Monitor:
+class ImageWatch:
     """Counts images and states, and tells what is wrong.
 
     Args:

@@ -3,33 +3,82 @@
 Symbols: n nodes (with the ghost node, if any), x (4n-1,) = x0, φ0, x1, …; edge j = x_{j+1} − x_j
 with
 tangent t; d̂, t̂ the reference director and tangent of the last converged step, d1 = P(t̂→t) d̂ the
-director now, m1, m2 the material frame at φ; at node i κb = 2 t_e×t_f / χ, χ = 1 + t_e·t_f, and κ1
-= ½ κb·(m2e + m2f), κ2 = −½ κb·(m1e + m1f), τ = φf − φe + reference twist (Bergou 2008, 2010).
+director now, m1, m2 the material frame at φ; at node i κb = 2 t_e×t_f / χ, χ = 1 + t_e·t_f, and
+
+    κ1 = ½ κb·(m2e + m2f),  κ2 = −½ κb·(m1e + m1f),  τ = φf − φe + reference twist
+
+(Bergou et al., "Discrete viscous threads", 2010, sections 3 and 4).
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from der_planner.rod.compile import kernel
-from der_planner.rod.state import Array, Arrays
+from der_planner.rod.state import Array
 
-# `rod` is the tuple of a rod's arrays:
-# rest (n-1,); axial (n-1,) EA; bend (n,) EI/l; twist (n,) GJ/l; cubic (n,) k3/l³; viscous (n,) EI
-# τ/l; rest_kappa (n, 2); rest_twist (n,); first (M,), last (M,) edges of the segments; gain (M,) Λ.
 
-# Columns of the work array `frame` (n-1, 13): t, 1/|e|, m1, m2, d1
+class SpatialRod(NamedTuple):
+    """The numbers of a rod in space."""
+
+    rest: Array  # (n-1,) edge lengths at rest ē [m]
+    axial: Array  # (n-1,) EA [N]
+    bend: Array  # (n,) EI/l [N·m]
+    twist: Array  # (n,) GJ/l [N·m]
+    cubic: Array  # (n,) k3/l³ [N·m]
+    viscous: Array  # (n,) EI τ/l, Kelvin-Voigt [N·m·s]
+    rest_kappa: Array  # (n, 2) κ̄
+    rest_twist: Array  # (n,) τ̄ [rad]
+    first: NDArray[np.int64]  # (M,) first edge of each segment
+    last: NDArray[np.int64]  # (M,) last edge of each segment
+    gain: Array  # (M,) Λ [N/Pa]
+
+
+class Base(NamedTuple):
+    """The reference frames of the state from which a step begins."""
+
+    tangents: Array  # (n-1, 3) t̂
+    directors: Array  # (n-1, 3) d̂
+    twists: Array  # (n,) reference twist [rad]
+
+
+class SpatialSpace(NamedTuple):
+    """Where the kernels work; nothing in here outlives a call."""
+
+    x: Array  # (4n-1,) the solution sought
+    v: Array  # (4n-1,) its velocity
+    acceleration: Array  # (4n-1,) of the last solve
+    residual: Array  # (4n-1,)
+    second_residual: Array  # (4n-1,)
+    x_start: Array  # (4n-1,) where a step began
+    v_start: Array  # (4n-1,)
+    base_start: Array  # (n, 7) frames there
+    s: Array  # (4n-1, 11) symmetric derivative of the residual, by columns
+    a: Array  # (4n-1, 21) exact derivative, by rows
+    drag: Array  # (4n-1, 21) viscous matrix times rate, by rows
+    frame: Array  # (n-1, 13) t, 1/|e|, m1, m2, d1 of each edge
+    twists: Array  # (n,) reference twists [rad]
+    own: Array  # (n-1, 4, 5) Hessian by each edge's (e, φ), gradient in the last column
+    link: Array  # (n, 4, 4) coupling of a node's two edges, rows of the second
+    local: Array  # (12, 8) Hessian, gradients and strains at one node
+    vectors: Array  # (10, 3) vectors at one node
+
+
+# Columns of `frame` at which t and d1 begin
 T, D1 = 0, 10
 
 
 @kernel
 def frames(
     x: Array,
-    base_tangent: Array,
-    base_director: Array,
+    base: Base,
     frame: Array,
 ) -> None:
     """Fill frame (n-1, 13): t, 1/|e|, m1, m2 and the transported director of each edge."""
+    base_tangent, base_director = base.tangents, base.directors
     for j in range(frame.shape[0]):
         k = 4 * j
         ex = x[k + 4] - x[k]
@@ -235,15 +284,14 @@ def add_curvature_hessian(  # noqa: PLR0912 - one loop a block
 
 
 @kernel
-def energy(
-    x: Array,
-    frame: Array,
-    twists: Array,
-    local: Array,
-    rod: Arrays,
-) -> float:
-    """Return the elastic energy [J]; frame and twists are those of x."""
-    rest, axial, bend, twist, cubic, _, rest_kappa, rest_twist, _, _, _ = rod
+def energy(x: Array, space: SpatialSpace, rod: SpatialRod) -> float:
+    """Return the elastic energy [J]; space.frame and space.twists are those of x.
+
+    E = Σ ½ EA (|e|/ē − 1)² ē + Σ ½ (EI/l) |κ − κ̄|² + ¼ (k3/l³) |κ − κ̄|⁴ + ½ (GJ/l) (τ − τ̄)².
+    """
+    rest, axial, bend, twist, cubic = rod.rest, rod.axial, rod.bend, rod.twist, rod.cubic
+    rest_kappa, rest_twist = rod.rest_kappa, rod.rest_twist
+    frame, twists, local = space.frame, space.twists, space.local
     total = 0.0
     strain = local[11]
     for j in range(frame.shape[0]):
@@ -258,9 +306,13 @@ def energy(
 
 
 @kernel
-def input_columns(frame: Array, rod: Arrays, columns: Array) -> None:
-    """Fill columns (4n-1, M) with B(q)Λ."""
-    first, last, gain = rod[8], rod[9], rod[10]
+def input_columns(frame: Array, rod: SpatialRod, columns: Array) -> None:
+    """Fill columns (4n-1, M) with B(q)Λ.
+
+    At a segment's first edge −Λ ẑ×t on its first node and +Λ ẑ×t on the second, at its last edge
+    the reverse: the two couples of the paper's Corollary 1.
+    """
+    first, last, gain = rod.first, rod.last, rod.gain
     columns[:] = 0.0
     for m in range(gain.shape[0]):
         for end in range(2):

@@ -1,22 +1,53 @@
 """Compiled kernels of a rod in a plane: two unknowns a node, half-bandwidth 5.
 
-Symbols: n nodes (with the ghost node, if any), x (2n,) positions, edge j = x_{j+1} − x_j of length
-|e_j|,
-t its tangent and n̂ its left normal; at node i the turning angle θ and the integrated curvature
-κ = 2 tan(θ/2), κ' = dκ/dθ = 1 + κ²/4, κ'' = κ κ'/2; w = EI/l, c = EI τ/l (Kelvin-Voigt), k3/l³
-(cubic).
+Symbols, after Bergou et al., "Discrete elastic rods" (2008) and "Discrete viscous threads" (2010),
+in two dimensions: n nodes (with the ghost node, if any), x (2n,) positions, edge j = x_{j+1} − x_j
+of length |e_j|, t its tangent and n̂ its left normal; at node i the turning angle θ and the
+integrated curvature κ = 2 tan(θ/2), κ' = dκ/dθ = 1 + κ²/4, κ'' = κ κ'/2.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
-from der_planner.rod.compile import kernel
-from der_planner.rod.state import Array, Arrays
+from der_planner.rod.compile import inlined_kernel, kernel
+from der_planner.rod.state import Array
 
-# `rod` is the tuple of a rod's arrays:
-# rest (n-1,) edge lengths; axial (n-1,) EA; bend (n,) w; rest_kappa (n,); cubic (n,); viscous (n,)
-# c; first (M,), last (M,) edge indices of the segments; gain (M,) Λ.
+
+class PlanarRod(NamedTuple):
+    """The numbers of a rod in a plane."""
+
+    rest: Array  # (n-1,) edge lengths at rest ē [m]
+    axial: Array  # (n-1,) EA [N]
+    bend: Array  # (n,) EI/l [N·m]
+    rest_kappa: Array  # (n,) κ̄
+    cubic: Array  # (n,) k3/l³ [N·m]
+    viscous: Array  # (n,) EI τ/l, Kelvin-Voigt [N·m·s]
+    first: NDArray[np.int64]  # (M,) first edge of each segment
+    last: NDArray[np.int64]  # (M,) last edge of each segment
+    gain: Array  # (M,) Λ [N/Pa]
+
+
+class PlanarSpace(NamedTuple):
+    """Where the kernels work; nothing in here outlives a call."""
+
+    x: Array  # (2n,) the solution sought
+    v: Array  # (2n,) its velocity
+    acceleration: Array  # (2n,) of the last solve
+    residual: Array  # (2n,)
+    second_residual: Array  # (2n,)
+    x_start: Array  # (2n,) where a step began
+    v_start: Array  # (2n,)
+    s: Array  # (2n, 6) symmetric derivative of the residual, by columns
+    a: Array  # (2n, 11) exact derivative, by rows
+    drag: Array  # (2n, 11) viscous matrix times rate, by rows
+    edge: Array  # (n-1, 3) t and 1/|e|
+    turn: Array  # (n,) κ
+    torque: Array  # (n, 2) moment about z and its derivative by θ
+    parts: Array  # (2, 6) gradients at one node
 
 
 @kernel
@@ -41,14 +72,15 @@ def edges_and_turns(
 
 
 @kernel
-def energy(
-    x: Array,
-    edge: Array,
-    turn: Array,
-    rod: Arrays,
-) -> float:
-    """Return the elastic energy [J]."""
-    rest, axial, bend, rest_kappa, cubic = rod[:5]
+def energy(x: Array, space: PlanarSpace, rod: PlanarRod) -> float:
+    """Return the elastic energy [J].
+
+    E = Σ ½ EA (|e|/ē − 1)² ē + Σ ½ (EI/l) (κ − κ̄)² + ¼ (k3/l³) (κ − κ̄)⁴; Bergou 2008, eq. 2, with
+    the stretching of Jawed et al., "A primer on the kinematics of discrete elastic rods" (2018).
+    """
+    rest, axial, bend = rod.rest, rod.axial, rod.bend
+    rest_kappa, cubic = rod.rest_kappa, rod.cubic
+    edge, turn = space.edge, space.turn
     edges_and_turns(x, edge, turn)
     total = 0.0
     n = turn.shape[0]
@@ -61,31 +93,16 @@ def energy(
     return total
 
 
-@kernel
-def assemble(  # noqa: PLR0915 - scalars, so that nothing is stored between the edges
-    x: Array,
-    v: Array,
-    rate: float,
-    u: Array,
-    convex: bool,
-    g: Array,
-    s: Array,
-    edge: Array,
-    turn: Array,
-    torque: Array,
-    rod: Arrays,
-) -> None:
-    """Elastic, viscous and actuating terms of the residual and its symmetric derivative.
+@inlined_kernel
+def moments(v: Array, rate: float, space: PlanarSpace, rod: PlanarRod) -> None:
+    """Fill torque (n, 2) from edge and turn: each node's moment about z and its derivative by θ.
 
-    g (2n,) becomes ∇E + viscous force − B(q)Λu; s (2n, 6) its derivative by x with v = rate·(x −
-    x_n), of which the unsymmetric part is left out or symmetrised (`unsymmetric` adds what is
-    missing). With `convex` the negative geometric terms are left out too: a safer direction far
-    from the solution. edge (n-1, 3), turn (n,), torque (n, 2) are work space: t and 1/|e|; κ;
-    moment and its derivative.
+    With δ = κ − κ̄ the moment is [(EI/l) δ + (k3/l³) δ³] κ' + (EI τ/l) κ'² θ̇, the last term
+    Kelvin-Voigt damping of κ; θ̇ changes by rate for a change of θ.
     """
-    rest, axial, bend, rest_kappa, cubic, viscous, first, last, gain = rod
+    edge, turn, torque = space.edge, space.turn, space.torque
+    bend, rest_kappa, cubic, viscous = rod.bend, rod.rest_kappa, rod.cubic, rod.viscous
     n = turn.shape[0]
-    edges_and_turns(x, edge, turn)
     torque[0, 0] = 0.0
     torque[0, 1] = 0.0
     torque[n - 1, 0] = 0.0
@@ -103,6 +120,38 @@ def assemble(  # noqa: PLR0915 - scalars, so that nothing is stored between the 
             turning = turning_rate(v, edge, i)
             torque[i, 0] += viscous[i] * slope * slope * turning
             torque[i, 1] += viscous[i] * slope * (slope * rate + 2.0 * second * turning)
+
+
+@inlined_kernel
+def assemble(  # noqa: PLR0915 - scalars, so that nothing is stored between the edges
+    x: Array,
+    v: Array,
+    rate: float,
+    u: Array,
+    convex: bool,
+    g: Array,
+    space: PlanarSpace,
+    rod: PlanarRod,
+) -> None:
+    """Elastic, viscous and actuating terms of the residual and its symmetric derivative.
+
+    g (2n,) becomes ∇E + viscous force − B(q)Λu; space.s its derivative by x with v = rate·(x −
+    x_n),
+    of which the unsymmetric part is left out or symmetrised (`unsymmetric` adds what is missing).
+    With `convex` the negative geometric terms are left out too: a safer direction far from the
+    solution.
+
+    An edge's energy depends on its length and, through the turning of its two nodes, on its
+    direction
+    ψ, with ∇ψ = n̂/|e|: ∇E = T t + (M_j − M_{j+1} − f |e|) n̂/|e| with the tension T = EA (|e|/ē
+    − 1), the nodes' moments M, and f = ∓Λu of the couple at a segment's first or last edge.
+    """
+    rest, axial = rod.rest, rod.axial
+    first, last, gain = rod.first, rod.last, rod.gain
+    s, edge, torque = space.s, space.edge, space.torque
+    n = space.turn.shape[0]
+    edges_and_turns(x, edge, space.turn)
+    moments(v, rate, space, rod)
     for k in range(2 * n):
         g[k] = 0.0
     # Edge by edge: gradient (gx, gy) and Hessian (hxx, hxy, hyy) by e; then the coupling of two
@@ -196,21 +245,18 @@ def unsymmetric(
     v: Array,
     rate: float,
     u: Array,
-    a: Array,
-    damping: Array,
-    edge: Array,
-    turn: Array,
-    parts: Array,
-    rod: Arrays,
+    space: PlanarSpace,
+    rod: PlanarRod,
 ) -> None:
-    """Complete a (2n, 11) to the exact derivative; fill damping (2n, 6): viscous matrix·rate.
+    """Complete space.a to the exact derivative; fill space.drag with c κ'² ∇θ ∇θᵀ times rate.
 
     Missing in `assemble` are −(Λu/|e|) n̂ tᵀ of a couple that keeps its force while its edge
-    stretches, and c κ'² ∇θ (∇²θ v)ᵀ of the viscous moment.
+    stretches, and c κ'² ∇θ (∇²θ v)ᵀ of the viscous moment, c = EI τ/l.
     """
-    viscous, first, last, gain = rod[5], rod[6], rod[7], rod[8]
+    viscous, first, last, gain = rod.viscous, rod.first, rod.last, rod.gain
+    a, drag, edge, turn, parts = space.a, space.drag, space.edge, space.turn, space.parts
     n = turn.shape[0]
-    damping[:] = 0.0
+    drag[:] = 0.0
     for m in range(gain.shape[0]):
         for end in range(2):
             j = first[m] if end == 0 else last[m]
@@ -253,16 +299,19 @@ def unsymmetric(
         for row in range(6):
             for column in range(6):
                 a[base + row, 5 + column - row] += strength * gradient[row] * change[column]
-                if row >= column:
-                    damping[base + column, row - column] += (
-                        strength * rate * gradient[row] * gradient[column]
-                    )
+                drag[base + row, 5 + column - row] += (
+                    strength * rate * gradient[row] * gradient[column]
+                )
 
 
 @kernel
-def input_columns(edge: Array, rod: Arrays, columns: Array) -> None:
-    """Fill columns (2n, M) with B(q)Λ for the tangents in edge."""
-    first, last, gain = rod[6], rod[7], rod[8]
+def input_columns(edge: Array, rod: PlanarRod, columns: Array) -> None:
+    """Fill columns (2n, M) with B(q)Λ for the tangents in edge.
+
+    At a segment's first edge −Λ n̂ on its first node and +Λ n̂ on the second (n̂ = ẑ×t), at its last
+    edge the reverse: the two couples of the paper's Corollary 1.
+    """
+    first, last, gain = rod.first, rod.last, rod.gain
     columns[:] = 0.0
     for m in range(gain.shape[0]):
         for end in range(2):

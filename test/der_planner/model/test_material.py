@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from der_planner import actuation
 from der_planner.limb import Limb, LimbError
+from der_planner.model import material
 
 
 def rubbing(**changes: float) -> Limb:
@@ -37,16 +37,16 @@ WANTED = 11_000.0 * np.stack([np.sin(TIME / 3), np.sin(TIME / 5)], axis=1)
 
 def test_differential_and_effective_pressure_are_inverse():
     limb = rubbing()
-    given = actuation.differential_pressure(limb, TIME, WANTED, BEND)
+    given = material.differential_pressure(limb, TIME, WANTED, BEND)
     np.testing.assert_allclose(
-        actuation.effective_pressure(limb, TIME, given, BEND), WANTED, atol=1e-8
+        material.effective_pressure(limb, TIME, given, BEND), WANTED, atol=1e-8
     )
     assert np.abs(given - WANTED).max() > 300.0
 
 
 def test_a_plain_limb_feels_what_its_chambers_hold():
     np.testing.assert_array_equal(
-        actuation.effective_pressure(Limb.default(), TIME, WANTED, BEND), WANTED
+        material.effective_pressure(Limb.default(), TIME, WANTED, BEND), WANTED
     )
 
 
@@ -54,21 +54,21 @@ def test_friction_saturates_closes_its_loops_and_does_not_depend_on_rate():
     angle = np.concatenate(
         [np.linspace(0, 2, 400), np.linspace(2, -2, 800), np.linspace(-2, 2, 800)]
     )
-    z = actuation.dahl(angle, 0.1)
+    z = material.dahl(angle, 0.1)
     assert np.abs(z).max() <= 1.0
     assert z[399] == pytest.approx(1.0, abs=1e-6)
     assert z[1199] == pytest.approx(-1.0, abs=1e-6)
     np.testing.assert_allclose(z[-1], z[399], atol=1e-6)
-    np.testing.assert_allclose(actuation.dahl(angle[::4], 0.1)[-1], z[-1], atol=1e-6)
+    np.testing.assert_allclose(material.dahl(angle[::4], 0.1)[-1], z[-1], atol=1e-6)
     # half way round after 0.1 ln 2 from saturation
-    turned = actuation.dahl(np.array([0.0, 5.0, 5.0 - 0.1 * np.log(2)]), 0.1)
+    turned = material.dahl(np.array([0.0, 5.0, 5.0 - 0.1 * np.log(2)]), 0.1)
     assert turned[-1] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_creep_relaxes_exponentially():
     time = np.linspace(0, 20, 401)
     strain = np.where(time > 0, 1.0, 0.0)
-    q = actuation.maxwell(time, strain, 4.0)
+    q = material.maxwell(time, strain, 4.0)
     np.testing.assert_allclose(q[1:], q[1] * np.exp(-(time[1:] - time[1]) / 4.0), rtol=1e-12)
 
 
@@ -79,8 +79,8 @@ def test_resting_bend_is_where_moment_and_effective_pressure_agree():
         replace(s, cubic_stiffness=cubic * s.bending_stiffness * s.length**2) for s in limb.segments
     ]
     limb = replace(limb, segments=tuple(stiffer))
-    bend = actuation.resting_bend(limb, TIME, WANTED)
-    effective = actuation.effective_pressure(limb, TIME, WANTED, bend)
+    bend = material.resting_bend(limb, TIME, WANTED)
+    effective = material.effective_pressure(limb, TIME, WANTED, bend)
     bent = bend - np.array([s.rest_curvature * s.length for s in limb.segments])
     held = bent + cubic * bent**3
     np.testing.assert_allclose(held[1:], (limb.static_gain * effective)[1:], atol=1e-9)
@@ -93,34 +93,20 @@ def test_coupling_adds_the_share_of_the_neighbours_pressure():
         limb,
         segments=(replace(first, coupling_after=0.04), replace(second, coupling_before=-0.02)),
     )
-    felt = actuation.effective_pressure(coupled, TIME, WANTED, BEND)
+    felt = material.effective_pressure(coupled, TIME, WANTED, BEND)
     expected = WANTED + WANTED[:, ::-1] * [0.04, -0.02]
     np.testing.assert_allclose(felt, expected, rtol=1e-12)
     alone = replace(limb, segments=(replace(first, coupling_before=0.04), second))
-    np.testing.assert_array_equal(actuation.effective_pressure(alone, TIME, WANTED, BEND), WANTED)
+    np.testing.assert_array_equal(material.effective_pressure(alone, TIME, WANTED, BEND), WANTED)
     with pytest.raises(LimbError, match="coupling_after"):
         replace(limb, segments=(replace(first, coupling_after=0.6), second))
-
-
-def test_lead_undoes_a_first_order_lag():
-    limb = Limb.default()
-    limb = replace(limb, pneumatics=replace(limb.pneumatics, time_constant=0.3, delay=0.1))
-    time = np.arange(0, 12, 0.01)
-    wanted = 5000.0 * np.sin(time)[:, None] * [1.0, -1.0]
-    command = actuation.lead(limb, time, wanted)
-    held = np.zeros(2)
-    for k in range(len(time)):
-        past = command[max(0, k - 10)]
-        held = held + 0.01 / 0.3 * (past - held)
-        if time[k] > 3.0 and time[k] < 11.0:
-            assert np.abs(held - wanted[k]).max() < 80.0
 
 
 def test_too_much_stiffening_is_refused_by_its_name():
     limb = rubbing()
     segments = tuple(replace(s, pressure_stiffening=1e-4) for s in limb.segments)
     with pytest.raises(ValueError, match="pressure_stiffening"):
-        actuation.differential_pressure(replace(limb, segments=segments), TIME, WANTED, BEND)
+        material.differential_pressure(replace(limb, segments=segments), TIME, WANTED, BEND)
 
 
 def test_limb_file_keeps_everything(tmp_path):

@@ -1,6 +1,9 @@
-"""Forward kinematics that inverse kinematics works on: the rod's own polyline and the arcs.
+"""What a bend angle is, and the shapes of evenly bent limbs: the rod's own polyline and the arcs.
 
-Both answer the same four questions, so that every planner can be given either.
+The bend angle of a segment is the heading where it ends less the heading where it starts [rad],
+counter-clockwise positive, as tags on the stiff pieces between segments show it. A rod's heading
+there is that of the edge between two segments, which belongs to neither (at the tip: of the last
+edge; at the clamp: +x).
 """
 
 from __future__ import annotations
@@ -15,7 +18,72 @@ from der_planner.limb import Limb
 from der_planner.pcc import Pcc
 from der_planner.rod import Rod
 
-Vector = NDArray[np.float64]
+Array = NDArray[np.float64]
+
+
+def end_edges(rod: Rod) -> list[tuple[int, int]]:
+    """Return the nodes of the edge that has the heading of each segment's end."""
+    last = len(rod.rest_lengths)
+    ends = [min(first + count - 1, last - 1) for first, count in rod.segments]
+    return [(end, end + 1) for end in ends]
+
+
+def bend_angles(rod: Rod, q: Array) -> Array:
+    """Return the bend angles (K, M) [rad] of a rod's configurations (K, 4N-1), continuous in time.
+
+    A turn by more than half a circle from one row to the next is taken for one the other way.
+    """
+    headings = [_heading(q, a, b) for a, b in end_edges(rod)]
+    absolute = np.unwrap(np.stack(headings, axis=1), axis=0)
+    relative: Array = np.diff(absolute, axis=1, prepend=0.0)
+    return relative
+
+
+def bend_outputs(rod: Rod) -> list[int]:
+    """Return the indices (4M) into q on which the bend angles depend, for `bend_change`."""
+    return [4 * node + axis for edge in end_edges(rod) for node in edge for axis in (0, 1)]
+
+
+def bend_change(rod: Rod, q: Array, moved: Array) -> Array:
+    """Return the first-order change (K, M) of the bend angles [rad].
+
+    Args:
+        rod: of the configurations.
+        q: (K, 4N-1).
+        moved: (K, 4M) change of the coordinates `bend_outputs`.
+    """
+    columns = []
+    for place, (a, b) in enumerate(end_edges(rod)):
+        x1, y1, x2, y2 = moved[:, 4 * place : 4 * place + 4].T
+        dx, dy, square = _edge(q, a, b)
+        columns.append((dx * (y2 - y1) - dy * (x2 - x1)) / square)
+    relative: Array = np.diff(np.stack(columns, axis=1), axis=1, prepend=0.0)
+    return relative
+
+
+def bend_gradient(rod: Rod, q: Array, weight: Array) -> Array:
+    """Return the gradient (K, 4M) of Σ weight · bend by `bend_outputs`, for weights (K, M)."""
+    # A bend angle is the difference of two headings: heading i counts in bend i and in bend i + 1.
+    by_heading = weight - np.concatenate([weight[:, 1:], np.zeros((len(weight), 1))], axis=1)
+    result = np.empty((len(q), 4 * weight.shape[1]))
+    for place, (a, b) in enumerate(end_edges(rod)):
+        dx, dy, square = _edge(q, a, b)
+        share = by_heading[:, place] / square
+        columns = np.stack([dy * share, -dx * share, -dy * share, dx * share], axis=1)
+        result[:, 4 * place : 4 * place + 4] = columns
+    return result
+
+
+def _edge(q: Array, first: int, second: int) -> tuple[Array, Array, Array]:
+    dx = q[:, 4 * second] - q[:, 4 * first]
+    dy = q[:, 4 * second + 1] - q[:, 4 * first + 1]
+    return dx, dy, dx * dx + dy * dy
+
+
+def _heading(q: Array, first: int, second: int) -> Array:
+    dx, dy, _ = _edge(q, first, second)
+    heading: Array = np.arctan2(dy, dx)
+    return heading
 
 
 class Kinematics(Protocol):
@@ -23,13 +91,13 @@ class Kinematics(Protocol):
 
     segment_count: int
 
-    def tip(self, bend_angles: ArrayLike) -> Vector:
+    def tip(self, bend_angles: ArrayLike) -> Array:
         """Return the tip (..., 2)."""
 
-    def tip_jacobians(self, bend_angles: ArrayLike) -> Vector:
+    def tip_jacobians(self, bend_angles: ArrayLike) -> Array:
         """Return ∂tip/∂bend angles (..., 2, M)."""
 
-    def curve(self, bend_angles: ArrayLike) -> Vector:
+    def curve(self, bend_angles: ArrayLike) -> Array:
         """Return the centreline (P, 2) of one configuration (M,)."""
 
 
@@ -66,44 +134,44 @@ class PolylineKinematics:
         edges: NDArray[np.complex128] = self.rest_lengths * np.exp(1j * heading)
         return edges
 
-    def tip(self, bend_angles: ArrayLike) -> Vector:
+    def tip(self, bend_angles: ArrayLike) -> Array:
         """Return the tip (..., 2) [m] for bend angles (..., M) [rad]."""
         end = self.base + self._edges(bend_angles).sum(axis=-1)
         return np.stack([end.real, end.imag], axis=-1)
 
-    def tip_jacobians(self, bend_angles: ArrayLike) -> Vector:
+    def tip_jacobians(self, bend_angles: ArrayLike) -> Array:
         """Return ∂tip/∂bend angles (..., 2, M) [m/rad]."""
         columns = 1j * (self._edges(bend_angles) @ self.turning)
         return np.stack([columns.real, columns.imag], axis=-2)
 
-    def curve(self, bend_angles: ArrayLike) -> Vector:
+    def curve(self, bend_angles: ArrayLike) -> Array:
         """Return the clamp and the nodes (P, 2) [m] of one configuration (M,) [rad]."""
         nodes = self.nodes(bend_angles)
         return np.concatenate([np.zeros((1, 2)), nodes]) if self.base else nodes
 
-    def nodes(self, bend_angles: ArrayLike) -> Vector:
+    def nodes(self, bend_angles: ArrayLike) -> Array:
         """Return the nodes (..., N, 2) [m] for bend angles (..., M) [rad]."""
         return self._placed(self._edges(bend_angles))
 
-    def _placed(self, edges: NDArray[np.complex128]) -> Vector:
+    def _placed(self, edges: NDArray[np.complex128]) -> Array:
         """Return the nodes (..., N, 2) [m] of edges (..., N-1) from the base on."""
         nodes = _points(edges)
         nodes[..., 0] += self.base
         return nodes
 
-    def edge_normals(self, bend_angles: ArrayLike) -> Vector:
+    def edge_normals(self, bend_angles: ArrayLike) -> Array:
         """Return the left normals of the edges (..., N-1, 2), unit vectors."""
         normal = 1j * np.exp(1j * (np.asarray(bend_angles, dtype=float) @ self.turning.T))
         return np.stack([normal.real, normal.imag], axis=-1)
 
-    def tangents(self, bend_angles: ArrayLike) -> Vector:
+    def tangents(self, bend_angles: ArrayLike) -> Array:
         """Return S = ∂nodes/∂bend angles (..., M, N, 2) [m/rad]."""
         edges = self._edges(bend_angles)
         return _points(1j * edges[..., None, :] * self.turning.T)
 
     def motion(
         self, angles: ArrayLike, rates: ArrayLike, accelerations: ArrayLike
-    ) -> tuple[Vector, Vector, Vector]:
+    ) -> tuple[Array, Array, Array]:
         """Return node positions, velocities and accelerations, (..., N, 2) each.
 
         With edge e = ē exp(iψ): ė = iψ̇ e and ë = (iψ̈ − ψ̇²) e.
@@ -125,20 +193,20 @@ class ArcKinematics:
         self.segment_count = limb.segment_count
         self._model = Pcc(limb)
 
-    def tip(self, bend_angles: ArrayLike) -> Vector:
+    def tip(self, bend_angles: ArrayLike) -> Array:
         """Return the tip (..., 2) [m] for bend angles (..., M) [rad]."""
         return self._model.tip(bend_angles)
 
-    def tip_jacobians(self, bend_angles: ArrayLike) -> Vector:
+    def tip_jacobians(self, bend_angles: ArrayLike) -> Array:
         """Return ∂tip/∂bend angles (..., 2, M) [m/rad]."""
         return self._model.tip_jacobian(bend_angles)
 
-    def curve(self, bend_angles: ArrayLike) -> Vector:
+    def curve(self, bend_angles: ArrayLike) -> Array:
         """Return points (P, 2) [m] of the centreline of one configuration (M,) [rad]."""
         return self._model.curve(bend_angles)
 
 
-def _points(edges: NDArray[np.complex128]) -> Vector:
+def _points(edges: NDArray[np.complex128]) -> Array:
     nodes = np.cumsum(edges, axis=-1)
     nodes = np.concatenate([np.zeros_like(nodes[..., :1]), nodes], axis=-1)
     return np.stack([nodes.real, nodes.imag], axis=-1)

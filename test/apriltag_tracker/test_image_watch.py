@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from apriltag_tracker.camera import project
-from apriltag_tracker.monitor import Monitor
+from apriltag_tracker.image_watch import ImageWatch
 from apriltag_tracker.overlay import draw_observation
 from apriltag_tracker.pipeline import LimbObservation, LimbTracker
 
@@ -28,61 +28,61 @@ def tracker(tags, model):
 
 
 def test_waiting_is_stale_and_names_who_is_missing(clock):
-    monitor = Monitor("/limb/camera/image_raw", True, clock)
-    report = monitor.report(None)
+    watch = ImageWatch("/limb/camera/image_raw", True, clock)
+    report = watch.report(None)
     assert report.level == "stale"
     assert "/limb/camera/image_raw" in report.message
     assert "start the camera" in report.message
 
 
 def test_lost_images_name_the_profile(clock):
-    monitor = Monitor("/limb/camera/image_raw", True, clock)
+    watch = ImageWatch("/limb/camera/image_raw", True, clock)
     clock.now += 5.0
-    report = monitor.report(None, publishers=1)
+    report = watch.report(None, publishers=1)
     assert "FASTRTPS_DEFAULT_PROFILES_FILE" in report.message
 
 
 def test_images_without_calibration_are_an_error(clock):
-    monitor = Monitor("topic", True, clock)
-    monitor.arrived()
-    assert monitor.report(None).level == "error"
-    assert "calibrate_camera" in monitor.report(None).message
-    monitor.calibration_problem = "the camera is not calibrated"
-    assert monitor.report(None).message == "the camera is not calibrated"
+    watch = ImageWatch("topic", True, clock)
+    watch.arrived()
+    assert watch.report(None).level == "error"
+    assert "calibrate_camera" in watch.report(None).message
+    watch.calibration_problem = "the camera is not calibrated"
+    assert watch.report(None).message == "the camera is not calibrated"
 
 
 def test_a_stream_that_stops_is_an_error(clock, tracker, camera, swing):
-    monitor = Monitor("topic", True, clock)
+    watch = ImageWatch("topic", True, clock)
     for k in range(5):
         clock.now += 0.1
-        monitor.arrived()
+        watch.arrived()
         frame = camera.frame(swing.shape(0.0))
-        monitor.observed(tracker.observe(frame.image, float(k)), 0.004, 0.002)
-    report = monitor.report(tracker, 1)
+        watch.observed(tracker.observe(frame.image, float(k)), 0.004, 0.002)
+    report = watch.report(tracker, 1)
     assert report.level == "ok"
     assert report.values["rate_hz"] == "10.0"
     assert report.values["latency_ms_median"] == "4.00"
     assert report.values["processing_ms_p99"] == "2.00"
     clock.now += 3.0
-    assert monitor.report(tracker, 1).level == "error"
+    assert watch.report(tracker, 1).level == "error"
 
 
 def test_problems_come_before_the_state(clock, tracker):
-    monitor = Monitor("topic", True, clock)
-    monitor.arrived()
-    monitor.failed_with("unknown encoding")
-    assert monitor.report(tracker).message == "unknown encoding"
-    monitor.observed(LimbObservation((), None, "no limb tag in the image"), 0.0, 0.0)
-    report = monitor.report(tracker)
+    watch = ImageWatch("topic", True, clock)
+    watch.arrived()
+    watch.failed_with("unknown encoding")
+    assert watch.report(tracker).message == "unknown encoding"
+    watch.observed(LimbObservation((), None, "no limb tag in the image"), 0.0, 0.0)
+    report = watch.report(tracker)
     assert (report.level, report.message) == ("error", "no limb tag in the image")
     assert report.values["states_invalid"] == 1
     assert report.values["images_failed"] == 1
 
 
 def test_a_silent_device_is_an_error_at_once(clock):
-    monitor = Monitor("/dev/video0", False, clock)
-    monitor.image_problem = "the camera /dev/video0 gives no images: was it unplugged?"
-    report = monitor.report(None)
+    watch = ImageWatch("/dev/video0", False, clock)
+    watch.image_problem = "the camera /dev/video0 gives no images: was it unplugged?"
+    report = watch.report(None)
     assert report.level == "error"
     assert "unplugged" in report.message
 

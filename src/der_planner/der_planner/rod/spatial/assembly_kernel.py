@@ -1,16 +1,21 @@
-"""Compiled assembly of gradient and Hessian of a rod in space; symbols as in `spatial_kernel`.
+"""Compiled assembly of gradient and Hessian of a rod in space; symbols as in `elastic_kernel`.
 
 Derivatives are kept by edge, w = (e, φ), and brought to the nodes at the end.
 """
 
 from __future__ import annotations
 
-from der_planner.rod.compile import kernel
-from der_planner.rod.spatial_kernel import add_curvature_hessian, node_strains
-from der_planner.rod.state import Array, Arrays
+from der_planner.rod.compile import inlined_kernel, kernel
+from der_planner.rod.spatial.elastic_kernel import (
+    SpatialRod,
+    SpatialSpace,
+    add_curvature_hessian,
+    node_strains,
+)
+from der_planner.rod.state import Array
 
 
-@kernel
+@inlined_kernel
 def assemble(
     x: Array,
     v: Array,
@@ -18,23 +23,22 @@ def assemble(
     u: Array,
     convex: bool,
     g: Array,
-    s: Array,
-    frame: Array,
-    twists: Array,
-    own: Array,
-    link: Array,
-    local: Array,
-    vectors: Array,
-    rod: Arrays,
+    space: SpatialSpace,
+    rod: SpatialRod,
 ) -> None:
     """Elastic, viscous and actuating terms of the residual and its symmetric derivative.
 
-    g (4n-1,) becomes ∇E + viscous force − B(q)Λu; s (4n-1, 11) the symmetric derivative by x, the
-    viscous part with v = rate·(x − x_n). frame and twists are those of x. Work space: own (n-1, 4,
-    5) gradient (last column) and Hessian of each edge's (e, φ); link (n, 4, 4) coupling of a node's
-    two edges, rows of the second; local (12, 8); vectors (10, 3).
+    g (4n-1,) becomes ∇E + viscous force − B(q)Λu; space.s the symmetric derivative by x, the
+    viscous part with v = rate·(x − x_n). space.frame and space.twists are those of x.
+
+    With δ the strains less their rest values, a node's force is c1 ∇κ1 + c2 ∇κ2 + c3 ∇τ with
+    c_{1,2} = (EI/l + (k3/l³) |δ|²) δ_{1,2} + (EI τ/l) κ̇_{1,2} and c3 = (GJ/l) δ3; its derivative is
+    the outer products of the ∇ with the derivatives of the c, and c1 ∇²κ1 + c2 ∇²κ2 + c3 ∇²τ.
     """
-    _, _, bend, twist, cubic, viscous, rest_kappa, rest_twist, _, _, _ = rod
+    bend, twist, cubic, viscous = rod.bend, rod.twist, rod.cubic, rod.viscous
+    rest_kappa, rest_twist = rod.rest_kappa, rod.rest_twist
+    frame, twists, own, link = space.frame, space.twists, space.own, space.link
+    local, vectors = space.local, space.vectors
     edges = frame.shape[0]
     stretch(frame, u, convex, own, rod)
     strain = local[11]
@@ -72,14 +76,18 @@ def assemble(
                 own[i, r, c] += local[4 + r, 4 + c]
             for c in range(4):
                 link[i, r, c] = local[4 + r, c]
-    to_nodes(own, link, g, s)
+    to_nodes(own, link, g, space.s)
 
 
 @kernel
-def stretch(frame: Array, u: Array, convex: bool, own: Array, rod: Arrays) -> None:
-    """Start own (n-1, 4, 5) with stretching and the couples, symmetrised."""
-    rest, axial = rod[0], rod[1]
-    first, last, gain = rod[8], rod[9], rod[10]
+def stretch(frame: Array, u: Array, convex: bool, own: Array, rod: SpatialRod) -> None:
+    """Start own (n-1, 4, 5) with stretching and the couples, symmetrised.
+
+    Stretching: ∇E = T t, T = EA (|e|/ē − 1), ∇²E = (EA/ē) t tᵀ + (T/|e|) (1 − t tᵀ). A couple's
+    force on its edge is ∓Λu ẑ×t.
+    """
+    rest, axial = rod.rest, rod.axial
+    first, last, gain = rod.first, rod.last, rod.gain
     own[:] = 0.0
     for j in range(frame.shape[0]):
         inverse = frame[j, 3]
@@ -109,14 +117,15 @@ def stretch(frame: Array, u: Array, convex: bool, own: Array, rod: Arrays) -> No
 
 
 @kernel
-def unsymmetric(frame: Array, u: Array, own: Array, rod: Arrays, a: Array) -> None:
-    """Add to a (4n-1, 21) what `assemble` left out of the derivative at the frames' own base.
+def unsymmetric(u: Array, space: SpatialSpace, rod: SpatialRod) -> None:
+    """Add to space.a what `assemble` left out of the derivative at the frames' own base.
 
     That is the unsymmetric part of the couples, which keep turning about z when their edge tilts,
     and half of each edge's twisting torque times [t]×/|e|², as the force is no gradient under
     transport.
     """
-    first, last, gain = rod[8], rod[9], rod[10]
+    first, last, gain = rod.first, rod.last, rod.gain
+    frame, own, a = space.frame, space.own, space.a
     for j in range(frame.shape[0]):
         half = 0.5 * own[j, 3, 4] * frame[j, 3] * frame[j, 3]
         for k in range(3):

@@ -105,16 +105,13 @@ def expand(s: Array, a: Array) -> None:
 
 
 @kernel
-def hold_fixed_general(a: Array, fixed: Array) -> None:
-    """As `hold_fixed` for a general band."""
-    n = a.shape[0]
+def hold_rows(a: Array, fixed: Array, diagonal: float) -> None:
+    """Replace the rows of fixed unknowns in a general band by `diagonal` times the unknown."""
     b = (a.shape[1] - 1) // 2
     for d in fixed:
         for k in range(2 * b + 1):
             a[d, k] = 0.0
-        for i in range(max(0, d - b), min(n, d + b + 1)):
-            a[i, d - i + b] = 0.0
-        a[d, b] = 1.0
+        a[d, b] = diagonal
 
 
 @kernel
@@ -130,6 +127,29 @@ def factor_general(a: Array) -> None:
             a[i, b + j - i] = factor
             for k in range(1, b + 1):
                 a[i, b + j - i + k] -= factor * a[j, b + k]
+
+
+@kernel
+def add_product(a: Array, x: Array, y: Array) -> None:
+    """Add A x to y for a general band a and the columns of x, y (n, C)."""
+    n = a.shape[0]
+    b = (a.shape[1] - 1) // 2
+    for i in range(n):
+        for k in range(max(0, i - b), min(n, i + b + 1)):
+            value = a[i, k - i + b]
+            if value != 0.0:
+                for c in range(x.shape[1]):
+                    y[i, c] += value * x[k, c]
+
+
+@kernel
+def add_transposed_product(a: Array, x: Array, y: Array) -> None:
+    """Add Aᵀ x to y for a general band a and vectors x, y (n,)."""
+    n = a.shape[0]
+    b = (a.shape[1] - 1) // 2
+    for i in range(n):
+        for k in range(max(0, i - b), min(n, i + b + 1)):
+            y[k] += a[i, k - i + b] * x[i]
 
 
 @kernel

@@ -1,0 +1,1 @@
+"""Fits the printed pattern of a tag to its pixels, with blur and smear of the camera."""

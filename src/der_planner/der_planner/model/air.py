@@ -1,0 +1,411 @@
+"""The air's law, commands to chamber pressures: dead time, lag, and outlets that are slow.
+
+Of a pair of chambers one is to hold |command|, the other none. After a dead time each follows with
+a first-order lag, one time constant while it fills and another while it is vented, but it never
+falls faster than its outlet lets it:
+
+    dp/dt ≥ −R (p / p_ref)ⁿ        R `vent_rate`, n `vent_exponent`, p_ref `VENT_REFERENCE`
+
+An orifice would have n = 1/2, a tube n = 1 (an exponential). Logs of a real limb fit n = 0.65 with
+a tenth of the error that an exponential leaves.
+
+The differential pressure of a pair is the first chamber's pressure less the second's, so that a
+chamber that falls too slowly can be balanced by filling its neighbour.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from der_planner.limb import VENT_REFERENCE, Pneumatics
+from der_planner.model.series import interpolate
+
+Array = NDArray[np.float64]
+
+_TUBE = 1e-3
+"""Exponents closer to 1 than this fall exponentially."""
+_EMPTY = 0.1
+"""A chamber with less pressure than this counts as empty [Pa]."""
+
+
+class AirLaw(NamedTuple):
+    """The law's numbers, as the compiled functions below take them."""
+
+    fill_lag: float  # [s]
+    vent_lag: float  # [s]
+    vent_speed: float  # R / p_ref [1/s]; 0 = outlets never hold a chamber up
+    vent_exponent: float  # n
+
+
+def law_of(air: Pneumatics) -> AirLaw:
+    """Return the numbers of a limb's air that its compiled law takes."""
+    return AirLaw(
+        air.time_constant, air.vent_lag, air.vent_rate / VENT_REFERENCE, air.vent_exponent
+    )
+
+
+@dataclass(frozen=True)
+class Chambers:
+    """What the chambers do under K commands, each held for S steps.
+
+    Attributes:
+        air: lag, dead time and venting.
+        period: of a command [s].
+        steps: S.
+        before: (M,) command and differential pressure before the first command [Pa].
+        differential: (K, S, M) differential pressure in the middle of each step [Pa].
+        pair: (K·S, M, 2) gauge pressure of both chambers at the end of each step [Pa].
+        target: (K·S, M, 2) what both chambers are commanded to hold, after the dead time [Pa].
+    """
+
+    air: Pneumatics
+    period: float
+    steps: int
+    before: Array
+    differential: Array
+    pair: Array
+    target: Array
+
+
+def follow_commands(
+    air: Pneumatics,
+    command: ArrayLike,
+    period: float,
+    steps: int,
+    before: ArrayLike | None = None,
+) -> Chambers:
+    """Return what both chambers of each pair do under commands.
+
+    Args:
+        air: lag, dead time and venting.
+        command: (K, M) [Pa], each held for ``period`` [s].
+        period: [s].
+        steps: S, in which the result is sampled; the law is solved exactly in each.
+        before: (M,) command in force before the first one, which the chambers had reached; none
+            (vented) if None.
+    """
+    given = np.ascontiguousarray(command, dtype=float)
+    start = np.zeros(given.shape[1]) if before is None else np.array(before, dtype=float)
+    target = pair_of(_delayed(given, start, air.delay / period * steps, steps))
+    middle, pair = _chamber_pressures(target, pair_of(start), period / steps, law_of(air))
+    differential = middle.reshape(-1, steps, middle.shape[1])
+    return Chambers(air, period, steps, start, differential, pair, target)
+
+
+def chamber_pressures(
+    air: Pneumatics,
+    command: ArrayLike,
+    period: float,
+    steps: int,
+    before: ArrayLike | None = None,
+) -> Array:
+    """Return `follow_commands(…).differential` (K, S, M) alone [Pa]."""
+    return follow_commands(air, command, period, steps, before).differential
+
+
+def pressures_at_commands(air: Pneumatics, command: Array, period: float, steps: int = 2) -> Array:
+    """Return the differential pressures (K, M) [Pa] at the instants of commands (K, M) [Pa].
+
+    They are read off straight lines between the middles of ``steps`` steps a period.
+    """
+    middle = chamber_pressures(air, command, period, steps)[:, 0]
+    # The middle of the first step comes half a step after the instant.
+    instants = np.arange(len(command)) * period
+    return interpolate(instants, instants + 0.5 * period / steps, middle)
+
+
+def pair_of(differential: Array) -> Array:
+    """Return (…, 2) what the chambers of a pair hold for a differential pressure (…) [Pa]."""
+    pair: Array = np.stack([np.maximum(differential, 0.0), np.maximum(-differential, 0.0)], axis=-1)
+    return pair
+
+
+def _delayed(command: Array, start: Array, delay: float, steps: int) -> Array:
+    """Return the commands (K·S, M) in force in each step, ``delay`` steps late."""
+    held = np.repeat(command, steps, axis=0)
+    if delay > 0:
+        whole, part = int(delay), delay - int(delay)
+        padded = np.concatenate([np.tile(start, (whole + 1, 1)), held])
+        held = (1 - part) * padded[1 : len(held) + 1] + part * padded[: len(held)]
+    return held
+
+
+def memory_of(air: Pneumatics) -> float:
+    """Return for how long after a command its chambers can still tell of it [s]."""
+    return air.delay + 25 * max(air.time_constant, air.vent_time_constant) + vent_memory(air)
+
+
+def vent_memory(air: Pneumatics) -> float:
+    """Return how long the fullest chamber takes until hardly anything is left in it [s]."""
+    if air.vent_rate == 0:
+        return 0.0
+    power = 1.0 - air.vent_exponent
+    full, empty = air.pressure_limit / VENT_REFERENCE, _EMPTY / VENT_REFERENCE
+    speed = law_of(air).vent_speed
+    if power < _TUBE:
+        return float(np.log(full / empty)) / speed
+    return float(full**power - empty**power) / power / speed
+
+
+@njit(cache=True, nogil=True)
+def vented(pressure: float, fall: float, exponent: float) -> float:
+    """Return the pressure [Pa] after dp/dt = −R (p / p_ref)ⁿ; ``fall`` is R/p_ref × time."""
+    if fall <= 0.0 or pressure <= 0.0:
+        return 0.0
+    power = 1.0 - exponent
+    if power < _TUBE:
+        return float(pressure * np.exp(-fall))
+    left = (pressure / VENT_REFERENCE) ** power - power * fall
+    if left <= 0.0:
+        return 0.0
+    return float(VENT_REFERENCE * left ** (1.0 / power))
+
+
+@njit(cache=True, nogil=True)
+def _chamber_pressures(target: Array, start: Array, h: float, law: AirLaw) -> tuple[Array, Array]:
+    """Return differential pressures (N, M) amid the steps and both chambers' (N, M, 2) after."""
+    count, inputs, _ = target.shape
+    middle = np.empty((count, inputs))
+    pair = np.empty((count, inputs, 2))
+    filling, half_filling = np.exp(-h / law.fill_lag), np.exp(-0.5 * h / law.fill_lag)
+    venting, half_venting = np.exp(-h / law.vent_lag), np.exp(-0.5 * h / law.vent_lag)
+    for m in range(inputs):
+        for side in range(2):
+            sign = 1.0 - 2.0 * side
+            state = start[m, side]
+            for k in range(count):
+                goal = target[k, m, side]
+                gap = state - goal
+                if gap <= 0.0:
+                    between, state = goal + gap * half_filling, goal + gap * filling
+                else:
+                    between = max(
+                        goal + gap * half_venting,
+                        vented(state, 0.5 * law.vent_speed * h, law.vent_exponent),
+                    )
+                    state = max(
+                        goal + gap * venting, vented(state, law.vent_speed * h, law.vent_exponent)
+                    )
+                pair[k, m, side] = state
+                middle[k, m] = between if side == 0 else middle[k, m] + sign * between
+    return middle, pair
+
+
+# The derivative --------------------------------------------------------------------------------
+
+
+def derivative(chambers: Chambers, first: int = 0) -> Array:
+    """Return ∂(differential pressure in the middle of a step)/∂command (W, S, W, M) [-].
+
+    Row (w, s) is step s of command ``first + w``, the third index the command that is changed; only
+    the W commands from ``first`` on count. Exact but where a command is zero: there it counts as
+    positive.
+    """
+    negative = chambers.target[..., 1] > 0
+    delay = chambers.air.delay / chambers.period * chambers.steps
+    last = len(chambers.target) // chambers.steps
+    spread: Array = _spread(_step_slopes(chambers), negative, delay, chambers.steps, first, last)
+    return spread
+
+
+def _step_slopes(chambers: Chambers) -> Array:
+    """Return what each step keeps (4, N, M, 2), see `_slopes`."""
+    before = np.concatenate([pair_of(chambers.before)[None], chambers.pair[:-1]])
+    h = chambers.period / chambers.steps
+    slopes: Array = _slopes(before, chambers.target, h, law_of(chambers.air))
+    return slopes
+
+
+@njit(cache=True, nogil=True)
+def _slopes(before: Array, target: Array, h: float, law: AirLaw) -> Array:
+    """Return the derivatives (4, N, M, 2) of each step by the state before it and by its target.
+
+    In this order: ∂middle/∂state, ∂middle/∂target, ∂end/∂state, ∂end/∂target.
+    """
+    count, inputs, sides = target.shape
+    result = np.empty((4, count, inputs, sides))
+    for k in range(count):
+        for m in range(inputs):
+            for side in range(sides):
+                state, goal = before[k, m, side], target[k, m, side]
+                for half in range(2):
+                    span = 0.5 * h if half == 0 else h
+                    share = np.exp(-span / (law.fill_lag if state <= goal else law.vent_lag))
+                    left = 0.0
+                    if state > goal:
+                        left = vented(state, law.vent_speed * span, law.vent_exponent)
+                    choked = left > goal + (state - goal) * share
+                    by_state = (left / state) ** law.vent_exponent if choked else share
+                    result[2 * half, k, m, side] = by_state
+                    result[2 * half + 1, k, m, side] = 0.0 if choked else 1.0 - share
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _spread(
+    slopes: Array,
+    negative: NDArray[np.bool_],
+    delay: float,
+    steps: int,
+    first: int,
+    last: int,
+) -> Array:
+    """Return the change (W, S, W, M) of the differential pressure in each step by each command."""
+    inputs = slopes.shape[2]
+    result = np.zeros((last - first, steps, last - first, inputs))
+    whole, part = int(delay), delay - int(delay)
+    for m in range(inputs):
+        for k in range(first, last):
+            begin = k * steps + whole
+            change = np.zeros(2)
+            for n in range(begin, last * steps):
+                share = 0.0
+                if n == begin:
+                    share = 1.0 - part
+                elif n < begin + steps:
+                    share = 1.0
+                elif n == begin + steps:
+                    share = part
+                for side in range(2):
+                    # A positive command fills the first chamber, a negative one the second.
+                    goal = share if negative[n, m] == (side == 1) else 0.0
+                    by = slopes[:, n, m, side]
+                    middle = by[0] * change[side] + by[1] * goal
+                    change[side] = by[2] * change[side] + by[3] * goal
+                    result[n // steps - first, n % steps, k - first, m] += middle
+    return result
+
+
+def even_pulse(air: Pneumatics, period: float, steps: int) -> Array:
+    """Return the change (R,) of the pressure in the steps after one command is raised by one [-].
+
+    For a limb whose outlets never hold a chamber up; with the mean lag of filling and venting, so
+    that it is exact where the two are alike.
+    """
+    mean = 0.5 * (air.time_constant + air.vent_lag)
+    reach = int(np.ceil((air.delay + 12 * mean) / period)) + 1
+    command = np.zeros((reach, 1))
+    command[0] = 1.0
+    even = replace(air, time_constant=mean, vent_time_constant=0.0, vent_rate=0.0)
+    return follow_commands(even, command, period, steps).differential.ravel()
+
+
+# The inverse -----------------------------------------------------------------------------------
+
+
+def leading_commands(air: Pneumatics, time: Array, pressure: Array) -> Array:
+    """Return what the chambers have to be commanded (F, M) [Pa] to hold wanted pressures in time.
+
+    The inverse of lag and venting; the dead time is the caller's, who asks for later pressures.
+    Where a chamber cannot fall as fast as is wanted, its neighbour is filled by the difference.
+
+    Args:
+        air: lag and venting.
+        time: (F,) rising instants [s].
+        pressure: (F, M) wanted differential pressures [Pa].
+    """
+    fill, vent = air.time_constant, air.vent_lag
+    if air.vent_rate == 0:
+        slope = np.gradient(pressure, time, axis=0)
+        led: Array = pressure + np.where(pressure * slope >= 0, fill, vent) * slope
+        return led
+    chambers, second = least_pairs(air, time, pressure)
+    slope = np.gradient(chambers, time, axis=1)
+    pair = np.maximum(chambers + np.where(slope >= 0, fill, vent) * slope, 0.0)
+    filled: Array = np.where(second, -pair[1], pair[0])
+    return filled
+
+
+def least_pairs(air: Pneumatics, time: Array, pressure: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the least gauge pressures (2, F, M) [Pa] of chambers whose difference is wanted.
+
+    Also which chamber the command has to fill (F, M): the second, or the first. Arguments as of
+    `leading_commands`.
+    """
+    pairs: tuple[Array, NDArray[np.bool_]] = _least_pairs(
+        np.ascontiguousarray(pressure), np.diff(time), law_of(air)
+    )
+    return pairs
+
+
+@njit(cache=True, nogil=True)
+def _least_pairs(wanted: Array, steps: Array, law: AirLaw) -> tuple[Array, NDArray[np.bool_]]:
+    count, inputs = wanted.shape
+    chambers = np.empty((2, count, inputs))
+    second = np.zeros((count, inputs), dtype=np.bool_)
+    for m in range(inputs):
+        left, right = max(wanted[0, m], 0.0), max(-wanted[0, m], 0.0)
+        for k in range(count):
+            if k > 0:
+                h = steps[k - 1]
+                keep = np.exp(-h / law.vent_lag)
+                left = max(keep * left, vented(left, law.vent_speed * h, law.vent_exponent))
+                right = max(keep * right, vented(right, law.vent_speed * h, law.vent_exponent))
+            gap = wanted[k, m] + right - left
+            second[k, m] = gap < 0.0
+            left, right = left + max(gap, 0.0), right + max(-gap, 0.0)
+            chambers[0, k, m], chambers[1, k, m] = left, right
+    return chambers, second
+
+
+@dataclass(frozen=True)
+class SlowVenting:
+    """Where a motion wants one pressure to fall faster than its chamber is vented.
+
+    Attributes:
+        index: of the pressure.
+        time: when it should fall fastest in comparison with what its chamber does by itself [s].
+        wanted: rate at which it should fall then [Pa/s].
+        possible: rate at which the chamber falls then [Pa/s].
+        opposite: the largest pressure that the opposite chamber needs to balance the slow one [Pa].
+    """
+
+    index: int
+    time: float
+    wanted: float
+    possible: float
+    opposite: float
+
+
+def slow_venting(air: Pneumatics, time: Array, pressure: Array) -> SlowVenting | None:
+    """Return the worst of the pressures (F, M) [Pa] that should fall too fast at times (F,) [s].
+
+    None for a limb whose outlets never hold a chamber up.
+    """
+    if air.vent_rate == 0:
+        return None
+    chambers, _ = least_pairs(air, time, pressure)
+    both = np.minimum(chambers[0], chambers[1])
+    j = int(np.argmax(both.max(axis=0)))
+    fall = -np.gradient(np.abs(pressure[:, j]), time)
+    held = np.maximum(chambers[0, :, j], chambers[1, :, j])
+    possible = air.vent_rate * (held / VENT_REFERENCE) ** air.vent_exponent
+    k = int(np.argmax(fall - possible))
+    return SlowVenting(
+        j, float(time[k]), float(fall[k]), float(possible[k]), float(both[:, j].max())
+    )
+
+
+__all__ = [
+    "AirLaw",
+    "Chambers",
+    "SlowVenting",
+    "chamber_pressures",
+    "derivative",
+    "even_pulse",
+    "follow_commands",
+    "law_of",
+    "leading_commands",
+    "least_pairs",
+    "memory_of",
+    "pair_of",
+    "pressures_at_commands",
+    "slow_venting",
+    "vent_memory",
+    "vented",
+]

@@ -1,0 +1,1 @@
+"""A rod in a coordinate plane: two unknowns a node."""

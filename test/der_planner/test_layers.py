@@ -1,0 +1,82 @@
+"""Which part of der_planner may import which: downward only, without cycles, also for types."""
+
+import ast
+from pathlib import Path
+
+import der_planner
+
+ROOT = Path(der_planner.__file__).parent
+LAYERS = {"limb": 0, "rod": 1, "pcc": 1, "model": 2, "planning": 3, "identification": 4}
+"""Parts with a place in the order; an import must go to a lower one, or stay inside its part."""
+
+
+def modules() -> dict[str, Path]:
+    return {
+        "der_planner." + ".".join(path.relative_to(ROOT).with_suffix("").parts): path
+        for path in ROOT.rglob("*.py")
+        if path.name != "__init__.py"
+    }
+
+
+def imports(path: Path) -> set[str]:
+    """Return every dotted name that a file imports, at any depth and under TYPE_CHECKING."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return {name for name in found if name.startswith("der_planner.")}
+
+
+def part(name: str) -> str:
+    return name.split(".")[1]
+
+
+def test_imports_go_downward():
+    wrong = [
+        f"{name} imports {other}"
+        for name, path in modules().items()
+        for other in imports(path)
+        if part(name) in LAYERS
+        and part(name) != part(other)
+        and (part(other) not in LAYERS or LAYERS[part(other)] >= LAYERS[part(name)])
+        and part(other) not in ALLOWED.get(part(name), ())
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+ALLOWED = {"identification": ("twin", "recording", "runs")}
+"""Identification reads bags, and plays its excitation on the twin."""
+
+
+def test_nobody_imports_nodes():
+    assert not [
+        name
+        for name, path in modules().items()
+        if part(name) != "nodes" and any(part(other) == "nodes" for other in imports(path))
+    ]
+
+
+TYPE_ONLY = ("der_planner.rod.state", "der_planner.rod.linearisation")
+"""A trajectory carries its linearisation: the rod's one cycle, for a type alone."""
+
+
+def test_no_module_imports_itself_by_way_of_others():
+    graph = {
+        name: {
+            other for other in imports(path) if other in modules() and (name, other) != TYPE_ONLY
+        }
+        for name, path in modules().items()
+    }
+    done: set[str] = set()
+
+    def visit(name: str, way: tuple[str, ...]) -> None:
+        assert name not in way, " -> ".join((*way[way.index(name) :], name))
+        if name not in done:
+            for other in sorted(graph[name]):
+                visit(other, (*way, name))
+            done.add(name)
+
+    for name in graph:
+        visit(name, ())
