@@ -43,7 +43,7 @@ class GuardianClient:
         self._channel: socket.socket | None = None
         self._vent = b""
         self._beat_at = 0.0
-        self._said_venting = False
+        self._said_vented = True
         self._told_at = 0.0
         self._answer_at = 0.0
         self._executor_at: float | None = None
@@ -111,24 +111,22 @@ class GuardianClient:
             self._vent = vent
             self._send(b"V" + vent)
 
-    def beat(self, venting: bool = False) -> None:
+    def beat(self, vented: bool) -> None:
         """Show a sign of life, unless the last one is young or the executor stands still.
 
         Args:
-            venting: whether nothing but the vent command is sent to the board; the guardian is
-                more patient then. The first sign of life after it must come before the pressures.
+            vented: the last command on the wire was to vent; the guardian is more patient then.
 
         Raises:
             GuardianError: the guardian has ended, or does not answer.
         """
         now = time.monotonic()
-        if venting == self._said_venting and now - self._beat_at < BEAT_PERIOD / 2.0:
+        if now - self._beat_at < BEAT_PERIOD / 2.0 and vented == self._said_vented:
             return
         if self._executor_at is not None and now - self._executor_at > EXECUTOR_TIMEOUT:
             return
-        self._beat_at = now
-        self._said_venting = venting
-        if not self._send(b"~" if venting else b"."):
+        self._beat_at, self._said_vented = now, vented
+        if not self._send(b"z" if vented else b"."):
             raise GuardianError("the guardian has ended")
         with contextlib.suppress(BlockingIOError):
             assert self._channel is not None
