@@ -322,3 +322,23 @@ def test_linearised_equilibrium_is_its_derivative(rod):
         behind = rod.equilibrium(u - step, start=state).q
         expected = (ahead - behind) / 2
         np.testing.assert_allclose(found[:, m], expected, atol=1e-5 * np.abs(found[:, m]).max())
+
+
+@pytest.mark.parametrize("plane", ["xz", None])
+def test_a_rod_without_segments_is_linearised_by_its_start(plane):
+    rod = Rod.uniform(
+        length=0.25, nodes=6, EI=0.06, EA=1e3, GJ=0.04, mass_per_length=0.9,
+        gravity=(0.0, 0.0, -9.81), clamp="inside", plane=plane,
+    )  # fmt: skip
+    state = rod.straight_state()
+    none = np.zeros((10, 0))
+    run = rod.simulate(state, none, 0.01, linearise=True)
+    step = 1e-6
+    start = np.zeros(len(rod.free))
+    v = state.v.copy()
+    start[-1] = step
+    v[rod.free[-1]] += step
+    moved = rod.simulate(rod.state(state.q, v), none, 0.01)
+    predicted = run.linearisation.tangent(none, (0.0 * start, start))
+    actual = moved.q[-1, -1] - run.q[-1, -1]
+    assert predicted[-1, -1] == pytest.approx(actual, rel=1e-3)
