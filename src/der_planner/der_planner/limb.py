@@ -189,7 +189,7 @@ class Limb:
         body["calibrated"] = {key: list(value) for key, value in body["calibrated"].items()}
         body["provenance"] = dict(self.provenance)
         text = yaml.safe_dump(body, sort_keys=False, allow_unicode=True)
-        head = "# A limb: every number in SI units. How to choose it: src/der_planner/doc/limb_parameters.md\n"
+        head = "# A limb, in SI units. How to choose each: src/der_planner/doc/limb_parameters.md\n"
         Path(path).write_text(head + commented(text, sections()), encoding="utf-8")
 
 
