@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apriltag_tracker.camera import CameraPose, Intrinsics, project
-from apriltag_tracker.detection import Tag
+from apriltag_tracker.tag import Tag
 from apriltag_tracker.tag_map import TagMap
 from apriltag_tracker.world import WorldPose
 from der_planner.page.situation import LimbView
