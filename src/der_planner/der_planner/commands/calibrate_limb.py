@@ -177,7 +177,7 @@ def _obtain(prior: Limb, given: argparse.Namespace) -> CalibrationLog:
     limit = prior.pneumatics.pressure_limit
     run = within_limits(_excitation(prior, limit, given), limit, math.inf)
     print(f"playing {run.duration:.0f} s on the twin of seed {given.seed} …", file=sys.stderr)
-    return record_twin(given.seed, run)
+    return record_twin(given.seed, run, limb=prior)
 
 
 def _play_on_graph(prior: Limb, given: argparse.Namespace) -> Path:
@@ -215,7 +215,7 @@ def _play_on_graph(prior: Limb, given: argparse.Namespace) -> Path:
         "prior": prior.name,
     }
     player = GraphCalibration(
-        run, given.folder, metadata, progress, seed=given.seed, hardware=hardware
+        run, given.folder, metadata, progress, limb=prior, seed=given.seed, hardware=hardware
     )
     bag = player.play().bag
     progress.say(f"bag: {bag}")
