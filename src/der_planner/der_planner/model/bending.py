@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from der_planner.limb import Limb
 from der_planner.pcc import Pcc
 from der_planner.rod import Rod
+from der_planner.rod.state import positions_of
 
 Array = NDArray[np.float64]
 
@@ -29,13 +30,17 @@ def end_edges(rod: Rod) -> list[tuple[int, int]]:
 
 
 def bend_angles(rod: Rod, q: Array) -> Array:
-    """Return the bend angles (K, M) [rad] of a rod's configurations (K, 4N-1), continuous in time.
+    """Return the bend angles (…, M) [rad] of a rod's configurations (…, 4N-1).
 
-    A turn by more than half a circle from one row to the next is taken for one the other way.
+    A heading is the sum of the turns from edge to edge, seen along z: each turn is less than half a
+    circle, so a limb that is rolled up counts every one of its turns.
     """
-    headings = [_heading(q, a, b) for a, b in end_edges(rod)]
-    absolute = np.unwrap(np.stack(headings, axis=1), axis=0)
-    relative: Array = np.diff(absolute, axis=1, prepend=0.0)
+    nodes = positions_of(q)[..., :2]
+    edges = np.diff(nodes[..., 0] + 1j * nodes[..., 1], axis=-1)
+    before = np.concatenate([np.ones_like(edges[..., :1]), edges[..., :-1]], axis=-1)
+    headings = np.cumsum(np.angle(edges * before.conj()), axis=-1)
+    at_ends = headings[..., [first for first, _ in end_edges(rod)]]
+    relative: Array = np.diff(at_ends, axis=-1, prepend=0.0)
     return relative
 
 
@@ -78,12 +83,6 @@ def _edge(q: Array, first: int, second: int) -> tuple[Array, Array, Array]:
     dx = q[:, 4 * second] - q[:, 4 * first]
     dy = q[:, 4 * second + 1] - q[:, 4 * first + 1]
     return dx, dy, dx * dx + dy * dy
-
-
-def _heading(q: Array, first: int, second: int) -> Array:
-    dx, dy, _ = _edge(q, first, second)
-    heading: Array = np.arctan2(dy, dx)
-    return heading
 
 
 class Kinematics(Protocol):
@@ -152,6 +151,13 @@ class PolylineKinematics:
     def nodes(self, bend_angles: ArrayLike) -> Array:
         """Return the nodes (..., N, 2) [m] for bend angles (..., M) [rad]."""
         return self._placed(self._edges(bend_angles))
+
+    def configuration(self, bend_angles: ArrayLike) -> Array:
+        """Return q (..., 4N-1) of the evenly bent rod for bend angles (..., M) [rad]."""
+        nodes = self.nodes(bend_angles)
+        q = np.zeros((*nodes.shape[:-2], 4 * nodes.shape[-2] - 1))
+        q[..., 0::4], q[..., 1::4] = nodes[..., 0], nodes[..., 1]
+        return q
 
     def _placed(self, edges: NDArray[np.complex128]) -> Array:
         """Return the nodes (..., N, 2) [m] of edges (..., N-1) from the base on."""
