@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 from der_planner.limb import Limb
 from der_planner.pcc import Pcc
 from der_planner.rod import Rod
-from der_planner.rod.state import positions_of
 
 Array = NDArray[np.float64]
 
@@ -30,17 +29,25 @@ def end_edges(rod: Rod) -> list[tuple[int, int]]:
 
 
 def bend_angles(rod: Rod, q: Array) -> Array:
-    """Return the bend angles (…, M) [rad] of a rod's configurations (…, 4N-1).
+    """Return the bend angles (…, K, M) [rad] of configurations in time (…, K, 4N-1).
 
-    A heading is the sum of the turns from edge to edge, seen along z: each turn is less than half a
-    circle, so a limb that is rolled up counts every one of its turns.
+    One configuration (4N-1,) gives (M,). See `angles_of_outputs` for limbs that are rolled up.
     """
-    nodes = positions_of(q)[..., :2]
-    edges = np.diff(nodes[..., 0] + 1j * nodes[..., 1], axis=-1)
-    before = np.concatenate([np.ones_like(edges[..., :1]), edges[..., :-1]], axis=-1)
-    headings = np.cumsum(np.angle(edges * before.conj()), axis=-1)
-    at_ends = headings[..., [first for first, _ in end_edges(rod)]]
-    relative: Array = np.diff(at_ends, axis=-1, prepend=0.0)
+    return angles_of_outputs(q[..., bend_outputs(rod)])
+
+
+def angles_of_outputs(outputs: Array) -> Array:
+    """Return the bend angles (…, K, M) [rad] of the coordinates `bend_outputs` (…, K, 4M).
+
+    A heading is known up to whole turns. In the first row each segment is taken to bend by less
+    than half a turn; from row to row headings change by less than half a turn.
+    """
+    dx = outputs[..., 2::4] - outputs[..., 0::4]
+    dy = outputs[..., 3::4] - outputs[..., 1::4]
+    headings = np.unwrap(np.arctan2(dy, dx), axis=-1)
+    if headings.ndim > 1:
+        headings = np.unwrap(headings, axis=-2)
+    relative: Array = np.diff(headings, axis=-1, prepend=0.0)
     return relative
 
 
