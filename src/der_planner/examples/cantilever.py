@@ -12,6 +12,8 @@ for the slope θ below the horizontal at arc length s, here solved by collocatio
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_bvp
@@ -39,7 +41,7 @@ def elastica_tip() -> float:
     return float(solution.y[2, -1])
 
 
-def rod_tip(nodes: int, clamp: str) -> float:
+def rod_tip(nodes: int, clamp: Literal["ghost", "inside"]) -> float:
     """Return the height of the discrete rod's tip at rest [m]."""
     rod = Rod.uniform(
         length=LENGTH, nodes=nodes, EI=EI, EA=1e3 * YOUNG * AREA, GJ=2 / 3 * EI,
@@ -54,7 +56,7 @@ def main() -> None:
     print(f"exact elastica: tip {1e3 * exact:.3f} mm")
     print("nodes   ghost edge [mm]   error     first edge held [mm]   error")
     for nodes in (11, 21, 41, 81):
-        ghost, inside = (rod_tip(nodes, clamp) for clamp in ("ghost", "inside"))
+        ghost, inside = rod_tip(nodes, "ghost"), rod_tip(nodes, "inside")
         print(
             f"{nodes:5d}   {1e3 * ghost:15.3f}   {ghost / exact - 1:+.3%}   "
             f"{1e3 * inside:20.3f}   {inside / exact - 1:+.3%}"

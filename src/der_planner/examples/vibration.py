@@ -27,7 +27,8 @@ def beam_frequencies(count: int) -> NDArray[np.float64]:
         brentq(lambda b: np.cos(b) * np.cosh(b) + 1.0, k * np.pi, (k + 1) * np.pi)
         for k in range(count)
     ]
-    return np.array(beta) ** 2 * np.sqrt(EI / MASS) / (2 * np.pi * LENGTH**2)
+    scale = np.sqrt(EI / MASS) / (2 * np.pi * LENGTH**2)
+    return np.array([scale * b**2 for b in beta])
 
 
 def rod_frequencies(nodes: int, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -37,11 +38,11 @@ def rod_frequencies(nodes: int, count: int) -> tuple[NDArray[np.float64], NDArra
         damping=DAMPING, plane="xy",
     )  # fmt: skip
     step, _ = rod.linearise_step(rod.straight_state(), [], STEP, "midpoint")
-    values = np.linalg.eigvals(step)
+    values = np.asarray(np.linalg.eigvals(step), dtype=np.complex128)
     rates = 2.0 / STEP * (values - 1.0) / (values + 1.0)
     rates = rates[rates.imag > 0.0]
     rates = rates[np.argsort(np.abs(rates))][:count]
-    return np.abs(rates) / (2 * np.pi), -rates.real
+    return np.array(np.abs(rates) / (2 * np.pi)), np.array(-rates.real)
 
 
 def main() -> None:
