@@ -9,10 +9,10 @@ from limb_interfaces.overrides import check_overrides
 from limb_interfaces.parameters import ParameterError, declare
 from pressure_driver.core import CoreSettings
 from pressure_driver.grid import NANOSECONDS
-from pressure_driver.monitor import MonitorLimits
 from pressure_driver.protocols import NAMES
 from pressure_driver.safety import SafetyLimits
 from pressure_driver.schedule import ScheduleLimits
+from pressure_driver.watch.limits import MonitorLimits
 
 if TYPE_CHECKING:
     from rclpy.node import Node
@@ -148,6 +148,44 @@ def _monitor_limits(node: Node, number: Any) -> MonitorLimits:
         ),
         slowest_vent=number(
             "slowest_vent", default.slowest_vent, "[s] time constant of a working valve", 0.05, 60.0
+        ),
+        leak_time=number(
+            "leak_time",
+            default.leak_time,
+            "[s] over which slow leaks are looked for; longer than a fill of a chamber",
+            2.0,
+            600.0,
+        ),
+        leak_tolerance=number(
+            "leak_tolerance",
+            default.leak_tolerance,
+            "[Pa] a chamber may lie below its command in the mean of leak_time; choose some times "
+            "what a sound limb shows at steady pressure",
+            50.0,
+            100_000.0,
+        ),
+        leak_opening=number(
+            "leak_opening",
+            default.leak_opening,
+            "mean opening of an inlet at steady pressure that is no leak; choose twice what "
+            "valve_opening shows there, 1: do not look",
+            0.0,
+            1.0,
+        ),
+        probe_pressure=number(
+            "probe_pressure",
+            default.probe_pressure,
+            "[Pa] by which a steady command is changed for a moment to see whether a board without "
+            "echo hears; choose more than the dead band of its valves, 0: never",
+            0.0,
+            2_000.0,
+        ),
+        probe_interval=number(
+            "probe_interval",
+            default.probe_interval,
+            "[s] a command is steady before it is changed for a moment",
+            5.0,
+            3600.0,
         ),
         vented_tolerance=number(
             "vented_tolerance",
