@@ -178,7 +178,7 @@ def test_a_board_with_other_chambers_or_less_range_cannot_be_armed(simulate):
     assert "reaches 20000 Pa" in text
     other = BoardWatch(sim.core.protocol, 24_000.0, 500.0)
     other.check_identity(replace(sim.core.identity, chamber_count=6, largest_pressure=3e4))
-    assert "6 chambers" in other.obstacle(np.zeros(4), sim.steady)
+    assert "6 chambers" in other.obstacle(sim.steady)
 
 
 def test_a_slow_native_board_is_asked_again(simulate):

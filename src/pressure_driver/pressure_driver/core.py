@@ -138,6 +138,7 @@ class DriverCore:
         self._board_log = LogAllowance()
         self._limited_noted = 0
         self._was_limited = False
+        self._start_noted = False
         self.venting = True
         """Whether the bytes of the last tick were the vent command."""
         self._clock_offset = 0.0
@@ -280,6 +281,7 @@ class DriverCore:
             self._board.has_sent(self._pending_number, now)
             self._note_mode()
             self._note_limit()
+            self._note_start()
         self._notify()
 
     def received(self, data: bytes) -> None:
@@ -328,7 +330,7 @@ class DriverCore:
             self.protocol.doubt()
         if (silence := self._board.silence(now)) and self._machine.mode in LIVE:
             self._machine.fail(silence)
-        self._machine.board_obstacle = self._board.obstacle(self._monitor.rest_pressure, now)
+        self._machine.board_obstacle = self._board.obstacle(now)
 
     def _take_reset(self, reset: BoardReset, now: float) -> None:
         """Set the board up anew; what was being played must not be played on."""
@@ -382,6 +384,13 @@ class DriverCore:
             self._log("the slew limit holds the output back: it follows the setpoints late", True)
         self._was_limited = limited > self._limited_noted
         self._limited_noted = limited
+
+    def _note_start(self) -> None:
+        """Warn once of a board that has started with pressure in its chambers."""
+        warning = self._board.started_under_pressure(self._monitor.rest_pressure)
+        if warning and not self._start_noted:
+            self._log(warning, True)
+        self._start_noted = bool(warning)
 
     def _note_mode(self) -> None:
         mode = self._machine.mode

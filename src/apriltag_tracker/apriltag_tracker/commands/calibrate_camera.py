@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import os
 import sys
 import time
 from collections.abc import Iterator
@@ -189,8 +188,13 @@ def _check_output(path: Path) -> None:
         raise CalibrationError(f"--out {path} is a folder: name a file")
     if not path.parent.is_dir():
         raise CalibrationError(f"--out {path} cannot be written: {path.parent} is no folder")
-    if not os.access(path if path.exists() else path.parent, os.W_OK):
-        raise CalibrationError(f"--out {path} cannot be written: no right to")
+    present = path.exists()
+    try:
+        path.open("ab").close()
+    except OSError as error:
+        raise CalibrationError(f"--out {path} cannot be written: {error.strerror}") from error
+    if not present:
+        path.unlink()
 
 
 def main() -> int:

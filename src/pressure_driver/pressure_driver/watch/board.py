@@ -79,16 +79,22 @@ class BoardWatch:
             self._starting = False
             self._at_start = np.maximum(self._at_start, reading)
 
-    def _started_under_pressure(self, rest: NDArray[np.float64]) -> str:
-        """Return what is wrong if the board took trapped air for the room's, or nothing."""
+    def started_under_pressure(self, rest: NDArray[np.float64]) -> str:
+        """Return the warning that the board may have taken trapped air for the room's, or nothing.
+
+        Whether it has shows when it fills a chamber: see `LeakWatch`.
+
+        Args:
+            rest: (2M,) [Pa] absolute rest pressures; NaN while they are not known.
+        """
         if not self._protocol.measures_room_at_start:
             return ""
         gauge = float(np.max(self._at_start - rest))  # NaN while the rest is not known
         if not gauge > self._vented_tolerance:
             return ""
         return (
-            f"the board started with {gauge:.0f} Pa in its chambers, which it may have taken for "
-            "the room's pressure: power it anew while they are vented"
+            f"the board started with {gauge:.0f} Pa in its chambers: if it takes that for the "
+            "room's pressure, it will fill them too high; power it anew while they are vented"
         )
 
     # --------------------------------------------------------------------------- its answers
@@ -149,17 +155,7 @@ class BoardWatch:
             )
         self._problem = problem
 
-    def obstacle(self, rest: NDArray[np.float64], now: float) -> str:
-        """Return what about the board forbids arming, or nothing.
-
-        Args:
-            rest: (2M,) [Pa] absolute rest pressures; NaN while they are not known.
-            now: [s] steady clock.
-        """
-        problems = (
-            self._problem,
-            self._protocol.unsettled,
-            self.silence(now),
-            self._started_under_pressure(rest),
-        )
+    def obstacle(self, now: float) -> str:
+        """Return what about the board forbids arming, or nothing (steady clock [s])."""
+        problems = (self._problem, self._protocol.unsettled, self.silence(now))
         return next(filter(None, problems), "")

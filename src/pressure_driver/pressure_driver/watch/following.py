@@ -80,7 +80,7 @@ class Following:
                 self._outside_since[chamber] = None
             elif self._outside_since[chamber] is None:
                 self._outside_since[chamber] = now
-        self._leaks.receive(self._lower, gauge, opening, now)
+        self._leaks.receive(self._lower, self._upper, gauge, opening, now)
 
     def restart(self, gauge: NDArray[np.float64], now: float) -> None:
         """Start afresh from what is measured now."""
@@ -110,6 +110,7 @@ class _Block:
     since: float
     count: int = 0
     shortfall: NDArray[np.float64] = field(default_factory=lambda: np.zeros(1))
+    excess: NDArray[np.float64] = field(default_factory=lambda: np.zeros(1))
     opening: NDArray[np.float64] = field(default_factory=lambda: np.zeros(1))
     rise: NDArray[np.float64] = field(default_factory=lambda: np.zeros(1))
     lowest: NDArray[np.float64] = field(default_factory=lambda: np.full(1, np.inf))
@@ -118,6 +119,8 @@ class _Block:
 
 class LeakWatch:
     """Finds slow leaks: chambers that stay below their commands, or must be fed all the time.
+
+    Also chambers that stay above: a board that mistook trapped air for the room's fills them so.
 
     In the mean over `MonitorLimits.leak_time` the noise of a sensor vanishes. A response that comes
     by d late lies below its command by at most d / leak_time times the span of the command, in the
@@ -148,14 +151,16 @@ class LeakWatch:
     def receive(
         self,
         expected: NDArray[np.float64],
+        highest: NDArray[np.float64],
         gauge: NDArray[np.float64],
         opening: NDArray[np.float64],
         now: float,
     ) -> None:
-        """Take what the slowest sound valve would have reached, what is measured, and the inlets.
+        """Take what the slowest sound valves would have reached, what is measured, and the inlets.
 
         Args:
-            expected: (2M,) [Pa] gauge.
+            expected: (2M,) [Pa] gauge, filling.
+            highest: (2M,) [Pa] gauge, venting.
             gauge: (2M,) [Pa].
             opening: (2M,) 0 … 1 or NaN.
             now: [s] steady clock.
@@ -169,6 +174,7 @@ class LeakWatch:
             block = self._block = _Block(now)
         block.count += 1
         block.shortfall = block.shortfall + (expected - gauge)
+        block.excess = block.excess + (gauge - highest)
         block.opening = block.opening + opening
         block.rise = block.rise + np.maximum(expected - self._expected, 0.0)
         block.lowest = np.minimum(block.lowest, expected)
@@ -187,24 +193,28 @@ class LeakWatch:
         blocks, limits = self._blocks, self._limits
         count = sum(block.count for block in blocks)
         shortfall = np.sum([block.shortfall for block in blocks], axis=0) / count
+        excess = np.sum([block.excess for block in blocks], axis=0) / count
         opening = np.sum([block.opening for block in blocks], axis=0) / count
         lowest = np.min([block.lowest for block in blocks], axis=0)
         span = np.max([block.highest for block in blocks], axis=0) - lowest
         rise = np.sum([block.rise for block in blocks], axis=0)
-        low = shortfall > limits.leak_tolerance + LONGEST_DELAY / limits.leak_time * span
+        allowed = limits.leak_tolerance + LONGEST_DELAY / limits.leak_time * span
         fed = (lowest > limits.vented_tolerance) & (
             opening > limits.leak_opening + rise / (limits.slowest_fill * limits.leak_time)
         )
+        mean = f"in the mean of {limits.leak_time:g} s"
+        told = f"{mean} ('leak_tolerance' allows {limits.leak_tolerance:.0f} Pa)"
         for chamber in range(self._count):
-            if low[chamber]:
-                self.faults.append(
-                    f"chamber {chamber} loses air: {shortfall[chamber]:.0f} Pa below what is "
-                    f"commanded in the mean of {limits.leak_time:g} s ('leak_tolerance' allows "
-                    f"{limits.leak_tolerance:.0f} Pa)"
-                )
+            name, short, over = f"chamber {chamber}", shortfall[chamber], excess[chamber]
+            if short > allowed[chamber]:
+                self.faults.append(f"{name} loses air: {short:.0f} Pa below its command {told}")
             elif fed[chamber]:
                 self.faults.append(
-                    f"chamber {chamber} loses air: its inlet valve was open by "
-                    f"{opening[chamber]:.0%} in the mean of {limits.leak_time:g} s "
+                    f"{name} loses air: its inlet valve was open by {opening[chamber]:.0%} {mean} "
                     f"('leak_opening' allows {limits.leak_opening:.0%} at steady pressure)"
+                )
+            if over > allowed[chamber] and lowest[chamber] > limits.vented_tolerance:
+                self.faults.append(
+                    f"{name} is filled too high: {over:.0f} Pa above its command {told}; a board "
+                    "that started under pressure must be powered anew with vented chambers"
                 )
