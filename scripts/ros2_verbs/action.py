@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 from typing import Any
 
@@ -65,14 +66,18 @@ def _send_goal(options: argparse.Namespace) -> int:
             print("Goal was rejected.")
             return 1
         print(f"Goal accepted with ID: {bytes(handle.goal_id.uuid).hex()}\n")
+        # A flag instead of an exception, which would tear rclpy's waiting apart.
+        asked: list[int] = []
+        signal.signal(signal.SIGINT, lambda number, _: asked.append(number))
         awaited = handle.get_result_async()
-        try:
-            answer = _result(session, awaited)
-        except KeyboardInterrupt:
-            # As the real tool: what was asked for is not left to run on alone.
-            print("Canceling goal...", file=sys.stderr)
-            _result(session, handle.cancel_goal_async())
-            answer = _result(session, awaited)
+        cancelling = None
+        while not awaited.done():
+            rclpy.spin_once(session.node, timeout_sec=0.1)
+            if asked and cancelling is None:
+                # As the real tool: what was asked for is not left to run on alone.
+                print("Canceling goal...", file=sys.stderr)
+                cancelling = handle.cancel_goal_async()
+        answer = _result(session, awaited)
         print(f"Result:\n    {to_yaml(answer.result)}")
         status = _ENDS.get(answer.status, "UNKNOWN")
         print(f"Goal finished with status: {status}")
@@ -90,7 +95,8 @@ def _result(session: Session, future: Any) -> Any:
     Raises:
         CommandError: it is an error.
     """
-    rclpy.spin_until_future_complete(session.node, future)
+    while not future.done():
+        rclpy.spin_once(session.node, timeout_sec=0.1)
     if future.result() is None:
         raise CommandError(f"Exception while calling the action: {future.exception()!r}")
     return future.result()
