@@ -5,20 +5,20 @@ Its state is the deviation from the model's motion under the plan (`der_planner.
     x = (δθ, δθ̇, d, g, b)
 
 bend angles [rad] and rates [rad/s], per segment the effective pressure d that the model lacks [Pa]
-and the relative error g of its gain, and a displacement b (2) of the tip that the bend angles do not
-explain [m]. With w the model's effective pressure under the *measured* chamber pressures and w̄ under
-the plan,
+and the relative error g of its gain, and a displacement b (2) of the tip that the bend angles do
+not explain [m]. With w the model's effective pressure under the *measured* chamber pressures and w̄
+under the plan,
 
     M_w δθ̈ + D_w δθ̇ + K_w δθ = (w − w̄) + d + g w
 
-d, g and b wander. Friction and creep remember the model's bend and the slow part of δθ: the noise of
-a measurement must not wear off what friction remembers.
+d, g and b wander. Friction and creep remember the model's bend and the slow part of δθ: the noise
+of a measurement must not wear off what friction remembers.
 
 Measurements come late and in any order. The filter runs on a grid of `nominal.STEP` and keeps its
 states of the last seconds; a measurement is put at its own instant, against the model at exactly
-that instant, and what follows is computed again. A measurement that the filter did not expect counts
-less (its covariance grows with its distance); where it happens again and again, something has
-happened to the limb, and what is known of rates and disturbances becomes uncertain.
+that instant, and what follows is computed again. A measurement that the filter did not expect
+counts less (its covariance grows with its distance); where it happens again and again, something
+has happened to the limb, and what is known of rates and disturbances becomes uncertain.
 """
 
 from __future__ import annotations
@@ -33,11 +33,16 @@ from der_planner.control.chambers import ChamberLog
 from der_planner.control.nominal import STEP, Nominal
 from der_planner.model import material
 from der_planner.model.drive import STEPS
+from der_planner.model.series import CONTROL_PERIOD
 
 Array = NDArray[np.float64]
 
 HISTORY = 2.0
 """Measurements older than this, against the newest instant, come too late [s]."""
+_WAITED_FOR = 1.0
+"""The first picture that comes may be so much younger than one that comes later [s]."""
+EARLIEST = 2.0
+"""The limb is watched from so long before the first setpoint on [s]."""
 
 
 @dataclass(frozen=True)
@@ -57,8 +62,8 @@ class EstimatorSettings:
         event_missing, event_rate, event_gain: what an event adds to d [Pa], rates [rad/s], g.
     """
 
-    bend_noise: float = 2.5e-3
-    tip_noise: float = 4e-4
+    bend_noise: float = 2e-3
+    tip_noise: float = 3e-4
     pressure_density: float = 15.0
     missing_first: float = 600.0
     missing_density: float = 250.0
@@ -85,6 +90,7 @@ class Estimate:
         missing_pressure: (M,) effective pressure that the model lacks, its gain error not counted
             [Pa].
         gain_error: (M,) relative error of the model's effective pressure.
+        effective_pressure: (M,) of the model, without either [Pa].
         tip_offset: (2,) displacement of the tip that the bend does not explain [m].
         deviation: (4M + 2,) standard deviations of bend_angle, bend_rate, missing_pressure,
             gain_error and tip_offset, in this order.
@@ -98,6 +104,7 @@ class Estimate:
     tip: Array
     missing_pressure: Array
     gain_error: Array
+    effective_pressure: Array
     tip_offset: Array
     deviation: Array
     tip_covariance: Array
@@ -114,6 +121,7 @@ class Knowledge:
         slow: (M,) slow part of δθ [rad].
         memory: of friction and creep.
         taken: (M,) pressure that friction and creep take [Pa].
+        effective: (M,) effective pressure of the model [Pa].
         strange: squared distances of the last measurements per coordinate, smoothed; 1 is expected.
         row: measurements in a row that were not expected.
     """
@@ -123,6 +131,7 @@ class Knowledge:
     slow: Array
     memory: material.Memory
     taken: Array
+    effective: Array
     strange: float = 1.0
     row: int = 0
 
@@ -163,11 +172,13 @@ class Estimator:
         self._first: int | None = None
         self._last = 0
         self._fresh: set[int] = set()
+        self._moves, self._noises = self._prepare()
 
     # What comes in -------------------------------------------------------------------------
 
     def begin(self, time: float) -> None:
-        """Start at an instant [s], if not started; what is older is not used."""
+        """Start a second before an instant [s], if not started; what is older is not used."""
+        time = max(time - _WAITED_FOR, -EARLIEST)
         if self._first is None:
             self._first = self._last = math.floor(time / STEP)
             self._known[self._first] = self.beginning(self._first)
@@ -201,9 +212,7 @@ class Estimator:
 
     def _noise(self, covariance: ArrayLike | None) -> Array:
         settings, inputs = self.settings, self.inputs
-        noise = np.diag(
-            np.repeat([settings.bend_noise**2, settings.tip_noise**2], [inputs, 2])
-        )
+        noise = np.diag(np.repeat([settings.bend_noise**2, settings.tip_noise**2], [inputs, 2]))
         if covariance is not None:
             given = np.asarray(covariance, dtype=float)
             if given.shape == noise.shape:
@@ -244,6 +253,7 @@ class Estimator:
             tip=tip + self.nominal.moved_tip(bend, change) + offset,
             missing_pressure=missing,
             gain_error=gain,
+            effective_pressure=known.effective,
             tip_offset=offset,
             deviation=np.sqrt(np.diag(known.covariance)),
             tip_covariance=rows @ known.covariance @ rows.T,
@@ -260,11 +270,10 @@ class Estimator:
             [inputs, inputs, inputs, inputs, 2],
         )
         zero = np.zeros(inputs)
-        bend = self.nominal.fine_bend[self.nominal.steps(first)]
-        memory = material.Memory(bend, zero, zero)
-        return Knowledge(
-            np.zeros(4 * inputs + 2), np.diag(deviation**2), zero, memory, zero.copy()
-        )
+        here = self.nominal.steps(first)
+        memory = material.Memory(self.nominal.fine_bend[here], zero, zero)
+        mean, effective = np.zeros(4 * inputs + 2), self.nominal.effective[here]
+        return Knowledge(mean, np.diag(deviation**2), zero, memory, zero, effective)
 
     def _forget(self, j: int) -> None:
         """Compute again from boundary ``j`` on."""
@@ -278,10 +287,14 @@ class Estimator:
     def _run(self, last: int) -> None:
         if last <= self._last:
             return
-        steps = np.arange(self._last, last)
-        differential = self.chambers.during(steps)
-        for j, held in zip(steps, differential, strict=True):
-            self._known[int(j) + 1] = self._step(int(j), held)
+        differential = self.chambers.during(np.arange(self._last, last))
+        begin = self._last
+        for first in range(begin, last):
+            # What friction and creep take changes once a control period.
+            if first > begin and first % STEPS:
+                continue
+            end = min(last, (first // STEPS + 1) * STEPS)
+            self._period(first, differential[first - begin : end - begin])
         self._last = last
         oldest = last - round(HISTORY / STEP)
         for j in list(self._known):
@@ -295,36 +308,58 @@ class Estimator:
             known = self._update(entry, known)
         return known
 
-    def _step(self, j: int, held: Array) -> Knowledge:
-        """Return what is known a fine step after boundary ``j``, under chamber pressures (M,)."""
-        known = self._updated(j, self._known[j])
-        settings, inputs, nominal = self.settings, self.inputs, self.nominal
-        here, k = nominal.steps(j), nominal.periods(j // STEPS)
-        slow = known.slow + (known.mean[:inputs] - known.slow) * (STEP / settings.memory_time)
-        memory, taken = self._remember(known, nominal.fine_bend[here] + slow)
+    def _period(self, first: int, held: Array) -> None:
+        """Go on from boundary ``first`` under a control period's chamber pressures (n, M) [Pa]."""
+        nominal, inputs = self.nominal, self.inputs
+        steps = nominal.steps(first + np.arange(len(held)))
+        k = int(nominal.periods(first // STEPS))
+        known = self._known[first]
+        memory, taken = known.memory, known.taken
+        if first % STEPS == 0:
+            memory, taken = self._remember(known, nominal.fine_bend[steps[0]] + known.slow)
         effective = material.without_memory(nominal.limb, held, taken)
-        nothing = effective - nominal.effective[here]
         push = nominal.fine_input[k]
-        move = np.eye(4 * inputs + 2)
+        pushed = (effective - nominal.effective[steps]) @ push.T
+        move, noise = self._moves[k].copy(), self._noises[k]
         swing = 2 * inputs
-        move[:swing, :swing] = nominal.fine_transition[k]
-        move[:swing, swing : swing + inputs] = push
-        move[:swing, swing + inputs : swing + 2 * inputs] = push * effective
-        fade = math.exp(-STEP / settings.tip_time)
-        move[-1, -1] = move[-2, -2] = fade
-        mean = move @ known.mean
-        mean[:swing] += push @ nothing
-        covariance = move @ known.covariance @ move.T
-        covariance[:swing, :swing] += push @ push.T * (settings.pressure_density**2 / STEP)
+        share = STEP / self.settings.memory_time
+        for i, felt in enumerate(effective):
+            known = self._updated(first + i, self._known[first + i])
+            move[:swing, swing + inputs : swing + 2 * inputs] = push * felt
+            mean = move @ known.mean
+            mean[:swing] += pushed[i]
+            self._known[first + i + 1] = Knowledge(
+                mean,
+                move @ known.covariance @ move.T + noise,
+                known.slow + share * (known.mean[:inputs] - known.slow),
+                memory,
+                taken,
+                felt,
+                known.strange,
+                known.row,
+            )
+
+    def _prepare(self) -> tuple[Array, Array]:
+        """Return F without its column of g, and the covariance that a fine step adds.
+
+        Of each control period, (K', 4M + 2, 4M + 2).
+        """
+        nominal, settings, inputs = self.nominal, self.settings, self.inputs
+        size, swing = 4 * inputs + 2, 2 * inputs
+        moves = np.tile(np.eye(size), (nominal.count, 1, 1))
+        moves[:, :swing, :swing] = nominal.fine_transition
+        moves[:, :swing, swing : swing + inputs] = nominal.fine_input
+        moves[:, -2:, -2:] *= math.exp(-STEP / settings.tip_time)
         wander = np.repeat(
-            [settings.missing_density, settings.gain_density, settings.tip_density],
-            [inputs, inputs, 2],
+            [0.0, settings.missing_density, settings.gain_density, settings.tip_density],
+            [swing, inputs, inputs, 2],
         )
-        place = np.arange(swing, len(mean))
-        covariance[place, place] += wander**2 * STEP
-        return replace(
-            known, mean=mean, covariance=covariance, slow=slow, memory=memory, taken=taken
+        noises = np.tile(np.diag(wander**2 * STEP), (nominal.count, 1, 1))
+        push = nominal.fine_input
+        noises[:, :swing, :swing] += (
+            push @ np.swapaxes(push, 1, 2) * (settings.pressure_density**2 / STEP)
         )
+        return moves, noises
 
     def _remember(self, known: Knowledge, bend: Array) -> tuple[material.Memory, Array]:
         """Return memory and taken pressures once the limb has come to a bend (M,) [rad]."""
@@ -332,7 +367,7 @@ class Estimator:
         if not any(s.friction_moment > 0 or s.creep_stiffness > 0 for s in limb.segments):
             return known.memory, known.taken
         history = material.remember(
-            limb, np.array([0.0, STEP]), np.stack([known.memory.bend, bend]), known.memory
+            limb, np.array([0.0, CONTROL_PERIOD]), np.stack([known.memory.bend, bend]), known.memory
         )
         return history.at(-1), material.taken_by(limb, history)[-1]
 

@@ -6,8 +6,8 @@
     f.command(time)                            # ahead of the instant, every 50 ms
     f.estimate(time)
 
-All times are seconds since the plan's first setpoint. Nothing here knows the present: what a command
-is based on is what was told before it was asked for.
+All times are seconds since the plan's first setpoint. Nothing here knows the present: a command is
+based on what was told before it was asked for.
 """
 
 from __future__ import annotations

@@ -6,11 +6,11 @@ correction. The corrections c (W, M), added to the plan's commands, then minimis
 
     Σ |tip − r̄|² + ν² Σ |δθ|² + λ² Σ |r_k − r_{k−1}|² + λ'² Σ |r_k − 2 r_{k−1} + r_{k−2}|²
 
-where r is c less what makes up for the disturbances d and g that are known ahead, and with |command| within the pressure limit, its change within the slew limit and |c| within the
-authority. ν keeps the segments near the model's bend where the tip hardly tells them apart. The
-chambers' law, with its slow venting, is linearised about the commands rolled forward. Corrections
-are straight lines between a few knots, close together at first, so that the programme has some
-twenty unknowns.
+where r is c less what makes up for the disturbances d and g, which are known ahead, with |command|
+within the pressure limit, its change within the slew limit and |c| within the authority. ν keeps
+the segments near the model's bend where the tip hardly tells them apart. The chambers' law, with
+its slow venting, is linearised about the commands rolled forward. Corrections are straight lines
+between a few knots, close together at first, so that the programme has some twenty unknowns.
 """
 
 from __future__ import annotations
@@ -84,8 +84,6 @@ class Horizon:
         self.settings = settings or HorizonSettings()
         self.window = self.settings.knots[-1] + 1
         self._hats = _hats(self.settings.knots)
-        inputs = nominal.limb.segment_count
-        self._spread = np.kron(self._hats, np.eye(inputs))
         self._guess: tuple[int, Array] | None = None
 
     def solve(self, first: int, known: Knowledge, allowed: Allowed) -> Array:
@@ -101,10 +99,10 @@ class Horizon:
         ahead = self._ahead(first, known)
         guess = self._begin(first, last[-1] - ahead[1]) + ahead[2:]
         misses, bends, jacobian, turned = self._roll(first, guess, known)
+        # Unknown is the change of the knots.
         knots = self._hats.shape[1] * inputs
-        # Unknown is the change of the knots, spread over the window.
-        tip = (jacobian @ self._spread).reshape(-1, knots)
-        bend = self.settings.bend * (turned @ self._spread).reshape(-1, knots)
+        tip = jacobian.reshape(-1, knots)
+        bend = self.settings.bend * turned.reshape(-1, knots)
         hessian = tip.T @ tip + bend.T @ bend
         gradient = tip.T @ misses.ravel() + self.settings.bend * (bend.T @ bends.ravel())
         run = np.concatenate([last, guess]) - ahead
@@ -161,7 +159,7 @@ class Horizon:
     ) -> tuple[Array, Array, Array, Array]:
         """Return misses (W, 2) [m] and bends (W, M) [rad] at the ends of the periods.
 
-        And their derivatives by the corrections (W, 2, W·M), (W, M, W·M).
+        And their derivatives by the corrections at the knots (W, 2, knots·M), (W, M, knots·M).
         """
         nominal, inputs = self._nominal, self._nominal.limb.segment_count
         periods = nominal.periods(first + np.arange(self.window))
@@ -184,41 +182,38 @@ class Horizon:
         felt = effective.mean(axis=1)
         planned = nominal.effective[fine].reshape(self.window, STEPS, inputs).mean(axis=1)
         push = felt * (1.0 + gain) + missing - planned
-        swing, moved = known.mean[: 2 * inputs].copy(), np.zeros((2 * inputs, self.window, inputs))
+        # Pressures by the knots' corrections, then swing by these, period after period.
+        reached = np.einsum("wvb,vn->wnb", reached, self._hats)
+        into = nominal.input[periods]
+        driven = np.einsum("wsb,wnb->wsnb", into @ slopes, reached)
+        driven = driven.reshape(self.window, 2 * inputs, -1)
+        pushed = np.einsum("wsb,wb->ws", into, push)
+        swing, moved = known.mean[: 2 * inputs], np.zeros(driven.shape[1:])
         bends = np.empty((self.window, inputs))
-        turned = np.empty((self.window, inputs, self.window, inputs))
-        for i, k in enumerate(periods):
-            into = nominal.input[k]
-            swing = nominal.transition[k] @ swing + into @ push[i]
-            moved = np.tensordot(nominal.transition[k], moved, axes=1)
-            moved += np.einsum("sa,ab,wb->swb", into, slopes[i], reached[i])
+        turned = np.empty((self.window, inputs, driven.shape[2]))
+        for i, transition in enumerate(nominal.transition[periods]):
+            swing = transition @ swing + pushed[i]
+            moved = transition @ moved + driven[i]
             bends[i], turned[i] = swing[:inputs], moved[:inputs]
         ends = nominal.periods(first + 1 + np.arange(self.window))
         bend = nominal.bend[ends]
         misses = nominal.tip[ends] + nominal.moved_tip(bend, bends) - nominal.reference[ends]
         misses = misses + known.mean[-2:]
-        jacobian = np.einsum(
-            "wtm,wmvb->wtvb", nominal.kinematics.tip_jacobians(bend + bends), turned
-        )
-        size = self.window * inputs
-        return (
-            misses,
-            bends,
-            jacobian.reshape(self.window, 2, size),
-            turned.reshape(self.window, inputs, size),
-        )
+        jacobian = nominal.kinematics.tip_jacobians(bend + bends) @ turned
+        return misses, bends, jacobian, turned
 
     def _within(
         self, hessian: Array, gradient: Array, first: int, guess: Array, allowed: Allowed
     ) -> Array:
         """Return the change (knots·M,) of the knots [Pa] that is best within what is allowed."""
-        change: Array = -np.linalg.solve(hessian, gradient)
+        change: Array = np.asarray(np.linalg.solve(hessian, -gradient), dtype=np.float64)
         inputs = guess.shape[1]
         periods = self._nominal.periods(first + np.arange(self.window))
         planned = self._nominal.commands[periods]
         low = np.maximum(-allowed.authority, -allowed.limit - planned) - guess
         high = np.minimum(allowed.authority, allowed.limit - planned) - guess
-        low, high = np.minimum(low, high), np.maximum(low, high)
+        bounds: Array = np.sort(np.stack([low, high]), axis=0)
+        low, high = bounds
         command = np.concatenate([self._chambers.sent(first - 1)[None], planned + guess])
         steps = np.diff(command, axis=0)
         rows = np.diff(self._hats, axis=0, prepend=0.0)
@@ -235,14 +230,14 @@ class Horizon:
         )
 
 
-def _programme(H: Array, gradient: Array, rows: Array, low: Array, high: Array) -> Array:
-    """Return x that minimises ½ xᵀHx + gradientᵀx with low ≤ rows x ≤ high, all in Pa and m."""
+def _programme(hessian: Array, gradient: Array, rows: Array, low: Array, high: Array) -> Array:
+    """Return x that minimises ½ xᵀ hessian x + gradientᵀ x with low ≤ rows x ≤ high."""
     scale = (_PRESSURE / _LENGTH) ** 2
     solver = piqp.DenseSolver()
     solver.settings.eps_abs = 1e-5
     solver.settings.eps_rel = 1e-6
     solver.setup(
-        np.asfortranarray(H * scale),
+        np.asfortranarray(hessian * scale),
         gradient * scale / _PRESSURE,
         None,
         None,

@@ -12,6 +12,8 @@ motion, so that weight and pose count. Friction and creep are part of δw.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import make_interp_spline
@@ -26,6 +28,7 @@ from der_planner.planning.motions import resting_spline, sample_spline
 from der_planner.planning.result import Plan
 
 Array = NDArray[np.float64]
+Whole = NDArray[np.signedinteger[Any]]
 
 STEP = CONTROL_PERIOD / STEPS
 """Fine step [s]: the grid of the estimator; `STEPS` of them make a control period."""
@@ -69,7 +72,7 @@ class Nominal:
         held = np.repeat(plan.differential_pressure[-1:], _HELD, axis=0)
         self.commands = np.concatenate([plan.differential_pressure, held])
         count = len(self.commands)
-        time = np.arange(count) * CONTROL_PERIOD
+        time = np.arange(count, dtype=np.float64) * CONTROL_PERIOD
         start = plan.reference.start
         spline = resting_spline(plan.time, plan.bend_angles, start)
         self.before = np.zeros(plan.limb.segment_count) if start is None else start.pressure
@@ -111,13 +114,15 @@ class Nominal:
         rate = np.where(moving, self._bend_spline(clipped, 1), 0.0)
         return self._bend_spline(clipped), rate, self._tip_spline(clipped)
 
-    def periods(self, k: int | Array) -> NDArray[np.int64]:
+    def periods(self, k: int | Whole) -> Whole:
         """Return control periods cut to those with tables."""
-        return np.clip(k, 0, self.count - 1).astype(np.int64)
+        cut: Whole = np.clip(k, 0, self.count - 1)
+        return cut
 
-    def steps(self, j: int | Array) -> NDArray[np.int64]:
+    def steps(self, j: int | Whole) -> Whole:
         """Return fine steps cut to those with tables."""
-        return np.clip(j, 0, self.count * STEPS - 1).astype(np.int64)
+        cut: Whole = np.clip(j, 0, self.count * STEPS - 1)
+        return cut
 
     def command(self, k: int) -> Array:
         """Return the plan's command (M,) of a control period [Pa]."""
@@ -136,8 +141,10 @@ class Nominal:
         return np.concatenate([known, np.repeat(known[-1:], _HELD, axis=0)])
 
     def _bend_of(self, bend: Array, moved: Array) -> Array:
-        """Return the changes of bend (K', M) [rad] that move the tip by (K', 2) [m], as far as it
-        tells them."""
+        """Return changes of bend (K', M) [rad] that move the tip by (K', 2) [m].
+
+        As far as the tip tells them.
+        """
         jacobian = self.kinematics.tip_jacobians(bend)
         square = np.einsum("kai,kaj->kij", jacobian, jacobian)
         square += _SEGMENTS_KNOWN**2 * np.eye(bend.shape[1])

@@ -28,6 +28,10 @@ REASONS = {
 """Every reason and what is said of it."""
 
 
+_SHRINKS = 0.7
+"""A swing whose next way is less than this share of the longest before dies out."""
+
+
 @dataclass(frozen=True)
 class Limits:
     """When feedback is taken back.
@@ -41,8 +45,9 @@ class Limits:
         inconsistent: squared distance of measurements per coordinate, smoothed; 1 is expected.
         patience: for which measurements may be inconsistent [s].
         saturated: for which a correction may be at its limit [s].
-        swing: standard deviation of a correction that swings, as a share of the authority.
-        window: in which swings are looked for [s].
+        swing: from one turn of a swinging correction to the next, as a share of the authority.
+        turns: so many of them are an oscillation, unless it dies out …
+        window: … if they come within this time [s].
         late: commands in a row that are asked for too late.
     """
 
@@ -54,7 +59,8 @@ class Limits:
     inconsistent: float = 20.0
     patience: float = 2.0
     saturated: float = 3.0
-    swing: float = 0.08
+    swing: float = 0.1
+    turns: int = 4
     window: float = 4.0
     late: int = 4
 
@@ -96,7 +102,7 @@ class Supervisor:
         self._strange_since: float | None = None
         self._limited_since: float | None = None
         self._late = 0
-        self._recent: deque[Array] = deque(maxlen=round(limits.window / CONTROL_PERIOD))
+        self._turns: list[_Turns] = []
 
     def advance(self, time: float, age: float, strange: float) -> float:
         """Return the share of a command's correction.
@@ -135,9 +141,13 @@ class Supervisor:
                 self.stop(time, "saturation", self.authority)
         else:
             self._limited_since = None
-        self._recent.append(correction)
-        if len(self._recent) == self._recent.maxlen:
-            self._look_for_swings(time)
+        if not self._turns:
+            self._turns = [_Turns(limits.swing * self.authority) for _ in correction]
+        for turns, value in zip(self._turns, correction, strict=True):
+            turns.add(time, float(value))
+            way = turns.oscillation(time, limits.turns, limits.window)
+            if way > 0.0:
+                self.stop(time, "oscillation", way)
 
     def asked(self, time: float, present: float) -> None:
         """Note that a command of an instant is asked for when so much is known [s]."""
@@ -156,16 +166,39 @@ class Supervisor:
             self.reason = name
             self.warnings.append(Warned(time, name, REASONS[name].format(number)))
 
-    def _look_for_swings(self, time: float) -> None:
-        """Stop if a correction crossed its own mean often, by much, and no less toward the end."""
-        recent = np.array(self._recent)
-        place = np.linspace(-1.0, 1.0, len(recent))
-        trend = np.polynomial.polynomial.polyfit(place, recent, 3)
-        around = recent - np.polynomial.polynomial.polyval(place, trend).T
-        half = len(recent) // 2
-        early, late = around[:half].std(axis=0), around[half:].std(axis=0)
-        crossings = (np.diff(np.sign(around), axis=0) != 0).sum(axis=0)
-        often = crossings >= self.limits.window
-        swinging = often & (late > self.limits.swing * self.authority) & (late > 0.8 * early)
-        if swinging.any():
-            self.stop(time, "oscillation", float(2 * np.sqrt(2) * late[swinging].max()))
+
+class _Turns:
+    """Finds where a series turns round by more than a threshold.
+
+    Args:
+        threshold: of the way back from an extreme.
+    """
+
+    def __init__(self, threshold: float) -> None:
+        self._threshold = threshold
+        self._low = self._high = self._last = 0.0
+        self._rising: bool | None = None
+        self.found: deque[tuple[float, float]] = deque(maxlen=16)
+        """Time of each turn and the way since the one before."""
+
+    def add(self, time: float, value: float) -> None:
+        """Look at the next value."""
+        self._low, self._high = min(self._low, value), max(self._high, value)
+        if self._rising is not False and value < self._high - self._threshold:
+            self._turn(time, self._high, rising=False)
+            self._low = value
+        elif self._rising is not True and value > self._low + self._threshold:
+            self._turn(time, self._low, rising=True)
+            self._high = value
+
+    def _turn(self, time: float, extreme: float, *, rising: bool) -> None:
+        if self._rising is not None:
+            self.found.append((time, abs(extreme - self._last)))
+        self._last, self._rising = extreme, rising
+
+    def oscillation(self, time: float, turns: int, window: float) -> float:
+        """Return the way between two turns if they are many and it does not shrink, else 0."""
+        recent = [way for when, way in self.found if when > time - window][-turns:]
+        if len(recent) < turns or recent[-1] < _SHRINKS * max(recent[:-1]):
+            return 0.0
+        return recent[-1]
