@@ -43,10 +43,10 @@ from der_planner.identification import (
     within_limits,
     write_excitation,
 )
+from der_planner.identification.logs.prepare import prepare
 from der_planner.identification.offline import AMPLITUDE
 from der_planner.identification.parameters import GROUPS
 from der_planner.identification.plots import plot_prediction
-from der_planner.identification.prepare import prepare
 from der_planner.limb import Limb, LimbError
 from pressure_driver.schedule import ScheduleLimits
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.identification.log import CalibrationLog
+from der_planner.identification.logs.log import CalibrationLog
+from der_planner.identification.logs.prepare import bridge, prepare
 from der_planner.identification.predict import predict
-from der_planner.identification.prepare import bridge, prepare
 from der_planner.limb import Limb
 
 Array = NDArray[np.float64]

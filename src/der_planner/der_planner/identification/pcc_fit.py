@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from der_planner.identification.prepare import Prepared
+from der_planner.identification.logs.prepare import Prepared
 from der_planner.limb import Limb, Segment
 from der_planner.model.material import slow_effective_pressure
 from der_planner.model.response import ArcModel, pressures_between

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from der_planner.identification.parameters import TERMS, column, put, to_limb
 from der_planner.limb import Limb
+from der_planner.model.bending import bend_change
 from der_planner.model.material import slow_effective_pressure
 from der_planner.model.response import Response, RodModel, simulate
 
@@ -38,7 +39,7 @@ class RodAngles:
     def __init__(self, prior: Limb, time: Array, pressure: Array, nodes: int = NODES) -> None:
         self._prior, self._time, self._nodes = prior, time, nodes
         self._pressure = pressure
-        self._period = float(time[1] - time[0])
+        self._loaded = any(prior.gravity[:2])
 
     def angles(self, values: Array) -> Array:
         """Return predicted bend angles (K, M) [rad] for the unknowns (M, T)."""
@@ -51,8 +52,11 @@ class RodAngles:
             values: (M, T) unknowns.
             wanted: (segment, term) of each of the P unknowns.
 
-        What acts as a pressure goes through the rod's exact tangent; stiffness and damping, which
-        change the rod itself, are differences of two simulations.
+        All go through the rod's exact tangent: what acts as a pressure, and stiffness, damping and
+        mass as well, which change the rod itself.
+
+        Raises:
+            ConvergenceError: the rod cannot follow.
         """
         model = RodModel(to_limb(self._prior, values), self._nodes)
         response = self._simulate(model, linearise=True)
@@ -60,8 +64,10 @@ class RodAngles:
         assert response.derivative is not None
         result = np.empty((*angles.shape, len(wanted)))
         for place, (segment, term) in enumerate(wanted):
-            if TERMS[term].group == "dynamics":
-                result[:, :, place] = self._difference(values, segment, term, angles)
+            if TERMS[term].group in ("dynamics", "mass"):
+                result[:, :, place] = self._changed_rod(
+                    values, segment, term, (model, response, effective)
+                )
                 continue
             change = self._pressure_change(values, segment, term)
             change[:, segment] += self._moment_change(
@@ -80,12 +86,29 @@ class RodAngles:
             model, self._time, pressures=self._pressure, steps=SUBSTEPS, linearise=linearise
         )
 
-    def _difference(self, values: Array, segment: int, term: int, angles: Array) -> Array:
-        step = TERMS[term].step
+    def _changed_rod(
+        self, values: Array, segment: int, term: int, about: tuple[RodModel, Response, Array]
+    ) -> Array:
+        """Return the derivative (K, M) by an unknown that changes the rod itself."""
+        model, response, effective = about
+        step = _NUDGE * TERMS[term].scale
         moved = values.copy()
         put(moved, segment, term, float(values[segment, term]) + step)
-        changed: Array = (self.angles(moved) - angles) / step
-        return changed
+        other = RodModel(to_limb(self._prior, moved), self._nodes)
+        trajectory, free = response.trajectory, model.rod.free
+        assert trajectory is not None
+        assert response.derivative is not None
+        rest = model.rod.equilibrium(effective[0])
+        shift = (other.rod.equilibrium(effective[0], start=rest).q - rest.q)[free]
+        outputs = model.rod.parameter_tangent(trajectory, other.rod, (shift, np.zeros_like(shift)))
+        changed = bend_change(model.rod, trajectory.q, outputs[:, 2:])
+        if self._loaded and TERMS[term].name in ("log_stiffness", "log_mass"):
+            # A limb that sags less rubs and creeps less.
+            changed = (
+                changed + response.derivative.by_effective(self.effective(moved) - effective)[1]
+            )
+        rate: Array = changed / step
+        return rate
 
     def _pressure_change(self, values: Array, segment: int, term: int) -> Array:
         """Return ∂(effective pressures)/∂unknown (K, M), by a difference of the closed form."""

@@ -48,3 +48,13 @@ def weight_of(limb: Limb) -> Weight:
         first[piece] += item.mass * (item.arc_length - ends[piece] + length[piece])
     beyond = np.append(np.cumsum(mass[::-1])[::-1][1:], 0.0)
     return Weight(first + length * beyond, np.array(turning), gravity)
+
+
+def torques(limb: Limb, bend: Array) -> Array:
+    """Return the torques (K, M) of the weight on the bend angles (K, M) [N·m]."""
+    weight = weight_of(limb)
+    heading = bend @ weight.turning.T
+    x, y = weight.gravity
+    turns = weight.lever * (y * np.cos(heading) - x * np.sin(heading))
+    torque: Array = turns @ weight.turning
+    return torque

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
-from der_planner.identification.log import CalibrationLog, LogError
+from der_planner.identification.logs.log import CalibrationLog, LogError
 from der_planner.limb import Limb
 from der_planner.model.series import CONTROL_PERIOD as PERIOD
 
