@@ -12,7 +12,7 @@ setup(
     name=PACKAGE,
     version=ElementTree.parse("package.xml").findtext("version"),
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
-    package_data={PACKAGE: ["py.typed", "data/*", "page/static/*"]},
+    package_data={PACKAGE: ["py.typed", "data/*", "page/static/*", "studies/shipped/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
@@ -31,6 +31,8 @@ setup(
         "pyelastica",
         "piqp",
         "threadpoolctl",
+        "distributed",
+        "pyarrow",
     ],
     extras_require={"page": ["nicegui==3.18.*"], "test": ["pytest"]},
     zip_safe=False,

@@ -33,9 +33,15 @@ def bend_angles(rod: Rod, q: Array) -> Array:
 
     A turn by more than half a circle from one row to the next is taken for one the other way.
     """
-    headings = [_heading(q, a, b) for a, b in end_edges(rod)]
-    absolute = np.unwrap(np.stack(headings, axis=1), axis=0)
-    relative: Array = np.diff(absolute, axis=1, prepend=0.0)
+    return angles_of_outputs(q[:, bend_outputs(rod)])
+
+
+def angles_of_outputs(outputs: Array) -> Array:
+    """Return the bend angles (…, K, M) [rad] of the coordinates `bend_outputs` (…, K, 4M)."""
+    dx = outputs[..., 2::4] - outputs[..., 0::4]
+    dy = outputs[..., 3::4] - outputs[..., 1::4]
+    absolute = np.unwrap(np.arctan2(dy, dx), axis=-2)
+    relative: Array = np.diff(absolute, axis=-1, prepend=0.0)
     return relative
 
 
@@ -78,12 +84,6 @@ def _edge(q: Array, first: int, second: int) -> tuple[Array, Array, Array]:
     dx = q[:, 4 * second] - q[:, 4 * first]
     dy = q[:, 4 * second + 1] - q[:, 4 * first + 1]
     return dx, dy, dx * dx + dy * dy
-
-
-def _heading(q: Array, first: int, second: int) -> Array:
-    dx, dy, _ = _edge(q, first, second)
-    heading: Array = np.arctan2(dy, dx)
-    return heading
 
 
 class Kinematics(Protocol):

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from der_planner.limb import Limb
+from der_planner.rod.backend import Backend
 from der_planner.rod.integration import Integrator, Method
 from der_planner.rod.linearisation import linearisation_of, step_matrices
 from der_planner.rod.mesh import Mesh, array, by_step, limb_mesh, positive, require, uniform_mesh
@@ -239,7 +240,7 @@ class Rod:
         run = self._integrator.run(state, inputs, h, method, load, linearise, halvings)
         linearisation = None
         if run.solved is not None:
-            wanted = self._output_indices(outputs)
+            wanted = self.output_indices(outputs)
             linearisation = linearisation_of(
                 self._backend, run.solved, (intervals, substeps), wanted, self._backend.rows(wanted)
             )
@@ -394,7 +395,17 @@ class Rod:
     def _as_state(self, state: RodState | ArrayLike) -> RodState:
         return state if isinstance(state, RodState) else self.state(state)
 
-    def _output_indices(self, outputs: Sequence[int] | None) -> NDArray[np.int64]:
+    @property
+    def backend(self) -> Backend:
+        """What holds the kernels' arrays: `simulate_many` stacks those of many rods."""
+        return self._backend
+
+    def output_indices(self, outputs: Sequence[int] | None) -> NDArray[np.int64]:
+        """Return the indices into q (P,) of outputs; of the tip's free coordinates for None.
+
+        Raises:
+            ValueError: an index that this rod's plane does not have.
+        """
         if outputs is None:
             size = 4 * self.nodes - 1
             return np.array([d for d in range(size - 3, size) if d in self.free], dtype=np.int64)
