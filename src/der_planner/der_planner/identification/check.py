@@ -71,7 +71,7 @@ def check(limb: Limb, log: CalibrationLog) -> Check:
     """Compare a limb file with a later run.
 
     Raises:
-        LogError: the log cannot be used, see `prepare`.
+        LogError: the log cannot be used, see `prepare`, or the limb's rod cannot follow it.
     """
     prepared = prepare(log, limb, to_fit=False)
     rows = prepared.usable

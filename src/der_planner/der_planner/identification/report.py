@@ -199,8 +199,8 @@ class FitReport:
         loads = self.loads
         pull = math.hypot(*loads.gravity)
         line = (
-            f"loads: gravity of {pull:.2f} m/s² in the plane pulls at {1e3 * loads.mass:.0f} g with "
-            f"a first moment of {1e3 * loads.first_moment:.1f} g·m about the clamp"
+            f"loads: gravity of {pull:.2f} m/s² in the plane pulls at {1e3 * loads.mass:.0f} g, "
+            f"first moment {1e3 * loads.first_moment:.1f} g·m about the clamp"
         )
         known = {u.name: u for u in self.unknowns}
         kept = "the mass" if "log_stiffness[0]" in known else "the stiffness"
@@ -210,19 +210,18 @@ class FitReport:
                 share = known[f"log_stiffness[{index}]"].deviation
                 told.append(f"EI of segment {index} = {stiffness:.4f} N·m² ± {100 * share:.1f} %")
             if f"log_mass[{index}]" in known:
-                share = known[f"log_mass[{index}]"]
+                found = known[f"log_mass[{index}]"]
                 told.append(
-                    f"mass of segment {index} = prior × {math.exp(share.value):.3f} ± "
-                    f"{100 * share.deviation:.1f} %"
+                    f"mass of segment {index} = prior × {math.exp(found.value):.3f} ± "
+                    f"{100 * found.deviation:.1f} %"
                 )
         if not told:
             return [line]
-        condition = f"{self.condition:.0f}"
         return [
             line,
-            f"loads: weight tells stiffness from gain: {', '.join(told)}, for {kept} that was given "
-            f"(all three scale together); condition of gains, stiffness and rest angles: "
-            f"{condition}",
+            f"loads: weight tells stiffness from gain: {', '.join(told)}",
+            f"loads: stiffness, gain and mass scale together, {kept} was given; condition of "
+            f"gains, rest angles and stiffness or mass: {self.condition:.0f}",
         ]
 
     @property

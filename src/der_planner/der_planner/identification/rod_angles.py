@@ -69,7 +69,7 @@ class RodAngles:
                     values, segment, term, (model, response, effective)
                 )
                 continue
-            change = self._pressure_change(values, segment, term)
+            change = self._pressure_change(values, segment, term, effective)
             change[:, segment] += self._moment_change(
                 values[segment], term, effective[:, segment], angles[:, segment]
             )
@@ -99,8 +99,8 @@ class RodAngles:
         assert trajectory is not None
         assert response.derivative is not None
         rest = model.rod.equilibrium(effective[0])
-        shift = (other.rod.equilibrium(effective[0], start=rest).q - rest.q)[free]
-        outputs = model.rod.parameter_tangent(trajectory, other.rod, (shift, np.zeros_like(shift)))
+        start = (other.rod.equilibrium(effective[0], start=rest).q - rest.q)[free]
+        outputs = model.rod.parameter_tangent(trajectory, other.rod, (start, np.zeros_like(start)))
         changed = bend_change(model.rod, trajectory.q, outputs[:, 2:])
         if self._loaded and TERMS[term].name in ("log_stiffness", "log_mass"):
             # A limb that sags less rubs and creeps less.
@@ -110,17 +110,15 @@ class RodAngles:
         rate: Array = changed / step
         return rate
 
-    def _pressure_change(self, values: Array, segment: int, term: int) -> Array:
+    def _pressure_change(self, values: Array, segment: int, term: int, effective: Array) -> Array:
         """Return ∂(effective pressures)/∂unknown (K, M), by a difference of the closed form."""
         value, kind = float(values[segment, term]), TERMS[term]
         nudge = _NUDGE * kind.scale
-        ends = (max(value - nudge, kind.low), min(value + nudge, kind.high))
-        pressures = []
-        for end in ends:
-            moved = values.copy()
-            put(moved, segment, term, end)
-            pressures.append(self.effective(moved))
-        slope: Array = (pressures[1] - pressures[0]) / (ends[1] - ends[0])
+        if value + nudge > kind.high:
+            nudge = -nudge
+        moved = values.copy()
+        put(moved, segment, term, value + nudge)
+        slope: Array = (self.effective(moved) - effective) / nudge
         return slope
 
     @staticmethod

@@ -313,7 +313,10 @@ def resting_law(limb: Limb) -> RestingLaw:
         )
         for s in limb.segments
     ]
-    return RestingLaw(*np.array(columns, dtype=float).T.copy(), weight_of(limb))
+    gain, cubic, rest, friction, turn, creep, relaxation, stiffness = np.array(columns).T.copy()
+    return RestingLaw(
+        gain, cubic, rest, friction, turn, creep, relaxation, stiffness, weight_of(limb)
+    )
 
 
 class SlowSlopes:

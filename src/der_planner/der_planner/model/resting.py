@@ -151,7 +151,7 @@ def balance(
                 step = min(max(step, -_LARGEST_STEP), _LARGEST_STEP)
             angle[i] = before[i] + step
             moved = max(moved, abs(step))
-        if not heavy or moved < 1e-11:
+        if not heavy or moved < 1e-10:
             return
 
 

@@ -10,7 +10,7 @@ from der_planner.model.resting import Weight
 
 Array = NDArray[np.float64]
 
-PIECES = 5
+PIECES = 4
 """Straight pieces a segment."""
 
 
