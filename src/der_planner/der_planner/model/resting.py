@@ -25,7 +25,9 @@ Array = NDArray[np.float64]
 _ROUNDS = 200
 """Sweeps over the segments at the most; without weight one is enough."""
 _LARGEST_STEP = 0.3
-"""Of a bend angle in one sweep [rad]."""
+"""Of a bend angle in one iteration [rad]."""
+_LARGEST_BEND = 6.0
+"""Of a segment [rad]."""
 
 
 class RestingLaw(NamedTuple):
@@ -193,8 +195,9 @@ def balanced_bend(
         error -= pulled + pulled_slope * (angle - now)
         slope = 1.0 + 3.0 * law.cubic[i] * bent**2 - pulled_slope
         slope += scale * (friction * (1.0 - z * sign) * fade / law.turn[i] + law.creep[i] * share)
-        step = error / max(slope, 0.05)
-        angle -= step
+        # A spring that softens with bend has no balance beyond some load: the bend ends there.
+        step = min(max(error / max(slope, 0.05), -_LARGEST_STEP), _LARGEST_STEP)
+        angle = min(max(angle - step, law.rest[i] - _LARGEST_BEND), law.rest[i] + _LARGEST_BEND)
         if (angle - last) * sign < 0.0:
             angle = last
         if abs(step) < 1e-12:
