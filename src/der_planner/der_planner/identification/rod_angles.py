@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from der_planner.identification.parameters import TERMS, column, put, to_limb
 from der_planner.limb import Limb
-from der_planner.model.bending import bend_change
 from der_planner.model.material import slow_effective_pressure
 from der_planner.model.response import Response, RodModel, simulate
 
@@ -24,6 +23,8 @@ SUBSTEPS = 1
 """Integrator steps of 50 ms: see the convergence on the page of the identification."""
 _NUDGE = 1e-3
 """Of an unknown in its scale, for the slope of the effective pressure."""
+_STEP = 0.1
+"""Of an unknown in its scale, for the difference of two simulations."""
 
 
 class RodAngles:
@@ -39,7 +40,6 @@ class RodAngles:
     def __init__(self, prior: Limb, time: Array, pressure: Array, nodes: int = NODES) -> None:
         self._prior, self._time, self._nodes = prior, time, nodes
         self._pressure = pressure
-        self._loaded = any(prior.gravity[:2])
 
     def angles(self, values: Array) -> Array:
         """Return predicted bend angles (K, M) [rad] for the unknowns (M, T)."""
@@ -52,8 +52,8 @@ class RodAngles:
             values: (M, T) unknowns.
             wanted: (segment, term) of each of the P unknowns.
 
-        All go through the rod's exact tangent: what acts as a pressure, and stiffness, damping and
-        mass as well, which change the rod itself.
+        What acts as a pressure goes through the rod's exact tangent; stiffness, damping and mass,
+        which change the rod itself, are differences of two simulations.
 
         Raises:
             ConvergenceError: the rod cannot follow.
@@ -65,9 +65,7 @@ class RodAngles:
         result = np.empty((*angles.shape, len(wanted)))
         for place, (segment, term) in enumerate(wanted):
             if TERMS[term].group in ("dynamics", "mass"):
-                result[:, :, place] = self._changed_rod(
-                    values, segment, term, (model, response, effective)
-                )
+                result[:, :, place] = self._difference(values, segment, term, angles)
                 continue
             change = self._pressure_change(values, segment, term, effective)
             change[:, segment] += self._moment_change(
@@ -86,29 +84,13 @@ class RodAngles:
             model, self._time, pressures=self._pressure, steps=SUBSTEPS, linearise=linearise
         )
 
-    def _changed_rod(
-        self, values: Array, segment: int, term: int, about: tuple[RodModel, Response, Array]
-    ) -> Array:
+    def _difference(self, values: Array, segment: int, term: int, angles: Array) -> Array:
         """Return the derivative (K, M) by an unknown that changes the rod itself."""
-        model, response, effective = about
-        step = _NUDGE * TERMS[term].scale
+        step = _STEP * TERMS[term].scale
         moved = values.copy()
         put(moved, segment, term, float(values[segment, term]) + step)
-        other = RodModel(to_limb(self._prior, moved), self._nodes)
-        trajectory, free = response.trajectory, model.rod.free
-        assert trajectory is not None
-        assert response.derivative is not None
-        rest = model.rod.equilibrium(effective[0])
-        start = (other.rod.equilibrium(effective[0], start=rest).q - rest.q)[free]
-        outputs = model.rod.parameter_tangent(trajectory, other.rod, (start, np.zeros_like(start)))
-        changed = bend_change(model.rod, trajectory.q, outputs[:, 2:])
-        if self._loaded and TERMS[term].name in ("log_stiffness", "log_mass"):
-            # A limb that sags less rubs and creeps less.
-            changed = (
-                changed + response.derivative.by_effective(self.effective(moved) - effective)[1]
-            )
-        rate: Array = changed / step
-        return rate
+        changed: Array = (self.angles(moved) - angles) / step
+        return changed
 
     def _pressure_change(self, values: Array, segment: int, term: int, effective: Array) -> Array:
         """Return ∂(effective pressures)/∂unknown (K, M), by a difference of the closed form."""
