@@ -12,7 +12,8 @@ from der_planner.studies.errors import StudyError
 from der_planner.studies.identity import cache
 from der_planner.studies.store import Store
 from der_planner.studies.study import Study
-from der_planner.studies.work import Outcome
+from der_planner.studies.twins import calibrated
+from der_planner.studies.work import Calibrated, Outcome, compute
 
 from .cluster import Processes, wait_for
 
@@ -141,29 +142,45 @@ def test_a_stopped_study_goes_on(tmp_path, processes):
     assert "1 files of rows were not whole" in processes.said()
     stopped = by_key(out)
     assert {row.key for row in study.rows[:8]} <= set(stopped)
-    once = tmp_path / "once"
-    options = ["--out", str(once), "--workers", "1", "--limit", "8"]
-    assert processes.study(str(path), *options).wait(600) == 0
-    for key, record in by_key(once).items():
-        assert stopped[key] == record
+    for row in study.rows[:8]:
+        outcome = compute("run", [row.values], Calibrated()).outcomes[0]
+        for column in study.keep:
+            assert stopped[row.key][column] == outcome.results[column]
 
 
-def test_a_twin_is_calibrated_once(tmp_path, processes):
-    """Both workers need it at once; and it is there for another study, in the same digits."""
+def test_a_twin_is_calibrated_once(tmp_path, monkeypatch):
+    """Both workers need it at once; whoever asks later gets the same file."""
+    monkeypatch.setenv("DER_LIMB_CACHE", str(tmp_path / "cache"))
     text = "task: run\nfactors: {seed: 5, period: 1, cycles: 1, amplitude: 0.1, model: [der, pcc]}"
-    for name in ("first", "second"):
-        path = write(tmp_path, text, f"{name}.yaml")
-        process = processes.study(str(path), "--out", str(tmp_path / name), "--workers", "2")
-        assert process.wait(600) == 0, processes.said()
-    first, second = by_key(tmp_path / "first"), by_key(tmp_path / "second")
-    assert first == second
-    assert all(record["error"] is None for record in first.values())
+    study, out = Study.read(write(tmp_path, text)), tmp_path / "out"
+    conduct(study, Settings(out, workers=2), Progress())
+    kept = by_key(out)
+    assert len(kept) == 2
+    assert all(record["error"] is None for record in kept.values())
+    # Below what a twin that was never calibrated leaves, by far.
+    assert max(record["mean_error_m"] for record in kept.values()) < 0.01
     limbs = list((tmp_path / "cache" / "twins").glob("*.yaml"))
     assert len(limbs) == 1
-    text = limbs[0].read_text()
-    # Below what a twin that was never calibrated leaves, by far.
-    assert max(record["mean_error_m"] for record in first.values()) < 0.01
-    assert "twin 5" in text
+    twin = study.task.twin(study.rows[0].values)
+    written = limbs[0].stat().st_mtime_ns
+    assert calibrated(twin, "") == limbs[0].read_text()
+    assert limbs[0].stat().st_mtime_ns == written
+
+
+def test_rows_that_are_done_again_are_there_once(tmp_path):
+    study = Study.read(write(tmp_path, RODS))
+    store = Store(tmp_path / "out", study)
+    good, bad = Outcome({"mean_error_m": 0.01, "max_error_m": 0.02}), Outcome(error="lost")
+    store.keep(study.rows[:3], [bad, good, good], "sources")
+    store.keep(study.rows[3:4], [bad], "sources")
+    failed = [study.rows[0].key, study.rows[3].key]
+    store.forget(failed)
+    assert set(by_key(tmp_path / "out")) == {row.key for row in study.rows[1:3]}
+    store.keep([study.rows[0], study.rows[3]], [good, good], "sources")
+    kept = store.load()
+    assert list(kept) == [row.key for row in study.rows[:4]]
+    assert by_key(tmp_path / "out") == kept
+    assert {record["error"] for record in kept.values()} == {None}
 
 
 def test_what_cannot_be_written_is_named(tmp_path):

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import queue
 import time
 from collections import Counter, deque
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -53,10 +54,11 @@ class Settings:
 
 @dataclass(frozen=True)
 class Piece:
-    """Rows that one task computes."""
+    """Rows that one task computes; the piece with the lowest place is begun first."""
 
     rows: tuple[Row, ...]
     twin: Twin | None
+    place: int
 
 
 @dataclass
@@ -106,6 +108,7 @@ def conduct(study: Study, settings: Settings, progress: Progress) -> dict[str, K
         + (f" ({state.failed} of those done have failed)" if state.failed else "")
     )
     if missing:
+        store.forget({row.key for row in missing})
         _play(study, settings, store, state, progress)
     done = store.load()
     return {row.key: done[row.key] for row in rows if row.key in done}
@@ -113,17 +116,12 @@ def conduct(study: Study, settings: Settings, progress: Progress) -> dict[str, K
 
 def pieces(study: Study, rows: list[Row]) -> Iterator[Piece]:
     """Return the rows in pieces of what a task computes together; a piece has one twin."""
-    batch: list[Row] = []
-    last: Twin | None = None
-    for row in rows:
-        twin = study.task.twin(row.values)
-        if batch and (len(batch) == study.task.batch or twin != last):
-            yield Piece(tuple(batch), last)
-            batch = []
-        batch.append(row)
-        last = twin
-    if batch:
-        yield Piece(tuple(batch), last)
+    place = 0
+    for twin, group in itertools.groupby(rows, key=lambda row: study.task.twin(row.values)):
+        left = list(group)
+        for begin in range(0, len(left), study.task.batch):
+            yield Piece(tuple(left[begin : begin + study.task.batch]), twin, place)
+            place += 1
 
 
 def _play(
@@ -171,7 +169,9 @@ def _welcome(client: Client, settings: Settings, progress: Progress) -> None:
 
 
 def _dashboard(client: Client) -> str:
-    link = client.dashboard_link or "none"
+    if "dashboard" not in client.scheduler_info(n_workers=0).get("services", {}):
+        return "none, the scheduler was started without"
+    link = client.dashboard_link
     try:
         import bokeh  # type: ignore[import-not-found]  # noqa: F401, PLC0415
     except ImportError:
@@ -234,22 +234,27 @@ class _Session:
             piece = state.left.popleft()
             limb: Any = Calibrated(self._study.limb)
             if piece.twin is not None:
-                limb = self._twin(piece.twin)
+                limb = self._twin(piece.twin, piece.place)
             future = self._client.submit(
                 work.compute,
                 self._study.task.name,
                 [row.values for row in piece.rows],
                 limb,
                 key=f"{self._study.task.name}-{piece.rows[0].key}-{len(piece.rows)}",
+                priority=-piece.place,
             )
             state.sent[future.key] = (future, piece)
             future.add_done_callback(self._back.put)
 
-    def _twin(self, twin: Twin) -> Future:
+    def _twin(self, twin: Twin, place: int) -> Future:
         """Return the calibration of a twin: one task, whatever waits for it."""
         if twin not in self._state.twins:
             self._state.twins[twin] = self._client.submit(
-                work.calibrate, twin, self._study.limb, key=f"calibrate-{hash_of(twin)}"
+                work.calibrate,
+                twin,
+                self._study.limb,
+                key="-".join(map(str, ("calibrate", *astuple(twin)))),
+                priority=-place,
             )
         return self._state.twins[twin]
 
@@ -317,11 +322,6 @@ class _Session:
             f"{rate:.3g} rows/s, {left} left, {self._threads} threads{failed}",
             unit="rows",
         )
-
-
-def hash_of(twin: Twin) -> str:
-    """Return a name for the calibration of a twin."""
-    return f"{twin.seed}-{twin.calibration}-{twin.noise!r}"
 
 
 def clock(seconds: float) -> str:

@@ -61,8 +61,8 @@ def sobol_indices(study: Study, kept: Mapping[str, Kept], of: str) -> tuple[Inde
             name,
             float(np.ravel(found.first_order)[i]),
             float(np.ravel(found.total_order)[i]),
-            _ends(spread.first_order, i),
-            _ends(spread.total_order, i),
+            _ends(spread.first_order.confidence_interval, i),
+            _ends(spread.total_order.confidence_interval, i),
         )
         for i, name in enumerate(names)
     )

@@ -9,7 +9,7 @@ from __future__ import annotations
 import errno
 import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,19 +67,38 @@ class Store:
         Raises:
             StudyError: the disk is full, or the folder cannot be written any more.
         """
-        records = []
+        records: list[Kept] = []
         for row, outcome in zip(rows, outcomes, strict=True):
             results = {name: outcome.results.get(name) for name in self._study.keep}
             error = outcome.error or None
             records.append(
                 {"key": row.key, **row.values, **results, "error": error, "sources": sources}
             )
+        self._write(pa.Table.from_pylist(records, schema=self._schema), rows[0].key)
+
+    def _write(self, table: Any, key: str) -> None:
         buffer = io.BytesIO()
-        pyarrow.parquet.write_table(pa.Table.from_pylist(records, schema=self._schema), buffer)
+        pyarrow.parquet.write_table(table, buffer)
         try:
-            identity.write_whole(self._rows / f"{rows[0].key}.parquet", buffer.getvalue())
+            identity.write_whole(self._rows / f"{key}.parquet", buffer.getvalue())
         except OSError as error:
             raise _unwritable(self._rows, error) from error
+
+    def forget(self, keys: Collection[str]) -> None:
+        """Take rows that are to be done again out of the files, so that none is there twice.
+
+        Raises:
+            StudyError: the folder cannot be written.
+        """
+        for path in sorted(self._rows.glob("*.parquet")):
+            table = pyarrow.parquet.read_table(path)
+            stay = [place for place, key in enumerate(table["key"].to_pylist()) if key not in keys]
+            if len(stay) == table.num_rows:
+                continue
+            if stay:
+                self._write(table.take(stay), table["key"][stay[0]].as_py())
+            if not stay or table["key"][stay[0]].as_py() != path.stem:
+                path.unlink()
 
     def note(self, lines: Iterable[tuple[str, str, float]]) -> None:
         """Append (what, where it ran, seconds) to ``times.csv``, which no result depends on."""
