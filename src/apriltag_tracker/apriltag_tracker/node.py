@@ -19,8 +19,10 @@ from sensor_msgs.msg import CameraInfo, Image
 from visualization_msgs.msg import Marker, MarkerArray
 
 from apriltag_tracker.camera import CameraError, Intrinsics
+from apriltag_tracker.camera.encodings import ImageReader
+from apriltag_tracker.camera.sources import Grabbed, SourceError, open_source
 from apriltag_tracker.detection import MOST_CORRECTED_BITS, Detector
-from apriltag_tracker.encodings import ImageReader
+from apriltag_tracker.detection.tracking import TrackingOptions
 from apriltag_tracker.image_watch import NO_CALIBRATION, ImageWatch
 from apriltag_tracker.overlay import draw_observation
 from apriltag_tracker.pipeline import (
@@ -31,9 +33,7 @@ from apriltag_tracker.pipeline import (
     Uncertainty,
     warm_up,
 )
-from apriltag_tracker.sources import Grabbed, SourceError, open_source
 from apriltag_tracker.tag_map import TagMap
-from apriltag_tracker.tracking import TrackingOptions
 from der_msgs.msg import LimbState, TagDetection, TagDetectionArray
 from limb_interfaces import qos, stamps, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health

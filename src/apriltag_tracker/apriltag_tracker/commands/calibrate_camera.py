@@ -30,17 +30,17 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import Image
 
-from apriltag_tracker.calibration import (
+from apriltag_tracker.camera import CameraError, Intrinsics
+from apriltag_tracker.camera.calibration import (
     BoardFinder,
     CalibrationError,
     calibrate_camera,
     calibrate_mounting,
     with_offsets,
 )
-from apriltag_tracker.camera import CameraError, Intrinsics
+from apriltag_tracker.camera.encodings import ImageError, to_grey
+from apriltag_tracker.camera.sources import PICTURES
 from apriltag_tracker.commands.calibration_board import add_board_arguments, given_board
-from apriltag_tracker.encodings import ImageError, to_grey
-from apriltag_tracker.sources import PICTURES
 from apriltag_tracker.tag_map import TagMap, TagMapError
 from limb_interfaces import qos
 

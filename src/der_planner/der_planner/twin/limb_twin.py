@@ -116,12 +116,6 @@ class LimbTwin:
         return tip
 
     @property
-    def tip_velocity(self) -> Array:
-        """(2,) velocity of the tip [m/s]."""
-        velocity: Array = self._rod.velocity_collection[:2, -1].copy()
-        return velocity
-
-    @property
     def bend_angles(self) -> Array:
         """(M,) heading at the end of each segment less the heading at its start [rad]."""
         heading = self._element_headings()
@@ -204,11 +198,6 @@ class LimbTwin:
             + u**2 * (u - 1) * scale * tangent[index + 1]
         )
         return TwinShape(arc, curve, np.interp(arc, node_arc, heading))
-
-    def kinetic_energy(self) -> float:
-        """Return the translational kinetic energy [J]."""
-        speed = np.sum(self._rod.velocity_collection**2, axis=0)
-        return float(0.5 * self._rod.mass @ speed)
 
     def _target(self, chamber_pressure: Array, duration: float) -> dict[str, Array]:
         """Return what the material shall be under these pressures, by the fields of `Ramp`."""
