@@ -40,6 +40,7 @@ def local(workers: int | None) -> Iterator[Client]:
             host="127.0.0.1",
             dashboard_address="127.0.0.1:0",
             memory_limit=0,
+            silence_logs=logging.CRITICAL,
         )
     except (OSError, TimeoutError, RuntimeError) as error:
         raise StudyError(f"the workers of this machine did not start: {error}") from error
