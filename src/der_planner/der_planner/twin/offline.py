@@ -12,7 +12,7 @@ from der_planner.limb import PointMass
 from der_planner.model.air import pair_of
 from der_planner.twin.limb_twin import LimbTwin, TwinError
 from der_planner.twin.loads import Push
-from pressure_driver.emulator.pneumatics import Pneumatics
+from pressure_driver.emulator.pneumatics import BoardPneumatics
 
 Array = NDArray[np.float64]
 
@@ -80,7 +80,7 @@ def play(
         )
     if not np.all(np.isfinite(wanted)) or not np.all(np.diff(instants) > 0):
         raise TwinError("time must rise and pressures must be finite")
-    pneumatics = Pneumatics(segment_count=wanted.shape[1], seed=seed)
+    pneumatics = BoardPneumatics(segment_count=wanted.shape[1], seed=seed)
     twin = LimbTwin(seed, run, atmosphere=pneumatics.atmosphere, gravity=gravity, masses=masses)
     if twin.segment_count != wanted.shape[1]:
         raise TwinError(
@@ -106,7 +106,9 @@ def play(
     )
 
 
-def _advance(pneumatics: Pneumatics, twin: LimbTwin, duration: float, fine_step: float) -> None:
+def _advance(
+    pneumatics: BoardPneumatics, twin: LimbTwin, duration: float, fine_step: float
+) -> None:
     count = max(1, int(np.ceil(duration / fine_step - 1e-9)))
     for _ in range(count):
         twin.step(pneumatics.step(duration / count), duration / count)
