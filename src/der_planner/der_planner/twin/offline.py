@@ -12,7 +12,7 @@ from der_planner.limb import PointMass
 from der_planner.model.air import pair_of
 from der_planner.twin.limb_twin import LimbTwin, TwinError
 from der_planner.twin.loads import Push
-from pressure_driver.emulator.pneumatics import Pneumatics
+from pressure_driver.emulator.pneumatics import BoardPneumatics
 
 Array = NDArray[np.float64]
 
@@ -69,7 +69,7 @@ class OfflineTwin:
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
         masses: Iterable[PointMass] = (),
     ) -> None:
-        self.pneumatics = Pneumatics(segment_count=segment_count, seed=seed)
+        self.pneumatics = BoardPneumatics(segment_count=segment_count, seed=seed)
         atmosphere = self.pneumatics.atmosphere
         self.twin = LimbTwin(seed, run, atmosphere=atmosphere, gravity=gravity, masses=masses)
         if self.twin.segment_count != segment_count:
