@@ -13,6 +13,7 @@ from typing import Any
 
 import yaml
 
+from der_planner.experiment.load_options import add_load_options
 from der_planner.limb import Limb, LimbError, gravity_of
 from der_planner.planning import METHODS as METHODS_BY_MODEL
 from der_planner.planning import Motion, PlanningError
@@ -231,27 +232,7 @@ def _add_stage(where: argparse._ArgumentGroup) -> None:
         default=1,
         help="of the first trial's twin; the next trial has the next seed",
     )
-    where.add_argument(
-        "--mounting",
-        default="",
-        help="horizontal, hanging, standing, sideways, or degrees by which a level limb is tilted "
-        "about its straight axis, left side up; of the twin, its calibration and the plans "
-        "(without it: the limb file's gravity, which is none in the default one)",
-    )
-    where.add_argument(
-        "--payload",
-        type=float,
-        default=0.0,
-        metavar="KG",
-        help="mass that the limb carries while it plays, known to the planner; it is put on "
-        "after the calibration",
-    )
-    where.add_argument(
-        "--payload-at",
-        type=float,
-        metavar="M",
-        help="where the payload sits, along the limb from its clamp (without it: the tip)",
-    )
+    add_load_options(where)
     where.add_argument(
         "--hardware",
         type=Path,
