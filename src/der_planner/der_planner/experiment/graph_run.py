@@ -289,6 +289,7 @@ class GraphTrial(GraphPlayer):
         if self._options.path is not None:
             # A path names no model: it gets the planner's defaults.
             parameters["default_model"] = self._trial.model
+            parameters["nearest_path"] = self._options.nearest
             if self._trial.model == "der":
                 parameters["default_method"] = self._trial.method
         return parameters

@@ -125,6 +125,7 @@ class Options:
     record_images: bool
     report: bool
     path: Path | None = None
+    nearest: bool = False
     mounting: str = ""
     payload: float = 0.0
     payload_at: float | None = None
@@ -152,7 +153,7 @@ class Options:
             PlanningError: the path's file has changed and cannot be read any more.
         """
         if self.path is not None:
-            return Motion.from_csv(self.path)
+            return Motion.from_csv(self.path, nearest=self.nearest)
         return Motion.named(name, amplitude=self.amplitude, period=self.period, cycles=self.cycles)
 
     def plan_of_trials(self) -> list[Trial]:
@@ -199,6 +200,11 @@ def _add_motions(what: argparse._ArgumentGroup) -> None:
         metavar="FILE.csv",
         help="draw this path with the tip, in place of --motions: columns x, y and, if timed, "
         "time, with units as in 'time [s], x [cm], y [cm]' (default units: s and m)",
+    )
+    what.add_argument(
+        "--nearest",
+        action="store_true",
+        help="follow the nearest path that the limb can follow where --path leaves its reach",
     )
     what.add_argument(
         "--models", nargs="+", default=list(MODELS), metavar="MODEL", help=f"of {', '.join(MODELS)}"
@@ -283,6 +289,8 @@ def parse(arguments: Sequence[str]) -> Options:
         if not least <= value <= most:
             raise OptionError(f"--{name} is {value}: choose {least} to {most}")
     _check_loads(given)
+    if given.nearest and given.path is None:
+        raise OptionError("--nearest is about a path: give --path FILE.csv, too")
     hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
     if hardware is not None and given.offline:
         raise OptionError("--offline simulates everything: it does not go with --hardware")
@@ -308,6 +316,7 @@ def parse(arguments: Sequence[str]) -> Options:
         record_images=given.record_images,
         report=not given.no_report,
         path=given.path.resolve() if given.path is not None else None,
+        nearest=given.nearest,
         mounting=given.mounting,
         payload=given.payload,
         payload_at=given.payload_at,
@@ -326,7 +335,7 @@ def _motions(given: argparse.Namespace) -> tuple[str, ...]:
     if given.motions:
         raise OptionError("--path is drawn in place of --motions: give one of the two")
     try:
-        Motion.from_csv(given.path)
+        Motion.from_csv(given.path, nearest=given.nearest)
     except PlanningError as error:
         raise OptionError(f"--path: {error}") from error
     return (re.sub(r"[^A-Za-z0-9-]+", "_", given.path.stem).strip("_") or "path",)

@@ -32,7 +32,8 @@ from der_planner.model.bending import ArcKinematics
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import paths, shapes
 from der_planner.planning.errors import PlanningError
-from der_planner.planning.inverse import follow
+from der_planner.planning.inverse import angle_limits, check_branch, follow
+from der_planner.planning.nearest import Deviation, line, nearest_path
 
 Array = NDArray[np.float64]
 
@@ -72,6 +73,7 @@ class Reference:
         bend_angles: (K, M) q̄ of constant-curvature arcs [rad].
         spline: q̄(t), twice continuously differentiable; `sample` reads it.
         start: where it begins, if not at rest.
+        deviation: from the drawn path, of a motion that follows the nearest one.
     """
 
     time: Array
@@ -79,6 +81,7 @@ class Reference:
     bend_angles: Array
     spline: BSpline
     start: Start | None = None
+    deviation: Deviation | None = None
 
     @property
     def duration(self) -> float:
@@ -127,6 +130,9 @@ class Motion:
         path: the tip path of shapes and paths.
         branch: of the arcs at the first point of a path, see `inverse.BRANCHES`; empty: least
             pressure.
+        nearest: follow the nearest path that the limb can follow instead of refusing one that
+            leaves its reach, see `nearest`.
+        limits: of the tip on a nearest path whose times mean nothing; None: its times count.
     """
 
     name: str
@@ -135,6 +141,8 @@ class Motion:
     cycles: int = 1
     path: paths.TipPath | None = None
     branch: str = ""
+    nearest: bool = False
+    limits: paths.PathLimits | None = None
 
     @classmethod
     def named(
@@ -186,11 +194,15 @@ class Motion:
         name: str = "path",
         branch: str = "",
         limits: paths.PathLimits | None = None,
+        nearest: bool = False,
     ) -> Motion:
         """Return a motion along a path of the tip.
 
         The limb first goes from rest to the first point and at the end back, over times of their
-        own.
+        own. With ``nearest``, a path that leaves the limb's reach is not refused: the limb follows
+        the nearest one that it can, a trembling line is smoothed, and times are stretched where
+        pressures cannot change as fast. `Reference.deviation` and the plan's warnings say how far
+        that is from what was drawn.
 
         Args:
             time: (P,) increasing instants [s]; None: the path gets its timing from the limits.
@@ -198,15 +210,25 @@ class Motion:
             name: for tables.
             branch: which way to reach the first point; empty: the one with the least pressure.
             limits: speed and acceleration for a path without times.
+            nearest: follow the nearest path that the limb can follow.
 
         Raises:
-            PlanningError: wrong shapes, not finite, not increasing, too few points.
+            PlanningError: wrong shapes, not finite, not increasing, too few points; unknown branch.
         """
-        return cls(name, path=paths.TipPath.build(time, tip, limits), branch=branch)
+        check_branch(branch)
+        if nearest and time is None:
+            drawn, limits = line(paths.checked_points(tip)), limits or paths.PathLimits()
+            return cls(name, path=drawn, branch=branch, nearest=True, limits=limits)
+        path = paths.TipPath.build(time, tip, limits)
+        return cls(name, path=path, branch=branch, nearest=nearest)
 
     @classmethod
     def from_csv(
-        cls, path: str | Path, branch: str = "", limits: paths.PathLimits | None = None
+        cls,
+        path: str | Path,
+        branch: str = "",
+        limits: paths.PathLimits | None = None,
+        nearest: bool = False,
     ) -> Motion:
         """Return a motion along a path in a CSV file: columns x, y [m] and, if timed, time [s].
 
@@ -214,7 +236,7 @@ class Motion:
             PlanningError: the file cannot be read; the message names line and column.
         """
         time, tip = paths.read_csv(path)
-        return cls.from_tip_path(time, tip, name=Path(path).stem, branch=branch, limits=limits)
+        return cls.from_tip_path(time, tip, Path(path).stem, branch, limits, nearest)
 
     def reference(self, limb: Limb, start: Start | None = None) -> Reference:
         """Return q̄(t) and r̄(t) for a limb.
@@ -228,17 +250,19 @@ class Motion:
             UnreachableError: a point of a tip path is out of reach.
             PlanningError: the path cannot be followed.
         """
+        deviation = None
         if self.name in JOINT_MOTIONS and self.path is None:
             time, angles = self._joint_motion(limb.segment_count)
         else:
-            time, angles = self._tip_motion(limb)
+            time, angles, deviation = self._tip_motion(limb)
         if start is not None:
             time, angles = _led_in(limb, start, time, angles)
         spline = resting_spline(time, angles, start)
         count = round(time[-1] / CONTROL_PERIOD) + 1
         instants = np.arange(count) * CONTROL_PERIOD
         sampled = sample_spline(spline, instants)[0]
-        return Reference(instants, ArcKinematics(limb).tip(sampled), sampled, spline, start)
+        tip = ArcKinematics(limb).tip(sampled)
+        return Reference(instants, tip, sampled, spline, start, deviation)
 
     def _joint_motion(self, segments: int) -> tuple[Array, Array]:
         total = self.cycles * self.period
@@ -260,32 +284,42 @@ class Motion:
         back = quintic(closing, *state, 0 * state[0], 0 * state[0], 0 * state[0])
         return np.append(time, total + closing[1:]), np.concatenate([angles, back[1:]])
 
-    def _tip_motion(self, limb: Limb) -> tuple[Array, Array]:
+    def _tip_motion(self, limb: Limb) -> tuple[Array, Array, Deviation | None]:
         kinematics = ArcKinematics(limb)
         path = self.path
         if path is None:
             path = shapes.draw(self.name, kinematics, self.amplitude, self.period, self.cycles)
-        time, tip = path.resample(_GRID * 2)
-        angles = follow(limb, kinematics, time, tip, self.branch)
-        inner = make_interp_spline(time, angles, k=5)
-        ends = [(inner(t), inner(t, 1), inner(t, 2)) for t in (time[0], time[-1])]
-        zero = np.zeros(limb.segment_count)
-        lead = _travel_time(limb, ends[0])
-        tail = _travel_time(limb, ends[1])
-        approach = quintic(_fine_grid(lead), zero, zero, zero, *ends[0])
-        back = quintic(_fine_grid(tail), *ends[1], zero, zero, zero)
-        between = _fine_grid(_on_grid(time[-1] - time[0]))
-        middle = inner(np.minimum(time[0] + between, time[-1]))
-        return (
-            np.concatenate(
-                [
-                    _fine_grid(lead),
-                    lead + between[1:],
-                    lead + between[-1] + _fine_grid(tail)[1:],
-                ]
-            ),
-            np.concatenate([approach, middle[1:], back[1:]]),
-        )
+        if not self.nearest:
+            time, tip = path.resample(_GRID * 2)
+            angles = follow(limb, kinematics, time, tip, self.branch)
+            return (*_with_ways(limb, time, angles), None)
+        found = nearest_path(limb, kinematics, path, self.limits, self.branch)
+        ways = _with_ways(limb, found.time, found.bend_angles)
+        low, high = angle_limits(limb)
+        if np.any(ways[1] < low) or np.any(ways[1] > high):
+            # A way that begins or ends in full motion near a limit would swing beyond it.
+            found = nearest_path(limb, kinematics, path, self.limits, self.branch, rest=True)
+            ways = _with_ways(limb, found.time, found.bend_angles)
+        return (*ways, found.deviation)
+
+
+def _with_ways(limb: Limb, time: Array, angles: Array) -> tuple[Array, Array]:
+    """Return times and angles with the ways from rest to their first and from their last pose."""
+    inner = make_interp_spline(time, angles, k=5)
+    ends = [(inner(t), inner(t, 1), inner(t, 2)) for t in (time[0], time[-1])]
+    zero = np.zeros(limb.segment_count)
+    lead = _travel_time(limb, ends[0])
+    tail = _travel_time(limb, ends[1])
+    approach = quintic(_fine_grid(lead), zero, zero, zero, *ends[0])
+    back = quintic(_fine_grid(tail), *ends[1], zero, zero, zero)
+    between = _fine_grid(_on_grid(time[-1] - time[0]))
+    middle = inner(np.minimum(time[0] + between, time[-1]))
+    instants = [
+        _fine_grid(lead),
+        lead + between[1:],
+        lead + between[-1] + _fine_grid(tail)[1:],
+    ]
+    return np.concatenate(instants), np.concatenate([approach, middle[1:], back[1:]])
 
 
 def smooth_step(x: ArrayLike) -> Array:

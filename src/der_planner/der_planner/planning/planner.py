@@ -91,6 +91,7 @@ def plan(
             "a smaller amplitude, or check the limb file's stiffness and mass"
         ) from error
     bend = sample_spline(spline, reference.time)[0]
+    left = str(reference.deviation or "")
     report(1.0)
     return Plan(
         time=reference.time,
@@ -107,7 +108,9 @@ def plan(
         limb=physics.limb,
         kinematics=physics.kinematics,
         solve_time=clock.perf_counter() - begin,
-        warnings=tuple(solved.warnings + _calibration_warnings(physics.limb, bend)),
+        warnings=tuple(
+            [left] * bool(left) + solved.warnings + _calibration_warnings(physics.limb, bend)
+        ),
         details=solved.details,
     )
 

@@ -9,7 +9,7 @@ from scipy.interpolate import BSpline
 from der_planner.limb import Limb
 from der_planner.model.balance import Balance
 from der_planner.model.response import NODES, RodModel
-from der_planner.planning.inverse import check_reach, solve
+from der_planner.planning.inverse import NEAREST_TOLERANCE, TOLERANCE, check_reach, solve
 from der_planner.planning.motions import Reference, resting_spline, sample_spline
 
 Array = NDArray[np.float64]
@@ -48,7 +48,8 @@ class PlanningRod(RodModel):
             # One angle cannot follow two coordinates: the rod bends as the arc does.
             return resting_spline(time, guess, reference.start)
         angles, distances = solve(self.kinematics, tip, guess, REFERENCE_PRIOR)
-        check_reach(self.limb, self.kinematics, time, tip, angles, distances)
+        tolerance = TOLERANCE if reference.deviation is None else NEAREST_TOLERANCE
+        check_reach(self.limb, self.kinematics, time, tip, angles, distances, tolerance)
         return resting_spline(time, angles, reference.start)
 
     def pressures(self, method: str, spline: BSpline, time: Array) -> Array:
