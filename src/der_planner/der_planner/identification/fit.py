@@ -97,7 +97,13 @@ def fit(
     pcc_residual = np.full(limb.segment_count, np.nan)
     if "dynamics" in problem.groups or loaded:
         pcc_segments, pcc_residual = fit_pcc(found, prepared, offset)
-        found = replace(found, pcc_segments=pcc_segments)
+        if np.all(np.isfinite(pcc_residual)):
+            found = replace(found, pcc_segments=pcc_segments)
+        else:
+            warnings.append(
+                "arcs of constant curvature cannot follow this log under its loads: the PCC model "
+                "has the rod's numbers"
+            )
     report = _report(
         log, prepared, unknowns, correlation, remaining, air=air, geometry=lengths,
         pcc_residual=pcc_residual, evaluations=problem.evaluations,

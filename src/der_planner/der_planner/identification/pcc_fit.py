@@ -45,7 +45,8 @@ def fit_pcc(limb: Limb, prepared: Prepared, offset: Array) -> tuple[tuple[Segmen
         offset: (M,) of the pressure sensors [Pa].
 
     Returns:
-        The segments for the PCC model, and its root mean square errors (M,) [rad].
+        The segments for the PCC model, and its root mean square errors (M,) [rad]; NaN if the arcs
+        cannot follow the log.
     """
     time = prepared.log.time
     pressure = prepared.pressure - offset
@@ -57,7 +58,10 @@ def fit_pcc(limb: Limb, prepared: Prepared, offset: Array) -> tuple[tuple[Segmen
 
     def angles(x: Array) -> Array:
         arcs = ArcModel(replace(limb, segments=segments_of(limb, x)))
-        return arcs.run(arcs.resting(effective[0]), held, period).bend_angles
+        try:
+            return arcs.run(arcs.resting(effective[0]), held, period).bend_angles
+        except RuntimeError:  # arcs that buckle under their load do not come to rest
+            return np.full(prepared.log.bend_angles.shape, np.nan)
 
     def residual(x: Array) -> Array:
         error = (angles(x) - prepared.log.bend_angles)[rows]
@@ -95,8 +99,8 @@ def fit_pcc(limb: Limb, prepared: Prepared, offset: Array) -> tuple[tuple[Segmen
         max_nfev=4,
     )
     found = put(solution.x)
-    error = np.sqrt(np.nanmean((angles(found) - prepared.log.bend_angles) ** 2, axis=0))
-    return segments_of(limb, found), np.asarray(error)
+    error = (angles(found) - prepared.log.bend_angles)[rows]
+    return segments_of(limb, found), np.asarray(np.sqrt(np.mean(error**2, axis=0)))
 
 
 def segments_of(limb: Limb, x: Array) -> tuple[Segment, ...]:
