@@ -69,23 +69,17 @@ def fit_pcc(limb: Limb, prepared: Prepared, offset: Array) -> tuple[tuple[Segmen
         data = error / (ANGLE_ERROR * np.sqrt(CORRELATION))
         return np.concatenate([data.ravel(), ((x - centre) / spread)[free]])
 
+    centre, spread, scale, low, high, free = _unknowns(limb)
+    start = centre + np.repeat([0.0, 1e-4, 0.0, 0.0, 0.0], [count, count, count, count, 1])
+
     def put(part: Array) -> Array:
-        x = start.copy()
+        x: Array = start.copy()
         x[free] = part
         return x
 
     def of_part(part: Array) -> Array:
         return residual(put(part))
 
-    def full(values: Array) -> Array:
-        return np.append(np.repeat(values[:4], count), values[4])
-
-    centre = np.zeros(4 * count + 1)
-    centre[count : 2 * count] = [segment.material_damping for segment in limb.segments]
-    spread, scale, low, high = full(SPREAD), full(SCALE), full(LOW), full(HIGH)
-    free = np.ones(len(centre), dtype=bool)
-    free[2 * count : 4 * count] = any(limb.gravity[:2])
-    start = centre + full(np.array([0.0, 1e-4, 0.0, 0.0, 0.0]))
     solution = least_squares(
         of_part,
         start[free],
@@ -101,6 +95,20 @@ def fit_pcc(limb: Limb, prepared: Prepared, offset: Array) -> tuple[tuple[Segmen
     found = put(solution.x)
     error = (angles(found) - prepared.log.bend_angles)[rows]
     return segments_of(limb, found), np.asarray(np.sqrt(np.mean(error**2, axis=0)))
+
+
+def _unknowns(limb: Limb) -> tuple[Array, Array, Array, Array, Array, NDArray[np.bool_]]:
+    """Return centres, spreads, scales and bounds of the (4M + 1,) unknowns, and which are free."""
+    count = limb.segment_count
+
+    def each(values: Array) -> Array:
+        return np.append(np.repeat(values[:4], count), values[4])
+
+    centre = np.zeros(4 * count + 1)
+    centre[count : 2 * count] = [segment.material_damping for segment in limb.segments]
+    free = np.ones(len(centre), dtype=bool)
+    free[2 * count : 4 * count] = any(limb.gravity[:2])
+    return centre, each(SPREAD), each(SCALE), each(LOW), each(HIGH), free
 
 
 def segments_of(limb: Limb, x: Array) -> tuple[Segment, ...]:
