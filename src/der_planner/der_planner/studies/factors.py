@@ -131,7 +131,10 @@ FACTORS: dict[str, Factor] = {
         "m", "where along the limb, from the clamp; 0: at the tip", PLANNED, 0.0, 0.0, 10.0
     ),
     "feedback": Factor(
-        "-", "whether commands are revised while the limb moves", (RUN,), "off",
+        "-",
+        "whether commands are revised while the limb moves",
+        (RUN,),
+        "off",
         choices=("off", "on"),
     ),
     "latency": Factor(

@@ -85,9 +85,11 @@ def _lines(study: Study, plot: Mapping[str, str], rows: Records, panel: Axes) ->
     """Draw the mean of y over x, one line for each value of ``lines``, ± a standard deviation."""
     (x_label, x_factor), (y_label, y_factor) = (quantity(plot[key], study) for key in ("x", "y"))
     by = plot.get("lines")
+    names = [] if _number(rows[0][plot["x"]]) else sorted({each[plot["x"]] for each in rows})
     for place, value in enumerate(sorted({each[by] for each in rows}, key=_order) if by else [""]):
         mine = [each for each in rows if not by or each[by] == value]
-        x, mean, deviation = spread_over(mine, plot["x"], plot["y"])
+        at, mean, deviation = spread_over(mine, plot["x"], plot["y"])
+        x = np.array([names.index(name) if names else name for name in at], dtype=float)
         look: dict[str, Any] = {"color": style.colour(str(value), place)}
         label = value.upper() if by == "model" else f"{by} {value}" if by else None
         panel.plot(
@@ -97,17 +99,19 @@ def _lines(study: Study, plot: Mapping[str, str], rows: Records, panel: Axes) ->
         low, high = (mean - deviation) * y_factor, (mean + deviation) * y_factor
         panel.fill_between(x * x_factor, low, high, alpha=0.18, lw=0, **look)
     panel.set(xlabel=x_label, ylabel=y_label)
+    if names:
+        panel.set_xticks(range(len(names)), names, rotation=30, ha="right")
     panel.set_ylim(bottom=0.0)
     if by:
         panel.legend()
 
 
-def spread_over(rows: Records, x: str, y: str) -> tuple[Array, Array, Array]:
+def spread_over(rows: Records, x: str, y: str) -> tuple[list[Any], Array, Array]:
     """Return the values of x, and mean and standard deviation of y at each of them."""
     places = sorted({each[x] for each in rows}, key=_order)
     groups = [np.array([each[y] for each in rows if each[x] == place]) for place in places]
     deviation = [group.std(ddof=1) if len(group) > 1 else 0.0 for group in groups]
-    return np.array(places), np.array([group.mean() for group in groups]), np.array(deviation)
+    return places, np.array([group.mean() for group in groups]), np.array(deviation)
 
 
 def _map(study: Study, plot: Mapping[str, str], rows: Records, panel: Axes) -> None:
