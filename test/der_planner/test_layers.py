@@ -6,7 +6,15 @@ from pathlib import Path
 import der_planner
 
 ROOT = Path(der_planner.__file__).parent
-LAYERS = {"limb": 0, "rod": 1, "pcc": 1, "model": 2, "planning": 3, "identification": 4}
+LAYERS = {
+    "limb": 0,
+    "rod": 1,
+    "pcc": 1,
+    "model": 2,
+    "planning": 3,
+    "identification": 4,
+    "control": 4,
+}
 """Parts with a place in the order; an import must go to a lower one, or stay inside its part."""
 
 
