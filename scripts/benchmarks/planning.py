@@ -51,7 +51,7 @@ def run(quick: bool) -> Figures:
 
 def without_limits(limb: Limb) -> Limb:
     """Return the limb with limits that no motion meets, to see the method alone."""
-    air = dataclasses.replace(limb.pneumatics, slew_limit=1e6, fill_rate=1e6, pressure_limit=1e5)
+    air = dataclasses.replace(limb.pneumatics, slew_limit=1e6, pressure_limit=1e5)
     return dataclasses.replace(limb, pneumatics=air)
 
 

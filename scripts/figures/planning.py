@@ -98,7 +98,7 @@ def draw_limits(path: Path) -> None:
     """What a slew limit leaves of a fast motion: cut afterwards, or known to the optimisation."""
     limb = Limb.default()
     free = dataclasses.replace(
-        limb, pneumatics=dataclasses.replace(limb.pneumatics, slew_limit=1e6, fill_rate=1e6)
+        limb, pneumatics=dataclasses.replace(limb.pneumatics, slew_limit=1e6)
     )
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), layout="constrained")
     motion = Motion.named("opposite_direction", period=3.0, cycles=2)

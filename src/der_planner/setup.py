@@ -12,7 +12,7 @@ setup(
     name=PACKAGE,
     version=ElementTree.parse("package.xml").findtext("version"),
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
-    package_data={PACKAGE: ["py.typed", "data/*"]},
+    package_data={PACKAGE: ["py.typed", "data/*", "page/static/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
@@ -32,7 +32,7 @@ setup(
         "piqp",
         "threadpoolctl",
     ],
-    extras_require={"test": ["pytest"]},
+    extras_require={"page": ["nicegui==3.18.*"], "test": ["pytest"]},
     zip_safe=False,
     maintainer="DER planner maintainers",
     maintainer_email="maintainers@example.org",
@@ -43,6 +43,7 @@ setup(
             "planner = der_planner.nodes.entry:planner",
             "recorder = der_planner.nodes.entry:recorder",
             "limb_twin = der_planner.nodes.entry:limb_twin",
+            "page = der_planner.nodes.entry:page",
         ],
     },
 )

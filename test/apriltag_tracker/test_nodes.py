@@ -176,7 +176,7 @@ def test_bad_input_is_named_and_gives_no_state(graph, states, tags, model):
     for k, (message, reason) in enumerate(
         [
             (image_message(good[:480, :640], now + 301), "640 x 480"),
-            (image_message(good, now + 302, encoding="bayer_rggb8"), "bayer_rggb8"),
+            (image_message(good, now + 302, encoding="yuv422p"), "yuv422p"),
             (image_message(np.zeros_like(good), now + 303), "no limb tag"),
         ]
     ):

@@ -7,13 +7,15 @@ import der_planner
 
 ROOT = Path(der_planner.__file__).parent
 LAYERS = {
-    "limb": 0,
-    "rod": 1,
-    "pcc": 1,
-    "model": 2,
-    "planning": 3,
-    "identification": 4,
-    "control": 4,
+    "limb_declaration": 0,
+    "limb_parameters": 1,
+    "limb": 2,
+    "rod": 3,
+    "pcc": 3,
+    "model": 4,
+    "planning": 5,
+    "identification": 6,
+    "control": 6,
 }
 """Parts with a place in the order; an import must go to a lower one, or stay inside its part."""
 

@@ -201,7 +201,7 @@ def test_a_malformed_limb_file_is_refused_before_anything_starts(experiment, tmp
     limb.write_text(text.replace("bending_stiffness: 0.0175", "bending_stiffness: -1.0", 1))
     run = experiment("--limb", str(limb))
     assert run.finish() == 2
-    assert "segments[0].bending_stiffness must be positive" in run.errors
+    assert "segments[0].bending_stiffness must be above 0 N" in run.errors
     assert not run.out.exists()
 
 

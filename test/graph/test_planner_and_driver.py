@@ -3,6 +3,7 @@
 import contextlib
 import signal
 import uuid
+from pathlib import Path
 
 import pytest
 
@@ -27,6 +28,7 @@ class Rig:
         self.commands = node.create_publisher(MotionCommand, topics.COMMAND, qos.COMMANDS)
         self.link = f"/tmp/der_limb_board_test_{uuid.uuid4().hex[:8]}"
         graph.start("pressure_driver", "board_emulator", port_link=self.link)
+        self.wait(Path(self.link).exists, "the board's port")
         self.driver = self.start_driver("driver")
         self.planner = graph.start("der_planner", "planner")
         self.client.wait_ready(["board_emulator", "pressure_driver", "planner"])

@@ -236,7 +236,7 @@ def test_a_guardian_that_fails_is_a_fault_and_is_replaced(run, number):
     os.kill(guardian, number)
     case.time_to_vent(begin)
     wait_for(lambda: "another one is started" in case.say(), "the new guardian")
-    assert "nothing would vent the limb if the driver died" in case.say()
+    wait_for(lambda: "nothing would vent the limb if the driver died" in case.say(), "the fault")
     wait_for(lambda: not alive(guardian), "the end of the old guardian")
     wait_for(case.pressurised, "pressure again")
     begin = time.time_ns()

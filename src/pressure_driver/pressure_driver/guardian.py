@@ -11,14 +11,17 @@ Messages come over a socket that keeps their bounds (one letter, then contents):
 ``P`` the vent command; with it comes the descriptor of the port that has been opened
 ``V`` a newer vent command
 ``L`` the port is lost: close the descriptor, so that the device can come back under its name
-``.`` a sign of life; it is answered with the same letter
+``.`` a sign of life of a driver that commands pressures; it is answered with this letter
+``z`` a sign of life of a driver that has told the board to vent; it is answered with ``.``
 ``G`` the driver has vented the board and ends: close everything and end with exit code 0
 ===== =========================================================================================
 
-If no sign of life comes for `HEARTBEAT_TIMEOUT`, or the socket closes without a ``G``, the guardian
-kills the driver (one that hangs must not wake up later and write old pressures), throws away what
-waits in the port's output queue, sends the vent command for `VENT_TIME`, and ends with exit code 1.
-It has a session of its own and ignores the signals by which people and terminals end programs.
+If no sign of life comes for `HEARTBEAT_TIMEOUT` (`VENTED_TIMEOUT` after a ``z``: the board holds no
+pressure then, and a driver that starts may well be slow), or the socket closes without a ``G``, the
+guardian kills the driver (one that hangs must not wake up later and write old pressures), throws
+away what waits in the port's output queue, sends the vent command for `VENT_TIME`, and ends with
+exit code 1. It has a session of its own and ignores the signals by which people and terminals end
+programs.
 """
 
 from __future__ import annotations
@@ -35,6 +38,8 @@ import time
 
 HEARTBEAT_TIMEOUT = 0.22
 """[s] without a sign of life. The rest of the promised 0.3 s is for the kill and the first vent."""
+VENTED_TIMEOUT = 3.0
+"""[s] the same while the last command on the wire was to vent: nothing presses then."""
 LATE_WAKE = 0.05
 """[s] The guardian woke up this much too late: the whole machine stood still, the driver too."""
 END_TIMEOUT = 0.04
@@ -66,6 +71,7 @@ class Guardian:
         self._driver = driver
         self._port = -1
         self._vent = b""
+        self._timeout = VENTED_TIMEOUT
 
     def run(self) -> int:
         """Return the exit code: 0 after a goodbye, 1 after a driver that had to be replaced."""
@@ -80,7 +86,7 @@ class Guardian:
 
     def _listen(self) -> str:
         """Serve messages; return why the driver counts as failed, or nothing after a goodbye."""
-        deadline = time.monotonic() + HEARTBEAT_TIMEOUT
+        deadline = time.monotonic() + self._timeout
         while True:
             planned = max(deadline - time.monotonic(), 0.0)
             begin = time.monotonic()
@@ -89,7 +95,7 @@ class Guardian:
                 if now - begin > planned + LATE_WAKE:
                     deadline = now + LATE_WAKE
                     continue
-                return f"no sign of life from the driver for {HEARTBEAT_TIMEOUT:g} s"
+                return f"no sign of life from the driver for {self._timeout:g} s"
             message, descriptors = self._receive()
             if not message:
                 return "the driver has ended without a goodbye"
@@ -97,7 +103,7 @@ class Guardian:
                 return ""
             self._take(message, descriptors)
             # Whatever comes is a sign of life; one that has waited here counts from now on.
-            deadline = time.monotonic() + HEARTBEAT_TIMEOUT
+            deadline = time.monotonic() + self._timeout
 
     def _receive(self) -> tuple[bytes, list[int]]:
         try:
@@ -108,7 +114,8 @@ class Guardian:
 
     def _take(self, message: bytes, descriptors: list[int]) -> None:
         kind, contents = message[:1], message[1:]
-        if kind == b".":
+        if kind in b".z":
+            self._timeout = VENTED_TIMEOUT if kind == b"z" else HEARTBEAT_TIMEOUT
             with contextlib.suppress(OSError):
                 self._channel.send(b".", socket.MSG_DONTWAIT)
         if kind in b"PV":

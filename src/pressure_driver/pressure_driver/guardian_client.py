@@ -43,6 +43,7 @@ class GuardianClient:
         self._channel: socket.socket | None = None
         self._vent = b""
         self._beat_at = 0.0
+        self._said_vented = True
         self._told_at = 0.0
         self._answer_at = 0.0
         self._executor_at: float | None = None
@@ -110,19 +111,22 @@ class GuardianClient:
             self._vent = vent
             self._send(b"V" + vent)
 
-    def beat(self) -> None:
+    def beat(self, vented: bool) -> None:
         """Show a sign of life, unless the last one is young or the executor stands still.
+
+        Args:
+            vented: the last command on the wire was to vent; the guardian is more patient then.
 
         Raises:
             GuardianError: the guardian has ended, or does not answer.
         """
         now = time.monotonic()
-        if now - self._beat_at < BEAT_PERIOD / 2.0:
+        if now - self._beat_at < BEAT_PERIOD / 2.0 and vented == self._said_vented:
             return
         if self._executor_at is not None and now - self._executor_at > EXECUTOR_TIMEOUT:
             return
-        self._beat_at = now
-        if not self._send(b"."):
+        self._beat_at, self._said_vented = now, vented
+        if not self._send(b"z" if vented else b"."):
             raise GuardianError("the guardian has ended")
         with contextlib.suppress(BlockingIOError):
             assert self._channel is not None

@@ -133,7 +133,7 @@ class SerialLink:
         self._bytes_waiting: select.epoll | None = None
         self._unsent = b""
         self._drained_at = 0.0
-        self._was_venting = False
+        self._was_venting = True
         self._retry_delay = FIRST_RETRY
         self._retry_at = 0.0
         self._name_exists = True
@@ -227,6 +227,9 @@ class SerialLink:
         if venting and not self._was_venting:
             self._drop_unsent()
             data = self._client.separator + data
+        if self._was_venting and not venting:
+            self._was_venting = False
+            self._show_life()  # the guardian becomes strict before the first pressure
         self._was_venting = venting
         self._watch_queue()
         self._write(data)
@@ -360,7 +363,7 @@ class SerialLink:
         if self._guardian is None or not self._guardian.running:
             return
         try:
-            self._guardian.beat()
+            self._guardian.beat(self._was_venting)
             if self._guardian.wants_vent():
                 self._guardian.renew(self._client.emergency())
         except GuardianError as error:
@@ -415,4 +418,4 @@ class SerialLink:
         """Show a sign of life at the end, when a guardian that has failed is not replaced."""
         if self._guardian is not None and self._guardian.running:
             with contextlib.suppress(GuardianError):
-                self._guardian.beat()
+                self._guardian.beat(vented=False)

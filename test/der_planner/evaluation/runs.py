@@ -111,6 +111,7 @@ class BagOfRun:
             TIMES[index],
             plan_id=plan_id,
             index=index,
+            revision=0,
             differential_pressure=np.asarray(value, dtype=float),
         )
 

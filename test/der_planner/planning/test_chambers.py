@@ -201,12 +201,12 @@ def test_limb_file_carries_the_law_and_refuses_what_it_cannot_be(tmp_path):
     limb = slow(vent_exponent=0.7)
     limb.to_yaml(tmp_path / "limb.yaml")
     assert Limb.from_yaml(tmp_path / "limb.yaml") == limb
-    assert "vent_rate [Pa/s, of a chamber at 10 kPa" in (tmp_path / "limb.yaml").read_text()
+    assert "# [Pa/s] fall of a chamber at 10 kPa" in (tmp_path / "limb.yaml").read_text()
     assert LIMB.pneumatics.vent_rate == 0.0
     for key, value, message in (
-        ("vent_rate", -1.0, r"pneumatics\.vent_rate must be 0 or more"),
-        ("vent_exponent", 0.0, r"pneumatics\.vent_exponent must be positive"),
-        ("vent_exponent", 1.5, r"pneumatics\.vent_exponent must be 1 \(a tube\) or less"),
+        ("vent_rate", -1.0, r"pneumatics\.vent_rate must be at least 0 Pa/s, got -1"),
+        ("vent_exponent", 0.0, r"pneumatics\.vent_exponent must be above 0 and at most 1, got 0"),
+        ("vent_exponent", 1.5, r"pneumatics\.vent_exponent must be above 0 and at most 1, got 1.5"),
     ):
         with pytest.raises(LimbError, match=message):
             slow(**{key: value})

@@ -173,7 +173,7 @@ def test_a_calibrated_limb_with_every_effect_is_followed(model_name, method):
 @pytest.mark.parametrize(("model_name", "method"), EVERY)
 @pytest.mark.parametrize("name", ["same_direction", "star"])
 def test_limits_are_never_violated(model_name, method, name):
-    limb = changed(LIMB, {"slew_limit": 7000.0, "fill_rate": 7000.0, "pressure_limit": 21e3})
+    limb = changed(LIMB, {"slew_limit": 7000.0, "pressure_limit": 21e3})
     result = plan(limb, Motion.named(name, period=3.0, cycles=1), model_name, method)
     steps = np.diff(result.differential_pressure, axis=0, prepend=0.0)
     assert np.abs(result.differential_pressure).max() <= 21e3 + 1e-6

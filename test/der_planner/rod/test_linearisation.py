@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from der_planner.limb import Limb
-from der_planner.rod import ConvergenceError, Rod
+from der_planner.rod import ConvergenceError, Rod, integration
 
 METHODS = ["sdirk2", "midpoint", "backward_euler"]
 
@@ -155,8 +155,10 @@ def test_tangent_by_the_initial_state(motion):
 
 
 @pytest.mark.parametrize("kind", ["planar", "space"])
-def test_a_step_that_fails_is_cut_and_the_linearisation_is_that_of_the_cut_steps(kind):
-    """A jolt that no step of 0.1 s follows: cut, it is the derivative of the motion as computed."""
+def test_the_linearisation_of_a_cut_step_is_its_derivative(kind, monkeypatch):
+    """A jolt that a step of 0.1 s cannot follow, in space with fewer iterations than it takes."""
+    if kind == "space":
+        monkeypatch.setattr(integration, "_LIMIT", 12)
     gravity = (0.3, -2.0, 0.0 if kind == "planar" else -2.0)
     rod = Rod.from_limb(dataclasses.replace(Limb.default(), gravity=gravity))
     start = rod.equilibrium([0.0, 0.0])
@@ -320,3 +322,23 @@ def test_linearised_equilibrium_is_its_derivative(rod):
         behind = rod.equilibrium(u - step, start=state).q
         expected = (ahead - behind) / 2
         np.testing.assert_allclose(found[:, m], expected, atol=1e-5 * np.abs(found[:, m]).max())
+
+
+@pytest.mark.parametrize("plane", ["xz", None])
+def test_a_rod_without_segments_is_linearised_by_its_start(plane):
+    rod = Rod.uniform(
+        length=0.25, nodes=6, EI=0.06, EA=1e3, GJ=0.04, mass_per_length=0.9,
+        gravity=(0.0, 0.0, -9.81), clamp="inside", plane=plane,
+    )  # fmt: skip
+    state = rod.straight_state()
+    none = np.zeros((10, 0))
+    run = rod.simulate(state, none, 0.01, linearise=True)
+    step = 1e-6
+    start = np.zeros(len(rod.free))
+    v = state.v.copy()
+    start[-1] = step
+    v[rod.free[-1]] += step
+    moved = rod.simulate(rod.state(state.q, v), none, 0.01)
+    predicted = run.linearisation.tangent(none, (0.0 * start, start))
+    actual = moved.q[-1, -1] - run.q[-1, -1]
+    assert predicted[-1, -1] == pytest.approx(actual, rel=1e-3)

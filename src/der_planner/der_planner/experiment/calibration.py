@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import uuid
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,6 @@ from der_planner.identification import Excitation
 from der_planner.planning.streaming import GRID, first_stamp
 from limb_interfaces import qos, stamps, topics
 
-PLAN_ID = "calibration"
 LEAD = 200_000_000
 """A setpoint is sent at least this much [ns] before its stamp."""
 LOOK = 50_000_000
@@ -49,6 +49,8 @@ class GraphCalibration(GraphPlayer):
         self._bag = folder / "bag"
         self._metadata = metadata
         self._seed = seed
+        # The driver refuses a plan that it has heard before an arming: each run has its own.
+        self._plan_id = f"calibration-{uuid.uuid4().hex[:8]}"
         self._start_stamp = 0
         self._next = 0
         self._publisher: Any = None
@@ -95,7 +97,7 @@ class GraphCalibration(GraphPlayer):
             stamp = self._start_stamp + self._next * GRID
             if stamp - now > LEAD + LOOK:
                 return
-            setpoint = PressureSetpoint(plan_id=PLAN_ID, index=self._next)
+            setpoint = PressureSetpoint(plan_id=self._plan_id, index=self._next)
             setpoint.header.stamp = stamps.stamp_from_nanoseconds(stamp)
             setpoint.header.frame_id = topics.BASE_FRAME
             values = self._excitation.differential_pressure[self._next]

@@ -319,7 +319,6 @@ def _finish(
             time_constant=air.fill_lag,
             vent_time_constant=air.vent_lag,
             delay=air.delay,
-            fill_rate=air.fill_rate if np.isfinite(air.fill_rate) else pneumatics.fill_rate,
         )
         if np.isfinite(air.vent_rate):
             pneumatics = replace(

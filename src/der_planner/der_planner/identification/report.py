@@ -123,7 +123,7 @@ class FitReport:
         air = self.air
         # A run without fast steps never shows how fast a chamber fills.
         seen = np.isfinite(air.fill_rate)
-        rate = f"{air.fill_rate:.0f} Pa/s" if seen else "not shown by this run, kept"
+        rate = f"{air.fill_rate:.0f} Pa/s" if seen else "not shown by this run"
         venting = "how slowly chambers are venting: not shown by this run, kept"
         if math.isfinite(air.vent_rate):
             speed, exponent = air.vent_uncertainty

@@ -18,3 +18,8 @@ def recorder() -> int:
 def limb_twin() -> int:
     """Run the twin of the limb."""
     return int(run_module("der_planner.nodes.limb_twin"))
+
+
+def page() -> int:
+    """Run the operator's page."""
+    return run_module("der_planner.page.node")

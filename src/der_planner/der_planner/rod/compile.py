@@ -21,7 +21,7 @@ _FLAGS = {"contract", "reassoc", "nsz", "arcp"}  # NaN must stay visible: it end
 def drop_stale_caches() -> None:
     """Delete cached kernels if any kernel source is not the one that they were compiled from."""
     digest = hashlib.sha256()
-    for source in sorted(_FOLDER.rglob("*_kernel.py")):
+    for source in [Path(__file__), *sorted(_FOLDER.rglob("*_kernel.py"))]:
         digest.update(source.read_bytes())
     stamp = _FOLDER / "__pycache__" / "kernels.sha256"
     with contextlib.suppress(OSError):  # a read-only install: numba then caches elsewhere by itself
@@ -37,18 +37,22 @@ drop_stale_caches()
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function with a cache on disk, without the interpreter lock."""
-    return _compile(function)
+    """Compile a function with a cache on disk, without the interpreter lock.
+
+    It may not make arrays, and so need not count references to those that it gets: with tuples of
+    arrays the counting costs up to a third of a step. The caller keeps them alive.
+    """
+    return _compile(function, _nrt=False)
 
 
 def inlined_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """As `kernel`, put into its callers: a call with tuples of arrays costs as much as its work."""
-    return _compile(function, inline="always")
+    return _compile(function, _nrt=False, inline="always")
 
 
-def parallel_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """As `kernel`, its `numba.prange` loops on all cores (`numba.set_num_threads` sets fewer)."""
-    return _compile(function, parallel=True)
+def allocating_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """As `kernel`, for a function that makes arrays of its own."""
+    return _compile(function, _nrt=True)
 
 
 def _compile(function: Callable[..., Any], **options: bool | str) -> Callable[..., Any]:

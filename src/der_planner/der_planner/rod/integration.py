@@ -182,7 +182,8 @@ def _solved(journey: _Journey, pressures: Array) -> Solved:
     else:
         record = Record(*(np.concatenate(parts) for parts in zip(*journey.records, strict=True)))
     steps = np.concatenate(journey.steps)
+    intervals, count, inputs = pressures.shape
     return Solved(
         record, np.concatenate(journey.rates), np.concatenate(journey.extrapolates), steps,
-        pressures.reshape(-1, pressures.shape[2])[steps], journey.load,
+        pressures.reshape(intervals * count, inputs)[steps], journey.load,
     )  # fmt: skip

@@ -19,7 +19,7 @@ from der_planner.rod.banded_kernel import (
     solve_columns,
     solve_transposed,
 )
-from der_planner.rod.compile import kernel
+from der_planner.rod.compile import allocating_kernel, kernel
 from der_planner.rod.state import Array
 from der_planner.rod.step_kernel import Record
 
@@ -89,7 +89,7 @@ def ends_interval(solve: int, steps: int, chain: Chain) -> bool:
     return bool(chain.steps[solve + 1] // steps > chain.steps[solve] // steps)
 
 
-@kernel
+@allocating_kernel
 def tangent(change: Array, start: Array, chain: Chain, out: Array) -> None:
     """Fill out (K+1, P) with the change of the outputs for a change (K, S, M) of the inputs.
 
@@ -114,7 +114,7 @@ def tangent(change: Array, start: Array, chain: Chain, out: Array) -> None:
             put_outputs(dq, chain.outputs, out[k + 1])
 
 
-@kernel
+@allocating_kernel
 def forced(forces: Array, start: Array, steps: int, chain: Chain, out: Array) -> None:
     """Fill out (K+1, P) with the change of the outputs for forces (solves, n) in each solve."""
     size = start.shape[1]
@@ -131,7 +131,7 @@ def forced(forces: Array, start: Array, steps: int, chain: Chain, out: Array) ->
             put_outputs(dq, chain.outputs, out[chain.steps[s] // steps + 1])
 
 
-@kernel
+@allocating_kernel
 def adjoint(weight: Array, chain: Chain, gradient: Array, start: Array) -> None:
     """Fill gradient (K, S, M) and start (2, n): `tangent` transposed, times weight (K+1, P)."""
     _, steps, count = gradient.shape
@@ -185,7 +185,7 @@ def gauge_transposed(gauge: Array, lq: Array, before: Array) -> None:
             before[here] -= gauge[j, 3 + k] * weight
 
 
-@kernel
+@allocating_kernel
 def sensitivity(
     pulse: Array, intervals: int, steps: int, chunk: int, chain: Chain, out: Array
 ) -> None:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from der_planner.rod.banded_kernel import expand, hold_rows
-from der_planner.rod.compile import kernel
+from der_planner.rod.compile import allocating_kernel, kernel
 from der_planner.rod.spatial.assembly_kernel import assemble, unsymmetric
 from der_planner.rod.spatial.elastic_kernel import (
     Base,
@@ -131,7 +131,7 @@ def add_gauge(x: Array, x_n: Array, back: Array, space: SpatialSpace) -> None:
                 back[row, near + 4] -= value * turning[3 + k]
 
 
-@kernel
+@allocating_kernel
 def add_viscous(i: int, x: Array, rate: float, strength: float, space: SpatialSpace) -> None:
     """Add c ∇κ (∇²κ v)ᵀ to space.a and c rate ∇κ ∇κᵀ to space.drag, both curvatures of node i."""
     frame, v, local = space.frame, space.v, space.local

@@ -1,0 +1,95 @@
+"""Write the page of a limb's parameters, doc/limb_parameters.md, from their declaration.
+
+python3 scripts/write_limb_page.py
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from der_planner.limb import CalibratedRange, Limb, Pneumatics, Segment
+from der_planner.limb_declaration import Parameter, Term, parameters
+
+PAGE = Path(__file__).resolve().parents[2] / "doc" / "limb_parameters.md"
+_HEAD = """\
+# The parameters of a limb
+
+Written by `python3 scripts/write_limb_page.py` from
+[limb_parameters.py](../der_planner/limb_parameters.py) and [limb.py](../der_planner/limb.py):
+change them there.
+
+All values are SI. A key without a default has to be in the limb file. "Fit" is the unknown by
+which the [calibration](identification.md) finds the value: its unit, its bounds, and ± the standard
+deviation of what is known before any data. A relative one is ln(value / the prior's). Without an
+entry there, the fit of the bend angles keeps the value; lengths and air have fits of their own.
+"""
+_SECTIONS: tuple[tuple[str, Any], ...] = (
+    ("`segments`, `pcc_segments`: one entry per segment", Segment),
+    ("`pneumatics`", Pneumatics),
+    ("The limb itself", Limb),
+    ("`calibrated`: one value per segment", CalibratedRange),
+)
+
+
+def page() -> str:
+    """Return the page in Markdown."""
+    return "\n".join([_HEAD, *(line for section in _SECTIONS for line in _section(*section))])
+
+
+def _section(title: str, kind: Any) -> Iterator[str]:
+    yield f"## {title}\n"
+    yield "| key | unit | range | default | meaning | how to choose | fit |"
+    yield "|---|---|---|---|---|---|---|"
+    defaults = {item.name: item.default for item in dataclasses.fields(kind)}
+    for name, declared in parameters(kind).items():
+        cells = (
+            f"`{name}`",
+            declared.unit,
+            declared.range,
+            _default(defaults[name]),
+            declared.text + _needs(declared),
+            declared.choose,
+            _fit(declared.fit),
+        )
+        yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+    yield ""
+
+
+def _default(value: Any) -> str:
+    if value is dataclasses.MISSING:
+        return ""
+    return f"{value:.4g}" if isinstance(value, float) else str(list(value))
+
+
+def _needs(declared: Parameter) -> str:
+    return f"; above 0 where `{declared.needs}` is" if declared.needs else ""
+
+
+def _fit(term: Term | None) -> str:
+    if term is None:
+        return ""
+    name = f"relative, `{term.name}`" if term.relative else f"`{term.name}`"
+    unit = "" if term.unit == "-" else f" {term.unit}"
+    spread = f", ± {term.spread:g}" if term.spread < float("inf") else ""
+    return f"{name} ({term.group}): {term.low:g} to {term.high:g}{unit}{spread}"
+
+
+def main() -> int:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, default=PAGE, help="file to write")
+    out = parser.parse_args().out
+    out.write_text(page(), encoding="utf-8")
+    print(f"wrote {out}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,84 @@
+"""What the page can ask of the graph; `node` does it by ROS services and topics."""
+
+from __future__ import annotations
+
+import asyncio
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+Service = Literal["vent", "arm", "start", "stop", "record_start", "record_stop"]
+
+PATIENCE = 3.0
+"""[s] to wait for a service's answer."""
+
+OWNERS: dict[Service, str] = {
+    "vent": "pressure_driver",
+    "arm": "pressure_driver",
+    "start": "planner",
+    "stop": "planner",
+    "record_start": "recorder",
+    "record_stop": "recorder",
+}
+"""The node that serves each."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What came of a request, in the words of the node that was asked."""
+
+    success: bool
+    message: str
+
+
+@dataclass(frozen=True)
+class MotionRequest:
+    """A named motion to play.
+
+    Attributes:
+        motion: its name.
+        model: `der` or `pcc`.
+        method: of the planner; empty: the best for the model.
+        amplitude: [rad].
+        period: [s] of one cycle.
+        cycles: how many.
+    """
+
+    motion: str
+    model: str
+    method: str
+    amplitude: float
+    period: float
+    cycles: int
+
+
+class Commands(Protocol):
+    """The graph as the page commands it; every method returns at once, from any thread."""
+
+    def call(self, service: Service) -> Future[Answer]:
+        """Call a service; the future fails only if the page itself is at fault."""
+        ...
+
+    def play(self, request: MotionRequest) -> Answer:
+        """Ask the planner to plan and play a motion."""
+        ...
+
+    def record(self, note: str) -> Future[Answer]:
+        """Start recording, with a note in the bag."""
+        ...
+
+
+async def answer_of(service: Service, pending: Future[Answer]) -> Answer:
+    """Wait for a service's answer, and say so if none comes."""
+    owner = OWNERS[service]
+    try:
+        return await asyncio.wait_for(asyncio.wrap_future(pending), PATIENCE)
+    except asyncio.TimeoutError:
+        text = f"no answer from {owner} within {PATIENCE:.0f} s"
+    except Exception as error:  # whatever failed, the operator must read it
+        text = f"{owner}: {error or type(error).__name__}"
+    if service == "vent":
+        text += (
+            ": NOT VENTED as far as the page knows; close the supply and open the valves by hand"
+        )
+    return Answer(False, text)

@@ -1,0 +1,139 @@
+"""Where the limb, its tags and its path are in the camera's picture."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apriltag_tracker.camera import CameraPose, Intrinsics, project
+from apriltag_tracker.tag import Tag
+from apriltag_tracker.tag_map import TagMap
+from apriltag_tracker.world import WorldPose
+from der_planner.page.situation import LimbView
+
+KEPT = 60
+"""Views of the limb kept, so that each picture gets its own: 2 s at 30 Hz."""
+PATH_POINTS = 200
+CURVE_POINTS = 40
+
+
+class Overlay:
+    """Turns metres in `limb_base` into pixels, with the camera's pose from the fixed tags.
+
+    Args:
+        tags: the tag map that the tracker uses.
+    """
+
+    def __init__(self, tags: TagMap) -> None:
+        self._tags = tags
+        self._height = max(tag.height for tag in tags.limb)
+        self._lock = threading.Lock()
+        self._intrinsics: Intrinsics | None = None
+        self._world: WorldPose | None = None
+        self._views: deque[LimbView] = deque(maxlen=KEPT)
+        self._corners: deque[tuple[int, list[list[float]]]] = deque(maxlen=KEPT)
+        self._path: NDArray[np.float64] = np.empty((0, 2))
+        self._limb: NDArray[np.float64] = np.empty((0, 2))
+
+    def put_camera(self, intrinsics: Intrinsics) -> None:
+        """Take the camera's calibration; the pose is found anew if it changed."""
+        with self._lock:
+            old = self._intrinsics
+            same = old is not None and np.array_equal(old.matrix, intrinsics.matrix)
+            if not same:
+                self._intrinsics = intrinsics
+                self._world = WorldPose(self._tags, intrinsics)
+
+    def put_tags(self, stamp: int, tags: Sequence[Tag]) -> None:
+        """Take the tags of one image [ns]; fixed ones tell where the camera is."""
+        with self._lock:
+            corners = [[round(float(v), 1) for v in tag.corners.ravel()] for tag in tags]
+            self._corners.append((stamp, corners))
+            if self._world is not None:
+                self._world.update(tags)
+
+    def put_limb(self, view: LimbView) -> None:
+        """Take the tracker's view of one image."""
+        with self._lock:
+            self._views.append(view)
+
+    def put_path(self, tip: NDArray[np.float64]) -> None:
+        """Take the reference path of the tip, (K, 2) m."""
+        step = max(1, len(tip) // PATH_POINTS)
+        with self._lock:
+            self._path = tip[::step]
+
+    def put_planned(self, curve: NDArray[np.float64]) -> None:
+        """Take the centreline (N, 2) m of the planned limb of now; empty: none."""
+        with self._lock:
+            self._limb = curve
+
+    def at(self, stamp: int, reference: tuple[float, float] | None) -> dict[str, Any]:
+        """Return what belongs over the picture of an instant, in pixels.
+
+        Args:
+            stamp: of the picture [ns].
+            reference: where the tip should be then [m].
+
+        Returns:
+            `tags`: eight numbers each; `curve`, `path`, `planned`: lists of points; `tip` and
+            `reference`: points or None; `matched`: whether the view is of this very picture;
+            `problem`: why nothing can be placed, else empty.
+        """
+        with self._lock:
+            view = _of(stamp, self._views)
+            newest = self._corners[-1][1] if self._corners else []
+            corners = next((c for s, c in reversed(self._corners) if s == stamp), newest)
+            pose = self._world.pose if self._world is not None else None
+            intrinsics, path, planned = self._intrinsics, self._path, self._limb
+            problem = "no calibration of the camera yet"
+            if self._world is not None:
+                problem = self._world.problem
+        answer: dict[str, Any] = {
+            "tags": corners,
+            "matched": view is not None and view.stamp == stamp,
+            "problem": problem,
+            "curve": [],
+            "path": [],
+            "planned": [],
+            "tip": None,
+            "reference": None,
+        }
+        if intrinsics is None or pose is None:
+            return answer
+        place = _Placer(intrinsics, pose, self._height)
+        if view is not None and view.valid:
+            curve = np.array(view.curve).reshape(-1, 2)
+            answer["curve"] = place(curve[:: max(1, len(curve) // CURVE_POINTS)])
+            answer["tip"] = place(np.array([view.tip]))[0]
+        answer["path"], answer["planned"] = place(path), place(planned)
+        if reference is not None:
+            answer["reference"] = place(np.array([reference]))[0]
+        return answer
+
+
+class _Placer:
+    def __init__(self, intrinsics: Intrinsics, pose: CameraPose, height: float) -> None:
+        self._intrinsics, self._pose, self._height = intrinsics, pose, height
+
+    def __call__(self, points: NDArray[np.float64]) -> list[list[float]]:
+        if not len(points):
+            return []
+        raised = np.column_stack([points, np.full(len(points), self._height)])
+        pixels: list[list[float]] = np.round(
+            project(self._intrinsics, self._pose, raised), 1
+        ).tolist()
+        return pixels
+
+
+def _of(stamp: int, views: Sequence[LimbView]) -> LimbView | None:
+    """Return the view of this picture, or the newest one."""
+    for view in reversed(views):
+        if view.stamp == stamp:
+            return view
+    return views[-1] if views else None

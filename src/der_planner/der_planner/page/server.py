@@ -1,0 +1,220 @@
+"""The page's HTTP server: live data, pictures, the vent button, log-in."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs
+
+import uvicorn
+from fastapi import FastAPI, Request, Response, WebSocket, WebSocketDisconnect
+from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse
+from fastapi.staticfiles import StaticFiles
+
+from der_planner.page.access import SESSION_LIFE, Binding, Sessions, bracketed
+from der_planner.page.commands import Commands, answer_of
+from der_planner.page.guard import COOKIE, LOGIN, Guard
+from der_planner.page.operators import Desk
+from der_planner.page.overlay import Overlay
+from der_planner.page.picture import PictureFeed
+from der_planner.page.situation import Situation
+
+STATIC = Path(__file__).parent / "static"
+RATE = 10.0
+"""Hz of the live data."""
+WRONG_PASSWORD_DELAY = 1.0
+"""[s] during which no other password is tried."""
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What the server shows and commands."""
+
+    situation: Situation
+    picture: PictureFeed
+    overlay: Overlay
+    desk: Desk
+    commands: Commands
+
+
+class LiveText:
+    """The live data as JSON, made once for all browsers."""
+
+    def __init__(self, parts: Parts, clock: Callable[[], float] = time.monotonic) -> None:
+        self._parts = parts
+        self._clock = clock
+        self._made = -1e9
+        self._text = ""
+        self._count = 0
+
+    def __call__(self) -> str:
+        """Return the data of now, or those made less than half an interval ago."""
+        now = self._clock()
+        if now - self._made > 0.5 / RATE:
+            self._made = now
+            self._count += 1
+            data = self._parts.situation.snapshot()
+            data["count"] = self._count
+            data["operator"] = self._parts.desk.operator is not None
+            self._text = json.dumps(data, separators=(",", ":"), allow_nan=False)
+        return self._text
+
+
+def create_app(parts: Parts, sessions: Sessions, secure: bool) -> FastAPI:
+    """Return the application without its layout.
+
+    Args:
+        parts: what it shows and commands.
+        sessions: who has given the password.
+        secure: served by TLS, so that cookies never travel without it.
+    """
+    app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
+    app.mount("/static", StaticFiles(directory=STATIC))
+    live = LiveText(parts)
+
+    @app.websocket("/live")
+    async def send_live(websocket: WebSocket) -> None:
+        await websocket.accept()
+        listening = asyncio.create_task(_until_closed(websocket))
+        try:
+            while not listening.done():
+                await websocket.send_text(live())
+                await asyncio.sleep(1.0 / RATE)
+        except (WebSocketDisconnect, RuntimeError):
+            pass  # the browser has gone
+        finally:
+            listening.cancel()
+
+    @app.post("/vent")
+    async def vent() -> JSONResponse:
+        # Whoever sees the page may vent, operator or not.
+        answer = await answer_of("vent", parts.commands.call("vent"))
+        return JSONResponse({"success": answer.success, "message": answer.message})
+
+    @app.get("/picture")
+    async def picture(after: int = 0) -> Response:
+        encoded = await asyncio.to_thread(parts.picture.take, after)
+        if encoded is None:
+            return Response(status_code=204)
+        reference = parts.situation.reference_at(encoded.stamp)
+        drawn = parts.overlay.at(encoded.stamp, reference) | {"number": encoded.number}
+        head = json.dumps(drawn, separators=(",", ":")).encode()
+        body = struct.pack(">I", len(head)) + head + encoded.jpeg
+        return Response(body, media_type="application/octet-stream", headers=_UNCACHED)
+
+    _add_login(app, sessions, secure)
+    return app
+
+
+_UNCACHED = {"Cache-Control": "no-store"}
+
+
+async def _until_closed(websocket: WebSocket) -> None:
+    try:
+        while True:
+            await websocket.receive()
+    except (WebSocketDisconnect, RuntimeError):
+        return
+
+
+def _add_login(app: FastAPI, sessions: Sessions, secure: bool) -> None:
+    form = (STATIC / "login.html").read_text()
+    trying = asyncio.Lock()
+
+    @app.get(LOGIN)
+    async def show_login() -> HTMLResponse:
+        return HTMLResponse(form.replace("{reason}", ""), headers=_UNCACHED)
+
+    @app.post(LOGIN)
+    async def log_in(request: Request) -> Response:
+        body = (await request.body())[:4096].decode(errors="replace")
+        password = parse_qs(body).get("password", [""])[0]
+        async with trying:
+            token = sessions.open(password)
+            if token is None:
+                await asyncio.sleep(WRONG_PASSWORD_DELAY)
+        if token is None:
+            text = form.replace("{reason}", "Wrong password.")
+            return HTMLResponse(text, status_code=403, headers=_UNCACHED)
+        answer = RedirectResponse("/", status_code=303)
+        answer.set_cookie(
+            COOKIE, token, max_age=int(SESSION_LIFE), httponly=True, secure=secure,
+            samesite="strict",
+        )  # fmt: skip
+        return answer
+
+
+class PageServer:
+    """Serves the page from a thread of its own.
+
+    Args:
+        binding: where, checked.
+        listener: bound socket.
+        parts: what it shows and commands.
+        lay_out: adds the layout to the application.
+    """
+
+    def __init__(
+        self,
+        binding: Binding,
+        listener: socket.socket,
+        parts: Parts,
+        lay_out: Callable[[FastAPI, Parts], None],
+    ) -> None:
+        self.port: int = listener.getsockname()[1]
+        self.url = f"{binding.scheme}://{bracketed(binding.address)}:{self.port}"
+        sessions = Sessions(binding.password)
+        app = create_app(parts, sessions, secure=bool(binding.certificate))
+        lay_out(app, parts)
+        self.guard = Guard(app, binding.hosts(self.port), binding.scheme, sessions)
+        self.error: BaseException | None = None
+        self._listener = listener
+        options: dict[str, Any] = {}
+        if binding.certificate:
+            options = {"ssl_certfile": binding.certificate, "ssl_keyfile": binding.private_key}
+        self._server = uvicorn.Server(
+            uvicorn.Config(
+                self.guard,
+                log_level=logging.WARNING,
+                access_log=False,
+                server_header=False,
+                proxy_headers=False,
+                ws_ping_interval=1.0,
+                ws_ping_timeout=2.0,
+                timeout_graceful_shutdown=1,
+                lifespan="on",
+                **options,
+            )
+        )
+        self._thread = threading.Thread(target=self._run, name="page", daemon=True)
+
+    def start(self) -> None:
+        """Begin to serve."""
+        self._thread.start()
+
+    @property
+    def ready(self) -> bool:
+        """Whether requests are answered."""
+        return self._server.started
+
+    def close(self) -> None:
+        """Stop serving; returns when the port is free, after 5 s at most."""
+        self._server.should_exit = True
+        if self._thread.is_alive():
+            self._thread.join(timeout=5.0)
+        self._listener.close()
+
+    def _run(self) -> None:
+        try:
+            self._server.run(sockets=[self._listener])
+        except BaseException as error:  # the node must hear of it, SystemExit too
+            self.error = error

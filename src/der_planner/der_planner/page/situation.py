@@ -1,0 +1,215 @@
+"""What the page knows of the graph, and how old each part of it is."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+PASCAL_PER_KILOPASCAL = 1000.0
+CENTIMETRES = 100.0
+NANOSECONDS = 1_000_000_000
+FRESH = {"driver": 0.5, "tracker": 0.5, "camera": 0.7}
+"""[s] that the newest message of a source may be old before the page greys it."""
+LATE, DEAD = 1.6, 5.0
+"""[s] without diagnostics, which every node sends once a second."""
+MODES = ("disarmed", "armed", "tracking", "holding", "venting", "fault")
+LEVELS = ("ok", "warning", "error", "stale")
+REFERENCES_KEPT = 200
+GAP = NANOSECONDS // 5
+"""[ns] between two references across which none is interpolated: four setpoints of 20 Hz."""
+
+
+@dataclass(frozen=True)
+class DriverState:
+    """What the driver says at a tick; pressures in Pa, NaN where unknown.
+
+    Attributes:
+        mode: number of its mode, an index of `MODES`.
+        faults: reasons, worst first.
+        plan_id: of the setpoint in force.
+        commanded: (M,) differential pressures sent to the board.
+        measured: (M,) differential pressures measured.
+        supply: absolute pressure of the reservoir.
+        telemetry_age: [s] since the board's last telemetry.
+    """
+
+    mode: int
+    faults: tuple[str, ...]
+    plan_id: str
+    commanded: tuple[float, ...]
+    measured: tuple[float, ...]
+    supply: float
+    telemetry_age: float
+
+
+@dataclass(frozen=True)
+class LimbView:
+    """What the tracker says of one image.
+
+    Attributes:
+        stamp: of the image [ns].
+        valid: whether the numbers mean anything.
+        reason: why not, or what was bridged.
+        tip: (2,) [m].
+        bend: (M,) bend angles [rad].
+        curve: (N, 2) centreline [m], base to tip.
+    """
+
+    stamp: int
+    valid: bool
+    reason: str
+    tip: tuple[float, float]
+    bend: tuple[float, ...]
+    curve: tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True)
+class NodeStatus:
+    """The newest diagnostics of a node, an index of `LEVELS` as its level."""
+
+    name: str
+    level: int
+    message: str
+    values: Mapping[str, str] = field(default_factory=dict)
+
+
+class Situation:
+    """The newest of everything, with the instant it came at; safe to use from several threads.
+
+    Args:
+        clock: steady [s].
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._heard: dict[str, float] = {}
+        self._driver: DriverState | None = None
+        self._limb: LimbView | None = None
+        self._nodes: dict[str, tuple[NodeStatus, float]] = {}
+        self._references: deque[tuple[int, float, float]] = deque(maxlen=REFERENCES_KEPT)
+
+    def hear(self, source: str) -> None:
+        """Note that a source has sent something now."""
+        with self._lock:
+            self._heard[source] = self._clock()
+
+    def put_driver(self, state: DriverState) -> None:
+        """Take the driver's newest state."""
+        with self._lock:
+            self._driver = state
+            self._heard["driver"] = self._clock()
+
+    def put_limb(self, view: LimbView) -> None:
+        """Take the tracker's newest view of the limb."""
+        with self._lock:
+            self._limb = view
+            self._heard["tracker"] = self._clock()
+
+    def put_reference(self, stamp: int, x: float, y: float) -> None:
+        """Take where the tip should be [m] at an instant [ns], which may lie ahead."""
+        with self._lock:
+            if self._references and stamp <= self._references[-1][0]:
+                self._references.clear()  # a newer plan took over
+            self._references.append((stamp, x, y))
+
+    def put_status(self, status: NodeStatus) -> None:
+        """Take a node's diagnostics."""
+        with self._lock:
+            self._nodes[status.name] = (status, self._clock())
+
+    def reference_at(self, stamp: int) -> tuple[float, float] | None:
+        """Return where the tip should be [m] at an instant [ns]; None where no plan says it."""
+        with self._lock:
+            references = list(self._references)
+        after = bisect_left(references, (stamp, -math.inf, -math.inf))
+        if after == len(references):
+            return None
+        late, x1, y1 = references[after]
+        if late == stamp:
+            return x1, y1
+        if after == 0:
+            return None
+        early, x0, y0 = references[after - 1]
+        if late - early > GAP:
+            return None
+        share = (stamp - early) / (late - early)
+        return x0 + share * (x1 - x0), y0 + share * (y1 - y0)
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return everything as JSON can carry it: kPa, cm and degrees, None where unknown."""
+        with self._lock:
+            now = self._clock()
+            heard, nodes = dict(self._heard), list(self._nodes.values())
+            driver, limb = self._driver, self._limb
+        ages = {
+            name: {
+                "age": _number(now - heard[name], 2) if name in heard else None,
+                "limit": limit,
+                "fresh": name in heard and now - heard[name] <= limit,
+            }
+            for name, limit in FRESH.items()
+        }
+        return {
+            "sources": ages,
+            "driver": None if driver is None else _driver_values(driver),
+            "limb": None if limb is None else self._limb_values(limb),
+            "nodes": [_node_values(status, now - at) for status, at in sorted(nodes, key=_name)],
+        }
+
+    def _limb_values(self, limb: LimbView) -> dict[str, Any]:
+        reference = self.reference_at(limb.stamp) if limb.valid else None
+        error = None
+        if reference is not None:
+            error = _number(math.dist(reference, limb.tip) * CENTIMETRES, 3)
+        return {
+            "valid": limb.valid,
+            "reason": limb.reason,
+            "tip_cm": [_number(value * CENTIMETRES, 2) for value in limb.tip],
+            "bend_deg": [_number(math.degrees(value), 2) for value in limb.bend],
+            "error_cm": error,
+        }
+
+
+def _name(entry: tuple[NodeStatus, float]) -> str:
+    return entry[0].name
+
+
+def _number(value: float, digits: int) -> float | None:
+    return round(value, digits) if math.isfinite(value) else None
+
+
+def _kilopascal(values: Sequence[float]) -> list[float | None]:
+    return [_number(value / PASCAL_PER_KILOPASCAL, 3) for value in values]
+
+
+def _driver_values(driver: DriverState) -> dict[str, Any]:
+    known = 0 <= driver.mode < len(MODES)
+    return {
+        "mode": MODES[driver.mode] if known else f"unknown mode {driver.mode}",
+        "faults": list(driver.faults),
+        "plan_id": driver.plan_id,
+        "commanded_kpa": _kilopascal(driver.commanded),
+        "measured_kpa": _kilopascal(driver.measured),
+        "supply_kpa": _number(driver.supply / PASCAL_PER_KILOPASCAL, 1),
+        "telemetry_age": _number(driver.telemetry_age, 2),
+    }
+
+
+def _node_values(status: NodeStatus, age: float) -> dict[str, Any]:
+    level = LEVELS[status.level] if 0 <= status.level < len(LEVELS) else "error"
+    if age > LATE:
+        level = "dead" if age > DEAD else "late"
+    return {
+        "name": status.name.rsplit("/", 1)[-1],
+        "state": level,
+        "message": status.message,
+        "age": round(age, 1),
+        "values": dict(status.values),
+    }

@@ -1,0 +1,124 @@
+// Keeps the page honest: shows what the server sends ten times a second, greys what is old, also when
+// nothing comes any more, and sends the vent. It needs nothing of the page's framework.
+"use strict";
+const page = { data: null, at: -Infinity, listeners: [] };
+(() => {
+  const LOST = 0.7; // seconds without live data after which the connection counts as lost
+  const seconds = () => performance.now() / 1000;
+  const find = (id) => document.getElementById(id);
+  const put = (element, text) => { if (element && element.textContent !== text) element.textContent = text; };
+  let socket = null, lastOpened = -Infinity, ventText = null, ventUntil = 0, ventGood = false;
+
+  function connect() {
+    lastOpened = seconds();
+    const mine = new WebSocket(location.origin.replace(/^http/, "ws") + "/live");
+    socket = mine;
+    mine.onmessage = (event) => {
+      if (socket !== mine) return;
+      page.data = JSON.parse(event.data);
+      page.at = seconds();
+      show();
+      page.listeners.forEach((listener) => listener(page.data));
+    };
+    mine.onclose = () => { if (socket === mine) socket = null; };
+  }
+
+  // The age of a source: what the server said, and the time since it said so.
+  function ageOf(source) {
+    const entry = page.data && page.data.sources[source];
+    return entry && entry.age !== null ? entry.age + seconds() - page.at : null;
+  }
+
+  function show() {
+    const silence = seconds() - page.at, lost = silence > LOST;
+    document.body.classList.toggle("lost", lost);
+    const notice = find("notice");
+    if (notice) {
+      const venting = seconds() < ventUntil;
+      notice.classList.toggle("shown", lost || venting);
+      notice.classList.toggle("good", venting && ventGood && !lost);
+      const away = Number.isFinite(silence) ? `No connection to the page's server for ${silence.toFixed(1)} s: nothing below is live.`
+        : "Waiting for the page's server…";
+      put(notice, [venting ? ventText : "", lost ? away : ""].filter(Boolean).join("  "));
+    }
+    for (const panel of document.querySelectorAll("#panels > section")) showAge(panel, lost, silence);
+    const driver = page.data && page.data.driver, age = ageOf("driver");
+    const old = lost || age === null || age > page.data.sources.driver.limit;
+    put(find("mode"), driver && age !== null ? driver.mode : "no driver");
+    put(find("faults"), driver && age !== null ? (old ? `${age.toFixed(1)} s ago  ` : "") + driver.faults.join("; ") : "");
+    find("mode")?.classList.toggle("fault", !!driver && driver.mode === "fault");
+    find("summary")?.classList.toggle("old", old);
+    if (page.data) { showNodes(page.data.nodes, seconds() - page.at); showSupply(driver); }
+  }
+
+  function showAge(panel, lost, silence) {
+    const source = panel.dataset.source, entry = source && page.data && page.data.sources[source];
+    let old = lost, text = lost && Number.isFinite(silence) ? `${silence.toFixed(1)} s old` : "";
+    if (source) {
+      const age = ageOf(source);
+      old = old || age === null || age > entry.limit;
+      text = age === null ? "nothing received" : old ? `${age.toFixed(1)} s old` : "live";
+    }
+    panel.classList.toggle("old-title", old);
+    for (const child of panel.children) if (child.querySelector && !child.querySelector("h2")) child.classList.toggle("old", old && panel.id !== "do");
+    put(panel.querySelector(".age"), text);
+  }
+
+  function showNodes(nodes, waited) {
+    const rows = find("node-rows");
+    if (!rows || !nodes.length) return;
+    const table = nodes.map((node) => {
+      const row = document.createElement("tr"), cells = [node.name, node.state, node.message, `${(node.age + waited).toFixed(1)} s`];
+      cells.forEach((text, index) => {
+        const cell = row.insertCell();
+        cell.textContent = text; // never as HTML: messages come from anywhere
+        if (index === 1) cell.className = `state ${node.state}`;
+      });
+      row.dataset.node = node.name;
+      return row;
+    });
+    rows.replaceChildren(...table);
+  }
+
+  function showSupply(driver) {
+    if (!driver) return;
+    const supply = driver.supply_kpa === null ? "unknown" : `${driver.supply_kpa.toFixed(1)} kPa`;
+    put(find("supply"), `Supply ${supply} absolute · board heard ${driver.telemetry_age === null ? "never" : driver.telemetry_age.toFixed(2) + " s ago"}`);
+  }
+
+  async function vent() {
+    const button = find("vent");
+    button?.classList.add("sent");
+    try {
+      const answer = await fetch("/vent", { method: "POST", signal: AbortSignal.timeout(4000) });
+      const result = answer.ok ? await answer.json() : { success: false, message: await answer.text() };
+      ventGood = result.success;
+      ventText = result.success ? `Vented: ${result.message}` : `VENT FAILED: ${result.message}`;
+    } catch (error) {
+      ventGood = false;
+      ventText = `VENT FAILED: the page's server does not answer (${error.message}). Close the supply by hand.`;
+    }
+    ventUntil = seconds() + (ventGood ? 4 : 30);
+    button?.classList.remove("sent");
+    show();
+  }
+
+  const typing = (element) => element && (element.isContentEditable || element.tagName === "TEXTAREA" ||
+    (element.tagName === "INPUT" && ["text", "search", "password"].includes(element.type) && !element.readOnly));
+  document.addEventListener("pointerdown", (event) => { if (event.target.closest?.("#vent")) { event.preventDefault(); vent(); } }, true);
+  // Before any other key handler, so that a space bar vents even where a button has the focus.
+  for (const kind of ["keydown", "keyup"]) window.addEventListener(kind, (event) => {
+    if (event.code !== "Space" || typing(event.target)) return;
+    event.preventDefault();
+    event.stopImmediatePropagation();
+    if (kind === "keydown" && !event.repeat) vent();
+  }, true);
+
+  setInterval(() => {
+    // A connection that says nothing is given up, since a dead server's may stay open for minutes.
+    if (socket && seconds() - page.at > 3 && seconds() - lastOpened > 3) { socket.close(); socket = null; }
+    if (!socket && seconds() - lastOpened > 1) connect();
+    show();
+  }, 200);
+  connect();
+})();

@@ -1,0 +1,66 @@
+// Fetches the camera's picture while somebody looks, and draws over it what belongs to it.
+"use strict";
+(() => {
+  const INTERVAL = 66, PATIENCE = 100, TRAIL = 10000; // ms
+  const wait = (time) => new Promise((done) => setTimeout(done, time));
+  let number = 0, trail = [];
+  page.pictures = 0;
+
+  function line(context, points, colour, width, closed = false) {
+    if (points.length < 2) return;
+    context.beginPath();
+    points.forEach(([x, y], index) => (index ? context.lineTo(x, y) : context.moveTo(x, y)));
+    if (closed) context.closePath();
+    context.lineJoin = "round";
+    context.strokeStyle = colour;
+    context.lineWidth = width;
+    context.stroke();
+  }
+
+  function draw(canvas, image, over) {
+    if (canvas.width !== image.width) { canvas.width = image.width; canvas.height = image.height; }
+    const context = canvas.getContext("2d"), now = performance.now();
+    context.drawImage(image, 0, 0);
+    line(context, over.path, "#30c060", 2.5);
+    line(context, over.planned, "#9be8b4", 5);
+    for (const tag of over.tags) line(context, [0, 2, 4, 6].map((i) => [tag[i], tag[i + 1]]), "#2e9bff", 2, true);
+    line(context, over.curve, "#ff7828", 3);
+    trail = trail.filter((point) => now - point[2] < TRAIL);
+    if (over.tip) trail.push([...over.tip, now]);
+    line(context, trail, "#ffd84a", 2);
+    for (const [point, colour] of [[over.tip, "#ff7828"], [over.reference, "#30c060"]]) {
+      if (!point) continue;
+      context.beginPath();
+      context.arc(point[0], point[1], 9, 0, 2 * Math.PI);
+      context.strokeStyle = colour;
+      context.lineWidth = 3;
+      context.stroke();
+    }
+    const note = document.getElementById("view-note");
+    if (note) note.textContent = over.problem;
+  }
+
+  async function next() {
+    const canvas = document.getElementById("picture");
+    if (!canvas || document.hidden) return 300;
+    const begin = performance.now();
+    const answer = await fetch(`/picture?after=${number}`, { signal: AbortSignal.timeout(3000) });
+    if (answer.status !== 200) return answer.status === 204 ? PATIENCE : 1000;
+    const body = await answer.arrayBuffer(), size = new DataView(body).getUint32(0);
+    const over = JSON.parse(new TextDecoder().decode(new Uint8Array(body, 4, size)));
+    const image = await createImageBitmap(new Blob([new Uint8Array(body, 4 + size)], { type: "image/jpeg" }));
+    number = over.number;
+    draw(canvas, image, over);
+    image.close();
+    page.pictures += 1;
+    return Math.max(0, INTERVAL - (performance.now() - begin));
+  }
+
+  (async () => {
+    for (;;) {
+      let pause = 1000;
+      try { pause = await next(); } catch (error) { number = 0; } // the banner says that the server is away
+      await wait(pause);
+    }
+  })();
+})();

@@ -1,0 +1,157 @@
+"""The page's server as a browser, and as a hostile page elsewhere, meets it."""
+
+from __future__ import annotations
+
+import struct
+import time
+from concurrent.futures import Future
+from typing import Any
+
+import numpy as np
+import pytest
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+from starlette.websockets import WebSocketDisconnect
+
+from apriltag_tracker.tag_map import LimbTag, TagMap
+from der_planner.page.access import Binding, Sessions
+from der_planner.page.commands import Answer, MotionRequest, Service
+from der_planner.page.guard import Guard
+from der_planner.page.operators import Desk
+from der_planner.page.overlay import Overlay
+from der_planner.page.picture import PictureFeed
+from der_planner.page.server import Parts, create_app
+from der_planner.page.situation import Situation
+
+HOST = "127.0.0.1:8080"
+ORIGIN = f"http://{HOST}"
+SOCKET = f"ws://{HOST}"
+"""The test client asks for websockets of another host unless it is told."""
+PASSWORD = "correct horse battery"
+TAGS = TagMap((0.12, 0.12), (LimbTag(0, 0.2, 0.03, 0.015),), ())
+
+
+class Calls:
+    """Notes what the server asks for; answers like the driver, or not at all."""
+
+    def __init__(self) -> None:
+        self.services: list[Service] = []
+        self.answers = True
+
+    def call(self, service: Service) -> Future[Answer]:
+        self.services.append(service)
+        answer: Future[Answer] = Future()
+        if self.answers:
+            answer.set_result(Answer(True, "vented"))
+        return answer
+
+    def play(self, request: MotionRequest) -> Answer:
+        return Answer(True, request.motion)
+
+    def record(self, note: str) -> Future[Answer]:
+        return self.call("record_start")
+
+
+class Rig:
+    def __init__(self, password: str = "") -> None:
+        self.calls = Calls()
+        self.situation = Situation()
+        self.picture = PictureFeed(15.0)
+        desk = Desk(lambda _: None)
+        parts = Parts(self.situation, self.picture, Overlay(TAGS), desk, self.calls)
+        sessions = Sessions(password)
+        self.app: FastAPI = create_app(parts, sessions, secure=False)
+        self.guard = Guard(self.app, Binding().hosts(8080), "http", sessions)
+
+    def client(self, **headers: str) -> TestClient:
+        return TestClient(self.guard, base_url=ORIGIN, headers=headers, follow_redirects=False)
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return Rig()
+
+
+def test_the_page_itself_vents(rig: Rig) -> None:
+    answer = rig.client(origin=ORIGIN).post("/vent")
+    assert answer.json() == {"success": True, "message": "vented"}
+    assert rig.calls.services == ["vent"]
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"origin": "http://evil.example"},
+        {"origin": "null"},
+        {"origin": "http://127.0.0.1:9999"},
+        {},  # no browser sends a command without an origin
+        {"host": "evil.example", "origin": "http://evil.example"},
+        {"host": "evil.example:8080", "origin": "http://evil.example:8080"},
+    ],
+)
+def test_a_page_elsewhere_neither_vents_nor_listens(rig: Rig, headers: dict[str, str]) -> None:
+    client = rig.client(**headers)
+    assert client.post("/vent").status_code == 403
+    for path in ("/live", "/_nicegui_ws/socket.io/"):
+        with pytest.raises(WebSocketDisconnect), client.websocket_connect(SOCKET + path):
+            pass
+    assert not rig.calls.services
+    assert rig.guard.refused == 3
+
+
+@pytest.mark.parametrize("host", ["evil.example:8080", "127.0.0.1.evil.example:8080", "127.0.0.1"])
+def test_reading_by_another_name_is_refused(rig: Rig, host: str) -> None:
+    answer = rig.client(host=host).get("/picture")
+    assert answer.status_code == 403
+    assert "host_names" in answer.text
+
+
+def test_answers_forbid_frames_and_other_machines(rig: Rig) -> None:
+    headers = rig.client().get("/static/live.js").headers
+    assert headers["x-frame-options"] == "DENY"
+    assert "default-src 'self'" in headers["content-security-policy"]
+    assert "frame-ancestors 'none'" in headers["content-security-policy"]
+
+
+def test_live_data_come_ten_times_a_second(rig: Rig) -> None:
+    with rig.client(origin=ORIGIN).websocket_connect(SOCKET + "/live") as live:
+        counts = [live.receive_json()["count"] for _ in range(5)]
+    assert counts == sorted(set(counts))
+
+
+def test_a_driver_that_does_not_answer_is_no_vent(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("der_planner.page.commands.PATIENCE", 0.05)
+    rig.calls.answers = False
+    answer = rig.client(origin=ORIGIN).post("/vent").json()
+    assert not answer["success"]
+    assert "NOT VENTED" in answer["message"]
+
+
+def test_a_password_is_asked_for_everywhere() -> None:
+    rig = Rig(PASSWORD)
+    client = rig.client(origin=ORIGIN)
+    assert client.get("/picture").headers["location"] == "/login"
+    assert client.post("/vent").status_code == 401
+    with pytest.raises(WebSocketDisconnect), client.websocket_connect(SOCKET + "/live"):
+        pass
+    begin = time.monotonic()
+    assert client.post("/login", data={"password": "wrong guess here"}).status_code == 403
+    assert time.monotonic() - begin >= 1.0
+    assert client.post("/login", data={"password": PASSWORD}).status_code == 303
+    assert client.post("/vent").json()["success"]
+    assert rig.calls.services == ["vent"]
+
+
+def test_a_picture_is_made_only_if_somebody_looks(rig: Rig) -> None:
+    grey: Any = np.full((72, 128), 90, dtype=np.uint8)
+    assert not rig.picture.due()
+    client = rig.client()
+    assert client.get("/picture").status_code == 204
+    assert rig.picture.due()
+    rig.picture.put(5, grey)
+    body = client.get("/picture").content
+    size = struct.unpack(">I", body[:4])[0]
+    assert body[4 + size : 6 + size] == b"\xff\xd8"
+    assert client.get("/picture?after=1").status_code == 204

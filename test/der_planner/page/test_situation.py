@@ -1,0 +1,110 @@
+"""What the page says is as old as it says, and never newer."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+
+from der_planner.page.situation import (
+    DEAD,
+    FRESH,
+    LATE,
+    DriverState,
+    LimbView,
+    NodeStatus,
+    Situation,
+)
+
+
+class Clock:
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def situation(clock: Clock) -> Situation:
+    return Situation(clock)
+
+
+def driver(mode: int = 5) -> DriverState:
+    nan = float("nan")
+    return DriverState(mode, ("no telemetry",), "p", (12_000.0, 0.0), (nan, 250.0), nan, nan)
+
+
+def view(stamp: int, tip: tuple[float, float] = (0.2, 0.05), valid: bool = True) -> LimbView:
+    return LimbView(stamp, valid, "", tip, (math.pi / 4, 0.0), ((0.0, 0.0), tip))
+
+
+def test_nothing_is_known_before_anything_came(situation: Situation) -> None:
+    known = situation.snapshot()
+    assert known["driver"] is None
+    assert all(not entry["fresh"] and entry["age"] is None for entry in known["sources"].values())
+
+
+def test_data_grow_old(situation: Situation, clock: Clock) -> None:
+    situation.put_driver(driver())
+    assert situation.snapshot()["sources"]["driver"]["fresh"]
+    clock.now += FRESH["driver"] + 0.01
+    source = situation.snapshot()["sources"]["driver"]
+    assert not source["fresh"]
+    assert source["age"] == pytest.approx(FRESH["driver"], abs=0.02)
+    assert max(FRESH.values()) < 1.0
+
+
+def test_numbers_come_in_kilopascal_and_unknown_ones_as_null(situation: Situation) -> None:
+    situation.put_driver(driver())
+    text = json.dumps(situation.snapshot(), allow_nan=False)
+    values = json.loads(text)["driver"]
+    assert values["mode"] == "fault"
+    assert values["commanded_kpa"] == [12.0, 0.0]
+    assert values["measured_kpa"] == [None, 0.25]
+    assert values["supply_kpa"] is None
+    situation.put_driver(driver(mode=17))
+    assert situation.snapshot()["driver"]["mode"] == "unknown mode 17"
+
+
+def test_nodes_turn_late_and_dead(situation: Situation, clock: Clock) -> None:
+    situation.put_status(NodeStatus("/limb/planner", 1, "refused: too far"))
+    situation.put_status(NodeStatus("/limb/a", 0, "running"))
+    first, second = situation.snapshot()["nodes"]
+    assert (first["name"], second["name"]) == ("a", "planner")
+    assert second["state"] == "warning"
+    clock.now += LATE + 0.1
+    situation.put_status(NodeStatus("/limb/a", 0, "running"))
+    first, second = situation.snapshot()["nodes"]
+    assert (first["state"], second["state"]) == ("ok", "late")
+    clock.now += DEAD
+    assert situation.snapshot()["nodes"][1]["state"] == "dead"
+
+
+def test_the_error_is_against_the_reference_at_the_image(situation: Situation) -> None:
+    step = 50_000_000
+    for index in range(5):  # sent ahead of time, as the planner does
+        situation.put_reference(index * step, 0.2, 0.01 * index)
+    situation.put_limb(view(stamp=step + step // 2, tip=(0.2, 0.015)))
+    assert situation.snapshot()["limb"]["error_cm"] == pytest.approx(0.0, abs=1e-3)
+    situation.put_limb(view(stamp=2 * step, tip=(0.203, 0.02)))
+    assert situation.snapshot()["limb"]["error_cm"] == pytest.approx(0.3)
+    situation.put_limb(view(stamp=99 * step))
+    assert situation.snapshot()["limb"]["error_cm"] is None
+    situation.put_limb(view(stamp=2 * step, valid=False))
+    assert situation.snapshot()["limb"]["error_cm"] is None
+
+
+def test_no_reference_is_made_up_across_a_pause(situation: Situation) -> None:
+    situation.put_reference(0, 0.2, 0.0)
+    situation.put_reference(2_000_000_000, 0.2, 0.1)
+    assert situation.reference_at(1_000_000_000) is None
+    assert situation.reference_at(-1) is None
+    situation.put_reference(1_000_000_000, 0.1, 0.0)  # a newer plan
+    assert situation.reference_at(2_000_000_000) is None
+    assert situation.reference_at(1_000_000_000) == (0.1, 0.0)
