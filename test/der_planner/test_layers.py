@@ -8,6 +8,7 @@ import der_planner
 ROOT = Path(der_planner.__file__).parent
 LAYERS = {
     "limb_declaration": 0,
+    "limb_loads": 1,
     "limb_parameters": 1,
     "limb": 2,
     "rod": 3,

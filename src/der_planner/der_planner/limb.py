@@ -29,9 +29,20 @@ from der_planner.limb_declaration import (
     parameters,
     refuse_unknown,
 )
+from der_planner.limb_loads import GRAVITY, MOUNTINGS, PointMass, gravity_of
 from der_planner.limb_parameters import CalibratedRange, Pneumatics, Segment
 
-__all__ = ["CalibratedRange", "Limb", "LimbError", "Pneumatics", "Segment"]
+__all__ = [
+    "GRAVITY",
+    "MOUNTINGS",
+    "CalibratedRange",
+    "Limb",
+    "LimbError",
+    "Pneumatics",
+    "PointMass",
+    "Segment",
+    "gravity_of",
+]
 
 SCHEMA_VERSION = 1
 VENT_REFERENCE = 10e3
@@ -51,6 +62,7 @@ class Limb:
         provenance: free text by key: source, date, bag, residuals.
         pcc_segments: (M,) what the same data say of the PCC model, where that differs; empty: as
             `segments`.
+        masses: that the limb carries at places of its centreline, beside its distributed mass.
     """
 
     name: str
@@ -70,7 +82,8 @@ class Limb:
         metadata=parameter(
             "m/s²",
             "acceleration in limb_base: x along the straight limb, y to its left",
-            "zeros for a limb that lies on a plate, [9.81, 0, 0] for one that hangs from its clamp",
+            "zeros for a limb that lies on a plate, [9.81, 0, 0] for one that hangs from its "
+            "clamp, [0, 0, -9.81] for one that is level and free to sag out of its plane",
         ),
     )
     calibrated: CalibratedRange = field(default_factory=CalibratedRange)
@@ -85,6 +98,7 @@ class Limb:
             least=0.0,
         ),
     )
+    masses: tuple[PointMass, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.segments:
@@ -101,6 +115,13 @@ class Limb:
             raise LimbError(f"gravity must be three numbers in m/s², got {self.gravity}")
         check(self.calibrated, "calibrated.")
         check(self)
+        for index, item in enumerate(self.masses):
+            check(item, f"masses[{index}].")
+            if item.arc_length > self.length * (1 + 1e-9):
+                raise LimbError(
+                    f"masses[{index}].arc_length must be at most the limb's length of "
+                    f"{self.length:.6g} m, got {item.arc_length}"
+                )
 
     @property
     def segment_count(self) -> int:
@@ -125,6 +146,26 @@ class Limb:
         if model == "der" or not self.pcc_segments:
             return self
         return dataclasses.replace(self, segments=self.pcc_segments, pcc_segments=())
+
+    def carrying(self, payload: float, at: float | None = None, name: str = "payload") -> Limb:
+        """Return the limb with one more mass.
+
+        Args:
+            payload: [kg]; with 0 the limb is returned as it is.
+            at: arc length from the clamp [m]; None: the tip.
+            name: of the mass.
+
+        Raises:
+            LimbError: a negative mass, or a place that is not on the limb.
+        """
+        if payload == 0:
+            return self
+        mass = PointMass(self.length if at is None else float(at), float(payload), name)
+        return dataclasses.replace(self, masses=(*self.masses, mass))
+
+    def mounted(self, mounting: str) -> Limb:
+        """Return the limb with the gravity of a mounting, see `gravity_of`."""
+        return dataclasses.replace(self, gravity=gravity_of(mounting))
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> Limb:
@@ -174,6 +215,7 @@ class Limb:
             connector_length=number(content.get("connector_length", 0.0), "connector_length"),
             base_length=number(content.get("base_length", 0.0), "base_length"),
             gravity=_triple(content.get("gravity", (0.0, 0.0, 0.0))),
+            masses=_masses(content.get("masses") or []),
             calibrated=CalibratedRange(
                 **{key: tuple(float(v) for v in values) for key, values in calibrated.items()}
             ),
@@ -186,6 +228,7 @@ class Limb:
         body["gravity"] = list(self.gravity)
         body["segments"] = list(body["segments"])
         body["pcc_segments"] = list(body["pcc_segments"])
+        body["masses"] = list(body["masses"])
         body["calibrated"] = {key: list(value) for key, value in body["calibrated"].items()}
         body["provenance"] = dict(self.provenance)
         text = yaml.safe_dump(body, sort_keys=False, allow_unicode=True)
@@ -201,6 +244,7 @@ def sections() -> dict[str, dict[str, Parameter]]:
         "pcc_segments": parameters(Segment),
         "pneumatics": parameters(Pneumatics),
         "calibrated": parameters(CalibratedRange),
+        "masses": parameters(PointMass),
     }
 
 
@@ -214,6 +258,21 @@ def _segments(content: object, key: str) -> tuple[Segment, ...]:
     return tuple(
         from_mapping(Segment, item, f"{key}[{index}]") for index, item in enumerate(content)
     )
+
+
+def _masses(content: object) -> tuple[PointMass, ...]:
+    if not isinstance(content, Sequence) or isinstance(content, str):
+        raise LimbError(f"masses must be a list of mappings with arc_length and mass: {content!r}")
+    result = []
+    for index, item in enumerate(content):
+        where = f"masses[{index}]"
+        numbers = item
+        if isinstance(item, Mapping):
+            numbers = {key: value for key, value in item.items() if key != "name"}
+        mass: PointMass = from_mapping(PointMass, numbers, where)
+        name = str(item["name"]) if "name" in item else mass.name
+        result.append(dataclasses.replace(mass, name=name))
+    return tuple(result)
 
 
 def _triple(value: object) -> tuple[float, float, float]:

@@ -43,7 +43,11 @@ def material_points(model, q, points=4001):
     heading, start, result, masses = 0.0, 0j, [], []
     for j, length in enumerate(model.lengths):
         if j:
-            start += np.exp(1j * heading) * model.connector
+            straight = np.exp(1j * heading) * model.connector
+            density = 0.5 * (model.masses / model.lengths)[j - 1 : j + 1].sum()
+            result.append(start + s * straight)
+            masses.append(np.full(points, density * model.connector / points))
+            start += straight
         step = length / points
         middle = np.exp(1j * (heading + q[j] * s)) * step
         chain = start + np.cumsum(middle) - middle / 2
@@ -107,7 +111,7 @@ def test_straight_segment_has_the_inertia_of_a_parabola():
     assert lumped[0, 0] == pytest.approx(mass * length**2 / 4, rel=1e-12)
 
 
-@pytest.mark.parametrize("order", [0, 1, 2])
+@pytest.mark.parametrize("order", [0, 1, 2, 3])
 def test_arc_functions_are_smooth_where_series_and_quotient_meet(order):
     z = kernels.SERIES_BELOW
     below, above = kernels.arc_moment(z - 1e-12, order), kernels.arc_moment(z + 1e-12, order)
@@ -153,7 +157,7 @@ def test_pressures_invert_the_forward_dynamics(model):
     q, v, a = rng.normal(size=(3, 6, model.segment_count))
     pressures = model.pressures(q, v, a)
     for k in range(len(q)):
-        back = kernels.acceleration(q[k], v[k], model.gain * pressures[k], *model._parameters())
+        back = kernels.acceleration(q[k], v[k], model.gain * pressures[k], model.arcs)
         np.testing.assert_allclose(back, a[k], rtol=1e-9, atol=1e-9)
 
 
@@ -180,3 +184,74 @@ def test_bad_input_is_named():
         Pcc(Limb.default(), mass="spread")
     with pytest.raises(ValueError, match=r"\(K, S, 2\)"):
         model.simulate(np.zeros((4, 2)), 0.01)
+
+
+def loaded(count):
+    """A limb under gravity with masses in a segment, on a connector and at the tip."""
+    limb = limb_of(count)
+    first = limb.segments[0].length
+    limb = dataclasses.replace(limb, gravity=(6.0, -7.0, 0.0), base_length=0.03)
+    limb = limb.carrying(0.03).carrying(0.02, at=0.03 + 0.4 * first)
+    return limb.carrying(0.05, at=0.03 + first + 0.004) if count > 1 else limb
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_carried_masses_move_with_their_places(count):
+    limb = loaded(count)
+    bare = Pcc(dataclasses.replace(limb, masses=()))
+    model = Pcc(limb)
+    for q, v in configurations(model, count=3):
+
+        def places(angles):
+            curve = bare.curve(angles, points_per_segment=500)
+            steps = np.append(0.0, np.cumsum(np.hypot(*np.diff(curve, axis=0).T)))
+            s = np.array([m.arc_length for m in limb.masses]) * steps[-1] / limb.length
+            return np.stack([np.interp(s, steps, axis) for axis in curve.T], axis=1)
+
+        h = 1e-4
+        mass = np.array([m.mass for m in limb.masses])
+        rate = (places(q + h * v) - places(q - h * v)) / (2 * h)
+        added = 0.5 * v @ (model.matrices(q, v)[0] - bare.matrices(q, v)[0]) @ v
+        assert added == pytest.approx(0.5 * (mass * (rate**2).sum(axis=1)).sum(), rel=1e-4)
+        height = -places(q) @ np.array(limb.gravity[:2])
+        assert model.energy(q, 0 * q) - bare.energy(q, 0 * q) == pytest.approx(
+            (mass * height).sum(), rel=1e-4
+        )
+        np.testing.assert_allclose(model.matrices(q, v)[2], bare.matrices(q, v)[2], rtol=1e-12)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_pressures_at_rest_balance_the_gradient_of_the_energy(count):
+    model = Pcc(loaded(count))
+    zero = np.zeros(count)
+    for q, _ in configurations(model, count=3):
+        h = 1e-6
+        slope = [
+            (model.energy(q + h * e, zero) - model.energy(q - h * e, zero)) / (2 * h)
+            for e in np.eye(count)
+        ]
+        torque = model.pressures(q, zero, zero)[0] * model.gain
+        np.testing.assert_allclose(torque, slope, rtol=1e-6, atol=1e-9)
+
+
+def test_a_loaded_swing_keeps_its_energy():
+    limb = loaded(2)
+    segments = tuple(dataclasses.replace(s, damping=0.0) for s in limb.segments)
+    model = Pcc(dataclasses.replace(limb, segments=segments))
+    angles, rates = model.simulate(np.zeros((60, 20, 2)), 1e-3, np.array([0.9, -0.6]))
+    energy = [model.energy(q, v) for q, v in zip(angles, rates, strict=True)]
+    kinetic = [0.5 * v @ model.matrices(q, v)[0] @ v for q, v in zip(angles, rates, strict=True)]
+    assert np.ptp(kinetic) > 1e-3
+    assert np.ptp(energy) < 3e-5 * np.ptp(kinetic)
+
+
+def test_a_stiff_limb_is_not_stepped_over_its_fastest_mode():
+    limb = limb_of(3)
+    segments = tuple(
+        dataclasses.replace(s, bending_stiffness=60 * s.bending_stiffness) for s in limb.segments
+    )
+    model = Pcc(dataclasses.replace(limb, segments=segments))
+    pressures = np.full((20, 5, 3), 5e4)
+    coarse, _ = model.simulate(pressures, 0.01)
+    fine, _ = model.simulate(np.repeat(pressures, 20, axis=1), 0.0005)
+    np.testing.assert_allclose(coarse, fine, atol=0.15 * np.abs(fine).max())

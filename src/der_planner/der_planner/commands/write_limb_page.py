@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from der_planner.limb import CalibratedRange, Limb, Pneumatics, Segment
+from der_planner.limb import CalibratedRange, Limb, Pneumatics, PointMass, Segment
 from der_planner.limb_declaration import Parameter, Term, parameters
 
 PAGE = Path(__file__).resolve().parents[2] / "doc" / "limb_parameters.md"
@@ -20,8 +20,8 @@ _HEAD = """\
 # The parameters of a limb
 
 Written by `python3 scripts/write_limb_page.py` from
-[limb_parameters.py](../der_planner/limb_parameters.py) and [limb.py](../der_planner/limb.py):
-change them there.
+[limb_parameters.py](../der_planner/limb_parameters.py), [limb.py](../der_planner/limb.py) and
+[limb_loads.py](../der_planner/limb_loads.py): change them there.
 
 All values are SI. A key without a default has to be in the limb file. "Fit" is the unknown by
 which the [calibration](identification.md) finds the value: its unit, its bounds, and ± the standard
@@ -32,6 +32,7 @@ _SECTIONS: tuple[tuple[str, Any], ...] = (
     ("`segments`, `pcc_segments`: one entry per segment", Segment),
     ("`pneumatics`", Pneumatics),
     ("The limb itself", Limb),
+    ("`masses`: one entry, which may have a `name`, per mass that the limb carries", PointMass),
     ("`calibrated`: one value per segment", CalibratedRange),
 )
 

@@ -8,28 +8,49 @@ reaches, at the fraction σ of its length, the point L σ g(σ θ) of its own fr
 Its derivatives are g⁽ᵏ⁾(z) = iᵏ ∫₀¹ ηᵏ exp(i z η) dη, smooth through z = 0: a power series is used
 there instead of the quotient, so that a straight limb is an ordinary configuration.
 
-Symbols: q (n,) bend angles [rad], P position of a material point as a function of q, J_i = ∂P/∂q_i,
-H_ik = ∂²P/∂q_i∂q_k. With these M_ij = ∫ μ ⟨J_i, J_j⟩ ds and C_ij = ∫ μ ⟨J_i, Σ_k H_jk q̇_k⟩ ds.
-Since H is symmetric these are Christoffel's symbols, and Ṁ = C + Cᵀ holds exactly, term by term.
+Symbols: q (n,) bend angles [rad], P position of a particle as a function of q, J_i = ∂P/∂q_i,
+H_ik = ∂²P/∂q_i∂q_k. With the particles' masses m, M_ij = Σ m ⟨J_i, J_j⟩, C_ij = Σ m ⟨J_i, Σ_k H_jk
+q̇_k⟩ and gravity's torque is Σ m ⟨J_i, g⟩. Since H is symmetric these are Christoffel's symbols, and
+Ṁ = C + Cᵀ holds exactly, term by term. The particles are the quadrature points of the distributed
+mass and what the limb carries.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 Vector = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 
 SERIES_BELOW = 0.5
 _SERIES_TERMS = 14
 
 
+class Arcs(NamedTuple):
+    """A limb of n arcs and P particles, in SI units."""
+
+    lengths: Vector  # (n,)
+    connector: float  # length between two segments
+    gravity: Vector  # (2,)
+    owner: NDArray[np.int64]  # (P,) segment of each particle
+    place: Vector  # (P,) fraction of its segment's length
+    beyond: Vector  # (P,) distance past the segment's end, on the connector behind it
+    mass: Vector  # (P,)
+    drag: Vector  # (P,) damping coefficient [kg/s]
+    gain: Vector  # (n,) moment per pressure [N·m/Pa]
+    stiffness: Vector  # (n,) EI / L
+    cubic: Vector  # (n,) k3 / L³
+    rest: Vector  # (n,) bend at rest
+    viscous: Vector  # (n,) Kelvin-Voigt time [s]
+
+
 @njit(cache=True, nogil=True)
 def arc_moment(z: float, k: int) -> Any:
-    """Return ∫₀¹ ηᵏ exp(i z η) dη for k = 0, 1, 2, to rounding for every real z."""
+    """Return ∫₀¹ ηᵏ exp(i z η) dη for k = 0 … 3, to rounding for every real z."""
     if abs(z) < SERIES_BELOW:
         total = 0.0 + 0.0j
         term = 1.0 + 0.0j
@@ -46,52 +67,56 @@ def arc_moment(z: float, k: int) -> Any:
 
 @njit(cache=True, nogil=True)
 def arc_point(z: float, k: int) -> Any:
-    """Return the k-th derivative of g at z (k = 0, 1, 2)."""
+    """Return the k-th derivative of g at z (k = 0 … 3)."""
     value = arc_moment(z, k)
     if k == 1:
         return 1j * value
     if k == 2:
         return -value
+    if k == 3:
+        return -1j * value
     return value
 
 
 @njit(cache=True, nogil=True)
+def joints(q: Vector, arcs: Arcs) -> Complex:
+    """Return (3, n + 1): where each segment starts, its first heading, and where it ends."""
+    n = q.size
+    result = np.zeros((3, n + 1), dtype=np.complex128)
+    position, heading = 0.0 + 0.0j, 1.0 + 0.0j
+    for i in range(n):
+        result[0, i], result[1, i] = position, heading
+        position = position + heading * arcs.lengths[i] * arc_point(q[i], 0)
+        result[2, i] = position
+        heading = heading * (np.cos(q[i]) + 1j * np.sin(q[i]))
+        position = position + heading * arcs.connector
+    result[0, n], result[1, n] = position, heading
+    return result
+
+
+@njit(cache=True, nogil=True)
 def point_derivatives(
-    q: Vector,
-    lengths: Vector,
-    connector: float,
-    j: int,
-    sigma: float,
-    J: NDArray[np.complex128],
-    H: NDArray[np.complex128],
+    q: Vector, arcs: Arcs, frame: Complex, p: int, slopes: Complex, J: Complex, H: Complex
 ) -> Any:
-    """Return the point at fraction sigma of segment j; fill J (n,), H (n, n): its derivatives.
+    """Return where particle p is; fill J (n,) and H (n, n), its first and second derivatives.
 
     A bend angle q_i turns everything beyond segment i as one body, hence the recurrences
     J_i = exp(iΦ_i) L_i g′(q_i) + i (P − p_i) and H_ik = i J_k for k > i, with p_i the end of
-    segment i and Φ_i = q_0 + … + q_{i−1}.
+    segment i and Φ_i = q_0 + … + q_{i−1}. ``frame`` is that of `joints`, ``slopes`` (2, n) holds
+    exp(iΦ_i) L_i times g′ and g″ (`arc_slopes`).
     """
-    n = q.size
     J[:] = 0.0
     H[:, :] = 0.0
-    ends = np.zeros(n, dtype=np.complex128)
-    headings = np.zeros(n, dtype=np.complex128)
-    position = 0.0 + 0.0j
-    heading = 1.0 + 0.0j
+    j, sigma = arcs.owner[p], arcs.place[p]
+    z, reach = sigma * q[j], frame[1, j] * arcs.lengths[j] * sigma
+    past = frame[1, j + 1] * arcs.beyond[p]
+    point = frame[0, j] + reach * arc_point(z, 0) + past
+    J[j] = reach * sigma * arc_point(z, 1) + 1j * past
+    H[j, j] = reach * sigma**2 * arc_point(z, 2) - past
     for i in range(j):
-        headings[i] = heading
-        position = position + heading * lengths[i] * arc_point(q[i], 0)
-        ends[i] = position
-        heading = heading * (np.cos(q[i]) + 1j * np.sin(q[i]))
-        position = position + heading * connector
-    z = sigma * q[j]
-    point = position + heading * lengths[j] * sigma * arc_point(z, 0)
-    J[j] = heading * lengths[j] * sigma**2 * arc_point(z, 1)
-    H[j, j] = heading * lengths[j] * sigma**3 * arc_point(z, 2)
-    for i in range(j):
-        beyond = point - ends[i]
-        J[i] = headings[i] * lengths[i] * arc_point(q[i], 1) + 1j * beyond
-        H[i, i] = headings[i] * lengths[i] * arc_point(q[i], 2) - beyond
+        past = point - frame[2, i]
+        J[i] = slopes[0, i] + 1j * past
+        H[i, i] = slopes[1, i] - past
     for i in range(j):
         for k in range(i + 1, j + 1):
             H[i, k] = 1j * J[k]
@@ -100,101 +125,66 @@ def point_derivatives(
 
 
 @njit(cache=True, nogil=True)
-def inertia(
-    q: Vector,
-    v: Vector,
-    lengths: Vector,
-    connector: float,
-    masses: Vector,
-    damping: Vector,
-    gravity: Vector,
-    fractions: Vector,
-    weights: Vector,
-) -> tuple[Vector, Vector, Vector, Vector]:
+def arc_slopes(q: Vector, arcs: Arcs, frame: Complex, order: int) -> Complex:
+    """Return exp(iΦ_i) L_i times the derivatives 1 … order of g at each bend angle."""
+    n = q.size
+    result = np.zeros((order, n), dtype=np.complex128)
+    for k in range(order):
+        for i in range(n):
+            result[k, i] = frame[1, i] * arcs.lengths[i] * arc_point(q[i], k + 1)
+    return result
+
+
+@njit(cache=True, nogil=True)
+def inertia(q: Vector, v: Vector, arcs: Arcs) -> tuple[Vector, Vector, Vector, Vector]:
     """Return M (n, n), C (n, n), the mass-proportional damping D (n, n) and gravity's torque (n,).
 
-    q, v are bend angles [rad] and their rates [rad/s], lengths [m], masses [kg] and damping [1/s]
-    of the segments, all (n,); connector is the length between two segments [m], gravity (2,) is
-    in m/s²; fractions and weights are the nodes and weights on [0, 1] that carry a segment's mass.
+    q, v are bend angles [rad] and their rates [rad/s], (n,) each.
     """
     n = q.size
-    M = np.zeros((n, n))
-    C = np.zeros((n, n))
-    D = np.zeros((n, n))
+    M, C, D = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
     torque = np.zeros(n)
     J = np.zeros(n, dtype=np.complex128)
     H = np.zeros((n, n), dtype=np.complex128)
     rate = np.zeros(n, dtype=np.complex128)
-    for j in range(n):
-        for p in range(fractions.size):
-            mass = masses[j] * weights[p]
-            point_derivatives(q, lengths, connector, j, fractions[p], J, H)
-            for i in range(j + 1):
-                total = 0.0 + 0.0j
-                for k in range(j + 1):
-                    total += H[i, k] * v[k]
-                rate[i] = total
-            for i in range(j + 1):
-                torque[i] += mass * (J[i].real * gravity[0] + J[i].imag * gravity[1])
-                for k in range(j + 1):
-                    product = J[i].real * J[k].real + J[i].imag * J[k].imag
-                    M[i, k] += mass * product
-                    D[i, k] += mass * damping[j] * product
-                    C[i, k] += mass * (J[i].real * rate[k].real + J[i].imag * rate[k].imag)
+    frame = joints(q, arcs)
+    slopes = arc_slopes(q, arcs, frame, 2)
+    for p in range(arcs.owner.size):
+        mass, drag, last = arcs.mass[p], arcs.drag[p], arcs.owner[p] + 1
+        point_derivatives(q, arcs, frame, p, slopes, J, H)
+        for i in range(last):
+            total = 0.0 + 0.0j
+            for k in range(last):
+                total += H[i, k] * v[k]
+            rate[i] = total
+        for i in range(last):
+            torque[i] += mass * (J[i].real * arcs.gravity[0] + J[i].imag * arcs.gravity[1])
+            for k in range(last):
+                product = J[i].real * J[k].real + J[i].imag * J[k].imag
+                M[i, k] += mass * product
+                D[i, k] += drag * product
+                C[i, k] += mass * (J[i].real * rate[k].real + J[i].imag * rate[k].imag)
     return M, C, D, torque
 
 
 @njit(cache=True, nogil=True)
-def acceleration(
-    q: Vector,
-    v: Vector,
-    torque: Vector,
-    lengths: Vector,
-    connector: float,
-    masses: Vector,
-    damping: Vector,
-    gravity: Vector,
-    fractions: Vector,
-    weights: Vector,
-    stiffness: Vector,
-    cubic: Vector,
-    rest: Vector,
-    material_damping: Vector,
-) -> Vector:
-    """Return q̈ from M q̈ + C q̇ + D q̇ + K(q) = torque, all (n,)."""
-    M, C, D, weight = inertia(
-        q, v, lengths, connector, masses, damping, gravity, fractions, weights
-    )
-    bend = q - rest
-    elastic = stiffness * (bend + material_damping * v) + cubic * bend**3
+def acceleration(q: Vector, v: Vector, torque: Vector, arcs: Arcs) -> Vector:
+    """Return q̈ from M q̈ + C q̇ + D q̇ + K(q) = torque + gravity's torque, all (n,)."""
+    M, C, D, weight = inertia(q, v, arcs)
+    bend = q - arcs.rest
+    elastic = arcs.stiffness * (bend + arcs.viscous * v) + arcs.cubic * bend**3
     force = torque + weight - elastic - (C + D) @ v
     return np.linalg.solve(M, force)
 
 
 @njit(cache=True, nogil=True)
 def simulate(
-    q: Vector,
-    v: Vector,
-    pressures: Vector,
-    step: float,
-    gain: Vector,
-    lengths: Vector,
-    connector: float,
-    masses: Vector,
-    damping: Vector,
-    gravity: Vector,
-    fractions: Vector,
-    weights: Vector,
-    stiffness: Vector,
-    cubic: Vector,
-    rest: Vector,
-    material_damping: Vector,
+    q: Vector, v: Vector, pressures: Vector, step: float, parts: int, arcs: Arcs
 ) -> tuple[Vector, Vector]:
     """Roll the model forward with the classical Runge-Kutta method.
 
-    pressures (K, S, n) [Pa] are constant over each of the S steps of an interval, step [s] is that
-    of the integrator, gain (n,) the moment per pressure [N·m/Pa]; the others are those of
-    `acceleration`. Returns angles and rates (K + 1, n) at the interval boundaries.
+    pressures (K, S, n) [Pa] are constant over each of the S steps of an interval; each step [s] is
+    taken in so many parts. Returns angles and rates (K + 1, n) at the interval boundaries.
     """
     count, substeps, n = pressures.shape
     angles = np.zeros((count + 1, n))
@@ -202,23 +192,21 @@ def simulate(
     angles[0] = q
     rates[0] = v
     slopes = np.zeros((4, n))
+    h = step / parts
     for k in range(count):
-        for s in range(substeps):
-            torque = gain * pressures[k, s]
+        for s in range(substeps * parts):
+            torque = arcs.gain * pressures[k, s // parts]
             q_stage, v_stage = q, v
             q_total, v_total = np.zeros(n), np.zeros(n)
             for stage in range(4):
-                slopes[stage] = acceleration(
-                    q_stage, v_stage, torque, lengths, connector, masses, damping, gravity,
-                    fractions, weights, stiffness, cubic, rest, material_damping,
-                )  # fmt: skip
+                slopes[stage] = acceleration(q_stage, v_stage, torque, arcs)
                 share = 2.0 if stage in (1, 2) else 1.0
                 q_total += share * v_stage
                 v_total += share * slopes[stage]
-                ahead = step if stage == 2 else 0.5 * step
+                ahead = h if stage == 2 else 0.5 * h
                 q_stage, v_stage = q + ahead * v_stage, v + ahead * slopes[stage]
-            q = q + step / 6.0 * q_total
-            v = v + step / 6.0 * v_total
+            q = q + h / 6.0 * q_total
+            v = v + h / 6.0 * v_total
         angles[k + 1] = q
         rates[k + 1] = v
     return angles, rates

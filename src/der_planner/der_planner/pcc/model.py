@@ -7,18 +7,20 @@ the end of each segment, as parts of the literature do). The equation of motion 
 
 with q the (n,) bend angles [rad], u the (n,) differential pressures [Pa] and G the moment gains.
 Damping is the same physical damping as the rod's: mass-proportional per segment, ∫ c μ JᵀJ ds, plus
-Kelvin-Voigt in the stiffness.
+Kelvin-Voigt in the stiffness. Gravity pulls in the plane at the distributed mass, at that of the
+connectors, and at the masses that the limb carries, which are not damped.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from der_planner.limb import Limb
 from der_planner.pcc import kernels
+from der_planner.pcc.kernels import Arcs
 
 Vector = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -26,6 +28,8 @@ MassModel = Literal["distributed", "lumped"]
 
 QUADRATURE_POINTS = 8
 """Gauss-Legendre points a segment: exact to rounding for bends below 180 degrees."""
+LARGEST_PHASE = 1.0
+"""Of the limb's fastest mode in one step of the integrator [rad]; it is unstable beyond 2.8."""
 
 
 class Pcc:
@@ -47,20 +51,56 @@ class Pcc:
         self.base = float(limb.base_length)
         self.connector = float(limb.connector_length)
         self.masses = np.array([s.mass_per_length * s.length for s in segments])
-        self.damping = np.array([s.damping for s in segments])
         self.stiffness = np.array([s.bending_stiffness / s.length for s in segments])
         self.cubic = np.array([s.cubic_stiffness / s.length**3 for s in segments])
         self.rest = np.array([s.rest_curvature * s.length for s in segments])
         self.material_damping = np.array([s.material_damping for s in segments])
         self.gain = np.array([s.moment_gain for s in segments])
-        self.gravity = np.array(limb.gravity[:2], dtype=float)
         if mass == "distributed":
             nodes, weights = np.polynomial.legendre.leggauss(QUADRATURE_POINTS)
-            self.fractions, self.weights = (nodes + 1) / 2, weights / 2
+            self.arcs = self._arcs((nodes + 1) / 2, weights / 2)
         elif mass == "lumped":
-            self.fractions, self.weights = np.ones(1), np.ones(1)
+            self.arcs = self._arcs(np.ones(1), np.ones(1))
         else:
             raise ValueError(f"mass must be 'distributed' or 'lumped', got {mass!r}")
+
+    def _arcs(self, fractions: Vector, weights: Vector) -> Arcs:
+        """Return the numbers of the kernels; a segment's mass sits at fractions of its length."""
+        # owner, place, beyond, mass and drag of every particle
+        particles: list[tuple[int, float, float, float, float]] = []
+        for j, segment in enumerate(self.limb.segments):
+            for place, weight in zip(fractions, weights * self.masses[j], strict=True):
+                particles.append((j, place, 0.0, weight, weight * segment.damping))
+            if j and self.connector:
+                # Two Gauss points carry the moments of a straight piece exactly.
+                before = self.limb.segments[j - 1]
+                half = 0.25 * self.connector * (before.mass_per_length + segment.mass_per_length)
+                drag = 0.5 * half * (before.damping + segment.damping)
+                for share in (0.5 - np.sqrt(1 / 12), 0.5 + np.sqrt(1 / 12)):
+                    particles.append((j - 1, 1.0, share * self.connector, half, drag))
+        particles += [
+            (*self._place(item.arc_length), item.mass, 0.0)
+            for item in self.limb.masses
+            if item.arc_length > self.base
+        ]
+        owner, place, beyond, mass, drag = np.array(particles, dtype=float).T.copy()
+        return Arcs(
+            self.lengths, self.connector, np.array(self.limb.gravity[:2], dtype=float),
+            owner.astype(np.int64), place, beyond, mass, drag, self.gain, self.stiffness,
+            self.cubic, self.rest, self.material_damping,
+        )  # fmt: skip
+
+    def _place(self, arc_length: float) -> tuple[int, float, float]:
+        """Return segment, fraction of it and distance past its end [m] of a place on the limb."""
+        left = arc_length - self.base
+        for j, length in enumerate(self.lengths):
+            last = j == self.segment_count - 1
+            if left <= length or last:
+                return j, min(left / length, 1.0), 0.0
+            if left <= length + self.connector:
+                return j, 1.0, left - length
+            left -= length + self.connector
+        raise AssertionError("the last segment takes what is left")
 
     def _check(self, name: str, value: ArrayLike) -> Vector:
         array = np.asarray(value, dtype=float)
@@ -120,10 +160,7 @@ class Pcc:
         return M, C, D + np.diag(self.stiffness * self.material_damping)
 
     def _inertia(self, q: Vector, v: Vector) -> tuple[Vector, Vector, Vector, Vector]:
-        result: tuple[Vector, Vector, Vector, Vector] = kernels.inertia(
-            q, v, self.lengths, self.connector, self.masses, self.damping, self.gravity,
-            self.fractions, self.weights,
-        )  # fmt: skip
+        result: tuple[Vector, Vector, Vector, Vector] = kernels.inertia(q, v, self.arcs)
         return result
 
     def elastic_torque(self, bend_angles: ArrayLike) -> Vector:
@@ -138,13 +175,14 @@ class Pcc:
         M = self._inertia(q, v)[0]
         bend = q - self.rest
         elastic = 0.5 * self.stiffness @ bend**2 + 0.25 * self.cubic @ bend**4
-        potential = 0.0
+        arcs = self.arcs
+        frame = kernels.joints(q, arcs)
+        slopes = kernels.arc_slopes(q, arcs, frame, 2)
         J, H = np.zeros(q.size, dtype=complex), np.zeros((q.size, q.size), dtype=complex)
-        for j, mass in enumerate(self.masses):
-            for sigma, weight in zip(self.fractions, self.weights, strict=True):
-                point = kernels.point_derivatives(q, self.lengths, self.connector, j, sigma, J, H)
-                height = point.real * self.gravity[0] + point.imag * self.gravity[1]
-                potential -= mass * weight * height
+        potential = 0.0
+        for p, mass in enumerate(arcs.mass):
+            point = self.base + kernels.point_derivatives(q, arcs, frame, p, slopes, J, H)
+            potential -= mass * (point.real * arcs.gravity[0] + point.imag * arcs.gravity[1])
         return float(0.5 * v @ M @ v + elastic + potential)
 
     def pressures(self, angles: ArrayLike, rates: ArrayLike, accelerations: ArrayLike) -> Vector:
@@ -197,16 +235,20 @@ class Pcc:
             self._check("rates", np.zeros(self.segment_count) if rates is None else rates),
             inputs,
             step,
-            self.gain,
-            *self._parameters(),
+            self._parts(step),
+            self.arcs,
         )
         return result
 
-    def _parameters(self) -> tuple[Any, ...]:
-        return (
-            self.lengths, self.connector, self.masses, self.damping, self.gravity, self.fractions,
-            self.weights, self.stiffness, self.cubic, self.rest, self.material_damping,
-        )  # fmt: skip
+    def _parts(self, step: float) -> int:
+        """Return in how many parts the integrator takes a step, by the fastest mode of the limb."""
+        zero = np.zeros(self.segment_count)
+        M, _, D, _ = self._inertia(zero, zero)
+        drag = np.linalg.solve(M, D + np.diag(self.stiffness * self.material_damping))
+        stiff = np.linalg.solve(M, np.diag(self.stiffness))
+        rates = np.block([[0 * M, np.eye(len(M))], [-stiff, -drag]])
+        fastest = float(np.abs(np.linalg.eigvals(rates)).max())
+        return max(1, int(np.ceil(fastest * step / LARGEST_PHASE)))
 
 
 def _arc(angle: Vector) -> Complex:

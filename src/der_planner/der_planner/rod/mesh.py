@@ -34,6 +34,7 @@ class Mesh:
         clamped: indices into q that do not move.
         segments: ((first node, node count), …).
         gain: (M,) Λ [N/Pa].
+        point_mass: (N,) carried by each node beside its edges' halves; it is not damped.
         base: x of node 0.
     """
 
@@ -53,6 +54,7 @@ class Mesh:
     clamped: NDArray[np.int64]
     segments: tuple[tuple[int, int], ...]
     gain: Array
+    point_mass: Array
     base: float = 0.0
 
     @property
@@ -80,9 +82,9 @@ class Mesh:
 
     @property
     def node_mass(self) -> Array:
-        """(N,) half the mass of the edges at each node."""
+        """(N,) half the mass of the edges at each node, and what it carries."""
         half = 0.5 * self.edge_mass
-        total: Array = np.append(half, 0.0) + np.append(0.0, half)
+        total: Array = np.append(half, 0.0) + np.append(0.0, half) + self.point_mass
         return total
 
     @property
@@ -177,7 +179,7 @@ def uniform_mesh(
     *, length: float, nodes: int, EI: float, EA: float, GJ: float, mass_per_length: float,
     damping: float, clamp: str, gravity: ArrayLike, segments: Sequence[tuple[int, int]],
     moment_gain: ArrayLike, material_damping: float, rest_curvature: ArrayLike, rest_twist: float,
-    fixed: Sequence[int],
+    fixed: Sequence[int], masses: Sequence[tuple[float, float]],
 ) -> Mesh:  # fmt: skip
     """Return the mesh of `Rod.uniform`; see there for the arguments."""
     require(
@@ -212,7 +214,26 @@ def uniform_mesh(
         gain=np.array(
             [g * (c - 1) / ((c - 2) * step) for g, (_, c) in zip(gain, pairs, strict=True)]
         ),
+        point_mass=_on_nodes(masses, np.full(nodes - 1, step)),
     )
+
+
+def _on_nodes(masses: Sequence[tuple[float, float]], rest: Array) -> Array:
+    """Return the (N,) nodes' shares of masses (arc length from node 0 [m], mass [kg]).
+
+    A mass between two nodes is split between them by the lever: its sum and its first moment stay.
+    """
+    ends = np.append(0.0, np.cumsum(rest))
+    result = np.zeros(len(ends))
+    for index, (place, mass) in enumerate(masses):
+        not_negative(mass, f"masses[{index}] [kg]")
+        inside = -1e-9 * ends[-1] <= place <= ends[-1] * (1 + 1e-9)
+        require(inside, f"masses[{index}] at", f"within 0 … {ends[-1]:.6g} m", place)
+        edge = min(max(int(np.searchsorted(ends, place)) - 1, 0), len(rest) - 1)
+        share = min(max((place - ends[edge]) / rest[edge], 0.0), 1.0)
+        result[edge] += (1.0 - share) * mass
+        result[edge + 1] += share * mass
+    return result
 
 
 def _cells(rest: Array, ghost: bool) -> Array:
@@ -292,6 +313,9 @@ def limb_mesh(limb: Limb, nodes: int, clamp: str) -> Mesh:
         clamped=clamped_indices(clamp, (), nodes),
         segments=pairs,
         gain=gain,
+        point_mass=_on_nodes(
+            [(max(m.arc_length - limb.base_length, 0.0), m.mass) for m in limb.masses], rest
+        ),
         base=limb.base_length,
     )
 

@@ -77,6 +77,7 @@ class Rod:
         rest_curvature: ArrayLike = (0.0, 0.0),
         rest_twist: float = 0.0,
         fixed: Sequence[int] = (),
+        masses: Sequence[tuple[float, float]] = (),
     ) -> Rod:
         """Build a straight uniform rod along x with its base at the origin.
 
@@ -98,6 +99,7 @@ class Rod:
             rest_curvature: (2,) curvature toward +y and toward +z of the rod at rest [1/m].
             rest_twist: twist of the rod at rest [rad/m].
             fixed: further indices into q that do not move.
+            masses: (arc length from the first node [m], mass [kg]) of each carried mass.
 
         Raises:
             ValueError: a value is out of range; the message says what was expected and what came.
@@ -106,7 +108,7 @@ class Rod:
             length=length, nodes=nodes, EI=EI, EA=EA, GJ=GJ, mass_per_length=mass_per_length,
             damping=damping, clamp=clamp, gravity=gravity, segments=segments,
             moment_gain=moment_gain, material_damping=material_damping,
-            rest_curvature=rest_curvature, rest_twist=rest_twist, fixed=fixed,
+            rest_curvature=rest_curvature, rest_twist=rest_twist, fixed=fixed, masses=masses,
         )  # fmt: skip
         return cls(mesh, plane)
 
@@ -123,7 +125,8 @@ class Rod:
 
         Each segment gets edges of one length; one connector edge between two segments belongs to
         neither. A `connector_length` of zero centres a regular edge on the boundary instead. Node 0
-        sits at the end of the stiff `base_length`.
+        sits at the end of the stiff `base_length`. The limb's masses sit on the nodes; one between
+        two nodes is shared by them so that its weight and its moment stay.
         """
         if plane == "auto":
             plane = "xy" if limb.gravity[2] == 0.0 else None

@@ -1,0 +1,62 @@
+"""Masses and mountings of a limb: its file, its checks, the meaning of a tilt."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from der_planner.limb import GRAVITY, Limb, LimbError, PointMass, gravity_of
+
+LIMB = Limb.default()
+
+
+def test_masses_survive_the_limb_file(tmp_path):
+    limb = LIMB.carrying(0.02).carrying(0.005, at=0.1, name="tag: 3").mounted("hanging")
+    limb.to_yaml(tmp_path / "limb.yaml")
+    assert Limb.from_yaml(tmp_path / "limb.yaml") == limb
+    assert limb.masses == (PointMass(LIMB.length, 0.02, "payload"), PointMass(0.1, 0.005, "tag: 3"))
+    text = (tmp_path / "limb.yaml").read_text()
+    assert "- arc_length: 0.244  # [m] distance from the clamp along the limb\n" in text
+
+
+def test_a_file_without_masses_has_none_and_a_wrong_one_is_named(tmp_path):
+    LIMB.to_yaml(tmp_path / "limb.yaml")
+    text = (tmp_path / "limb.yaml").read_text()
+    for wrong, said in (
+        ("masses: 3", "masses must be a list of mappings"),
+        ("masses: [3]", r"masses\[0\] must be a mapping"),
+        ("masses: [{arc_length: 0.1}]", r"masses\[0\]\.mass is missing"),
+        ("masses: [{arc_length: 0.1, mass: a}]", r"masses\[0\]\.mass must be a number"),
+        ("masses: [{arc_length: 0.1, mass: -1}]", r"masses\[0\]\.mass must be at least 0 kg"),
+        ("masses: [{arc_length: 0.5, mass: 1}]", r"masses\[0\]\.arc_length must be at most"),
+        ("masses: [{place: 0.5, mass: 1}]", r"unknown key masses\[0\]\.place"),
+    ):
+        (tmp_path / "limb.yaml").write_text(text.replace("masses: []", wrong))
+        with pytest.raises(LimbError, match=said):
+            Limb.from_yaml(tmp_path / "limb.yaml")
+    (tmp_path / "limb.yaml").write_text(text.replace("masses: []\n", ""))
+    assert Limb.from_yaml(tmp_path / "limb.yaml") == LIMB
+
+
+def test_a_payload_of_nothing_changes_nothing_and_one_off_the_limb_is_refused():
+    assert LIMB.carrying(0.0) is LIMB
+    with pytest.raises(LimbError, match=r"at most the limb's length of 0\.244 m, got 0\.3"):
+        LIMB.carrying(0.01, at=0.3)
+    with pytest.raises(LimbError, match=r"at least 0 kg, got -0\.01"):
+        LIMB.carrying(-0.01)
+    base = dataclasses.replace(LIMB, base_length=0.02)
+    assert base.carrying(0.01).masses[0].arc_length == pytest.approx(0.264)
+    assert base.carrying(0.01).for_model("pcc").masses == base.carrying(0.01).masses
+
+
+def test_mountings_say_where_gravity_points():
+    assert gravity_of("hanging") == (GRAVITY, 0.0, 0.0)
+    assert gravity_of("standing") == (-GRAVITY, 0.0, 0.0)
+    assert gravity_of("horizontal") == (0.0, 0.0, 0.0)
+    np.testing.assert_allclose(gravity_of("90"), gravity_of("sideways"), atol=1e-15)
+    np.testing.assert_allclose(gravity_of("10"), (0.0, -1.7035, 0.0), atol=1e-4)
+    np.testing.assert_allclose(gravity_of("-10.0"), (0.0, 1.7035, 0.0), atol=1e-4)
+    assert LIMB.mounted("0").gravity == pytest.approx((0.0, 0.0, 0.0))
+    for wrong in ("upside down", "nan", "inf", ""):
+        with pytest.raises(LimbError, match="choose horizontal, hanging, standing, sideways"):
+            gravity_of(wrong)

@@ -1,0 +1,116 @@
+"""Gravity and carried masses on the rod, against integrals and closed forms."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_bvp
+from scipy.optimize import brentq
+
+from der_planner.limb import GRAVITY, Limb
+from der_planner.rod import Rod
+
+BEAM = {"length": 0.25, "EI": 0.02, "EA": 2e4, "GJ": 0.013, "mass_per_length": 0.8}
+
+
+def rod_of(nodes=81, *, plane="xy", **changes):
+    return Rod.uniform(nodes=nodes, plane=plane, **(BEAM | changes))
+
+
+@pytest.mark.parametrize("arc_length", [0.05, 0.1, 0.1337, 0.18, 0.2459, 0.254])
+def test_a_mass_keeps_its_weight_and_its_moment(arc_length):
+    limb = Limb.default()
+    limb = limb.mounted("sideways").carrying(0.3, at=0.0)
+    bare = Rod.from_limb(limb)
+    rod = Rod.from_limb(limb.carrying(0.04, at=min(arc_length, limb.length)))
+    added = rod.mesh.node_mass - bare.mesh.node_mass
+    x = rod.positions(rod.straight_state())[:, 0]
+    assert added.min() >= 0
+    assert added.sum() == pytest.approx(0.04, rel=1e-12)
+    assert added @ x == pytest.approx(0.04 * min(arc_length, limb.length), rel=1e-12)
+    force = rod.external_force[1::4] - bare.external_force[1::4]
+    assert force.sum() == pytest.approx(-0.04 * GRAVITY, rel=1e-12)
+
+
+def elastica(tip_mass, gravity):
+    """Tip of the heavy elastica with an end mass: EI ψ'' = −n × t, n the force beyond s."""
+    length, density = BEAM["length"], BEAM["mass_per_length"]
+
+    def slopes(s, y):
+        beyond = density * (length - s) + tip_mass
+        fx, fy = beyond * gravity[0], beyond * gravity[1]
+        moment = np.cos(y[0]) * fy - np.sin(y[0]) * fx
+        return np.stack([y[1], -moment / BEAM["EI"], np.cos(y[0]), np.sin(y[0])])
+
+    grid = np.linspace(0.0, length, 200)
+    guess = np.zeros((4, grid.size))
+    for share in np.linspace(0.1, 1.0, 10):
+        gravity_now = gravity
+        gravity = np.asarray(gravity_now) * share
+        solved = solve_bvp(
+            slopes, lambda a, b: np.array([a[0], b[1], a[2], a[3]]), grid, guess, tol=1e-9,
+            max_nodes=20000,
+        )  # fmt: skip
+        gravity = gravity_now
+        assert solved.success
+        grid, guess = solved.x, solved.y
+    return solved.y[2:, -1]
+
+
+@pytest.mark.parametrize("plane", ["xy", None])
+@pytest.mark.parametrize("gravity", [(0.0, -9.81, 0.0), (6.0, 7.0, 0.0), (-2.0, -3.0, 0.0)])
+def test_rest_under_weight_and_tip_mass_is_the_heavy_elastica(gravity, plane):
+    rod = rod_of(gravity=gravity, masses=[(0.25, 0.05)], plane=plane)
+    tip = rod.tip(rod.equilibrium([]))[:2]
+    exact = elastica(0.05, np.array(gravity[:2]))
+    assert np.hypot(*(exact - [0.25, 0.0])) > 0.03
+    np.testing.assert_allclose(tip, exact, atol=1.5e-4)
+
+
+def test_first_frequency_with_a_tip_mass_is_that_of_euler_and_bernoulli():
+    """1 + cos cosh + μ β (cos sinh − sin cosh) = 0, β of the beam, μ the tip's over its mass."""
+    tip_mass = 0.1
+    ratio = tip_mass / (BEAM["mass_per_length"] * BEAM["length"])
+
+    def balance(b):
+        return (
+            1
+            + np.cos(b) * np.cosh(b)
+            + ratio * b * (np.cos(b) * np.sinh(b) - np.sin(b) * np.cosh(b))
+        )
+
+    beta = brentq(balance, 0.5, 1.8751)
+    exact = beta**2 / BEAM["length"] ** 2 * np.sqrt(BEAM["EI"] / BEAM["mass_per_length"])
+    rod = rod_of(masses=[(0.25, tip_mass)])
+    free = rod.free
+    stiffness = rod.stiffness(rod.straight_state())[np.ix_(free, free)]
+    root = np.sqrt(rod.mass_diagonal[free])
+    squares = np.linalg.eigvalsh(stiffness / root[:, None] / root)
+    assert np.sqrt(squares[0]) == pytest.approx(exact, rel=2e-3)
+
+
+@pytest.mark.parametrize("plane", ["xy", None])
+def test_the_linearisation_knows_the_masses(plane):
+    limb = Limb.default().mounted("hanging").carrying(0.05)
+    rod = Rod.from_limb(limb, 13, plane=plane)
+    state = rod.equilibrium([3000.0, -1000.0])
+    u = np.array([[4000.0, 2000.0]] * 6)
+    change = np.array([[300.0, -200.0]] * 6)
+    motion = rod.simulate(state, u, 0.01, linearise=True)
+    ahead = rod.simulate(state, u + 1e-3 * change, 0.01).tip
+    behind = rod.simulate(state, u - 1e-3 * change, 0.01).tip
+    slope = ((ahead - behind) / 2e-3)[:, : motion.linearisation.outputs.size]
+    np.testing.assert_allclose(motion.linearisation.tangent(change), slope, atol=2e-7)
+
+
+def test_an_undamped_loaded_rod_keeps_its_energy():
+    rod = rod_of(41, gravity=(9.81, 0.0, 0.0), masses=[(0.25, 0.05), (0.11, 0.02)])
+    bent = rod_of(41, masses=[(0.25, 0.05), (0.11, 0.02)], gravity=(0.0, -6.0, 0.0))
+    state = rod.state(bent.equilibrium([]).q)
+    motion = rod.simulate(state, np.zeros((60, 0)), 0.01, substeps=5, method="midpoint")
+
+    def energies(q, v):
+        kinetic = 0.5 * rod.mass_diagonal @ v**2
+        return kinetic, kinetic + rod.energy(q) - rod.external_force @ q
+
+    kinetic, total = np.array([energies(*pair) for pair in zip(motion.q, motion.v, strict=True)]).T
+    assert np.ptp(kinetic) > 5e-3
+    assert np.ptp(total) < 0.01 * np.ptp(kinetic)
