@@ -147,11 +147,21 @@ class Optimiser:
         pulse = air.even_pulse(model.limb.pneumatics, CONTROL_PERIOD, substeps)
         self._pulse = np.tile(pulse[:, None], (1, inputs))
 
-    def run(self, progress: Callable[[float], None] = lambda _share: None) -> Outcome:
-        """Solve all windows, one after the other."""
+    def run(
+        self,
+        progress: Callable[[float], None] = lambda _share: None,
+        begin: Array | None = None,
+    ) -> Outcome:
+        """Solve all windows, one after the other.
+
+        Args:
+            progress: called with the share that is done, 0 … 1.
+            begin: (K, M) commands where the search starts, if not at the warm start [Pa].
+        """
         count = len(self.warm)
+        first_guess = self.warm if begin is None else begin
         command, _ = within_limits(
-            self.warm, self.model.limb.pneumatics, CONTROL_PERIOD, self.before
+            first_guess, self.model.limb.pneumatics, CONTROL_PERIOD, self.before
         )
         state = self.start
         tip = np.empty((count, 2))
