@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from apriltag_tracker import lens
+from apriltag_tracker.camera import lens
 
 PINHOLE_MODELS = ("plumb_bob", "rational_polynomial")
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apriltag_tracker.camera import CameraError, CameraPose, Intrinsics, solve_pose
-from apriltag_tracker.tag import Tag
+from apriltag_tracker.detection.tag import Tag
 from apriltag_tracker.tag_map import TagMap, WorldTag
 
 

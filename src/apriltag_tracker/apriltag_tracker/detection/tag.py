@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apriltag_tracker.alignment.aligner import USUAL_BLUR
+from apriltag_tracker.detection.alignment.aligner import USUAL_BLUR
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from apriltag_tracker import family
-from apriltag_tracker.edges import inside, sample
+from apriltag_tracker.detection.edges import inside, sample
 
 SHARPENING = 0.25
 """Share of the difference between a cell and its neighbours that is added to it."""

@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from apriltag_tracker.detection import Detector, grey
-from apriltag_tracker.tag import Tag
+from apriltag_tracker.detection.detector import Detector, grey
+from apriltag_tracker.detection.tag import Tag
 
 _TILE = 16
 """Tiles of the mosaic are padded to a multiple of this [px]."""

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from apriltag_tracker.alignment.pattern import MARGIN
+from apriltag_tracker.detection.alignment.pattern import MARGIN
 
 UNKNOWNS = 15
 """Homography (8), blur [px], smear x, y [px], offset, gain, slopes of the gain along both sides."""

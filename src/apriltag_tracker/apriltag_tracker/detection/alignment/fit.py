@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from apriltag_tracker.alignment.sampling import (
+from apriltag_tracker.detection.alignment.sampling import (
     BORDER,
     UNKNOWNS,
     corner_slopes,
@@ -23,7 +23,7 @@ from apriltag_tracker.alignment.sampling import (
     side_length,
     write_corners,
 )
-from apriltag_tracker.decoding import square_to_quad
+from apriltag_tracker.detection.decoding import square_to_quad
 
 RESULT_VALUES = 8
 """Blur, smear x, smear y [px], explained share of all pixels, residual [grey levels], share of the

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apriltag_tracker import family
-from apriltag_tracker.alignment import fit
-from apriltag_tracker.alignment.pattern import tabulate
-from apriltag_tracker.alignment.smear import guess_smear
+from apriltag_tracker.detection.alignment import fit
+from apriltag_tracker.detection.alignment.pattern import tabulate
+from apriltag_tracker.detection.alignment.smear import guess_smear
 
 USUAL_BLUR = 0.65
 """Of a sharp picture, lens and pixel together: where the first fit starts [px]."""

@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from apriltag_tracker.camera import CameraPose, Intrinsics
-from apriltag_tracker.lens import undistort_pixels
+from apriltag_tracker.camera.lens import undistort_pixels
 from apriltag_tracker.tag_map import LimbTag
 
 

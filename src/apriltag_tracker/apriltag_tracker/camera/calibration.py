@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from apriltag_tracker.camera import Intrinsics
-from apriltag_tracker.detection import Detector, grey
+from apriltag_tracker.camera.pinhole import Intrinsics
+from apriltag_tracker.detection.detector import Detector, grey
 from apriltag_tracker.pipeline import LimbTracker
 from apriltag_tracker.sheets import BoardLayout
 from apriltag_tracker.tag_map import LimbTag, TagMap

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from apriltag_tracker.curve import PLACE, Curve, Evaluation, wrap
+from apriltag_tracker.pose.curve import PLACE, Curve, Evaluation, wrap
 from apriltag_tracker.tag_map import TagMap
 
 

@@ -12,10 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from apriltag_tracker import decoding, edges, family
-from apriltag_tracker.alignment.aligner import USUAL_BLUR, Aligner, Alignment
-from apriltag_tracker.covered import covered_quads
-from apriltag_tracker.tag import Tag, counter_clockwise, once
+from apriltag_tracker import family
+from apriltag_tracker.detection import decoding, edges
+from apriltag_tracker.detection.alignment.aligner import USUAL_BLUR, Aligner, Alignment
+from apriltag_tracker.detection.covered import covered_quads
+from apriltag_tracker.detection.tag import Tag, counter_clockwise, once
 
 MOST_CORRECTED_BITS = 2
 """At three forgiven cells 19 of 1000 pictures of noise show a tag."""

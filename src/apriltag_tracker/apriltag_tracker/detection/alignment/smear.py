@@ -8,8 +8,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from apriltag_tracker.alignment.sampling import BORDER, UNKNOWNS, sample_model, side_length
-from apriltag_tracker.decoding import square_to_quad
+from apriltag_tracker.detection.alignment.sampling import (
+    BORDER,
+    UNKNOWNS,
+    sample_model,
+    side_length,
+)
+from apriltag_tracker.detection.decoding import square_to_quad
 
 _LEAST_BLUR = 0.32
 """Of a pixel alone [px]."""
