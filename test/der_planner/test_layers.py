@@ -15,6 +15,7 @@ LAYERS = {
     "pcc": 3,
     "model": 4,
     "planning": 5,
+    "control": 6,
     "identification": 6,
     "control": 6,
 }
