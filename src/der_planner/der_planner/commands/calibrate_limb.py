@@ -25,10 +25,10 @@ from pathlib import Path
 
 import numpy as np
 
-from der_planner.commands.loads import add_load_options, as_loaded, without_payload
 from der_planner.commands.outputs import OutputError, check_file, check_folder
 from der_planner.experiment.errors import GraphError, NodeError
 from der_planner.experiment.interrupts import interrupt_once
+from der_planner.experiment.load_options import add_load_options, as_loaded, without_payload
 from der_planner.experiment.options import Hardware, OptionError
 from der_planner.experiment.progress import Progress
 from der_planner.identification import (
@@ -188,7 +188,7 @@ def _obtain(prior: Limb, given: argparse.Namespace) -> CalibrationLog:
     limit = prior.pneumatics.pressure_limit
     run = within_limits(_excitation(prior, limit, given), limit, math.inf)
     print(f"playing {run.duration:.0f} s on the twin of seed {given.seed} …", file=sys.stderr)
-    return record_twin(given.seed, run)
+    return record_twin(given.seed, run, limb=prior)
 
 
 def _play_on_graph(prior: Limb, given: argparse.Namespace) -> Path:
@@ -226,7 +226,7 @@ def _play_on_graph(prior: Limb, given: argparse.Namespace) -> Path:
         "prior": prior.name,
     }
     player = GraphCalibration(
-        run, given.folder, metadata, progress, seed=given.seed, hardware=hardware
+        run, given.folder, metadata, progress, limb=prior, seed=given.seed, hardware=hardware
     )
     bag = player.play().bag
     progress.say(f"bag: {bag}")

@@ -14,7 +14,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from der_planner.commands.loads import add_load_options, as_loaded
+from der_planner.experiment.load_options import add_load_options, as_loaded
 from der_planner.identification import (
     ColumnMap,
     LogError,

@@ -22,6 +22,7 @@ from der_planner.runs.evaluation.table import (
     format_value,
     latex_table,
     markdown_table,
+    shows_loads,
     shows_namespace,
 )
 from der_planner.runs.run import RunSeries
@@ -134,10 +135,11 @@ def _page(
 
 
 def _summary_table(rows: Sequence[Summary]) -> str:
-    several = shows_namespace(rows)
+    several, loaded = shows_namespace(rows), shows_loads(rows)
     lines = [
         [
             *([html.escape(row.namespace)] if several else []),
+            *([html.escape(row.loads or "horizontal")] if loaded else []),
             html.escape(CASE.get(row.motion, row.motion)),
             html.escape(row.model.upper()),
             html.escape(row.method),
@@ -152,10 +154,11 @@ def _summary_table(rows: Sequence[Summary]) -> str:
     ]
     header = [
         *(["limb"] if several else []),
+        *(["loads"] if loaded else []),
         *("case", "model", "method", "trials", "E [cm]", "E<sub>x</sub> [cm]"),
         *("E<sub>y</sub> [cm]", "max [cm]", "predicted E [cm]"),
     ]
-    return table(header, lines, names=4 if several else 3)
+    return table(header, lines, names=3 + several + loaded)
 
 
 def _number(value: float, scale: float = 1.0, digits: int = 2) -> str:

@@ -7,11 +7,8 @@ import dataclasses
 
 from der_planner.limb import Limb
 
-PAYLOAD = "payload"
-"""Name of the mass that belongs to a run and not to the limb."""
 
-
-def add_load_options(parser: argparse.ArgumentParser) -> None:
+def add_load_options(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
     """Add --mounting, --payload and --payload-at."""
     parser.add_argument(
         "--mounting",
@@ -41,7 +38,7 @@ def as_loaded(limb: Limb, given: argparse.Namespace) -> Limb:
         LimbError: the mounting is unknown, or the payload is negative or not on the limb.
     """
     mounted = limb.mounted(given.mounting) if given.mounting else limb
-    return mounted.carrying(given.payload, given.payload_at, PAYLOAD)
+    return mounted.carrying(given.payload, given.payload_at)
 
 
 def without_payload(limb: Limb, given: argparse.Namespace) -> Limb:
