@@ -17,7 +17,6 @@ LAYERS = {
     "planning": 5,
     "control": 6,
     "identification": 6,
-    "control": 6,
 }
 """Parts with a place in the order; an import must go to a lower one, or stay inside its part."""
 
