@@ -75,6 +75,9 @@ class Factor:
             StudyError: it is of another kind or out of range; names ``where``.
         """
         if self.choices:
+            if isinstance(value, bool):  # so YAML reads yes and no, on and off
+                said = {True: ("yes", "on"), False: ("no", "off")}[value]
+                value = next((name for name in said if name in self.choices), value)
             if value in self.choices:
                 return str(value)
             if self.also is not None and not isinstance(value, bool):
@@ -129,6 +132,9 @@ FACTORS: dict[str, Factor] = {
     "payload": Factor("kg", "carried while it plays, not when calibrated", PLANNED, 0.0, 0.0, 10.0),
     "payload_at": Factor(
         "m", "where along the limb, from the clamp; 0: at the tip", PLANNED, 0.0, 0.0, 10.0
+    ),
+    "learning_runs": Factor(
+        "-", "earlier runs of the motion that the plan has learned from (der)", (RUN,), 0, 0, 100
     ),
     "feedback": Factor(
         "-",

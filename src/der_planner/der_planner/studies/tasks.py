@@ -35,6 +35,8 @@ Values = Mapping[str, Value]
 Result = dict[str, float]
 _VENTED = 1.0
 """Before a run the twin rests for so long [s], with feedback and without."""
+_FIRST_LEARNING_RUN = 10
+"""Runs of a twin's hardware from here on are learned from; the one that counts is run 0."""
 _UNSEEN_RUN = 2
 """The run of a twin's hardware on which an identified limb is tried."""
 
@@ -128,6 +130,8 @@ def _run(limb: str, rows: Sequence[Values]) -> list[Result | Exception]:
 def _play(limb: str, row: Mapping[str, Any]) -> Result:
     planned = _planned(with_errors(limb_of(limb), row), row)
     loads = loaded(limb_of(limb), row)
+    if row["learning_runs"]:
+        planned = _learned(planned, loads, row)
     tip, held = (_with_feedback if row["feedback"] == "on" else _blind)(planned, loads, row)
     return {
         **_errors(planned, tip),
@@ -136,7 +140,23 @@ def _play(limb: str, row: Mapping[str, Any]) -> Result:
     }
 
 
-def _blind(planned: Plan, loads: Limb, row: Mapping[str, Any]) -> tuple[Array, Array]:
+def _learned(planned: Plan, loads: Limb, row: Mapping[str, Any]) -> Plan:
+    """Return the plan after runs of it on the same hardware, as a camera would have seen them."""
+    from der_planner.control import Learner  # noqa: PLC0415
+    from der_planner.identification.offline import TIP_NOISE  # noqa: PLC0415
+
+    learner = Learner(planned)
+    for run in range(_FIRST_LEARNING_RUN, _FIRST_LEARNING_RUN + row["learning_runs"]):
+        tip, _ = _blind(planned, loads, row, run)
+        noise = np.random.default_rng([row["seed"], run]).standard_normal(tip.shape)
+        learner.add(planned.time, tip + row["tag_noise"] * TIP_NOISE * noise)
+        planned = learner.next()
+        if learner.stopped:
+            break
+    return planned
+
+
+def _blind(planned: Plan, loads: Limb, row: Mapping[str, Any], run: int = 0) -> tuple[Array, Array]:
     """Return the twin's tips (K, 2) [m] and chamber less commanded pressures (K, M) [Pa]."""
     # PyElastica takes a second to import: only who plays pays for it.
     from der_planner.twin.offline import play  # noqa: PLC0415
@@ -145,6 +165,7 @@ def _blind(planned: Plan, loads: Limb, row: Mapping[str, Any]) -> tuple[Array, A
         planned.time,
         planned.differential_pressure,
         seed=row["seed"],
+        run=run,
         gravity=loads.gravity,
         masses=loads.masses,
     )
