@@ -65,7 +65,7 @@ def test_names_that_yaml_takes_for_something_else(tmp_path):
         "payload_known": ["no"],
         "mounting": ["hanging", "30", "-12.5"],
     }
-    with pytest.raises(StudyError, match="mounting must be one of horizontal.*or degrees"):
+    with pytest.raises(StudyError, match=r"mounting must be one of horizontal.*or degrees"):
         study(tmp_path, factors="{mounting: upside}")
 
 
