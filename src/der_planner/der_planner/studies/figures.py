@@ -73,9 +73,23 @@ def _panels(study: Study, plot: Mapping[str, str], rows: Records) -> Figure:
         fill(study, plot, [each for each in rows if not by or each[by] == value], panel)
         if by:
             label, factor = quantity(by, study)
-            panel.set_title(f"{label} = {value * factor:.3g}" if _number(value) else str(value))
+            panel.set_title(f"{label}: {value * factor:.3g}" if _number(value) else str(value))
         if place and plot["kind"] != "map":
             panel.set_ylabel("")
+            if panel.get_legend() is not None:
+                panel.get_legend().remove()
+    # Panels share their axis: where it ends is known when all are drawn.
+    for panel in axes:
+        for axis in plot.get("log", ""):
+            (panel.set_xscale if axis == "x" else panel.set_yscale)("log")
+        if plot["kind"] == "lines" and "y" not in plot.get("log", ""):
+            panel.set_ylim(bottom=0.0)
+        if "x" in plot.get("log", ""):
+            ticks = sorted({each[plot["x"]] * quantity(plot["x"], study)[1] for each in rows})
+            panel.set_xticks(ticks, [f"{tick:.3g}" for tick in ticks], minor=False)
+            panel.set_xticks([], minor=True)
+        if "y" in plot.get("log", ""):
+            panel.yaxis.set_major_formatter("{x:g}")
     if plot.get("title"):
         figure.suptitle(plot["title"])
     return figure
@@ -101,7 +115,6 @@ def _lines(study: Study, plot: Mapping[str, str], rows: Records, panel: Axes) ->
     panel.set(xlabel=x_label, ylabel=y_label)
     if names:
         panel.set_xticks(range(len(names)), names, rotation=30, ha="right")
-    panel.set_ylim(bottom=0.0)
     if by:
         panel.legend()
 
