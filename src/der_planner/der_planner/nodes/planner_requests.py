@@ -75,7 +75,7 @@ def from_command(message: MotionCommand, options: PlannerOptions, now: int) -> R
         cycles=message.cycles or DEFAULT_CYCLES,
         branch=options.branch,
     )
-    method = _method(model, message.method, options)
+    method = choose_method(model, message.method or options.method)
     start = start_of(nanoseconds(message.header.stamp), now)
     return Request(message.plan_id, motion, model, method, start)
 
@@ -96,8 +96,6 @@ def from_path(message: PathMessage, plan_id: str, options: PlannerOptions, now: 
         time, tip.reshape(-1, 2), branch=options.branch, limits=options.limits
     )
     start = start_of(nanoseconds(message.header.stamp), now)
-    return Request(plan_id, motion, options.model, _method(options.model, "", options), start)
-
-
-def _method(model: str, method: str, options: PlannerOptions) -> str:
-    return choose_method(model, method or (options.method if model == "der" else ""))
+    return Request(
+        plan_id, motion, options.model, choose_method(options.model, options.method), start
+    )

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from der_planner.limb import Limb
 from der_planner.pcc import kernels
 from der_planner.pcc.kernels import Arcs
+from der_planner.pcc.linearisation import Linearisation
 
 Vector = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -30,6 +31,12 @@ QUADRATURE_POINTS = 8
 """Gauss-Legendre points a segment: exact to rounding for bends below 180 degrees."""
 LARGEST_PHASE = 1.0
 """Of the limb's fastest mode in one step of the integrator [rad]; it is unstable beyond 2.8."""
+_ITERATIONS = 30
+_SMALLEST_PART = 1 / 256
+
+
+class NoRestError(RuntimeError):
+    """The arcs do not come to rest under their load."""
 
 
 class Pcc:
@@ -227,18 +234,79 @@ class Pcc:
         Raises:
             ValueError: wrong shapes.
         """
+        result: tuple[Vector, Vector] = kernels.simulate(*self._run(pressures, step, angles, rates))
+        return result
+
+    def linearised(
+        self,
+        pressures: ArrayLike,
+        step: float,
+        angles: ArrayLike | None = None,
+        rates: ArrayLike | None = None,
+    ) -> tuple[Vector, Vector, Linearisation]:
+        """Roll the model forward as `simulate`, with the exact linearisation of the motion."""
+        q, v, by_state, by_pressure = kernels.linearised(*self._run(pressures, step, angles, rates))
+        return q, v, Linearisation(by_state, by_pressure)
+
+    def _run(
+        self, pressures: ArrayLike, step: float, angles: ArrayLike | None, rates: ArrayLike | None
+    ) -> tuple[Vector, Vector, Vector, float, int, Arcs]:
+        """Return the arguments of the kernels that roll the model forward."""
         inputs = np.ascontiguousarray(pressures, dtype=float)
         if inputs.ndim != 3 or inputs.shape[2] != self.segment_count:
             raise ValueError(f"pressures must be (K, S, {self.segment_count}), got {inputs.shape}")
-        result: tuple[Vector, Vector] = kernels.simulate(
-            self._check("angles", self.rest if angles is None else angles),
-            self._check("rates", np.zeros(self.segment_count) if rates is None else rates),
-            inputs,
-            step,
-            self._parts(step),
-            self.arcs,
-        )
-        return result
+        q = self._check("angles", self.rest if angles is None else angles)
+        v = self._check("rates", np.zeros(self.segment_count) if rates is None else rates)
+        return q, v, inputs, step, self._parts(step), self.arcs
+
+    def equilibrium(self, pressures: ArrayLike) -> Vector:
+        """Return the bend angles (n,) [rad] at rest under effective pressures (n,) [Pa].
+
+        By Newton's method, the load raised in parts that shrink where it fails.
+
+        Raises:
+            NoRestError: no rest was found on the way from no load, or it is not a stable one.
+        """
+        wanted = self.gain * self._check("pressures", pressures)
+        q, reached, part = self.rest.copy(), 0.0, 1.0
+        while reached < 1.0:
+            share = min(1.0, reached + part)
+            trial = self._newton(q, share * wanted, share)
+            if trial is not None:
+                q, reached = trial, share
+                continue
+            part *= 0.5
+            if part < _SMALLEST_PART:
+                break
+        if reached < 1.0 or self.firmness(q) <= 0:
+            raise NoRestError("the arcs have no stable rest under their load: they would buckle")
+        return q
+
+    def _newton(self, q: Vector, torque: Vector, share: float) -> Vector | None:
+        """Return angles at rest under a torque (n,) and a share of gravity; None: not found."""
+        arcs = self.arcs._replace(gravity=share * self.arcs.gravity)
+        zero = np.zeros_like(q)
+        for _ in range(_ITERATIONS):
+            weight = kernels.inertia(q, zero, arcs)[3]
+            change = np.linalg.solve(
+                kernels.force_slopes(q, zero, zero, arcs)[0],
+                torque + weight - self.elastic_torque(q),
+            )
+            q = q + change * min(1.0, 0.5 / max(float(np.abs(change).max()), 1e-300))
+            if np.abs(change).max() < 1e-12:
+                return q
+        return None
+
+    def firmness(self, bend_angles: ArrayLike) -> float:
+        """Return the smallest eigenvalue of the stiffness of arcs at rest [N·m/rad]."""
+        return float(np.linalg.eigvalsh(self.stiffness_matrix(bend_angles))[0])
+
+    def stiffness_matrix(self, bend_angles: ArrayLike) -> Vector:
+        """Return ∂(elastic less gravity's torque)/∂(bend angles) (n, n) [N·m/rad], symmetric."""
+        q = self._check("bend_angles", bend_angles)
+        zero = np.zeros_like(q)
+        matrix: Vector = kernels.force_slopes(q, zero, zero, self.arcs)[0]
+        return matrix
 
     def _parts(self, step: float) -> int:
         """Return in how many parts the integrator takes a step, by the fastest mode of the limb."""
