@@ -26,8 +26,8 @@ from der_planner.planning import (
     plan,
     rod_model,
 )
+from der_planner.planning.loads.posed import REFERENCE_PRIOR
 from der_planner.planning.motions import sample_spline
-from der_planner.planning.posed import REFERENCE_PRIOR
 from der_planner.planning.rod_model import PlanningRod
 
 CASES = ("asynchronous", "same_direction", "opposite_direction")

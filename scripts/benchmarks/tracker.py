@@ -16,10 +16,10 @@ import pyapriltags
 from numpy.typing import NDArray
 
 from apriltag_tracker.detection import Detector
+from apriltag_tracker.detection.tracking import TagTracker
 from apriltag_tracker.pipeline import LimbTracker
 from apriltag_tracker.synthetic.camera import CameraModel, SyntheticCamera
 from apriltag_tracker.tag_map import TagMap
-from apriltag_tracker.tracking import TagTracker
 from benchmarks.tracker_graph import measure_graph
 from benchmarks.tracker_pictures import (
     CONDITIONS,

@@ -14,6 +14,7 @@ import numpy as np
 
 from benchmarks.rod import cantilever, run_elastica
 from der_planner.limb import Limb
+from der_planner.model.bending import PolylineKinematics
 from der_planner.rod import Rod, RodState
 from workspace_setup.basics import ROOT
 
@@ -83,7 +84,7 @@ def theorem(folder: Path) -> None:
     """Bending forces of an even bend, and what uneven edges make of them."""
     limb = Limb.default()
     rod = Rod.from_limb(limb)
-    q, _ = rod.configuration_from_bend_angles(np.radians([45.0, -60.0]))
+    q = PolylineKinematics.of_rod(rod).configuration(np.radians([45.0, -60.0]))
     force = rod.internal_force(q)
     forces = np.stack([force[0::4], force[1::4]], axis=1)
     x = rod.positions(q) * 1e3

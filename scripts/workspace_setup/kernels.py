@@ -1,7 +1,7 @@
 """Compile the kernels of planner, twin, camera and tracker, so that no node starts cold.
 
-Called once by the set-up, through scripts/compile_kernels.py. A kernel that is changed later is
-compiled again by what uses it first. Unlike the rest of this folder it needs the workspace.
+Called by the set-up, through scripts/compile_kernels.py, when a kernel is new or changed. Unlike
+the rest of this folder it needs the workspace.
 """
 
 from __future__ import annotations

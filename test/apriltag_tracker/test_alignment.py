@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from apriltag_tracker import family
-from apriltag_tracker.alignment.aligner import Aligner
-from apriltag_tracker.alignment.pattern import tabulate
+from apriltag_tracker.detection.alignment.aligner import Aligner
+from apriltag_tracker.detection.alignment.pattern import tabulate
 from benchmarks.tracker_renderer import Scene, render
 
 

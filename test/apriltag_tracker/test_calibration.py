@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import yaml
 
-from apriltag_tracker.calibration import (
+from apriltag_tracker.camera import Intrinsics
+from apriltag_tracker.camera.calibration import (
     BoardFinder,
     BoardView,
     CalibrationError,
@@ -18,7 +19,6 @@ from apriltag_tracker.calibration import (
     calibrate_mounting,
     with_offsets,
 )
-from apriltag_tracker.camera import Intrinsics
 from apriltag_tracker.sheets import BoardLayout
 from apriltag_tracker.synthetic.camera import SyntheticCamera
 from apriltag_tracker.synthetic.shapes import constant_curvature

@@ -4,9 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from apriltag_tracker import detection, family
+from apriltag_tracker import family
 from apriltag_tracker.camera import CameraPose, Intrinsics
 from apriltag_tracker.detection import Detector
+from apriltag_tracker.detection import detector as detection
 from apriltag_tracker.synthetic.camera import CameraModel, Optics, SyntheticCamera
 from apriltag_tracker.synthetic.shapes import constant_curvature
 from apriltag_tracker.tag_map import LimbTag, TagMap, WorldTag

@@ -5,9 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from apriltag_tracker import decoding, edges, lens, plane
-from apriltag_tracker.camera import Intrinsics
+from apriltag_tracker.camera import Intrinsics, lens
+from apriltag_tracker.detection import decoding, edges
 from apriltag_tracker.pipeline import LimbTracker, TrackerOptions, Uncertainty, warm_up
+from apriltag_tracker.pose import plane
 from apriltag_tracker.synthetic.camera import Errors, Optics, SyntheticCamera
 
 PERIOD = 1.0 / 30.0

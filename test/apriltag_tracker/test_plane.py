@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from apriltag_tracker.camera import CameraPose, project
-from apriltag_tracker.plane import centreline_pose, locate, planar_pose
+from apriltag_tracker.pose.plane import centreline_pose, locate, planar_pose
 from apriltag_tracker.tag_map import UNIT_CORNERS, LimbTag
 
 

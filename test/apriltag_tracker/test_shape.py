@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from apriltag_tracker.curve import Curve, Evaluation, wrap
-from apriltag_tracker.shape import (
+from apriltag_tracker.pose.curve import Curve, Evaluation, wrap
+from apriltag_tracker.pose.shape import (
     PlanarTag,
     ShapeFitter,
     ShapePrior,

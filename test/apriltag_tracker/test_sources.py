@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from apriltag_tracker.encodings import ImageError, ImageReader, to_grey
-from apriltag_tracker.sources import (
+from apriltag_tracker.camera.encodings import ImageError, ImageReader, to_grey
+from apriltag_tracker.camera.sources import (
     DeviceSource,
     SourceError,
     VideoSource,

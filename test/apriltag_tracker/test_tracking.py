@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from apriltag_tracker.detection.tracking import TagTracker, TrackingOptions
 from apriltag_tracker.synthetic.camera import Optics, SyntheticCamera
-from apriltag_tracker.tracking import TagTracker, TrackingOptions
 
 PERIOD = 1.0 / 30.0
 

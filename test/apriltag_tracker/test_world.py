@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from apriltag_tracker.camera import CameraPose, project
-from apriltag_tracker.tag import Tag
-from apriltag_tracker.world import WorldPose
+from apriltag_tracker.detection.tag import Tag
+from apriltag_tracker.pose.world import WorldPose
 
 
 def tags_seen(tags, model, pose, noise=0.0, random=None, moved=None):

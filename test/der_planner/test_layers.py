@@ -68,15 +68,9 @@ def test_nobody_imports_nodes():
     ]
 
 
-TYPE_ONLY = ("der_planner.rod.state", "der_planner.rod.linearisation")
-"""A trajectory carries its linearisation: the rod's one cycle, for a type alone."""
-
-
 def test_no_module_imports_itself_by_way_of_others():
     graph = {
-        name: {
-            other for other in imports(path) if other in modules() and (name, other) != TYPE_ONLY
-        }
+        name: {other for other in imports(path) if other in modules()}
         for name, path in modules().items()
     }
     done: set[str] = set()

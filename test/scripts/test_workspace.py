@@ -62,3 +62,47 @@ def test_the_environment_holds_nothing_of_another_workspace(monkeypatch: pytest.
     assert "/somebody/elses" not in inside["CMAKE_PREFIX_PATH"]
     for package in workspace.PACKAGES:
         assert f"install/{package}" in inside["AMENT_PREFIX_PATH"]
+
+
+def _answer(source: Path) -> str:
+    package = source / "robot"
+    command = "from robot.inner.caller import twice; print(twice())"
+    found = subprocess.run(
+        [sys.executable, "-c", command], cwd=package, capture_output=True, text=True, check=True
+    )
+    return found.stdout.strip()
+
+
+def test_a_kernel_is_compiled_again_when_one_that_it_calls_has_changed(tmp_path: Path):
+    from workspace_setup.building import drop_stale_kernels, kernel_digests
+
+    inner = tmp_path / "robot" / "robot" / "inner"
+    inner.mkdir(parents=True)
+    (inner / "called.py").write_text(
+        "from numba import njit\n\n\n@njit(cache=True)\ndef one():\n    return 1\n"
+    )
+    (inner / "caller.py").write_text(
+        "from numba import njit\nfrom robot.inner.called import one\n\n\n"
+        "@njit(cache=True)\ndef twice():\n    return 2 * one()\n"
+    )
+    (inner / "plain.py").write_text("HERE = 1\n")
+    before = kernel_digests(tmp_path)
+    assert list(before) == ["robot/inner"]
+    assert _answer(tmp_path) == "2"
+    (inner / "plain.py").write_text("HERE = 2\n")
+    assert kernel_digests(tmp_path) == before
+
+    text = (inner / "called.py").read_text()
+    (inner / "called.py").write_text(text.replace("return 1", "return 10"))
+    assert kernel_digests(tmp_path) != before
+    assert _answer(tmp_path) == "2", "numba notices by itself now: the caches need not be dropped"
+    drop_stale_kernels(tmp_path, ["robot/inner"])
+    assert _answer(tmp_path) == "20"
+
+
+def test_every_kernel_of_the_workspace_is_in_a_group():
+    from workspace_setup.building import kernel_digests
+
+    with_kernels = {"model", "pcc", "rod", "twin"}
+    groups = {"apriltag_tracker", *(f"der_planner/{name}" for name in with_kernels)}
+    assert set(kernel_digests(ROOT / "src")) == groups

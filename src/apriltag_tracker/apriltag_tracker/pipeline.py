@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from apriltag_tracker.camera import CameraPose, Intrinsics
 from apriltag_tracker.detection import Detector, enlarged_tag
-from apriltag_tracker.plane import centreline_pose, locate, pose_moves
-from apriltag_tracker.shape import LimbEstimate, PlanarTag, ShapeFitter, ShapePrior
-from apriltag_tracker.tag import Tag
+from apriltag_tracker.detection.tag import Tag
+from apriltag_tracker.detection.tracking import TagTracker, TrackingOptions
+from apriltag_tracker.pose.plane import centreline_pose, locate, pose_moves
+from apriltag_tracker.pose.shape import LimbEstimate, PlanarTag, ShapeFitter, ShapePrior
+from apriltag_tracker.pose.world import WorldPose
 from apriltag_tracker.tag_map import LimbTag, TagMap, WorldTag
-from apriltag_tracker.tracking import TagTracker, TrackingOptions
-from apriltag_tracker.world import WorldPose
 
 
 @dataclass(frozen=True)

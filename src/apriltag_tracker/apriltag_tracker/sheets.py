@@ -6,7 +6,6 @@ vectors, so that the edges of the tags are as straight as the printer is.
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +13,11 @@ from typing import Any
 
 import cv2
 import numpy as np
+from matplotlib import rc_context
+from matplotlib.backends.backend_pdf import PdfPages
+from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path as MatplotlibPath
 from numpy.typing import NDArray
 
 from apriltag_tracker import family
@@ -21,7 +25,8 @@ from apriltag_tracker.tag_map import TagMap
 
 PAPERS = {"a4": (210.0, 297.0), "letter": (215.9, 279.4)}
 _MARGIN = 12.0
-_POINTS = 72.0 / 25.4
+_INCH = 25.4  # mm
+_POINTS = 72.0 / _INCH  # points of a font to a mm
 
 
 class SheetError(ValueError):
@@ -173,76 +178,37 @@ def _black_rectangles(black: NDArray[np.bool_]) -> list[tuple[int, int, int, int
     return result
 
 
+def drawing(page: Page) -> Figure:
+    """Return a page as a matplotlib figure of its true size, one unit of its axes being 1 mm."""
+    figure = Figure(figsize=(page.width / _INCH, page.height / _INCH))
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set(xlim=(0.0, page.width), ylim=(page.height, 0.0))
+    axes.set_axis_off()
+    # One path: rectangles that touch are printed without a seam between them.
+    axes.add_patch(PathPatch(_outline(page.rectangles), facecolor="black", linewidth=0.0))
+    axes.add_patch(PathPatch(_outline(page.cuts), fill=False, edgecolor="0.73", linewidth=0.3))
+    for x, y, size, text in page.labels:
+        axes.text(x, y, text, fontsize=size * _POINTS, parse_math=False)
+    return figure
+
+
+def _outline(boxes: Sequence[tuple[float, float, float, float]]) -> MatplotlibPath:
+    """Return rectangles (x, y, width, height) as one path."""
+    corners = [((x, y), (x + w, y), (x + w, y + h), (x, y + h), (x, y)) for x, y, w, h in boxes]
+    codes = [
+        MatplotlibPath.MOVETO, *[MatplotlibPath.LINETO] * 3, MatplotlibPath.CLOSEPOLY
+    ] * len(boxes)  # fmt: skip
+    return MatplotlibPath(np.reshape(corners, (-1, 2)), codes)
+
+
 def write_svg(page: Page, path: Path) -> None:
     """Write one page as SVG."""
-    lines = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{page.width}mm" height="{page.height}mm" '
-        f'viewBox="0 0 {page.width} {page.height}" shape-rendering="crispEdges">',
-        f'<rect width="{page.width}" height="{page.height}" fill="white"/>',
-    ]
-    lines += [
-        f'<rect x="{x:.4f}" y="{y:.4f}" width="{w:.4f}" height="{h:.4f}"/>'
-        for x, y, w, h in page.rectangles
-    ]
-    lines += [
-        f'<rect x="{x:.4f}" y="{y:.4f}" width="{w:.4f}" height="{h:.4f}" fill="none" stroke="#bbb" '
-        'stroke-width="0.1"/>'
-        for x, y, w, h in page.cuts
-    ]
-    lines += [
-        f'<text x="{x:.2f}" y="{y:.2f}" font-size="{size}" font-family="sans-serif">{text}</text>'
-        for x, y, size, text in page.labels
-    ]
-    path.write_text("\n".join([*lines, "</svg>"]) + "\n")
+    with rc_context({"svg.fonttype": "none"}):
+        drawing(page).savefig(path, format="svg")
 
 
 def write_pdf(pages: Sequence[Page], path: Path) -> None:
     """Write pages as one PDF."""
-    objects: list[bytes] = [b"<< /Type /Catalog /Pages 2 0 R >>", b""]
-    objects.append(b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica >>")
-    kids = []
-    for page in pages:
-        content = zlib.compress(_pdf_content(page).encode("latin-1"))
-        stream = b"<< /Length %d /Filter /FlateDecode >>\nstream\n" % len(content)
-        objects.append(stream + content + b"\nendstream")
-        box = f"[0 0 {page.width * _POINTS:.4f} {page.height * _POINTS:.4f}]"
-        objects.append(
-            f"<< /Type /Page /Parent 2 0 R /MediaBox {box} /Contents {len(objects)} 0 R "
-            "/Resources << /Font << /F1 3 0 R >> >> >>".encode()
-        )
-        kids.append(f"{len(objects)} 0 R")
-    objects[1] = f"<< /Type /Pages /Kids [{' '.join(kids)}] /Count {len(kids)} >>".encode()
-    body, places = b"%PDF-1.4\n", []
-    for number, content in enumerate(objects, 1):
-        places.append(len(body))
-        body += b"%d 0 obj\n" % number + content + b"\nendobj\n"
-    table = b"".join(b"%010d 00000 n \n" % place for place in places)
-    body += b"xref\n0 %d\n0000000000 65535 f \n" % (len(objects) + 1) + table
-    start = body.rindex(b"xref\n0 ")
-    body += b"trailer\n<< /Size %d /Root 1 0 R >>\n" % (len(objects) + 1)
-    path.write_bytes(body + b"startxref\n%d\n%%%%EOF\n" % start)
-
-
-def _pdf_content(page: Page) -> str:
-    """Return the drawing of a page; y runs upward in PDF, so the page is turned over."""
-    scale = _POINTS
-    lines = [f"{scale:.6f} 0 0 {-scale:.6f} 0 {page.height * scale:.6f} cm", "0 g"]
-    lines += [f"{x:.4f} {y:.4f} {w:.4f} {h:.4f} re" for x, y, w, h in page.rectangles]
-    lines += ["f", "0.73 G 0.1 w"]
-    lines += [f"{x:.4f} {y:.4f} {w:.4f} {h:.4f} re" for x, y, w, h in page.cuts]
-    lines.append("S")
-    for x, y, size, text in page.labels:
-        escaped = text.replace("\\", r"\\").replace("(", r"\(").replace(")", r"\)")
-        lines.append(f"BT /F1 1 Tf {size:.2f} 0 0 {-size:.2f} {x:.3f} {y:.3f} Tm ({escaped}) Tj ET")
-    return "\n".join(lines)
-
-
-def rasterise(page: Page, dots_per_mm: float) -> NDArray[np.uint8]:
-    """Return a page as a grey image, for looking at it and for tests."""
-    size = (round(page.height * dots_per_mm), round(page.width * dots_per_mm))
-    image = np.full(size, 255, dtype=np.uint8)
-    for x, y, w, h in page.rectangles:
-        left, right = round(x * dots_per_mm), round((x + w) * dots_per_mm)
-        top, bottom = round(y * dots_per_mm), round((y + h) * dots_per_mm)
-        image[top:bottom, left:right] = 0
-    return image
+    with PdfPages(path) as document:
+        for page in pages:
+            document.savefig(drawing(page))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from der_planner.limb import Limb
-from der_planner.model.bending import ArcKinematics, PolylineKinematics
+from der_planner.model.bending import ArcKinematics, PolylineKinematics, bend_angles
 from der_planner.planning import inverse
 from der_planner.planning.rod_model import PlanningRod
 from der_planner.rod import Rod
@@ -33,21 +33,22 @@ def test_jacobian_against_finite_differences(kinematics):
         np.testing.assert_allclose(kinematics.tip_jacobians(angles)[..., j], slope, atol=1e-9)
 
 
-def test_the_chain_is_the_rods_evenly_bent_configuration():
+@pytest.mark.parametrize("angles", [[0.9, -0.9], [0.2, 0.7], [0.0, 0.0], [3.0, 2.9], [-3.1, 0.4]])
+def test_an_evenly_bent_chain_has_these_bend_angles_and_tangents(angles):
     rod = Rod.from_limb(LIMB, 21)
-    for angles in ([0.9, -0.9], [0.2, 0.7], [0.0, 0.0]):
-        q, tangents = rod.configuration_from_bend_angles(angles)
-        np.testing.assert_allclose(CHAIN.nodes(angles), rod.positions(q)[:, :2], atol=1e-14)
-        S = CHAIN.tangents(angles)
-        np.testing.assert_allclose(S[..., 0].T, tangents[0::4], atol=1e-13)
-        np.testing.assert_allclose(S[..., 1].T, tangents[1::4], atol=1e-13)
+    np.testing.assert_allclose(bend_angles(rod, CHAIN.configuration(angles)), angles, atol=1e-13)
+    step = 1e-6 * np.eye(2)
+    slope = (CHAIN.nodes(angles + step) - CHAIN.nodes(angles - step)) / 2e-6
+    np.testing.assert_allclose(CHAIN.tangents(angles), slope, atol=1e-9)
+    still = CHAIN.configuration(np.zeros(2))
+    np.testing.assert_allclose(still, rod.straight_state().q, atol=1e-15)
 
 
 def test_a_stiff_base_moves_the_limb_along_x():
     based = replace(LIMB, base_length=7e-3)
     model, rod = PlanningRod(based), Rod.from_limb(based, 21)
     angles = [0.9, -0.4]
-    q, _ = rod.configuration_from_bend_angles(angles)
+    q = PolylineKinematics.of_rod(rod).configuration(angles)
     np.testing.assert_allclose(model.kinematics.nodes(angles), rod.positions(q)[:, :2], atol=1e-14)
     for with_base, without in ((model.kinematics, CHAIN), (ArcKinematics(based), ARCS)):
         np.testing.assert_allclose(

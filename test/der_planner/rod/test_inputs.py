@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from der_planner.model.bending import PolylineKinematics, bend_angles
 from der_planner.rod import Rod
 
 EI = 0.02
@@ -26,7 +27,7 @@ def node_forces(force):
 def test_bending_forces_of_an_even_bend_are_two_couples(turn, plane):
     """Theorem 1: nothing inside, and |F| = 4 EI sinθ / (l ē (1 + cosθ)²) at the four end nodes."""
     rod = segment_rod(plane=plane)
-    q, _ = rod.configuration_from_bend_angles([turn * 10])
+    q = PolylineKinematics.of_rod(rod).configuration([turn * 10])
     forces = node_forces(rod.internal_force(q))
     step = rod.rest_lengths[0]
     magnitude = 4 * EI * abs(np.sin(turn)) / (step * step * (1 + np.cos(turn)) ** 2)
@@ -39,7 +40,7 @@ def test_bending_forces_of_an_even_bend_are_two_couples(turn, plane):
 def test_input_matrix_is_the_direction_against_bending():
     """Corollary 1: each segment's unit couples are −F_b/|F_b|, the connector carries nothing."""
     rod = segment_rod(segments=((0, 6), (6, 6)))
-    q, _ = rod.configuration_from_bend_angles([0.5, 0.8])
+    q = PolylineKinematics.of_rod(rod).configuration([0.5, 0.8])
     forces = node_forces(rod.internal_force(q))
     matrix = rod.input_matrix(q) / rod.input_gain
     for index, (first, count) in enumerate(rod.segments):
@@ -62,7 +63,7 @@ def test_couples_balance_an_even_bend_exactly():
     """The pressure of Theorem 1 holds the even bend: the whole force vanishes."""
     rod = segment_rod(segments=((0, 6), (6, 6)))
     angles = np.array([0.5, -0.8])
-    q, _ = rod.configuration_from_bend_angles(angles)
+    q = PolylineKinematics.of_rod(rod).configuration(angles)
     turn = angles / 4
     step = rod.rest_lengths[0]
     moment = EI / step * 2 * np.tan(turn / 2) * (1 + np.tan(turn / 2) ** 2)
@@ -81,7 +82,7 @@ def test_uneven_edges_break_the_localisation(grading):
     bend[1:-1] = EI / cells
     uneven = Rod(dataclasses.replace(rod.mesh, rest=rest, bend=bend))
     turn = 0.1
-    q, _ = uneven.configuration_from_bend_angles([turn * 10])
+    q = PolylineKinematics.of_rod(uneven).configuration([turn * 10])
     forces = node_forces(uneven.internal_force(q))
     moment = EI / cells * 2 * np.tan(turn / 2) * (1 + np.tan(turn / 2) ** 2)
     edge_force = -np.diff(np.concatenate([[0.0], moment, [0.0]])) / rest
@@ -106,26 +107,5 @@ def test_pressure_bends_as_the_continuum_does():
         rod = segment_rod(nodes=count, segments=((0, count),), plane="xy")
         clamped = Rod(dataclasses.replace(rod.mesh, clamped=np.arange(7)), "xy")
         pressure = 100.0
-        angle = clamped.bend_angles(clamped.equilibrium([pressure]))
+        angle = bend_angles(clamped, clamped.equilibrium([pressure]).q)
         assert angle[0] == pytest.approx(1e-5 * pressure * 0.24 / EI, rel=1e-4)
-
-
-def test_control_affine_form_is_the_equation_of_motion():
-    rod = Rod.uniform(
-        length=0.24, nodes=12, EI=EI, EA=1000.0, GJ=0.015, mass_per_length=1.0, damping=0.7,
-        segments=[(0, 6), (6, 6)], moment_gain=[1e-5, 1e-5], gravity=(0, 0, -9.81),
-        material_damping=0.01,
-    )  # fmt: skip
-    state = rod.straight_state()
-    for _ in range(3):
-        state = rod.step(state, [4e3, -6e3], 0.01)
-    u = np.array([2e3, 5e3])
-    drift, gain = rod.control_affine(state)
-    # a very short step moves by f + g u
-    dt = 1e-7
-    after = rod.step(state, u, dt, "backward_euler")
-    free = rod.free
-    change = np.concatenate([after.q[free] - state.q[free], after.v[free] - state.v[free]]) / dt
-    predicted = drift + gain @ u
-    np.testing.assert_allclose(change, predicted, atol=2e-3 * np.abs(predicted).max())
-    assert not gain[: len(free)].any()

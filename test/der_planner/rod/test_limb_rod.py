@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from der_planner.limb import Limb
+from der_planner.model.bending import PolylineKinematics, bend_angles
 from der_planner.rod import ConvergenceError, Rod
 
 
@@ -40,7 +41,7 @@ def test_three_segments():
     rod = Rod.from_limb(limb, 32)
     state = rod.equilibrium([3e3, -2e3, 1e3])
     expected = limb.static_gain * [3e3, -2e3, 1e3]
-    np.testing.assert_allclose(rod.bend_angles(state), expected, rtol=1e-3)
+    np.testing.assert_allclose(bend_angles(rod, state.q), expected, rtol=1e-3)
 
 
 @pytest.mark.parametrize("connector", [0.0, 0.015])
@@ -54,8 +55,8 @@ def test_static_bend_angles_are_those_of_the_segments(connector):
     u = np.array([4e3, -6e3])
     expected = limb.static_gain * u + [0.8 * 0.1, -0.5 * 0.15]
     state = rod.equilibrium(u)
-    np.testing.assert_allclose(rod.bend_angles(state), expected, rtol=3e-3)
-    q, _ = rod.configuration_from_bend_angles(rod.bend_angles(state))
+    np.testing.assert_allclose(bend_angles(rod, state.q), expected, rtol=3e-3)
+    q = PolylineKinematics.of_rod(rod).configuration(bend_angles(rod, state.q))
     np.testing.assert_allclose(q, state.q, atol=1e-9)
 
 
@@ -64,25 +65,10 @@ def test_cubic_stiffness_is_the_segments_law():
     limb = changed({"cubic_stiffness": stiffening}, {"cubic_stiffness": stiffening})
     rod = Rod.from_limb(limb, 41)
     u = np.array([1e4, -1.5e4])
-    curvature = rod.bend_angles(rod.equilibrium(u)) / 0.122
+    curvature = bend_angles(rod, rod.equilibrium(u).q) / 0.122
     moment = 0.0175 * curvature + stiffening * curvature**3
     np.testing.assert_allclose(moment, 9.1e-6 * u, rtol=3e-3)
     assert np.all(np.abs(curvature) < 0.98 * np.abs(9.1e-6 * u / 0.0175))
-
-
-def test_tangent_of_the_even_bend():
-    rod = Rod.from_limb(Limb.default())
-    angles = np.array([0.7, -0.4])
-    q, tangent = rod.configuration_from_bend_angles(angles)
-    np.testing.assert_allclose(rod.bend_angles(q), angles, atol=1e-14)
-    for m in range(2):
-        step = np.zeros(2)
-        step[m] = 1e-6
-        ahead, _ = rod.configuration_from_bend_angles(angles + step)
-        behind, _ = rod.configuration_from_bend_angles(angles - step)
-        np.testing.assert_allclose(tangent[:, m], (ahead - behind) / 2e-6, atol=1e-10)
-    many = rod.bend_angles(np.stack([q, rod.straight_state().q]))
-    np.testing.assert_allclose(many, [angles, [0.0, 0.0]], atol=1e-14)
 
 
 def test_gravity_out_of_the_plane_makes_the_rod_spatial():
@@ -123,7 +109,6 @@ def test_bad_arguments_of_a_motion_are_named(method, arguments, message):
         (lambda rod: rod.state(np.ones(83)), "q must stay in the plane xy"),
         (lambda rod: rod.state(np.ones(7)), r"q must have shape \(83,\), got \(7,\)"),
         (lambda rod: rod.equilibrium([0, 0], forces=np.ones((21, 3))), "forces must stay in"),
-        (lambda rod: rod.configuration_from_bend_angles([1.0]), "angles must have shape"),
         (lambda _: Rod.from_limb(Limb.default(), 4), "nodes must be an int of 6 or more"),
         (lambda _: Rod.from_limb(Limb.default(), plane="yz"), "plane must be"),
     ],
@@ -186,7 +171,7 @@ def test_halving_is_the_callers_choice():
         rod.step(state, jolt, 0.1, "backward_euler")
     halved = rod.step(state, jolt, 0.1, "backward_euler", halvings=4)
     assert np.isfinite(halved.q).all()
-    assert np.abs(rod.bend_angles(halved)).max() > 1.0
+    assert np.abs(bend_angles(rod, halved.q)).max() > 1.0
 
 
 def test_fixed_degrees_of_freedom_do_not_move():

@@ -252,64 +252,6 @@ def test_one_interval_is_the_linearised_step():
     np.testing.assert_allclose(moved, A[:count, :count] @ dq, atol=1e-10)
 
 
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [
-        ("bending_stiffness", 0.0175),
-        ("moment_gain", 9.1e-6),
-        ("damping", 0.75),
-        ("material_damping", 0.01),
-        ("rest_curvature", 0.5),
-        ("mass_per_length", 1.066),
-        ("cubic_stiffness", 1e-5),
-    ],
-)
-def test_parameter_tangent_is_the_derivative_by_a_parameter(option, value):
-    base = {"material_damping": 0.01, "rest_curvature": 0.5, "cubic_stiffness": 1e-5}
-    size = 1e-5 * value
-    rod = limb_rod(**base)
-    ahead, behind = (
-        limb_rod(**{**base, option: value + sign * size}) for sign in (1, -1)
-    )  # fmt: skip
-    time = np.arange(30)[:, None] * 0.05
-    u = 8e3 * np.sin(3 * time + [0.0, 1.0])
-    start = rod.equilibrium([0.0, 0.0])
-    run = rod.simulate(start, u, 0.05, substeps=2, linearise=True)
-    predicted = rod.parameter_tangent(run, ahead)
-    ends = [r.simulate(start, u, 0.05, substeps=2).tip[:, :2] for r in (ahead, behind)]
-    expected = (ends[0] - ends[1]) / 2
-    assert np.abs(expected).max() > 1e-9
-    np.testing.assert_allclose(predicted, expected, atol=2e-4 * np.abs(expected).max())
-
-
-def test_parameter_tangent_in_space():
-    """Stiffness, gravity, damping and rest shape changed together, of a rod out of its plane."""
-    rod = spatial_rod()
-
-    def changed(size: float) -> Rod:
-        mesh = rod.mesh
-        return Rod(
-            dataclasses.replace(
-                mesh,
-                bend=mesh.bend * (1 + size),
-                twist=mesh.twist * (1 - 2 * size),
-                edge_mass=mesh.edge_mass * (1 + 0.5 * size),
-                viscous=mesh.viscous * (1 + 3 * size),
-                rest_kappa=mesh.rest_kappa * (1 - size),
-                rest_twist=mesh.rest_twist * (1 + size),
-                gravity=mesh.gravity * (1 + size),
-            )
-        )
-
-    start = rod.equilibrium([0.0, 0.0])
-    u = 8e3 * np.sin(3 * np.arange(30)[:, None] * 0.05 + [0.0, 1.0])
-    run = rod.simulate(start, u, 0.05, substeps=2, linearise=True)
-    predicted = rod.parameter_tangent(run, changed(1e-5))
-    ends = [changed(s).simulate(start, u, 0.05, substeps=2).tip for s in (1e-5, -1e-5)]
-    expected = (ends[0] - ends[1]) / 2
-    np.testing.assert_allclose(predicted, expected, atol=2e-4 * np.abs(expected).max())
-
-
 @pytest.mark.parametrize("rod", [limb_rod(cubic_stiffness=1e-5), spatial_rod()], ids=str)
 def test_linearised_equilibrium_is_its_derivative(rod):
     u = np.array([4e3, -3e3])

@@ -30,17 +30,17 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import Image
 
-from apriltag_tracker.calibration import (
+from apriltag_tracker.camera import CameraError, Intrinsics
+from apriltag_tracker.camera.calibration import (
     BoardFinder,
     CalibrationError,
     calibrate_camera,
     calibrate_mounting,
     with_offsets,
 )
-from apriltag_tracker.camera import CameraError, Intrinsics
+from apriltag_tracker.camera.encodings import ImageError, to_grey
+from apriltag_tracker.camera.sources import PICTURES
 from apriltag_tracker.commands.calibration_board import add_board_arguments, given_board
-from apriltag_tracker.encodings import ImageError, to_grey
-from apriltag_tracker.sources import PICTURES
 from apriltag_tracker.tag_map import TagMap, TagMapError
 from limb_interfaces import qos
 
@@ -178,6 +178,25 @@ def mounting(options: argparse.Namespace) -> None:
     print(f"written to {options.out}, from {result.pictures} pictures")
 
 
+def _check_output(path: Path) -> None:
+    """Refuse a file that cannot be written before pictures are taken; nothing is left behind.
+
+    Raises:
+        CalibrationError: it is a folder, its folder is missing, or there is no right to write.
+    """
+    if path.is_dir():
+        raise CalibrationError(f"--out {path} is a folder: name a file")
+    if not path.parent.is_dir():
+        raise CalibrationError(f"--out {path} cannot be written: {path.parent} is no folder")
+    present = path.exists()
+    try:
+        path.open("ab").close()
+    except OSError as error:
+        raise CalibrationError(f"--out {path} cannot be written: {error.strerror}") from error
+    if not present:
+        path.unlink()
+
+
 def main() -> int:
     """Run the command line."""
     parser = argparse.ArgumentParser(
@@ -199,6 +218,7 @@ def main() -> int:
     tags.add_argument("--calibration", type=Path, required=True, metavar="FILE")
     options = parser.parse_args()
     try:
+        _check_output(options.out)
         (intrinsics if options.what == "intrinsics" else mounting)(options)
     except (CalibrationError, CameraError, ImageError, TagMapError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)

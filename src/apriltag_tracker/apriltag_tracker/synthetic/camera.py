@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from apriltag_tracker import family
 from apriltag_tracker.camera import CameraError, CameraPose, Intrinsics, project
-from apriltag_tracker.lens import ray_map
+from apriltag_tracker.camera.lens import ray_map
 from apriltag_tracker.synthetic import render
 from apriltag_tracker.tag_map import UNIT_CORNERS, TagMap
 

@@ -13,9 +13,6 @@ from der_planner.model.series import CONTROL_PERIOD as PERIOD
 
 Array = NDArray[np.float64]
 
-SETTLED = 0.6
-"""Share of a stair after which air and limb rest."""
-
 
 @dataclass(frozen=True)
 class Excitation:

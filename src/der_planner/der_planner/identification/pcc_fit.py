@@ -15,8 +15,9 @@ from scipy.optimize import least_squares
 
 from der_planner.identification.prepare import Prepared
 from der_planner.limb import Limb, Segment
+from der_planner.model.inputs import pressures_between
 from der_planner.model.material import slow_effective_pressure
-from der_planner.model.response import ArcModel, pressures_between
+from der_planner.model.response import ArcModel
 
 Array = NDArray[np.float64]
 

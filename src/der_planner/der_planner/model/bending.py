@@ -29,13 +29,25 @@ def end_edges(rod: Rod) -> list[tuple[int, int]]:
 
 
 def bend_angles(rod: Rod, q: Array) -> Array:
-    """Return the bend angles (K, M) [rad] of a rod's configurations (K, 4N-1), continuous in time.
+    """Return the bend angles (…, K, M) [rad] of configurations in time (…, K, 4N-1).
 
-    A turn by more than half a circle from one row to the next is taken for one the other way.
+    One configuration (4N-1,) gives (M,). See `angles_of_outputs` for limbs that are rolled up.
     """
-    headings = [_heading(q, a, b) for a, b in end_edges(rod)]
-    absolute = np.unwrap(np.stack(headings, axis=1), axis=0)
-    relative: Array = np.diff(absolute, axis=1, prepend=0.0)
+    return angles_of_outputs(q[..., bend_outputs(rod)])
+
+
+def angles_of_outputs(outputs: Array) -> Array:
+    """Return the bend angles (…, K, M) [rad] of the coordinates `bend_outputs` (…, K, 4M).
+
+    A heading is known up to whole turns. In the first row each segment is taken to bend by less
+    than half a turn; from row to row headings change by less than half a turn.
+    """
+    dx = outputs[..., 2::4] - outputs[..., 0::4]
+    dy = outputs[..., 3::4] - outputs[..., 1::4]
+    headings = np.unwrap(np.arctan2(dy, dx), axis=-1)
+    if headings.ndim > 1:
+        headings = np.unwrap(headings, axis=-2)
+    relative: Array = np.diff(headings, axis=-1, prepend=0.0)
     return relative
 
 
@@ -78,12 +90,6 @@ def _edge(q: Array, first: int, second: int) -> tuple[Array, Array, Array]:
     dx = q[:, 4 * second] - q[:, 4 * first]
     dy = q[:, 4 * second + 1] - q[:, 4 * first + 1]
     return dx, dy, dx * dx + dy * dy
-
-
-def _heading(q: Array, first: int, second: int) -> Array:
-    dx, dy, _ = _edge(q, first, second)
-    heading: Array = np.arctan2(dy, dx)
-    return heading
 
 
 class Kinematics(Protocol):
@@ -152,6 +158,13 @@ class PolylineKinematics:
     def nodes(self, bend_angles: ArrayLike) -> Array:
         """Return the nodes (..., N, 2) [m] for bend angles (..., M) [rad]."""
         return self._placed(self._edges(bend_angles))
+
+    def configuration(self, bend_angles: ArrayLike) -> Array:
+        """Return q (..., 4N-1) of the evenly bent rod for bend angles (..., M) [rad]."""
+        nodes = self.nodes(bend_angles)
+        q = np.zeros((*nodes.shape[:-2], 4 * nodes.shape[-2] - 1))
+        q[..., 0::4], q[..., 1::4] = nodes[..., 0], nodes[..., 1]
+        return q
 
     def _placed(self, edges: NDArray[np.complex128]) -> Array:
         """Return the nodes (..., N, 2) [m] of edges (..., N-1) from the base on."""

@@ -24,8 +24,8 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from apriltag_tracker.camera import CameraError, Intrinsics
-from apriltag_tracker.encodings import ImageError, to_grey
-from apriltag_tracker.tag import Tag
+from apriltag_tracker.camera.encodings import ImageError, to_grey
+from apriltag_tracker.detection.tag import Tag
 from apriltag_tracker.tag_map import TagMap
 from der_msgs.msg import LimbState, MotionCommand, PressurePlan, PressureState, TagDetectionArray
 from der_planner.page.access import Binding, listen, read_password

@@ -116,7 +116,7 @@ def check_reach(
     """Refuse a path whose points are missed or need more pressure than the limb may have.
 
     Under gravity only what is missed counts here: what pressures have to hold is for
-    `der_planner.planning.overload`.
+    `der_planner.planning.loads.overload`.
 
     Args:
         limb: its `pneumatics.pressure_limit` counts.
@@ -258,7 +258,7 @@ def solutions(limb: Limb, kinematics: Kinematics, point: ArrayLike) -> list[Solu
     """Return every way found to reach one point within the pressure limit, least pressure first.
 
     If there is none under gravity, ways beyond the limit are returned: what it takes to hold them
-    is for `der_planner.planning.overload`.
+    is for `der_planner.planning.loads.overload`.
 
     Args:
         limb: for the pressure limit.

@@ -34,8 +34,8 @@ from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import paths, shapes
 from der_planner.planning.errors import PlanningError
 from der_planner.planning.inverse import follow
-from der_planner.planning.rest import Rest, rest_of
-from der_planner.planning.sagged import sagged_tips
+from der_planner.planning.loads.rest import Rest, rest_of
+from der_planner.planning.loads.sagged import sagged_tips
 
 Array = NDArray[np.float64]
 

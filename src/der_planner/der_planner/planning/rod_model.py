@@ -10,8 +10,8 @@ from der_planner.limb import Limb
 from der_planner.model.balance import Balance
 from der_planner.model.response import NODES, RodModel
 from der_planner.planning.inverse import check_reach, is_loaded, solve
+from der_planner.planning.loads.posed import REFERENCE_PRIOR, PosedMotion, posed_motion
 from der_planner.planning.motions import Reference, Start, resting_spline, sample_spline
-from der_planner.planning.posed import REFERENCE_PRIOR, PosedMotion, posed_motion
 from der_planner.rod import RodState
 
 Array = NDArray[np.float64]

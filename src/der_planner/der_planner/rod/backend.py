@@ -90,12 +90,6 @@ class Backend(Protocol):
         ...
 
 
-def planar_or_spatial_body(backend: Backend, load: Array) -> Body:
-    """Return what moves under a load (4N-1,) [N]."""
-    extended = np.concatenate([np.zeros(backend.offset), load[backend.index]])
-    return Body(backend.mass, backend.damping, extended, backend.fixed)
-
-
 def band_to_dense(band: Array) -> Array:
     """Return the full matrix of a symmetric band stored by columns."""
     size, width = band.shape

@@ -111,7 +111,7 @@ class Integrator:
         final = backend.state(journey.place, state)
         return Run(
             backend.restore(x, state.q), backend.restore(rate, state.v), final,
-            journey.iterations, _solved(journey, pressures) if linearise else None,
+            journey.iterations, _solved(journey) if linearise else None,
         )  # fmt: skip
 
     def _go(
@@ -175,15 +175,13 @@ def _no_state(nodes: int) -> RodState:
     return RodState(zero, zero, np.tile([0.0, 1.0, 0.0], (nodes - 1, 1)), np.zeros(nodes))
 
 
-def _solved(journey: _Journey, pressures: Array) -> Solved:
+def _solved(journey: _Journey) -> Solved:
     """Join the pieces of a run's linearisation."""
     if len(journey.records) == 1:
         record = journey.records[0]
     else:
         record = Record(*(np.concatenate(parts) for parts in zip(*journey.records, strict=True)))
     steps = np.concatenate(journey.steps)
-    intervals, count, inputs = pressures.shape
     return Solved(
-        record, np.concatenate(journey.rates), np.concatenate(journey.extrapolates), steps,
-        pressures.reshape(intervals * count, inputs)[steps], journey.load,
-    )  # fmt: skip
+        record, np.concatenate(journey.rates), np.concatenate(journey.extrapolates), steps
+    )

@@ -23,15 +23,12 @@ class Solved(NamedTuple):
         record: the linearisation of each solve.
         rates: (solves,) 1/h. extrapolate: (solves,) e.
         steps: (solves,) index of the integrator step that each belongs to.
-        pressures: (solves, M) [Pa]. load: (4N-1,) gravity and point forces [N].
     """
 
     record: Record
     rates: Array
     extrapolate: Array
     steps: NDArray[np.int64]
-    pressures: Array
-    load: Array
 
 
 @dataclass(frozen=True)
@@ -48,14 +45,12 @@ class Linearisation:
     Attributes:
         intervals: K. steps: S, integrator steps in an interval.
         outputs: (P,) indices into q.
-        state_indices: indices into q of the free degrees of freedom, for `start` arguments.
         solved: the solves that it comes from.
     """
 
     intervals: int
     steps: int
     outputs: NDArray[np.int64]
-    state_indices: NDArray[np.int64]
     solved: Solved
     _chain: Chain
     _state_rows: NDArray[np.int64]
@@ -78,12 +73,6 @@ class Linearisation:
         require(len(change) == self.intervals, "pressures", f"{self.intervals} rows", len(change))
         out = np.empty((self.intervals + 1, len(self.outputs)))
         sensitivity_kernel.tangent(change, self._initial(start), self._chain, out)
-        return out
-
-    def forced(self, forces: Array, start: tuple[ArrayLike, ArrayLike] | None = None) -> Array:
-        """Return the change of the outputs (K+1, P) for forces (solves, n) added in each solve."""
-        out = np.empty((self.intervals + 1, len(self.outputs)))
-        sensitivity_kernel.forced(forces, self._initial(start), self.steps, self._chain, out)
         return out
 
     def _initial(self, start: tuple[ArrayLike, ArrayLike] | None) -> Array:
@@ -133,7 +122,7 @@ def linearisation_of(
 ) -> Linearisation:  # fmt: skip
     """Return the linearisation of solves in shape (K, S); rows are the outputs' in the kernels."""
     chain = chain_of(backend, solved, rows)
-    return Linearisation(*shape, outputs, backend.free, solved, chain, backend.free_rows)
+    return Linearisation(*shape, outputs, solved, chain, backend.free_rows)
 
 
 def chain_of(backend: Backend, solved: Solved, rows: NDArray[np.int64]) -> Chain:

@@ -9,13 +9,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from der_planner.limb import Limb
+from der_planner.rod.backend import Backend
 from der_planner.rod.integration import Integrator, Method
 from der_planner.rod.linearisation import linearisation_of, step_matrices
 from der_planner.rod.mesh import Mesh, array, by_step, limb_mesh, positive, require, uniform_mesh
 from der_planner.rod.planar.backend import PlanarBackend
 from der_planner.rod.spatial.backend import SpatialBackend
-from der_planner.rod.state import Array, RodState, Trajectory, positions_of
-from der_planner.rod.statics import even_bend, find_equilibrium, turning
+from der_planner.rod.state import Array, RodState, positions_of
+from der_planner.rod.statics import find_equilibrium
+from der_planner.rod.trajectory import Trajectory
 
 Plane = Literal["xy", "xz"]
 
@@ -142,7 +144,6 @@ class Rod:
             motion.linearisation.adjoint(np.zeros((2, len(motion.linearisation.outputs))))
             motion.linearisation.sensitivity()
         self.linearise_step(state, still[0], 1e-3)
-        self.control_affine(state)
         self.energy(state)
         self.stiffness(state)
         self.equilibrium(still[0])
@@ -239,7 +240,7 @@ class Rod:
         run = self._integrator.run(state, inputs, h, method, load, linearise, halvings)
         linearisation = None
         if run.solved is not None:
-            wanted = self._output_indices(outputs)
+            wanted = self.output_indices(outputs)
             linearisation = linearisation_of(
                 self._backend, run.solved, (intervals, substeps), wanted, self._backend.rows(wanted)
             )
@@ -282,22 +283,6 @@ class Rod:
         """Return B(q)Λ (4N-1, M) [N/Pa]: unit couples times Λ; rows of φ are zero."""
         return self._backend.input_matrix(self._as_state(state))
 
-    def control_affine(
-        self, state: RodState, forces: ArrayLike | None = None
-    ) -> tuple[Array, Array]:
-        """Return f (2F,) and g (2F, M) of ẋ = f(x) + g(x) u, x = (q[free], v[free])."""
-        free = self.free
-        force = (
-            self.internal_force(state)
-            + self._backend.viscous_force(state)
-            - self.damping_diagonal * state.v
-            + self._load(forces)
-        )
-        mass = self.mass_diagonal[free]
-        drift = np.concatenate([state.v[free], force[free] / mass])
-        gain = self.input_matrix(state)[free] / mass[:, None]
-        return drift, np.concatenate([np.zeros_like(gain), gain])
-
     def linearise_equilibrium(self, state: RodState, u: ArrayLike) -> Array:
         """Return ∂q/∂u (4N-1, M) [m/Pa] of a state that rests under u (M,) [Pa]."""
         return self._backend.linearise_equilibrium(state, array(u, (self.segment_count,), "u"))
@@ -312,39 +297,6 @@ class Rod:
         if self.plane:  # there couples have an energy, and the matrix is symmetric
             return float(np.linalg.eigvalsh(0.5 * (moving + moving.T))[0])
         return float(np.linalg.eigvals(moving).real.min())
-
-    def parameter_tangent(
-        self,
-        motion: Trajectory,
-        other: Rod,
-        start: tuple[ArrayLike, ArrayLike] | None = None,
-    ) -> Array:
-        """Return the change of a motion's outputs, to first order, if this rod became `other`.
-
-        Stiffness, mass, damping, gain, rest shape and gravity may differ a little; divided by a
-        small difference of one parameter this is the sensitivity to it, at the cost of one sweep.
-
-        Args:
-            motion: of this rod, simulated with `linearise`.
-            other: a rod with the same nodes, segments and plane.
-            start: change of q[free] and v[free] at the beginning, each (F,).
-
-        Returns:
-            (K+1, P) change of the outputs.
-        """
-        linearisation = motion.linearisation
-        mine, its = self._backend, other._backend
-        same = (self.nodes, self.segments, self.plane) == (other.nodes, other.segments, other.plane)
-        require(same, "other", "a rod with the same nodes, segments and plane", other.segments)
-        if linearisation is None:
-            raise ValueError("motion must be one simulated with linearise=True")
-        if isinstance(mine, PlanarBackend) and isinstance(its, PlanarBackend):  # noqa: SIM114 - types
-            forces = mine.residual_changes(its, linearisation.solved)
-        elif isinstance(mine, SpatialBackend) and isinstance(its, SpatialBackend):
-            forces = mine.residual_changes(its, linearisation.solved)
-        else:
-            raise AssertionError("rods with one plane have one kind of backend")
-        return linearisation.forced(forces, start)
 
     def linearise_step(
         self,
@@ -369,19 +321,6 @@ class Rod:
             raise AssertionError("a linearised run has its solves")
         return step_matrices(self._backend, run.solved)
 
-    def bend_angles(self, state: RodState | ArrayLike) -> Array:
-        """Return (…, M) each segment's turning about +z from its first to its last edge [rad]."""
-        q = state.q if isinstance(state, RodState) else np.asarray(state, dtype=np.float64)
-        return turning(q, self.segments)
-
-    def configuration_from_bend_angles(self, angles: ArrayLike) -> tuple[Array, Array]:
-        """Return q (4N-1,) of segments that bend evenly in xy, and S = ∂q/∂angles (4N-1, M).
-
-        Args:
-            angles: (M,) bend angles [rad], as `bend_angles` measures them.
-        """
-        return even_bend(array(angles, (self.segment_count,), "angles"), self.mesh)
-
     def _load(self, forces: ArrayLike | None) -> Array:
         if forces is None:
             return self.external_force
@@ -405,7 +344,17 @@ class Rod:
     def _as_state(self, state: RodState | ArrayLike) -> RodState:
         return state if isinstance(state, RodState) else self.state(state)
 
-    def _output_indices(self, outputs: Sequence[int] | None) -> NDArray[np.int64]:
+    @property
+    def backend(self) -> Backend:
+        """What holds the kernels' arrays: `simulate_many` stacks those of many rods."""
+        return self._backend
+
+    def output_indices(self, outputs: Sequence[int] | None) -> NDArray[np.int64]:
+        """Return the indices into q (P,) of outputs; of the tip's free coordinates for None.
+
+        Raises:
+            ValueError: an index that this rod's plane does not have.
+        """
         if outputs is None:
             size = 4 * self.nodes - 1
             return np.array([d for d in range(size - 3, size) if d in self.free], dtype=np.int64)

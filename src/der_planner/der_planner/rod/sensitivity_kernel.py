@@ -115,23 +115,6 @@ def tangent(change: Array, start: Array, chain: Chain, out: Array) -> None:
 
 
 @allocating_kernel
-def forced(forces: Array, start: Array, steps: int, chain: Chain, out: Array) -> None:
-    """Fill out (K+1, P) with the change of the outputs for forces (solves, n) in each solve."""
-    size = start.shape[1]
-    dq = start[0].copy().reshape(size, 1)
-    dv = start[1].copy().reshape(size, 1)
-    y = np.zeros((size, 1))
-    before = np.zeros((size, 1))
-    put_outputs(dq, chain.outputs, out[0])
-    for s in range(chain.steps.shape[0]):
-        for i in range(size):
-            y[i, 0] = forces[s, i]
-        advance(s, dq, dv, y, before, chain)
-        if ends_interval(s, steps, chain):
-            put_outputs(dq, chain.outputs, out[chain.steps[s] // steps + 1])
-
-
-@allocating_kernel
 def adjoint(weight: Array, chain: Chain, gradient: Array, start: Array) -> None:
     """Fill gradient (K, S, M) and start (2, n): `tangent` transposed, times weight (K+1, P)."""
     _, steps, count = gradient.shape

@@ -1,18 +1,13 @@
-"""States and trajectories of a rod."""
+"""The state of a rod."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from der_planner.rod.linearisation import Linearisation
-
 Array = NDArray[np.float64]
-Arrays = tuple[Any, ...]
 
 
 @dataclass(frozen=True)
@@ -42,37 +37,6 @@ class RodState:
     def angles(self) -> Array:
         """(N-1,) edge angles φ [rad]."""
         return self.q[3::4].copy()
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """A simulated motion: K intervals, K + 1 samples (the initial state is sample 0).
-
-    Attributes:
-        time: (K+1,) time since the initial state [s].
-        q: (K+1, 4N-1) configurations, as in `RodState`.
-        v: (K+1, 4N-1) velocities.
-        final: the last state, from which `simulate` can go on.
-        newton_iterations: Newton iterations of all steps together.
-        linearisation: sensitivities along the motion, if asked for.
-    """
-
-    time: Array
-    q: Array
-    v: Array
-    final: RodState
-    newton_iterations: int
-    linearisation: Linearisation | None = None
-
-    @property
-    def positions(self) -> Array:
-        """(K+1, N, 3) node positions [m]."""
-        return positions_of(self.q)
-
-    @property
-    def tip(self) -> Array:
-        """(K+1, 3) position of the last node [m]."""
-        return self.q[:, -3:].copy()
 
 
 def positions_of(q: Array) -> Array:

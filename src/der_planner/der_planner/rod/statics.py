@@ -1,4 +1,4 @@
-"""Resting states: even bending in closed form, equilibria by Newton's method and load stepping."""
+"""Resting states, by Newton's method and load stepping."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from der_planner.rod.errors import ConvergenceError
 from der_planner.rod.mesh import Mesh
-from der_planner.rod.state import Array, RodState, positions_of
+from der_planner.rod.state import Array, RodState
 from der_planner.rod.step_kernel import Solver
 
 _LIMIT = 40
@@ -64,40 +64,3 @@ def find_equilibrium(backend: StaticSolver, start: RodState, u: Array, load: Arr
                 step=index, residual=update, iterations=spent, state=state,
             )  # fmt: skip
     return state
-
-
-def turning(q: Array, segments: tuple[tuple[int, int], ...]) -> Array:
-    """Return (…, M) the turning about z of each segment from its first to its last edge [rad]."""
-    edges = np.diff(positions_of(q), axis=-2)
-    e, f = edges[..., :-1, :], edges[..., 1:, :]
-    sine = e[..., 0] * f[..., 1] - e[..., 1] * f[..., 0]
-    cosine = e[..., 0] * f[..., 0] + e[..., 1] * f[..., 1]
-    turns = np.arctan2(sine, cosine)
-    result = np.zeros((*q.shape[:-1], len(segments)))
-    for index, (first, count) in enumerate(segments):
-        result[..., index] = turns[..., first : first + count - 2].sum(axis=-1)
-    return result
-
-
-def even_bend(angles: Array, mesh: Mesh) -> tuple[Array, Array]:
-    """Return q (4N-1,) and S = ∂q/∂angles (4N-1, M) of segments that bend evenly in the xy plane.
-
-    Each of a segment's inner nodes turns by the same angle, everything else is straight and
-    unstretched: where the rod rests under constant pressures without loads (Corollary 1 of the
-    paper).
-    """
-    nodes = mesh.nodes
-    share = np.zeros((nodes, len(angles)))
-    for index, (first, count) in enumerate(mesh.segments):
-        share[first + 1 : first + count - 1, index] = 1.0 / (count - 2)
-    direction_by_angle = np.cumsum(share, axis=0)[:-1]
-    direction = direction_by_angle @ angles
-    step = mesh.rest[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
-    turned = np.stack([-step[:, 1], step[:, 0]], axis=1)
-    q = np.zeros(4 * nodes - 1)
-    q[0::4] = mesh.base
-    tangent = np.zeros((4 * nodes - 1, len(angles)))
-    for axis in range(2):
-        q[4 + axis :: 4] += np.cumsum(step[:, axis])
-        tangent[4 + axis :: 4] = np.cumsum(turned[:, axis, None] * direction_by_angle, axis=0)
-    return q, tangent

@@ -52,9 +52,6 @@ class Record(NamedTuple):
     back: Array  # (solves or 0, n, 2b+1)
     inputs: Array  # (solves, n, M) B(q)Λ [N/Pa]
     gauge: Array  # (solves or 0, n_edges, 6) [rad/m]
-    states: Array  # (solves, 3, n) position, velocity, acceleration of the solution
-    frames: Array  # (solves or 0, n_edges, 6) tangent and director from which the solve began
-    twists: Array  # (solves or 0, n_nodes) reference twists there
 
 
 @kernel
@@ -95,24 +92,3 @@ def go_on(
         acceleration[d] = (velocity - v_n[d]) * rate
         x_n[d] += extrapolate * (x[d] - x_n[d])
         v_n[d] += extrapolate * (velocity - v_n[d])
-
-
-@kernel
-def keep_state(slot: int, x: Array, x_n: Array, v_n: Array, rate: float, record: Record) -> None:
-    """Write position, velocity and acceleration of a solution into the record."""
-    for d in range(x.shape[0]):
-        velocity = (x[d] - x_n[d]) * rate
-        record.states[slot, 0, d] = x[d]
-        record.states[slot, 1, d] = velocity
-        record.states[slot, 2, d] = (velocity - v_n[d]) * rate
-
-
-@kernel
-def add_forces(change: Array, states: Array, ours: Body, other: Body) -> None:
-    """Add to change (n,) what body `ours` adds to a residual at states (3, n), less `other`'s."""
-    for d in range(change.shape[0]):
-        change[d] += (ours.mass[d] - other.mass[d]) * states[2, d]
-        change[d] += (ours.damping[d] - other.damping[d]) * states[1, d]
-        change[d] -= ours.load[d] - other.load[d]
-    for d in ours.fixed:
-        change[d] = 0.0

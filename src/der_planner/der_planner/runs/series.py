@@ -30,7 +30,6 @@ PLAN_TYPE = "der_msgs/msg/PressurePlan"
 SETPOINT_TYPE = "der_msgs/msg/PressureSetpoint"
 PRESSURE_TYPE = "der_msgs/msg/PressureState"
 STATE_TYPE = "der_msgs/msg/LimbState"
-CHAMBERS_TYPE = "der_msgs/msg/ChamberPressures"
 TRUTH_SUFFIX = "twin/ground_truth"
 BOARD_SUFFIX = "twin/board_commands"
 FAULT_MODE = 5

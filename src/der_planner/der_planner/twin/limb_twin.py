@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from elastica import CosseratRod
 from numpy.typing import NDArray
 
+from der_planner.limb import PointMass
+from der_planner.twin.body import build
 from der_planner.twin.hardware import Hardware, draw
-from der_planner.twin.kernel import Material, Ramp, RodArrays, advance
+from der_planner.twin.kernel import Ramp, advance
+from der_planner.twin.loads import LoadError, NodeLoads, Push
 
 Array = NDArray[np.float64]
 
@@ -21,14 +24,14 @@ TIME_STEP = 2e-4
 RAMP = 0.02
 """Time in which new chamber pressures reach the limb [s], on a straight line: a jump would ring.
 The board tells its pressures once in that time."""
-ELEMENTS_PER_SEGMENT = 8
-AXIAL_STIFFNESS = 1380.0
-"""EA [N] of the silicone tube, which fits its bending stiffness only with a thin wall."""
-SHEAR_STIFFNESS = 27.0 / 28.0 * AXIAL_STIFFNESS / 3.0
-TORSIONAL_STIFFNESS = 0.0117
-RADIUS = 0.0165
-"""Outer radius [m]: with 1.066 kg/m it gives the rotary inertia."""
 _CHAMBER_LIMIT = 2e5
+_SETTLING_DRAG = 8.0
+"""Damping [1/s] with which a limb finds its rest: about critical for its first mode."""
+_MANY_STEPS = 1_000_000_000
+_SETTLED_SPEED = 2e-5
+"""Largest speed of a node [m/s] of a limb that rests."""
+_LONGEST_SETTLING = 30.0
+"""Simulated time [s] after which a limb that still creeps toward its rest is left to the run."""
 
 
 class TwinError(RuntimeError):
@@ -60,6 +63,11 @@ class LimbTwin:
         run: draws how the rest angles wander in this run of the same hardware.
         hardware: takes this hardware instead of drawing it (for tests).
         atmosphere: absolute pressure outside [Pa].
+        gravity: (3,) acceleration in `limb_base` [m/s²].
+        masses: point masses that the limb carries beside its own from the start.
+
+    Raises:
+        TwinError: a mass is not on the limb, or gravity is not finite.
     """
 
     def __init__(
@@ -68,6 +76,8 @@ class LimbTwin:
         run: int = 0,
         hardware: Hardware | None = None,
         atmosphere: float = ATMOSPHERE,
+        gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        masses: Iterable[PointMass] = (),
     ) -> None:
         self._hardware = draw(seed) if hardware is None else hardware
         self.atmosphere = float(atmosphere)
@@ -76,10 +86,23 @@ class LimbTwin:
         self._pressure = np.full(2 * self.segment_count, self.atmosphere)
         self._ramp_left = 0
         self._wander_noise = np.random.default_rng([7_919, seed, run])
-        self._build()
+        body = build(self._hardware)
+        rod = self._rod = body.rod
+        self._arrays, self._material = body.arrays, body.material
+        self._node_arc = body.node_arc
+        self._element_segment, self._vertex_segment = body.element_segment, body.vertex_segment
+        self._rigid_elements = np.nonzero(self._element_segment < 0)[0]
+        try:
+            self._loads = NodeLoads(self._node_arc, rod.mass, rod.external_forces, gravity)
+        except LoadError as error:
+            raise TwinError(str(error)) from error
+        for item in masses:
+            self.push(Push(-math.inf, item.arc_length, mass=item.mass))
         self._wander = np.array([s.wander for s in self._hardware.segments])
         self._wander *= self._wander_noise.standard_normal(self.segment_count)
         self._settle()
+        if self._loads.any:
+            self._settle_under_loads()
 
     @property
     def segment_count(self) -> int:
@@ -91,12 +114,6 @@ class LimbTwin:
         """(2,) position of the tip [m]."""
         tip: Array = self._rod.position_collection[:2, -1].copy()
         return tip
-
-    @property
-    def tip_velocity(self) -> Array:
-        """(2,) velocity of the tip [m/s]."""
-        velocity: Array = self._rod.velocity_collection[:2, -1].copy()
-        return velocity
 
     @property
     def bend_angles(self) -> Array:
@@ -127,10 +144,27 @@ class LimbTwin:
         self._carry -= steps * TIME_STEP
         ramp = self._ramp(target, self._ramp_left or steps)
         self._ramp_left = max(0, self._ramp_left - steps)
-        advance(self._arrays, self._material, ramp, steps, TIME_STEP, self._hardware.drag)
-        self.time += steps * TIME_STEP
+        while steps:
+            count = min(steps, self._steps_to(self._loads.next_change(self.time)))
+            advance(self._arrays, self._material, ramp, count, TIME_STEP, self._hardware.drag)
+            ramp = ramp._replace(steps=max(0, ramp.steps - count))
+            steps -= count
+            self.time += count * TIME_STEP
+            self._loads.update(self.time)
         if not np.isfinite(self._rod.position_collection[0, -1]):
             raise TwinError(f"the simulated limb became unstable at t = {self.time:.3f} s")
+
+    def push(self, push: Push) -> None:
+        """Push the limb, or hang a mass on it, from an instant of `time` on.
+
+        Raises:
+            TwinError: the place is not on the limb, or a number is not finite.
+        """
+        try:
+            self._loads.add(push)
+        except LoadError as error:
+            raise TwinError(str(error)) from error
+        self._loads.update(self.time)
 
     def shape(self, points: int = 0) -> TwinShape:
         """Return the true centreline.
@@ -164,11 +198,6 @@ class LimbTwin:
             + u**2 * (u - 1) * scale * tangent[index + 1]
         )
         return TwinShape(arc, curve, np.interp(arc, node_arc, heading))
-
-    def kinetic_energy(self) -> float:
-        """Return the translational kinetic energy [J]."""
-        speed = np.sum(self._rod.velocity_collection**2, axis=0)
-        return float(0.5 * self._rod.mass @ speed)
 
     def _target(self, chamber_pressure: Array, duration: float) -> dict[str, Array]:
         """Return what the material shall be under these pressures, by the fields of `Ramp`."""
@@ -221,10 +250,38 @@ class LimbTwin:
         rest = np.full(2 * self.segment_count, self.atmosphere)
         steps = int(2.0 / TIME_STEP)
         ramp = self._ramp(self._target(rest, 0.0), steps // 4)
-        advance(self._arrays, self._material, ramp, steps, TIME_STEP, 8.0)
+        advance(self._arrays, self._material, ramp, steps, TIME_STEP, _SETTLING_DRAG)
         self._rod.velocity_collection[:] = 0.0
         self._rod.omega_collection[:] = 0.0
         self._material.creep[:] = 0.0
+
+    def _settle_under_loads(self) -> None:
+        """Bring the limb to the pose in which its loads leave it.
+
+        Friction and creep are switched off meanwhile and begin the run relaxed: the limb has hung
+        there for long, and has been moved about before.
+        """
+        material = self._material
+        calm = material._replace(
+            friction_moment=np.zeros_like(material.friction_moment),
+            creep_stiffness=np.zeros_like(material.creep_stiffness),
+        )
+        rest = np.full(2 * self.segment_count, self.atmosphere)
+        ramp = self._ramp(self._target(rest, 0.0), 0)
+        steps = round(0.5 / TIME_STEP)
+        for _ in range(round(_LONGEST_SETTLING / (steps * TIME_STEP))):
+            advance(self._arrays, calm, ramp, steps, TIME_STEP, _SETTLING_DRAG)
+            if np.abs(self._rod.velocity_collection).max() < _SETTLED_SPEED:
+                break
+        self._rod.velocity_collection[:] = 0.0
+        self._rod.omega_collection[:] = 0.0
+        material.creep[:] = 0.0
+        material.friction[:] = 0.0
+
+    def _steps_to(self, instant: float) -> int:
+        """Return how many steps lead to an instant [s], at least one."""
+        left = (instant - self.time) / TIME_STEP
+        return math.ceil(left) if left < _MANY_STEPS else _MANY_STEPS
 
     def _element_headings(self) -> Array:
         tangent = self._rod.director_collection[2]
@@ -238,127 +295,3 @@ class LimbTwin:
         weight = flexible[1:] / np.maximum(flexible[1:] + flexible[:-1], 1e-12)
         inner = element[:-1] + (1.0 - weight) * np.diff(element)
         return np.concatenate([element[:1], inner, element[-1:]])
-
-    def _build(self) -> None:
-        hardware, count = self._hardware, ELEMENTS_PER_SEGMENT
-        lengths = [hardware.base_fitting]
-        owner = [-1]
-        for index, segment in enumerate(hardware.segments):
-            lengths += [segment.flexible_length / count] * count
-            owner += [index] * count
-            last = index == self.segment_count - 1
-            lengths.append(hardware.tip_fitting if last else hardware.connector)
-            owner.append(-1)
-        rest_lengths = np.array(lengths)
-        self._element_segment = np.array(owner)
-        self._rigid_elements = np.nonzero(self._element_segment < 0)[0]
-        self._node_arc = np.concatenate([[0.0], np.cumsum(rest_lengths)])
-        position = np.zeros((3, len(lengths) + 1))
-        position[0] = self._node_arc
-        density = hardware.mass_per_length / (math.pi * RADIUS**2)
-        rod = CosseratRod.straight_rod(
-            len(lengths),
-            np.zeros(3),
-            np.array([1.0, 0.0, 0.0]),
-            np.array([0.0, 0.0, 1.0]),
-            self._node_arc[-1],
-            RADIUS,
-            density,
-            youngs_modulus=AXIAL_STIFFNESS / (math.pi * RADIUS**2),
-            position=position,
-        )
-        self._rod = rod
-        self._set_sections(rest_lengths)
-        self._set_fittings()
-        self._set_material(rest_lengths)
-        self._collect()
-
-    def _set_sections(self, rest_lengths: Array) -> None:
-        rod = self._rod
-        flexible = rest_lengths[self._element_segment == 0][0]
-        for k in range(rod.n_elems):
-            # A short stiff fitting would shorten the step for nothing: it gives like a whole
-            # element.
-            share = 1.0 if self._element_segment[k] >= 0 else rest_lengths[k] / flexible
-            rod.shear_matrix[0, 0, k] = rod.shear_matrix[1, 1, k] = SHEAR_STIFFNESS * share
-            rod.shear_matrix[2, 2, k] = AXIAL_STIFFNESS * share
-        stiffness = max(segment.bending_stiffness for segment in self._hardware.segments)
-        for i, value in enumerate((stiffness, stiffness, TORSIONAL_STIFFNESS)):
-            rod.bend_matrix[i, i, :] = value
-
-    def _set_fittings(self) -> None:
-        rod, hardware = self._rod, self._hardware
-        masses = [0.0, hardware.connector_mass, hardware.tip_mass]
-        for element, mass in zip(self._rigid_elements, masses, strict=True):
-            rod.mass[element : element + 2] += 0.5 * mass
-            for i, factor in enumerate((0.25, 0.25, 0.5)):
-                rod.mass_second_moment_of_inertia[i, i, element] += factor * mass * RADIUS**2
-                rod.inv_mass_second_moment_of_inertia[i, i, element] = (
-                    1.0 / rod.mass_second_moment_of_inertia[i, i, element]
-                )
-
-    def _set_material(self, rest_lengths: Array) -> None:
-        owner = self._element_segment
-        self._vertex_segment = np.maximum(owner[1:], owner[:-1])
-        flexible = np.where(owner >= 0, rest_lengths, 0.0)
-        share = (flexible[1:] + flexible[:-1]) / (rest_lengths[1:] + rest_lengths[:-1])
-        per_vertex = [self._hardware.segments[index] for index in self._vertex_segment]
-
-        def column(name: str) -> Array:
-            return np.array([getattr(segment, name) for segment in per_vertex], dtype=float)
-
-        count = len(per_vertex)
-        self._material = Material(
-            flexible_share=share,
-            stiffness=column("bending_stiffness"),
-            cubic=column("cubic_stiffness"),
-            rest=column("rest_curvature"),
-            active=np.zeros(count),
-            friction_moment=column("friction_moment"),
-            friction_curvature=column("friction_curvature"),
-            friction_exponent=column("friction_exponent"),
-            friction_share=column("friction_share"),
-            creep_stiffness=np.ascontiguousarray(column("creep_stiffness").T),
-            creep_time=np.ascontiguousarray(column("creep_time").T),
-            curvature=np.zeros(count),
-            friction=np.zeros(count),
-            creep=np.zeros((3, count)),
-            rest_stretch=np.zeros(len(owner)),
-        )
-
-    def _collect(self) -> None:
-        rod = self._rod
-        self._arrays = RodArrays(
-            position=rod.position_collection,
-            velocity=rod.velocity_collection,
-            directors=rod.director_collection,
-            omega=rod.omega_collection,
-            acceleration=rod.acceleration_collection,
-            alpha=rod.alpha_collection,
-            volume=rod.volume,
-            lengths=rod.lengths,
-            tangents=rod.tangents,
-            radius=rod.radius,
-            rest_lengths=rod.rest_lengths,
-            rest_voronoi_lengths=rod.rest_voronoi_lengths,
-            dilatation=rod.dilatation,
-            dilatation_rate=rod.dilatation_rate,
-            voronoi_dilatation=rod.voronoi_dilatation,
-            sigma=rod.sigma,
-            rest_sigma=rod.rest_sigma,
-            kappa=rod.kappa,
-            rest_kappa=rod.rest_kappa,
-            shear_matrix=rod.shear_matrix,
-            bend_matrix=rod.bend_matrix,
-            internal_stress=rod.internal_stress,
-            internal_couple=rod.internal_couple,
-            internal_forces=rod.internal_forces,
-            internal_torques=rod.internal_torques,
-            external_forces=rod.external_forces,
-            external_torques=rod.external_torques,
-            mass=rod.mass,
-            inertia=rod.mass_second_moment_of_inertia,
-            inverse_inertia=rod.inv_mass_second_moment_of_inertia,
-            ghost_elements=rod.ghost_elems_idx,
-            ghost_vertices=rod.ghost_voronoi_idx,
-        )

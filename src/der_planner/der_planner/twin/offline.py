@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from der_planner.limb import PointMass
 from der_planner.model.air import pair_of
 from der_planner.twin.limb_twin import LimbTwin, TwinError
-from pressure_driver.emulator.pneumatics import Pneumatics
+from der_planner.twin.loads import Push
+from pressure_driver.emulator.pneumatics import BoardPneumatics
 
 Array = NDArray[np.float64]
 
@@ -46,6 +49,9 @@ def play(
     run: int = 0,
     lead: float = 1.0,
     fine_step: float = FINE_STEP,
+    gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    masses: Iterable[PointMass] = (),
+    pushes: Iterable[Push] = (),
 ) -> Playback:
     """Play differential pressures on the twin of a seed, from rest.
 
@@ -59,9 +65,12 @@ def play(
         run: draws the wandering rest angles of this run of the same hardware.
         lead: vented time before the first setpoint [s].
         fine_step: longest time for which the limb feels constant pressures [s].
+        gravity: (3,) acceleration in `limb_base` [m/s²].
+        masses: what the limb carries from the start beside its own mass.
+        pushes: what pushes or loads it on the way; their instants are on the axis of ``time``.
 
     Raises:
-        TwinError: the arrays do not fit together or to the twin.
+        TwinError: the arrays do not fit together or to the twin, or a load is not on the limb.
     """
     instants = np.asarray(time, dtype=float)
     wanted = np.asarray(differential_pressure, dtype=float)
@@ -71,14 +80,16 @@ def play(
         )
     if not np.all(np.isfinite(wanted)) or not np.all(np.diff(instants) > 0):
         raise TwinError("time must rise and pressures must be finite")
-    pneumatics = Pneumatics(segment_count=wanted.shape[1], seed=seed)
-    twin = LimbTwin(seed, run, atmosphere=pneumatics.atmosphere)
+    pneumatics = BoardPneumatics(segment_count=wanted.shape[1], seed=seed)
+    twin = LimbTwin(seed, run, atmosphere=pneumatics.atmosphere, gravity=gravity, masses=masses)
     if twin.segment_count != wanted.shape[1]:
         raise TwinError(
             f"the twin has {twin.segment_count} segments, the pressures {wanted.shape[1]}"
         )
     tip = np.empty((instants.size, 2))
     angles, chambers = np.empty_like(wanted), np.empty((instants.size, 2 * wanted.shape[1]))
+    for push in pushes:
+        twin.push(replace(push, instant=push.instant - instants[0] + lead))
     _advance(pneumatics, twin, lead, fine_step)
     for k, setpoint in enumerate(wanted):
         tip[k], angles[k], chambers[k] = twin.tip, twin.bend_angles, pneumatics.pressure
@@ -95,7 +106,9 @@ def play(
     )
 
 
-def _advance(pneumatics: Pneumatics, twin: LimbTwin, duration: float, fine_step: float) -> None:
+def _advance(
+    pneumatics: BoardPneumatics, twin: LimbTwin, duration: float, fine_step: float
+) -> None:
     count = max(1, int(np.ceil(duration / fine_step - 1e-9)))
     for _ in range(count):
         twin.step(pneumatics.step(duration / count), duration / count)

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from der_planner.rod import banded_kernel
 from der_planner.rod.backend import Piece, Place, band_to_dense, general_band_to_dense
-from der_planner.rod.linearisation import Solved
 from der_planner.rod.mesh import Mesh
 from der_planner.rod.planar import elastic_kernel, step_kernel
 from der_planner.rod.planar.elastic_kernel import PlanarRod, PlanarSpace
@@ -59,7 +58,7 @@ class PlanarBackend:
 
         return PlanarSpace(
             x=vector(), v=vector(), acceleration=vector(), residual=vector(),
-            second_residual=vector(), x_start=vector(), v_start=vector(),
+            x_start=vector(), v_start=vector(),
             s=np.zeros((self.size, 6)), a=np.zeros((self.size, 11)),
             drag=np.zeros((self.size, 11)), edge=np.zeros((n - 1, 3)), turn=np.zeros(n),
             torque=np.zeros((n, 2)), parts=np.zeros((2, 6)),
@@ -93,9 +92,6 @@ class PlanarBackend:
             back=np.empty((back, self.size, 11)),
             inputs=np.empty((solves, self.size, len(self.mesh.gain))),
             gauge=np.empty((0, 0, 6)),
-            states=np.empty((solves, 3, self.size)),
-            frames=np.empty((0, 0, 6)),
-            twists=np.empty((0, 0)),
         )
 
     def simulate(
@@ -108,16 +104,6 @@ class PlanarBackend:
             self.body(load), self.rod,
         )  # fmt: skip
         return Piece(done, iterations, update, failed, record)
-
-    def residual_changes(self, other: PlanarBackend, solved: Solved) -> Array:
-        """Return (solves, n) what a change to the other rod adds to the right sides of solves."""
-        out = np.empty((len(solved.steps), self.size))
-        load = solved.load + other.gravity - self.gravity
-        step_kernel.residual_changes(
-            solved.record, solved.pressures, solved.rates, self.work_space(),
-            self.body(solved.load), self.rod, other.body(load), other.rod, out,
-        )  # fmt: skip
-        return out
 
     def linearise_equilibrium(self, state: RodState, u: Array) -> Array:
         """Return ∂q/∂u (4N-1, M) of a resting state."""
@@ -178,15 +164,6 @@ class PlanarBackend:
         elastic_kernel.edges_and_turns(self._extend(state.q), space.edge, space.turn)
         elastic_kernel.input_columns(space.edge, self.rod, columns)
         return self._full(columns)
-
-    def viscous_force(self, state: RodState) -> Array:
-        """Return the Kelvin-Voigt force (4N-1,) at a state."""
-        v = self._rate(state.v)
-        space = self.work_space()
-        u = np.zeros(len(self.mesh.gain))
-        elastic_kernel.edges_and_turns(self._extend(state.q), space.edge, space.turn)
-        elastic_kernel.unsymmetric(v, 1.0, u, space, self.rod)
-        return self._full(-general_band_to_dense(space.drag) @ v)
 
     def _extend(self, q: Array) -> Array:
         """Return the kernels' coordinates of q (4N-1,), with the ghost node."""

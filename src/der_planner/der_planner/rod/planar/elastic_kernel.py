@@ -38,7 +38,6 @@ class PlanarSpace(NamedTuple):
     v: Array  # (2n,) its velocity
     acceleration: Array  # (2n,) of the last solve
     residual: Array  # (2n,)
-    second_residual: Array  # (2n,)
     x_start: Array  # (2n,) where a step began
     v_start: Array  # (2n,)
     s: Array  # (2n, 6) symmetric derivative of the residual, by columns

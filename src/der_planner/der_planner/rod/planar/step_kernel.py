@@ -27,10 +27,8 @@ from der_planner.rod.step_kernel import (
     Body,
     Record,
     Solver,
-    add_forces,
     add_inertia,
     go_on,
-    keep_state,
     predict,
 )
 
@@ -122,9 +120,8 @@ def simulate(
                 return index, total - iterations, update, -iterations
             total += iterations
             if record.factors.shape[0] > 0:
-                keep(
-                    (index - begin) * stages + stage, x, x_n, v_n, rate, u, record, space, body, rod
-                )
+                slot = (index - begin) * stages + stage
+                keep(slot, x, x_n, rate, u, record, space, body, rod)
             go_on(x, x_n, v_n, acceleration, rate, solver.extrapolate[stage])
         if step == steps - 1:
             put(x_n, q[k + 1])
@@ -134,7 +131,7 @@ def simulate(
 
 @kernel
 def keep(
-    slot: int, x: Array, x_n: Array, v_n: Array, rate: float, u: Array, record: Record,
+    slot: int, x: Array, x_n: Array, rate: float, u: Array, record: Record,
     space: PlanarSpace, body: Body, rod: PlanarRod,
 ) -> None:  # fmt: skip
     """Write the exact linearisation of the solve that led from x_n to x into the record."""
@@ -145,7 +142,6 @@ def keep(
     if record.back.shape[0] > 0:
         for d in range(x.shape[0]):
             put(space.drag[d], record.back[slot, d])
-    keep_state(slot, x, x_n, v_n, rate, record)
 
 
 @kernel
@@ -171,22 +167,3 @@ def linearise(
     for d in fixed:
         for m in range(columns.shape[1]):
             columns[d, m] = 0.0
-
-
-@kernel
-def residual_changes(
-    record: Record, pressures: Array, rates: Array, space: PlanarSpace, body: Body,
-    rod: PlanarRod, other_body: Body, other_rod: PlanarRod, out: Array,
-) -> None:  # fmt: skip
-    """Fill out (solves, 2n) with this rod's residual less another's at the recorded solutions.
-
-    pressures (solves, M) and rates (solves,) are those of each solve.
-    """
-    ours, theirs = space.residual, space.second_residual
-    for index in range(out.shape[0]):
-        states, rate, u = record.states[index], rates[index], pressures[index]
-        assemble(states[0], states[1], rate, u, False, ours, space, rod)
-        assemble(states[0], states[1], rate, u, False, theirs, space, other_rod)
-        for d in range(out.shape[1]):
-            out[index, d] = ours[d] - theirs[d]
-        add_forces(out[index], states, body, other_body)

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from der_planner.rod import banded_kernel
 from der_planner.rod.backend import Piece, Place, band_to_dense, general_band_to_dense
-from der_planner.rod.linearisation import Solved
 from der_planner.rod.mesh import Mesh
 from der_planner.rod.spatial import (
     assembly_kernel,
@@ -70,7 +69,7 @@ class SpatialBackend:
 
         return SpatialSpace(
             x=vector(), v=vector(), acceleration=vector(), residual=vector(),
-            second_residual=vector(), x_start=vector(), v_start=vector(),
+            x_start=vector(), v_start=vector(),
             base_start=np.zeros((n, 7)), s=np.zeros((self.size, 11)),
             a=np.zeros((self.size, 21)), drag=np.zeros((self.size, 21)),
             frame=np.zeros((n - 1, 13)), twists=np.zeros(n), own=np.zeros((n - 1, 4, 5)),
@@ -102,9 +101,6 @@ class SpatialBackend:
             back=np.empty((solves, self.size, 21)),
             inputs=np.empty((solves, self.size, len(self.mesh.gain))),
             gauge=np.empty((solves, nodes - 1, 6)),
-            states=np.empty((solves, 3, self.size)),
-            frames=np.empty((solves, nodes - 1, 6)),
-            twists=np.empty((solves, nodes)),
         )
 
     def simulate(
@@ -118,18 +114,6 @@ class SpatialBackend:
             self.body(load), self.rod,
         )  # fmt: skip
         return Piece(done, iterations, update, failed, record)
-
-    def residual_changes(self, other: SpatialBackend, solved: Solved) -> Array:
-        """Return (solves, n) what a change to the other rod adds to the right sides of solves."""
-        nodes = (self.size + 1) // 4
-        out = np.empty((len(solved.steps), self.size))
-        load = solved.load + other.gravity - self.gravity
-        base = Base(np.empty((nodes - 1, 3)), np.empty((nodes - 1, 3)), np.empty(nodes))
-        step_kernel.residual_changes(
-            solved.record, solved.pressures, solved.rates, base, self.work_space(),
-            self.body(solved.load), self.rod, other.body(load), other.rod, out,
-        )  # fmt: skip
-        return out
 
     def linearise_equilibrium(self, state: RodState, u: Array) -> Array:
         """Return ∂q/∂u (4N-1, M) of a resting state."""
@@ -188,12 +172,6 @@ class SpatialBackend:
         """Return ∇E (4N-1,) and ∇²E (4N-1, 4N-1) at a state, its frames re-based there."""
         gradient, band = self._assemble(state, np.zeros(self.size))
         return gradient, band_to_dense(band)[self.offset :, self.offset :]
-
-    def viscous_force(self, state: RodState) -> Array:
-        """Return the Kelvin-Voigt force (4N-1,) at a state."""
-        moving, _ = self._assemble(state, self._rate(state.v))
-        still, _ = self._assemble(state, np.zeros(self.size))
-        return still - moving
 
     def input_matrix(self, state: RodState) -> Array:
         """Return B(q)Λ (4N-1, M)."""

@@ -52,7 +52,6 @@ class SpatialSpace(NamedTuple):
     v: Array  # (4n-1,) its velocity
     acceleration: Array  # (4n-1,) of the last solve
     residual: Array  # (4n-1,)
-    second_residual: Array  # (4n-1,)
     x_start: Array  # (4n-1,) where a step began
     v_start: Array  # (4n-1,)
     base_start: Array  # (n, 7) frames there

@@ -31,10 +31,8 @@ from der_planner.rod.step_kernel import (
     Body,
     Record,
     Solver,
-    add_forces,
     add_inertia,
     go_on,
-    keep_state,
     predict,
 )
 
@@ -185,7 +183,7 @@ def simulate(
             extrapolate = solver.extrapolate[stage]
             if record.factors.shape[0] > 0:
                 slot = (index - begin) * stages + stage
-                keep(slot, x, x_n, v_n, base, rate, extrapolate, u, record, space, body, rod)
+                keep(slot, x, x_n, base, rate, extrapolate, u, record, space, body, rod)
             go_on(x, x_n, v_n, acceleration, rate, extrapolate)
             carry(x_n, base, space)
         if step == steps - 1:
@@ -196,7 +194,7 @@ def simulate(
 
 @kernel
 def keep(
-    slot: int, x: Array, x_n: Array, v_n: Array, base: Base, rate: float, extrapolate: float,
+    slot: int, x: Array, x_n: Array, base: Base, rate: float, extrapolate: float,
     u: Array, record: Record, space: SpatialSpace, body: Body, rod: SpatialRod,
 ) -> None:  # fmt: skip
     """Write the exact linearisation of the solve that led from x_n to x into the record."""
@@ -205,34 +203,3 @@ def keep(
     for d in range(x.shape[0]):
         put(space.a[d], record.factors[slot, d])
     gauge_of_step(x, x_n, extrapolate, record.gauge[slot], space)
-    keep_state(slot, x, x_n, v_n, rate, record)
-    for j in range(base.tangents.shape[0]):
-        for k in range(3):
-            record.frames[slot, j, k] = base.tangents[j, k]
-            record.frames[slot, j, 3 + k] = base.directors[j, k]
-    put(base.twists, record.twists[slot])
-
-
-@kernel
-def residual_changes(
-    record: Record, pressures: Array, rates: Array, base: Base, space: SpatialSpace, body: Body,
-    rod: SpatialRod, other_body: Body, other_rod: SpatialRod, out: Array,
-) -> None:  # fmt: skip
-    """Fill out (solves, 4n-1) with this rod's residual less another's at the recorded solutions.
-
-    pressures (solves, M) and rates (solves,) are those of each solve; base is overwritten.
-    """
-    ours, theirs = space.residual, space.second_residual
-    for index in range(out.shape[0]):
-        states, rate, u = record.states[index], rates[index], pressures[index]
-        for j in range(base.tangents.shape[0]):
-            for k in range(3):
-                base.tangents[j, k] = record.frames[index, j, k]
-                base.directors[j, k] = record.frames[index, j, 3 + k]
-        frames(states[0], base, space.frame)
-        reference_twists(space.frame, record.twists[index], space.twists)
-        assemble(states[0], states[1], rate, u, False, ours, space, rod)
-        assemble(states[0], states[1], rate, u, False, theirs, space, other_rod)
-        for d in range(out.shape[1]):
-            out[index, d] = ours[d] - theirs[d]
-        add_forces(out[index], states, body, other_body)

@@ -1,0 +1,240 @@
+"""The camera: calibration, pose from fixed tags, and rays onto planes above the base.
+
+Pixels have the centre of the first pixel at (0, 0). A camera pose maps points of `limb_base` into
+the camera's optical frame (x right, y down, z forward).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from apriltag_tracker.camera import lens
+
+PINHOLE_MODELS = ("plumb_bob", "rational_polynomial")
+
+
+class CameraError(ValueError):
+    """A calibration or a pose cannot be used; the message names what and the remedy."""
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Calibration of a camera.
+
+    Attributes:
+        width: of the image [px].
+        height: of the image [px].
+        matrix: (3, 3) camera matrix [px].
+        distortion: (8,) k1 k2 p1 p2 k3 k4 k5 k6.
+    """
+
+    width: int
+    height: int
+    matrix: NDArray[np.float64]
+    distortion: NDArray[np.float64]
+
+    @classmethod
+    def create(
+        cls, width: int, height: int, matrix: Any, distortion: Any, model: str = "plumb_bob"
+    ) -> Intrinsics:
+        """Check the numbers of a calibration and keep them.
+
+        Args:
+            width: of the image [px].
+            height: of the image [px].
+            matrix: nine numbers, row by row [px].
+            distortion: 0, 4, 5 or 8 coefficients in OpenCV's order.
+            model: `plumb_bob` or `rational_polynomial`.
+
+        Raises:
+            CameraError: not calibrated, another model, or impossible numbers.
+        """
+        k = np.asarray(matrix, dtype=np.float64).reshape(-1)
+        if model and model not in PINHOLE_MODELS:
+            raise CameraError(
+                f"distortion model '{model}': {' and '.join(PINHOLE_MODELS)} are known; calibrate "
+                "again with scripts/calibrate_camera.py"
+            )
+        if width <= 0 or height <= 0:
+            raise CameraError(f"camera_info says {width} x {height} px: the size must be positive")
+        if k.size != 9 or not np.all(np.isfinite(k)) or k[0] <= 0.0 or k[4] <= 0.0:
+            raise CameraError(
+                "the camera is not calibrated (its focal length is zero): run "
+                "scripts/calibrate_camera.py and publish its result as camera_info, or set "
+                "the parameter calibration_file"
+            )
+        given = np.asarray(distortion, dtype=np.float64).reshape(-1)
+        if given.size > lens.COEFFICIENTS or not np.all(np.isfinite(given)):
+            raise CameraError(
+                f"{given.size} distortion coefficients: 0, 4, 5 or 8 finite ones expected"
+            )
+        coefficients = np.zeros(lens.COEFFICIENTS)
+        coefficients[: given.size] = given
+        return cls(int(width), int(height), k.reshape(3, 3).copy(), coefficients)
+
+    @classmethod
+    def from_yaml(cls, path: str | Path) -> Intrinsics:
+        """Read the calibration YAML that ROS's camera drivers use.
+
+        Raises:
+            CameraError: the file is missing, malformed or not of a pinhole camera.
+        """
+        try:
+            data = yaml.safe_load(Path(path).read_text())
+            return cls.create(
+                data["image_width"],
+                data["image_height"],
+                data["camera_matrix"]["data"],
+                data["distortion_coefficients"]["data"],
+                data.get("distortion_model", "plumb_bob"),
+            )
+        except OSError as error:
+            raise CameraError(f"cannot read the calibration {path}: {error.strerror}") from error
+        except (yaml.YAMLError, KeyError, TypeError) as error:
+            raise CameraError(
+                f"{path} is no camera_info YAML ({error}): scripts/calibrate_camera.py writes one"
+            ) from error
+
+    def to_yaml(self, path: str | Path, camera_name: str = "limb_camera") -> None:
+        """Write the calibration as the YAML that ROS's camera drivers read."""
+        rational = bool(np.any(self.distortion[5:]))
+        coefficients = self.distortion if rational else self.distortion[:5]
+        projection = np.hstack([self.matrix, np.zeros((3, 1))])
+
+        def block(values: NDArray[np.float64]) -> dict[str, Any]:
+            table = np.atleast_2d(values)
+            data = [float(value) for value in table.ravel()]
+            return {"rows": table.shape[0], "cols": table.shape[1], "data": data}
+
+        content = {
+            "image_width": self.width,
+            "image_height": self.height,
+            "camera_name": camera_name,
+            "camera_matrix": block(self.matrix),
+            "distortion_model": "rational_polynomial" if rational else "plumb_bob",
+            "distortion_coefficients": block(coefficients),
+            "rectification_matrix": block(np.eye(3)),
+            "projection_matrix": block(projection),
+        }
+        Path(path).write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+
+    def rays(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return normalised coordinates (n, 2) of pixels (n, 2), lens distortion removed."""
+        points = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 2)
+        result: NDArray[np.float64] = lens.undistort_pixels(points, self.matrix, self.distortion)
+        return result
+
+    def pixels(self, normalised: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return pixels (n, 2) of normalised coordinates (n, 2), lens distortion added."""
+        points = np.ascontiguousarray(normalised, dtype=np.float64).reshape(-1, 2)
+        result: NDArray[np.float64] = lens.distort_to_pixels(points, self.matrix, self.distortion)
+        return result
+
+
+@dataclass(frozen=True)
+class CameraPose:
+    """Rotation (3, 3) and translation (3,) [m] from `limb_base` into the camera's optical frame."""
+
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+
+    @classmethod
+    def looking_down(
+        cls,
+        position: tuple[float, float, float],
+        turn: float,
+        tilt: tuple[float, float] = (0.0, 0.0),
+    ) -> CameraPose:
+        """Return the pose of a camera above the plane.
+
+        Args:
+            position: of the camera in `limb_base` [m].
+            turn: angle from the base's x axis to the image's right-hand direction [rad].
+            tilt: small rotations about the camera's own x and y axes [rad].
+        """
+        cosine, sine = np.cos(turn), np.sin(turn)
+        upright = np.array([[cosine, sine, 0.0], [sine, -cosine, 0.0], [0.0, 0.0, -1.0]])
+        tilted = cv2.Rodrigues(np.array([tilt[0], tilt[1], 0.0]))[0] @ upright
+        return cls(tilted, -tilted @ np.array(position))
+
+    @property
+    def position(self) -> NDArray[np.float64]:
+        """Where the camera is in `limb_base`, (3,) m."""
+        result: NDArray[np.float64] = -self.rotation.T @ self.translation
+        return result
+
+    def normalised(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return normalised image coordinates (n, 2) of points (n, 3) in `limb_base`."""
+        inside = points @ self.rotation.T + self.translation
+        result: NDArray[np.float64] = inside[:, :2] / inside[:, 2:3]
+        return result
+
+    def onto_plane(self, rays: NDArray[np.float64], height: float) -> NDArray[np.float64]:
+        """Return where rays (n, 2) meet the plane at a height [m] over the base, (n, 2) m."""
+        directions = rays @ self.rotation[:2] + self.rotation[2]
+        origin = self.position
+        scale = (height - origin[2]) / directions[:, 2]
+        result: NDArray[np.float64] = origin[:2] + scale[:, None] * directions[:, :2]
+        return result
+
+
+def project(
+    intrinsics: Intrinsics, pose: CameraPose, points: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the pixels (n, 2) of points (n, 3) in `limb_base`."""
+    return intrinsics.pixels(pose.normalised(np.asarray(points, dtype=np.float64)))
+
+
+def solve_pose(
+    intrinsics: Intrinsics,
+    points: NDArray[np.float64],
+    pixels: NDArray[np.float64],
+    start: CameraPose | None = None,
+) -> tuple[CameraPose, NDArray[np.float64]]:
+    """Find the camera pose that explains all fixed points together.
+
+    Args:
+        intrinsics: of the camera.
+        points: (n, 3) in `limb_base` [m], n at least 4.
+        pixels: (n, 2) where they were seen.
+        start: a pose to start from; without it the closed-form SQPnP solution is used.
+
+    Returns:
+        The pose and the reprojection residuals (n, 2) px.
+
+    Raises:
+        CameraError: fewer than four points, no solution, or one that looks at the plane from below
+            (a mirror image, or a map with mirrored positions).
+    """
+    if len(points) < 4:
+        raise CameraError(
+            f"{len(points)} fixed points: the camera pose needs four, one tag, at least"
+        )
+    normalised = intrinsics.rays(pixels)
+    identity = np.eye(3)
+    if start is None:
+        found, rotation, translation = cv2.solvePnP(
+            points, normalised, identity, None, flags=cv2.SOLVEPNP_SQPNP
+        )
+        if not found:
+            raise CameraError("no camera pose explains the fixed tags: check their positions")
+    else:
+        rotation, translation = cv2.Rodrigues(start.rotation)[0], start.translation.reshape(3, 1)
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-12)
+    rotation, translation = cv2.solvePnPRefineLM(
+        points, pixels, intrinsics.matrix, intrinsics.distortion, rotation, translation, stop
+    )
+    pose = CameraPose(cv2.Rodrigues(rotation)[0], np.asarray(translation).reshape(3))
+    if pose.position[2] <= float(np.max(points[:, 2])):
+        raise CameraError(
+            "the fixed tags are seen from below: the image is mirrored, or positions in "
+            "the tag map are"
+        )
+    return pose, project(intrinsics, pose, points) - pixels

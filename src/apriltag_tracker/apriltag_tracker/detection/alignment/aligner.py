@@ -1,0 +1,196 @@
+"""Aligns tags: keeps the tables of patterns, and decides when a smear is to be fitted."""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apriltag_tracker import family
+from apriltag_tracker.detection.alignment import fit
+from apriltag_tracker.detection.alignment.pattern import tabulate
+from apriltag_tracker.detection.alignment.smear import guess_smear
+
+USUAL_BLUR = 0.65
+"""Of a sharp picture, lens and pixel together: where the first fit starts [px]."""
+
+_STEP = 1.09
+"""Tables exist for blurs in steps of this ratio; a fit is linear in between."""
+
+_TABLES = 96
+_POINTS = 1.7
+"""Points of the table in one standard deviation of the blur."""
+
+_SMEARED = 0.12
+"""Correlation of neighbouring residuals from which a smear is looked for."""
+
+_SHORTEST = 0.9
+"""A shorter smear cannot be told from blur, and is counted as such [px]."""
+
+_PASSES = 8
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """A tag's pattern fitted to its pixels.
+
+    Attributes:
+        corners: (4, 2) px.
+        covariance: (8, 8) px² of the corners x0 y0 x1 ….
+        blur: standard deviation of lens and pixel together [px].
+        smear: (2,) px, the way during the exposure; its sign is not known.
+        explained: share of the pixels' variance that the pattern explains, covered ones and all.
+        kept: share of the weight that was kept: less than 1 where something covers the tag.
+        residual: RMS of the pixels that fit [grey levels].
+        contrast: white minus black [grey levels].
+    """
+
+    corners: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    blur: float
+    smear: NDArray[np.float64]
+    explained: float
+    kept: float
+    residual: float
+    contrast: float
+
+
+class Aligner:
+    """Fits patterns of tags to pictures; remembers the tables that this takes."""
+
+    def __init__(self) -> None:
+        self._tables: OrderedDict[tuple[int, int], tuple[NDArray[np.float32], float]] = (
+            OrderedDict()
+        )
+
+    def align(
+        self,
+        image: NDArray[np.uint8],
+        tag: int,
+        corners: NDArray[np.float64],
+        blur: float = USUAL_BLUR,
+        smear: NDArray[np.float64] | None = None,
+    ) -> Alignment | None:
+        """Fit one tag.
+
+        Args:
+            image: grey image.
+            tag: id within the family.
+            corners: (4, 2) px to start from, within about half a cell.
+            blur: standard deviation to start from [px].
+            smear: (2,) px to start from, None if nothing is known of it.
+
+        Returns:
+            The fit, None if there is none.
+        """
+        if smear is not None and math.hypot(*smear) >= _SHORTEST:
+            known = self._fit(image, tag, corners, blur, smear)
+            if known is not None and known[1] < _SMEARED:
+                return known[0]
+        plain = self._fit(image, tag, corners, blur, None)
+        if plain is None:
+            return self._from_all_sides(image, tag, corners)
+        best, alike = plain
+        if alike < _SMEARED:
+            return best
+        smeared = self._smeared(image, tag, best)
+        if smeared is not None and smeared.residual < 0.98 * best.residual:
+            best = smeared
+        if best.explained < 0.93 and best.kept > 0.97 and alike > 0.5:
+            searched = self._from_all_sides(image, tag, corners)
+            if searched is not None and searched.residual < 0.9 * best.residual:
+                best = searched
+        return best
+
+    def _smeared(self, image: NDArray[np.uint8], tag: int, plain: Alignment) -> Alignment | None:
+        cell = _cell(plain.corners)
+        table, table_blur = self._table(tag, plain.blur / cell)
+        guess = np.zeros(2)
+        blur = guess_smear(image, table, table_blur, plain.corners, plain.blur, guess)
+        if math.hypot(*guess) < _SHORTEST:
+            return None
+        found = self._fit(image, tag, plain.corners, max(blur, 0.5), guess)
+        return None if found is None else found[0]
+
+    def _from_all_sides(
+        self, image: NDArray[np.uint8], tag: int, corners: NDArray[np.float64]
+    ) -> Alignment | None:
+        """Try smears in eight directions of half a turn; the best fit counts."""
+        best: Alignment | None = None
+        length = 1.6 * _cell(corners)
+        for k in range(8):
+            angle = k * math.pi / 8.0
+            smear = length * np.array([math.cos(angle), math.sin(angle)])
+            found = self._fit(image, tag, corners, USUAL_BLUR, smear)
+            if found is not None and (best is None or found[0].residual < best.residual):
+                best = found[0]
+        return best
+
+    def _fit(
+        self,
+        image: NDArray[np.uint8],
+        tag: int,
+        corners: NDArray[np.float64],
+        blur: float,
+        smear: NDArray[np.float64] | None,
+    ) -> tuple[Alignment, float] | None:
+        """Fit with or without a smear; returns the fit and the correlation of its residuals."""
+        result = np.zeros(fit.RESULT_VALUES)
+        placed, covariance = np.empty((4, 2)), np.empty((8, 8))
+        start = np.ascontiguousarray(corners)
+        cell = _cell(corners)
+        result[0] = blur
+        if smear is not None:
+            result[1:3] = smear
+        for attempt in range(3):
+            table, table_blur = self._table(tag, result[0] / cell)
+            free = smear is not None
+            settled = fit.align(
+                image, table, table_blur, start, free, _PASSES, placed, covariance, result
+            )
+            if not settled and attempt > 0:
+                return None
+            if not np.all(np.isfinite(placed)):
+                return None
+            if settled and abs(math.log(result[0] / (cell * table_blur))) < math.log(_STEP):
+                break
+            start = placed.copy() if settled else start
+        if not settled or not np.all(np.isfinite(covariance)):
+            return None
+        return (
+            Alignment(
+                placed,
+                covariance,
+                float(result[0]),
+                result[1:3].copy(),
+                float(result[3]),
+                float(result[5]),
+                float(result[4]),
+                float(result[6]),
+            ),
+            float(result[7]),
+        )
+
+    def _table(self, tag: int, blur: float) -> tuple[NDArray[np.float32], float]:
+        """Return the table of a tag's pattern nearest to a blur [cells], and its blur."""
+        level = round(math.log(min(max(blur, 0.04), 2.0)) / math.log(_STEP))
+        key = (tag, level)
+        if key in self._tables:
+            self._tables.move_to_end(key)
+            return self._tables[key]
+        near = _STEP**level
+        resolution = min(max(round(_POINTS / near), 5), 16)
+        entry = tabulate(family.printed_cells(tag, 1), resolution, near), near
+        self._tables[key] = entry
+        if len(self._tables) > _TABLES:
+            self._tables.popitem(last=False)
+        return entry
+
+
+def _cell(corners: NDArray[np.float64]) -> float:
+    """Return the mean edge of a cell [px]."""
+    sides = np.hypot(*(np.roll(corners, -1, axis=0) - corners).T)
+    return float(sides.mean()) / 8.0

@@ -1,0 +1,298 @@
+"""Place a tag by fitting its whole printed pattern to the pixels (photometric alignment).
+
+The model of a pixel is offset + (gain + slopes) × the printed pattern, seen through a homography,
+a Gaussian blur and a linear smear (the mean along the way that the tag goes during the exposure).
+All of it is fitted to the grey levels by Gauss-Newton with analytic derivatives; pixels that do not
+fit, such as those of a thing that covers the tag, lose their weight. The covariance of the corners
+is that of the fit: noise of the pixels, as the residuals show it, through the same derivatives.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from apriltag_tracker.detection.alignment.sampling import (
+    BORDER,
+    UNKNOWNS,
+    corner_slopes,
+    sample_model,
+    side_length,
+    write_corners,
+)
+from apriltag_tracker.detection.decoding import square_to_quad
+
+RESULT_VALUES = 8
+"""Blur, smear x, smear y [px], explained share of all pixels, residual [grey levels], share of the
+weight that was kept, gain [grey levels], correlation of neighbouring residuals."""
+
+_BLUR, _SMEAR, _LINEAR = 8, 9, 11
+_MOST_PIXELS = 1700.0
+_LEAST_BLUR, _MOST_BLUR = 0.32, 4.0
+_QUANTISATION = 0.3
+"""Standard deviation of the rounding to whole grey levels."""
+
+_SETTLED = 0.015
+"""Steps end when no corner moves further [px]; Gauss-Newton gains another digit with it."""
+
+_MODEL_ERROR = 0.004
+"""What the model leaves out, whatever the noise, moves a corner by so much [px]."""
+
+
+@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
+def _weighted_normal(
+    rows: NDArray[np.float64],
+    residual: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    first: int,
+    count: int,
+    normal: NDArray[np.float64],
+    right: NDArray[np.float64],
+) -> None:
+    """Accumulate the normal equations of the unknowns from `first` on."""
+    for a in range(first, rows.shape[0]):
+        scaled = rows[a, :count] * weights[:count]
+        total = 0.0
+        for i in range(count):
+            total += scaled[i] * residual[i]
+        right[a] = total
+        for b in range(first, a + 1):
+            total = 0.0
+            for i in range(count):
+                total += scaled[i] * rows[b, i]
+            normal[a, b] = total
+            normal[b, a] = total
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _linear_terms(
+    rows: NDArray[np.float64],
+    values: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    count: int,
+    linear: NDArray[np.float64],
+) -> None:
+    """Fit offset, gain and slopes, which are linear, for the present geometry."""
+    normal = np.zeros((UNKNOWNS, UNKNOWNS))
+    right = np.zeros(UNKNOWNS)
+    _weighted_normal(rows, values, weights, _LINEAR, count, normal, right)
+    block = normal[_LINEAR:, _LINEAR:].copy()
+    for k in range(4):
+        block[k, k] = block[k, k] * (1.0 + 1e-9) + 1e-6
+    linear[:] = np.linalg.solve(block, right[_LINEAR:])
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _typical(residual: NDArray[np.float64], count: int) -> float:
+    """Return the residuals' standard deviation from the median of about 200 of them."""
+    step = max(count // 200, 1)
+    return max(1.4826 * float(np.median(np.abs(residual[:count:step]))), _QUANTISATION)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _neighbours_alike(
+    residual: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    where: NDArray[np.int64],
+    count: int,
+) -> float:
+    """Return the correlation of the residuals of neighbouring pixels, 0 to 0.9.
+
+    What the model lacks leaves residuals that are alike in neighbours. Of a sequence with this
+    correlation ρ, n values are worth n (1 − ρ) / (1 + ρ); the same holds across the rows.
+    """
+    product, square = 0.0, 1e-12
+    for i in range(count - 1):
+        if where[0, i] == where[0, i + 1] and where[1, i] + 1 == where[1, i + 1]:
+            both = weights[i] * weights[i + 1]
+            product += both * residual[i] * residual[i + 1]
+            square += 0.5 * both * (residual[i] ** 2 + residual[i + 1] ** 2)
+    return min(max(product / square, 0.0), 0.9)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _weigh(
+    residual: NDArray[np.float64],
+    values: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    count: int,
+    result: NDArray[np.float64],
+) -> None:
+    """Take weight from what is far off; writes share explained, residual and weight kept.
+
+    Something that covers a part of the tag is blurred, too: what is beside it counts less as well.
+    """
+    limit = 3.5 * _typical(residual, count)
+    kept, square, all_square, mean = 0.0, 0.0, 0.0, 0.0
+    for i in range(count):
+        off = abs(residual[i])
+        weights[i] = 1.0 if off <= limit else (limit / off) ** 4
+        all_square += off * off
+        mean += values[i]
+    for i in range(count):
+        if abs(residual[i]) > 2.0 * limit:
+            for k in range(max(i - 2, 0), min(i + 3, count)):
+                weights[k] = min(weights[k], 0.1)
+    for i in range(count):
+        kept += weights[i]
+        square += weights[i] * residual[i] ** 2
+    mean /= count
+    whole = 1e-9
+    for i in range(count):
+        whole += (values[i] - mean) ** 2
+    result[3] = 1.0 - all_square / whole
+    result[4] = max(math.sqrt(square / max(kept - UNKNOWNS, 10.0)), _QUANTISATION)
+    result[5] = kept / count
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _prepare(
+    rows: NDArray[np.float64],
+    values: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    residual: NDArray[np.float64],
+    count: int,
+    result: NDArray[np.float64],
+) -> bool:
+    """Fit the light, write residuals and weights; derivatives become those of the grey level."""
+    linear = np.zeros(4)
+    _linear_terms(rows, values, weights, count, linear)
+    gain = linear[1]
+    result[6] = gain
+    if gain < 4.0:
+        return False
+    for i in range(count):
+        seen = linear[0] + gain * rows[12, i] + linear[2] * rows[13, i] + linear[3] * rows[14, i]
+        residual[i] = values[i] - seen
+    _weigh(residual, values, weights, count, result)
+    # The slopes of the light are small: derivatives take the gain of the tag's middle.
+    for a in range(_LINEAR):
+        for i in range(count):
+            rows[a, i] *= gain
+    return True
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _hold_smear(normal: NDArray[np.float64], right: NDArray[np.float64]) -> None:
+    """Take the smear out of the unknowns."""
+    for a in range(_SMEAR, _LINEAR):
+        normal[a, :] = 0.0
+        normal[:, a] = 0.0
+        normal[a, a] = 1.0
+        right[a] = 0.0
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _advance(
+    state: NDArray[np.float64], h: NDArray[np.float64], move: NDArray[np.float64]
+) -> float:
+    """Take one step; returns by how much the blur changed. Blur and smear change by little."""
+    blur = min(max(move[_BLUR], -0.35 * state[0]), 0.35 * state[0])
+    before = state[0]
+    state[0] = min(max(before + blur, _LEAST_BLUR), _MOST_BLUR)
+    share = min(1.0, 1.5 / max(math.hypot(move[_SMEAR], move[_SMEAR + 1]), 1e-9))
+    state[1] += share * move[_SMEAR]
+    state[2] += share * move[_SMEAR + 1]
+    h[:8] += move[:8]
+    return float(abs(state[0] - before))
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _finish(
+    h: NDArray[np.float64],
+    normal: NDArray[np.float64],
+    residual: float,
+    alike: float,
+    covariance: NDArray[np.float64],
+) -> None:
+    """Write the covariance of the corners."""
+    slopes = corner_slopes(h)
+    spread = np.ascontiguousarray(np.linalg.inv(normal)[:8, :8])
+    variance = residual**2 * ((1.0 + alike) / (1.0 - alike)) ** 2
+    covariance[:] = variance * (slopes @ spread @ np.ascontiguousarray(slopes.T))
+    for a in range(8):
+        covariance[a, a] += _MODEL_ERROR**2
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def align(
+    image: NDArray[np.uint8],
+    table: NDArray[np.float32],
+    table_blur: float,
+    start: NDArray[np.float64],
+    free_smear: bool,
+    passes: int,
+    corners: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    result: NDArray[np.float64],
+) -> bool:
+    """Fit one tag.
+
+    Args:
+        image: grey image.
+        table: of `pattern.tabulate`.
+        table_blur: blur of the table [cells]; the fit's may differ by a few percent.
+        start: (4, 2) px, corners to start from, from the printed lower left counter-clockwise.
+        free_smear: whether the smear is fitted; it cannot start from zero, where both of its
+            directions are alike.
+        passes: at most so many steps of Gauss-Newton.
+        corners: (4, 2) px, output.
+        covariance: (8, 8) px² of the corners x0 y0 x1 …, output.
+        result: (8,) output, see `RESULT_VALUES`; its first three say where to start.
+
+    Returns:
+        Whether the fit settled.
+    """
+    centre = np.array([start[:, 0].mean(), start[:, 1].mean()])
+    corners[:] = start - centre
+    h = np.empty(9)
+    h[:8] = square_to_quad(corners)
+    h[8] = 1.0
+    state = np.array([min(max(result[0], _LEAST_BLUR), _MOST_BLUR), result[1], result[2]])
+    if not free_smear:
+        state[1:] = 0.0
+    side = side_length(start)
+    cell = side / BORDER
+    wide = (start[:, 0].max() - start[:, 0].min()) * 1.3 + 4.0
+    high = (start[:, 1].max() - start[:, 1].min()) * 1.3 + 4.0
+    # Of a large tag every second or third row of pixels is enough.
+    stride = 1 + int(wide * high / _MOST_PIXELS) if not free_smear else 1
+    room = int(wide + 4.0) * int(high / stride + 4.0)
+    rows, values = np.empty((UNKNOWNS, room)), np.empty(room)
+    where = np.empty((2, room), dtype=np.int64)
+    weights, residual = np.ones(room), np.empty(room)
+    normal, right = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS)
+    settled, moved, count = False, 0.0, 0
+    for step in range(passes + 1):
+        before = count
+        count = sample_model(
+            image, h, state, table, table_blur, cell, stride, centre, rows, values, where
+        )
+        if count < 60:
+            return False
+        if count != before:
+            weights[:count] = 1.0
+        if not _prepare(rows, values, weights, residual, count, result):
+            return False
+        _weighted_normal(rows, residual, weights, 0, count, normal, right)
+        if not free_smear:
+            _hold_smear(normal, right)
+        for a in range(UNKNOWNS):
+            normal[a, a] = normal[a, a] * (1.0 + 1e-9) + 1e-9
+        if settled or step == passes:
+            break
+        last = corners.copy()
+        widened = _advance(state, h, np.linalg.solve(normal, right))
+        write_corners(h, corners)
+        moved = np.abs(corners - last).max()
+        if not moved < 0.5 * side:
+            return False
+        settled = moved < _SETTLED and widened < 0.03 * state[0]
+    result[0], result[1], result[2] = state[0], state[1], state[2]
+    result[7] = _neighbours_alike(residual, weights, where, count)
+    _finish(h, normal, result[4], result[7], covariance)
+    corners += centre
+    return moved < 0.1

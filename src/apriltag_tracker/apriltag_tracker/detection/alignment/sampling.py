@@ -1,0 +1,214 @@
+"""The pattern under a homography, a blur and a smear: grey levels and derivatives, by pixel."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from apriltag_tracker.detection.alignment.pattern import MARGIN
+
+UNKNOWNS = 15
+"""Homography (8), blur [px], smear x, y [px], offset, gain, slopes of the gain along both sides."""
+
+BORDER = 8.0
+"""Cells along the black border."""
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def inverse(h: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the inverse of a homography with h[8] = 1, up to scale, (9,)."""
+    out = np.empty(9)
+    out[0] = h[4] - h[5] * h[7]
+    out[1] = h[2] * h[7] - h[1]
+    out[2] = h[1] * h[5] - h[2] * h[4]
+    out[3] = h[5] * h[6] - h[3]
+    out[4] = h[0] - h[2] * h[6]
+    out[5] = h[2] * h[3] - h[0] * h[5]
+    out[6] = h[3] * h[7] - h[4] * h[6]
+    out[7] = h[1] * h[6] - h[0] * h[7]
+    out[8] = h[0] * h[4] - h[1] * h[3]
+    return out
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def write_corners(h: NDArray[np.float64], corners: NDArray[np.float64]) -> None:
+    """Write where the corners of the unit square go, (4, 2)."""
+    for k in range(4):
+        u = 1.0 if k in {1, 2} else 0.0
+        v = 1.0 if k in {2, 3} else 0.0
+        w = h[6] * u + h[7] * v + 1.0
+        corners[k, 0] = (h[0] * u + h[1] * v + h[2]) / w
+        corners[k, 1] = (h[3] * u + h[4] * v + h[5]) / w
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def corner_slopes(h: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the derivative of the corners x0 y0 x1 … by the homography, (8, 8)."""
+    slopes = np.zeros((8, 8))
+    for k in range(4):
+        u = 1.0 if k in {1, 2} else 0.0
+        v = 1.0 if k in {2, 3} else 0.0
+        w = h[6] * u + h[7] * v + 1.0
+        x = (h[0] * u + h[1] * v + h[2]) / w
+        y = (h[3] * u + h[4] * v + h[5]) / w
+        for axis in range(2):
+            row, place = 2 * k + axis, x if axis == 0 else y
+            slopes[row, 3 * axis] = u / w
+            slopes[row, 3 * axis + 1] = v / w
+            slopes[row, 3 * axis + 2] = 1.0 / w
+            slopes[row, 6] = -place * u / w
+            slopes[row, 7] = -place * v / w
+    return slopes
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def side_length(corners: NDArray[np.float64]) -> float:
+    """Return the mean length of the sides [px]."""
+    total = 0.0
+    for k in range(4):
+        n = (k + 1) % 4
+        total += math.hypot(corners[n, 0] - corners[k, 0], corners[n, 1] - corners[k, 1])
+    return 0.25 * total
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _bounds(h: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    """Return the range of x and of y that a tag with its margin covers."""
+    low_x = low_y = 1e9
+    high_x = high_y = -1e9
+    for k in range(4):
+        u = 1.0 + MARGIN / BORDER if k in {1, 2} else -MARGIN / BORDER
+        v = 1.0 + MARGIN / BORDER if k in {2, 3} else -MARGIN / BORDER
+        w = h[6] * u + h[7] * v + 1.0
+        x, y = (h[0] * u + h[1] * v + h[2]) / w, (h[3] * u + h[4] * v + h[5]) / w
+        low_x, high_x = min(low_x, x), max(high_x, x)
+        low_y, high_y = min(low_y, y), max(high_y, y)
+    return low_x, high_x, low_y, high_y
+
+
+@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
+def _look_up(
+    table: NDArray[np.float32],
+    resolution: int,
+    c: float,
+    r: float,
+    dc: float,
+    dr: float,
+    instants: int,
+) -> tuple[float, float, float, float, float, float]:
+    """Average the pattern over the way of a pixel through it, (dc, dr) cells about (c, r).
+
+    Returns:
+        Value, derivatives by column, row and blur, means of the first two times the instant.
+    """
+    value, by_c, by_r, by_blur, along_c, along_r = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    one = np.uintp(1)
+    for k in range(instants):
+        t = (k + 0.5) / instants - 0.5
+        at_c, at_r = (c + t * dc) * resolution, (r + t * dr) * resolution
+        i, j = np.uintp(at_r), np.uintp(at_c)
+        a, b = at_c - j, at_r - i
+        w00, w01 = (1.0 - b) * (1.0 - a), (1.0 - b) * a
+        w10, w11 = b * (1.0 - a), b * a
+        value += w00 * table[i, j, 0] + w01 * table[i, j + one, 0]
+        value += w10 * table[i + one, j, 0] + w11 * table[i + one, j + one, 0]
+        g = w00 * table[i, j, 1] + w01 * table[i, j + one, 1]
+        g += w10 * table[i + one, j, 1] + w11 * table[i + one, j + one, 1]
+        f = w00 * table[i, j, 2] + w01 * table[i, j + one, 2]
+        f += w10 * table[i + one, j, 2] + w11 * table[i + one, j + one, 2]
+        by_blur += w00 * table[i, j, 3] + w01 * table[i, j + one, 3]
+        by_blur += w10 * table[i + one, j, 3] + w11 * table[i + one, j + one, 3]
+        by_c += g
+        by_r += f
+        along_c += t * g
+        along_r += t * f
+    share = 1.0 / instants
+    return (
+        value * share,
+        by_c * share,
+        by_r * share,
+        by_blur * share,
+        along_c * share,
+        along_r * share,
+    )
+
+
+@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
+def sample_model(
+    image: NDArray[np.uint8],
+    h: NDArray[np.float64],
+    state: NDArray[np.float64],
+    table: NDArray[np.float32],
+    table_blur: float,
+    cell: float,
+    stride: int,
+    centre: NDArray[np.float64],
+    rows: NDArray[np.float64],
+    values: NDArray[np.float64],
+    where: NDArray[np.int64],
+) -> int:
+    """Write derivatives (15, n), grey levels (n,) and pixels (2, n) of what the tag covers.
+
+    Derivatives are those of the bare pattern by homography, blur and smear (not times the gain),
+    and the linear terms themselves; returns how many pixels there are.
+    """
+    size = table.shape[0]
+    resolution = (size - 1) // 10
+    smear_x, smear_y = state[1], state[2]
+    travel = math.hypot(smear_x, smear_y)
+    instants = 1 if travel < 1e-9 else int(travel / 0.6) + 3
+    back = inverse(h)
+    reach = 2.0 * state[0] / cell
+    low_x, high_x, low_y, high_y = _bounds(h)
+    first_row = max(int(low_y + centre[1]), 0)
+    last_row = min(int(high_y + centre[1]) + 1, image.shape[0] - 1)
+    first = max(int(low_x + centre[0]), 0)
+    last = min(int(high_x + centre[0]) + 1, image.shape[1] - 1)
+    count = 0
+    change = state[0] / cell - table_blur
+    for row in range(first_row, last_row + 1, stride):
+        y = row - centre[1]
+        for column in range(first, last + 1):
+            if count >= values.shape[0]:
+                return count
+            x = column - centre[0]
+            scale = 1.0 / (back[6] * x + back[7] * y + back[8])
+            u = (back[0] * x + back[1] * y + back[2]) * scale
+            v = (back[3] * x + back[4] * y + back[5]) * scale
+            # Derivatives of u, v by the pixel, in cells.
+            ux = (back[0] - u * back[6]) * scale * BORDER
+            uy = (back[1] - u * back[7]) * scale * BORDER
+            vx = (back[3] - v * back[6]) * scale * BORDER
+            vy = (back[4] - v * back[7]) * scale * BORDER
+            # In the table columns run to the right and rows down, from the margin's corner.
+            c = u * BORDER + MARGIN
+            r = (1.0 - v) * BORDER + MARGIN
+            dc, dr = ux * smear_x + uy * smear_y, -(vx * smear_x + vy * smear_y)
+            edge_c, edge_r = 0.5 * abs(dc) + reach, 0.5 * abs(dr) + reach
+            if c < edge_c or c > 10.0 - edge_c or r < edge_r or r > 10.0 - edge_r:
+                continue
+            value, by_c, by_r, by_blur, along_c, along_r = _look_up(
+                table, resolution, c, r, dc, dr, instants
+            )
+            value += by_blur * change
+            # Derivatives by the pixel.
+            gx, gy = by_c * ux - by_r * vx, by_c * uy - by_r * vy
+            w = 1.0 / (h[6] * u + h[7] * v + 1.0)
+            along = gx * x + gy * y
+            rows[0, count], rows[1, count], rows[2, count] = -gx * u * w, -gx * v * w, -gx * w
+            rows[3, count], rows[4, count], rows[5, count] = -gy * u * w, -gy * v * w, -gy * w
+            rows[6, count], rows[7, count] = along * u * w, along * v * w
+            rows[8, count] = by_blur / cell
+            rows[9, count] = along_c * ux - along_r * vx
+            rows[10, count] = along_c * uy - along_r * vy
+            rows[11, count] = 1.0
+            rows[12, count] = value
+            rows[13, count] = value * (u - 0.5)
+            rows[14, count] = value * (v - 0.5)
+            values[count] = image[row, column]
+            where[0, count], where[1, count] = row, column
+            count += 1
+    return count

@@ -1,0 +1,93 @@
+"""What the residuals of a fit without a smear say about the smear that there is."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from apriltag_tracker.detection.alignment.sampling import (
+    BORDER,
+    UNKNOWNS,
+    sample_model,
+    side_length,
+)
+from apriltag_tracker.detection.decoding import square_to_quad
+
+_LEAST_BLUR = 0.32
+"""Of a pixel alone [px]."""
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def guess_smear(
+    image: NDArray[np.uint8],
+    table: NDArray[np.float32],
+    table_blur: float,
+    corners: NDArray[np.float64],
+    blur: float,
+    smear: NDArray[np.float64],
+) -> float:
+    """Guess the smear from how residuals of a fit without one follow second derivatives.
+
+    To second order a smear s adds s sᵀ / 12 to the covariance of the blur, and a change Σ of that
+    covariance adds Σ : ∇∇ / 2 of the picture. The anisotropic part of the best Σ gives direction
+    and length; its sign cannot be told and does not matter.
+
+    Args:
+        image: grey image.
+        table: of `pattern.tabulate`.
+        table_blur: its blur [cells].
+        corners: (4, 2) px of the fit.
+        blur: of the fit [px].
+        smear: (2,) px, output.
+
+    Returns:
+        The standard deviation of the blur without the smear's share [px].
+    """
+    centre = np.array([corners[:, 0].mean(), corners[:, 1].mean()])
+    h = np.empty(9)
+    h[:8] = square_to_quad(corners - centre)
+    h[8] = 1.0
+    cell = side_length(corners) / BORDER
+    low_x, low_y = int(corners[:, 0].min() - cell - 2), int(corners[:, 1].min() - cell - 2)
+    high_x, high_y = int(corners[:, 0].max() + cell + 3), int(corners[:, 1].max() + cell + 3)
+    room = (high_x - low_x + 1) * (high_y - low_y + 1)
+    smear[:] = 0.0
+    rows, values = np.empty((UNKNOWNS, room)), np.empty(room)
+    where = np.empty((2, room), dtype=np.int64)
+    state = np.array([blur, 0.0, 0.0])
+    count = sample_model(image, h, state, table, table_blur, cell, 1, centre, rows, values, where)
+    if count < 60:
+        return blur
+    grid = np.full((high_y - low_y + 1, high_x - low_x + 1), np.nan)
+    for i in range(count):
+        grid[where[0, i] - low_y, where[1, i] - low_x] = rows[12, i]
+    design, right = np.zeros((5, 5)), np.zeros(5)
+    row = np.empty(5)
+    for i in range(count):
+        y, x = where[0, i] - low_y, where[1, i] - low_x
+        if not (0 < y < grid.shape[0] - 1 and 0 < x < grid.shape[1] - 1):
+            continue
+        row[0] = 0.5 * (grid[y, x + 1] + grid[y, x - 1]) - grid[y, x]
+        row[1] = 0.5 * (grid[y + 1, x] + grid[y - 1, x]) - grid[y, x]
+        row[2] = 0.25 * (grid[y + 1, x + 1] + grid[y - 1, x - 1])
+        row[2] -= 0.25 * (grid[y + 1, x - 1] + grid[y - 1, x + 1])
+        row[3], row[4] = 1.0, grid[y, x]
+        if not np.all(np.isfinite(row)):
+            continue
+        for a in range(5):
+            right[a] += row[a] * values[i]
+            for b in range(5):
+                design[a, b] += row[a] * row[b]
+    for a in range(5):
+        design[a, a] += 1e-6
+    best = np.linalg.solve(design, right)
+    gain = max(best[4], 4.0)
+    xx, yy, xy = best[0] / gain, best[1] / gain, best[2] / gain
+    half, difference = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
+    length = math.sqrt(24.0 * difference)
+    angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
+    smear[0], smear[1] = length * math.cos(angle), length * math.sin(angle)
+    return math.sqrt(max(blur**2 + half - difference, _LEAST_BLUR**2))

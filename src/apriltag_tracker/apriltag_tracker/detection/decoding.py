@@ -1,0 +1,204 @@
+"""Read the code of a tag whose corners are known.
+
+Cells are sampled at their centres, sharpened against their neighbours, and compared with a
+threshold half-way between two planes: one through the white margin, one through the black border,
+so that uneven light does not matter.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from apriltag_tracker import family
+from apriltag_tracker.detection.edges import inside, sample
+
+SHARPENING = 0.25
+"""Share of the difference between a cell and its neighbours that is added to it."""
+
+UNREADABLE = 64
+
+_GRID = 10
+_LEAST_CONTRAST = 12.0
+
+
+@functools.cache
+def code_table() -> NDArray[np.uint64]:
+    """Return the codes of all printed tags in four directions as integers, (4, 587).
+
+    Row r holds what is read when the corners start r corners late: at the printed lower right for
+    r = 1, and so on counter-clockwise.
+    """
+    weights = np.uint64(1) << np.arange(35, -1, -1, dtype=np.uint64)
+    rows = [
+        (np.rot90(family.codes(), -turn, axes=(1, 2)).reshape(family.TAG_COUNT, -1) * weights).sum(
+            axis=1, dtype=np.uint64
+        )
+        for turn in range(4)
+    ]
+    return np.ascontiguousarray(rows)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def square_to_quad(c: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the projective map of the unit square onto a quadrilateral (Heckbert 1989)."""
+    dx1, dx2 = c[1, 0] - c[2, 0], c[3, 0] - c[2, 0]
+    dy1, dy2 = c[1, 1] - c[2, 1], c[3, 1] - c[2, 1]
+    sx = c[0, 0] - c[1, 0] + c[2, 0] - c[3, 0]
+    sy = c[0, 1] - c[1, 1] + c[2, 1] - c[3, 1]
+    determinant = dx1 * dy2 - dx2 * dy1
+    g = (sx * dy2 - dx2 * sy) / determinant
+    h = (dx1 * sy - sx * dy1) / determinant
+    out = np.empty(8)
+    out[0] = c[1, 0] - c[0, 0] + g * c[1, 0]
+    out[1] = c[3, 0] - c[0, 0] + h * c[3, 0]
+    out[2] = c[0, 0]
+    out[3] = c[1, 1] - c[0, 1] + g * c[1, 1]
+    out[4] = c[3, 1] - c[0, 1] + h * c[3, 1]
+    out[5] = c[0, 1]
+    out[6] = g
+    out[7] = h
+    return out
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _sample_cells(
+    image: NDArray[np.uint8], corners: NDArray[np.float64], values: NDArray[np.float64]
+) -> bool:
+    """Sample the 10 x 10 cells of a tag with its margin; row 0 is the upper one."""
+    h = square_to_quad(corners)
+    for row in range(_GRID):
+        v = 1.0 - (row - 0.5) / 8.0
+        for column in range(_GRID):
+            u = (column - 0.5) / 8.0
+            w = h[6] * u + h[7] * v + 1.0
+            x = (h[0] * u + h[1] * v + h[2]) / w
+            y = (h[3] * u + h[4] * v + h[5]) / w
+            if not inside(image, x, y):
+                return False
+            values[row, column] = sample(image, x, y)
+    return True
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _ring_plane(values: NDArray[np.float64], ring: int) -> tuple[float, float, float]:
+    """Return mean and slopes a row and a column of one ring of cells around the middle."""
+    last = _GRID - 1 - ring
+    total, along_row, along_column, weight, count = 0.0, 0.0, 0.0, 0.0, 0.0
+    middle = 0.5 * (_GRID - 1)
+    for row in range(ring, last + 1):
+        for column in range(ring, last + 1):
+            if row not in {ring, last} and column not in {ring, last}:
+                continue
+            value = values[row, column]
+            total += value
+            along_row += (row - middle) * value
+            along_column += (column - middle) * value
+            weight += (row - middle) ** 2
+            count += 1.0
+    return total / count, along_row / weight, along_column / weight
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def read_code(image: NDArray[np.uint8], corners: NDArray[np.float64]) -> tuple[bool, np.uint64]:
+    """Read the 36 cells of one tag as an integer, upper left cell first.
+
+    Args:
+        image: grey image.
+        corners: (4, 2) px, counter-clockwise as printed; the first is taken for the lower left.
+
+    Returns:
+        Whether there is a tag (white margin, black border, contrast), and the code.
+    """
+    values = np.empty((_GRID, _GRID))
+    code = np.uint64(0)
+    if not _sample_cells(image, corners, values):
+        return False, code
+    white, white_row, white_column = _ring_plane(values, 0)
+    black, black_row, black_column = _ring_plane(values, 1)
+    if white - black < _LEAST_CONTRAST:
+        return False, code
+    mean = 0.5 * (white + black)
+    slope_row, slope_column = 0.5 * (white_row + black_row), 0.5 * (white_column + black_column)
+    wrong = 0
+    for row in range(1, _GRID - 1):
+        for column in range(1, _GRID - 1):
+            threshold = mean + slope_row * (row - 4.5) + slope_column * (column - 4.5)
+            value = values[row, column]
+            if row in {1, _GRID - 2} or column in {1, _GRID - 2}:
+                wrong += value > threshold
+                continue
+            neighbours = values[row - 1, column] + values[row + 1, column]
+            neighbours += values[row, column - 1] + values[row, column + 1]
+            value += SHARPENING * (4.0 * value - neighbours)
+            code = (code << np.uint64(1)) | np.uint64(value > threshold)
+    return wrong <= 2, code
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def count_bits(value: np.uint64) -> int:
+    """Count the ones of an integer."""
+    count = 0
+    while value:
+        value &= value - np.uint64(1)
+        count += 1
+    return count
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def distances(
+    image: NDArray[np.uint8],
+    corners: NDArray[np.float64],
+    expected: NDArray[np.uint64],
+    found: NDArray[np.bool_],
+    distance: NDArray[np.int64],
+) -> None:
+    """Count the cells in which quadrilaterals (n, 4, 2) differ from the codes (n,) expected there.
+
+    Where `found` is false or nothing can be read the distance is `UNREADABLE`.
+    """
+    for i in range(corners.shape[0]):
+        distance[i] = UNREADABLE
+        if not found[i]:
+            continue
+        readable, code = read_code(image, corners[i])
+        if readable:
+            distance[i] = count_bits(code ^ expected[i])
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def identify(
+    image: NDArray[np.uint8],
+    corners: NDArray[np.float64],
+    table: NDArray[np.uint64],
+    found: NDArray[np.bool_],
+    ids: NDArray[np.int64],
+    turns: NDArray[np.int64],
+    distance: NDArray[np.int64],
+) -> None:
+    """Find the tag whose code is nearest to what quadrilaterals (n, 4, 2) show, in any direction.
+
+    Args:
+        image: grey image.
+        corners: (n, 4, 2) px, counter-clockwise as printed, starting anywhere.
+        table: of `code_table`.
+        found: (n,) which to read.
+        ids: (n,) output.
+        turns: (n,) output: which corner is the printed lower left.
+        distance: (n,) output: wrong cells; `UNREADABLE` where there is no tag.
+    """
+    for i in range(corners.shape[0]):
+        distance[i] = UNREADABLE
+        if not found[i]:
+            continue
+        readable, code = read_code(image, corners[i])
+        if not readable:
+            continue
+        for turn in range(4):
+            for tag in range(table.shape[1]):
+                wrong = count_bits(code ^ table[turn, tag])
+                if wrong < distance[i]:
+                    distance[i], ids[i], turns[i] = wrong, tag, (4 - turn) % 4

@@ -1,0 +1,387 @@
+"""Find AprilTags (36h11) in a grey image: OpenCV finds them, line fits place their corners."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from apriltag_tracker import family
+from apriltag_tracker.detection import decoding, edges
+from apriltag_tracker.detection.alignment.aligner import USUAL_BLUR, Aligner, Alignment
+from apriltag_tracker.detection.covered import covered_quads
+from apriltag_tracker.detection.tag import Tag, counter_clockwise, once
+
+MOST_CORRECTED_BITS = 2
+"""At three forgiven cells 19 of 1000 pictures of noise show a tag."""
+
+SMALLEST_TAG = 12.0
+"""Shortest side that is looked for [px]; a cell is 1.5 px then."""
+
+_FROM_OPENCV = (1, 0, 3, 2)
+"""OpenCV's corners run clockwise from what is the printed tag's lower right."""
+
+_LINES_ALONE = 0.15
+"""Standard deviation that lines have where the whole pattern could not be fitted [px]."""
+
+_EXPLAINED = 0.93
+_WRONG_BUT_NEAR = 5
+_DIM = 60.0
+_THRESHOLD, _FAINT_THRESHOLD = 7.0, 3.0
+"""By how much a pixel must be darker than its surroundings to be black [grey levels]."""
+
+
+def refine(
+    gray: NDArray[np.uint8], quads: NDArray[np.float64], search: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Refine corners (n, 4, 2) px; returns corners, side statistics (n, 4, 6) and success (n,)."""
+    corners = np.empty_like(quads)
+    stats = np.zeros((len(quads), 4, edges.EDGE_VALUES))
+    found = np.zeros(len(quads), dtype=np.bool_)
+    edges.refine_quads(gray, quads, search, corners, stats, found)
+    return corners, stats, found
+
+
+def grey(image: Any) -> NDArray[np.uint8]:
+    """Check an image and return it as contiguous grey.
+
+    Raises:
+        ValueError: not an array of uint8 with one or three channels.
+    """
+    if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim not in {2, 3}:
+        what = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image)
+        raise ValueError(
+            f"image: uint8 array (rows, columns) or (rows, columns, 3) expected, not {what}"
+        )
+    if image.size == 0:
+        raise ValueError(f"image: the picture is empty ({image.shape[1]} x {image.shape[0]} px)")
+    if image.ndim == 3:
+        image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    return np.ascontiguousarray(image)
+
+
+class Detector:
+    """Finds all tags of an image.
+
+    Args:
+        smallest: shortest side of a tag to look for [px].
+        correct_bits: wrong cells of a code that are forgiven in a search; one more where the tag is
+            expected. A random square passes for a tag once in 790 000 at 1, once in 44 000 at 2.
+        largest_residual: RMS residual of the border's lines above which a candidate is dropped
+            [px].
+
+    Raises:
+        ValueError: a tag smaller than can be read, or more forgiven cells than are safe.
+    """
+
+    def __init__(
+        self, smallest: float = SMALLEST_TAG, correct_bits: int = 1, largest_residual: float = 0.4
+    ) -> None:
+        if smallest < 8.0:
+            raise ValueError(f"smallest tag of {smallest} px: 8 px or more can be read")
+        if not 0 <= correct_bits <= MOST_CORRECTED_BITS:
+            raise ValueError(
+                f"correct_bits {correct_bits}: 0 to {MOST_CORRECTED_BITS}; with more, pictures "
+                "without a tag show some"
+            )
+        self.smallest = smallest
+        self.correct_bits = correct_bits
+        self.largest_residual = largest_residual
+        self._aligner = Aligner()
+        check_orientation()
+
+    def warm_up(self) -> None:
+        """Load or compile everything a first image would wait for."""
+        canvas = np.full((96, 96), 255, dtype=np.uint8)
+        canvas[28:68, 28:68] = enlarged_tag(0, 5)
+        if [tag.id for tag in self.detect(canvas)] != [0]:
+            raise family.FamilyError("a perfect picture of tag 0 is not detected")
+        quad = np.array([[[27.5, 67.5], [67.5, 67.5], [67.5, 27.5], [27.5, 27.5]]])
+        if [tag.id for tag in self._read_again(canvas, quad, [], "full")] != [0]:
+            raise family.FamilyError("a perfect picture of tag 0 is not read")
+
+    def detect(self, gray: NDArray[np.uint8], thorough: bool = False) -> list[Tag]:
+        """Find tags in a grey image (rows, columns) of uint8; duplicates are returned as they are.
+
+        Args:
+            gray: the image.
+            thorough: search once more with a lower threshold, for tags in a dark corner of an image
+                that is bright elsewhere. An image that is dark as a whole is searched like that
+                anyway.
+
+        Raises:
+            ValueError: not such an image, or an empty one.
+        """
+        return self.search(grey(gray), "full", thorough=thorough)
+
+    def search(
+        self, image: NDArray[np.uint8], found_by: str, scale: int = 1, thorough: bool = False
+    ) -> list[Tag]:
+        """Find tags in a grey image that may have been enlarged by a whole number.
+
+        Corners belong to the image as given. Quadrilaterals whose code OpenCV does not read are
+        read again at their refined corners, where many more are readable; so are dark shapes that
+        something covers a corner of.
+        """
+        smallest = self.smallest * scale
+        dim = _is_dim(image)
+        passes = (True,) if dim else (False, True) if thorough else (False,)
+        tags: list[Tag] = []
+        for faint in passes:
+            ids, quads, others = find_quads(image, smallest, faint)
+            tags += self.confirm(image, ids, quads, 3.0 * scale, found_by)
+            tags += self._read_again(image, others, tags, found_by)
+        covered = covered_quads(image, smallest, dim, [tag.corners for tag in tags])
+        tags += self._read_again(image, covered, tags, found_by)
+        return once(tags)
+
+    def confirm(
+        self,
+        image: NDArray[np.uint8],
+        ids: NDArray[np.int64],
+        quads: NDArray[np.float64],
+        search: float,
+        found_by: str,
+        before: Mapping[int, Tag] | None = None,
+    ) -> list[Tag]:
+        """Refine candidates and keep those whose border is straight and whose code is right.
+
+        Args:
+            image: grey image.
+            ids: (n,) the tag each candidate should be.
+            quads: (n, 4, 2) px, from the printed lower left counter-clockwise.
+            search: how far a side may be from where the candidate says [px].
+            found_by: noted in the tags.
+            before: tags as they were last seen: where blur and smear start from. One that is
+                `tracked` may also be confirmed by its whole pattern, if its border is too smeared.
+        """
+        if len(ids) == 0:
+            return []
+        known = before or {}
+        corners, stats, found = refine(image, quads, search)
+        distance = np.empty(len(ids), dtype=np.int64)
+        decoding.distances(image, corners, decoding.code_table()[0, ids], found, distance)
+        forgiven = self.correct_bits + (found_by == "tracked")
+        tags = self._collect(ids, corners, stats, found & (distance <= forgiven), found_by)
+        tags = [self._aligned(image, tag, known.get(tag.id)) for tag in tags]
+        if found_by == "tracked":
+            seen = {tag.id for tag in tags}
+            for tag, quad in zip(ids.tolist(), quads, strict=True):
+                if tag not in seen and tag in known:
+                    whole = self._by_pattern(image, tag, quad, known[tag], found_by)
+                    tags += [whole] if whole is not None else []
+        return tags
+
+    def _aligned(self, image: NDArray[np.uint8], tag: Tag, before: Tag | None = None) -> Tag:
+        """Return a tag with the corners of its whole pattern, which a smear does not shift."""
+        near = before or tag
+        fitted = self._aligner.align(
+            image, tag.id, tag.corners, near.blur, np.array(near.smear, dtype=np.float64)
+        )
+        cell = tag.pixel_size / family.BORDER_CELLS
+        if fitted is None or np.abs(fitted.corners - tag.corners).max() > 0.3 * cell + 1.0:
+            # Lines alone: blur and smear may have moved them, by how much is not known.
+            unsure = 4.0 * tag.covariance + _LINES_ALONE**2 * np.eye(8)
+            return replace(tag, covariance=unsure)
+        return replace(
+            tag,
+            corners=fitted.corners,
+            covariance=fitted.covariance,
+            contrast=fitted.contrast,
+            blur=fitted.blur,
+            smear=(float(fitted.smear[0]), float(fitted.smear[1])),
+        )
+
+    def _by_pattern(
+        self,
+        image: NDArray[np.uint8],
+        tag: int,
+        quad: NDArray[np.float64],
+        before: Tag | None,
+        found_by: str,
+    ) -> Tag | None:
+        """Return a tag that is confirmed by nearly all of its pixels, None if it is not there."""
+        blur = before.blur if before is not None else USUAL_BLUR
+        smear = np.array(before.smear if before is not None else (0.0, 0.0))
+        fitted = self._aligner.align(image, tag, quad, blur, smear)
+        if fitted is None or not _is_the_tag(fitted, quad):
+            return None
+        return Tag(
+            id=tag,
+            corners=fitted.corners,
+            covariance=fitted.covariance,
+            line_residual=math.nan,
+            edge_share=0.0,
+            contrast=fitted.contrast,
+            found_by=found_by,
+            blur=fitted.blur,
+            smear=(float(fitted.smear[0]), float(fitted.smear[1])),
+        )
+
+    def _read_again(
+        self,
+        image: NDArray[np.uint8],
+        quads: NDArray[np.float64],
+        known: Sequence[Tag],
+        found_by: str,
+    ) -> list[Tag]:
+        """Refine quadrilaterals (n, 4, 2) that OpenCV could not read, and read them."""
+        for tag in known:
+            apart = np.hypot(*(quads.mean(axis=1) - tag.corners.mean(axis=0)).T)
+            quads = quads[apart > 0.5 * tag.pixel_size]
+        if len(quads) == 0:
+            return []
+        corners, stats, found = refine(image, quads, 3.0)
+        ids, turns, distance = (np.zeros(len(quads), dtype=np.int64) for _ in range(3))
+        decoding.identify(image, corners, decoding.code_table(), found, ids, turns, distance)
+        for i in np.flatnonzero(distance < decoding.UNREADABLE):
+            corners[i] = np.roll(corners[i], -turns[i], axis=0)
+            stats[i] = np.roll(stats[i], -turns[i], axis=0)
+        good = found & (distance <= self.correct_bits)
+        tags = self._collect(ids, corners, stats, good, found_by)
+        tags = [self._aligned(image, tag) for tag in tags]
+        for i in np.flatnonzero(found & ~good & (distance <= _WRONG_BUT_NEAR)):
+            if counter_clockwise(corners[i]):
+                whole = self._by_pattern(image, int(ids[i]), corners[i], None, found_by)
+                tags += [whole] if whole is not None else []
+        return tags
+
+    def _collect(
+        self,
+        ids: NDArray[np.int64],
+        corners: NDArray[np.float64],
+        stats: NDArray[np.float64],
+        good: NDArray[np.bool_],
+        found_by: str,
+    ) -> list[Tag]:
+        """Put together those candidates whose border is straight and runs the right way round."""
+        residuals = np.sqrt(np.mean(stats[:, :, 3] ** 2, axis=1))
+        good = good & (residuals <= self.largest_residual)
+        kept = [i for i in np.flatnonzero(good) if counter_clockwise(corners[i])]
+        spread = np.empty((len(kept), 8, 8))
+        edges.corner_covariances(corners[kept], stats[kept], spread)
+        return [
+            Tag(
+                id=int(ids[i]),
+                corners=corners[i],
+                covariance=spread[k],
+                line_residual=float(residuals[i]),
+                edge_share=float(stats[i, :, 4].min()),
+                contrast=float(stats[i, :, 5].min()),
+                found_by=found_by,
+            )
+            for k, i in enumerate(kept)
+        ]
+
+
+def _is_the_tag(fitted: Alignment, quad: NDArray[np.float64]) -> bool:
+    """Tell whether a pattern explains nearly all pixels, close to where it was looked for.
+
+    A pattern with two other cells of 100 explains 92 % at most, however sharp the picture is.
+    """
+    cell = math.dist(quad[0].tolist(), quad[2].tolist()) / (math.sqrt(2.0) * family.BORDER_CELLS)
+    return (
+        fitted.explained > _EXPLAINED
+        and fitted.contrast > 12.0
+        and counter_clockwise(fitted.corners)
+        and bool(np.abs(fitted.corners - quad).max() < 1.5 * cell)
+    )
+
+
+def _is_dim(image: NDArray[np.uint8]) -> bool:
+    """Tell from 1 pixel of 64 whether nothing stands out against OpenCV's usual threshold."""
+    low, high = np.percentile(image[::8, ::8], (1.0, 99.0))
+    return bool(high - low < _DIM)
+
+
+def find_quads(
+    image: NDArray[np.uint8], smallest: float, faint: bool = False
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Let OpenCV find tags.
+
+    Args:
+        image: grey image.
+        smallest: shortest side [px].
+        faint: whether to look for tags of little contrast.
+
+    Returns:
+        ids (n,) and corners (n, 4, 2) px of tags, printed lower left first; and corners (m, 4, 2)
+        of quadrilaterals that it could not read, counter-clockwise as printed.
+    """
+    detector = _opencv_detector(max(image.shape), smallest, faint)
+    if faint:
+        image = cv2.GaussianBlur(image, (3, 3), 0.0)
+    found, ids, others = detector.detectMarkers(image)
+    rest = _quads(others)
+    if ids is None or len(ids) == 0:
+        return np.empty(0, dtype=np.int64), np.empty((0, 4, 2)), rest
+    return np.asarray(ids, dtype=np.int64).ravel(), _quads(found), rest
+
+
+def _quads(found: Sequence[Any]) -> NDArray[np.float64]:
+    """Return OpenCV's quadrilaterals as an array (n, 4, 2) that runs as printed."""
+    if len(found) == 0:
+        return np.empty((0, 4, 2))
+    table = np.array([np.asarray(quad, dtype=np.float64).reshape(4, 2) for quad in found])
+    return np.ascontiguousarray(table[:, _FROM_OPENCV])
+
+
+@functools.lru_cache(maxsize=32)
+def _opencv_detector(extent: int, smallest: float, faint: bool) -> Any:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
+    parameters.minMarkerPerimeterRate = 0.8 * 4.0 * smallest / extent
+    parameters.maxMarkerPerimeterRate = 4.0
+    parameters.adaptiveThreshConstant = _FAINT_THRESHOLD if faint else _THRESHOLD
+    parameters.adaptiveThreshWinSizeMin = 13
+    parameters.adaptiveThreshWinSizeMax = 13
+    parameters.adaptiveThreshWinSizeStep = 10
+    parameters.minCornerDistanceRate = 0.05
+    # Else the outline of the white sheet takes the place of the black border inside of it.
+    parameters.minMarkerDistanceRate = 0.02
+    parameters.minDistanceToBorder = 2
+    # Loose, so that a border with a dent where something covers it is still taken for four sides.
+    parameters.polygonalApproxAccuracyRate = 0.08
+    parameters.perspectiveRemovePixelPerCell = 4
+    parameters.errorCorrectionRate = 1.0
+    return cv2.aruco.ArucoDetector(family.dictionary(), parameters)
+
+
+def enlarged_tag(tag: int, scale: int) -> NDArray[np.uint8]:
+    """Return a perfect picture of a tag without its margin, (8 scale, 8 scale) of 0 and 255."""
+    cells = family.printed_cells(tag, margin=0) * np.uint8(255)
+    return np.repeat(np.repeat(cells, scale, axis=0), scale, axis=1)
+
+
+@functools.cache
+def check_orientation() -> None:
+    """Detect one known tag and check id, corner order, rotation and pixel convention.
+
+    Raises:
+        family.FamilyError: this OpenCV answers otherwise than this package expects.
+    """
+    family.check_code_of_tag_0()
+    scale, left, top = 5, 30, 20
+    canvas = np.full((100, 110), 255, dtype=np.uint8)
+    canvas[top : top + 8 * scale, left : left + 8 * scale] = enlarged_tag(0, scale)
+    ids, quads, _ = find_quads(canvas, 20.0)
+    right, bottom = left + 8 * scale, top + 8 * scale
+    expected = np.array([[left, bottom], [right, bottom], [right, top], [left, top]]) - 0.5
+    if list(ids) != [0] or np.abs(quads[0] - expected).max() > 2.0:
+        raise family.FamilyError(
+            f"OpenCV {cv2.__version__} finds ids {list(ids)} with corners {quads.tolist()} in a "
+            f"picture of tag 0 with corners {expected.tolist()}: its conventions changed; "
+            "install opencv-python-headless 4.14 or 5.0"
+        )
+    corners, _, found = refine(canvas, quads, 3.0)
+    if not found[0] or np.abs(corners[0] - expected).max() > 0.05:
+        raise family.FamilyError(
+            f"the line fit places the corners of a perfect tag at {corners[0].tolist()}, not at "
+            f"{expected.tolist()}"
+        )

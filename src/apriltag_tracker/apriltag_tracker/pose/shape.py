@@ -1,0 +1,330 @@
+"""From tags on the plane to the limb: tip, curve, bend angles, and how sure they are.
+
+The limb's heading is θ(s) = θ0 + ∫κ ds with one constant curvature a segment and smooth corrections
+(Legendre polynomials of the segment's coordinate) that a prior keeps small. Positions follow from
+integrating the tangent, stretched by one elongation. All unknowns come from one weighted
+least-squares fit of the tags' positions and headings (maximum a posteriori, Gauss-Newton).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apriltag_tracker.pose.curve import PLACE, Curve, Evaluation, wrap
+from apriltag_tracker.tag_map import TagMap
+
+
+@dataclass(frozen=True)
+class PlanarTag:
+    """A tag of the limb on the plane.
+
+    Attributes:
+        id: of the tag.
+        arc_length: where on the limb its centre is [m].
+        pose: (3,) x, y [m] and heading [rad] of the centreline there, mounting offsets taken off.
+        covariance: (3, 3) repeatability, from the noise of its corners.
+    """
+
+    id: int
+    arc_length: float
+    pose: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ShapePrior:
+    """How far the limb may be from an unstretched, constant-curvature limb clamped at the base.
+
+    Attributes:
+        base_position: standard deviation of the clamp's position [m].
+        base_heading: standard deviation of its direction [rad].
+        elongation: standard deviation of length over rest length.
+        curvature: standard deviation of a segment's mean curvature [1/m].
+        corrections: standard deviations of the Legendre terms of degree 1, 2, … of a segment's
+            curvature [1/m].
+        tag_position: what a tag's position may be off besides noise, e.g. by its mounting [m].
+        tag_heading: the same of its heading [rad].
+        arc_position: how far a real limb's points are from arcs of constant curvature [m].
+        arc_heading: the same of its heading [rad].
+    """
+
+    base_position: float = 0.0005
+    base_heading: float = 0.005
+    elongation: float = 0.03
+    curvature: float = 12.0
+    corrections: tuple[float, ...] = (2.0, 1.5, 1.0, 0.7)
+    tag_position: float = 5e-5
+    tag_heading: float = 3e-3
+    arc_position: float = 5e-4
+    arc_heading: float = 5e-3
+
+
+@dataclass(frozen=True)
+class LimbEstimate:
+    """The limb in one image.
+
+    Attributes:
+        tip: (2,) m.
+        tip_covariance: (2, 2) m², noise of this image's corners and of the camera's pose.
+        tip_systematic: (2, 2) m², what averaging does not remove: survey, height, mounting.
+        tip_heading: [rad].
+        bend_angle: (M,) rad, heading at the end of each segment less that at its start, of the
+            smooth fit: a limb with stiff fittings is no arc, arcs would mix the segments' bends.
+        bend_angle_sigma: (M,) rad.
+        curvature: (M,) 1/m, of the parts of each segment that bend, by constant curvature.
+        elongation: length over length at rest.
+        residual: RMS distance of the tags from the constant-curvature shape [m].
+        curve: (n, 2) m, base to tip.
+        tags_used: ids of the tags the fit kept.
+        rejected: ids of tags that cannot be where they were seen, with their distance [m].
+    """
+
+    tip: NDArray[np.float64]
+    tip_covariance: NDArray[np.float64]
+    tip_systematic: NDArray[np.float64]
+    tip_heading: float
+    bend_angle: NDArray[np.float64]
+    bend_angle_sigma: NDArray[np.float64]
+    curvature: NDArray[np.float64]
+    elongation: float
+    residual: float
+    curve: NDArray[np.float64]
+    tags_used: tuple[int, ...]
+    rejected: dict[int, float] = field(default_factory=dict)
+
+    @property
+    def tip_sigma(self) -> float:
+        """Standard deviation of the tip in its least certain direction, of both parts [m]."""
+        both = self.tip_covariance + self.tip_systematic
+        return float(np.sqrt(np.linalg.eigvalsh(both)[-1]))
+
+
+@dataclass(frozen=True)
+class _Fit:
+    parameters: NDArray[np.float64]
+    gain: NDArray[np.float64]
+    residuals: NDArray[np.float64]
+    left_open: NDArray[np.float64]
+
+
+def _furthest(fit: _Fit) -> float:
+    """Return the largest distance of a tag from the fit [m]."""
+    return float(np.hypot(fit.residuals[:, 0], fit.residuals[:, 1]).max())
+
+
+_HOPELESS = 5.0
+"""Residual over the distance of rejection above which nothing can be said."""
+
+
+class ShapeFitter:
+    """Fits the limb to its tags.
+
+    Args:
+        tags: the tag map; gives lengths and which tags there are.
+        prior: how the limb may differ from ideal.
+        reject_beyond: distance from the fit of all others at which a tag is on the wrong place [m].
+        mounting: standard deviation of the tags' mounting on the limb [m].
+        mounting_angle: the same of their direction [rad].
+        curve_points: points of the published curve.
+    """
+
+    def __init__(
+        self,
+        tags: TagMap,
+        prior: ShapePrior | None = None,
+        reject_beyond: float = 0.004,
+        mounting: float = 2e-4,
+        mounting_angle: float = 5e-3,
+        curve_points: int = 41,
+    ) -> None:
+        self.prior = prior or ShapePrior()
+        self.reject_beyond = reject_beyond
+        self._mounting = np.array([mounting, mounting, mounting_angle])
+        self._smooth = Curve(tags.segment_lengths, len(self.prior.corrections), tags.stiff)
+        self._constant = Curve(tags.segment_lengths, 0, tags.stiff)
+        self._outline = Evaluation(
+            self._smooth, np.linspace(0.0, tags.length, curve_points).tolist()
+        )
+        self._evaluations: dict[tuple[int, tuple[float, ...]], Evaluation] = {}
+        self._last = np.zeros(self._smooth.size)
+
+    def reset(self) -> None:
+        """Forget the last shape, from which the next fit would start."""
+        self._last = np.zeros(self._smooth.size)
+
+    def fit(
+        self,
+        tags: Sequence[PlanarTag],
+        common: NDArray[np.float64] | None = None,
+        shared_noise: NDArray[np.float64] | None = None,
+    ) -> LimbEstimate | None:
+        """Fit the limb to the tags of one image.
+
+        Args:
+            tags: of the limb, each id once.
+            common: (n, 3, k) how the tags' poses move with k systematic errors of one standard
+                deviation each (survey, heights), in the order of the tags.
+            shared_noise: (n, 3, k) the same for noise that all tags share, of the camera's pose.
+
+        Returns:
+            The estimate, or None if no tag, or no consistent set of tags, was left.
+        """
+        kept, rejected, arcs = self._consistent(list(tags))
+        if arcs is None:
+            return None
+        fit = self._solve(self._smooth, kept, self._last)
+        self._last = fit.parameters
+        order = [i for i, tag in enumerate(tags) if tag.id not in rejected]
+        shared = tuple(
+            np.zeros((len(order), PLACE, 1)) if moves is None else moves[order]
+            for moves in (common, shared_noise)
+        )
+        return self._estimate(fit, arcs, kept, rejected, shared[0], shared[1])
+
+    def _consistent(
+        self, tags: list[PlanarTag]
+    ) -> tuple[list[PlanarTag], dict[int, float], _Fit | None]:
+        """Leave out tags that are far from the arcs through all others.
+
+        Arcs are stiff enough to show a tag on the wrong place, which the smooth fit would follow.
+
+        Returns:
+            The tags that are left; those left out with their distance; and the fit of arcs to what
+            is left, None if that is less than half or still contradicts itself.
+        """
+        kept, rejected = list(tags), {}
+        while kept:
+            arcs = self._solve(self._constant, kept, self._last)
+            furthest = _furthest(arcs)
+            if furthest < 0.5 * self.reject_beyond or len(kept) < 3:
+                break
+            outside, distance, rest = self._odd_one_out(kept)
+            if distance < self.reject_beyond or rest > 0.5 * furthest:
+                break
+            rejected[kept[outside].id] = distance
+            del kept[outside]
+        if len(kept) <= len(tags) // 2 or furthest > _HOPELESS * self.reject_beyond:
+            return kept, rejected, None
+        return kept, rejected, arcs
+
+    def _odd_one_out(self, tags: Sequence[PlanarTag]) -> tuple[int, float, float]:
+        """Find the tag without which the others agree best.
+
+        Returns:
+            Its index, its distance from the arcs through the others, and the largest residual of
+            these others [m].
+        """
+        fits = [
+            self._solve(self._constant, [*tags[:i], *tags[i + 1 :]], self._last)
+            for i in range(len(tags))
+        ]
+        rest = [_furthest(fit) for fit in fits]
+        outside = int(np.argmin(rest))
+        tag = tags[outside]
+        place, _ = self._evaluation(self._constant, [tag]).places(fits[outside].parameters)
+        return outside, float(np.hypot(*(place[0, :2] - tag.pose[:2]))), rest[outside]
+
+    def _evaluation(self, curve: Curve, tags: Sequence[PlanarTag]) -> Evaluation:
+        key = (curve.size, tuple(tag.arc_length for tag in tags))
+        if key not in self._evaluations:
+            if len(self._evaluations) > 200:
+                self._evaluations.clear()
+            self._evaluations[key] = Evaluation(curve, key[1])
+        return self._evaluations[key]
+
+    def _prior_sigma(self, curve: Curve) -> NDArray[np.float64]:
+        prior = self.prior
+        base = [prior.base_position, prior.base_position, prior.base_heading, prior.elongation]
+        mean = [prior.curvature] * curve.segments
+        return np.array(base + mean + list(prior.corrections[: curve.degrees]) * curve.segments)
+
+    def _solve(self, curve: Curve, tags: Sequence[PlanarTag], start: NDArray[np.float64]) -> _Fit:
+        """Find the most probable parameters and the gain (size, n, 3) from measurements to them."""
+        evaluation = self._evaluation(curve, tags)
+        measured = np.array([tag.pose for tag in tags])
+        prior = self.prior
+        slack = (
+            (prior.tag_position, prior.tag_heading)
+            if curve.degrees
+            else (prior.arc_position, prior.arc_heading)
+        )
+        extra = np.array([slack[0], slack[0], slack[1]]) ** 2
+        whiten = np.array(
+            [np.linalg.inv(np.linalg.cholesky(tag.covariance + np.diag(extra))) for tag in tags]
+        )
+        weak = 1.0 / self._prior_sigma(curve)
+        parameters = start[: curve.size].copy()
+        count = PLACE * len(tags)
+        for _ in range(12):
+            places, jacobian = evaluation.places(parameters)
+            gap = measured - places
+            gap[:, 2] = wrap(gap[:, 2])
+            rows = np.vstack([(whiten @ jacobian).reshape(count, -1), np.diag(weak)])
+            right = np.concatenate(
+                [np.einsum("nij,nj->ni", whiten, gap).ravel(), -weak * parameters]
+            )
+            normal = rows.T @ rows
+            move = np.linalg.solve(normal, rows.T @ right)
+            # A step of more than a radian of heading is damped: the fit may start far away.
+            reach = float(np.abs(evaluation.inner @ move).max())
+            parameters = parameters + move * min(1.0, 1.0 / max(reach, 1e-9))
+            if reach < 1e-9 and float(np.abs(move[:2]).max()) < 1e-9:
+                break
+        gain = np.linalg.solve(normal, rows[:count].T).reshape(-1, len(tags), PLACE)
+        gain = np.einsum("pni,nij->pnj", gain, whiten)
+        # I - G J, times the prior: how much of each parameter the measurements leave open.
+        left_open = (np.eye(curve.size) - np.einsum("pnj,njq->pq", gain, jacobian)) / weak
+        return _Fit(parameters, gain, gap, left_open)
+
+    def _estimate(
+        self,
+        fit: _Fit,
+        arcs: _Fit,
+        tags: Sequence[PlanarTag],
+        rejected: dict[int, float],
+        common: NDArray[np.float64],
+        shared_noise: NDArray[np.float64],
+    ) -> LimbEstimate:
+        curve, slopes = self._outline.places(fit.parameters)
+        noise = np.zeros((2, 2))
+        systematic = np.zeros((2, 2))
+        tip_gain = np.einsum("ip,pnj->inj", slopes[-1, :2], fit.gain)
+        for i, tag in enumerate(tags):
+            noise += tip_gain[:, i] @ tag.covariance @ tip_gain[:, i].T
+            systematic += (tip_gain[:, i] * self._mounting**2) @ tip_gain[:, i].T
+        shared = np.einsum("inj,njk->ik", tip_gain, common)
+        systematic += shared @ shared.T
+        shared = np.einsum("inj,njk->ik", tip_gain, shared_noise)
+        noise += shared @ shared.T
+        # What the tags do not determine, the prior leaves open.
+        undetermined = slopes[-1, :2] @ fit.left_open
+        systematic += undetermined @ undetermined.T
+        # A tip that may be far to the side is also nearer: the second order of a long arc.
+        systematic += (np.sum(undetermined**2) / self._smooth.ends[-1]) ** 2 * np.eye(2)
+        # The corrections of a segment integrate to nothing: its mean curvature is its bend.
+        means = slice(4, 4 + self._smooth.segments)
+        bending = self._smooth.active
+        bend_gain = fit.gain[means]
+        variance = np.zeros(self._smooth.segments)
+        for i, tag in enumerate(tags):
+            spread = tag.covariance + np.diag(self._mounting**2)
+            variance += np.einsum("pj,jk,pk->p", bend_gain[:, i], spread, bend_gain[:, i])
+        variance += np.sum(fit.left_open[means] ** 2, axis=1)
+        return LimbEstimate(
+            tip=curve[-1, :2],
+            tip_covariance=noise,
+            tip_systematic=systematic,
+            tip_heading=float(curve[-1, 2]),
+            bend_angle=fit.parameters[means] * bending,
+            bend_angle_sigma=np.sqrt(variance) * bending,
+            curvature=arcs.parameters[4:],
+            elongation=1.0 + float(fit.parameters[3]),
+            residual=float(np.sqrt(np.mean(np.sum(arcs.residuals[:, :2] ** 2, axis=1)))),
+            curve=curve[:, :2],
+            tags_used=tuple(tag.id for tag in tags),
+            rejected=rejected,
+        )

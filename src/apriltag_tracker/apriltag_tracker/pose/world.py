@@ -1,0 +1,186 @@
+"""The camera's pose from the fixed tags, averaged while nothing moves and watched for bumps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apriltag_tracker.camera import CameraError, CameraPose, Intrinsics, solve_pose
+from apriltag_tracker.detection.tag import Tag
+from apriltag_tracker.tag_map import TagMap, WorldTag
+
+
+@dataclass
+class _Seen:
+    """Running mean of one fixed tag's corners and of their covariance in one frame."""
+
+    corners: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    count: int = 1
+
+    def add(self, tag: Tag, memory: int) -> None:
+        """Take one more frame."""
+        self.count = min(self.count + 1, memory)
+        self.corners += (tag.corners - self.corners) / self.count
+        self.covariance += (tag.covariance - self.covariance) / self.count
+
+
+_LASTING = 0.01
+"""Error of a corner that stays from frame to frame, so that averaging does not remove it [px]."""
+
+
+class WorldPose:
+    """Keeps the camera pose.
+
+    Args:
+        tags: the tag map.
+        intrinsics: of the camera.
+        memory: frames over which corners are averaged.
+        solve_every: frames between two solutions once the pose has settled.
+        bump: shift of the fixed tags, all together, that means that the camera was moved [px].
+        bump_frames: frames in a row that must show it.
+        misfit: residual at which a fixed tag does not fit the others [px].
+    """
+
+    def __init__(
+        self,
+        tags: TagMap,
+        intrinsics: Intrinsics,
+        memory: int = 150,
+        solve_every: int = 30,
+        bump: float = 0.5,
+        bump_frames: int = 3,
+        misfit: float = 1.5,
+    ) -> None:
+        self._map = tags
+        self._intrinsics = intrinsics
+        self._memory = memory
+        self._solve_every = solve_every
+        self._bump = bump
+        self._bump_frames = bump_frames
+        self._misfit = misfit
+        self._seen: dict[int, _Seen] = {}
+        self._frames = 0
+        self._shifted = 0
+        self.pose: CameraPose | None = None
+        self.covariance = np.zeros((6, 6))
+        """Of the pose: a rotation vector [rad] and a shift [m], both in the camera's frame."""
+        self.residual = float("nan")
+        """RMS reprojection error of the fixed tags in the present solution [px]."""
+        self.bumps = 0
+        self.excluded: dict[int, float] = {}
+        """Fixed tags that do not fit the others, with their residual [px]."""
+        self.problem = "no fixed tag has been seen yet"
+
+    def update(self, tags: Sequence[Tag]) -> CameraPose | None:
+        """Take the fixed tags of one image and return the pose to use for it, None without one."""
+        known = [(tag, entry) for tag in tags if (entry := self._map.world_tag(tag.id)) is not None]
+        if self._moved(known):
+            self.bumps += 1
+            self._seen.clear()
+            self._frames = 0
+        for tag, _ in known:
+            seen = self._seen.get(tag.id)
+            if seen is None:
+                self._seen[tag.id] = _Seen(tag.corners.copy(), tag.covariance.copy())
+            else:
+                seen.add(tag, self._memory)
+        if known and (self._frames < 10 or self._frames % self._solve_every == 0):
+            self._solve()
+        if known:
+            self._frames += 1
+        return self.pose
+
+    def _moved(self, known: Sequence[tuple[Tag, WorldTag]]) -> bool:
+        """Tell whether most fixed tags have been elsewhere than their mean for a few frames."""
+        shifts = [
+            float(np.hypot(*(tag.corners - self._seen[tag.id].corners).mean(axis=0)))
+            for tag, _ in known
+            if tag.id in self._seen
+        ]
+        if not shifts:
+            return False
+        if float(np.median(shifts)) > self._bump:
+            self._shifted += 1
+        else:
+            self._shifted = 0
+        if self._shifted < self._bump_frames:
+            return False
+        self._shifted = 0
+        return True
+
+    def _solve(self) -> None:
+        entries = {
+            tag: entry for tag in self._seen if (entry := self._map.world_tag(tag)) is not None
+        }
+        ids = sorted(entries)
+        excluded: dict[int, float] = {}
+        start = self.pose if self._frames > 0 else None
+        while ids:
+            points = np.vstack([entries[tag].corners() for tag in ids])
+            pixels = np.vstack([self._seen[tag].corners for tag in ids])
+            try:
+                pose, residuals = solve_pose(self._intrinsics, points, pixels, start)
+            except CameraError as error:
+                self.pose, self.problem = None, str(error)
+                return
+            per_tag = np.sqrt(np.mean(np.sum(residuals.reshape(-1, 4, 2) ** 2, axis=2), axis=1))
+            worst = int(np.argmax(per_tag))
+            if per_tag[worst] <= self._misfit or len(ids) <= 2:
+                break
+            # Out goes the tag without which the others agree best, not the one that shows it most.
+            worst = self._best_without(ids, entries)
+            excluded[ids[worst]] = float(per_tag[worst])
+            del ids[worst]
+            start = None
+        if per_tag.max() > 4.0 * self._misfit:
+            self.pose = None
+            self.problem = (
+                f"the fixed tags {ids} do not fit together ({per_tag.max():.1f} px): survey their "
+                "positions again or calibrate the camera"
+            )
+            return
+        self.pose, self.excluded, self.problem = pose, excluded, ""
+        self.residual = float(np.sqrt(np.mean(residuals**2)))
+        self.covariance = self._pose_covariance(pose, ids, points)
+
+    def _pose_covariance(
+        self, pose: CameraPose, ids: Sequence[int], points: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Carry the noise of the averaged corners over to the pose that fits them best, (6, 6)."""
+        seen = points @ pose.rotation.T + pose.translation
+        slopes = np.zeros((len(points), 2, 6))
+        depth = seen[:, 2]
+        for axis in range(2):
+            # The lens bends little across a tag: the focal length is the slope of the pixels.
+            per_metre = self._intrinsics.matrix[axis, axis] / depth
+            by_point = np.zeros((len(points), 3))
+            by_point[:, axis] = per_metre
+            by_point[:, 2] = -per_metre * seen[:, axis] / depth
+            slopes[:, axis, :3] = np.cross(seen, by_point)
+            slopes[:, axis, 3:] = by_point
+        rows = slopes.reshape(-1, 6)
+        gain = np.linalg.pinv(rows)
+        result = np.zeros((6, 6))
+        for k, tag in enumerate(ids):
+            known = self._seen[tag]
+            spread = known.covariance / known.count + _LASTING**2 * np.eye(8)
+            part = gain[:, 8 * k : 8 * k + 8]
+            result += part @ spread @ part.T
+        return result
+
+    def _best_without(self, ids: Sequence[int], entries: dict[int, WorldTag]) -> int:
+        costs = []
+        for left_out in range(len(ids)):
+            rest = [tag for i, tag in enumerate(ids) if i != left_out]
+            points = np.vstack([entries[tag].corners() for tag in rest])
+            pixels = np.vstack([self._seen[tag].corners for tag in rest])
+            try:
+                _, residuals = solve_pose(self._intrinsics, points, pixels)
+                costs.append(float(np.mean(residuals**2)))
+            except CameraError:
+                costs.append(np.inf)
+        return int(np.argmin(costs))

@@ -1,0 +1,173 @@
+"""The simulated limb as PyElastica's rod: its mesh, its sections, its fittings, its material."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from elastica import CosseratRod
+from numpy.typing import NDArray
+
+from der_planner.twin.hardware import Hardware
+from der_planner.twin.kernel import Material, RodArrays
+
+Array = NDArray[np.float64]
+
+ELEMENTS_PER_SEGMENT = 8
+AXIAL_STIFFNESS = 1380.0
+"""EA [N] of the silicone tube, which fits its bending stiffness only with a thin wall."""
+SHEAR_STIFFNESS = 27.0 / 28.0 * AXIAL_STIFFNESS / 3.0
+TORSIONAL_STIFFNESS = 0.0117
+RADIUS = 0.0165
+"""Outer radius [m]: with 1.066 kg/m it gives the rotary inertia."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """A limb of M segments at rest along +x, clamped at the origin.
+
+    Attributes:
+        rod: PyElastica's rod of E elements.
+        arrays: of the rod, as the kernel takes them.
+        material: the bending law at each vertex.
+        node_arc: (E+1,) material coordinate of the nodes [m].
+        element_segment: (E,) segment of each element; -1 for a stiff fitting.
+        vertex_segment: (E-1,) segment whose material bends at each vertex.
+    """
+
+    rod: CosseratRod
+    arrays: RodArrays
+    material: Material
+    node_arc: Array
+    element_segment: NDArray[np.int64]
+    vertex_segment: NDArray[np.int64]
+
+
+def build(hardware: Hardware) -> Body:
+    """Return the rod of a limb, straight and unloaded."""
+    lengths, owner = [hardware.base_fitting], [-1]
+    for index, segment in enumerate(hardware.segments):
+        lengths += [segment.flexible_length / ELEMENTS_PER_SEGMENT] * ELEMENTS_PER_SEGMENT
+        owner += [index] * ELEMENTS_PER_SEGMENT
+        last = index == len(hardware.segments) - 1
+        lengths.append(hardware.tip_fitting if last else hardware.connector)
+        owner.append(-1)
+    rest_lengths, element_segment = np.array(lengths), np.array(owner)
+    node_arc = np.concatenate([[0.0], np.cumsum(rest_lengths)])
+    position = np.zeros((3, len(lengths) + 1))
+    position[0] = node_arc
+    rod = CosseratRod.straight_rod(
+        len(lengths),
+        np.zeros(3),
+        np.array([1.0, 0.0, 0.0]),
+        np.array([0.0, 0.0, 1.0]),
+        node_arc[-1],
+        RADIUS,
+        hardware.mass_per_length / (math.pi * RADIUS**2),
+        youngs_modulus=AXIAL_STIFFNESS / (math.pi * RADIUS**2),
+        position=position,
+    )
+    vertex_segment = np.maximum(element_segment[1:], element_segment[:-1])
+    flexible = np.where(element_segment >= 0, rest_lengths, 0.0)
+    share = (flexible[1:] + flexible[:-1]) / (rest_lengths[1:] + rest_lengths[:-1])
+    _set_sections(rod, hardware, element_segment)
+    # What the law of the plane does for itself: only the flexible share of a vertex bends.
+    rod.bend_matrix[1, 1, :] /= share
+    _set_fittings(rod, hardware, np.nonzero(element_segment < 0)[0])
+    return Body(
+        rod=rod,
+        arrays=_arrays(rod),
+        material=_material(hardware, vertex_segment, share, len(lengths)),
+        node_arc=node_arc,
+        element_segment=element_segment,
+        vertex_segment=vertex_segment,
+    )
+
+
+def _set_sections(rod: CosseratRod, hardware: Hardware, element_segment: NDArray[np.int64]) -> None:
+    flexible = rod.rest_lengths[element_segment == 0][0]
+    for k in range(rod.n_elems):
+        # A short stiff fitting would shorten the step for nothing: it gives like a whole element.
+        share = 1.0 if element_segment[k] >= 0 else rod.rest_lengths[k] / flexible
+        rod.shear_matrix[0, 0, k] = rod.shear_matrix[1, 1, k] = SHEAR_STIFFNESS * share
+        rod.shear_matrix[2, 2, k] = AXIAL_STIFFNESS * share
+    stiffness = max(segment.bending_stiffness for segment in hardware.segments)
+    for i, value in enumerate((stiffness, stiffness, TORSIONAL_STIFFNESS)):
+        rod.bend_matrix[i, i, :] = value
+
+
+def _set_fittings(rod: CosseratRod, hardware: Hardware, rigid_elements: NDArray[np.int64]) -> None:
+    masses = [0.0, hardware.connector_mass, hardware.tip_mass]
+    for element, mass in zip(rigid_elements, masses, strict=True):
+        rod.mass[element : element + 2] += 0.5 * mass
+        for i, factor in enumerate((0.25, 0.25, 0.5)):
+            rod.mass_second_moment_of_inertia[i, i, element] += factor * mass * RADIUS**2
+            rod.inv_mass_second_moment_of_inertia[i, i, element] = (
+                1.0 / rod.mass_second_moment_of_inertia[i, i, element]
+            )
+
+
+def _material(
+    hardware: Hardware, vertex_segment: NDArray[np.int64], share: Array, elements: int
+) -> Material:
+    per_vertex = [hardware.segments[index] for index in vertex_segment]
+
+    def column(name: str) -> Array:
+        return np.array([getattr(segment, name) for segment in per_vertex], dtype=float)
+
+    count = len(per_vertex)
+    return Material(
+        flexible_share=share,
+        stiffness=column("bending_stiffness"),
+        cubic=column("cubic_stiffness"),
+        rest=column("rest_curvature"),
+        active=np.zeros(count),
+        friction_moment=column("friction_moment"),
+        friction_curvature=column("friction_curvature"),
+        friction_exponent=column("friction_exponent"),
+        friction_share=column("friction_share"),
+        creep_stiffness=np.ascontiguousarray(column("creep_stiffness").T),
+        creep_time=np.ascontiguousarray(column("creep_time").T),
+        curvature=np.zeros(count),
+        friction=np.zeros(count),
+        creep=np.zeros((3, count)),
+        rest_stretch=np.zeros(elements),
+    )
+
+
+def _arrays(rod: CosseratRod) -> RodArrays:
+    return RodArrays(
+        position=rod.position_collection,
+        velocity=rod.velocity_collection,
+        directors=rod.director_collection,
+        omega=rod.omega_collection,
+        acceleration=rod.acceleration_collection,
+        alpha=rod.alpha_collection,
+        volume=rod.volume,
+        lengths=rod.lengths,
+        tangents=rod.tangents,
+        radius=rod.radius,
+        rest_lengths=rod.rest_lengths,
+        rest_voronoi_lengths=rod.rest_voronoi_lengths,
+        dilatation=rod.dilatation,
+        dilatation_rate=rod.dilatation_rate,
+        voronoi_dilatation=rod.voronoi_dilatation,
+        sigma=rod.sigma,
+        rest_sigma=rod.rest_sigma,
+        kappa=rod.kappa,
+        rest_kappa=rod.rest_kappa,
+        shear_matrix=rod.shear_matrix,
+        bend_matrix=rod.bend_matrix,
+        internal_stress=rod.internal_stress,
+        internal_couple=rod.internal_couple,
+        internal_forces=rod.internal_forces,
+        internal_torques=rod.internal_torques,
+        external_forces=rod.external_forces,
+        external_torques=rod.external_torques,
+        mass=rod.mass,
+        inertia=rod.mass_second_moment_of_inertia,
+        inverse_inertia=rod.inv_mass_second_moment_of_inertia,
+        ghost_elements=rod.ghost_elems_idx,
+        ghost_vertices=rod.ghost_voronoi_idx,
+    )

@@ -1,0 +1,206 @@
+"""The simulated limb under gravity, carried masses and pushes, against a beam solved otherwise."""
+
+import math
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+from der_planner.limb import PointMass, gravity_of
+from der_planner.twin import LimbTwin, Push, TwinError
+from der_planner.twin.body import AXIAL_STIFFNESS, SHEAR_STIFFNESS
+from der_planner.twin.hardware import draw
+from der_planner.twin.limb_twin import ATMOSPHERE
+from der_planner.twin.offline import play
+
+REST = np.full(4, ATMOSPHERE)
+MOUNTINGS = ("hanging", "standing", "sideways", "10", "-30")
+
+
+def elastic(**changes: float):
+    """Return hardware that is a beam of one stiffness between stiff fittings, without memory."""
+    hardware = draw(0)
+    segments = tuple(
+        replace(
+            segment,
+            bending_stiffness=0.03,
+            cubic_stiffness=0.0,
+            pressure_stiffening=0.0,
+            elongation=0.0,
+            rest_curvature=0.0,
+            friction_moment=0.0,
+            creep_stiffness=(0.0, 0.0, 0.0),
+            wander=0.0,
+            coupling=0.0,
+        )
+        for segment in hardware.segments
+    )
+    return replace(hardware, segments=segments, **changes)
+
+
+def beam_tip(hardware, gravity, payload: float = 0.0, at: float = 0.244):
+    """Return the resting tip of the same beam, integrated from the tip to the clamp by shooting.
+
+    The force in a section is the weight beyond it, whatever the shape. Stiff pieces do not bend;
+    the mass of a fitting is spread over its length.
+    """
+    first, second = hardware.segments
+    ends = np.cumsum(
+        [hardware.base_fitting, first.flexible_length, hardware.connector,
+         second.flexible_length, hardware.tip_fitting]
+    )  # fmt: skip
+    count = 4000
+    step = ends[-1] / count
+    middle = (np.arange(count) + 0.5) * step
+
+    def between(low, high):
+        return ((middle >= low) & (middle < high)).astype(float)
+
+    bends = between(ends[0], ends[1]) + between(ends[2], ends[3])
+    mass = np.full(count, hardware.mass_per_length)
+    mass += hardware.connector_mass / hardware.connector * between(ends[1], ends[2])
+    mass += hardware.tip_mass / hardware.tip_fitting * between(ends[3], ends[4])
+    beyond = np.cumsum((mass * step)[::-1])[::-1] - 0.5 * mass * step + payload * (middle < at)
+    force = beyond[:, None] * np.array(gravity[:2])
+
+    def from_the_tip(tip_heading: float):
+        heading, moment, tip = tip_heading, 0.0, np.zeros(2)
+        for k in range(count - 1, -1, -1):
+            turned = heading - 0.5 * step * bends[k] * moment / first.bending_stiffness
+            along = np.array([math.cos(turned), math.sin(turned)])
+            across = np.array([-along[1], along[0]])
+            slope = along * (1 + along @ force[k] / AXIAL_STIFFNESS)
+            slope += across * (across @ force[k]) / SHEAR_STIFFNESS
+            moment += step * (slope[0] * force[k, 1] - slope[1] * force[k, 0])
+            heading -= step * bends[k] * moment / first.bending_stiffness
+            tip += step * slope
+        return heading, tip
+
+    tip_heading = brentq(lambda angle: from_the_tip(angle)[0], -1.5, 1.5, xtol=1e-7)
+    return from_the_tip(tip_heading)[1]
+
+
+@pytest.mark.parametrize("mounting", ["sideways", "10", "-30"])
+@pytest.mark.parametrize("payload", [0.0, 0.02])
+def test_a_resting_limb_is_the_beam_of_the_textbook(mounting, payload):
+    hardware, gravity = elastic(), gravity_of(mounting)
+    masses = (PointMass(0.244, payload),) if payload else ()
+    twin = LimbTwin(hardware=hardware, gravity=gravity, masses=masses)
+    expected = beam_tip(hardware, gravity, payload)
+    sag = np.linalg.norm(expected - [0.244, 0.0])
+    assert sag > 0.02
+    # A polyline of eight elements a segment, and the payload over 2 mm, leave a few tenths.
+    assert np.linalg.norm(twin.tip - expected) < 0.01 * sag
+
+
+def test_a_hanging_limb_is_stiffer_and_a_standing_one_softer_against_pressure():
+    hardware = elastic(drag=6.0)
+    bends = {}
+    for mounting in ("hanging", "horizontal", "standing"):
+        twin = LimbTwin(hardware=hardware, gravity=gravity_of(mounting))
+        twin.step(REST + np.array([4000.0, 0.0, 4000.0, 0.0]), 6.0)
+        bends[mounting] = twin.bend_angles.sum()
+    assert 1.2 * bends["hanging"] < bends["horizontal"] < bends["standing"] / 1.2
+
+
+def test_nothing_gets_lost_of_masses_and_of_energy():
+    hardware = elastic(drag=0.0)
+    payload, at = 0.03, 0.2
+    twin = LimbTwin(hardware=hardware, masses=(PointMass(at, payload),))
+    bare = LimbTwin(hardware=hardware)
+    mass, own, arc = twin._rod.mass, bare._rod.mass, twin._node_arc
+    assert mass.sum() - own.sum() == pytest.approx(payload)
+    assert (mass - own) @ arc == pytest.approx(payload * at)
+    total = hardware.mass_per_length * 0.244 + hardware.connector_mass + hardware.tip_mass
+    assert own.sum() == pytest.approx(total)
+
+    # A steady push does work on a limb at rest; nothing takes it away but the slight viscosity.
+    twin.push(Push(0.0, 0.244, force=(0.0, 0.2, 0.0)))
+    before = 0.0
+    for _ in range(60):
+        twin.step(REST, 0.01)
+        stored = twin.kinetic_energy() + elastic_energy(twin)
+        assert stored == pytest.approx(0.2 * twin.tip[1], rel=0.02, abs=2e-6)
+        before = max(before, stored)
+    assert before > 5e-3
+
+
+def elastic_energy(twin: LimbTwin) -> float:
+    """Return the energy of bend, stretch, shear and rotation [J] of a limb of `elastic`."""
+    rod = twin._rod
+    stretch = rod.sigma - rod.rest_sigma
+    stored = 0.5 * np.einsum("ik,ijk,jk,k->", stretch, rod.shear_matrix, stretch, rod.rest_lengths)
+    bend = twin._material.curvature
+    flexible = rod.rest_voronoi_lengths * twin._material.flexible_share
+    stored += 0.5 * (twin._material.stiffness * bend**2) @ flexible
+    spin = np.einsum("ik,ijk,jk->", rod.omega_collection, rod.mass_second_moment_of_inertia,
+                     rod.omega_collection)  # fmt: skip
+    return float(stored + 0.5 * spin)
+
+
+@pytest.mark.parametrize("mounting", MOUNTINGS)
+def test_a_run_begins_at_rest_and_stays_there_until_something_happens(mounting):
+    for seed, payload in ((1, 0.0), (2, 0.05)):
+        masses = (PointMass(0.244, payload),) if payload else ()
+        twin = LimbTwin(seed, gravity=gravity_of(mounting), masses=masses)
+        rest = twin.tip
+        twin.step(REST, 2.0)
+        # Rest angles wander, by tenths of a degree.
+        assert np.linalg.norm(twin.tip - rest) < 2e-3
+
+
+def test_stable_for_every_admissible_pressure_mounting_and_payload():
+    generator = np.random.default_rng(1)
+    spent = simulated = 0.0
+    for mounting in MOUNTINGS:
+        for payload in (0.0, 0.05):
+            masses = (PointMass(0.244, payload),) if payload else ()
+            twin = LimbTwin(3, gravity=gravity_of(mounting), masses=masses)
+            begin = time.process_time()
+            for _ in range(6):
+                twin.step(ATMOSPHERE + generator.choice([0.0, 24_000.0, 40_000.0], 4), 0.15)
+                stretch = twin._rod.lengths / twin._rod.rest_lengths
+                assert 0.5 < stretch.min() < stretch.max() < 1.7
+                assert np.linalg.norm(twin.tip) < 0.3
+            spent += time.process_time() - begin
+            simulated += 6 * 0.15
+    assert simulated > spent, "slower than real time on one core"
+
+
+def test_a_payload_put_on_at_mid_run_sags_the_limb_from_its_instant_on():
+    def run(pushes=()):
+        instants = np.arange(60) * 0.05
+        return play(instants, np.zeros((60, 2)), seed=2, gravity=gravity_of("30"), pushes=pushes)
+
+    plain, loaded = run(), run([Push(1.02, 0.244, mass=0.02)])
+    np.testing.assert_array_equal(loaded.tip[:21], plain.tip[:21])
+    assert plain.tip[-1, 1] - loaded.tip[-1, 1] > 0.01
+    # For 0.5 s only, the limb swings back.
+    short = run([Push(1.02, 0.244, mass=0.02, duration=0.5)])
+    np.testing.assert_array_equal(short.tip[:31], loaded.tip[:31])
+    assert np.linalg.norm(short.tip[-1] - loaded.tip[-1]) > 5e-3
+
+
+def test_gravity_across_the_plane_sags_the_limb_out_of_it():
+    hardware = elastic()
+    twin = LimbTwin(hardware=hardware, gravity=(0.0, 0.0, -1.7))
+    level = LimbTwin(hardware=hardware, gravity=(0.0, -1.7, 0.0))
+    # Round limbs are as stiff one way as the other.
+    assert twin._rod.position_collection[2, -1] == pytest.approx(level.tip[1], rel=0.02)
+    assert twin.tip[1] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"masses": (PointMass(0.3, 0.02),)}, r"0\.3 m is not on the limb"),
+        ({"gravity": (0.0, math.nan, 0.0)}, "gravity"),
+    ],
+)
+def test_impossible_loads_are_refused(changes, match):
+    with pytest.raises(TwinError, match=match):
+        LimbTwin(0, **changes)
+    with pytest.raises(TwinError, match="to take"):
+        LimbTwin(0).push(Push(0.0, 0.244, mass=-1.0))
