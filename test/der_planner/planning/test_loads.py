@@ -39,7 +39,7 @@ def rest_tip(limb):
 
 
 MOUNTED = {
-    "hanging": LIMB.mounted("hanging"),
+    "hanging": stiffer(LIMB, 1.3).mounted("hanging"),
     "tilted, with a payload": LIMB.mounted("15").carrying(0.02),
     "sideways": stiffer(LIMB, 3.0).mounted("sideways"),
     "standing": stiffer(LIMB, 1.5).mounted("standing").carrying(0.01),
