@@ -344,6 +344,15 @@ def test_commands_invert_hold_lag_and_delay():
     assert np.abs(chambers.reshape(-1, 2) - exact)[50:].max() < 60.0
 
 
+@pytest.mark.parametrize(("name", "period"), [("asynchronous", 6.0), ("opposite_direction", 3.0)])
+def test_the_optimum_is_found_in_few_steps_whatever_the_dead_time(name, period):
+    """The linearisation must know the delay: without, the plan takes 12 steps and misses more."""
+    late = changed(LIMB, {"slew_limit": 1e6, "pressure_limit": 1e5, "delay": 0.12})
+    result = plan(late, Motion.named(name, 0.6, period, 1), "der", "optimal")
+    assert result.details["steps"] <= 4
+    assert result.predicted_error < 3e-5
+
+
 def test_static_pressure_holds_the_angles_of_the_rod():
     angles = np.array([0.5, -0.6])
     rod = PlanningRod(LIMB).rod

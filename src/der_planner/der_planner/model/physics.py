@@ -176,12 +176,12 @@ class ArcModel:
 
     @cached_property
     def rest(self) -> ArcState:
-        """The vented limb at rest under its loads."""
+        """The vented limb at rest."""
         return self.resting(np.zeros(self.limb.segment_count))
 
     def resting(self, effective: Array) -> ArcState:
-        """Return the arcs at rest under effective pressures (M,) [Pa] and gravity."""
-        angles = self.pcc.equilibrium(effective)
+        """Return the arcs at rest under effective pressures (M,) [Pa] and their weight."""
+        angles = self.pcc.resting(effective)
         return ArcState(angles, np.zeros_like(angles))
 
     def state(self, angles: ArrayLike, rates: ArrayLike) -> ArcState:

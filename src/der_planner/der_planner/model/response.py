@@ -117,7 +117,6 @@ def simulate(
     Raises:
         ValueError: neither or both of commands and pressures, or shapes that do not fit.
         ConvergenceError: the rod could not be simulated.
-        NoRestError: the arcs do not come to rest under their load.
     """
     physics = build(limb, model, nodes) if isinstance(limb, Limb) else limb
     case = prepare(physics, time, commands, pressures, bend, start, before, memory, steps)

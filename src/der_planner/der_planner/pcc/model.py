@@ -29,14 +29,9 @@ MassModel = Literal["distributed", "lumped"]
 
 QUADRATURE_POINTS = 8
 """Gauss-Legendre points a segment: exact to rounding for bends below 180 degrees."""
+RESTING_STEPS = 60
 LARGEST_PHASE = 1.0
 """Of the limb's fastest mode in one step of the integrator [rad]; it is unstable beyond 2.8."""
-_ITERATIONS = 30
-_SMALLEST_PART = 1 / 256
-
-
-class NoRestError(RuntimeError):
-    """The arcs do not come to rest under their load."""
 
 
 class Pcc:
@@ -176,6 +171,27 @@ class Pcc:
         torque: Vector = self.stiffness * bend + self.cubic * bend**3
         return torque
 
+    def resting(self, pressures: ArrayLike) -> Vector:
+        """Return the bend angles (n,) [rad] at rest under effective pressures (n,) [Pa] and weight.
+
+        By Newton's method on G u + Q_gravity = K (q − q_rest), with steps of at most 0.3 rad along
+        which the energy falls: beyond the load that buckles the straight limb, a bent one is found.
+        """
+        drive = self.gain * self._check("pressures", pressures)
+        still = np.zeros(self.segment_count)
+        q: Vector = self.rest + drive / self.stiffness
+        if not self.arcs.gravity.any() and not self.cubic.any():
+            return q
+        for _ in range(RESTING_STEPS):
+            pull = self._inertia(q, still)[3] + drive - self.elastic_torque(q)
+            values, vectors = np.linalg.eigh(self.stiffness_matrix(q))
+            firm = np.maximum(np.abs(values), 1e-3 * self.stiffness.min())
+            step = vectors @ ((vectors.T @ pull) / firm)
+            q = q + step * min(1.0, 0.3 / max(float(np.abs(step).max()), 1e-12))
+            if np.abs(step).max() < 1e-10:
+                break
+        return q
+
     def energy(self, bend_angles: ArrayLike, rates: ArrayLike) -> float:
         """Return kinetic plus elastic plus gravity's potential energy [J]."""
         q, v = self._check("bend_angles", bend_angles), self._check("rates", rates)
@@ -258,44 +274,6 @@ class Pcc:
         q = self._check("angles", self.rest if angles is None else angles)
         v = self._check("rates", np.zeros(self.segment_count) if rates is None else rates)
         return q, v, inputs, step, self._parts(step), self.arcs
-
-    def equilibrium(self, pressures: ArrayLike) -> Vector:
-        """Return the bend angles (n,) [rad] at rest under effective pressures (n,) [Pa].
-
-        By Newton's method, the load raised in parts that shrink where it fails.
-
-        Raises:
-            NoRestError: no rest was found on the way from no load, or it is not a stable one.
-        """
-        wanted = self.gain * self._check("pressures", pressures)
-        q, reached, part = self.rest.copy(), 0.0, 1.0
-        while reached < 1.0:
-            share = min(1.0, reached + part)
-            trial = self._newton(q, share * wanted, share)
-            if trial is not None:
-                q, reached = trial, share
-                continue
-            part *= 0.5
-            if part < _SMALLEST_PART:
-                break
-        if reached < 1.0 or self.firmness(q) <= 0:
-            raise NoRestError("the arcs have no stable rest under their load: they would buckle")
-        return q
-
-    def _newton(self, q: Vector, torque: Vector, share: float) -> Vector | None:
-        """Return angles at rest under a torque (n,) and a share of gravity; None: not found."""
-        arcs = self.arcs._replace(gravity=share * self.arcs.gravity)
-        zero = np.zeros_like(q)
-        for _ in range(_ITERATIONS):
-            weight = kernels.inertia(q, zero, arcs)[3]
-            change = np.linalg.solve(
-                kernels.force_slopes(q, zero, zero, arcs)[0],
-                torque + weight - self.elastic_torque(q),
-            )
-            q = q + change * min(1.0, 0.5 / max(float(np.abs(change).max()), 1e-300))
-            if np.abs(change).max() < 1e-12:
-                return q
-        return None
 
     def firmness(self, bend_angles: ArrayLike) -> float:
         """Return the smallest eigenvalue of the stiffness of arcs at rest [N·m/rad]."""

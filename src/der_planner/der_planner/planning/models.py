@@ -9,7 +9,6 @@ from scipy.interpolate import BSpline
 from der_planner.limb import Limb
 from der_planner.model.material import differential_pressure
 from der_planner.model.response import ArcModel, ArcState
-from der_planner.pcc import NoRestError
 from der_planner.planning.errors import BucklingError, PlanningError
 from der_planner.planning.inverse import check_reach, is_loaded, solve, static_pressure
 from der_planner.planning.loads.overload import check_load
@@ -21,6 +20,8 @@ Array = NDArray[np.float64]
 
 METHODS = {"der": ("paper", "projected", "optimal"), "pcc": ("paper", "projected", "optimal")}
 """The methods of each model. Arcs have one unknown a pressure: their two balances are the same."""
+_FALLEN = 1.0
+"""Arcs that rest this far from the rod have buckled [rad]."""
 
 
 class PlanningArcs(ArcModel):
@@ -41,10 +42,12 @@ class PlanningArcs(ArcModel):
         if not is_loaded(self.limb):
             check_reach(self.limb, self.kinematics, time, tip, angles, np.zeros(len(time)))
             return reference.spline
-        try:
-            home = self.rest.angles
-        except NoRestError as error:
-            raise BucklingError(f"{error}; mount the limb otherwise, or make it lighter") from error
+        home = self.rest.angles
+        if np.abs(home - reference.rest).max() > _FALLEN:
+            raise BucklingError(
+                "the arcs fall over under their load where the rod stands: make the limb lighter "
+                "or stiffer, or mount it otherwise"
+            )
         near = angles + (home - reference.rest)
         # What arcs miss of the rod's reach is theirs: the plan says it.
         own = solve(self.kinematics, tip, near, REFERENCE_PRIOR)[0]

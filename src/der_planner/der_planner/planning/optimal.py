@@ -114,9 +114,12 @@ class Optimiser:
         begin: its state where the motion starts.
         spline: bend angles along the motion.
         reference: r̄, and the command before the motion.
-        warm: (K, M) commands of a balance, before limits [Pa].
+        warm: (K, M) commands where the search starts and toward which they are pulled: those of a
+            balance, before limits, or the last ones played [Pa].
         substeps: integrator steps a command.
         settings: weights and sizes.
+        offset: (K, 2) what is added to the model's tip at the setpoints before it is compared with
+            r̄, e.g. what a run showed beyond the model [m]; None: nothing.
     """
 
     def __init__(
@@ -128,12 +131,14 @@ class Optimiser:
         warm: Array,
         substeps: int,
         settings: Settings | None = None,
+        offset: Array | None = None,
     ) -> None:
         self.model = model
         self.settings = settings or Settings()
         vented = model.limb.pneumatics.vent_rate > 0
         self.nearness = self.settings.nearness_vented if vented else self.settings.nearness
-        self.target = np.concatenate([reference.tip[1:], reference.tip[-1:]])
+        wanted = reference.tip if offset is None else reference.tip - offset
+        self.target = np.concatenate([wanted[1:], wanted[-1:]])
         self.warm = warm
         count, inputs = warm.shape
         start = reference.start
@@ -145,11 +150,21 @@ class Optimiser:
         pulse = air.even_pulse(model.limb.pneumatics, CONTROL_PERIOD, substeps)
         self._pulse = np.tile(pulse[:, None], (1, inputs))
 
-    def run(self, progress: Callable[[float], None] = lambda _share: None) -> Outcome:
-        """Solve all windows, one after the other."""
+    def run(
+        self,
+        progress: Callable[[float], None] = lambda _share: None,
+        begin: Array | None = None,
+    ) -> Outcome:
+        """Solve all windows, one after the other.
+
+        Args:
+            progress: called with the share that is done, 0 … 1.
+            begin: (K, M) commands where the search starts, if not at the warm start [Pa].
+        """
         count = len(self.warm)
+        first_guess = self.warm if begin is None else begin
         command, _ = within_limits(
-            self.warm, self.model.limb.pneumatics, CONTROL_PERIOD, self.before
+            first_guess, self.model.limb.pneumatics, CONTROL_PERIOD, self.before
         )
         state = self.start
         tip = np.empty((count, 2))
