@@ -136,6 +136,9 @@ class GraphPlayer(ABC):
                 client.wait_for(lambda: os.path.exists(port), 60.0, "the emulated board's port")
         client.wait_ready(self._processes)
         self._progress.say(f"  ready after {time.monotonic() - begin:.1f} s")
+        if "page" in self._processes:
+            address = client.diagnostic_values("page").get("url", "unknown")
+            self._progress.say(f"  the operator's page is at {address}")
 
     def _record(self, client: GraphClient) -> GraphRun:
         bag = Path(client.call("recorder/start"))
@@ -277,6 +280,7 @@ class GraphTrial(GraphPlayer):
             hardware=self._hardware,
             planner=self._planner_parameters(),
             record_images=self._options.record_images,
+            page=self._options.page,
         )
 
     def _planner_parameters(self) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from der_planner.planning.motions import NAMES as MOTIONS
 
 MODELS = tuple(METHODS_BY_MODEL)
 METHODS = METHODS_BY_MODEL["der"]
+DEFAULT_PAGE_PORT = 8080
 DEFAULT_MOTIONS = ("same_direction",)
 
 
@@ -43,6 +44,7 @@ class Trial:
         model, method: names, see MODELS, METHODS.
         number: of the trial, from 1.
         seed: of the twin; the same for every motion and model of a trial.
+        feedback: the commands are corrected while they are played.
     """
 
     motion: str
@@ -50,11 +52,18 @@ class Trial:
     method: str
     number: int
     seed: int
+    feedback: bool = False
 
     @property
     def name(self) -> str:
         """Name of the bag and of every other file of this run."""
-        return f"{self.motion}_{self.model}_{self.method}_trial{self.number}"
+        method = f"{self.method}_feedback" if self.feedback else self.method
+        return f"{self.motion}_{self.model}_{method}_trial{self.number}"
+
+    @property
+    def manner(self) -> str:
+        """The method, and if there is feedback: what tables call it."""
+        return f"{self.method} + feedback" if self.feedback else self.method
 
 
 @dataclass(frozen=True)
@@ -126,6 +135,8 @@ class Options:
     report: bool
     path: Path | None = None
     nearest: bool = False
+    page: int | None = None
+    feedback: bool = False
     mounting: str = ""
     payload: float = 0.0
     payload_at: float | None = None
@@ -159,16 +170,11 @@ class Options:
     def plan_of_trials(self) -> list[Trial]:
         """Return every trial in the order in which they are played."""
         return [
-            Trial(
-                motion,
-                model,
-                self.method if model == "der" else "paper",
-                number,
-                self.seed + number - 1,
-            )
+            Trial(motion, model, self.method, number, self.seed + number - 1, feedback)
             for motion in self.motions
             for number in range(1, self.trials + 1)
             for model in self.models
+            for feedback in ((False, True) if self.feedback and model == "der" else (False,))
         ]
 
 
@@ -210,7 +216,7 @@ def _add_motions(what: argparse._ArgumentGroup) -> None:
         "--models", nargs="+", default=list(MODELS), metavar="MODEL", help=f"of {', '.join(MODELS)}"
     )
     what.add_argument(
-        "--method", default="optimal", help=f"of {', '.join(METHODS)}; PCC always uses paper"
+        "--method", default="optimal", help=f"of {', '.join(METHODS)}, for both models"
     )
     what.add_argument("--trials", type=int, default=1, help="runs of each motion and model")
     what.add_argument(
@@ -258,6 +264,20 @@ def _add_manner(how: argparse._ArgumentGroup) -> None:
         help="folder of bags, logs, figures and results.json; a folder that holds a stopped "
         "experiment goes on with it; without it: experiments/ and the time",
     )
+    how.add_argument(
+        "--feedback",
+        action="store_true",
+        help="play every plan of the rod twice: open loop, and corrected while it moves",
+    )
+    how.add_argument(
+        "--page",
+        type=int,
+        nargs="?",
+        const=DEFAULT_PAGE_PORT,
+        metavar="PORT",
+        help=f"serve the operator's page while the graph runs, at port {DEFAULT_PAGE_PORT} of this "
+        "machine if none is given",
+    )
     how.add_argument("--record-images", action="store_true", help="raw images into the bags, too")
     how.add_argument("--no-report", action="store_true", help="skip the HTML report at the end")
     how.add_argument("--dry-run", action="store_true", help="say what would be done, start nothing")
@@ -289,11 +309,12 @@ def parse(arguments: Sequence[str]) -> Options:
         if not least <= value <= most:
             raise OptionError(f"--{name} is {value}: choose {least} to {most}")
     _check_loads(given)
-    if given.nearest and given.path is None:
-        raise OptionError("--nearest is about a path: give --path FILE.csv, too")
+    _check_path_and_page(given)
     hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
     if hardware is not None and given.offline:
         raise OptionError("--offline simulates everything: it does not go with --hardware")
+    if given.feedback and "der" not in models:
+        raise OptionError("--feedback corrects plans of the rod: choose --models der")
     limb = given.limb or (Path(hardware.limb) if hardware and hardware.limb else None)
     if hardware is not None and limb is None:
         raise OptionError("--hardware needs a limb file: --limb FILE (scripts/calibrate_limb.py)")
@@ -317,6 +338,8 @@ def parse(arguments: Sequence[str]) -> Options:
         report=not given.no_report,
         path=given.path.resolve() if given.path is not None else None,
         nearest=given.nearest,
+        page=given.page,
+        feedback=given.feedback,
         mounting=given.mounting,
         payload=given.payload,
         payload_at=given.payload_at,
@@ -354,6 +377,20 @@ def _check_loads(given: argparse.Namespace) -> None:
         raise OptionError(f"--mounting: {error}") from error
     if given.payload_at is not None and not given.payload:
         raise OptionError("--payload-at is the place of a payload: give --payload, too")
+
+
+def _check_path_and_page(given: argparse.Namespace) -> None:
+    """Refuse --nearest without a path, a port that is none, and a page without a graph.
+
+    Raises:
+        OptionError: names the option.
+    """
+    if given.nearest and given.path is None:
+        raise OptionError("--nearest is about a path: give --path FILE.csv, too")
+    if given.page is not None and not 1 <= given.page <= 65535:
+        raise OptionError(f"--page is {given.page}: choose a port of 1 to 65535")
+    if given.page is not None and given.offline:
+        raise OptionError("--page shows a running graph: it does not go with --offline")
 
 
 def _timestamped() -> Path:

@@ -27,7 +27,7 @@ from der_planner.limb import Limb
 from der_planner.model.bending import Kinematics
 from der_planner.model.series import interpolate
 from der_planner.planning.inverse import BRANCHES, angle_limits, static_pressure
-from der_planner.planning.pace import retimed
+from der_planner.planning.nearest.pace import retimed
 from der_planner.planning.paths import PathLimits, TipPath
 
 Array = NDArray[np.float64]
@@ -121,6 +121,7 @@ def nearest_path(
     limb: Limb,
     kinematics: Kinematics,
     path: TipPath,
+    offset: Array,
     limits: PathLimits | None = None,
     branch: str = "",
     rest: bool = False,
@@ -131,6 +132,7 @@ def nearest_path(
         limb: for its pressure and slew limits.
         kinematics: of arcs.
         path: drawn; its times are kept where the slew limit lets them.
+        offset: (2,) of the limb's tip from that of the arcs, where loads make it [m].
         limits: speed and acceleration of the tip, for a path whose times mean nothing (`line`).
         branch: see `inverse.BRANCHES`; empty: whichever comes nearest.
         rest: begin and end a path with times at rest, too.
@@ -139,7 +141,7 @@ def nearest_path(
     time, drawn = _sampled(path, samples)
     step = float(time[1])
     wave = TIMED_WAVE if limits is None else DRAWN_WAVE / PACE
-    target = _smoothed(drawn.mean(axis=1), step, wave)
+    target = _smoothed(drawn.mean(axis=1) - offset, step, wave)
     angles = _Search(limb, kinematics, target, step, branch).run()
     # Without overshoot where the course hurries along a limit; what is left of corners goes after.
     course = PchipInterpolator(time, angles)
@@ -151,7 +153,7 @@ def nearest_path(
     followed = _smoothed(course(along), float(clock[1]), TIMED_WAVE)
     slowed = math.nan if limits is not None else float(clock[-1] / path.duration)
     deviation = _deviation(
-        drawn.mean(axis=1), kinematics.tip(angles), np.interp(time, along, clock), slowed
+        drawn.mean(axis=1), kinematics.tip(angles) + offset, np.interp(time, along, clock), slowed
     )
     return NearestPath(clock, followed, deviation)
 
