@@ -10,14 +10,21 @@ import numpy as np
 
 from der_planner.experiment.errors import GraphError
 from der_planner.experiment.options import Options, Trial
+from der_planner.identification.offline import CALIBRATION_RUN
 from der_planner.limb import Limb
 from der_planner.planning import PlanningError, plan
+from der_planner.planning.plan_file import read_plan
 from der_planner.runs.evaluation import Description, RunSeries
+from der_planner.runs.run import method_name
 from der_planner.twin.offline import play
 
 
 def play_offline(
-    trial: Trial, options: Options, robot: Limb, metadata: dict[str, Any]
+    trial: Trial,
+    options: Options,
+    robot: Limb,
+    metadata: dict[str, Any],
+    learned: Path | None = None,
 ) -> dict[str, Any]:
     """Plan, play and keep one trial; the error is against the twin's true tip, not an image's.
 
@@ -26,19 +33,24 @@ def play_offline(
         options: of the experiment.
         robot: to plan with, under its loads; the twin is mounted as it is and carries its masses.
         metadata: kept with the arrays.
+        learned: file of a learned plan, which is played in place of a new one.
 
     Raises:
         GraphError: the motion cannot be planned; with the planner's reason.
     """
     try:
-        motion = options.motion(trial.motion)
-        planned = plan(robot, motion, model=trial.model, method=trial.method)
+        if learned is not None:
+            planned = read_plan(learned)
+        else:
+            motion = options.motion(trial.motion)
+            planned = plan(robot, motion, model=trial.model, method=trial.method)
     except PlanningError as error:
         raise GraphError(f"the planner refused: {error}") from error
     played = play(
         planned.time,
         planned.differential_pressure,
         seed=trial.seed,
+        run=_run_of_twin(trial),
         gravity=robot.gravity,
         masses=robot.masses,
     )
@@ -69,6 +81,11 @@ def play_offline(
     }
 
 
+def _run_of_twin(trial: Trial) -> int:
+    """Return which wander of the rest angles the twin has: one of its own for every run."""
+    return 0 if trial.run == 1 else CALIBRATION_RUN + trial.run - 1
+
+
 def load_arrays(path: Path) -> RunSeries:
     """Read a run that `play_offline` kept."""
     with np.load(path) as kept:
@@ -77,7 +94,7 @@ def load_arrays(path: Path) -> RunSeries:
             Description(
                 motion=about["motion"],
                 model=about["model"],
-                method=about["method"],
+                method=method_name(about["method"], about.get("learned_from")),
                 trial=about["trial"],
                 seed=about["seed"],
                 amplitude=about["amplitude_rad"],
@@ -98,4 +115,5 @@ def load_arrays(path: Path) -> RunSeries:
             pressure_time=kept["time"],
             commanded=kept["differential_pressure"],
             measured=kept["measured_differential"],
+            setpoints=kept["differential_pressure"],
         )
