@@ -35,6 +35,23 @@ def add_run(learner: Learner, run: RunSeries) -> None:
         raise GraphError(f"cannot learn from {run.description.title}: {error}") from error
 
 
+def about(learner: Learner, **more: Any) -> dict[str, Any]:
+    """Return what was learned so far, to be kept with a plan.
+
+    Args:
+        learner: with its history.
+        more: what else is to be kept.
+    """
+    return {
+        **more,
+        "mean_error_m": [run.mean_error for run in learner.history],
+        "accepted": [run.accepted for run in learner.history],
+        "reasons": [run.reason for run in learner.history],
+        "repeatability_m": learner.repeatability,
+        "stopped": learner.stopped,
+    }
+
+
 class TrialLearning:
     """The learner of one trial's motion.
 
@@ -84,7 +101,11 @@ class TrialLearning:
         except PlanningError as error:
             raise GraphError(f"{name} cannot be planned: {error}") from error
         path = self._options.out / FOLDER / f"{name}.yaml"
-        write_plan(following, path, about=self.summary())
+        write_plan(
+            following,
+            path,
+            about=about(self._learner, seed=self._trial.seed, trial=self._trial.number),
+        )
         return path
 
     def conclude(self) -> None:
@@ -98,17 +119,3 @@ class TrialLearning:
         self._progress.say(
             f"  {self.stopped or 'learning can go on from here'}; the plan to go on with: {path}"
         )
-
-    def summary(self) -> dict[str, Any]:
-        """Return what was learned so far, for files."""
-        history = self._learner.history
-        return {
-            "motion": self._trial.motion,
-            "trial": self._trial.number,
-            "seed": self._trial.seed,
-            "mean_error_m": [run.mean_error for run in history],
-            "accepted": [run.accepted for run in history],
-            "reasons": [run.reason for run in history],
-            "repeatability_m": self._learner.repeatability,
-            "stopped": self._learner.stopped,
-        }
