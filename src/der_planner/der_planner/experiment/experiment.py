@@ -40,12 +40,12 @@ def run(options: Options) -> None:
         if trial not in left:
             continue
         progress.say(
-            f"[{place}/{len(trials)}] {trial.motion}, {trial.model} {trial.method}, "
+            f"[{place}/{len(trials)}] {trial.motion}, {trial.model} {trial.manner}, "
             f"trial {trial.number} (seed {trial.seed})"
         )
         if ledger.finished(trial) is None:
             ledger.record(trial, _play(trial, options, progress))
-        if options.learn and trial.model == "der":
+        if options.learn:
             _learn(trial, options, ledger, progress)
     kept = [(run, entry) for trial in trials for run, entry in _runs_of(trial, ledger)]
     results.conclude(options, kept, progress)
@@ -54,7 +54,7 @@ def run(options: Options) -> None:
 def _whole(trial: Trial, options: Options, ledger: Ledger) -> bool:
     """Tell whether a trial was played, and learned from as often as is asked for."""
     runs = len(_runs_of(trial, ledger))
-    return runs > (options.learn if trial.model == "der" else 0)
+    return runs > options.learn
 
 
 def _runs_of(trial: Trial, ledger: Ledger) -> list[tuple[Trial, dict[str, Any]]]:
@@ -197,7 +197,7 @@ def _metadata(trial: Trial, options: Options, limb: Path | None, robot: Limb) ->
     return {
         "motion": trial.motion,
         "model": trial.model,
-        "method": trial.method,
+        "method": trial.manner,
         "trial": trial.number,
         **({"learned_from": trial.run - 1} if trial.run > 1 else {}),
         "seed": trial.seed,

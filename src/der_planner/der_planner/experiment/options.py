@@ -45,6 +45,7 @@ class Trial:
         number: of the trial, from 1.
         seed: of the twin; the same for every motion and model of a trial.
         run: of the trial, from 1; those after the first play what was learned from the ones before.
+        feedback: the commands are corrected while they are played.
     """
 
     motion: str
@@ -53,16 +54,23 @@ class Trial:
     number: int
     seed: int
     run: int = 1
+    feedback: bool = False
 
     @property
     def name(self) -> str:
         """Name of the bag and of every other file of this run."""
-        name = f"{self.motion}_{self.model}_{self.method}_trial{self.number}"
+        method = f"{self.method}_feedback" if self.feedback else self.method
+        name = f"{self.motion}_{self.model}_{method}_trial{self.number}"
         return name if self.run == 1 else f"{name}_run{self.run}"
 
     def following(self) -> Trial:
         """Return the next run, which plays what was learned."""
         return dataclasses.replace(self, method=LEARNED, run=self.run + 1)
+
+    @property
+    def manner(self) -> str:
+        """The method, and if there is feedback: what tables call it."""
+        return f"{self.method} + feedback" if self.feedback else self.method
 
 
 @dataclass(frozen=True)
@@ -134,6 +142,7 @@ class Options:
     report: bool
     path: Path | None = None
     learn: int = 0
+    feedback: bool = False
     mounting: str = ""
     payload: float = 0.0
     payload_at: float | None = None
@@ -167,16 +176,11 @@ class Options:
     def plan_of_trials(self) -> list[Trial]:
         """Return every trial in the order in which they are played."""
         return [
-            Trial(
-                motion,
-                model,
-                self.method if model == "der" else "paper",
-                number,
-                self.seed + number - 1,
-            )
+            Trial(motion, model, self.method, number, self.seed + number - 1, feedback)
             for motion in self.motions
             for number in range(1, self.trials + 1)
             for model in self.models
+            for feedback in ((False, True) if self.feedback and model == "der" else (False,))
         ]
 
 
@@ -213,14 +217,14 @@ def _add_motions(what: argparse._ArgumentGroup) -> None:
         "--models", nargs="+", default=list(MODELS), metavar="MODEL", help=f"of {', '.join(MODELS)}"
     )
     what.add_argument(
-        "--method", default="optimal", help=f"of {', '.join(METHODS)}; PCC always uses paper"
+        "--method", default="optimal", help=f"of {', '.join(METHODS)}, for both models"
     )
     what.add_argument(
         "--learn",
         type=int,
         default=0,
         metavar="N",
-        help="after each trial of the rod, up to N more runs, each of the plan that was learned "
+        help="after each trial, up to N more runs, each of the plan that was learned "
         "from the ones before",
     )
     what.add_argument("--trials", type=int, default=1, help="runs of each motion and model")
@@ -269,6 +273,11 @@ def _add_manner(how: argparse._ArgumentGroup) -> None:
         help="folder of bags, logs, figures and results.json; a folder that holds a stopped "
         "experiment goes on with it; without it: experiments/ and the time",
     )
+    how.add_argument(
+        "--feedback",
+        action="store_true",
+        help="play every plan of the rod twice: open loop, and corrected while it moves",
+    )
     how.add_argument("--record-images", action="store_true", help="raw images into the bags, too")
     how.add_argument("--no-report", action="store_true", help="skip the HTML report at the end")
     how.add_argument("--dry-run", action="store_true", help="say what would be done, start nothing")
@@ -304,6 +313,8 @@ def parse(arguments: Sequence[str]) -> Options:
     hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
     if hardware is not None and given.offline:
         raise OptionError("--offline simulates everything: it does not go with --hardware")
+    if given.feedback and "der" not in models:
+        raise OptionError("--feedback corrects plans of the rod: choose --models der")
     limb = given.limb or (Path(hardware.limb) if hardware and hardware.limb else None)
     if hardware is not None and limb is None:
         raise OptionError("--hardware needs a limb file: --limb FILE (scripts/calibrate_limb.py)")
@@ -327,6 +338,7 @@ def parse(arguments: Sequence[str]) -> Options:
         report=not given.no_report,
         learn=given.learn,
         path=given.path.resolve() if given.path is not None else None,
+        feedback=given.feedback,
         mounting=given.mounting,
         payload=given.payload,
         payload_at=given.payload_at,

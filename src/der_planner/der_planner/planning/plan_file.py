@@ -54,6 +54,7 @@ def write_plan(plan: Plan, path: str | Path, about: Mapping[str, Any] | None = N
         "start": None
         if start is None
         else {key: np.asarray(value).tolist() for key, value in vars(start).items()},
+        "rest_bend_angles_rad": np.asarray(plan.reference.rest).tolist(),
         # rows of setpoints, 50 ms apart
         "differential_pressure_pa": plan.differential_pressure.tolist(),
         "tip_reference_m": plan.reference.tip.tolist(),
@@ -109,7 +110,8 @@ def _plan_of(content: Any) -> Plan:
     if steps > air.slew_limit * CONTROL_PERIOD * slack:
         raise ValueError("its pressures change faster than the limb's limit")
     time: Array = np.arange(count, dtype=np.float64) * CONTROL_PERIOD
-    reference = Reference(time, tip, angles, resting_spline(time, angles, start), start)
+    rest = np.array(content["rest_bend_angles_rad"], dtype=float)
+    reference = Reference(time, tip, angles, resting_spline(time, angles, start), rest, start)
     physics = models.build(limb, str(content["model"]), NODES)
     bend = sample_spline(physics.configuration(reference), time)[0]
     return Plan(

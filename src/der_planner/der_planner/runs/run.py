@@ -20,7 +20,8 @@ LEARNED = "learned"
 
 def method_name(method: str, learned_from: object = None) -> str:
     """Return a run's method; for a learned plan with the number of runs, where that is known."""
-    return f"{LEARNED} {learned_from}" if method == LEARNED and learned_from else method
+    name, _, rest = method.partition(" ")
+    return f"{name} {learned_from} {rest}".strip() if name == LEARNED and learned_from else method
 
 
 class EvaluationError(ValueError):

@@ -18,21 +18,23 @@ CM = 100.0
 
 def learned_from(method: str) -> int:
     """Return how many runs a method's plan was learned from: 0 for a first plan."""
-    name, _, count = method.partition(" ")
+    name, count, *_ = [*method.split(), "", ""]
     return int(count) if name == LEARNED and count.isdigit() else 0
 
 
 def learning_curves(results: Sequence[RunResult]) -> dict[str, list[list[float]]]:
     """Return by motion the mean errors [m] of each trial's runs, in the order of learning.
 
-    Trials that were not learned from are left out, and so are runs of another model.
+    Trials that were not learned from are left out.
     """
-    trials: dict[tuple[str, str, int], dict[int, float]] = {}
+    trials: dict[tuple[str, str, int, str], dict[int, float]] = {}
     for result in results:
-        key = (result.motion, result.model, result.trial)
+        # "learned 2 + feedback": what was played beside the plan makes a curve of its own.
+        beside = result.method.partition("+")[2]
+        key = (result.motion, result.model, result.trial, beside)
         trials.setdefault(key, {})[learned_from(result.method)] = result.mean_error_m
     curves: dict[str, list[list[float]]] = {}
-    for (motion, _, _), errors in trials.items():
+    for (motion, *_), errors in trials.items():
         if max(errors) > 0 and 0 in errors:
             curves.setdefault(motion, []).append([errors[k] for k in sorted(errors)])
     return curves
