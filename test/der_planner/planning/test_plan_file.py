@@ -7,17 +7,18 @@ import pytest
 import yaml
 
 from der_planner.limb import Limb
-from der_planner.planning import Motion, PlanningError, plan
+from der_planner.planning import Motion, PlanningError, Start, plan
 from der_planner.planning.plan_file import learned_plan, read_plan, write_plan
 
 
 @pytest.fixture(scope="module")
 def bent():
-    """Return a plan that starts from a bent rest."""
+    """Return a plan of a limb that rests bent, which begins where another motion is left."""
     limb = Limb.default()
     segments = tuple(replace(s, rest_curvature=0.3) for s in limb.segments)
     motion = Motion.named("asynchronous", amplitude=0.3, period=3.0, cycles=1)
-    return plan(replace(limb, segments=segments), motion, method="projected")
+    start = Start(np.array([0.1, 0.05]), np.zeros(2), np.zeros(2), np.array([500.0, 100.0]))
+    return plan(replace(limb, segments=segments), motion, method="projected", start=start)
 
 
 def test_a_plan_is_read_back_whole(bent, tmp_path):
@@ -28,6 +29,7 @@ def test_a_plan_is_read_back_whole(bent, tmp_path):
     assert again.limb.to_mapping() == bent.limb.to_mapping()
     assert np.allclose(again.bend_angles, bent.bend_angles, atol=1e-9)
     assert np.array_equal(again.reference.start.bend_angles, bent.reference.start.bend_angles)
+    assert np.array_equal(again.reference.rest, bent.reference.rest)
     for name in ("motion", "model", "method", "amplitude", "period", "cycles"):
         assert getattr(again, name) == getattr(bent, name)
     assert [path.name for path in (tmp_path / "kept").iterdir()] == ["a.yaml"]

@@ -53,8 +53,8 @@ class Trial:
     method: str
     number: int
     seed: int
-    run: int = 1
     feedback: bool = False
+    run: int = 1
 
     @property
     def name(self) -> str:
