@@ -71,7 +71,7 @@ page.sketch = (() => {
     if (event.pointerId !== pointer) return;
     pointer = null;
     // Whole pixels of the camera's picture over ten are finer than any hand.
-    if (event.type === "pointerup") emitEvent("drawn", points.map(([x, y]) => [Math.round(x * 10) / 10, Math.round(y * 10) / 10]));
+    if (event.type === "pointerup") emitEvent("drawn", { points: points.map(([x, y]) => [Math.round(x * 10) / 10, Math.round(y * 10) / 10]) });
     else points = [];
   }
 
