@@ -46,3 +46,22 @@ def test_an_unreachable_path_says_where(tmp_path: Path):
     options = parse(["--offline", "--no-calibration", "--path", str(file), "--out", str(tmp_path)])
     with pytest.raises(GraphError, match=r"point \(0\.40\d+, 0\.19\d+\) m at t = 0\.00 s"):
         run(options)
+
+
+@pytest.mark.slow
+def test_feedback_stands_beside_the_open_loop(tmp_path: Path):
+    arguments = ["--offline", "--no-calibration", "--models", "der", "--feedback", "--seed", "3"]
+    arguments += ["--period", "6", "--cycles", "1"]
+    found = []
+    for name in ("first", "again"):
+        out = tmp_path / name
+        run(parse([*arguments, "--out", str(out)]))
+        runs = json.loads((out / "results.json").read_text())["runs"]
+        found.append({result["method"]: result for result in runs})
+    alone, corrected = found[0]["optimal"], found[0]["optimal + feedback"]
+    assert corrected["mean_error_m"] < 0.75 * alone["mean_error_m"]
+    assert max(corrected["extra"]["feedback"]["correction_rms_pa"]) > 100.0
+    assert corrected["mean_error_m"] == found[1]["optimal + feedback"]["mean_error_m"]
+    page = (tmp_path / "first" / "report" / "report.html").read_text()
+    assert "What feedback added" in page
+    assert page.count("optimal + feedback") > 1

@@ -40,7 +40,7 @@ def run(options: Options) -> None:
         if trial not in left:
             continue
         progress.say(
-            f"[{place}/{len(trials)}] {trial.motion}, {trial.model} {trial.method}, "
+            f"[{place}/{len(trials)}] {trial.motion}, {trial.model} {trial.manner}, "
             f"trial {trial.number} (seed {trial.seed})"
         )
         ledger.record(trial, _play(trial, options, progress))
@@ -155,7 +155,7 @@ def _metadata(trial: Trial, options: Options, limb: Path | None, robot: Limb) ->
     return {
         "motion": trial.motion,
         "model": trial.model,
-        "method": trial.method,
+        "method": trial.manner,
         "trial": trial.number,
         "seed": trial.seed,
         "amplitude_rad": options.amplitude,

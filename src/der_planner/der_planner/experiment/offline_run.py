@@ -8,12 +8,17 @@ from typing import Any
 
 import numpy as np
 
+from der_planner.control import Feedback, lockstep
+from der_planner.control.lockstep import Played
 from der_planner.experiment.errors import GraphError
 from der_planner.experiment.options import Options, Trial
 from der_planner.limb import Limb
-from der_planner.planning import PlanningError, plan
+from der_planner.planning import Plan, PlanningError, plan
 from der_planner.runs.evaluation import Description, RunSeries
-from der_planner.twin.offline import play
+from der_planner.twin.offline import OfflineTwin
+
+_AT_REST = 1.0
+"""The twin is vented for so long before the first setpoint [s]."""
 
 
 def play_offline(
@@ -35,13 +40,7 @@ def play_offline(
         planned = plan(robot, motion, model=trial.model, method=trial.method)
     except PlanningError as error:
         raise GraphError(f"the planner refused: {error}") from error
-    played = play(
-        planned.time,
-        planned.differential_pressure,
-        seed=trial.seed,
-        gravity=robot.gravity,
-        masses=robot.masses,
-    )
+    played, about_feedback = _play(planned, trial, robot)
     payload, place = robot.payload
     path = options.out / "runs" / f"{trial.name}.npz"
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -53,19 +52,45 @@ def play_offline(
                 "gravity_m_s2": robot.gravity,
                 "payload_kg": payload,
                 "payload_at_m": place,
+                **({"feedback": about_feedback} if about_feedback else {}),
             }
         ),
         time=planned.time,
         tip_reference=planned.tip_reference,
         tip_predicted=planned.tip_predicted,
-        differential_pressure=planned.differential_pressure,
-        measured_differential=played.measured_differential,
+        differential_pressure=played.commanded,
+        planned_pressure=planned.differential_pressure,
+        measured_differential=played.differential_pressure,
         tip=played.tip,
+        tip_estimated=played.estimated_tip,
+        missing_pressure=played.missing_pressure,
     )
     return {
         "arrays": str(path.relative_to(options.out)),
         "solve_time_s": planned.solve_time,
         "predicted_error_m": planned.predicted_error,
+    }
+
+
+def _play(planned: Plan, trial: Trial, robot: Limb) -> tuple[Played, dict[str, Any]]:
+    """Play a plan on the twin; return also what feedback did, in numbers."""
+    plant = OfflineTwin(
+        trial.seed,
+        segment_count=robot.segment_count,
+        gravity=robot.gravity,
+        masses=robot.masses,
+    )
+    plant.rest(_AT_REST)
+    feedback = Feedback(planned) if trial.feedback else None
+    played = lockstep.play(planned, plant, feedback, lockstep.Sensors(seed=trial.seed))
+    if feedback is None:
+        return played, {}
+    size = np.linalg.norm(played.estimated_tip - played.tip, axis=1)
+    return played, {
+        "correction_rms_pa": np.sqrt(np.mean(played.correction**2, axis=0)).tolist(),
+        "correction_max_pa": np.abs(played.correction).max(axis=0).tolist(),
+        "estimate_rms_m": float(np.sqrt(np.mean(size**2))),
+        "warnings": [f"{w.time:.2f} s: {w.name}, {w.message}" for w in feedback.warnings],
     }
 
 

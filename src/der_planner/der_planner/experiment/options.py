@@ -43,6 +43,7 @@ class Trial:
         model, method: names, see MODELS, METHODS.
         number: of the trial, from 1.
         seed: of the twin; the same for every motion and model of a trial.
+        feedback: the commands are corrected while they are played.
     """
 
     motion: str
@@ -50,11 +51,18 @@ class Trial:
     method: str
     number: int
     seed: int
+    feedback: bool = False
 
     @property
     def name(self) -> str:
         """Name of the bag and of every other file of this run."""
-        return f"{self.motion}_{self.model}_{self.method}_trial{self.number}"
+        method = f"{self.method}_feedback" if self.feedback else self.method
+        return f"{self.motion}_{self.model}_{method}_trial{self.number}"
+
+    @property
+    def manner(self) -> str:
+        """The method, and if there is feedback: what tables call it."""
+        return f"{self.method} + feedback" if self.feedback else self.method
 
 
 @dataclass(frozen=True)
@@ -125,6 +133,7 @@ class Options:
     record_images: bool
     report: bool
     path: Path | None = None
+    feedback: bool = False
     mounting: str = ""
     payload: float = 0.0
     payload_at: float | None = None
@@ -164,10 +173,12 @@ class Options:
                 self.method if model == "der" else "paper",
                 number,
                 self.seed + number - 1,
+                feedback,
             )
             for motion in self.motions
             for number in range(1, self.trials + 1)
             for model in self.models
+            for feedback in ((False, True) if self.feedback and model == "der" else (False,))
         ]
 
 
@@ -252,6 +263,11 @@ def _add_manner(how: argparse._ArgumentGroup) -> None:
         help="folder of bags, logs, figures and results.json; a folder that holds a stopped "
         "experiment goes on with it; without it: experiments/ and the time",
     )
+    how.add_argument(
+        "--feedback",
+        action="store_true",
+        help="play every plan of the rod twice: open loop, and corrected while it moves",
+    )
     how.add_argument("--record-images", action="store_true", help="raw images into the bags, too")
     how.add_argument("--no-report", action="store_true", help="skip the HTML report at the end")
     how.add_argument("--dry-run", action="store_true", help="say what would be done, start nothing")
@@ -286,6 +302,8 @@ def parse(arguments: Sequence[str]) -> Options:
     hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
     if hardware is not None and given.offline:
         raise OptionError("--offline simulates everything: it does not go with --hardware")
+    if given.feedback and "der" not in models:
+        raise OptionError("--feedback corrects plans of the rod: choose --models der")
     limb = given.limb or (Path(hardware.limb) if hardware and hardware.limb else None)
     if hardware is not None and limb is None:
         raise OptionError("--hardware needs a limb file: --limb FILE (scripts/calibrate_limb.py)")
@@ -308,6 +326,7 @@ def parse(arguments: Sequence[str]) -> Options:
         record_images=given.record_images,
         report=not given.no_report,
         path=given.path.resolve() if given.path is not None else None,
+        feedback=given.feedback,
         mounting=given.mounting,
         payload=given.payload,
         payload_at=given.payload_at,

@@ -125,6 +125,7 @@ def _page(
         *(figure(_CAPTIONS[name], path) for name, path in figures.items()),
         "<h2>Every run</h2>",
         _run_table(results),
+        _feedback_table(results),
         _checks_table(results),
         "<h2>Definitions</h2>",
         _DEFINITIONS,
@@ -207,6 +208,30 @@ def _run_table(results: Sequence[RunResult]) -> str:
     return table(header, lines, names=1)
 
 
+def _feedback_table(results: Sequence[RunResult]) -> str:
+    """List what feedback added to the commands of each run that had it."""
+    corrected = [run for run in results if run.extra.get("feedback")]
+    if not corrected:
+        return ""
+    several, lines = shows_namespace(results), []
+    for run in corrected:
+        about = run.extra["feedback"]
+        lines.append(
+            [
+                html.escape(_run_name(run, several, run.method)),
+                str(run.trial),
+                *(
+                    ", ".join(_number(value, 1e-3) for value in about.get(key, ()))
+                    for key in ("correction_rms_pa", "correction_max_pa")
+                ),
+                _number(about.get("estimate_rms_m", math.nan), 1000),
+                html.escape("; ".join(about.get("warnings", ())) or "none"),
+            ]
+        )
+    header = ["run", "trial", "added, RMS [kPa]", "largest [kPa]", "estimate RMS [mm]", "warnings"]
+    return "<h2>What feedback added</h2>" + table(header, lines, names=1)
+
+
 def _checks_table(results: Sequence[RunResult]) -> str:
     checked = [run for run in results if run.checks]
     if not checked:
@@ -240,7 +265,7 @@ def _count(run: RunResult, name: str) -> str:
 
 def _provenance(results: Sequence[RunResult]) -> str:
     """List what the runs say of themselves: one line where all agree, else every value."""
-    keys = sorted({key for run in results for key in run.extra})
+    keys = sorted({key for run in results for key in run.extra} - {"feedback"})
     lines = []
     for key in keys:
         values = list(dict.fromkeys(str(run.extra.get(key, "–")) for run in results))
