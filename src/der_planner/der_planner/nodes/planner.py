@@ -282,6 +282,11 @@ class PlannerNode(Node):
         while True:
             progress(0.0)
             stamp, start = self._hand_over(request.start, allowance)
+            if request.learned is not None:
+                if start is not None:
+                    raise ValueError("a learned plan begins at rest: send it after this motion")
+                result = request.learned
+                break
             result = plan(
                 request.limb, request.motion, request.model, request.method,
                 nodes=self._options.nodes, start=start, progress=progress,

@@ -35,6 +35,7 @@ class PlannerOptions:
     branch: str
     limits: PathLimits
     driver_timeout: float
+    learned_plans: str
 
 
 def read_parameters(node: Node) -> PlannerOptions:
@@ -92,5 +93,9 @@ def read_parameters(node: Node) -> PlannerOptions:
         driver_timeout=float(
             read("driver_timeout", 1.0, "silence of the driver [s] after which it counts as dead",
                  at_least=0.2, at_most=60.0)
+        ),
+        learned_plans=str(
+            read("learned_plans", "", "folder of learned plans: a command of the method 'learned' "
+                 "names one of them in place of its motion")
         ),
     )  # fmt: skip
