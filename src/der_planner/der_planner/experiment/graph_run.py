@@ -285,6 +285,7 @@ class GraphTrial(GraphPlayer):
             "mounting": self._options.mounting,
             "payload": self._options.payload,
             "payload_at": self._options.payload_at or 0.0,
+            "feedback": self._trial.feedback,
         }
         if self._options.path is not None:
             # A path names no model: it gets the planner's defaults.

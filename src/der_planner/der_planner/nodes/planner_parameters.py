@@ -35,6 +35,7 @@ class PlannerOptions:
     branch: str
     limits: PathLimits
     driver_timeout: float
+    feedback: bool
 
 
 def read_parameters(node: Node) -> PlannerOptions:
@@ -92,5 +93,9 @@ def read_parameters(node: Node) -> PlannerOptions:
         driver_timeout=float(
             read("driver_timeout", 1.0, "silence of the driver [s] after which it counts as dead",
                  at_least=0.2, at_most=60.0)
+        ),
+        feedback=bool(
+            read("feedback", False, "correct plans of the rod while they are played, where a "
+                 "command does not ask for it")
         ),
     )  # fmt: skip

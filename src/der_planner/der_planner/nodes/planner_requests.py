@@ -36,6 +36,7 @@ class Request:
     model: str
     method: str
     start: int
+    feedback: bool = False
     cancelled: threading.Event = field(default_factory=threading.Event)
 
 
@@ -97,7 +98,12 @@ def from_command(message: MotionCommand, options: PlannerOptions, now: int) -> R
     carried = message.payload, message.payload_at
     if message.payload == 0:
         carried = options.payload, options.payload_at
-    return Request(message.plan_id, loaded(limb, *carried), motion, model, method, start)
+    if message.feedback and model != "der":
+        raise ValueError(
+            f"feedback corrects plans of the rod, not of the model {model}: ask for der"
+        )
+    feedback = message.feedback or (options.feedback and model == "der")
+    return Request(message.plan_id, loaded(limb, *carried), motion, model, method, start, feedback)
 
 
 def from_path(message: PathMessage, plan_id: str, options: PlannerOptions, now: int) -> Request:
@@ -118,7 +124,8 @@ def from_path(message: PathMessage, plan_id: str, options: PlannerOptions, now: 
     start = start_of(nanoseconds(message.header.stamp), now)
     limb = loaded(options.limb, options.payload, options.payload_at)
     method = _method(options.model, "", options)
-    return Request(plan_id, limb, motion, options.model, method, start)
+    feedback = options.feedback and options.model == "der"
+    return Request(plan_id, limb, motion, options.model, method, start, feedback)
 
 
 def _method(model: str, method: str, options: PlannerOptions) -> str:
