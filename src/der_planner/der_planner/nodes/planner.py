@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import queue
 import sys
 import threading
@@ -315,6 +316,8 @@ class PlannerNode(Node):
                 nodes=self._options.nodes, start=start, progress=progress,
             )  # fmt: skip
             feedback = Feedback(result) if request.feedback else None
+            if feedback is not None:
+                result = dataclasses.replace(result, method=f"{result.method} + feedback")
             progress(1.0)
             if start is None or stamp - self._options.lead > self._now():
                 break
