@@ -31,7 +31,7 @@ def test_a_path_is_drawn_and_reported(tmp_path: Path):
     (result,) = json.loads((out / "results.json").read_text())["runs"]
     assert (result["motion"], result["model"], result["cycles"]) == ("arc", "pcc", 1)
     assert 0.0 < result["mean_error_m"] < 0.05
-    played = np.load(out / "runs" / "arc_pcc_paper_trial1.npz")
+    played = np.load(out / "runs" / "arc_pcc_optimal_trial1.npz")
     start, end = 0.224 * np.array([[np.cos(a), np.sin(a)] for a in (0.46, 0.56)])
     for point in (start, end):
         assert np.linalg.norm(played["tip_reference"] - point, axis=1).min() < 1e-3

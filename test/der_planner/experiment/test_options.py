@@ -6,7 +6,7 @@ import pytest
 
 from der_planner.experiment.experiment import run
 from der_planner.experiment.ledger import Ledger
-from der_planner.experiment.options import OptionError, parse
+from der_planner.experiment.options import METHODS, OptionError, parse
 from der_planner.limb import Limb, PointMass
 from der_planner.planning.motions import NAMES
 
@@ -48,12 +48,10 @@ def test_trials_share_seeds_between_models_and_differ_between_trials():
     assert len({trial.name for trial in trials}) == len(trials)
 
 
-def test_pcc_is_always_planned_by_its_own_method():
-    trials = parse(["--method", "optimal"]).plan_of_trials()
-    assert [(trial.model, trial.method) for trial in trials] == [
-        ("der", "optimal"),
-        ("pcc", "paper"),
-    ]
+@pytest.mark.parametrize("method", METHODS)
+def test_a_method_counts_for_both_models(method):
+    trials = parse(["--method", method]).plan_of_trials()
+    assert [(trial.model, trial.method) for trial in trials] == [("der", method), ("pcc", method)]
 
 
 def test_a_stopped_experiment_goes_on_and_refuses_other_options(tmp_path: Path):

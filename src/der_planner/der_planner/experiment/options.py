@@ -167,14 +167,7 @@ class Options:
     def plan_of_trials(self) -> list[Trial]:
         """Return every trial in the order in which they are played."""
         return [
-            Trial(
-                motion,
-                model,
-                self.method if model == "der" else "paper",
-                number,
-                self.seed + number - 1,
-                feedback,
-            )
+            Trial(motion, model, self.method, number, self.seed + number - 1, feedback)
             for motion in self.motions
             for number in range(1, self.trials + 1)
             for model in self.models
@@ -215,7 +208,7 @@ def _add_motions(what: argparse._ArgumentGroup) -> None:
         "--models", nargs="+", default=list(MODELS), metavar="MODEL", help=f"of {', '.join(MODELS)}"
     )
     what.add_argument(
-        "--method", default="optimal", help=f"of {', '.join(METHODS)}; PCC always uses paper"
+        "--method", default="optimal", help=f"of {', '.join(METHODS)}, for both models"
     )
     what.add_argument("--trials", type=int, default=1, help="runs of each motion and model")
     what.add_argument(

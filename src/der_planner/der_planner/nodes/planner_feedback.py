@@ -153,8 +153,10 @@ class Corrector:
             return
         stamp = nanoseconds(state.header.stamp)
         bend, tip = np.array(state.bend_angle), np.array([state.tip.x, state.tip.y])
-        sigma = np.maximum(np.nan_to_num(np.array(state.bend_angle_sigma)), _SMALLEST_BEND)
-        size = len(bend)
+        size, told = len(bend), np.array(state.bend_angle_sigma)
+        sigma = np.full(size, _SMALLEST_BEND)
+        if len(told) == size:
+            sigma = np.maximum(np.nan_to_num(told), sigma)
         spread = np.zeros((size + 2, size + 2))
         spread[:size, :size] = np.diag(sigma**2)
         covariance = np.nan_to_num(np.array(state.tip_covariance)).reshape(2, 2)

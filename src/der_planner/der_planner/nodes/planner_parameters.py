@@ -71,7 +71,7 @@ def read_parameters(node: Node) -> PlannerOptions:
                  choices=tuple(METHODS))
         ),
         method=str(
-            read("default_method", "", "method of the rod where none is named; empty: the best",
+            read("default_method", "", "method where none is named; empty: the best",
                  choices=("", *METHODS["der"]))
         ),
         nodes=int(read("nodes", 21, "nodes of the rod", at_least=6, at_most=201)),

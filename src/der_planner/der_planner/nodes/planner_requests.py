@@ -90,7 +90,7 @@ def from_command(message: MotionCommand, options: PlannerOptions, now: int) -> R
         cycles=message.cycles or DEFAULT_CYCLES,
         branch=options.branch,
     )
-    method = _method(model, message.method, options)
+    method = choose_method(model, message.method or options.method)
     start = start_of(nanoseconds(message.header.stamp), now)
     limb = options.limb.mounted(message.mounting) if message.mounting else options.limb
     if message.payload < 0 or message.payload > LARGEST_PAYLOAD:
@@ -123,10 +123,6 @@ def from_path(message: PathMessage, plan_id: str, options: PlannerOptions, now: 
     )
     start = start_of(nanoseconds(message.header.stamp), now)
     limb = loaded(options.limb, options.payload, options.payload_at)
-    method = _method(options.model, "", options)
+    method = choose_method(options.model, options.method)
     feedback = options.feedback and options.model == "der"
     return Request(plan_id, limb, motion, options.model, method, start, feedback)
-
-
-def _method(model: str, method: str, options: PlannerOptions) -> str:
-    return choose_method(model, method or (options.method if model == "der" else ""))

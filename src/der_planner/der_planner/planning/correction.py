@@ -83,16 +83,13 @@ class Correction:
             PlanningError: the model cannot be rolled forward under them.
         """
         start = self._plan.reference.start
-        begin = None
-        if start is not None:
-            begin = self._physics.state(self._spline(0.0), self._spline(0.0, 1))
         try:
             response = simulate(
                 self._physics,
                 np.arange(len(commands)) * CONTROL_PERIOD,
                 commands=commands,
                 bend=lambda time: sample_spline(self._spline, time)[0],
-                start=begin,
+                start=self._physics.begin(self._spline, start),
                 before=None if start is None else start.pressure,
             )
         except ConvergenceError as error:
@@ -139,6 +136,7 @@ class Correction:
             offset = self._plan.tip_reference - wanted
             solver = Optimiser(
                 self._physics,
+                self._physics.begin(self._spline, self._plan.reference.start),
                 self._spline,
                 self._plan.reference,
                 commands,
