@@ -93,6 +93,19 @@ def test_a_chain_of_links_that_was_never_calibrated_is_learned_in_two_runs():
     assert errors[2] < errors[0] / 4
 
 
+def test_arcs_learn_as_the_rod_does():
+    motion = Motion.named("same_direction", period=8.0, cycles=1)
+    planned, errors = plan(LIMB, motion, model="pcc", method="paper"), []
+    learner = Learner(planned)
+    for _ in range(3):
+        tip = play(planned, other_limb())
+        errors.append(mean_error(planned, tip))
+        learner.add(planned.time, tip)
+        planned = learner.next()
+    assert planned.model == "pcc"
+    assert errors[2] < errors[0] / 3
+
+
 def test_lost_tags_teach_nothing_wrong(first):
     limb = other_limb()
     tip = play(first, limb)

@@ -127,7 +127,7 @@ class Learner:
         stopped: why nothing more is learned; empty while it goes on.
 
     Raises:
-        LearningError: the plan's model has no optimiser.
+        LearningError: the plan's model is unknown, or its reference is out of reach.
     """
 
     def __init__(self, plan: Plan) -> None:

@@ -38,6 +38,7 @@ def node_specs(
     metadata: dict[str, Any],
     *,
     seed: int = 0,
+    run: int = 0,
     limb: Limb | None = None,
     hardware: Hardware | None = None,
     planner: dict[str, Any] | None = None,
@@ -50,6 +51,7 @@ def node_specs(
         bag: folder that the recorder makes.
         metadata: stored in the bag.
         seed: of the twin.
+        run: of the same twin: its rest angles wander in each in a way of their own.
         limb: whose gravity and masses the twin gets; None: no loads.
         hardware: in place of the twin.
         planner: parameters of the planner; None for a graph without one.
@@ -66,7 +68,7 @@ def node_specs(
     specs = [
         NodeSpec("pressure_driver", "board_emulator", {"port_link": port, "seed": seed}),
         NodeSpec("pressure_driver", "pressure_driver", driver),
-        NodeSpec("der_planner", "limb_twin", {"seed": seed, **twin_loads(limb)}),
+        NodeSpec("der_planner", "limb_twin", {"seed": seed, "run": run, **twin_loads(limb)}),
         NodeSpec("apriltag_tracker", "synthetic_camera", {"seed": seed}),
         NodeSpec("apriltag_tracker", "apriltag_tracker", dict(rig.tracker)),
     ]

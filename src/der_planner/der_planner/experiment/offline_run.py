@@ -12,9 +12,12 @@ from der_planner.control import Feedback, lockstep
 from der_planner.control.lockstep import Played
 from der_planner.experiment.errors import GraphError
 from der_planner.experiment.options import Options, Trial
+from der_planner.identification.offline import CALIBRATION_RUN
 from der_planner.limb import Limb
 from der_planner.planning import Plan, PlanningError, plan
+from der_planner.planning.plan_file import read_plan
 from der_planner.runs.evaluation import Description, RunSeries
+from der_planner.runs.run import method_name
 from der_planner.twin.offline import OfflineTwin
 
 _AT_REST = 1.0
@@ -22,7 +25,11 @@ _AT_REST = 1.0
 
 
 def play_offline(
-    trial: Trial, options: Options, robot: Limb, metadata: dict[str, Any]
+    trial: Trial,
+    options: Options,
+    robot: Limb,
+    metadata: dict[str, Any],
+    learned: Path | None = None,
 ) -> dict[str, Any]:
     """Plan, play and keep one trial; the error is against the twin's true tip, not an image's.
 
@@ -31,13 +38,17 @@ def play_offline(
         options: of the experiment.
         robot: to plan with, under its loads; the twin is mounted as it is and carries its masses.
         metadata: kept with the arrays.
+        learned: file of a learned plan, which is played in place of a new one.
 
     Raises:
         GraphError: the motion cannot be planned; with the planner's reason.
     """
     try:
-        motion = options.motion(trial.motion)
-        planned = plan(robot, motion, model=trial.model, method=trial.method)
+        if learned is not None:
+            planned = read_plan(learned)
+        else:
+            motion = options.motion(trial.motion)
+            planned = plan(robot, motion, model=trial.model, method=trial.method)
     except PlanningError as error:
         raise GraphError(f"the planner refused: {error}") from error
     played, about_feedback = _play(planned, trial, robot)
@@ -72,10 +83,16 @@ def play_offline(
     }
 
 
+def _run_of_twin(trial: Trial) -> int:
+    """Return which wander of the rest angles the twin has: one of its own for every run."""
+    return 0 if trial.run == 1 else CALIBRATION_RUN + trial.run - 1
+
+
 def _play(planned: Plan, trial: Trial, robot: Limb) -> tuple[Played, dict[str, Any]]:
     """Play a plan on the twin; return also what feedback did, in numbers."""
     plant = OfflineTwin(
         trial.seed,
+        run=_run_of_twin(trial),
         segment_count=robot.segment_count,
         gravity=robot.gravity,
         masses=robot.masses,
@@ -102,7 +119,7 @@ def load_arrays(path: Path) -> RunSeries:
             Description(
                 motion=about["motion"],
                 model=about["model"],
-                method=about["method"],
+                method=method_name(about["method"], about.get("learned_from")),
                 trial=about["trial"],
                 seed=about["seed"],
                 amplitude=about["amplitude_rad"],
@@ -123,4 +140,5 @@ def load_arrays(path: Path) -> RunSeries:
             pressure_time=kept["time"],
             commanded=kept["differential_pressure"],
             measured=kept["measured_differential"],
+            setpoints=kept["differential_pressure"],
         )

@@ -24,6 +24,7 @@ from der_planner.planning.motions import (
     JOINT_MOTIONS,
 )
 from der_planner.planning.motions import NAMES as MOTIONS
+from der_planner.runs.run import LEARNED
 
 MODELS = tuple(METHODS_BY_MODEL)
 METHODS = METHODS_BY_MODEL["der"]
@@ -43,6 +44,7 @@ class Trial:
         model, method: names, see MODELS, METHODS.
         number: of the trial, from 1.
         seed: of the twin; the same for every motion and model of a trial.
+        run: of the trial, from 1; those after the first play what was learned from the ones before.
         feedback: the commands are corrected while they are played.
     """
 
@@ -52,12 +54,18 @@ class Trial:
     number: int
     seed: int
     feedback: bool = False
+    run: int = 1
 
     @property
     def name(self) -> str:
         """Name of the bag and of every other file of this run."""
         method = f"{self.method}_feedback" if self.feedback else self.method
-        return f"{self.motion}_{self.model}_{method}_trial{self.number}"
+        name = f"{self.motion}_{self.model}_{method}_trial{self.number}"
+        return name if self.run == 1 else f"{name}_run{self.run}"
+
+    def following(self) -> Trial:
+        """Return the next run, which plays what was learned."""
+        return dataclasses.replace(self, method=LEARNED, run=self.run + 1)
 
     @property
     def manner(self) -> str:
@@ -133,6 +141,7 @@ class Options:
     record_images: bool
     report: bool
     path: Path | None = None
+    learn: int = 0
     feedback: bool = False
     mounting: str = ""
     payload: float = 0.0
@@ -210,6 +219,14 @@ def _add_motions(what: argparse._ArgumentGroup) -> None:
     what.add_argument(
         "--method", default="optimal", help=f"of {', '.join(METHODS)}, for both models"
     )
+    what.add_argument(
+        "--learn",
+        type=int,
+        default=0,
+        metavar="N",
+        help="after each trial, up to N more runs, each of the plan that was learned "
+        "from the ones before",
+    )
     what.add_argument("--trials", type=int, default=1, help="runs of each motion and model")
     what.add_argument(
         "--amplitude", type=float, default=DEFAULT_AMPLITUDE, help="largest bend of a segment [rad]"
@@ -282,6 +299,7 @@ def parse(arguments: Sequence[str]) -> Options:
     _check_names("method", (given.method,), METHODS)
     for name, least, most in (
         ("trials", 1, 1000),
+        ("learn", 0, 100),
         ("cycles", 1, 1000),
         ("seed", 0, 2**31 - 1000),
         ("period", 0.5, 600.0),
@@ -318,6 +336,7 @@ def parse(arguments: Sequence[str]) -> Options:
         dry_run=given.dry_run,
         record_images=given.record_images,
         report=not given.no_report,
+        learn=given.learn,
         path=given.path.resolve() if given.path is not None else None,
         feedback=given.feedback,
         mounting=given.mounting,

@@ -48,6 +48,8 @@ Array = NDArray[np.float64]
 
 _MARGIN = 100_000_000
 """A plan starts this much [ns] after the earliest instant, so that its message travels first."""
+_FEEDBACK_MARGIN = 500_000_000
+"""What feedback needs to be made ready for a plan takes less than this [ns]."""
 _ARMING_PATIENCE = 0.5
 """[s] for the state of a driver that was armed just now to arrive."""
 _LEVELS = {
@@ -305,23 +307,10 @@ class PlannerNode(Node):
                 raise Cancelled
             self._progress = share
 
-        # A motion that is being played goes on meanwhile; the new one takes over where it then is.
-        allowance = _MARGIN
-        while True:
-            progress(0.0)
-            begun = clock.monotonic()
-            stamp, start = self._hand_over(request.start, allowance)
-            result = plan(
-                request.limb, request.motion, request.model, request.method,
-                nodes=self._options.nodes, start=start, progress=progress,
-            )  # fmt: skip
-            feedback = Feedback(result) if request.feedback else None
-            if feedback is not None:
-                result = dataclasses.replace(result, method=f"{result.method} + feedback")
-            progress(1.0)
-            if start is None or stamp - self._options.lead > self._now():
-                break
-            allowance = 2 * round((clock.monotonic() - begun) * 1e9) + _MARGIN
+        stamp, start, result = self._planned(request, progress)
+        feedback = Feedback(result) if request.feedback else None
+        if feedback is not None:
+            result = dataclasses.replace(result, method=f"{result.method} + feedback")
         for warning in result.warnings:
             self.get_logger().warning(f"plan {request.plan_id}: {warning}")
         with self._lock:
@@ -335,6 +324,32 @@ class PlannerNode(Node):
         else:
             self._publish_plan(Schedule(request.plan_id, result, 0))
             self._set("done", request.plan_id, reason="waits for the service start", progress=1.0)
+
+    def _planned(
+        self, request: Request, progress: Callable[[float], None]
+    ) -> tuple[int, Start | None, Plan]:
+        """Return when a plan can take over, where the limb is then (None: at rest), and the plan.
+
+        A motion that is being played goes on meanwhile; the new one takes over where it then is.
+        """
+        allowance = _MARGIN + (_FEEDBACK_MARGIN if request.feedback else 0)
+        while True:
+            progress(0.0)
+            begun = clock.monotonic()
+            stamp, start = self._hand_over(request.start, allowance)
+            if request.learned is not None:
+                if start is not None:
+                    raise ValueError("a learned plan begins at rest: send it after this motion")
+                return stamp, start, request.learned
+            result = plan(
+                request.limb, request.motion, request.model, request.method,
+                nodes=self._options.nodes, start=start, progress=progress,
+            )  # fmt: skip
+            progress(1.0)
+            spare = _FEEDBACK_MARGIN if request.feedback else 0
+            if start is None or stamp - self._options.lead - spare > self._now():
+                return stamp, start, result
+            allowance = 2 * round((clock.monotonic() - begun) * 1e9) + spare + _MARGIN
 
     def _hand_over(self, wanted: int, allowance: int) -> tuple[int, Start | None]:
         """Return when a plan of now can take over, and where the limb is then; None: at rest."""

@@ -35,6 +35,7 @@ class PlannerOptions:
     branch: str
     limits: PathLimits
     driver_timeout: float
+    learned_plans: str
     feedback: bool
 
 
@@ -93,6 +94,10 @@ def read_parameters(node: Node) -> PlannerOptions:
         driver_timeout=float(
             read("driver_timeout", 1.0, "silence of the driver [s] after which it counts as dead",
                  at_least=0.2, at_most=60.0)
+        ),
+        learned_plans=str(
+            read("learned_plans", "", "folder of learned plans: a command of the method 'learned' "
+                 "names one of them in place of its motion")
         ),
         feedback=bool(
             read("feedback", False, "correct plans of the rod while they are played, where a "

@@ -19,7 +19,6 @@ from der_planner.planning.inverse import solve
 from der_planner.planning.motions import sample_spline
 from der_planner.planning.optimal import Optimiser, Outcome, Settings
 from der_planner.planning.result import Plan
-from der_planner.planning.rod_model import PlanningRod
 from der_planner.rod import ConvergenceError
 
 Array = NDArray[np.float64]
@@ -53,18 +52,11 @@ class Correction:
         plan: by any method.
 
     Raises:
-        PlanningError: the plan is one of the PCC model, which has no optimiser.
+        PlanningError: the model of the plan is unknown, or its reference is out of reach.
     """
 
     def __init__(self, plan: Plan) -> None:
-        if plan.model != "der":
-            raise PlanningError(
-                f"a plan of the model '{plan.model}' cannot be corrected: only the rod's optimiser "
-                "can; plan the motion with the model der"
-            )
-        physics = models.build(plan.limb, "der", NODES)
-        if not isinstance(physics, PlanningRod):
-            raise AssertionError("the model der is a rod")
+        physics = models.build(plan.limb, plan.model, NODES)
         self._physics = physics
         self._spline = physics.configuration(plan.reference)
         self._plan = plan

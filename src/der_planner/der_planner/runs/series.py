@@ -23,6 +23,7 @@ from der_planner.runs.run import (
     EvaluationError,
     RunSeries,
     Stream,
+    method_name,
 )
 
 NANOSECONDS = 1_000_000_000
@@ -46,6 +47,7 @@ class LimbRecord:
         setpoint_indices: by plan id, in the order of ``setpoints``.
         revised: ids of the plans of which a setpoint was revised.
         tip, angles: measured tip [m] and bend angles [rad], NaN where the limb was not seen.
+        covariance: of the measured tip [m²], row by row.
         truth: simulated tip [m] (twin only).
         commanded, measured: differential pressures [Pa].
         faults: reasons of the driver with their stamps [ns].
@@ -58,6 +60,7 @@ class LimbRecord:
     revised: set[str] = field(default_factory=set)
     tip: Columns = field(default_factory=lambda: Columns(2))
     angles: Columns = field(default_factory=Columns)
+    covariance: Columns = field(default_factory=lambda: Columns(4))
     truth: Columns = field(default_factory=lambda: Columns(2))
     commanded: Columns = field(default_factory=Columns)
     measured: Columns = field(default_factory=Columns)
@@ -195,6 +198,7 @@ def _take_state(limb: LimbRecord, message: Any) -> None:
     stamp, valid = _stamp(message), bool(message.valid)
     limb.tip.append(stamp, (message.tip.x, message.tip.y) if valid else ())
     limb.angles.append(stamp, message.bend_angle if valid else ())
+    limb.covariance.append(stamp, message.tip_covariance if valid else ())
 
 
 def _take_truth(limb: LimbRecord, message: Any) -> None:
@@ -289,6 +293,8 @@ def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
         predicted=Stream(times, np.array(plan.tip_predicted).reshape(-1, 2)),
         tip=tip,
         bend_angle=stream(limb.angles, segment_count, origin),
+        tip_covariance=stream(limb.covariance, 4, origin),
+        setpoints=Stream(times, _commands(plan, setpoints)),
         commanded=stream(limb.commanded, segment_count, origin),
         measured=stream(limb.measured, segment_count, origin),
         truth=stream(limb.truth, 2, origin) if len(limb.truth) else None,
@@ -297,6 +303,16 @@ def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
         finished=played == len(times) - 1 and tip.time[-1] >= end - 1.0,
         origin=origin,
     )
+
+
+def _commands(plan: Any, setpoints: _Setpoints) -> Array:
+    """Return the commands (K, M) [Pa] as they were sent; as planned where none was recorded."""
+    command = np.array(plan.differential_pressure, dtype=float)
+    command = command.reshape(len(plan.time), -1).copy()
+    known = setpoints.index < len(command)
+    known &= np.isfinite(setpoints.value).all(axis=1)
+    command[setpoints.index[known]] = setpoints.value[known]
+    return command
 
 
 def stream(columns: Columns, width: int, origin: int) -> Stream:
@@ -400,7 +416,7 @@ def _describe(
     return Description(
         motion=(run.get("motion") if drawn else "") or plan.motion,
         model=plan.model or run.get("model", ""),
-        method=plan.method or run.get("method", ""),
+        method=method_name(plan.method or run.get("method", ""), run.get("learned_from")),
         trial=int(run.get("trial", -1)),
         seed=int(run.get("seed", -1)),
         amplitude=float(plan.amplitude),

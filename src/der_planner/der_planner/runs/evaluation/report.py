@@ -11,6 +11,7 @@ from pathlib import Path
 
 from der_planner.runs.evaluation.figures import plot_error, plot_pressures, plot_tip
 from der_planner.runs.evaluation.html import document, figure, table
+from der_planner.runs.evaluation.learning import plot_learning
 from der_planner.runs.evaluation.metrics import RunResult
 from der_planner.runs.evaluation.overlay import plot_shapes
 from der_planner.runs.evaluation.results import write_results
@@ -28,6 +29,7 @@ from der_planner.runs.evaluation.table import (
 from der_planner.runs.run import RunSeries
 
 _CAPTIONS = {
+    "learning": "Mean tip error over the runs that a plan was learned from, a line a trial.",
     "error": "Tip error over time: mean over trials, shaded one standard deviation.",
     "tip": "Measured tip against the reference: path in the plane, x and y over time.",
     "shapes": "Planned and measured limb, over the camera's frames where these were recorded.",
@@ -95,6 +97,7 @@ def write_report(
         ("tip", plot_tip),
         ("shapes", plot_shapes),
         ("pressures", plot_pressures),
+        ("learning", lambda _, place: plot_learning(results, place)),
     ):
         ready = [path for path in drawn if path.stem == name]
         if ready:
