@@ -8,6 +8,7 @@ import sys
 import threading
 import time as clock
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -149,7 +150,9 @@ class PlannerNode(Node):
     def _on_path(self, message: PathMessage) -> None:
         plan_id = new_plan_id()
         try:
-            request = from_path(message, plan_id, self._options, self._now())
+            nearest = bool(self.get_parameter("nearest_path").value)
+            options = replace(self._options, nearest_path=nearest)
+            request = from_path(message, plan_id, options, self._now())
         except (ValueError, IndexError) as error:
             self._refuse(plan_id, str(error))
             return

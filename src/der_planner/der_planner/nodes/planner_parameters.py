@@ -34,6 +34,7 @@ class PlannerOptions:
     auto_start: bool
     branch: str
     limits: PathLimits
+    nearest_path: bool
     driver_timeout: float
     learned_plans: str
     feedback: bool
@@ -90,6 +91,10 @@ def read_parameters(node: Node) -> PlannerOptions:
                        at_least=1e-3, at_most=1.0)),
             float(read("path_acceleration", 0.05, "acceleration along and across it [m/s^2]",
                        at_least=1e-3, at_most=10.0)),
+        ),
+        nearest_path=bool(
+            read("nearest_path", False, "follow the nearest path that the limb can follow where a "
+                 "path on the topic leaves its reach, instead of refusing it", read_only=False)
         ),
         driver_timeout=float(
             read("driver_timeout", 1.0, "silence of the driver [s] after which it counts as dead",

@@ -146,8 +146,9 @@ def from_path(message: PathMessage, plan_id: str, options: PlannerOptions, now: 
     stamps = [nanoseconds(pose.header.stamp) for pose in message.poses]
     time = (np.array(stamps) - stamps[0]) * 1e-9 if any(stamps) else None
     motion = Motion.from_tip_path(
-        time, tip.reshape(-1, 2), branch=options.branch, limits=options.limits
-    )
+        time, tip.reshape(-1, 2), branch=options.branch, limits=options.limits,
+        nearest=options.nearest_path,
+    )  # fmt: skip
     start = start_of(nanoseconds(message.header.stamp), now)
     limb = loaded(options.limb, options.payload, options.payload_at)
     method = choose_method(options.model, options.method)

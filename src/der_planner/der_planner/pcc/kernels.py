@@ -318,9 +318,12 @@ def linearised(
                 q_total, v_total = np.zeros(n), np.zeros(n)
                 d_total = np.zeros((2 * n, 3 * n))
                 for stage in range(4):
-                    slope = acceleration(q_stage, v_stage, torque, arcs)
+                    M, C, D, weight = inertia(q_stage, v_stage, arcs)
+                    bend = q_stage - arcs.rest
+                    elastic = arcs.stiffness * (bend + arcs.viscous * v_stage)
+                    elastic = elastic + arcs.cubic * bend**3
+                    slope = np.linalg.solve(M, torque + weight - elastic - (C + D) @ v_stage)
                     by_angle, by_rate = force_slopes(q_stage, v_stage, slope, arcs)
-                    M = inertia(q_stage, v_stage, arcs)[0]
                     d_slope = np.empty((2 * n, 3 * n))
                     d_slope[:n] = d_stage[n:]
                     right = inputs - by_angle @ d_stage[:n] - by_rate @ d_stage[n:]

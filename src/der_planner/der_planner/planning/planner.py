@@ -83,14 +83,9 @@ def plan(
         report(0.1)
         spline = physics.configuration(reference)
         report(0.3)
-        try:
-            solved = _solve(physics, spline, reference, method, report)
-        except ConvergenceError as error:
-            raise PlanningError(
-                f"the rod cannot be rolled forward along this motion ({error}): take a longer "
-                "period, a smaller amplitude, or check the limb file's stiffness and mass"
-            ) from error
+        solved = _followed(physics, spline, reference, method, report)
     bend = sample_spline(spline, reference.time)[0]
+    left = str(reference.deviation or "")
     report(1.0)
     return Plan(
         time=reference.time,
@@ -107,7 +102,9 @@ def plan(
         limb=physics.limb,
         kinematics=physics.kinematics,
         solve_time=clock.perf_counter() - begin,
-        warnings=tuple(solved.warnings + _calibration_warnings(physics.limb, bend)),
+        warnings=tuple(
+            [left] * bool(left) + solved.warnings + _calibration_warnings(physics.limb, bend)
+        ),
         details=solved.details,
     )
 
@@ -118,6 +115,27 @@ class _Solved:
     tip: Array
     warnings: list[str]
     details: dict[str, float]
+
+
+def _followed(
+    physics: PlanningModel,
+    spline: BSpline,
+    reference: Reference,
+    method: str,
+    report: Callable[[float], None],
+) -> _Solved:
+    """Return what `_solve` does.
+
+    Raises:
+        PlanningError: the rod cannot be simulated along the motion.
+    """
+    try:
+        return _solve(physics, spline, reference, method, report)
+    except ConvergenceError as error:
+        raise PlanningError(
+            f"the rod cannot be rolled forward along this motion ({error}): take a longer "
+            "period, a smaller amplitude, or check the limb file's stiffness and mass"
+        ) from error
 
 
 def _solve(
