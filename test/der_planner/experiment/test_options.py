@@ -23,6 +23,9 @@ from der_planner.planning.motions import NAMES
         (["--mounting", "upside"], "--mounting: mounting 'upside' is unknown"),
         (["--payload", "-0.1"], "--payload"),
         (["--payload-at", "0.2"], "give --payload, too"),
+        (["--nearest"], "--nearest is about a path"),
+        (["--page", "70000"], "--page is 70000"),
+        (["--page", "--offline"], "does not go with --offline"),
     ],
 )
 def test_a_bad_option_is_refused_by_its_name(arguments, named):

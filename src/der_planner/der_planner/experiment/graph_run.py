@@ -136,6 +136,9 @@ class GraphPlayer(ABC):
                 client.wait_for(lambda: os.path.exists(port), 60.0, "the emulated board's port")
         client.wait_ready(self._processes)
         self._progress.say(f"  ready after {time.monotonic() - begin:.1f} s")
+        if "page" in self._processes:
+            address = client.diagnostic_values("page").get("url", "unknown")
+            self._progress.say(f"  the operator's page is at {address}")
 
     def _record(self, client: GraphClient) -> GraphRun:
         bag = Path(client.call("recorder/start"))
@@ -281,6 +284,7 @@ class GraphTrial(GraphPlayer):
             hardware=self._hardware,
             planner=self._planner_parameters(),
             record_images=self._options.record_images,
+            page=self._options.page,
         )
 
     def _planner_parameters(self) -> dict[str, Any]:
@@ -289,12 +293,14 @@ class GraphTrial(GraphPlayer):
             "mounting": self._options.mounting,
             "payload": self._options.payload,
             "payload_at": self._options.payload_at or 0.0,
+            "feedback": self._trial.feedback,
         }
         if self._learned is not None:
             parameters["learned_plans"] = str(self._learned.parent)
         elif self._options.path is not None:
             # A path names no model: it gets the planner's defaults.
             parameters["default_model"] = self._trial.model
+            parameters["nearest_path"] = self._options.nearest
             if self._trial.model == "der":
                 parameters["default_method"] = self._trial.method
         return parameters

@@ -17,6 +17,7 @@ STOP_ORDER = (
     "limb_twin",
     "recorder",
     "pressure_driver",
+    "page",
     "board_emulator",
 )
 TWIN_NODES = ("board_emulator", "limb_twin", "synthetic_camera")
@@ -43,6 +44,7 @@ def node_specs(
     hardware: Hardware | None = None,
     planner: dict[str, Any] | None = None,
     record_images: bool = False,
+    page: int | None = None,
 ) -> list[NodeSpec]:
     """Return the nodes of a run in the order in which they start.
 
@@ -55,6 +57,7 @@ def node_specs(
         limb: whose gravity and masses the twin gets; None: no loads.
         hardware: in place of the twin.
         planner: parameters of the planner; None for a graph without one.
+        page: port of the operator's page; None for a graph without one.
         record_images: whether the bag holds the raw images, too.
     """
     rig = hardware or Hardware()
@@ -77,7 +80,19 @@ def node_specs(
     if planner is not None:
         specs.append(NodeSpec("der_planner", "planner", {**planner, **rig.planner}))
     specs.append(NodeSpec("der_planner", "recorder", recorder))
+    if page is not None:
+        specs.append(NodeSpec("der_planner", "page", page_parameters(page, planner or {}, rig)))
     return specs
+
+
+def page_parameters(port: int, planner: dict[str, Any], rig: Hardware) -> dict[str, Any]:
+    """Return the parameters of a page that draws with the planner's limb on the tracker's tags."""
+    shared = ("limb_file", "mounting", "payload", "payload_at", "path_speed", "path_acceleration")
+    all_of_planner = {**planner, **rig.planner}
+    parameters = {name: all_of_planner[name] for name in shared if name in all_of_planner}
+    if "tag_map" in rig.tracker:
+        parameters["tag_map"] = rig.tracker["tag_map"]
+    return {"port": port, **parameters}
 
 
 def twin_loads(limb: Limb | None) -> dict[str, Any]:

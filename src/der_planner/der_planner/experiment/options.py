@@ -28,6 +28,7 @@ from der_planner.runs.run import LEARNED
 
 MODELS = tuple(METHODS_BY_MODEL)
 METHODS = METHODS_BY_MODEL["der"]
+DEFAULT_PAGE_PORT = 8080
 DEFAULT_MOTIONS = ("same_direction",)
 
 
@@ -141,6 +142,8 @@ class Options:
     record_images: bool
     report: bool
     path: Path | None = None
+    nearest: bool = False
+    page: int | None = None
     learn: int = 0
     feedback: bool = False
     mounting: str = ""
@@ -170,7 +173,7 @@ class Options:
             PlanningError: the path's file has changed and cannot be read any more.
         """
         if self.path is not None:
-            return Motion.from_csv(self.path)
+            return Motion.from_csv(self.path, nearest=self.nearest)
         return Motion.named(name, amplitude=self.amplitude, period=self.period, cycles=self.cycles)
 
     def plan_of_trials(self) -> list[Trial]:
@@ -212,6 +215,11 @@ def _add_motions(what: argparse._ArgumentGroup) -> None:
         metavar="FILE.csv",
         help="draw this path with the tip, in place of --motions: columns x, y and, if timed, "
         "time, with units as in 'time [s], x [cm], y [cm]' (default units: s and m)",
+    )
+    what.add_argument(
+        "--nearest",
+        action="store_true",
+        help="follow the nearest path that the limb can follow where --path leaves its reach",
     )
     what.add_argument(
         "--models", nargs="+", default=list(MODELS), metavar="MODEL", help=f"of {', '.join(MODELS)}"
@@ -278,6 +286,15 @@ def _add_manner(how: argparse._ArgumentGroup) -> None:
         action="store_true",
         help="play every plan of the rod twice: open loop, and corrected while it moves",
     )
+    how.add_argument(
+        "--page",
+        type=int,
+        nargs="?",
+        const=DEFAULT_PAGE_PORT,
+        metavar="PORT",
+        help=f"serve the operator's page while the graph runs, at port {DEFAULT_PAGE_PORT} of this "
+        "machine if none is given",
+    )
     how.add_argument("--record-images", action="store_true", help="raw images into the bags, too")
     how.add_argument("--no-report", action="store_true", help="skip the HTML report at the end")
     how.add_argument("--dry-run", action="store_true", help="say what would be done, start nothing")
@@ -310,6 +327,7 @@ def parse(arguments: Sequence[str]) -> Options:
         if not least <= value <= most:
             raise OptionError(f"--{name} is {value}: choose {least} to {most}")
     _check_loads(given)
+    _check_path_and_page(given)
     hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
     if hardware is not None and given.offline:
         raise OptionError("--offline simulates everything: it does not go with --hardware")
@@ -338,6 +356,8 @@ def parse(arguments: Sequence[str]) -> Options:
         report=not given.no_report,
         learn=given.learn,
         path=given.path.resolve() if given.path is not None else None,
+        nearest=given.nearest,
+        page=given.page,
         feedback=given.feedback,
         mounting=given.mounting,
         payload=given.payload,
@@ -357,7 +377,7 @@ def _motions(given: argparse.Namespace) -> tuple[str, ...]:
     if given.motions:
         raise OptionError("--path is drawn in place of --motions: give one of the two")
     try:
-        Motion.from_csv(given.path)
+        Motion.from_csv(given.path, nearest=given.nearest)
     except PlanningError as error:
         raise OptionError(f"--path: {error}") from error
     return (re.sub(r"[^A-Za-z0-9-]+", "_", given.path.stem).strip("_") or "path",)
@@ -376,6 +396,20 @@ def _check_loads(given: argparse.Namespace) -> None:
         raise OptionError(f"--mounting: {error}") from error
     if given.payload_at is not None and not given.payload:
         raise OptionError("--payload-at is the place of a payload: give --payload, too")
+
+
+def _check_path_and_page(given: argparse.Namespace) -> None:
+    """Refuse --nearest without a path, a port that is none, and a page without a graph.
+
+    Raises:
+        OptionError: names the option.
+    """
+    if given.nearest and given.path is None:
+        raise OptionError("--nearest is about a path: give --path FILE.csv, too")
+    if given.page is not None and not 1 <= given.page <= 65535:
+        raise OptionError(f"--page is {given.page}: choose a port of 1 to 65535")
+    if given.page is not None and given.offline:
+        raise OptionError("--page shows a running graph: it does not go with --offline")
 
 
 def _timestamped() -> Path:

@@ -26,6 +26,9 @@ Array = NDArray[np.float64]
 
 TOLERANCE = 1e-3
 """Points missed by less than this [m] count as reached (the models' reach differs by less)."""
+NEAREST_TOLERANCE = 5e-3
+"""The same [m] for a nearest path: along the edge of what arcs reach, a rod's polyline stays behind
+by 1 to 2 mm."""
 PRIOR_WEIGHT = 1e-5
 """Pull toward the first guess [m/rad]: decides what the tip leaves open (straight limb, M > 2)."""
 BRANCHES = ("counter_clockwise", "clockwise")
@@ -290,6 +293,16 @@ def solutions(limb: Limb, kinematics: Kinematics, point: ArrayLike) -> list[Solu
     return sorted(held or found, key=lambda item: item.pressure)
 
 
+def check_branch(branch: str) -> None:
+    """Refuse the name of a branch that is neither empty nor one of `BRANCHES`.
+
+    Raises:
+        PlanningError: names the choices.
+    """
+    if branch and branch not in BRANCHES:
+        raise PlanningError(f"branch '{branch}' is unknown: choose {' or '.join(BRANCHES)}")
+
+
 def follow(
     limb: Limb, kinematics: Kinematics, time: ArrayLike, tip: ArrayLike, branch: str = ""
 ) -> Array:
@@ -307,8 +320,7 @@ def follow(
         PlanningError: unknown branch, or the first point has no solution on it.
     """
     times, points = np.asarray(time, dtype=float), np.asarray(tip, dtype=float)
-    if branch and branch not in BRANCHES:
-        raise PlanningError(f"branch '{branch}' is unknown: choose {' or '.join(BRANCHES)}")
+    check_branch(branch)
     found = solutions(limb, kinematics, points[0])
     if not found:
         middle = np.add(*angle_limits(limb)) / 2 + 0.1

@@ -33,9 +33,10 @@ from der_planner.model.bending import ArcKinematics
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import paths, shapes
 from der_planner.planning.errors import PlanningError
-from der_planner.planning.inverse import follow
+from der_planner.planning.inverse import angle_limits, check_branch, follow
 from der_planner.planning.loads.rest import Rest, rest_of
 from der_planner.planning.loads.sagged import sagged_tips
+from der_planner.planning.nearest import Deviation, line, nearest_path
 
 Array = NDArray[np.float64]
 
@@ -78,6 +79,7 @@ class Reference:
         spline: q̄(t), twice continuously differentiable; `sample` reads it.
         rest: (M,) bend angles of arcs where the vented limb rests [rad].
         start: where it begins, if not where the vented limb rests.
+        deviation: from the drawn path, of a motion that follows the nearest one.
     """
 
     time: Array
@@ -86,6 +88,7 @@ class Reference:
     spline: BSpline
     rest: Array
     start: Start | None = None
+    deviation: Deviation | None = None
 
     @property
     def duration(self) -> float:
@@ -134,6 +137,9 @@ class Motion:
         path: the tip path of shapes and paths.
         branch: of the arcs at the first point of a path, see `inverse.BRANCHES`; empty: least
             pressure.
+        nearest: follow the nearest path that the limb can follow instead of refusing one that
+            leaves its reach, see `nearest`.
+        limits: of the tip on a nearest path whose times mean nothing; None: its times count.
     """
 
     name: str
@@ -142,6 +148,8 @@ class Motion:
     cycles: int = 1
     path: paths.TipPath | None = None
     branch: str = ""
+    nearest: bool = False
+    limits: paths.PathLimits | None = None
 
     @classmethod
     def named(
@@ -193,11 +201,15 @@ class Motion:
         name: str = "path",
         branch: str = "",
         limits: paths.PathLimits | None = None,
+        nearest: bool = False,
     ) -> Motion:
         """Return a motion along a path of the tip.
 
         The limb first goes from rest to the first point and at the end back, over times of their
-        own.
+        own. With ``nearest``, a path that leaves the limb's reach is not refused: the limb follows
+        the nearest one that it can, a trembling line is smoothed, and times are stretched where
+        pressures cannot change as fast. `Reference.deviation` and the plan's warnings say how far
+        that is from what was drawn.
 
         Args:
             time: (P,) increasing instants [s]; None: the path gets its timing from the limits.
@@ -205,15 +217,25 @@ class Motion:
             name: for tables.
             branch: which way to reach the first point; empty: the one with the least pressure.
             limits: speed and acceleration for a path without times.
+            nearest: follow the nearest path that the limb can follow.
 
         Raises:
-            PlanningError: wrong shapes, not finite, not increasing, too few points.
+            PlanningError: wrong shapes, not finite, not increasing, too few points; unknown branch.
         """
-        return cls(name, path=paths.TipPath.build(time, tip, limits), branch=branch)
+        check_branch(branch)
+        if nearest and time is None:
+            drawn, limits = line(paths.checked_points(tip)), limits or paths.PathLimits()
+            return cls(name, path=drawn, branch=branch, nearest=True, limits=limits)
+        path = paths.TipPath.build(time, tip, limits)
+        return cls(name, path=path, branch=branch, nearest=nearest)
 
     @classmethod
     def from_csv(
-        cls, path: str | Path, branch: str = "", limits: paths.PathLimits | None = None
+        cls,
+        path: str | Path,
+        branch: str = "",
+        limits: paths.PathLimits | None = None,
+        nearest: bool = False,
     ) -> Motion:
         """Return a motion along a path in a CSV file: columns x, y [m] and, if timed, time [s].
 
@@ -221,7 +243,7 @@ class Motion:
             PlanningError: the file cannot be read; the message names line and column.
         """
         time, tip = paths.read_csv(path)
-        return cls.from_tip_path(time, tip, name=Path(path).stem, branch=branch, limits=limits)
+        return cls.from_tip_path(time, tip, Path(path).stem, branch, limits, nearest)
 
     def reference(self, limb: Limb, start: Start | None = None) -> Reference:
         """Return q̄(t) and r̄(t) for a limb.
@@ -235,6 +257,7 @@ class Motion:
             BucklingError: the vented limb does not stay where it rests.
             PlanningError: the path cannot be followed.
         """
+        deviation = None
         rest = rest_of(limb)
         if self.name in JOINT_MOTIONS and self.path is None:
             time, angles = self._joint_motion(limb.segment_count, rest)
@@ -242,7 +265,7 @@ class Motion:
                 zero = np.zeros_like(rest.bend_angles)
                 time, angles = _led_in(limb, (rest.bend_angles, zero, zero), time, angles)
         else:
-            time, angles = self._tip_motion(limb, rest)
+            time, angles, deviation = self._tip_motion(limb, rest)
         if start is not None:
             state = (start.bend_angles, start.rate, start.acceleration)
             time, angles = _led_in(limb, state, time, angles)
@@ -253,7 +276,7 @@ class Motion:
         tip = ArcKinematics(limb).tip(sampled) + rest.offset
         if limb.gravity[2]:
             tip = sagged_tips(limb, instants, sampled, rest.bend_angles)
-        return Reference(instants, tip, sampled, spline, rest.bend_angles, start)
+        return Reference(instants, tip, sampled, spline, rest.bend_angles, start, deviation)
 
     def _joint_motion(self, segments: int, rest: Rest) -> tuple[Array, Array]:
         total = self.cycles * self.period
@@ -276,13 +299,15 @@ class Motion:
         back = quintic(closing, *state, rest.bend_angles, zero, zero)
         return np.append(time, total + closing[1:]), np.concatenate([angles, back[1:]])
 
-    def _tip_motion(self, limb: Limb, rest: Rest) -> tuple[Array, Array]:
+    def _tip_motion(self, limb: Limb, rest: Rest) -> tuple[Array, Array, Deviation | None]:
         kinematics = ArcKinematics(limb)
         path = self.path
         if path is None:
             path = shapes.draw(
                 self.name, kinematics, self.amplitude, self.period, self.cycles, rest.sag
             )
+        if self.nearest:
+            return self._nearest_motion(limb, rest, path)
         time, tip = path.resample(_GRID * 2)
         angles = follow(limb, kinematics, time, tip - rest.offset, self.branch)
         if limb.gravity[2]:
@@ -290,25 +315,48 @@ class Motion:
             for _ in range(_SAG_ROUNDS):
                 short = kinematics.tip(angles) - sagged_tips(limb, time, angles, rest.bend_angles)
                 angles = follow(limb, kinematics, time, tip + short, self.branch)
-        inner = make_interp_spline(time, angles, k=5)
-        ends = [(inner(t), inner(t, 1), inner(t, 2)) for t in (time[0], time[-1])]
-        home, zero = rest.bend_angles, np.zeros(limb.segment_count)
-        lead = _travel_time(limb, ends[0], home)
-        tail = _travel_time(limb, ends[1], home)
-        approach = quintic(_fine_grid(lead), home, zero, zero, *ends[0])
-        back = quintic(_fine_grid(tail), *ends[1], home, zero, zero)
-        between = _fine_grid(_on_grid(time[-1] - time[0]))
-        middle = inner(np.minimum(time[0] + between, time[-1]))
-        return (
-            np.concatenate(
-                [
-                    _fine_grid(lead),
-                    lead + between[1:],
-                    lead + between[-1] + _fine_grid(tail)[1:],
-                ]
-            ),
-            np.concatenate([approach, middle[1:], back[1:]]),
-        )
+        return (*_with_ways(limb, time, angles, rest.bend_angles), None)
+
+    def _nearest_motion(
+        self, limb: Limb, rest: Rest, path: paths.TipPath
+    ) -> tuple[Array, Array, Deviation]:
+        kinematics = ArcKinematics(limb)
+        offset = rest.offset
+        found = nearest_path(limb, kinematics, path, offset, self.limits, self.branch)
+        if limb.gravity[2]:
+            # On average: the arcs' reach is longer than that of a limb which sags out of the plane.
+            time, angles = found.time, found.bend_angles
+            sagged = sagged_tips(limb, time, angles, rest.bend_angles)
+            offset = (sagged - kinematics.tip(angles)).mean(axis=0)
+            found = nearest_path(limb, kinematics, path, offset, self.limits, self.branch)
+        ways = _with_ways(limb, found.time, found.bend_angles, rest.bend_angles)
+        low, high = angle_limits(limb)
+        if np.any(ways[1] < low) or np.any(ways[1] > high):
+            # A way that begins or ends in full motion near a limit would swing beyond it.
+            found = nearest_path(
+                limb, kinematics, path, offset, self.limits, self.branch, rest=True
+            )
+            ways = _with_ways(limb, found.time, found.bend_angles, rest.bend_angles)
+        return (*ways, found.deviation)
+
+
+def _with_ways(limb: Limb, time: Array, angles: Array, home: Array) -> tuple[Array, Array]:
+    """Return times and angles with the ways from home to their first and from their last pose."""
+    inner = make_interp_spline(time, angles, k=5)
+    ends = [(inner(t), inner(t, 1), inner(t, 2)) for t in (time[0], time[-1])]
+    zero = np.zeros(limb.segment_count)
+    lead = _travel_time(limb, ends[0], home)
+    tail = _travel_time(limb, ends[1], home)
+    approach = quintic(_fine_grid(lead), home, zero, zero, *ends[0])
+    back = quintic(_fine_grid(tail), *ends[1], home, zero, zero)
+    between = _fine_grid(_on_grid(time[-1] - time[0]))
+    middle = inner(np.minimum(time[0] + between, time[-1]))
+    instants = [
+        _fine_grid(lead),
+        lead + between[1:],
+        lead + between[-1] + _fine_grid(tail)[1:],
+    ]
+    return np.concatenate(instants), np.concatenate([approach, middle[1:], back[1:]])
 
 
 def smooth_step(x: ArrayLike) -> Array:

@@ -85,6 +85,7 @@ def plan(
         report(0.3)
         solved = _followed(physics, spline, reference, method, report)
     bend = sample_spline(spline, reference.time)[0]
+    left = str(reference.deviation or "")
     report(1.0)
     return Plan(
         time=reference.time,
@@ -101,7 +102,9 @@ def plan(
         limb=physics.limb,
         kinematics=physics.kinematics,
         solve_time=clock.perf_counter() - begin,
-        warnings=tuple(solved.warnings + _calibration_warnings(physics.limb, bend)),
+        warnings=tuple(
+            [left] * bool(left) + solved.warnings + _calibration_warnings(physics.limb, bend)
+        ),
         details=solved.details,
     )
 

@@ -9,7 +9,13 @@ from scipy.interpolate import BSpline
 from der_planner.limb import Limb
 from der_planner.model.balance import Balance
 from der_planner.model.response import NODES, RodModel
-from der_planner.planning.inverse import check_reach, is_loaded, solve
+from der_planner.planning.inverse import (
+    NEAREST_TOLERANCE,
+    TOLERANCE,
+    check_reach,
+    is_loaded,
+    solve,
+)
 from der_planner.planning.loads.posed import REFERENCE_PRIOR, PosedMotion, posed_motion
 from der_planner.planning.motions import Reference, Start, resting_spline, sample_spline
 from der_planner.rod import RodState
@@ -57,7 +63,8 @@ class PlanningRod(RodModel):
             # One angle cannot follow two coordinates: the rod bends as the arc does.
             return resting_spline(time, guess, reference.start)
         angles, distances = solve(self.kinematics, tip, guess, REFERENCE_PRIOR)
-        check_reach(self.limb, self.kinematics, time, tip, angles, distances)
+        tolerance = TOLERANCE if reference.deviation is None else NEAREST_TOLERANCE
+        check_reach(self.limb, self.kinematics, time, tip, angles, distances, tolerance)
         return resting_spline(time, angles, reference.start)
 
     def begin(self, spline: BSpline, start: Start | None) -> RodState:
