@@ -293,6 +293,7 @@ class GraphTrial(GraphPlayer):
             "mounting": self._options.mounting,
             "payload": self._options.payload,
             "payload_at": self._options.payload_at or 0.0,
+            "feedback": self._trial.feedback,
         }
         if self._learned is not None:
             parameters["learned_plans"] = str(self._learned.parent)

@@ -37,6 +37,7 @@ class PlannerOptions:
     nearest_path: bool
     driver_timeout: float
     learned_plans: str
+    feedback: bool
 
 
 def read_parameters(node: Node) -> PlannerOptions:
@@ -102,5 +103,9 @@ def read_parameters(node: Node) -> PlannerOptions:
         learned_plans=str(
             read("learned_plans", "", "folder of learned plans: a command of the method 'learned' "
                  "names one of them in place of its motion")
+        ),
+        feedback=bool(
+            read("feedback", False, "correct plans of the rod while they are played, where a "
+                 "command does not ask for it")
         ),
     )  # fmt: skip

@@ -40,6 +40,7 @@ class Request:
     method: str
     start: int
     learned: Plan | None = None
+    feedback: bool = False
     cancelled: threading.Event = field(default_factory=threading.Event)
 
 
@@ -98,7 +99,8 @@ def from_command(message: MotionCommand, options: PlannerOptions, now: int) -> R
         branch=options.branch,
     )
     method = choose_method(model, message.method or options.method)
-    return Request(message.plan_id, limb, motion, model, method, start)
+    feedback = _corrected(message, model, options)
+    return Request(message.plan_id, limb, motion, model, method, start, feedback=feedback)
 
 
 def _from_learned(
@@ -107,7 +109,8 @@ def _from_learned(
     """Return the learned plan whose name stands in place of the motion's."""
     plan = learned_plan(options.learned_plans, message.motion, limb)
     motion = Motion(plan.motion, plan.amplitude, plan.period, plan.cycles)
-    return Request(message.plan_id, plan.limb, motion, plan.model, LEARNED, start, plan)
+    feedback = _corrected(message, plan.model, options)
+    return Request(message.plan_id, plan.limb, motion, plan.model, LEARNED, start, plan, feedback)
 
 
 def _asked_for(message: MotionCommand, options: PlannerOptions) -> Limb:
@@ -119,6 +122,15 @@ def _asked_for(message: MotionCommand, options: PlannerOptions) -> Limb:
     if message.payload == 0:
         carried = options.payload, options.payload_at
     return loaded(limb, *carried)
+
+
+def _corrected(message: MotionCommand, model: str, options: PlannerOptions) -> bool:
+    """Tell whether a plan of a model is to be corrected while it is played."""
+    if message.feedback and model != "der":
+        raise ValueError(
+            f"feedback corrects plans of the rod, not of the model {model}: ask for der"
+        )
+    return message.feedback or (options.feedback and model == "der")
 
 
 def from_path(message: PathMessage, plan_id: str, options: PlannerOptions, now: int) -> Request:
@@ -140,4 +152,5 @@ def from_path(message: PathMessage, plan_id: str, options: PlannerOptions, now: 
     start = start_of(nanoseconds(message.header.stamp), now)
     limb = loaded(options.limb, options.payload, options.payload_at)
     method = choose_method(options.model, options.method)
-    return Request(plan_id, limb, motion, options.model, method, start)
+    feedback = options.feedback and options.model == "der"
+    return Request(plan_id, limb, motion, options.model, method, start, feedback=feedback)
