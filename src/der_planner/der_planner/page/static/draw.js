@@ -85,7 +85,7 @@ page.sketch = (() => {
     get on() { return on; },
     get points() { return points; },
     get preview() { return preview; },
-    turn(wanted) { on = wanted; canvas()?.classList.toggle("on", on); if (!on) { points = []; preview = null; } },
+    turn(wanted) { on = wanted; canvas()?.classList.toggle("on", on); document.getElementById("draw-legend")?.toggleAttribute("hidden", !on); if (!on) { points = []; preview = null; } },
     clear() { points = []; preview = null; },
     show(found) { preview = found; begun = performance.now(); if (!points.length || pointer === null) points = found.drawn; },
   };
