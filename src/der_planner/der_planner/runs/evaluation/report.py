@@ -42,7 +42,8 @@ tip that the tracker measured in that image. E is the mean of |r − r̄| over t
 window, E<sub>x</sub> and E<sub>y</sub> are the means of |x − x̄| and |y − ȳ|. The table shows mean ±
 sample standard deviation of these over trials, and the largest |r − r̄| of any trial. Times come
 from stamps; nothing is shifted. The split fits r(t) ≈ g r̄(t − τ) + b: lag τ, gains g, bias b, and
-the RMS error that is left when lag, then bias, then gain are taken out.</p>
+the RMS error that is left when lag, then bias, then gain are taken out. Models are compared under
+the same loads; where a comparison says that methods differ, too, it is not one of models alone.</p>
 """
 
 
