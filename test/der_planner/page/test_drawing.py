@@ -48,8 +48,8 @@ def test_the_region_holds_what_the_tip_reaches_and_nothing_else() -> None:
 
 
 def test_pixels_become_metres_where_they_are_drawn() -> None:
-    tags = TagMap.from_yaml(str(TAG_MAP))
-    overlay = Overlay(tags)
+    tags, now = TagMap.from_yaml(str(TAG_MAP)), 0.0
+    overlay = Overlay(tags, clock=lambda: now)
     pixels = np.array([[500.0, 300.0], [700.0, 420.0]])
     assert overlay.on_plane(pixels) is None
     assert overlay.pixels_of(pixels) == []
@@ -69,6 +69,10 @@ def test_pixels_become_metres_where_they_are_drawn() -> None:
     back = project(camera, pose, np.column_stack([on_plane, np.full(2, height)]))
     np.testing.assert_allclose(back, pixels, atol=0.5)
     np.testing.assert_allclose(overlay.pixels_of(on_plane), pixels, atol=0.2)
+    overlay.put_estimate(on_plane)
+    np.testing.assert_allclose(overlay.at(1, None)["estimate"], pixels, atol=0.2)
+    now = 1.0
+    assert overlay.at(1, None)["estimate"] == []  # feedback has ended
 
 
 @pytest.mark.parametrize(

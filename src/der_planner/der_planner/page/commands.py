@@ -38,7 +38,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class MotionRequest:
-    """A named motion to play.
+    """A named motion to play, or a learned plan, whose name is the motion's and method `learned`.
 
     Attributes:
         motion: its name.
@@ -47,6 +47,7 @@ class MotionRequest:
         amplitude: [rad].
         period: [s] of one cycle.
         cycles: how many.
+        feedback: correct the setpoints while the limb moves.
     """
 
     motion: str
@@ -55,6 +56,7 @@ class MotionRequest:
     amplitude: float
     period: float
     cycles: int
+    feedback: bool
 
 
 class Commands(Protocol):

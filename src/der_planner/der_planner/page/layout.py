@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 
 from fastapi import FastAPI
 from nicegui import Client, ui
@@ -19,6 +20,7 @@ from der_planner.planning.motions import (
     DEFAULT_PERIOD,
     NAMES,
 )
+from der_planner.planning.plan_file import LEARNED
 
 RECONNECT = 3.0
 """[s] that a browser's connection may be away before it counts as lost."""
@@ -91,6 +93,10 @@ class Window:
             self._cycles = ui.number("Cycles", value=DEFAULT_CYCLES, min=1, max=100, precision=0)
             self._button("Play motion", "play", self._on_play, "primary")
         with ui.row().classes("line"):
+            self._learned = ui.input("Learned plan (name; empty: the motion)")
+            self._learned.props('id="learned"')
+            self._feedback = ui.switch("Feedback").props('id="feedback"')
+        with ui.row().classes("line"):
             self._note = ui.input("Note for the recording")
             self._button("Record", "record", self._on_record, "primary")
             self._button("End recording", "unrecord", lambda: self._call("record_stop"), "primary")
@@ -153,8 +159,11 @@ class Window:
         amplitude, period, cycles = values
         request = MotionRequest(
             str(self._motion.value), str(self._model.value), str(self._method.value),
-            math.radians(float(amplitude)), float(period), int(cycles),
+            math.radians(float(amplitude)), float(period), int(cycles), bool(self._feedback.value),
         )  # fmt: skip
+        learned = str(self._learned.value or "").strip()
+        if learned:
+            request = replace(request, motion=learned, method=LEARNED)
         self._tell("play", self._parts.commands.play(request))
 
     def _tell(self, what: str, answer: Answer) -> None:

@@ -29,7 +29,14 @@ from apriltag_tracker.camera import CameraError, Intrinsics
 from apriltag_tracker.camera.encodings import ImageError, to_grey
 from apriltag_tracker.detection.tag import Tag
 from apriltag_tracker.tag_map import TagMap
-from der_msgs.msg import LimbState, MotionCommand, PressurePlan, PressureState, TagDetectionArray
+from der_msgs.msg import (
+    LimbEstimate,
+    LimbState,
+    MotionCommand,
+    PressurePlan,
+    PressureState,
+    TagDetectionArray,
+)
 from der_planner.limb import Limb
 from der_planner.page.access import Binding, listen, read_password
 from der_planner.page.commands import OWNERS, Answer, MotionRequest, Service
@@ -158,6 +165,7 @@ class PageNode(Node):
         subscribe(MarkerArray, topics.SHAPE_MARKERS, self._on_markers, qos.STATES)
         subscribe(CameraInfo, topics.CAMERA_INFO, self._on_camera, qos.LATCHED)
         subscribe(CameraInfo, topics.CAMERA_INFO, self._on_camera, qos.IMAGES)
+        subscribe(LimbEstimate, topics.ESTIMATE, self._on_estimate, qos.STATES)
         subscribe(DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, qos.STATES)
 
     def _on_driver(self, message: PressureState) -> None:
@@ -198,6 +206,9 @@ class PageNode(Node):
 
     def _on_plan(self, message: PressurePlan) -> None:
         self._overlay.put_path(np.array(message.tip_reference).reshape(-1, 2))
+
+    def _on_estimate(self, message: LimbEstimate) -> None:
+        self._overlay.put_estimate(np.array([(point.x, point.y) for point in message.curve]))
 
     def _on_markers(self, message: MarkerArray) -> None:
         for marker in message.markers:
@@ -278,6 +289,7 @@ class PageNode(Node):
             MotionCommand(
                 motion=request.motion, model=request.model, method=request.method,
                 amplitude=request.amplitude, period=request.period, cycles=request.cycles,
+                feedback=request.feedback,
             )
         )  # fmt: skip
         return Answer(True, f"asked the planner for {request.motion} with {request.model}")

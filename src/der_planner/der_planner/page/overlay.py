@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,8 @@ from der_planner.page.situation import LimbView
 KEPT = 60
 """Views of the limb kept, so that each picture gets its own: 2 s at 30 Hz."""
 PATH_POINTS = 200
+LASTING = 0.5
+"""[s] that an estimate is shown after it came."""
 CURVE_POINTS = 40
 
 
@@ -27,9 +30,11 @@ class Overlay:
 
     Args:
         tags: the tag map that the tracker uses.
+        clock: steady [s].
     """
 
-    def __init__(self, tags: TagMap) -> None:
+    def __init__(self, tags: TagMap, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
         self._tags = tags
         self._height = max(tag.height for tag in tags.limb)
         self._lock = threading.Lock()
@@ -39,6 +44,7 @@ class Overlay:
         self._corners: deque[tuple[int, list[list[float]]]] = deque(maxlen=KEPT)
         self._path: NDArray[np.float64] = np.empty((0, 2))
         self._limb: NDArray[np.float64] = np.empty((0, 2))
+        self._estimate: tuple[float, NDArray[np.float64]] = (-np.inf, np.empty((0, 2)))
 
     def put_camera(self, intrinsics: Intrinsics) -> None:
         """Take the camera's calibration; the pose is found anew if it changed."""
@@ -73,6 +79,11 @@ class Overlay:
         with self._lock:
             self._limb = curve
 
+    def put_estimate(self, curve: NDArray[np.float64]) -> None:
+        """Take the centreline (N, 2) m that feedback estimates; shown for `LASTING` seconds."""
+        with self._lock:
+            self._estimate = (self._clock(), curve)
+
     def camera(self) -> tuple[bool, str]:
         """Tell whether a calibration has come, and why the camera's pose is not known, if so."""
         with self._lock:
@@ -105,8 +116,8 @@ class Overlay:
             reference: where the tip should be then [m].
 
         Returns:
-            `tags`: eight numbers each; `curve`, `path`, `planned`: lists of points; `tip` and
-            `reference`: points or None; `matched`: whether the view is of this very picture;
+            `tags`: eight numbers each; `curve`, `path`, `planned`, `estimate`: lists of points;
+            `tip` and `reference`: points or None; `matched`: whether the view is of this very picture;
             `problem`: why nothing can be placed, else empty.
         """
         with self._lock:
@@ -115,6 +126,7 @@ class Overlay:
             corners = next((c for s, c in reversed(self._corners) if s == stamp), newest)
             pose = self._world.pose if self._world is not None else None
             intrinsics, path, planned = self._intrinsics, self._path, self._limb
+            heard, estimate = self._estimate
             problem = "no calibration of the camera yet"
             if self._world is not None:
                 problem = self._world.problem
@@ -125,6 +137,7 @@ class Overlay:
             "curve": [],
             "path": [],
             "planned": [],
+            "estimate": [],
             "tip": None,
             "reference": None,
         }
@@ -136,6 +149,8 @@ class Overlay:
             answer["curve"] = place(curve[:: max(1, len(curve) // CURVE_POINTS)])
             answer["tip"] = place(np.array([view.tip]))[0]
         answer["path"], answer["planned"] = place(path), place(planned)
+        if self._clock() - heard <= LASTING:
+            answer["estimate"] = place(estimate)
         if reference is not None:
             answer["reference"] = place(np.array([reference]))[0]
         return answer

@@ -24,6 +24,7 @@
     line(context, over.path, "#30c060", 2.5);
     line(context, over.planned, "#9be8b4", 5);
     for (const tag of over.tags) line(context, [0, 2, 4, 6].map((i) => [tag[i], tag[i + 1]]), "#2e9bff", 2, true);
+    line(context, over.estimate || [], "#ff5fd0", 2);
     line(context, over.curve, "#ff7828", 3);
     trail = trail.filter((point) => now - point[2] < TRAIL);
     if (over.tip) trail.push([...over.tip, now]);
