@@ -117,8 +117,8 @@ class Overlay:
 
         Returns:
             `tags`: eight numbers each; `curve`, `path`, `planned`, `estimate`: lists of points;
-            `tip` and `reference`: points or None; `matched`: whether the view is of this very picture;
-            `problem`: why nothing can be placed, else empty.
+            `tip` and `reference`: points or None; `matched`: whether the view is of this very
+            picture; `problem`: why nothing can be placed, else empty.
         """
         with self._lock:
             view = _of(stamp, self._views)
