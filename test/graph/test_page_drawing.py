@@ -103,7 +103,7 @@ def test_a_drawing_is_previewed_played_and_kept(
     assert "leaves what the limb reaches" in said
     assert "kPa" in said
 
-    browser.find_element("css selector", "#drawing-name").send_keys("../hand")
+    browser.find_element("css selector", ".drawing-name input").send_keys("../hand")
     press("save-drawing")
     client.wait_for((tmp_path / "drawings" / "hand.csv").exists, 20.0, "the kept drawing")
     press("play-drawing")

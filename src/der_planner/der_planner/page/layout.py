@@ -94,7 +94,6 @@ class Window:
             self._button("Play motion", "play", self._on_play, "primary")
         with ui.row().classes("line"):
             self._learned = ui.input("Learned plan (name; empty: the motion)")
-            self._learned.props('id="learned"')
             self._feedback = ui.switch("Feedback").props('id="feedback"')
         with ui.row().classes("line"):
             self._note = ui.input("Note for the recording")

@@ -54,7 +54,7 @@ class Sketch:
         with ui.row().classes("line"):
             self._kept = ui.select(parts.studio.drawings.names(), label="Kept drawings")
             ui.button("Show", on_click=self._on_load).props('id="load-drawing" flat')
-            self._title = ui.input("Name of the drawing").props('id="drawing-name"')
+            self._title = ui.input("Name of the drawing").classes("drawing-name")
             ui.button("Keep", on_click=self._on_save).props('id="save-drawing" flat')
         self._result = ui.label().props('id="preview"')
         ui.on("drawn", self._on_drawn)
