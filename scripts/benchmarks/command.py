@@ -14,7 +14,16 @@ import platform
 import time
 from pathlib import Path
 
-PARTS = ("rod", "planning", "driver", "tracker", "recorder", "identification")
+PARTS = (
+    "rod",
+    "planning",
+    "driver",
+    "tracker",
+    "recorder",
+    "identification",
+    "studies",
+    "loads",
+)
 
 
 def machine() -> dict[str, str | int]:

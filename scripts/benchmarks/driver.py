@@ -47,6 +47,8 @@ Setpoints = dict[int, tuple[float, ...]]
 def _nodes(case: str, port: str, folder: Path) -> list[tuple[str, str, dict[str, object]]]:
     board = ("pressure_driver", "board_emulator", {"port_link": port})
     options: dict[str, object] = {"real_time_priority": 0} if case == "ordinary" else {}
+    if case in ("quiet", "alone"):
+        options["guardian"] = "always" if case == "quiet" else "never"
     driver = ("pressure_driver", "pressure_driver", {"port": port, **options})
     if case != "graph":
         return [board, driver]
@@ -154,6 +156,17 @@ def _percentiles(name: str, values: NDArray[np.float64]) -> dict[str, float | st
     }
 
 
+def _guardian_cost(figures: dict[str, float | str]) -> dict[str, float | str]:
+    """Return what the guardian adds from a setpoint's stamp to its first byte on the wire."""
+    found: dict[str, float | str] = {}
+    for share in ("p50", "p99"):
+        with_it, without = (
+            figures[f"{case}_stamp_to_first_byte_{share}_ms"] for case in ("quiet", "alone")
+        )
+        found[f"guardian_adds_to_first_byte_{share}_ms"] = float(with_it) - float(without)
+    return found
+
+
 def _measure(case: str, seconds: float) -> dict[str, float | str]:
     """Start the nodes of a case, play, and return its figures."""
     play: Callable[[GraphClient, float], Setpoints] = _plan if case == "graph" else _stream
@@ -200,7 +213,8 @@ def run(quick: bool) -> dict[str, float | str]:
     """Measure all cases; ``quick`` takes 10 s each instead of 60."""
     seconds = 10.0 if quick else 60.0
     titles = {
-        "quiet": "driver and board alone",
+        "quiet": "driver, guardian and board",
+        "alone": "the same without the guardian",
         "busy": "driver and board, every core busy with another process",
         "ordinary": "the same without real-time priority for the driver",
         "graph": "driver, board and planner, twin, camera, tracker, recorder",
@@ -209,6 +223,9 @@ def run(quick: bool) -> dict[str, float | str]:
     for case, title in titles.items():
         print(f"driver: {title}, {seconds:.0f} s …", file=sys.stderr, flush=True)
         found = _measure(case, seconds)
+        figures |= found
+        if case == "alone":
+            found |= _guardian_cost(figures)
         figures |= found
         print(f"\n{title}")
         for key, value in found.items():

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 COMMANDS = {
+    "action": "Various action related sub-commands",
     "interface": "Show information about ROS interfaces",
     "node": "Various node related sub-commands",
     "param": "Various param related sub-commands",

@@ -27,16 +27,16 @@ _ARRAYS = (list, tuple, array.array, np.ndarray)
 
 
 def interface(identifier: str, kind: str) -> Any:
-    """Return the class of a message or service.
+    """Return the class of a message, service or action.
 
     Args:
         identifier: ``std_msgs/msg/String``, or ``std_msgs/String``.
-        kind: ``msg`` or ``srv``.
+        kind: ``msg``, ``srv`` or ``action``.
 
     Raises:
         CommandError: there is no such type.
     """
-    what = "message" if kind == "msg" else "service"
+    what = {"msg": "message", "srv": "service"}.get(kind, kind)
     parts = identifier.split("/")
     if len(parts) == 2:
         parts.insert(1, kind)

@@ -18,7 +18,7 @@ setup(
         (f"share/{PACKAGE}", ["package.xml"]),
         (f"share/{PACKAGE}/config", config),
     ],
-    install_requires=["setuptools", "numpy", "pyserial"],
+    install_requires=["setuptools", "cobs", "numpy", "pyserial"],
     extras_require={"test": ["pytest"]},
     zip_safe=False,
     maintainer="DER planner maintainers",

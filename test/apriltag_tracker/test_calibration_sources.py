@@ -54,6 +54,25 @@ def test_a_bag_of_pictures(tmp_path: Path):
     assert np.abs(Intrinsics.from_yaml(out).matrix - TRUE.matrix).max() < 3.0
 
 
+@pytest.mark.parametrize(
+    ("out", "reason"),
+    [
+        (".", "is a folder: name a file"),
+        ("missing/camera.yaml", "is no folder"),
+        ("/proc/camera.yaml", "cannot be written"),
+    ],
+)
+def test_a_place_that_cannot_be_written_is_refused_before_pictures_are_taken(
+    tmp_path: Path, out: str, reason: str
+):
+    process = calibrate(tmp_path / out, "no_pictures_here")
+    said, complaint = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert reason in complaint
+    assert len(complaint.splitlines()) == 1
+    assert said == ""
+
+
 @pytest.mark.graph
 def test_a_running_camera(graph, tmp_path: Path):
     from sensor_msgs.msg import Image

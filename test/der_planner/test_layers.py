@@ -15,6 +15,7 @@ LAYERS = {
     "pcc": 3,
     "model": 4,
     "planning": 5,
+    "control": 6,
     "identification": 6,
 }
 """Parts with a place in the order; an import must go to a lower one, or stay inside its part."""

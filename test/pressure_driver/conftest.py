@@ -8,7 +8,7 @@ import pytest
 from pressure_driver.core import CoreSettings, DriverCore
 from pressure_driver.emulator.board import EmulatedBoard
 from pressure_driver.emulator.faults import Faults
-from pressure_driver.emulator.pneumatics import Pneumatics
+from pressure_driver.emulator.pneumatics import BoardPneumatics
 from pressure_driver.protocols import board_protocol, host_protocol
 from pressure_driver.safety import Mode
 from pressure_driver.schedule import Setpoint, Verdict
@@ -31,7 +31,7 @@ class Simulation:
         self.clock_error = 0
         self.settings = replace(CoreSettings(), **settings)
         self.core = DriverCore(host_protocol(protocol), self.settings, steady=lambda: self.steady)
-        self.board = EmulatedBoard(board_protocol(protocol), Pneumatics(2, seed), seed)
+        self.board = EmulatedBoard(board_protocol(protocol), BoardPneumatics(2, seed), seed)
         self.plugged = True
         self.sent = []
         self.received = []

@@ -81,3 +81,16 @@ def test_the_vectors_of_the_board_are_understood():
     assert not refused.fatal
     assert host.rejected == 0
     assert len(NativeBoard(4).decode(wire["HELLO"] + wire["SETPOINT"] + wire["VENT"])) == 3
+
+
+def test_every_rule_of_the_safety_table_names_tests_that_exist():
+    table = README.split("| what fails |")[1].split("\n\n")[0].splitlines()[2:]
+    assert len(table) >= 30
+    for row in table:
+        named = row.rstrip("| ").split("| ")[-1].strip().strip("`")
+        for group in named.split("; "):
+            module, _, names = group.partition(": ")
+            source = (Path(__file__).parent / f"test_{module}.py").read_text()
+            for name in names.split(", "):
+                assert name, row
+                assert f"def test_{name}" in source, f"{name} in the row: {row}"

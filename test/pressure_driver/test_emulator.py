@@ -9,7 +9,7 @@ import pytest
 
 from pressure_driver.emulator.board import EmulatedBoard
 from pressure_driver.emulator.faults import FaultError, Faults
-from pressure_driver.emulator.pneumatics import Pneumatics
+from pressure_driver.emulator.pneumatics import BoardPneumatics
 from pressure_driver.emulator.port import EmulatedPort
 from pressure_driver.protocols import board_protocol, host_protocol
 
@@ -23,7 +23,7 @@ def trace(air, command, seconds, dt=0.01):
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_filling_is_a_ramp_and_lifts_the_neighbour_for_a_second(seed):
-    air = Pneumatics(2, seed)
+    air = BoardPneumatics(2, seed)
     gauge = trace(air, [7000.0, 0.0, 0.0, 0.0], 5.0)
     rate = np.diff(gauge[:, 0]) / 0.01
     middle = (gauge[1:, 0] > 700.0) & (gauge[1:, 0] < 5000.0)
@@ -37,7 +37,7 @@ def test_filling_is_a_ramp_and_lifts_the_neighbour_for_a_second(seed):
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_venting_takes_its_time_and_ends(seed):
-    air = Pneumatics(2, seed)
+    air = BoardPneumatics(2, seed)
     trace(air, [0.0, 0.0, 7000.0, 0.0], 4.0)
     gauge = trace(air, [0.0] * 4, 8.0)[:, 2] / 7000.0
     duration = 0.01 * (np.argmax(gauge < 0.1) - np.argmax(gauge < 0.9))
@@ -61,16 +61,16 @@ def test_the_real_limb_fills_and_vents_like_that(shared_data):
 
 
 def test_seeds_repeat_and_differ():
-    runs = [trace(Pneumatics(2, seed), [9000.0, 0.0, 0.0, 5000.0], 1.0) for seed in (3, 3, 4)]
+    runs = [trace(BoardPneumatics(2, seed), [9000.0, 0.0, 0.0, 5000.0], 1.0) for seed in (3, 3, 4)]
     assert np.array_equal(runs[0], runs[1])
     assert np.abs(runs[0] - runs[2]).max() > 50.0
-    assert Pneumatics(2, 3).atmosphere != Pneumatics(2, 4).atmosphere
+    assert BoardPneumatics(2, 3).atmosphere != BoardPneumatics(2, 4).atmosphere
 
 
 def test_the_step_size_does_not_matter():
     ends = []
     for count in (1, 20, 150):
-        air = Pneumatics(2, 1)
+        air = BoardPneumatics(2, 1)
         air.command(air.atmosphere + np.array([9000.0, 0.0, 0.0, 4000.0]))
         for _ in range(count):
             air.step(0.6 / count)
@@ -80,7 +80,7 @@ def test_the_step_size_does_not_matter():
 
 
 def test_pressures_stay_between_atmosphere_and_supply():
-    air = Pneumatics(2, 2)
+    air = BoardPneumatics(2, 2)
     generator = np.random.default_rng(15)
     for _ in range(60):
         air.command(air.atmosphere + generator.uniform(-1e4, 1e5, 4))
@@ -92,18 +92,18 @@ def test_pressures_stay_between_atmosphere_and_supply():
 @pytest.mark.parametrize("bad", [[1e5] * 3, [1e5, 1e5, 1e5, float("nan")]])
 def test_bad_commands_are_errors(bad):
     with pytest.raises(ValueError, match="pressures"):
-        Pneumatics(2).command(bad)
+        BoardPneumatics(2).command(bad)
     with pytest.raises(ValueError, match="duration"):
-        Pneumatics(2).step(-1.0)
+        BoardPneumatics(2).step(-1.0)
     with pytest.raises(ValueError, match="segment_count"):
-        Pneumatics(0)
+        BoardPneumatics(0)
 
 
 # ------------------------------------------------------------------------------------ board
 
 
 def test_a_command_is_stamped_with_its_first_byte():
-    board = EmulatedBoard(board_protocol("ezloop"), Pneumatics(2), 0)
+    board = EmulatedBoard(board_protocol("ezloop"), BoardPneumatics(2), 0)
     first, second = b"<1013.00,1014.00,1015.00,1016.00>\n", b"<1013.00,1013.00,1013.00,1013.00>\n"
     pieces = [(b"junk" + first[:3], 100), (first[3:20], 200), (first[20:] + second[:1], 300)]
     received = [c for data, stamp in pieces for c in board.receive(data, stamp)[0]]
@@ -114,7 +114,7 @@ def test_a_command_is_stamped_with_its_first_byte():
 
 @pytest.mark.parametrize("protocol", ["ezloop", "ctrlp", "native"])
 def test_the_board_reaches_what_it_is_told(protocol):
-    board = EmulatedBoard(board_protocol(protocol), Pneumatics(2, 5), 5)
+    board = EmulatedBoard(board_protocol(protocol), BoardPneumatics(2, 5), 5)
     host = host_protocol(protocol)
     board.receive(host.start(), 0)
     data, _ = host.setpoint([8000.0, -3000.0], board.atmosphere, 9.0)
@@ -147,7 +147,7 @@ def test_fault_texts():
 
 
 def test_dropped_and_corrupted_bytes_come_in_the_stated_share():
-    board = EmulatedBoard(board_protocol("ezloop"), Pneumatics(2), 0)
+    board = EmulatedBoard(board_protocol("ezloop"), BoardPneumatics(2), 0)
     board.set_faults(Faults.parse(["drop:0.3"], 4))
     data = host_protocol("ezloop").vent(101_325.0)[0]
     got = sum(len(board.receive(data, 0)[0]) for _ in range(2000))

@@ -12,7 +12,7 @@ import pytest
 
 from pressure_driver.emulator.board import EmulatedBoard
 from pressure_driver.emulator.faults import Faults
-from pressure_driver.emulator.pneumatics import Pneumatics
+from pressure_driver.emulator.pneumatics import BoardPneumatics
 from pressure_driver.emulator.port import EmulatedPort
 from pressure_driver.emulator.runner import BoardRunner
 from pressure_driver.protocols import board_protocol
@@ -28,7 +28,7 @@ from pressure_driver.core import CoreSettings, DriverCore
 from pressure_driver.grid import TickGrid
 from pressure_driver.guardian_client import GuardianClient
 from pressure_driver.link import SerialLink
-from pressure_driver.monitor import MonitorLimits
+from pressure_driver.watch.limits import MonitorLimits
 from pressure_driver.protocols import host_protocol
 from pressure_driver.schedule import ScheduleLimits, Setpoint
 
@@ -89,7 +89,7 @@ class Run:
         self.protocol, self.folder = protocol, folder
         self.commands = []
         self.port = EmulatedPort(str(folder / "board"), 115_200)
-        self.board = EmulatedBoard(board_protocol(protocol), Pneumatics(2, 1), 1)
+        self.board = EmulatedBoard(board_protocol(protocol), BoardPneumatics(2, 1), 1)
         self.runner = BoardRunner(self.board, self.port, on_command=self.commands.append)
         self.runner.start()
         self.driver = None

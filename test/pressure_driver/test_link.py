@@ -14,17 +14,17 @@ from pressure_driver import link, ports
 from pressure_driver.core import CoreSettings, DriverCore
 from pressure_driver.emulator.board import EmulatedBoard
 from pressure_driver.emulator.faults import Faults
-from pressure_driver.emulator.pneumatics import Pneumatics
+from pressure_driver.emulator.pneumatics import BoardPneumatics
 from pressure_driver.emulator.port import EmulatedPort
 from pressure_driver.emulator.runner import BoardRunner
 from pressure_driver.grid import TickGrid
 from pressure_driver.link import SerialLink
-from pressure_driver.monitor import MonitorLimits
 from pressure_driver.ports import PortError, open_port
 from pressure_driver.protocols import board_protocol, host_protocol
 from pressure_driver.realtime import prefer_thread
 from pressure_driver.safety import Mode
 from pressure_driver.schedule import Setpoint, Verdict
+from pressure_driver.watch.limits import MonitorLimits
 
 PERIOD = 50_000_000
 
@@ -42,7 +42,7 @@ class Rig:
     def __init__(self, folder, protocol="ezloop"):
         self.commands = []
         self.port = EmulatedPort(str(folder / "board"), 115_200)
-        self.board = EmulatedBoard(board_protocol(protocol), Pneumatics(2, 1), 1)
+        self.board = EmulatedBoard(board_protocol(protocol), BoardPneumatics(2, 1), 1)
         self.runner = BoardRunner(self.board, self.port, on_command=self.commands.append)
         self.runner.start()
         settings = CoreSettings(monitor=MonitorLimits(rest_time=0.15))

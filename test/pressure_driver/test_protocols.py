@@ -260,12 +260,12 @@ def reference_telemetry(name, stream):
         if name == "ezloop":
             match = re.fullmatch(rb"\[MPR\]:\s*(" + NUMBER + rb"(?:\s+" + NUMBER + rb"){3})", line)
             values = [float(v) for v in match[1].split()] if match else []
-            ok = True  # whether a room or a chamber can have that is for the driver to judge
         else:
             match = re.fullmatch(rb"[0-9]{1,10}\t1((?:\t-?[0-9]{1,4}(?:\.[0-9]{1,6})?){4})", line)
             values = [float(v) for v in match[1].split()] if match else []
-            ok = all(abs(v) <= 500.0 for v in values)
-        if values and ok and len(raw) <= 512:
+            if not all(abs(v) <= 500.0 for v in values):
+                continue
+        if values and len(raw) <= 512:
             found.append(values)
     return found
 

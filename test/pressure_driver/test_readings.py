@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from pressure_driver.core import LogAllowance
-from pressure_driver.monitor import MonitorLimits
 from pressure_driver.protocols import NAMES
 from pressure_driver.safety import MOST_FAULTS, Mode
+from pressure_driver.watch.limits import MonitorLimits
 
 # ---------------------------------------------------------------------------------- supply
 

@@ -1,18 +1,17 @@
 """Every refusal and every fault, in simulated time."""
 
-from collections import deque
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from pressure_driver.core import CoreSettings, DriverCore
-from pressure_driver.monitor import MonitorLimits
+from pressure_driver.core import CoreSettings
 from pressure_driver.protocols import NAMES
-from pressure_driver.protocols.base import BoardReport, Echo
+from pressure_driver.protocols.base import BoardReport
 from pressure_driver.safety import Mode
 from pressure_driver.schedule import ScheduleLimits, Verdict
+from pressure_driver.watch.board import BoardWatch
+from pressure_driver.watch.limits import MonitorLimits
 
 # --------------------------------------------------------------------------------- refusals
 
@@ -177,9 +176,9 @@ def test_a_board_with_other_chambers_or_less_range_cannot_be_armed(simulate):
     success, text = sim.core.arm()
     assert not success
     assert "reaches 20000 Pa" in text
-    sim.core._check_identity(replace(sim.core.identity, chamber_count=6, largest_pressure=3e4))
-    sim.tick()
-    assert "6 chambers" in sim.core.arm()[1]
+    other = BoardWatch(sim.core.protocol, 24_000.0, 500.0)
+    other.check_identity(replace(sim.core.identity, chamber_count=6, largest_pressure=3e4))
+    assert "6 chambers" in other.obstacle(sim.steady)
 
 
 def test_a_slow_native_board_is_asked_again(simulate):
@@ -286,11 +285,3 @@ def test_the_monitor_bounds_are_those_of_the_settings(simulate):
     begin = sim.steady
     push(sim, 6.0)
     assert sim.steady - begin > quick + 1.0
-
-
-def test_a_late_status_of_an_older_command_leaves_the_newest_waiting():
-    waiting = SimpleNamespace(_awaiting_echo=deque([(8, 1.00)]), _round_trip=float("nan"))
-    DriverCore._take_echo(waiting, Echo(7), 1.01)
-    assert np.isnan(waiting._round_trip)
-    DriverCore._take_echo(waiting, Echo(8), 1.02)
-    assert waiting._round_trip == pytest.approx(0.02)

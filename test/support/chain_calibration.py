@@ -46,9 +46,10 @@ def calibrated(
 
 def prior(gravity: Gravity = (0.0, 0.0, 0.0), masses: tuple[Mass, ...] = ()) -> Limb:
     """Return what is known of a chain before it is calibrated: the default limb, its loads."""
-    if masses:
-        raise ValueError("limbs do not carry masses yet")
-    return replace(Limb.default(), gravity=gravity)
+    limb = replace(Limb.default(), gravity=gravity)
+    for at, mass in masses:
+        limb = limb.carrying(mass, at)
+    return limb
 
 
 def write_csv(log: CalibrationLog, table: Path, columns: Path) -> None:

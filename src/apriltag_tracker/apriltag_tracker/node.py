@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 from ament_index_python.packages import get_package_share_directory
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Pose2D
+from geometry_msgs.msg import Point
 from numpy.typing import NDArray
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
-from visualization_msgs.msg import Marker, MarkerArray
+from visualization_msgs.msg import MarkerArray
 
 from apriltag_tracker.camera import CameraError, Intrinsics
 from apriltag_tracker.camera.encodings import ImageReader
@@ -24,23 +24,24 @@ from apriltag_tracker.camera.sources import Grabbed, SourceError, open_source
 from apriltag_tracker.detection import MOST_CORRECTED_BITS, Detector
 from apriltag_tracker.detection.tracking import TrackingOptions
 from apriltag_tracker.image_watch import NO_CALIBRATION, ImageWatch
+from apriltag_tracker.node_messages import limb_markers, tag_message
 from apriltag_tracker.overlay import draw_observation
 from apriltag_tracker.pipeline import (
     LimbObservation,
     LimbTracker,
-    PlacedTag,
     TrackerOptions,
     Uncertainty,
     warm_up,
 )
 from apriltag_tracker.tag_map import TagMap
-from der_msgs.msg import LimbState, TagDetection, TagDetectionArray
+from der_msgs.msg import LimbState, TagDetectionArray
 from limb_interfaces import qos, stamps, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.gaps import StampGaps
 from limb_interfaces.overrides import check_overrides
 from limb_interfaces.parameters import declare
 from limb_interfaces.runner import run_node
+from limb_interfaces.transforms import TransformPublisher, camera_transform, limb_transforms
 
 ANNOTATED_IMAGE = "camera/image_annotated"
 _MARKER_PERIOD = 0.1
@@ -80,34 +81,14 @@ class TrackerNode(Node):
         cv2.setNumThreads(threads)
         self._map = TagMap.from_yaml(str(tag_map))
         self._options = self._declare_options()
-        self._detector = Detector(
-            float(
-                declare(
-                    self,
-                    "smallest_tag",
-                    14.0,
-                    "shortest side of a tag in px",
-                    at_least=8.0,
-                    at_most=500.0,
-                )
-            ),
-            int(
-                declare(
-                    self,
-                    "correct_bits",
-                    1,
-                    "wrong bits of a code that are forgiven in a search",
-                    at_least=0,
-                    at_most=MOST_CORRECTED_BITS,
-                )
-            ),
-        )
+        self._detector = self._make_detector()
         check_overrides(self)
         self._warm_up()
         self._gaps = StampGaps()
         self._tracker: LimbTracker | None = None
         self._reader = ImageReader()
         self._last_stamp = -1
+        self._frame = ""
         self._level = ""
         self._last_markers = 0.0
         self._image_topic = self.resolve_topic_name(topics.IMAGE)
@@ -194,6 +175,30 @@ class TrackerNode(Node):
             ),
         )
 
+    def _make_detector(self) -> Detector:
+        return Detector(
+            float(
+                declare(
+                    self,
+                    "smallest_tag",
+                    14.0,
+                    "shortest side of a tag in px",
+                    at_least=8.0,
+                    at_most=500.0,
+                )
+            ),
+            int(
+                declare(
+                    self,
+                    "correct_bits",
+                    1,
+                    "wrong bits of a code that are forgiven in a search",
+                    at_least=0,
+                    at_most=MOST_CORRECTED_BITS,
+                )
+            ),
+        )
+
     def _warm_up(self) -> None:
         """Compile or load every kernel and check OpenCV's conventions before the first image."""
         warm_up(self._detector)
@@ -203,6 +208,7 @@ class TrackerNode(Node):
         self._states = self.create_publisher(LimbState, topics.LIMB_STATE, qos.STATES)
         self._markers = self.create_publisher(MarkerArray, topics.SHAPE_MARKERS, qos.STATES)
         self._annotated = self.create_publisher(Image, ANNOTATED_IMAGE, qos.SENSOR_DATA)
+        self._transforms = TransformPublisher(self)
 
     def _subscribe(self, needs_info: bool) -> None:
         # A best-effort subscriber hears best-effort and reliable publishers alike.
@@ -239,6 +245,7 @@ class TrackerNode(Node):
         self._tracker = LimbTracker(self._map, intrinsics, self._options, self._detector)
 
     def _on_image(self, message: Image) -> None:
+        self._frame = message.header.frame_id
         try:
             gray = self._reader.to_grey(
                 message.data,
@@ -297,11 +304,12 @@ class TrackerNode(Node):
         state = self._state(observation, stamp)
         self._states.publish(state)
         array_message = TagDetectionArray(
-            detections=[_tag_message(placed) for placed in observation.tags]
+            detections=[tag_message(placed) for placed in observation.tags]
         )
         array_message.header.stamp = stamp
         array_message.header.frame_id = topics.BASE_FRAME
         self._tags.publish(array_message)
+        self._publish_transforms(observation, stamp)
         now = time.monotonic()
         if (
             now - self._last_markers >= _MARKER_PERIOD
@@ -309,7 +317,7 @@ class TrackerNode(Node):
             and observation.estimate is not None
         ):
             self._last_markers = now
-            self._markers.publish(_markers(state))
+            self._markers.publish(limb_markers(state))
         if self._annotated.get_subscription_count() > 0 and self._tracker is not None:
             picture = draw_observation(gray, observation, self._tracker)
             message = Image(
@@ -322,6 +330,18 @@ class TrackerNode(Node):
             message.header.stamp = stamp
             self._annotated.publish(message)
         return float(state.latency)
+
+    def _publish_transforms(self, observation: LimbObservation, stamp: Time) -> None:
+        """Tell RViz where clamp, tip and camera are, where tf2 is installed."""
+        if not self._transforms.active or self._tracker is None:
+            return
+        found = []
+        if observation.estimate is not None:
+            found += limb_transforms(observation.estimate.curve, stamp)
+        pose = self._tracker.world.pose
+        if pose is not None:
+            found.append(camera_transform(pose.rotation, pose.translation, stamp, self._frame))
+        self._transforms.publish(found)
 
     def _state(self, observation: LimbObservation, stamp: Time) -> LimbState:
         message = LimbState(reason=observation.reason)
@@ -363,37 +383,6 @@ class TrackerNode(Node):
         return Health(
             report.level, report.message, {**report.values, "images_missed": self._gaps.missed}
         )
-
-
-def _tag_message(placed: PlacedTag) -> TagDetection:
-    tag = placed.tag
-    message = TagDetection(
-        id=tag.id,
-        corners=tag.corners.ravel(),
-        on_limb=placed.on_limb,
-        pose_valid=placed.pose is not None,
-        pixel_size=tag.pixel_size,
-        line_residual=tag.line_residual,
-    )
-    if placed.pose is not None:
-        x, y, yaw = placed.pose.tolist()
-        message.pose = Pose2D(x=x, y=y, theta=yaw)
-    return message
-
-
-def _markers(state: LimbState) -> MarkerArray:
-    """Draw the measured limb and its tip for RViz and Foxglove."""
-    line = Marker(ns="measured", id=0, type=Marker.LINE_STRIP, points=list(state.curve))
-    tip = Marker(ns="measured", id=1, type=Marker.SPHERE)
-    for marker in (line, tip):
-        marker.header = state.header
-        marker.color.g = marker.color.b = 0.7
-        marker.color.a = 1.0
-        marker.pose.orientation.w = 1.0
-    line.scale.x = 0.004
-    tip.pose.position = state.tip
-    tip.scale.x = tip.scale.y = tip.scale.z = 0.01
-    return MarkerArray(markers=[line, tip])
 
 
 def main() -> int:

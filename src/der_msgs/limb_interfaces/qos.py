@@ -37,6 +37,11 @@ STATES = QoSProfile(
 )
 """Measured and published states, tags and references."""
 
+TRANSFORMS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE
+)
+"""Of `/tf`, as tf2_ros has it."""
+
 LATCHED = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
     depth=1,

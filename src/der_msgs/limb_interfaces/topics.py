@@ -20,5 +20,6 @@ TWIN_CHAMBER_PRESSURES = "twin/chamber_pressures"
 TWIN_BOARD_COMMANDS = "twin/board_commands"
 TWIN_SHAPE = "twin/shape"
 TWIN_GROUND_TRUTH = "twin/ground_truth"
+TWIN_PUSH = "twin/push"
 
 BASE_FRAME = "limb_base"

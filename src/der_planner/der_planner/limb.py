@@ -29,7 +29,7 @@ from der_planner.limb_declaration import (
     parameters,
     refuse_unknown,
 )
-from der_planner.limb_loads import GRAVITY, MOUNTINGS, PointMass, gravity_of
+from der_planner.limb_loads import GRAVITY, MOUNTINGS, PointMass, gravity_of, mounting_of
 from der_planner.limb_parameters import CalibratedRange, Pneumatics, Segment
 
 __all__ = [
@@ -42,11 +42,16 @@ __all__ = [
     "PointMass",
     "Segment",
     "gravity_of",
+    "mounting_of",
 ]
 
 SCHEMA_VERSION = 1
 VENT_REFERENCE = 10e3
 """Gauge pressure [Pa] for which `Pneumatics.vent_rate` is given."""
+PAYLOAD = "payload"
+"""Name of the mass that only one run carries."""
+BEYOND_THE_TIP = 5e-3
+"""A payload so little beyond the tip [m] is on it."""
 DEFAULT_LIMB_FILE = Path(__file__).resolve().parent / "data" / "default_limb.yaml"
 
 
@@ -147,12 +152,13 @@ class Limb:
             return self
         return dataclasses.replace(self, segments=self.pcc_segments, pcc_segments=())
 
-    def carrying(self, payload: float, at: float | None = None, name: str = "payload") -> Limb:
+    def carrying(self, payload: float, at: float | None = None, name: str = PAYLOAD) -> Limb:
         """Return the limb with one more mass.
 
         Args:
             payload: [kg]; with 0 the limb is returned as it is.
-            at: arc length from the clamp [m]; None: the tip.
+            at: arc length from the clamp [m]; None: the tip. Up to 5 mm beyond the tip is the tip,
+                since a calibrated length differs from the measured one.
             name: of the mass.
 
         Raises:
@@ -160,8 +166,20 @@ class Limb:
         """
         if payload == 0:
             return self
-        mass = PointMass(self.length if at is None else float(at), float(payload), name)
+        place = self.length if at is None else float(at)
+        if 0 < place - self.length <= BEYOND_THE_TIP:
+            place = self.length
+        mass = PointMass(place, float(payload), name)
         return dataclasses.replace(self, masses=(*self.masses, mass))
+
+    @property
+    def payload(self) -> tuple[float, float]:
+        """What only this run carries: its mass [kg], and where along the limb [m]; 0 is the tip."""
+        for item in self.masses:
+            if item.name == PAYLOAD:
+                at_tip = item.arc_length >= self.length * (1 - 1e-9)
+                return item.mass, 0.0 if at_tip else item.arc_length
+        return 0.0, 0.0
 
     def mounted(self, mounting: str) -> Limb:
         """Return the limb with the gravity of a mounting, see `gravity_of`."""

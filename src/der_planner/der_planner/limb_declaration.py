@@ -32,7 +32,6 @@ class Term:
         spread: standard deviation of what is known before any data; infinite for nothing.
         group: the model term that it belongs to; `linear` is always fitted.
         shared: one value for all segments.
-        step: of a difference quotient, for what has no exact derivative.
         per: powers of other parameters: unknown = parameter · Π other^power. They are declared
             before this parameter.
         relative: the unknown is ln(parameter / prior's), and `per` is not used.
@@ -49,7 +48,6 @@ class Term:
     spread: float
     group: str
     shared: bool = False
-    step: float = 0.0
     per: Mapping[str, int] = field(default_factory=dict)
     relative: bool = False
     start: float = 0.0

@@ -16,12 +16,14 @@ plane is given its gravity itself: `gravity: [0, 0, -9.81]` in the limb file.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from der_planner.limb_declaration import LimbError, parameter
 
 GRAVITY = 9.81
 """Of the earth [m/s²]."""
+_SAME_GRAVITY = 1e-6
 MOUNTINGS = {
     "horizontal": (0.0, 0.0, 0.0),
     "hanging": (GRAVITY, 0.0, 0.0),
@@ -56,6 +58,17 @@ class PointMass:
         )
     )
     name: str = "mass"
+
+
+def mounting_of(gravity: Sequence[float]) -> str:
+    """Return the name of a mounting by its gravity (3,) [m/s²]; its degrees, or gravity itself."""
+    x, y, z = (float(value) for value in gravity)
+    for name, named in MOUNTINGS.items():
+        if math.dist((x, y, z), named) < _SAME_GRAVITY:
+            return name
+    if abs(x) < _SAME_GRAVITY and abs(z) < _SAME_GRAVITY and abs(y) <= GRAVITY:
+        return f"{math.degrees(math.asin(-y / GRAVITY)):.4g}°"
+    return f"gravity ({x:.3g}, {y:.3g}, {z:.3g}) m/s²"
 
 
 def gravity_of(mounting: str) -> tuple[float, float, float]:

@@ -36,7 +36,6 @@ class Segment:
             above=0.0,
             fit=Term(
                 *("log_stiffness", "-", 0.2, -1.2, 1.2, 0.3, "dynamics"),
-                step=0.02,
                 relative=True,
                 kept=True,
             ),
@@ -59,7 +58,13 @@ class Segment:
         )
     )
     mass_per_length: float = field(
-        metadata=parameter("kg/m", "mass per length", "weigh it, divide by its length", above=0.0)
+        metadata=parameter(
+            "kg/m",
+            "mass per length",
+            "weigh it, divide by its length",
+            above=0.0,
+            fit=Term(*("log_mass", "-", 0.1, -1.2, 1.2, 0.3, "mass"), relative=True, kept=True),
+        )
     )
     damping: float = field(
         metadata=parameter(
@@ -70,7 +75,6 @@ class Segment:
             fit=Term(
                 *("log_damping", "-", 0.5, -3.0, 3.0, 0.5, "dynamics"),
                 shared=True,
-                step=0.1,
                 relative=True,
                 kept=True,
             ),
@@ -118,9 +122,7 @@ class Segment:
             "Kelvin-Voigt time τ in moment = EI (κ + τ κ̇)",
             "0.01 takes away ringing that a real limb does not show; calibration with fast motion",
             least=0.0,
-            fit=Term(
-                *("material_damping", "s", 0.01, 0.0, 0.1, 0.02, "dynamics"), step=2e-3, kept=True
-            ),
+            fit=Term(*("material_damping", "s", 0.01, 0.0, 0.1, 0.02, "dynamics"), kept=True),
         ),
     )
     gain_asymmetry: float = field(

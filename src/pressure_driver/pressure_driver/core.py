@@ -8,12 +8,10 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from pressure_driver.admission import Origin
-from pressure_driver.monitor import MonitorLimits, TelemetryMonitor, chamber_gauge
 from pressure_driver.protocols.base import (
     BoardIdentity,
     BoardReport,
@@ -26,16 +24,17 @@ from pressure_driver.protocols.base import (
 )
 from pressure_driver.safety import LIVE, Mode, SafetyLimits, SafetyMachine
 from pressure_driver.schedule import Counters, ScheduleLimits, Setpoint, SetpointSchedule, Verdict
+from pressure_driver.watch.board import BoardWatch
+from pressure_driver.watch.following import chamber_gauge
+from pressure_driver.watch.limits import MonitorLimits
+from pressure_driver.watch.monitor import TelemetryMonitor
+from pressure_driver.watch.probe import SteadyProbe
 
 STANDARD_ATMOSPHERE = 101_325.0
 """[Pa] on the wire until the room's has been measured; only vent commands are sent before."""
 
 LARGEST_CLOCK_STEP = 0.3
 """[s] between two ticks, above slewing and late wakes, that means the wall clock was set."""
-IDENTITY_RETRY = 1.0
-"""[s] after which a board that has not introduced or set itself up is greeted again."""
-ECHO_TIMEOUT = 1.0
-"""[s] without an echo of any command, on boards that echo: the board takes no commands."""
 
 
 class LogAllowance:
@@ -120,27 +119,26 @@ class DriverCore:
         self.protocol = protocol
         protocol.assumed_atmosphere = settings.atmosphere or STANDARD_ATMOSPHERE
         self.settings = settings
-        self.identity: BoardIdentity | None = None
         self._steady = steady
         self._notify = notify
         self._log = log
         self._lock = threading.RLock()
+        pressure_limit = settings.schedule.pressure_limit
         self._schedule = SetpointSchedule(settings.schedule, settings.period, settings.interpolate)
         self._monitor = TelemetryMonitor(
             protocol.chamber_count, settings.monitor, settings.atmosphere, protocol.reports_supply
         )
-        self._machine = SafetyMachine(self._schedule, self._monitor, settings.safety)
+        # A board that echoes its commands needs no other sign that it hears.
+        probe = None if protocol.echoes else SteadyProbe(settings.monitor, pressure_limit)
+        self._machine = SafetyMachine(self._schedule, self._monitor, settings.safety, probe)
+        self._board = BoardWatch(protocol, pressure_limit, settings.monitor.vented_tolerance)
         self._last_tick = 0
         self._last_mode = Mode.DISARMED
-        self._awaiting_echo: deque[tuple[int | None, float]] = deque(maxlen=64)
-        self._round_trip = float("nan")
         self._pending_number: int | None = None
         self._board_log = LogAllowance()
         self._limited_noted = 0
         self._was_limited = False
-        self._asked_at = 0.0
-        self._identity_problem = ""
-        self._echo_awaited_since: float | None = None
+        self._start_noted = False
         self.venting = True
         """Whether the bytes of the last tick were the vent command."""
         self._clock_offset = 0.0
@@ -185,6 +183,11 @@ class DriverCore:
         return self._monitor.atmosphere
 
     @property
+    def identity(self) -> BoardIdentity | None:
+        """How the board has introduced itself; None before, and where the protocol has no such."""
+        return self._board.identity
+
+    @property
     def last_refusal(self) -> str:
         """Why the last setpoint that was not accepted was not."""
         return self._schedule.reason
@@ -227,7 +230,7 @@ class DriverCore:
                 valve_opening=tuple(monitor.valve_opening.tolist()),
                 supply_pressure=monitor.supply_pressure,
                 telemetry_age=monitor.telemetry_age(self._steady()),
-                round_trip=self._round_trip,
+                round_trip=self._board.round_trip,
                 counters=Counters(**vars(self._schedule.counters)),
             )
 
@@ -238,10 +241,8 @@ class DriverCore:
         with self._lock:
             self.protocol.reset()
             self._monitor.forget()
-            self._awaiting_echo.clear()
-            self._echo_awaited_since = None
             self._machine.link_fault = ""
-            self._forget_identity()
+            self._board.opened(self._steady())
             self._watch_board(self._steady())
             return self.protocol.start() + self._vent_bytes()
 
@@ -256,7 +257,7 @@ class DriverCore:
             self.venting = action.dump or bool(self.protocol.unsettled)
             if self.venting:
                 self._machine.command_nothing()
-                return self._ask_identity(now) + self._vent_bytes()
+                return self._board.greeting(now) + self._vent_bytes()
             data, self._pending_number = self.protocol.setpoint(
                 action.differential, self._wire_atmosphere(), self.settings.command_validity
             )
@@ -277,11 +278,10 @@ class DriverCore:
         with self._lock:
             now = self._steady()
             self._monitor.command(self._machine.differential, now)
-            self._awaiting_echo.append((self._pending_number, now))
-            if self._echo_awaited_since is None:
-                self._echo_awaited_since = now
+            self._board.has_sent(self._pending_number, now)
             self._note_mode()
             self._note_limit()
+            self._note_start()
         self._notify()
 
     def received(self, data: bytes) -> None:
@@ -328,57 +328,17 @@ class DriverCore:
         """Find out whether the board is set up, reports, and takes commands."""
         if self._monitor.telemetry_faults(now):
             self.protocol.doubt()
-        since = self._echo_awaited_since
-        stalled = self.protocol.echoes and since is not None and now - since > ECHO_TIMEOUT
-        silence = f"the board has not answered a command for {ECHO_TIMEOUT:g} s" if stalled else ""
-        if silence and self._machine.mode in LIVE:
+        if (silence := self._board.silence(now)) and self._machine.mode in LIVE:
             self._machine.fail(silence)
-        problems = (self._identity_problem, self.protocol.unsettled, silence)
-        self._machine.board_obstacle = next(filter(None, problems), "")
+        self._machine.board_obstacle = self._board.obstacle(now)
 
     def _take_reset(self, reset: BoardReset, now: float) -> None:
         """Set the board up anew; what was being played must not be played on."""
         self._log(f"the board has been reset: {reset.sign}", True)
+        self._board.has_reset(self._monitor.chamber_pressure, now)
         self._monitor.forget()
-        self._forget_identity()
-        self._asked_at = now - IDENTITY_RETRY
         if self._machine.mode in LIVE:
             self._machine.fail(f"the board has been reset: {reset.sign}")
-
-    def _forget_identity(self) -> None:
-        self.identity = None
-        self._asked_at = self._steady()
-        if self.protocol.introduces_itself:
-            self._identity_problem = "the board has not introduced itself yet"
-
-    def _ask_identity(self, now: float) -> bytes:
-        """Return the greeting again while it has not been answered; a board may boot slowly."""
-        if not (self.protocol.unsettled or self._identity_missing()):
-            return b""
-        if now - self._asked_at < IDENTITY_RETRY:
-            return b""
-        self._asked_at = now
-        return self.protocol.start()
-
-    def _identity_missing(self) -> bool:
-        return self.protocol.introduces_itself and self.identity is None
-
-    def _check_identity(self, identity: BoardIdentity) -> None:
-        """Refuse to arm a board that is not the one which the parameters describe."""
-        self.identity = identity
-        limit = self.settings.schedule.pressure_limit
-        problem = ""
-        if identity.chamber_count != self.protocol.chamber_count:
-            problem = (
-                f"the board has {identity.chamber_count} chambers, the driver expects "
-                f"{self.protocol.chamber_count}: set the parameter 'segment_count'"
-            )
-        elif identity.largest_pressure < limit:
-            problem = (
-                f"the board reaches {identity.largest_pressure:.0f} Pa, less than 'pressure_limit' "
-                f"({limit:.0f} Pa): lower the parameter"
-            )
-        self._identity_problem = problem
 
     def _wire_atmosphere(self) -> float:
         return self._monitor.atmosphere if self._monitor.rest_known() else STANDARD_ATMOSPHERE
@@ -392,8 +352,11 @@ class DriverCore:
             # Rest pressures are measured only where nothing has been asked of the chambers.
             resting = self._machine.mode in (Mode.DISARMED, Mode.FAULT)
             self._monitor.receive(event, now, resting)
+            if event.chamber_pressure is not None:
+                self._board.reports(self._monitor.chamber_pressure)
+                self._machine.hear(now)
         elif isinstance(event, Echo):
-            self._take_echo(event, now)
+            self._board.take_echo(event, now)
         elif isinstance(event, BoardReport):
             self._log_board(event.text, True, now)
             if event.fatal:
@@ -401,9 +364,10 @@ class DriverCore:
         elif isinstance(event, BoardReset):
             self._take_reset(event, now)
         elif isinstance(event, BoardIdentity):
-            self._check_identity(event)
+            self._board.check_identity(event)
         elif isinstance(event, BoardText):
             self.last_text = event.text
+            self._board.says_words()
             self._log_board(event.text, False, now)
 
     def _log_board(self, text: str, warning: bool, now: float) -> None:
@@ -413,23 +377,6 @@ class DriverCore:
         elif self._board_log.withheld == 1:
             self._log("the board sends text faster than it is logged: the rest is counted", True)
 
-    def _take_echo(self, echo: Echo, now: float) -> None:
-        """Measure the round trip; an echo without a number is that of the newest command."""
-        if echo.sequence is None and self._awaiting_echo:
-            self._round_trip = now - self._awaiting_echo[-1][1]
-            self._awaiting_echo.clear()
-            self._echo_awaited_since = None
-        # A status that left the board before the newest command came echoes an older one: the
-        # newest goes on waiting for its own.
-        if echo.sequence not in [number for number, _ in self._awaiting_echo]:
-            return
-        while self._awaiting_echo:
-            number, sent = self._awaiting_echo.popleft()
-            if number == echo.sequence:
-                self._round_trip = now - sent
-                self._echo_awaited_since = now if self._awaiting_echo else None
-                return
-
     def _note_limit(self) -> None:
         """Say when the slew limit begins to hold the output back."""
         limited = self._machine.limited_ticks
@@ -437,6 +384,13 @@ class DriverCore:
             self._log("the slew limit holds the output back: it follows the setpoints late", True)
         self._was_limited = limited > self._limited_noted
         self._limited_noted = limited
+
+    def _note_start(self) -> None:
+        """Warn once of a board that has started with pressure in its chambers."""
+        warning = self._board.started_under_pressure(self._monitor.rest_pressure)
+        if warning and not self._start_noted:
+            self._log(warning, True)
+        self._start_noted = bool(warning)
 
     def _note_mode(self) -> None:
         mode = self._machine.mode

@@ -8,7 +8,11 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Protocol
+
+import serial
 
 from pressure_driver import guardian
 
@@ -23,6 +27,9 @@ EXECUTOR_TIMEOUT = 1.0
 stop: a node that serves nothing any more cannot be told to vent. Longer than any pause by load."""
 END_TIMEOUT = 1.0
 """[s] for the guardian to end after a goodbye."""
+
+GUARDIAN_STARTS = 3
+"""Guardians that may fail in one run of the driver before the driver gives up."""
 
 
 class GuardianError(RuntimeError):
@@ -178,3 +185,86 @@ class GuardianClient:
         if self._channel is not None:
             self._channel.close()
         self._process = self._channel = None
+
+
+class GuardedClient(Protocol):
+    """What is asked for the vent command, and told of guardians that fail."""
+
+    def emergency(self) -> bytes:
+        """Return the vent command for the guardian to keep, complete after any half-sent bytes."""
+
+    def failed(self, reason: str) -> None:
+        """Something beside the port has failed without which the limb must not be driven."""
+
+
+class GuardianKeeper:
+    """Has one guardian hold the port as long as it is open, if there is to be one.
+
+    Args:
+        guardian: None for boards that vent by themselves; every call then does nothing.
+        client: knows the vent command.
+        log: takes a sentence for the log.
+    """
+
+    def __init__(
+        self, guardian: GuardianClient | None, client: GuardedClient, log: Callable[[str], None]
+    ) -> None:
+        self._guardian = guardian
+        self._client = client
+        self._log = log
+        self._failures = 0
+
+    def arm(self, device: serial.Serial | None) -> None:
+        """Hand the open port to the guardian, starting one if there is none.
+
+        Raises:
+            GuardianError: it cannot be started.
+        """
+        if self._guardian is None or device is None:
+            return
+        vent, port = self._client.emergency(), device.fileno()
+        if self._guardian.running:
+            self._guardian.hand_over(vent, port)
+        else:
+            self._guardian.start(vent, port)
+
+    def port_lost(self) -> None:
+        """Have the guardian let go of the port."""
+        if self._guardian is not None:
+            self._guardian.port_lost()
+
+    def show_life(self, vented: bool, device: serial.Serial | None) -> None:
+        """Tell the guardian that the thread lives; replace a guardian that does not live itself.
+
+        Args:
+            vented: the last command on the wire was to vent.
+            device: the port, for another guardian; None while it is lost.
+
+        Raises:
+            GuardianError: several guardians have failed, or another one cannot be started.
+        """
+        if self._guardian is None or not self._guardian.running:
+            return
+        try:
+            self._guardian.beat(vented)
+            if self._guardian.wants_vent():
+                self._guardian.renew(self._client.emergency())
+        except GuardianError as error:
+            self._failures += 1
+            self._client.failed(f"{error}: nothing would vent the limb if the driver died")
+            self._log(f"{error}; another one is started")
+            if self._failures >= GUARDIAN_STARTS:
+                raise
+            self._guardian.discard()
+            self.arm(device)
+
+    def calm(self) -> None:
+        """Show a sign of life at the end, when a guardian that has failed is not replaced."""
+        if self._guardian is not None and self._guardian.running:
+            with contextlib.suppress(GuardianError):
+                self._guardian.beat(vented=False)
+
+    def end(self) -> None:
+        """Say goodbye to the guardian."""
+        if self._guardian is not None:
+            self._guardian.end()

@@ -21,7 +21,7 @@ from typing import Protocol
 import serial
 
 from pressure_driver.grid import NANOSECONDS, TickGrid
-from pressure_driver.guardian_client import GuardianClient, GuardianError
+from pressure_driver.guardian_client import GuardianClient, GuardianError, GuardianKeeper
 from pressure_driver.ports import (
     PortError,
     open_port,
@@ -43,8 +43,6 @@ VENT_REPEATS = 3
 """How often the vent command is sent at the end: there may be no checksum, and no second chance."""
 LAST_WORDS_TIME = 0.5
 """[s] that the operating system may take to send them."""
-GUARDIAN_STARTS = 3
-"""Guardians that may fail in one run of the driver before the driver gives up."""
 
 
 class LinkClient(Protocol):
@@ -125,8 +123,7 @@ class SerialLink:
         self.vented_at_end = False
         """Whether the vent commands at the end have left this computer."""
         self._client = client
-        self._guardian = guardian
-        self._guardian_failures = 0
+        self._keeper = GuardianKeeper(guardian, client, log)
         self._priority = real_time_priority
         self._log = log
         self._device: serial.Serial | None = None
@@ -154,7 +151,7 @@ class SerialLink:
         """
         self._device = open_port_when_free(self.port, self.baud_rate)
         try:
-            self._arm_guardian()
+            self._keeper.arm(self._device)
         except GuardianError:
             release_port(self._device)
             raise
@@ -218,7 +215,7 @@ class SerialLink:
                 self._write(self._client.separator + self._client.farewell())
         if self._bytes_waiting is not None and self._bytes_waiting.fileno() in readable:
             self._read()
-        self._show_life()
+        self._keeper.show_life(self._was_venting, self._device)
 
     def _send_tick(self, instant: int) -> None:
         """Write the tick's command; the first vent command overtakes what waits to be sent."""
@@ -229,7 +226,9 @@ class SerialLink:
             data = self._client.separator + data
         if self._was_venting and not venting:
             self._was_venting = False
-            self._show_life()  # the guardian becomes strict before the first pressure
+            self._keeper.show_life(
+                self._was_venting, self._device
+            )  # the guardian becomes strict before the first pressure
         self._was_venting = venting
         self._watch_queue()
         self._write(data)
@@ -312,8 +311,7 @@ class SerialLink:
         if self._device is not None:
             release_port(self._device)
         self._device = None
-        if self._guardian is not None:
-            self._guardian.port_lost()
+        self._keeper.port_lost()
         self._unsent = b""
         self.connected = False
         self._name_exists = os.path.exists(self.port)
@@ -337,43 +335,10 @@ class SerialLink:
             self._device = open_port(self.port, self.baud_rate)
         except PortError:
             return
-        self._arm_guardian()
+        self._keeper.arm(self._device)
         self.reconnects += 1
         self._log(f"{self.port} is back")
         self._opened()
-
-    # --------------------------------------------------------------------------- the guardian
-
-    def _arm_guardian(self) -> None:
-        """Hand the open port to the guardian, starting one if there is none."""
-        if self._guardian is None or self._device is None:
-            return
-        vent, port = self._client.emergency(), self._device.fileno()
-        if self._guardian.running:
-            self._guardian.hand_over(vent, port)
-        else:
-            self._guardian.start(vent, port)
-
-    def _show_life(self) -> None:
-        """Tell the guardian that the thread lives; replace a guardian that does not live itself.
-
-        Raises:
-            GuardianError: several guardians have failed, or another one cannot be started.
-        """
-        if self._guardian is None or not self._guardian.running:
-            return
-        try:
-            self._guardian.beat(self._was_venting)
-            if self._guardian.wants_vent():
-                self._guardian.renew(self._client.emergency())
-        except GuardianError as error:
-            self._guardian_failures += 1
-            self._client.failed(f"{error}: nothing would vent the limb if the driver died")
-            self._log(f"{error}; another one is started")
-            if self._guardian_failures >= GUARDIAN_STARTS:
-                raise
-            self._guardian.discard()
-            self._arm_guardian()
 
     # ------------------------------------------------------------------------------- the end
 
@@ -390,8 +355,7 @@ class SerialLink:
             self._bytes_waiting.close()
         self._device = self._bytes_waiting = None
         self.connected = False
-        if self._guardian is not None:
-            self._guardian.end()
+        self._keeper.end()
 
     def _send_last_words(self, device: serial.Serial) -> bool:
         """Return whether the vent commands have left the operating system in time."""
@@ -401,7 +365,7 @@ class SerialLink:
         while farewell or device.out_waiting:
             if time.monotonic() > deadline:
                 return False
-            self._keep_guardian_calm()
+            self._keeper.calm()
             with contextlib.suppress(BlockingIOError):
                 count = os.write(device.fileno(), farewell)
                 self.bytes_sent += count
@@ -410,12 +374,6 @@ class SerialLink:
         # The last bytes may still be in the port's hardware buffer.
         deadline = time.monotonic() + 64 * 10 / self.baud_rate
         while time.monotonic() < deadline:
-            self._keep_guardian_calm()
+            self._keeper.calm()
             time.sleep(0.002)
         return True
-
-    def _keep_guardian_calm(self) -> None:
-        """Show a sign of life at the end, when a guardian that has failed is not replaced."""
-        if self._guardian is not None and self._guardian.running:
-            with contextlib.suppress(GuardianError):
-                self._guardian.beat(vented=False)

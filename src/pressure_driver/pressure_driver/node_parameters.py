@@ -9,10 +9,10 @@ from limb_interfaces.overrides import check_overrides
 from limb_interfaces.parameters import ParameterError, declare
 from pressure_driver.core import CoreSettings
 from pressure_driver.grid import NANOSECONDS
-from pressure_driver.monitor import MonitorLimits
 from pressure_driver.protocols import NAMES
 from pressure_driver.safety import SafetyLimits
 from pressure_driver.schedule import ScheduleLimits
+from pressure_driver.watch.limits import MonitorLimits
 
 if TYPE_CHECKING:
     from rclpy.node import Node
@@ -49,20 +49,6 @@ def read_parameters(node: Node) -> DriverOptions:
     )
     protocol = declare(node, "protocol", "ezloop", "language of the board", choices=NAMES)
     baud_rate = number("baud_rate", 0, "[baud] 0: what the protocol says", 0, 4_000_000)
-    rate = number("rate", 20.0, "[Hz] ticks, on an absolute grid", 1.0, 100.0)
-    interpolation = declare(
-        node, "interpolation", "hold", "between setpoints", choices=("hold", "linear")
-    )
-    atmosphere = number(
-        "atmosphere", 0.0, "[Pa] absolute pressure of the room; 0: measure it at rest", 0.0, 1.1e5
-    )
-    validity = number(
-        "command_validity",
-        0.25,
-        "[s] a command holds on a board that has a watchdog",
-        0.06,
-        10.0,
-    )
     priority = number("real_time_priority", 10, "SCHED_FIFO priority, 0: none", 0, 90)
     cmd_u_t = declare(
         node,
@@ -77,6 +63,29 @@ def read_parameters(node: Node) -> DriverOptions:
         "a process that vents if the driver dies or hangs; auto: for boards without a watchdog",
         choices=("auto", "always", "never"),
     )
+    core = _core_settings(node, number)
+    # A misspelt limit must not leave the default in force.
+    check_overrides(node, refuse=True)
+    return DriverOptions(
+        str(port), str(protocol), int(baud_rate), int(priority), bool(cmd_u_t), str(guardian), core
+    )
+
+
+def _core_settings(node: Node, number: Any) -> CoreSettings:
+    rate = number("rate", 20.0, "[Hz] ticks, on an absolute grid", 1.0, 100.0)
+    interpolation = declare(
+        node, "interpolation", "hold", "between setpoints", choices=("hold", "linear")
+    )
+    atmosphere = number(
+        "atmosphere", 0.0, "[Pa] absolute pressure of the room; 0: measure it at rest", 0.0, 1.1e5
+    )
+    validity = number(
+        "command_validity",
+        0.25,
+        "[s] a command holds on a board that has a watchdog",
+        0.06,
+        10.0,
+    )
     core = CoreSettings(
         schedule=_schedule_limits(number),
         monitor=_monitor_limits(node, number),
@@ -87,11 +96,7 @@ def read_parameters(node: Node) -> DriverOptions:
         command_validity=float(validity),
     )
     _check_together(core)
-    # A misspelt limit must not leave the default in force.
-    check_overrides(node, refuse=True)
-    return DriverOptions(
-        str(port), str(protocol), int(baud_rate), int(priority), bool(cmd_u_t), str(guardian), core
-    )
+    return core
 
 
 def _schedule_limits(number: Any) -> ScheduleLimits:
@@ -133,22 +138,8 @@ def _monitor_limits(node: Node, number: Any) -> MonitorLimits:
                 "arm only with a fresh reading of the supply, where the protocol tells it",
             )
         ),
-        follow_tolerance=number(
-            "follow_tolerance",
-            default.follow_tolerance,
-            "[Pa] beyond the normal response of a chamber",
-            100.0,
-            100_000.0,
-        ),
-        follow_time=number(
-            "follow_time", default.follow_time, "[s] a chamber may be outside of it", 0.1, 60.0
-        ),
-        slowest_fill=number(
-            "slowest_fill", default.slowest_fill, "[Pa/s] of a working valve", 100.0, 1e6
-        ),
-        slowest_vent=number(
-            "slowest_vent", default.slowest_vent, "[s] time constant of a working valve", 0.05, 60.0
-        ),
+        **_following_limits(number, default),
+        **_slow_limits(number, default),
         vented_tolerance=number(
             "vented_tolerance",
             default.vented_tolerance,
@@ -157,6 +148,72 @@ def _monitor_limits(node: Node, number: Any) -> MonitorLimits:
             5_000.0,
         ),
     )
+
+
+def _following_limits(number: Any, default: MonitorLimits) -> dict[str, Any]:
+    """Return the bounds of chambers that follow in seconds."""
+    return {
+        "follow_tolerance": number(
+            "follow_tolerance",
+            default.follow_tolerance,
+            "[Pa] beyond the normal response of a chamber",
+            100.0,
+            100_000.0,
+        ),
+        "follow_time": number(
+            "follow_time", default.follow_time, "[s] a chamber may be outside of it", 0.1, 60.0
+        ),
+        "slowest_fill": number(
+            "slowest_fill", default.slowest_fill, "[Pa/s] of a working valve", 100.0, 1e6
+        ),
+        "slowest_vent": number(
+            "slowest_vent", default.slowest_vent, "[s] time constant of a working valve", 0.05, 60.0
+        ),
+    }
+
+
+def _slow_limits(number: Any, default: MonitorLimits) -> dict[str, Any]:
+    """Return the bounds of slow leaks, and of boards that no longer hear."""
+    return {
+        "leak_time": number(
+            "leak_time",
+            default.leak_time,
+            "[s] over which slow leaks are looked for; longer than a fill of a chamber",
+            2.0,
+            600.0,
+        ),
+        "leak_tolerance": number(
+            "leak_tolerance",
+            default.leak_tolerance,
+            "[Pa] a chamber may lie below its command in the mean of leak_time; choose some times "
+            "what a sound limb shows at steady pressure",
+            50.0,
+            100_000.0,
+        ),
+        "leak_opening": number(
+            "leak_opening",
+            default.leak_opening,
+            "mean opening of an inlet at steady pressure that is no leak; choose twice what "
+            "valve_opening shows there, 1: do not look",
+            0.0,
+            1.0,
+        ),
+        "probe_pressure": number(
+            "probe_pressure",
+            default.probe_pressure,
+            "[Pa] by which a steady command is changed for a moment to see whether a board without "
+            "echo hears; choose more than the dead band of its valves, 0: never",
+            0.0,
+            2_000.0,
+        ),
+        "probe_interval": number(
+            "probe_interval",
+            default.probe_interval,
+            "[s] a command is steady before it is changed for a moment",
+            5.0,
+            3600.0,
+        ),
+    }
 
 
 def _safety_limits(number: Any) -> SafetyLimits:

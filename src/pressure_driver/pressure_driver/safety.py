@@ -21,8 +21,9 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 from pressure_driver.admission import Origin, SourceGate, SpentPlans
-from pressure_driver.monitor import TelemetryMonitor
 from pressure_driver.schedule import NANOSECONDS, Sample, Setpoint, SetpointSchedule, Verdict
+from pressure_driver.watch.monitor import TelemetryMonitor
+from pressure_driver.watch.probe import SteadyProbe
 
 
 class Mode(IntEnum):
@@ -72,14 +73,20 @@ class SafetyMachine:
         schedule: of timed setpoints.
         monitor: of the board's telemetry.
         limits: of the state machine.
+        probe: changes steady commands of boards that do not echo; None for others.
     """
 
     def __init__(
-        self, schedule: SetpointSchedule, monitor: TelemetryMonitor, limits: SafetyLimits
+        self,
+        schedule: SetpointSchedule,
+        monitor: TelemetryMonitor,
+        limits: SafetyLimits,
+        probe: SteadyProbe | None = None,
     ) -> None:
         self.schedule = schedule
         self.monitor = monitor
         self.limits = limits
+        self._probe = probe
         self.mode = Mode.DISARMED
         self.faults: list[str] = []
         """Why the mode is FAULT, worst first."""
@@ -119,6 +126,8 @@ class SafetyMachine:
         self._latched = False
         self.schedule.clear()
         self.monitor.reset_following(now)
+        if self._probe is not None:
+            self._probe.restart()
         self.command_nothing()
         self._enter(Mode.ARMED)
         return True, "armed"
@@ -178,6 +187,12 @@ class SafetyMachine:
         self._spent.hear(plan, now)
         return schedule.offer(setpoint, wall, self.differential)
 
+    def hear(self, now: float) -> None:
+        """Note that the monitor has new chamber pressures (steady clock [s])."""
+        if self._probe is not None:
+            gauge = self.monitor.gauge
+            self._probe.receive(gauge[0::2] - gauge[1::2], now)
+
     def fail(self, reason: str) -> None:
         """Go to FAULT for a reason from outside (the line, the board's own report)."""
         self._fault([reason])
@@ -222,7 +237,7 @@ class SafetyMachine:
             self._fresh_at = now
             self._enter(Mode.TRACKING)
         if self.mode is Mode.TRACKING:
-            self._approach_target()
+            self._approach_target(now)
         silence = now - self._fresh_at
         if self.mode is Mode.TRACKING and silence > self.limits.setpoint_timeout:
             self._enter(Mode.HOLDING)
@@ -233,18 +248,19 @@ class SafetyMachine:
         if self.mode is Mode.VENTING:
             self._ramp_down()
 
-    def _approach_target(self) -> None:
+    def _approach_target(self, now: float) -> None:
         """Move what is commanded to what is wanted, by no more than the slew limit allows a tick.
 
         The step is taken from what was commanded last, whatever brought it there.
         """
+        target = self._target if self._probe is None else self._probe.change(self._target, now)
         step = self.schedule.limits.slew_limit * self.schedule.period / NANOSECONDS
         step *= 1.0 + 1e-9  # a plan at the limit is not beyond it for the sake of rounding
         moved = tuple(
             min(max(wanted, last - step), last + step)
-            for wanted, last in zip(self._target, self.differential, strict=True)
+            for wanted, last in zip(target, self.differential, strict=True)
         )
-        if moved != self._target:
+        if moved != target:
             self.limited_ticks += 1
         self.differential = moved
 
@@ -283,6 +299,8 @@ class SafetyMachine:
             silent = [self.link_fault] if self.link_fault else monitor.telemetry_faults(now)
             found += silent + monitor.supply_faults(now) + monitor.reading_faults(now)
             found += monitor.below_rest_faults(now)
+            if self._probe is not None and self._probe.fault:
+                found.append(self._probe.fault)
         elif self.mode is Mode.FAULT:
             if self.link_fault:
                 found.append(self.link_fault)

@@ -80,7 +80,7 @@ class BagOfRun:
         # A message arrives some time after its stamp; the evaluation must go by the stamp.
         self.bag.write(topic, self.stamp(seconds + 0.03), self.stamp(seconds + 0.02), data)
 
-    def plan(self, plan_id="p", model="der", stamp=0.0) -> None:
+    def plan(self, plan_id="p", model="der", stamp=0.0, gravity=(0.0, 0.0, 0.0)) -> None:
         zeros = np.zeros(2 * len(TIMES))
         self.write(
             "/limb/plan",
@@ -95,6 +95,9 @@ class BagOfRun:
             period=PERIOD,
             cycles=CYCLES,
             limb="test limb",
+            gravity=np.array(gravity),
+            payload=0.02 if any(gravity) else 0.0,
+            payload_at=0.244 if any(gravity) else 0.0,
             segment_count=2,
             time=TIMES,
             differential_pressure=zeros,

@@ -231,3 +231,16 @@ def test_a_calibration_takes_one_limb_of_a_bag(tmp_path: Path):
     instants = log.time + TIMES[0]
     assert np.nanmax(np.abs(log.tip - reference(instants) - [0.0, 0.008])) < 1e-3
     assert np.allclose(log.measured_differential, [200.0, 300.0])
+
+
+def test_loads_of_a_bag_are_those_of_its_plan(tmp_path: Path):
+    bag = BagOfRun(tmp_path / "hung")
+    bag.plan(gravity=(9.81, 0.0, 0.0))
+    for when in FRAMES:
+        bag.state(when, reference(when)[0])
+    bag.bag.close()
+    result = evaluate_bag(tmp_path / "hung")
+    written = result.to_dict()
+    assert (written["mounting"], written["gravity_m_s2"]) == ("hanging", [9.81, 0.0, 0.0])
+    assert (written["payload_kg"], written["payload_at_m"]) == (0.02, 0.244)
+    assert "hanging, 20 g at 24.4 cm" in format_table(summarise([result]))

@@ -107,6 +107,19 @@ def test_other_motions_are_not_mixed():
     assert len(summarise([*DER, *other])) == 2
 
 
+def test_other_loads_are_not_mixed():
+    hung = [dataclasses.replace(run, mounting="hanging", payload_kg=0.02) for run in [*DER, *PCC]]
+    level, loaded = compare([*DER, *PCC, *hung])
+    assert (level.loads, loaded.loads) == ("", "hanging, 20 g")
+    rows = summarise([*DER, *PCC, *hung])
+    assert len(rows) == 4
+    text = format_table(rows, [level, loaded])
+    assert "same_direction (hanging, 20 g): der" in text
+    assert "loads" not in format_table(summarise(DER))
+    for table in (markdown_table(rows), csv_table(rows), latex_table(rows)):
+        assert "hanging, 20 g" in table
+
+
 def test_results_file(tmp_path):
     path = write_results([*DER, *PCC], tmp_path)
     document = json.loads(path.read_text())

@@ -7,6 +7,7 @@ import pytest
 from der_planner.experiment.experiment import run
 from der_planner.experiment.ledger import Ledger
 from der_planner.experiment.options import OptionError, parse
+from der_planner.limb import Limb, PointMass
 from der_planner.planning.motions import NAMES
 
 
@@ -19,6 +20,9 @@ from der_planner.planning.motions import NAMES
         (["--trials", "0"], "--trials"),
         (["--period", "0.1"], "--period"),
         (["--hardware", "/nowhere/rig.yaml"], "/nowhere/rig.yaml"),
+        (["--mounting", "upside"], "--mounting: mounting 'upside' is unknown"),
+        (["--payload", "-0.1"], "--payload"),
+        (["--payload-at", "0.2"], "give --payload, too"),
     ],
 )
 def test_a_bad_option_is_refused_by_its_name(arguments, named):
@@ -62,6 +66,26 @@ def test_a_stopped_experiment_goes_on_and_refuses_other_options(tmp_path: Path):
     assert again.finished(second) is None
     with pytest.raises(OptionError, match=r"period = 20\.0, not 6\.0"):
         Ledger(parse([*arguments, "--period", "6"])).finished(first)
+
+
+def test_loads_are_those_of_the_command_line():
+    options = parse(["--mounting", "hanging", "--payload", "0.02", "--payload-at", "0.2"])
+    default = Limb.default()
+    assert options.mounted(default) == default.mounted("hanging")
+    assert options.loaded(default).masses == (PointMass(0.2, 0.02, "payload"),)
+    # A calibrated limb is a little shorter or longer than the place that was measured.
+    at_tip = parse(["--payload", "0.02", "--payload-at", "0.2465"]).loaded(default)
+    assert at_tip.masses[0].arc_length == default.length
+    assert at_tip.payload == (0.02, 0.0)
+    assert options.loaded(default).payload == (0.02, 0.2)
+    hung = default.mounted("30")
+    assert parse([]).loaded(hung) == hung
+
+
+def test_a_payload_beyond_the_limb_is_refused_before_anything_starts(tmp_path: Path):
+    with pytest.raises(OptionError, match=r"arc_length must be at most"):
+        run(parse(["--payload", "0.02", "--payload-at", "0.3", "--out", str(tmp_path / "out")]))
+    assert not (tmp_path / "out").exists()
 
 
 def test_every_motion_of_the_planner_is_taken():

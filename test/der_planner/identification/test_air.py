@@ -31,7 +31,7 @@ def synthetic_log(air: Pneumatics, command: np.ndarray, noise: float = 5.0) -> C
 
 
 def emulated_log(seed: int, command: np.ndarray) -> CalibrationLog:
-    board = emulator.Pneumatics(command.shape[1], seed)
+    board = emulator.BoardPneumatics(command.shape[1], seed)
     measured = np.empty_like(command)
     for k, setpoint in enumerate(command):
         pressure = board.pressure

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_bvp
 
-from der_planner.model.bending import PolylineKinematics
 from der_planner.rod import ConvergenceError, Rod
 
 RADIUS = 0.015
@@ -110,51 +109,6 @@ def helix(curvature, torsion, length, nodes):
     across = tangent - along
     aside = np.cross(axis, tangent)
     return along * s + across * np.sin(rate * s) / rate + aside * (1 - np.cos(rate * s)) / rate
-
-
-def ring(nodes: int, twist: float):
-    """A closed ring of `nodes` nodes with a total twist, and its rod (two more nodes overlap)."""
-    count = nodes + 2
-    length = 1.0 + 1.0 / nodes
-    held = [*range(7), *range(4 * count - 8, 4 * count - 1)]
-    rod = Rod.uniform(
-        length=length, nodes=count, EI=0.02, EA=2e5, GJ=0.016, mass_per_length=1.0,
-        clamp="inside", fixed=held, segments=[(0, count)], moment_gain=[1.0],
-    )  # fmt: skip
-    state = rod.straight_state()
-    for part in np.linspace(0.02, 1.0, 50):
-        q = PolylineKinematics.of_rod(rod).configuration([part * 2 * np.pi])
-        state = rod.state(q, like=state)
-    for part in np.linspace(0.05, 1.0, 20):
-        q = state.q.copy()
-        q[3::4] = np.linspace(0.0, part * twist, count - 1)
-        state = rod.state(q, like=state)
-    return rod, state
-
-
-@pytest.mark.parametrize("nodes", [24, 48])
-def test_a_twisted_ring_becomes_unstable_at_michells_twist(nodes):
-    """Michell (1889), Zajac (1962): a ring loses stability at a twist of 2π √3 EI/GJ."""
-    critical = 2 * np.pi * np.sqrt(3) * 0.02 / 0.016
-
-    def softest(part):
-        rod, state = ring(nodes, part * critical)
-        force = rod.internal_force(state)[rod.free]
-        np.testing.assert_allclose(force, 0.0, atol=1e-7)  # the plane ring stays an equilibrium
-        stiffness = rod.stiffness(state)[np.ix_(rod.free, rod.free)]
-        values = np.linalg.eigvalsh(stiffness)
-        # turning the ring about the held edge and its cross-sections back costs an isotropic rod
-        # nothing
-        neutral = np.argmin(np.abs(values))
-        assert abs(values[neutral]) < 1e-6
-        return np.delete(values, neutral)[0]
-
-    stable, unstable = 0.9, 1.1
-    assert softest(stable) > 0 > softest(unstable)
-    while unstable - stable > 1e-4:
-        middle = 0.5 * (stable + unstable)
-        stable, unstable = (middle, unstable) if softest(middle) > 0 else (stable, middle)
-    assert stable == pytest.approx(1.0, abs=8.0 / nodes**2)
 
 
 def test_point_forces_deflect_a_cantilever_as_beam_theory_says():

@@ -50,6 +50,34 @@ def test_follows_the_newest_pressures_and_keeps_time(graph):
     assert process.stop(timeout=20.0) == 0
 
 
+def test_hangs_carries_and_is_pushed(graph):
+    from der_msgs.msg import LimbPush, LimbState
+    from limb_interfaces import qos, stamps, topics
+
+    truths = []
+    node = graph.client.node
+    node.create_subscription(LimbState, "/limb/" + topics.TWIN_GROUND_TRUTH, truths.append, 10)
+    pushes = node.create_publisher(LimbPush, "/limb/" + topics.TWIN_PUSH, qos.COMMANDS)
+    loads = {"gravity": [0.0, -4.0, 0.0], "masses": [0.02], "masses_at": [0.244]}
+    process = graph.start("der_planner", "limb_twin", seed=1, **loads)
+    graph.client.watch([process])
+    graph.client.wait_for(pushes.get_subscription_count, 60.0, "the twin to listen")
+    graph.client.wait_for(lambda: len(truths) > 5, 60.0, "the shape at rest")
+    sag = truths[-1].tip.y
+    assert sag < -0.06
+    # Half a newton upward lifts the tip; it begins at its instant and ends by itself.
+    begin = node.get_clock().now().nanoseconds + stamps.NANOSECONDS
+    push = LimbPush(arc_length=0.244, duration=1.0)
+    push.force.y = 0.5
+    push.header.stamp = stamps.stamp_from_nanoseconds(begin)
+    pushes.publish(push)
+    graph.client.wait_for(lambda: truths[-1].tip.y > sag + 0.04, 60.0, "the limb to be lifted")
+    lifted = [t.header.stamp for t in truths if t.tip.y > sag + 0.002]
+    assert 0.0 < (stamps.nanoseconds(lifted[0]) - begin) / stamps.NANOSECONDS < 0.4
+    graph.client.wait_for(lambda: truths[-1].tip.y < sag + 0.01, 60.0, "the limb to sink again")
+    assert process.stop(timeout=20.0) == 0
+
+
 def test_refuses_a_bad_parameter_by_its_name(graph):
     process = graph.start("der_planner", "limb_twin", rate=0.0)
     graph.client.wait_for(lambda: process.exit_code is not None, 60.0, "the node to end")

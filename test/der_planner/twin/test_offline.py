@@ -6,7 +6,7 @@ import pytest
 from der_planner.model.air import pair_of
 from der_planner.twin import TwinError
 from der_planner.twin.offline import play
-from pressure_driver.emulator.pneumatics import Pneumatics
+from pressure_driver.emulator.pneumatics import BoardPneumatics
 
 
 def test_each_differential_goes_into_one_chamber_of_its_pair():
@@ -33,7 +33,7 @@ def test_limb_feels_the_boards_pneumatics():
     time = np.arange(30) * 0.05
     pressure = np.tile([0.0, -4000.0], (30, 1))
     result = play(time, pressure, seed=3, lead=0.0)
-    air = Pneumatics(2, 3)
+    air = BoardPneumatics(2, 3)
     expected = []
     for row in pressure:
         expected.append(air.pressure)

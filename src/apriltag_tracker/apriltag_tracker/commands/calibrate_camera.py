@@ -178,6 +178,25 @@ def mounting(options: argparse.Namespace) -> None:
     print(f"written to {options.out}, from {result.pictures} pictures")
 
 
+def _check_output(path: Path) -> None:
+    """Refuse a file that cannot be written before pictures are taken; nothing is left behind.
+
+    Raises:
+        CalibrationError: it is a folder, its folder is missing, or there is no right to write.
+    """
+    if path.is_dir():
+        raise CalibrationError(f"--out {path} is a folder: name a file")
+    if not path.parent.is_dir():
+        raise CalibrationError(f"--out {path} cannot be written: {path.parent} is no folder")
+    present = path.exists()
+    try:
+        path.open("ab").close()
+    except OSError as error:
+        raise CalibrationError(f"--out {path} cannot be written: {error.strerror}") from error
+    if not present:
+        path.unlink()
+
+
 def main() -> int:
     """Run the command line."""
     parser = argparse.ArgumentParser(
@@ -199,6 +218,7 @@ def main() -> int:
     tags.add_argument("--calibration", type=Path, required=True, metavar="FILE")
     options = parser.parse_args()
     try:
+        _check_output(options.out)
         (intrinsics if options.what == "intrinsics" else mounting)(options)
     except (CalibrationError, CameraError, ImageError, TagMapError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)

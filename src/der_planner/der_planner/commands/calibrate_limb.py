@@ -10,6 +10,9 @@
 time on the running graph, on the twin or the hardware, records a bag, vents, and fits to the bag:
 about three minutes. A bag is any recorded run that excites every input; `--excitation FILE.csv`
 writes the pressures of the calibration run, and `--play FILE.csv` plays such a file instead.
+
+--mounting says how the limb was mounted in the log, --payload what it carried beside its own
+masses: the payload belongs to the log and does not enter the limb file.
 """
 
 from __future__ import annotations
@@ -25,6 +28,7 @@ import numpy as np
 from der_planner.commands.outputs import OutputError, check_file, check_folder
 from der_planner.experiment.errors import GraphError, NodeError
 from der_planner.experiment.interrupts import interrupt_once
+from der_planner.experiment.load_options import add_load_options, as_loaded, without_payload
 from der_planner.experiment.options import Hardware, OptionError
 from der_planner.experiment.progress import Progress
 from der_planner.identification import (
@@ -43,10 +47,10 @@ from der_planner.identification import (
     within_limits,
     write_excitation,
 )
+from der_planner.identification.logs.prepare import prepare
 from der_planner.identification.offline import AMPLITUDE
 from der_planner.identification.parameters import GROUPS
 from der_planner.identification.plots import plot_prediction
-from der_planner.identification.prepare import prepare
 from der_planner.limb import Limb, LimbError
 from pressure_driver.schedule import ScheduleLimits
 
@@ -91,6 +95,12 @@ def _arguments() -> argparse.Namespace:
         default=",".join(GROUPS),
         help=f"model terms to fit, of {', '.join(GROUPS)}; 'none' for gain and rest angle alone",
     )
+    add_load_options(parser)
+    parser.add_argument(
+        "--fit-mass",
+        action="store_true",
+        help="fit the mass of each segment and keep the prior's stiffness, not the other way round",
+    )
     parser.add_argument("--longest-gap", type=float, default=1.0, help="in the log, bridged [s]")
     parser.add_argument(
         "--held-out",
@@ -128,14 +138,15 @@ def main() -> int:
     given = _arguments()
     try:
         _check_outputs(given)
-        prior = Limb.from_yaml(given.prior) if given.prior else Limb.default()
+        prior = as_loaded(Limb.from_yaml(given.prior) if given.prior else Limb.default(), given)
         if given.excitation:
             run = _excitation(prior, prior.pneumatics.pressure_limit, given)
             write_excitation(run, given.excitation)
             print(f"{run.duration:.0f} s of excitation in {given.excitation}")
             return 0
         log = _obtain(prior, given)
-        terms = () if given.terms == "none" else given.terms.split(",")
+        terms = [] if given.terms == "none" else given.terms.split(",")
+        terms += ["mass"] if given.fit_mass else []
         limb, report = fit(prior, log, terms=terms, longest_gap=given.longest_gap)
         held_out = [_read(path, given) for path in given.held_out]
         _conclude(limb, report, log, held_out, given)
@@ -177,7 +188,7 @@ def _obtain(prior: Limb, given: argparse.Namespace) -> CalibrationLog:
     limit = prior.pneumatics.pressure_limit
     run = within_limits(_excitation(prior, limit, given), limit, math.inf)
     print(f"playing {run.duration:.0f} s on the twin of seed {given.seed} …", file=sys.stderr)
-    return record_twin(given.seed, run)
+    return record_twin(given.seed, run, limb=prior)
 
 
 def _play_on_graph(prior: Limb, given: argparse.Namespace) -> Path:
@@ -215,7 +226,7 @@ def _play_on_graph(prior: Limb, given: argparse.Namespace) -> Path:
         "prior": prior.name,
     }
     player = GraphCalibration(
-        run, given.folder, metadata, progress, seed=given.seed, hardware=hardware
+        run, given.folder, metadata, progress, limb=prior, seed=given.seed, hardware=hardware
     )
     bag = player.play().bag
     progress.say(f"bag: {bag}")
@@ -242,7 +253,7 @@ def _conclude(
         text += "\n" + _held_out_text(limb, unseen, given.longest_gap)
     print(text)
     given.out.parent.mkdir(parents=True, exist_ok=True)
-    limb.to_yaml(given.out)
+    without_payload(limb, given).to_yaml(given.out)
     print(f"limb file: {given.out}")
     if given.report:
         given.report.mkdir(parents=True, exist_ok=True)

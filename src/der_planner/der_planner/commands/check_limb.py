@@ -3,8 +3,9 @@
     python3 scripts/check_limb.py out/bags/same_direction_der_1 --limb my_limb.yaml
     python3 scripts/check_limb.py log.csv --columns columns.yaml --limb my_limb.yaml
 
-Predicts the run open loop from its measured pressures. Exit code 0: it fits; 3: calibrate again;
-1: the run or the file cannot be used.
+Predicts the run open loop from its measured pressures, for a limb that is mounted as --mounting
+says (without it: as its file says) and carries a --payload in this run. Exit code 0: it fits; 3:
+calibrate again; 1: the run or the file cannot be used.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from der_planner.experiment.load_options import add_load_options, as_loaded
 from der_planner.identification import (
     ColumnMap,
     LogError,
@@ -37,9 +39,10 @@ def main() -> int:
         metavar="NAME",
         help="of the limb, where a bag holds several",
     )
+    add_load_options(parser)
     given = parser.parse_args()
     try:
-        limb = Limb.from_yaml(given.limb)
+        limb = as_loaded(Limb.from_yaml(given.limb), given)
         if given.run.suffix == ".csv":
             if given.columns is None:
                 parser.error("a table needs --columns FILE")

@@ -14,15 +14,19 @@ import sys
 
 from der_planner.experiment.errors import GraphError, NodeError
 from der_planner.experiment.experiment import run
-from der_planner.experiment.interrupts import interrupt_once
 from der_planner.experiment.options import OptionError, parse
 
 
 def main() -> int:
     """Run the command line; 0 when every trial was played, 1 after an error, 2 for bad options."""
-    interrupt_once()
     try:
-        run(parse(sys.argv[1:]))
+        options = parse(sys.argv[1:])
+        if not options.offline:
+            # There are nodes to end in order; without ROS there is nothing to vent.
+            from der_planner.experiment.interrupts import interrupt_once  # noqa: PLC0415
+
+            interrupt_once()
+        run(options)
     except OptionError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -13,6 +13,7 @@ from der_planner.experiment.node_specs import NodeSpec, node_specs
 from der_planner.experiment.options import Hardware
 from der_planner.experiment.progress import Progress
 from der_planner.identification import Excitation
+from der_planner.limb import Limb
 from der_planner.planning.streaming import GRID, first_stamp
 from limb_interfaces import qos, stamps, topics
 
@@ -30,6 +31,7 @@ class GraphCalibration(GraphPlayer):
         folder: gets the bag (``bag``) and the nodes' logs (``logs``).
         metadata: stored in the bag.
         progress: shows what happens.
+        limb: whose gravity and masses the twin gets; None: no loads.
         seed: of the twin.
         hardware: in place of the twin.
     """
@@ -41,6 +43,7 @@ class GraphCalibration(GraphPlayer):
         metadata: dict[str, Any],
         progress: Progress,
         *,
+        limb: Limb | None = None,
         seed: int = 0,
         hardware: Hardware | None = None,
     ) -> None:
@@ -48,6 +51,7 @@ class GraphCalibration(GraphPlayer):
         self._excitation = excitation
         self._bag = folder / "bag"
         self._metadata = metadata
+        self._limb = limb
         self._seed = seed
         # The driver refuses a plan that it has heard before an arming: each run has its own.
         self._plan_id = f"calibration-{uuid.uuid4().hex[:8]}"
@@ -69,7 +73,14 @@ class GraphCalibration(GraphPlayer):
         return run
 
     def _specs(self, port: str) -> list[NodeSpec]:
-        return node_specs(port, self._bag, self._metadata, seed=self._seed, hardware=self._hardware)
+        return node_specs(
+            port,
+            self._bag,
+            self._metadata,
+            seed=self._seed,
+            limb=self._limb,
+            hardware=self._hardware,
+        )
 
     def _join(self, client: GraphClient) -> None:
         client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES, self._keep_state)

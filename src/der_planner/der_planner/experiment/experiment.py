@@ -14,7 +14,7 @@ from der_planner.experiment import results
 from der_planner.experiment.ledger import Ledger
 from der_planner.experiment.options import OptionError, Options, Trial
 from der_planner.experiment.progress import Progress
-from der_planner.limb import Limb, LimbError
+from der_planner.limb import Limb, LimbError, mounting_of
 
 
 def run(options: Options) -> None:
@@ -65,8 +65,14 @@ def _make_folder(path: Path) -> None:
 
 
 def _check_limb(options: Options) -> Limb:
+    """Return the limb of the file, or the default one, under the loads of the experiment.
+
+    Raises:
+        OptionError: the file cannot be used, or the payload is not on the limb.
+    """
     try:
-        return Limb.from_yaml(options.limb) if options.limb is not None else Limb.default()
+        limb = Limb.from_yaml(options.limb) if options.limb is not None else Limb.default()
+        return options.loaded(limb)
     except LimbError as error:
         raise OptionError(str(error)) from error
 
@@ -82,6 +88,7 @@ def _describe(
 ) -> None:
     """Say what would be done."""
     progress.say(f"limb: {limb.name}, {limb.segment_count} segments, {limb.length:.3f} m")
+    progress.say(f"loads: {_loads(limb)}")
     progress.say(f"stage: {_stage(options)}")
     if options.hardware is not None:
         for node in ("driver", "tracker", "planner", "recorder"):
@@ -100,15 +107,16 @@ def _describe(
 
 def _play(trial: Trial, options: Options, progress: Progress) -> dict[str, Any]:
     limb = _limb_file(trial, options, progress)
-    metadata = _metadata(trial, options, limb)
+    robot = options.loaded(Limb.from_yaml(limb) if limb is not None else Limb.default())
+    metadata = _metadata(trial, options, limb, robot)
     if options.offline:
         # ROS-free: the other branch is imported only where it is used.
         from der_planner.experiment.offline_run import play_offline  # noqa: PLC0415
 
-        return play_offline(trial, options, limb, metadata)
+        return play_offline(trial, options, robot, metadata)
     from der_planner.experiment.graph_run import GraphTrial  # noqa: PLC0415
 
-    played = GraphTrial(trial, options, limb, metadata, progress).play()
+    played = GraphTrial(trial, options, limb, robot, metadata, progress).play()
     return {
         "bag": str(played.bag.relative_to(options.out)),
         "plan_id": played.plan_id,
@@ -123,21 +131,27 @@ def _limb_file(trial: Trial, options: Options, progress: Progress) -> Path | Non
     """Return the limb file to plan with; the twin of a new seed is calibrated first."""
     if not options.calibrate:
         return options.limb
-    path = options.out / "limbs" / f"seed_{trial.seed}.yaml"
+    mounting = f"_{options.mounting}" if options.mounting else ""
+    path = options.out / "limbs" / f"seed_{trial.seed}{mounting}.yaml"
     if path.exists():
         return path
     from der_planner.identification import calibrate_twin  # noqa: PLC0415
 
     progress.say(f"  calibrating on the twin of seed {trial.seed}")
     begin = time.monotonic()
-    limb, _ = calibrate_twin(trial.seed, Limb.default())
+    limb, _ = calibrate_twin(trial.seed, options.mounted(Limb.default()))
     path.parent.mkdir(parents=True, exist_ok=True)
     limb.to_yaml(path)
     progress.say(f"  calibrated in {time.monotonic() - begin:.1f} s: {path}")
     return path
 
 
-def _metadata(trial: Trial, options: Options, limb: Path | None) -> dict[str, Any]:
+def _loads(limb: Limb) -> str:
+    masses = [f"{m.name} {m.mass * 1000:.4g} g at {m.arc_length:.3f} m" for m in limb.masses]
+    return ", ".join([mounting_of(limb.gravity), *masses])
+
+
+def _metadata(trial: Trial, options: Options, limb: Path | None, robot: Limb) -> dict[str, Any]:
     return {
         "motion": trial.motion,
         "model": trial.model,
@@ -149,6 +163,7 @@ def _metadata(trial: Trial, options: Options, limb: Path | None) -> dict[str, An
         "cycles": options.cycles,
         **({"path": str(options.path)} if options.path is not None else {}),
         "limb": str(limb) if limb else "default",
+        "loads": _loads(robot),
         "stage": _stage(options),
         "commit": _commit(),
         "python": platform.python_version(),

@@ -22,6 +22,7 @@ from der_planner.experiment.node_specs import STOP_ORDER, NodeSpec, node_specs
 from der_planner.experiment.options import Hardware, Options, Trial
 from der_planner.experiment.processes import NodeProcess
 from der_planner.experiment.progress import Progress
+from der_planner.limb import Limb
 from der_planner.planning import paths
 from limb_interfaces import qos, stamps, topics
 
@@ -245,6 +246,7 @@ class GraphTrial(GraphPlayer):
     Args:
         trial, options: what to play.
         limb: limb file for the planner, or None for the default limb.
+        robot: the same limb under the loads of the experiment, which the twin gets.
         metadata: stored in the bag.
         progress: shows what happens.
     """
@@ -254,6 +256,7 @@ class GraphTrial(GraphPlayer):
         trial: Trial,
         options: Options,
         limb: Path | None,
+        robot: Limb,
         metadata: dict[str, Any],
         progress: Progress,
     ) -> None:
@@ -261,6 +264,7 @@ class GraphTrial(GraphPlayer):
         self._trial = trial
         self._options = options
         self._limb = limb
+        self._robot = robot
         self._metadata = metadata
 
     def _specs(self, port: str) -> list[NodeSpec]:
@@ -269,13 +273,19 @@ class GraphTrial(GraphPlayer):
             self._options.out / "bags" / self._trial.name,
             self._metadata,
             seed=self._trial.seed,
+            limb=self._robot,
             hardware=self._hardware,
             planner=self._planner_parameters(),
             record_images=self._options.record_images,
         )
 
     def _planner_parameters(self) -> dict[str, Any]:
-        parameters: dict[str, Any] = {"limb_file": str(self._limb) if self._limb else ""}
+        parameters: dict[str, Any] = {
+            "limb_file": str(self._limb) if self._limb else "",
+            "mounting": self._options.mounting,
+            "payload": self._options.payload,
+            "payload_at": self._options.payload_at or 0.0,
+        }
         if self._options.path is not None:
             # A path names no model: it gets the planner's defaults.
             parameters["default_model"] = self._trial.model

@@ -5,16 +5,16 @@ from __future__ import annotations
 import signal
 from types import FrameType
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+from limb_interfaces.entry import END_SIGNALS
 
 
 def interrupt_once() -> None:
-    """Turn the first of `SIGNALS` into a KeyboardInterrupt with its name; ignore later ones."""
-    for each in SIGNALS:
+    """Turn the first of `END_SIGNALS` into a KeyboardInterrupt with its name; ignore later ones."""
+    for each in END_SIGNALS:
         signal.signal(each, _interrupt)
 
 
 def _interrupt(number: int, _frame: FrameType | None) -> None:
-    for each in SIGNALS:
+    for each in END_SIGNALS:
         signal.signal(each, signal.SIG_IGN)
     raise KeyboardInterrupt(signal.Signals(number).name)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from der_planner.experiment.options import Hardware
+from der_planner.limb import Limb
 
 STOP_ORDER = (
     "planner",
@@ -37,6 +38,7 @@ def node_specs(
     metadata: dict[str, Any],
     *,
     seed: int = 0,
+    limb: Limb | None = None,
     hardware: Hardware | None = None,
     planner: dict[str, Any] | None = None,
     record_images: bool = False,
@@ -48,6 +50,7 @@ def node_specs(
         bag: folder that the recorder makes.
         metadata: stored in the bag.
         seed: of the twin.
+        limb: whose gravity and masses the twin gets; None: no loads.
         hardware: in place of the twin.
         planner: parameters of the planner; None for a graph without one.
         record_images: whether the bag holds the raw images, too.
@@ -63,7 +66,7 @@ def node_specs(
     specs = [
         NodeSpec("pressure_driver", "board_emulator", {"port_link": port, "seed": seed}),
         NodeSpec("pressure_driver", "pressure_driver", driver),
-        NodeSpec("der_planner", "limb_twin", {"seed": seed}),
+        NodeSpec("der_planner", "limb_twin", {"seed": seed, **twin_loads(limb)}),
         NodeSpec("apriltag_tracker", "synthetic_camera", {"seed": seed}),
         NodeSpec("apriltag_tracker", "apriltag_tracker", dict(rig.tracker)),
     ]
@@ -73,3 +76,14 @@ def node_specs(
         specs.append(NodeSpec("der_planner", "planner", {**planner, **rig.planner}))
     specs.append(NodeSpec("der_planner", "recorder", recorder))
     return specs
+
+
+def twin_loads(limb: Limb | None) -> dict[str, Any]:
+    """Return the parameters by which the twin's node is mounted and loaded as a limb."""
+    if limb is None:
+        return {}
+    parameters: dict[str, Any] = {"gravity": list(limb.gravity)}
+    if limb.masses:
+        parameters["masses"] = [item.mass for item in limb.masses]
+        parameters["masses_at"] = [item.arc_length for item in limb.masses]
+    return parameters

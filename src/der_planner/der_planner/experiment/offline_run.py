@@ -17,25 +17,44 @@ from der_planner.twin.offline import play
 
 
 def play_offline(
-    trial: Trial, options: Options, limb: Path | None, metadata: dict[str, Any]
+    trial: Trial, options: Options, robot: Limb, metadata: dict[str, Any]
 ) -> dict[str, Any]:
     """Plan, play and keep one trial; the error is against the twin's true tip, not an image's.
+
+    Args:
+        trial: what to play.
+        options: of the experiment.
+        robot: to plan with, under its loads; the twin is mounted as it is and carries its masses.
+        metadata: kept with the arrays.
 
     Raises:
         GraphError: the motion cannot be planned; with the planner's reason.
     """
-    robot = Limb.from_yaml(limb) if limb is not None else Limb.default()
     try:
         motion = options.motion(trial.motion)
         planned = plan(robot, motion, model=trial.model, method=trial.method)
     except PlanningError as error:
         raise GraphError(f"the planner refused: {error}") from error
-    played = play(planned.time, planned.differential_pressure, seed=trial.seed)
+    played = play(
+        planned.time,
+        planned.differential_pressure,
+        seed=trial.seed,
+        gravity=robot.gravity,
+        masses=robot.masses,
+    )
+    payload, place = robot.payload
     path = options.out / "runs" / f"{trial.name}.npz"
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(
         path,
-        metadata=json.dumps(metadata),
+        metadata=json.dumps(
+            {
+                **metadata,
+                "gravity_m_s2": robot.gravity,
+                "payload_kg": payload,
+                "payload_at_m": place,
+            }
+        ),
         time=planned.time,
         tip_reference=planned.tip_reference,
         tip_predicted=planned.tip_predicted,
@@ -66,6 +85,9 @@ def load_arrays(path: Path) -> RunSeries:
                 cycles=about["cycles"],
                 limb=about["limb"],
                 bag=str(path),
+                gravity=tuple(about.get("gravity_m_s2", (0.0, 0.0, 0.0))),
+                payload=about.get("payload_kg", 0.0),
+                payload_at=about.get("payload_at_m", 0.0),
                 extra=about,
             ),
             time=kept["time"],

@@ -13,6 +13,8 @@ from typing import Any
 
 import yaml
 
+from der_planner.experiment.load_options import add_load_options
+from der_planner.limb import Limb, LimbError, gravity_of
 from der_planner.planning import METHODS as METHODS_BY_MODEL
 from der_planner.planning import Motion, PlanningError
 from der_planner.planning.motions import (
@@ -123,6 +125,25 @@ class Options:
     record_images: bool
     report: bool
     path: Path | None = None
+    mounting: str = ""
+    payload: float = 0.0
+    payload_at: float | None = None
+
+    def mounted(self, limb: Limb) -> Limb:
+        """Return a limb as it is mounted here, without the payload: what is calibrated.
+
+        Raises:
+            LimbError: the mounting is unknown.
+        """
+        return limb.mounted(self.mounting) if self.mounting else limb
+
+    def loaded(self, limb: Limb) -> Limb:
+        """Return a limb as it is mounted here, with the payload: what is planned and played.
+
+        Raises:
+            LimbError: the mounting is unknown, or the payload is not on the limb.
+        """
+        return self.mounted(limb).carrying(self.payload, self.payload_at)
 
     def motion(self, name: str) -> Motion:
         """Return the motion of a trial.
@@ -211,6 +232,7 @@ def _add_stage(where: argparse._ArgumentGroup) -> None:
         default=1,
         help="of the first trial's twin; the next trial has the next seed",
     )
+    add_load_options(where)
     where.add_argument(
         "--hardware",
         type=Path,
@@ -255,10 +277,12 @@ def parse(arguments: Sequence[str]) -> Options:
         ("seed", 0, 2**31 - 1000),
         ("period", 0.5, 600.0),
         ("amplitude", 0.01, 2.0),
+        ("payload", 0.0, 10.0),
     ):
         value = getattr(given, name)
         if not least <= value <= most:
             raise OptionError(f"--{name} is {value}: choose {least} to {most}")
+    _check_loads(given)
     hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
     if hardware is not None and given.offline:
         raise OptionError("--offline simulates everything: it does not go with --hardware")
@@ -284,6 +308,9 @@ def parse(arguments: Sequence[str]) -> Options:
         record_images=given.record_images,
         report=not given.no_report,
         path=given.path.resolve() if given.path is not None else None,
+        mounting=given.mounting,
+        payload=given.payload,
+        payload_at=given.payload_at,
     )
 
 
@@ -303,6 +330,21 @@ def _motions(given: argparse.Namespace) -> tuple[str, ...]:
     except PlanningError as error:
         raise OptionError(f"--path: {error}") from error
     return (re.sub(r"[^A-Za-z0-9-]+", "_", given.path.stem).strip("_") or "path",)
+
+
+def _check_loads(given: argparse.Namespace) -> None:
+    """Refuse an unknown mounting, or the place of a payload that is not there.
+
+    Raises:
+        OptionError: names the option.
+    """
+    try:
+        if given.mounting:
+            gravity_of(given.mounting)
+    except LimbError as error:
+        raise OptionError(f"--mounting: {error}") from error
+    if given.payload_at is not None and not given.payload:
+        raise OptionError("--payload-at is the place of a payload: give --payload, too")
 
 
 def _timestamped() -> Path:

@@ -19,17 +19,17 @@ class Progress:
         self._end_bar()
         print(text, file=sys.stderr, flush=True)
 
-    def bar(self, done: float, total: float, text: str) -> None:
-        """Show that ``done`` of ``total`` seconds are over."""
+    def bar(self, done: float, total: float, text: str, unit: str = "s") -> None:
+        """Show that ``done`` of ``total`` seconds, or of another unit, are over."""
         now = time.monotonic()
         finished = done >= total
         if now - self._last_shown < (0.2 if self._terminal else 15.0) and not finished:
             return
         self._last_shown = -1e9 if finished else now
         share = min(max(done / total, 0.0), 1.0) if total > 0 else 1.0
-        line = f"  [{'#' * int(30 * share):<30}] {max(done, 0.0):5.0f} / {total:.0f} s {text}"
+        line = f"  [{'#' * int(30 * share):<30}] {max(done, 0.0):5.0f} / {total:.0f} {unit} {text}"
         if self._terminal:
-            print(f"\r{line:<78}", end="", file=sys.stderr, flush=True)
+            print(f"\r{line:<100}", end="", file=sys.stderr, flush=True)
             self._open_line = True
             if finished:
                 self._end_bar()

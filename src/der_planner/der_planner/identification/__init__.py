@@ -1,8 +1,6 @@
 """From logs to a limb file: excitation, fits, reports, and checks of later runs."""
 
-from der_planner.identification.bag_log import read_bag
 from der_planner.identification.check import Check, check
-from der_planner.identification.csv_log import ColumnMap, read_csv
 from der_planner.identification.excitation import (
     Excitation,
     calibration_run,
@@ -11,7 +9,9 @@ from der_planner.identification.excitation import (
     write_excitation,
 )
 from der_planner.identification.fit import fit
-from der_planner.identification.log import CalibrationLog, LogError
+from der_planner.identification.logs.bag import read_bag
+from der_planner.identification.logs.log import CalibrationLog, LogError
+from der_planner.identification.logs.table import ColumnMap, read_csv
 from der_planner.identification.offline import calibrate_twin, record_twin
 from der_planner.identification.predict import Prediction, predict
 from der_planner.identification.report import FitReport, Unknown

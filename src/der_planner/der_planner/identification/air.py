@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from der_planner.identification.log import CalibrationLog, LogError
+from der_planner.identification.logs.log import CalibrationLog, LogError
 from der_planner.limb import Limb, Pneumatics
 from der_planner.model.air import pressures_at_commands
 

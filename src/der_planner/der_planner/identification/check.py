@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.identification.log import CalibrationLog
+from der_planner.identification.logs.log import CalibrationLog
+from der_planner.identification.logs.prepare import bridge, prepare
 from der_planner.identification.predict import predict
-from der_planner.identification.prepare import bridge, prepare
 from der_planner.limb import Limb
 
 Array = NDArray[np.float64]
@@ -71,7 +71,7 @@ def check(limb: Limb, log: CalibrationLog) -> Check:
     """Compare a limb file with a later run.
 
     Raises:
-        LogError: the log cannot be used, see `prepare`.
+        LogError: the log cannot be used, see `prepare`, or the limb's rod cannot follow it.
     """
     prepared = prepare(log, limb, to_fit=False)
     rows = prepared.usable

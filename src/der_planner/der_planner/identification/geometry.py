@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from der_planner.identification.log import CalibrationLog
+from der_planner.identification.logs.log import CalibrationLog
 from der_planner.limb import Limb
 from der_planner.model.bending import PolylineKinematics
 from der_planner.rod import Rod
@@ -56,13 +56,25 @@ class GeometryFit:
     residual: float
 
 
-def fit_geometry(limb: Limb, log: CalibrationLog, nodes: int = NODES) -> GeometryFit | None:
-    """Fit the lengths to tips at given bend angles; None where the log has no tips."""
+def fit_geometry(
+    limb: Limb, log: CalibrationLog, nodes: int = NODES, uneven: Array | None = None
+) -> GeometryFit | None:
+    """Fit the lengths to tips at given bend angles; None where the log has no tips.
+
+    Args:
+        limb: the prior.
+        log: with tips and bend angles.
+        nodes: of the rod.
+        uneven: (K, 2) tip of the limb less that of an evenly bent one at the same bend angles, as
+            its weight bends it [m]; None: it bends evenly.
+    """
     rows = np.all(np.isfinite(log.bend_angles), axis=1) & np.all(np.isfinite(log.tip), axis=1)
     if np.count_nonzero(rows) < 20:
         return None
     every = max(1, int(np.count_nonzero(rows)) // 800)
     angles, tip = log.bend_angles[rows][::every], log.tip[rows][::every]
+    if uneven is not None:
+        tip = tip - uneven[rows][::every]
     prior = np.array([segment.length for segment in limb.segments])
     known = limb.connector_length or 4e-3
     connector = min(max(known, 1.1 * CONNECTOR_RANGE[0]), 0.9 * CONNECTOR_RANGE[1])
@@ -106,14 +118,31 @@ def fit_geometry(limb: Limb, log: CalibrationLog, nodes: int = NODES) -> Geometr
 def with_geometry(
     limb: Limb, lengths: Array, connector: float | None = None, base: float | None = None
 ) -> Limb:
-    """Return the limb with these lengths (M,), connector and base [m]; None keeps the old."""
+    """Return the limb with these lengths (M,), connector and base [m]; None keeps the old.
+
+    What the limb carries stays where it is on its segment or connector.
+    """
     segments = tuple(
         replace(segment, length=float(length))
         for segment, length in zip(limb.segments, lengths, strict=True)
     )
     kept = limb.connector_length if connector is None else connector
     start = limb.base_length if base is None else base
-    return replace(limb, segments=segments, connector_length=kept, base_length=start)
+    bare = replace(limb, segments=segments, connector_length=kept, base_length=start, masses=())
+    places = np.interp([m.arc_length for m in limb.masses], _joints(limb), _joints(bare))
+    masses = [
+        replace(item, arc_length=float(place))
+        for item, place in zip(limb.masses, places, strict=True)
+    ]
+    return replace(bare, masses=tuple(masses))
+
+
+def _joints(limb: Limb) -> Array:
+    """Return the arc lengths of the clamp and of the ends of base, segments and connectors [m]."""
+    pieces = [0.0, limb.base_length]
+    for index, segment in enumerate(limb.segments):
+        pieces += [limb.connector_length if index else 0.0, segment.length]
+    return np.cumsum(pieces)
 
 
 def _distance(difference: Array) -> float:

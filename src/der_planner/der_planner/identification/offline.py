@@ -8,7 +8,7 @@ import numpy as np
 
 from der_planner.identification.excitation import Excitation, calibration_run
 from der_planner.identification.fit import fit
-from der_planner.identification.log import CalibrationLog
+from der_planner.identification.logs.log import CalibrationLog
 from der_planner.identification.report import FitReport
 from der_planner.limb import Limb
 
@@ -25,7 +25,11 @@ AMPLITUDE = 0.7
 
 
 def record_twin(
-    seed: int, excitation: Excitation, run: int = CALIBRATION_RUN, noise: float = 1.0
+    seed: int,
+    excitation: Excitation,
+    run: int = CALIBRATION_RUN,
+    noise: float = 1.0,
+    limb: Limb | None = None,
 ) -> CalibrationLog:
     """Play an excitation on the twin and return what camera and board would have measured.
 
@@ -34,11 +38,20 @@ def record_twin(
         excitation: pressures to play.
         run: of the same hardware.
         noise: factor on the sensors' noise.
+        limb: the twin is mounted as this limb is, and carries its masses; None: no loads.
     """
     # PyElastica takes a second to import: only who plays pays for it.
     from der_planner.twin.offline import play  # noqa: PLC0415
 
-    played = play(excitation.time, excitation.differential_pressure, seed, run=run)
+    loads = limb or Limb.default()
+    played = play(
+        excitation.time,
+        excitation.differential_pressure,
+        seed,
+        run=run,
+        gravity=loads.gravity,
+        masses=loads.masses,
+    )
     generator = np.random.default_rng([seed, run])
 
     def noisy(values: np.ndarray, deviation: float) -> np.ndarray:
@@ -61,7 +74,8 @@ def calibrate_twin(seed: int, prior: Limb, *, quick: bool = True) -> tuple[Limb,
 
     Args:
         seed: of the hardware.
-        prior: limb with the geometry, masses and limits, and first guesses of the rest.
+        prior: limb with the geometry, masses and limits, and first guesses of the rest; the twin is
+            mounted as it is and carries its `masses`.
         quick: use the short run of a minute and a half instead of three minutes.
 
     Returns:
@@ -72,5 +86,5 @@ def calibrate_twin(seed: int, prior: Limb, *, quick: bool = True) -> tuple[Limb,
     """
     amplitude = AMPLITUDE * prior.pneumatics.pressure_limit
     excitation = calibration_run(amplitude, prior.segment_count, quick)
-    limb, report = fit(prior, record_twin(seed, excitation))
+    limb, report = fit(prior, record_twin(seed, excitation, limb=prior))
     return replace(limb, name=f"{prior.name}, twin {seed}"), report

@@ -17,7 +17,10 @@ Array = NDArray[np.float64]
 
 GROUPS = ("asymmetry", "stiffening", "cubic", "coupling", "friction", "creep", "dynamics")
 """Model terms that may be left out, in the order in which they are explained."""
-_ORDER = ("linear", *GROUPS)
+OPTIONAL = ("mass",)
+"""Model terms that are fitted only where they are asked for: the mass, in place of the stiffness.
+Stiffness, gain and mass together have no scale in a log without forces: one is given."""
+_ORDER = ("linear", *GROUPS, *OPTIONAL)
 _FITTED: dict[str, Parameter] = {
     key: declared for key, declared in parameters(Segment).items() if declared.fit
 }

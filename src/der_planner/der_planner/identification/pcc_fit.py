@@ -1,8 +1,9 @@
-"""The same data for the baseline: stiffness and damping of the constant-curvature model.
+"""The same data for the baseline: the numbers of the constant-curvature model.
 
-Under no gravity both models have the same statics, segment by segment, so gain, rest angle, unequal
-chambers, stiffening, friction and creep are shared. Their dynamics differ - an arc is stiffer
-than a rod that may bend unevenly - and are fitted to each.
+Without gravity both models have the same statics, segment by segment, so gain, rest angle, unequal
+chambers, stiffening, friction and creep are shared, and only stiffness and damping are fitted to
+each: an arc is stiffer than a rod that may bend unevenly. Under gravity their statics differ as
+well, and the arcs get gains and rest angles of their own from the same log.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from der_planner.identification.prepare import Prepared
+from der_planner.identification.logs.prepare import Prepared
 from der_planner.limb import Limb, Segment
 from der_planner.model.inputs import pressures_between
 from der_planner.model.material import slow_effective_pressure
@@ -21,8 +22,14 @@ from der_planner.model.response import ArcModel
 
 Array = NDArray[np.float64]
 
-SPREAD = np.array([0.3, 0.02, 0.5])
-"""Prior standard deviations of ln stiffness, material damping [s] and ln damping."""
+SPREAD = np.array([0.3, 0.02, 0.2, 0.2, 0.5])
+"""Prior standard deviations of ln stiffness, material damping [s], ln gain, rest angle [rad] and ln
+damping, about the rod's."""
+SCALE = np.array([0.2, 0.01, 0.1, 0.05, 0.5])
+LOW = np.array([-1.2, 0.0, -0.8, -0.8, -3.0])
+HIGH = np.array([1.2, 0.12, 0.8, 0.8, 3.0])
+NOT_FOLLOWED = np.pi
+"""Error of a row in which the arcs have left every bound [rad]."""
 ANGLE_ERROR = np.deg2rad(0.3)
 CORRELATION = 20.0
 STEPS = 2
@@ -53,48 +60,68 @@ def fit_pcc(limb: Limb, prepared: Prepared, offset: Array) -> tuple[tuple[Segmen
         return arcs.run(arcs.resting(effective[0]), held, period).bend_angles
 
     def residual(x: Array) -> Array:
-        data = (angles(x) - prepared.log.bend_angles)[rows] / (ANGLE_ERROR * np.sqrt(CORRELATION))
-        prior = np.concatenate([x[:count] / SPREAD[0], (x[count : 2 * count] - before) / SPREAD[1]])
-        return np.concatenate([data.ravel(), prior, x[-1:] / SPREAD[2]])
+        error = (angles(x) - prepared.log.bend_angles)[rows]
+        error = np.where(np.isfinite(error), error, NOT_FOLLOWED)
+        data = error / (ANGLE_ERROR * np.sqrt(CORRELATION))
+        return np.concatenate([data.ravel(), ((x - centre) / spread)[free]])
 
-    before = np.array([segment.material_damping for segment in limb.segments])
-    start = np.concatenate([np.zeros(count), before + 1e-4, [0.0]])
-    low = np.concatenate([np.full(count, -1.2), np.zeros(count), [-3.0]])
-    high = np.concatenate([np.full(count, 1.2), np.full(count, 0.12), [3.0]])
+    def put(part: Array) -> Array:
+        x = start.copy()
+        x[free] = part
+        return x
+
+    def of_part(part: Array) -> Array:
+        return residual(put(part))
+
+    def full(values: Array) -> Array:
+        return np.append(np.repeat(values[:4], count), values[4])
+
+    centre = np.zeros(4 * count + 1)
+    centre[count : 2 * count] = [segment.material_damping for segment in limb.segments]
+    spread, scale, low, high = full(SPREAD), full(SCALE), full(LOW), full(HIGH)
+    free = np.ones(len(centre), dtype=bool)
+    free[2 * count : 4 * count] = any(limb.gravity[:2])
+    start = centre + full(np.array([0.0, 1e-4, 0.0, 0.0, 0.0]))
     solution = least_squares(
-        residual,
-        start,
-        bounds=(low, high),
-        x_scale=np.concatenate([np.full(count, 0.2), np.full(count, 0.01), [0.5]]),
+        of_part,
+        start[free],
+        bounds=(low[free], high[free]),
+        x_scale=scale[free],
         loss="soft_l1",
         f_scale=3.0 / np.sqrt(CORRELATION),
-        diff_step=np.full(len(start), 1e-3),
+        diff_step=np.full(int(free.sum()), 1e-3),
         xtol=1e-3,
         ftol=1e-4,
         max_nfev=4,
     )
-    error = np.sqrt(np.nanmean((angles(solution.x) - prepared.log.bend_angles) ** 2, axis=0))
-    return segments_of(limb, solution.x), np.asarray(error)
+    found = put(solution.x)
+    error = np.sqrt(np.nanmean((angles(found) - prepared.log.bend_angles) ** 2, axis=0))
+    return segments_of(limb, found), np.asarray(error)
 
 
 def segments_of(limb: Limb, x: Array) -> tuple[Segment, ...]:
-    """Return the segments with stiffness × e^x, material damping and damping × e^x put in place.
+    """Return the segments with the arcs' numbers put in place.
 
-    Cubic term, gain, friction and creep scale with the stiffness: the statics stay as they are.
+    ``x`` (4M + 1,) holds for each segment ln stiffness, material damping, ln gain and change of the
+    rest angle, then ln damping. Cubic term, gain, friction and creep scale with the stiffness, the
+    last two with the gain as well: where it alone is changed, the statics stay as they are.
     """
     count = limb.segment_count
     result = []
     for index, segment in enumerate(limb.segments):
         factor = float(np.exp(x[index]))
+        drive = factor * float(np.exp(x[2 * count + index]))
         result.append(
             replace(
                 segment,
                 bending_stiffness=segment.bending_stiffness * factor,
                 cubic_stiffness=segment.cubic_stiffness * factor,
-                moment_gain=segment.moment_gain * factor,
-                friction_moment=segment.friction_moment * factor,
-                creep_stiffness=segment.creep_stiffness * factor,
+                moment_gain=segment.moment_gain * drive,
+                friction_moment=segment.friction_moment * drive,
+                creep_stiffness=segment.creep_stiffness * drive,
                 material_damping=float(x[count + index]),
+                rest_curvature=segment.rest_curvature
+                + float(x[3 * count + index]) / segment.length,
                 damping=segment.damping * float(np.exp(x[-1])),
             )
         )

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from der_planner.identification.log import CalibrationLog
+from der_planner.identification.logs.log import CalibrationLog
+from der_planner.identification.logs.prepare import bridge
 from der_planner.identification.predict import predict
-from der_planner.identification.prepare import bridge
 from der_planner.limb import Limb
 from der_planner.model.series import CONTROL_PERIOD
 

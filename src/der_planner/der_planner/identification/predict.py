@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from der_planner.identification.logs.log import LogError
 from der_planner.limb import Limb
 from der_planner.model.response import simulate
+from der_planner.rod import ConvergenceError
 
 Array = NDArray[np.float64]
 
@@ -43,6 +45,15 @@ def predict(
     Returns:
         Bend angles and tips at ``time``, from the equilibrium of the first pressures on. Measured
         angles are not used.
+
+    Raises:
+        LogError: the rod cannot follow the pressures.
     """
-    response = simulate(limb, time, pressures=differential_pressure, model=model)
+    try:
+        response = simulate(limb, time, pressures=differential_pressure, model=model)
+    except ConvergenceError as error:
+        raise LogError(
+            f"the rod of the limb '{limb.name}' cannot follow this log ({error}): check that the "
+            "limb file is that of this limb, with its mounting and what it carries"
+        ) from error
     return Prediction(response.bend_angles, response.tip)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.identification.air import AirFit
 from der_planner.identification.geometry import GeometryFit
+from der_planner.limb import Limb
+from der_planner.model.sag import weight_of
 
 Array = NDArray[np.float64]
 
@@ -36,6 +39,42 @@ class Unknown:
 
 
 @dataclass(frozen=True)
+class LoadsFit:
+    """What gravity pulls at, and what that tells.
+
+    Attributes:
+        gravity: (2,) in the plane [m/s²].
+        mass: of what moves: segments, connectors and what they carry [kg].
+        first_moment: of that about the clamp, of the straight limb [kg·m].
+        stiffness: (M,) EI [N·m²].
+    """
+
+    gravity: tuple[float, float]
+    mass: float
+    first_moment: float
+    stiffness: tuple[float, ...]
+
+
+def loads_of(limb: Limb) -> LoadsFit | None:
+    """Return what gravity in the plane pulls at; None without such gravity."""
+    if not any(limb.gravity[:2]):
+        return None
+    straight = replace(limb, gravity=(0.0, 1.0, 0.0))
+    weight = weight_of(straight)
+    count = limb.segment_count
+    carried = sum(m.mass for m in limb.masses if m.arc_length > limb.base_length)
+    densities = [s.mass_per_length for s in limb.segments]
+    mass = sum(s.mass_per_length * s.length for s in limb.segments) + carried
+    mass += limb.connector_length * sum(0.5 * (a + b) for a, b in pairwise(densities))
+    return LoadsFit(
+        (limb.gravity[0], limb.gravity[1]),
+        float(mass),
+        float(weight.lever.sum() + limb.base_length * mass),
+        tuple(s.bending_stiffness for s in limb.segments[:count]),
+    )
+
+
+@dataclass(frozen=True)
 class FitReport:
     """What a fit found, and how well.
 
@@ -56,6 +95,7 @@ class FitReport:
         evaluations: of model and derivatives.
         fit_time: [s].
         warnings: sentences.
+        loads: what gravity pulls at; None for a limb that no gravity pulls in its plane.
     """
 
     source: str
@@ -74,6 +114,7 @@ class FitReport:
     evaluations: int
     fit_time: float
     warnings: tuple[str, ...] = ()
+    loads: LoadsFit | None = None
 
     def value(self, name: str) -> Unknown:
         """Return the unknown of this name, e.g. ``gain[0]``.
@@ -109,7 +150,7 @@ class FitReport:
                 f"max {math.degrees(largest):.2f}°, {100 * error / max(span, 1e-9):.2f} % of "
                 f"its range{other}"
             )
-        lines += self._air_lines() + self._geometry_lines()
+        lines += self._air_lines() + self._geometry_lines() + self._load_lines()
         for first, second, value in self.strongly_correlated:
             lines.append(
                 f"the log cannot tell {first} and {second} apart (correlation {value:+.2f})"
@@ -151,6 +192,44 @@ class FitReport:
             f"{1e3 * geometry.residual:.2f} mm of an evenly bent rod at the measured angles "
             f"(with the prior's lengths {1e3 * geometry.residual_before:.2f} mm)"
         ]
+
+    def _load_lines(self) -> list[str]:
+        if self.loads is None:
+            return []
+        loads = self.loads
+        pull = math.hypot(*loads.gravity)
+        line = (
+            f"loads: gravity of {pull:.2f} m/s² in the plane pulls at {1e3 * loads.mass:.0f} g, "
+            f"first moment {1e3 * loads.first_moment:.1f} g·m about the clamp"
+        )
+        known = {u.name: u for u in self.unknowns}
+        kept = "the mass" if "log_stiffness[0]" in known else "the stiffness"
+        told = []
+        for index, stiffness in enumerate(loads.stiffness):
+            if f"log_stiffness[{index}]" in known:
+                share = known[f"log_stiffness[{index}]"].deviation
+                told.append(f"EI of segment {index} = {stiffness:.4f} N·m² ± {100 * share:.1f} %")
+            if f"log_mass[{index}]" in known:
+                found = known[f"log_mass[{index}]"]
+                told.append(
+                    f"mass of segment {index} = prior × {math.exp(found.value):.3f} ± "
+                    f"{100 * found.deviation:.1f} %"
+                )
+        if not told:
+            return [line]
+        return [
+            line,
+            f"loads: weight tells stiffness from gain: {', '.join(told)}",
+            f"loads: stiffness, gain and mass scale together, {kept} was given; condition of "
+            f"gains, rest angles and stiffness or mass: {self.condition:.0f}",
+        ]
+
+    @property
+    def condition(self) -> float:
+        """Of the correlation of gains, rest angles and stiffnesses or masses: 1 is all apart."""
+        names = ("gain[", "rest_angle[", "log_stiffness[", "log_mass[")
+        rows = [i for i, u in enumerate(self.unknowns) if u.name.startswith(names)]
+        return float(np.linalg.cond(self.correlation[np.ix_(rows, rows)]))
 
 
 def _readable(item: Unknown) -> tuple[float, float, str]:

@@ -23,6 +23,8 @@ SUBSTEPS = 1
 """Integrator steps of 50 ms: see the convergence on the page of the identification."""
 _NUDGE = 1e-3
 """Of an unknown in its scale, for the slope of the effective pressure."""
+_STEP = 0.1
+"""Of an unknown in its scale, for the difference of two simulations."""
 
 
 class RodAngles:
@@ -38,7 +40,6 @@ class RodAngles:
     def __init__(self, prior: Limb, time: Array, pressure: Array, nodes: int = NODES) -> None:
         self._prior, self._time, self._nodes = prior, time, nodes
         self._pressure = pressure
-        self._period = float(time[1] - time[0])
 
     def angles(self, values: Array) -> Array:
         """Return predicted bend angles (K, M) [rad] for the unknowns (M, T)."""
@@ -51,8 +52,11 @@ class RodAngles:
             values: (M, T) unknowns.
             wanted: (segment, term) of each of the P unknowns.
 
-        What acts as a pressure goes through the rod's exact tangent; stiffness and damping, which
-        change the rod itself, are differences of two simulations.
+        What acts as a pressure goes through the rod's exact tangent; stiffness, damping and mass,
+        which change the rod itself, are differences of two simulations.
+
+        Raises:
+            ConvergenceError: the rod cannot follow.
         """
         model = RodModel(to_limb(self._prior, values), self._nodes)
         response = self._simulate(model, linearise=True)
@@ -60,10 +64,10 @@ class RodAngles:
         assert response.derivative is not None
         result = np.empty((*angles.shape, len(wanted)))
         for place, (segment, term) in enumerate(wanted):
-            if TERMS[term].group == "dynamics":
+            if TERMS[term].group in ("dynamics", "mass"):
                 result[:, :, place] = self._difference(values, segment, term, angles)
                 continue
-            change = self._pressure_change(values, segment, term)
+            change = self._pressure_change(values, segment, term, effective)
             change[:, segment] += self._moment_change(
                 values[segment], term, effective[:, segment], angles[:, segment]
             )
@@ -81,23 +85,22 @@ class RodAngles:
         )
 
     def _difference(self, values: Array, segment: int, term: int, angles: Array) -> Array:
-        step = TERMS[term].step
+        """Return the derivative (K, M) by an unknown that changes the rod itself."""
+        step = _STEP * TERMS[term].scale
         moved = values.copy()
         put(moved, segment, term, float(values[segment, term]) + step)
         changed: Array = (self.angles(moved) - angles) / step
         return changed
 
-    def _pressure_change(self, values: Array, segment: int, term: int) -> Array:
+    def _pressure_change(self, values: Array, segment: int, term: int, effective: Array) -> Array:
         """Return ∂(effective pressures)/∂unknown (K, M), by a difference of the closed form."""
         value, kind = float(values[segment, term]), TERMS[term]
         nudge = _NUDGE * kind.scale
-        ends = (max(value - nudge, kind.low), min(value + nudge, kind.high))
-        pressures = []
-        for end in ends:
-            moved = values.copy()
-            put(moved, segment, term, end)
-            pressures.append(self.effective(moved))
-        slope: Array = (pressures[1] - pressures[0]) / (ends[1] - ends[0])
+        if value + nudge > kind.high:
+            nudge = -nudge
+        moved = values.copy()
+        put(moved, segment, term, value + nudge)
+        slope: Array = (self.effective(moved) - effective) / nudge
         return slope
 
     @staticmethod

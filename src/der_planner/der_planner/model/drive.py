@@ -23,12 +23,12 @@ STEPS = 5
 
 @dataclass(frozen=True)
 class Window:
-    """Effective pressures of the W commands from one of them on.
+    """Effective pressures under W commands in a row, the first of which has the index `first`.
 
     Attributes:
         limb: of the pressures.
         first: index of the first command of the window.
-        chambers: what the chambers do, from ``begin`` commands on.
+        chambers: what the chambers do under the commands from index ``begin`` on.
         begin: index of the first command that the chambers were given.
         effective: (W, S, M) effective pressure of each integrator step [Pa].
     """

@@ -28,6 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from der_planner.limb import Limb, Segment
 from der_planner.model.resting import RestingLaw, RestingSlopes, rest_along, rest_slopes
+from der_planner.model.sag import weight_of
 
 Array = NDArray[np.float64]
 
@@ -273,8 +274,8 @@ def resting_bend(
 ) -> Array:
     """Return the bend angles (K, M) [rad] of a slow motion under chamber pressures (K, M) [Pa].
 
-    Without inertia each segment bends by its own moment alone; friction and creep are solved for at
-    each instant together with the bend, since they act along it.
+    Without inertia each segment bends by its own moment and the limb's weight; friction and creep
+    are solved for at each instant together with the bend, since they act along it.
 
     Args:
         limb: calibrated limb.
@@ -284,37 +285,37 @@ def resting_bend(
     """
     times = np.ascontiguousarray(time, dtype=float)
     pressures = np.asarray(differential, dtype=float)
-    bend = np.empty_like(pressures)
-    driven, stiffer, _, _ = _drive(limb, pressures)
-    for index, segment in enumerate(limb.segments):
-        bend[:, index] = rest_along(
-            times,
-            np.ascontiguousarray(driven[:, index]),
-            np.ascontiguousarray(stiffer[:, index]),
-            resting_law(segment),
-            _begin(limb, index, start),
-        )
+    driven, stiffer, _, _ = (np.ascontiguousarray(part) for part in _drive(limb, pressures))
+    bend: Array = rest_along(times, driven, stiffer, resting_law(limb), _begin(limb, start))
     return bend
 
 
-def _begin(limb: Limb, index: int, start: Memory | None) -> Array:
-    """Return bend [rad], z and creep [rad] of one segment at the start; NaN: at rest."""
+def _begin(limb: Limb, start: Memory | None) -> Array:
+    """Return bend [rad], z and creep [rad] of each segment (M, 3) at the start; NaN: at rest."""
     if start is None:
-        return np.full(3, np.nan)
-    strain = start.creep[index] * limb.segments[index].length
-    return np.array([start.bend[index], start.friction[index], strain])
+        return np.full((limb.segment_count, 3), np.nan)
+    lengths = np.array([s.length for s in limb.segments])
+    return np.stack([start.bend, start.friction, start.creep * lengths], axis=1)
 
 
-def resting_law(segment: Segment) -> RestingLaw:
-    """Return what the bend at rest of one segment depends on."""
+def resting_law(limb: Limb) -> RestingLaw:
+    """Return what the bend at rest depends on."""
+    columns = [
+        (
+            s.moment_gain * s.length / s.bending_stiffness,
+            s.cubic_stiffness / s.bending_stiffness / s.length**2,
+            s.rest_curvature * s.length,
+            s.friction_moment / s.moment_gain,
+            max(s.friction_curvature * s.length, 1e-6),
+            s.creep_stiffness / s.length / s.moment_gain,
+            max(s.creep_time, 1e-6),
+            s.bending_stiffness / s.length,
+        )
+        for s in limb.segments
+    ]
+    gain, cubic, rest, friction, turn, creep, relaxation, stiffness = np.array(columns).T.copy()
     return RestingLaw(
-        gain=float(segment.moment_gain * segment.length / segment.bending_stiffness),
-        cubic=segment.cubic_stiffness / segment.bending_stiffness / segment.length**2,
-        rest=segment.rest_curvature * segment.length,
-        friction=segment.friction_moment / segment.moment_gain,
-        turn=max(segment.friction_curvature * segment.length, 1e-6),
-        creep=segment.creep_stiffness / segment.length / segment.moment_gain,
-        relaxation=max(segment.creep_time, 1e-6),
+        gain, cubic, rest, friction, turn, creep, relaxation, stiffness, weight_of(limb)
     )
 
 
@@ -340,39 +341,26 @@ class SlowSlopes:
         self._effective = effective
         _, self._stiffer, self._gain, self._stiffening = _drive(limb, differential)
         self._coupling = coupling_matrix(limb)
+        law = resting_law(limb)
         bend = resting_bend(limb, time, differential, start)
-        self._slopes = [
-            RestingSlopes(
-                resting_law(segment),
-                rest_slopes(
-                    np.ascontiguousarray(time),
-                    np.ascontiguousarray(self._stiffer[:, index]),
-                    np.ascontiguousarray(bend[:, index]),
-                    resting_law(segment),
-                    _begin(limb, index, start),
-                ),
-            )
-            for index, segment in enumerate(limb.segments)
-        ]
+        times = np.ascontiguousarray(time)
+        steps = rest_slopes(times, self._stiffer, bend, law, _begin(limb, start))
+        self._memory = RestingSlopes(law, steps)
 
     def tangent(self, change: Array) -> Array:
         """Return the change (K, M) of the effective pressures by one of the chambers' (K, M)."""
         driven = change * self._gain + change @ self._coupling.T
         stiffer = change * self._stiffening
-        memory = [each.tangent(driven[:, i], stiffer[:, i]) for i, each in enumerate(self._slopes)]
-        moved: Array = (
-            driven - np.stack(memory, axis=1) - self._effective * stiffer
-        ) / self._stiffer
+        memory = self._memory.tangent(driven, stiffer)
+        moved: Array = (driven - memory - self._effective * stiffer) / self._stiffer
         return moved
 
     def adjoint(self, weight: Array) -> Array:
         """Return Σ weight · ∂w/∂u (K, M), the transpose of `tangent`, for weights (K, M)."""
         scaled = weight / self._stiffer
-        driven, stiffer = scaled.copy(), -scaled * self._effective
-        for index, each in enumerate(self._slopes):
-            by_driven, by_stiffer = each.adjoint(scaled[:, index])
-            driven[:, index] -= by_driven
-            stiffer[:, index] -= by_stiffer
+        by_driven, by_stiffer = self._memory.adjoint(scaled)
+        driven = scaled - by_driven
+        stiffer = -scaled * self._effective - by_stiffer
         gradient: Array = driven * self._gain + driven @ self._coupling
         return gradient + stiffer * self._stiffening
 

@@ -143,11 +143,11 @@ class ArcModel:
     @property
     def rest(self) -> ArcState:
         """The vented limb at rest."""
-        return ArcState(self.pcc.rest, np.zeros_like(self.pcc.rest))
+        return self.resting(np.zeros(self.limb.segment_count))
 
     def resting(self, effective: Array) -> ArcState:
-        """Return the arcs at rest under effective pressures (M,) [Pa], by the linear stiffness."""
-        angles = self.pcc.rest + self.pcc.gain * effective / self.pcc.stiffness
+        """Return the arcs at rest under effective pressures (M,) [Pa] and their weight."""
+        angles = self.pcc.resting(effective)
         return ArcState(angles, np.zeros_like(angles))
 
     def state(self, angles: ArrayLike, rates: ArrayLike) -> ArcState:

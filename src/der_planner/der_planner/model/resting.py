@@ -1,10 +1,14 @@
-"""The bend of one segment at rest under changing pressures, with friction and creep; compiled.
+"""The bend of a limb at rest under changing pressures and its weight, with friction and creep.
 
-With φ = θ − θ_rest, gain g [rad/Pa], friction f [Pa] and creep c [Pa/rad] in pressures,
+With φ = θ − θ_rest of each segment, gain g [rad/Pa], friction f [Pa] and creep c [Pa/rad] in
+pressures,
 
-    φ + k φ³ = g (driven − f z − c q) / stiffer
+    φ + k φ³ = g (driven − f z − c q) / stiffer + W(θ)
 
-holds at each instant, z and q following the bend by the laws of `der_planner.model.material`.
+holds at each instant, z and q following the bend by the laws of `der_planner.model.material`. W is
+the torque of gravity on the segment's bend over the segment's stiffness, for evenly bent segments:
+the only term that couples them. Friction and creep hardly care that a loaded limb does not bend
+quite evenly, and no other use is made of this bend.
 """
 
 from __future__ import annotations
@@ -18,182 +22,306 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+_ROUNDS = 200
+"""Sweeps over the segments at the most; without weight one is enough."""
+_LARGEST_STEP = 0.3
+"""Of a bend angle in one iteration [rad]."""
+_LARGEST_BEND = 6.0
+"""Of a segment [rad]."""
+
 
 class RestingLaw(NamedTuple):
-    """The numbers of one segment."""
+    """The numbers of M segments."""
 
-    gain: float  # g [rad/Pa]
-    cubic: float  # k [1/rad²]
-    rest: float  # θ_rest [rad]
-    friction: float  # f [Pa]
-    turn: float  # bend over which friction turns round [rad]
-    creep: float  # c [Pa/rad]
-    relaxation: float  # of the creep [s]
+    gain: Array  # (M,) g [rad/Pa]
+    cubic: Array  # (M,) k [1/rad²]
+    rest: Array  # (M,) θ_rest [rad]
+    friction: Array  # (M,) f [Pa]
+    turn: Array  # (M,) bend over which friction turns round [rad]
+    creep: Array  # (M,) c [Pa/rad]
+    relaxation: Array  # (M,) of the creep [s]
+    stiffness: Array  # (M,) EI / L [N·m/rad]
+    weight: Weight
+
+
+class Weight(NamedTuple):
+    """Gravity on straight pieces, E in a chain of evenly bent segments.
+
+    A piece with heading ψ_e = Σ_j turning_ej θ_j has the torque lever_e · (e(ψ_e) × gravity).
+    """
+
+    lever: Array  # (E,) first moment of the piece, and its length times the mass beyond [kg·m]
+    turning: Array  # (E, M) share of each bend angle in the heading
+    gravity: Array  # (2,) [m/s²]
+
+
+@njit(cache=True)
+def weigh(angle: Array, law: RestingLaw, torque: Array, slope: Array) -> None:
+    """Write W (M,) [rad] at bend angles (M,) and its slope ∂W/∂θ (M, M)."""
+    weight = law.weight
+    torque[:] = 0.0
+    slope[:] = 0.0
+    count = angle.shape[0]
+    for e in range(weight.lever.shape[0]):
+        heading = 0.0
+        for i in range(count):
+            heading += weight.turning[e, i] * angle[i]
+        x, y = np.cos(heading), np.sin(heading)
+        turns = weight.lever[e] * (x * weight.gravity[1] - y * weight.gravity[0])
+        falls = -weight.lever[e] * (x * weight.gravity[0] + y * weight.gravity[1])
+        for i in range(count):
+            torque[i] += weight.turning[e, i] * turns / law.stiffness[i]
+            for j in range(count):
+                share = weight.turning[e, i] * weight.turning[e, j]
+                slope[i, j] += share * falls / law.stiffness[i]
 
 
 @njit(cache=True)
 def rest_along(time: Array, driven: Array, stiffer: Array, law: RestingLaw, begin: Array) -> Array:
-    """Return the bend angle (K,) [rad], solved at each instant by Newton's method.
+    """Return the bend angles (K, M) [rad], solved at each instant by Newton's method.
 
     Args:
         time: (K,) [s].
-        driven: (K,) right side without friction and creep [Pa].
-        stiffer: (K,) growth of the stiffness.
-        law: of the segment.
-        begin: θ [rad], z and q [rad] at ``time[0]``; NaN: at rest under ``driven[0]``, z = q = 0.
-
-    Friction makes the residual rise with θ, and bending away from the last angle stiffens the
-    segment: there is one root, on the side to which the residual points at the last angle.
+        driven: (K, M) pressures without friction and creep [Pa].
+        stiffer: (K, M) growth of the stiffness.
+        law: of the segments.
+        begin: (M, 3) θ [rad], z and q [rad] at ``time[0]``; NaN: at rest under ``driven[0]``, z = q
+            = 0.
     """
-    bend = np.empty(time.shape[0])
-    angle, z, q = begin[0], begin[1], begin[2]
-    if np.isnan(angle):
-        linear = law.gain * driven[0] / stiffer[0]
-        angle, z, q = law.rest + linear, 0.0, 0.0
-        for _ in range(20):
-            bent = angle - law.rest
-            angle -= (bent + law.cubic * bent**3 - linear) / (1.0 + 3.0 * law.cubic * bent**2)
+    instants, count = driven.shape
+    bend = np.empty((instants, count))
+    angle, z, q = begin[:, 0].copy(), begin[:, 1].copy(), begin[:, 2].copy()
+    keep, share = np.zeros(count), np.zeros(count)
+    if np.isnan(begin[0, 0]):
+        angle[:], z[:], q[:] = law.rest, 0.0, 0.0
+        balance(angle, driven[0], stiffer[0], law, angle.copy(), z, q, keep, share)
     bend[0] = angle
-    for k in range(1, time.shape[0]):
-        rate = (time[k] - time[k - 1]) / law.relaxation
-        keep = np.exp(-rate)
-        share = (1.0 - keep) / rate
-        last = angle
-        scale = law.gain / stiffer[k]
-        bent = last - law.rest
-        error = bent + law.cubic * bent**3
-        error -= scale * (driven[k] - law.friction * z - law.creep * q * keep)
-        sign = -1.0 if error > 0.0 else 1.0
-        for _ in range(30):
-            change = angle - last
-            fade = np.exp(-abs(change) / law.turn)
-            moved = sign + (z - sign) * fade
-            load = law.friction * moved + law.creep * (q * keep + change * share)
-            bent = angle - law.rest
-            error = bent + law.cubic * bent**3 - scale * (driven[k] - load)
-            slope = 1.0 + 3.0 * law.cubic * bent**2
-            slope += scale * (law.friction * (1.0 - z * sign) * fade / law.turn + law.creep * share)
-            step = error / slope
-            angle -= step
-            if (angle - last) * sign < 0.0:
-                angle = last
-            if abs(step) < 1e-12:
-                break
-        change = angle - last
-        z = sign + (z - sign) * np.exp(-abs(change) / law.turn)
-        q = q * keep + change * share
+    for k in range(1, instants):
+        for i in range(count):
+            rate = (time[k] - time[k - 1]) / law.relaxation[i]
+            keep[i] = np.exp(-rate)
+            share[i] = (1.0 - keep[i]) / rate
+        last = bend[k - 1]
+        balance(angle, driven[k], stiffer[k], law, last, z, q, keep, share)
+        for i in range(count):
+            change = angle[i] - last[i]
+            sign = 1.0 if change >= 0.0 else -1.0
+            z[i] = sign + (z[i] - sign) * np.exp(-abs(change) / law.turn[i])
+            q[i] = q[i] * keep[i] + change * share[i]
         bend[k] = angle
     return bend
 
 
-class StepSlopes(NamedTuple):
-    """Derivatives of each step (K,), by the last θ, z, q and by this instant's drive.
+@njit(cache=True)
+def balance(
+    angle: Array,
+    driven: Array,
+    stiffer: Array,
+    law: RestingLaw,
+    last: Array,
+    z: Array,
+    q: Array,
+    keep: Array,
+    share: Array,
+) -> None:
+    """Move the angles (M,) to where the moments of one instant balance.
 
-    The first entries are those of the start: at rest under ``driven[0]``, or given and fixed.
+    One segment after the other, with W to first order about the angles of the sweep before; the
+    balance of all is convex below the load that buckles the limb, so that this converges. ``last``,
+    z and q are those of the instant before; a ``share`` of zero is an instant without memory.
+    """
+    count = angle.shape[0]
+    torque, slope = np.empty(count), np.zeros((count, count))
+    heavy = law.weight.lever.shape[0] > 0
+    if not heavy:
+        torque[:] = 0.0
+    for _ in range(_ROUNDS):
+        if heavy:
+            weigh(angle, law, torque, slope)
+        moved, before = 0.0, angle.copy()
+        for i in range(count):
+            pulled = torque[i]
+            for j in range(count):
+                if j != i:
+                    pulled += slope[i, j] * (angle[j] - before[j])
+            found = balanced_bend(
+                i, before[i], driven[i], stiffer[i], law, last[i], z[i], q[i], keep[i], share[i],
+                pulled, slope[i, i],
+            )  # fmt: skip
+            step = found - before[i]
+            if heavy:
+                step = min(max(step, -_LARGEST_STEP), _LARGEST_STEP)
+            angle[i] = before[i] + step
+            moved = max(moved, abs(step))
+        if not heavy or moved < 1e-10:
+            return
+
+
+@njit(cache=True)
+def balanced_bend(
+    i: int,
+    now: float,
+    driven: float,
+    stiffer: float,
+    law: RestingLaw,
+    last: float,
+    z: float,
+    q: float,
+    keep: float,
+    share: float,
+    pulled: float,
+    pulled_slope: float,
+) -> float:
+    """Return θ of segment i, where W = pulled + pulled_slope · (θ − now).
+
+    Friction makes the residual rise with θ, and bending away from the last angle stiffens the
+    segment: there is one root, on the side to which the residual points at the last angle.
+    """
+    scale = law.gain[i] / stiffer
+    memory = share > 0.0
+    friction = law.friction[i] if memory else 0.0
+    bent = last - law.rest[i]
+    error = bent + law.cubic[i] * bent**3 - pulled - pulled_slope * (last - now)
+    error -= scale * (driven - friction * z - law.creep[i] * q * keep)
+    sign = -1.0 if error > 0.0 else 1.0
+    angle = now if memory and (now - last) * sign > 0.0 else last
+    for _ in range(30):
+        change = angle - last
+        fade = np.exp(-abs(change) / law.turn[i]) if memory else 1.0
+        moved = sign + (z - sign) * fade
+        load = friction * moved + law.creep[i] * (q * keep + change * share)
+        bent = angle - law.rest[i]
+        error = bent + law.cubic[i] * bent**3 - scale * (driven - load)
+        error -= pulled + pulled_slope * (angle - now)
+        slope = 1.0 + 3.0 * law.cubic[i] * bent**2 - pulled_slope
+        slope += scale * (friction * (1.0 - z * sign) * fade / law.turn[i] + law.creep[i] * share)
+        # A spring that softens with bend has no balance beyond some load: the bend ends there.
+        step = min(max(error / max(slope, 0.05), -_LARGEST_STEP), _LARGEST_STEP)
+        angle = min(max(angle - step, law.rest[i] - _LARGEST_BEND), law.rest[i] + _LARGEST_BEND)
+        if (angle - last) * sign < 0.0:
+            angle = last
+        if abs(step) < 1e-12:
+            break
+    return angle
+
+
+class StepSlopes(NamedTuple):
+    """Derivatives of each step, by the last θ, z, q and by this instant's drive.
+
+    The change of the angles is ``inverse`` times the sum of the terms `angle_by_…`. The first
+    entries are those of the start: at rest under ``driven[0]``, or given and fixed.
     """
 
-    angle_by_angle: Array
-    angle_by_friction: Array  # [rad]
-    angle_by_creep: Array
-    angle_by_driven: Array  # [rad/Pa]
-    angle_by_stiffer: Array  # [rad]
-    friction_kept: Array
-    friction_by_change: Array  # [1/rad]
-    creep_kept: Array
-    creep_by_change: Array
+    inverse: Array  # (K, M, M)
+    angle_by_angle: Array  # (K, M)
+    angle_by_friction: Array  # (K, M) [rad]
+    angle_by_creep: Array  # (K, M)
+    angle_by_driven: Array  # (K, M) [rad/Pa]
+    angle_by_stiffer: Array  # (K, M) [rad]
+    friction_kept: Array  # (K, M)
+    friction_by_change: Array  # (K, M) [1/rad]
+    creep_kept: Array  # (K, M)
+    creep_by_change: Array  # (K, M)
 
 
 @njit(cache=True)
 def rest_slopes(
     time: Array, stiffer: Array, bend: Array, law: RestingLaw, begin: Array
 ) -> StepSlopes:
-    """Return the derivatives of each step along bend angles (K,) found by `rest_along`.
+    """Return the derivatives of each step along bend angles (K, M) found by `rest_along`.
 
-    By the implicit function theorem on the step's residual
-    φ + k φ³ − g (driven − f z' − c q') / stiffer = 0 with z' = s + (z − s) exp(−|Δθ| / turn), s the
-    sign of Δθ, and q' = keep q + share Δθ.
+    By the implicit function theorem on the step's residual φ + k φ³ − W(θ) − g (driven − f z' − c
+    q') / stiffer = 0 with z' = s + (z − s) exp(−|Δθ| / turn), s the sign of Δθ, and q' = keep q +
+    share Δθ.
     """
-    count = time.shape[0]
-    angle, friction, creep = np.zeros(count), np.zeros(count), np.zeros(count)
-    by_driven, by_stiffer = np.zeros(count), np.zeros(count)
-    z_kept, z_change = np.zeros(count), np.zeros(count)
-    q_kept, q_change = np.zeros(count), np.zeros(count)
-    known = not np.isnan(begin[0])
-    z = begin[1] if known else 0.0
-    for k in range(count):
-        bent = bend[k] - law.rest
-        stiffness = 1.0 + 3.0 * law.cubic * bent**2
-        scale = law.gain / stiffer[k]
-        if k > 0:
-            rate = (time[k] - time[k - 1]) / law.relaxation
-            change = bend[k] - bend[k - 1]
-            sign = 1.0 if change >= 0.0 else -1.0
-            z_kept[k] = np.exp(-abs(change) / law.turn)
-            z_change[k] = (1.0 - z * sign) * z_kept[k] / law.turn
-            q_kept[k] = np.exp(-rate)
-            q_change[k] = (1.0 - q_kept[k]) / rate
-            z = sign + (z - sign) * z_kept[k]
-        rub = scale * (law.friction * z_change[k] + law.creep * q_change[k])
-        total = stiffness + rub
-        if k == 0 and known:
-            continue
-        angle[k] = rub / total
-        friction[k] = -scale * law.friction * z_kept[k] / total
-        creep[k] = -scale * law.creep * q_kept[k] / total
-        by_driven[k] = scale / total
-        by_stiffer[k] = -(bent + law.cubic * bent**3) / stiffer[k] / total
+    instants, count = bend.shape
+    shape = (instants, count)
+    inverse = np.zeros((instants, count, count))
+    angle, friction, creep = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    by_driven, by_stiffer = np.zeros(shape), np.zeros(shape)
+    z_kept, z_change = np.zeros(shape), np.zeros(shape)
+    q_kept, q_change = np.zeros(shape), np.zeros(shape)
+    known = not np.isnan(begin[0, 0])
+    z = begin[:, 1].copy() if known else np.zeros(count)
+    torque, slope = np.zeros(count), np.zeros((count, count))
+    for k in range(instants):
+        weigh(bend[k], law, torque, slope)
+        matrix = -slope
+        for i in range(count):
+            bent = bend[k, i] - law.rest[i]
+            scale = law.gain[i] / stiffer[k, i]
+            if k > 0:
+                rate = (time[k] - time[k - 1]) / law.relaxation[i]
+                change = bend[k, i] - bend[k - 1, i]
+                sign = 1.0 if change >= 0.0 else -1.0
+                z_kept[k, i] = np.exp(-abs(change) / law.turn[i])
+                z_change[k, i] = (1.0 - z[i] * sign) * z_kept[k, i] / law.turn[i]
+                q_kept[k, i] = np.exp(-rate)
+                q_change[k, i] = (1.0 - q_kept[k, i]) / rate
+                z[i] = sign + (z[i] - sign) * z_kept[k, i]
+            rub = scale * (law.friction[i] * z_change[k, i] + law.creep[i] * q_change[k, i])
+            matrix[i, i] += 1.0 + 3.0 * law.cubic[i] * bent**2 + rub
+            angle[k, i] = rub
+            friction[k, i] = -scale * law.friction[i] * z_kept[k, i]
+            creep[k, i] = -scale * law.creep[i] * q_kept[k, i]
+            by_driven[k, i] = scale
+            held = bent + law.cubic[i] * bent**3 - torque[i]
+            by_stiffer[k, i] = -held / stiffer[k, i]
+        if k > 0 or not known:
+            inverse[k] = np.linalg.inv(matrix)
     return StepSlopes(
-        angle, friction, creep, by_driven, by_stiffer, z_kept, z_change, q_kept, q_change
+        inverse, angle, friction, creep, by_driven, by_stiffer, z_kept, z_change, q_kept, q_change
     )
 
 
 @dataclass(frozen=True)
 class RestingSlopes:
-    """First-order change of what friction and creep take, by the drive of the same segment."""
+    """First-order change of what friction and creep take, by the drive."""
 
     law: RestingLaw
     steps: StepSlopes
 
     def tangent(self, driven: Array, stiffer: Array) -> Array:
-        """Return the change (K,) of f z + c q [Pa] by changes (K,) of the drive."""
-        result: Array = _tangent(self.law, self.steps, driven.copy(), stiffer.copy())
+        """Return the change (K, M) of f z + c q [Pa] by changes (K, M) of the drive."""
+        result: Array = _tangent(self.law, self.steps, driven, stiffer)
         return result
 
     def adjoint(self, weight: Array) -> tuple[Array, Array]:
-        """Return the gradient of Σ weight (f z + c q) by ``driven`` and by ``stiffer``, (K,)."""
-        gradients: tuple[Array, Array] = _adjoint(self.law, self.steps, weight.copy())
+        """Return the gradient of Σ weight (f z + c q) by ``driven`` and ``stiffer``, (K, M)."""
+        gradients: tuple[Array, Array] = _adjoint(self.law, self.steps, weight)
         return gradients
 
 
 @njit(cache=True)
 def _tangent(law: RestingLaw, steps: StepSlopes, driven: Array, stiffer: Array) -> Array:
-    result = np.empty(driven.shape[0])
-    angle, z, q = 0.0, 0.0, 0.0
+    result = np.empty(driven.shape)
+    angle, z, q = np.zeros(law.gain.size), np.zeros(law.gain.size), np.zeros(law.gain.size)
     for k in range(driven.shape[0]):
-        before = angle
-        angle = (
+        right = (
             steps.angle_by_angle[k] * angle
             + steps.angle_by_friction[k] * z
             + steps.angle_by_creep[k] * q
             + steps.angle_by_driven[k] * driven[k]
             + steps.angle_by_stiffer[k] * stiffer[k]
         )
-        z = steps.friction_kept[k] * z + steps.friction_by_change[k] * (angle - before)
-        q = steps.creep_kept[k] * q + steps.creep_by_change[k] * (angle - before)
+        after = (steps.inverse[k] * right).sum(axis=1)
+        z = steps.friction_kept[k] * z + steps.friction_by_change[k] * (after - angle)
+        q = steps.creep_kept[k] * q + steps.creep_by_change[k] * (after - angle)
+        angle = after
         result[k] = law.friction * z + law.creep * q
     return result
 
 
 @njit(cache=True)
 def _adjoint(law: RestingLaw, steps: StepSlopes, weight: Array) -> tuple[Array, Array]:
-    count = weight.shape[0]
-    driven, stiffer = np.empty(count), np.empty(count)
-    angle, z, q = 0.0, 0.0, 0.0  # gradients by the state after step k
-    for k in range(count - 1, -1, -1):
-        z += weight[k] * law.friction
-        q += weight[k] * law.creep
+    driven, stiffer = np.empty(weight.shape), np.empty(weight.shape)
+    # gradients by the state after step k
+    angle, z, q = np.zeros(law.gain.size), np.zeros(law.gain.size), np.zeros(law.gain.size)
+    for k in range(weight.shape[0] - 1, -1, -1):
+        z = z + weight[k] * law.friction
+        q = q + weight[k] * law.creep
         moved = z * steps.friction_by_change[k] + q * steps.creep_by_change[k]
-        total = angle + moved
+        total = (steps.inverse[k].T * (angle + moved)).sum(axis=1)
         driven[k] = total * steps.angle_by_driven[k]
         stiffer[k] = total * steps.angle_by_stiffer[k]
         angle = total * steps.angle_by_angle[k] - moved

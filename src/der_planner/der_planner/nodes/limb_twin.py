@@ -6,6 +6,7 @@ import math
 import sys
 import threading
 import time
+from collections.abc import Sequence
 
 import numpy as np
 import rclpy
@@ -13,9 +14,10 @@ from geometry_msgs.msg import Point
 from rclpy.node import Node
 from std_msgs.msg import Header
 
-from der_msgs.msg import ChamberPressures, LimbShape, LimbState
-from der_planner.twin import LimbTwin, TwinError
-from der_planner.twin.realtime import RealTimeLoop
+from der_msgs.msg import ChamberPressures, LimbPush, LimbShape, LimbState
+from der_planner.limb import PointMass
+from der_planner.twin import LimbTwin, Push, TwinError
+from der_planner.twin.realtime import BACKLOG, RealTimeLoop
 from limb_interfaces import parameters, qos, stamps, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.overrides import check_overrides
@@ -44,8 +46,8 @@ class LimbTwinNode(Node):
                 self, "rate", 30.0, "shapes published per second [Hz]", at_least=1.0, at_most=120.0
             )
         )
+        self._twin = self._mount(seed, run)
         check_overrides(self)
-        self._twin = LimbTwin(seed, run)
         self._lock = threading.Lock()
         self._pressures: np.ndarray | None = None
         self._received_at = math.nan
@@ -56,11 +58,40 @@ class LimbTwinNode(Node):
         self.create_subscription(
             ChamberPressures, topics.TWIN_CHAMBER_PRESSURES, self._on_pressures, qos.STATES
         )
+        self.create_subscription(LimbPush, topics.TWIN_PUSH, self._on_push, qos.COMMANDS)
         self._loop = RealTimeLoop(self._advance, self._publish, 1.0 / rate)
         self._diagnostics = DiagnosticsPublisher(self, self._report)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._work, name="physics", daemon=True)
         self._thread.start()
+
+    def _mount(self, seed: int, run: int) -> LimbTwin:
+        """Return the twin under the loads that the parameters name.
+
+        Raises:
+            TwinError: a load is impossible.
+        """
+        gravity = parameters.declare(
+            self, "gravity", [0.0, 0.0, 0.0], "acceleration in limb_base: x, y, z [m/s^2]"
+        )
+        masses = parameters.declare(self, "masses", [0.0], "that the limb carries [kg]")
+        places = parameters.declare(
+            self, "masses_at", [0.0], "where each mass sits, from the clamp along the limb [m]"
+        )
+        assert isinstance(gravity, Sequence)
+        assert isinstance(masses, Sequence)
+        assert isinstance(places, Sequence)
+        if len(gravity) != 3:
+            raise TwinError(f"parameter 'gravity' must be three numbers in m/s², got {gravity}")
+        if len(masses) != len(places):
+            raise TwinError(
+                f"parameters 'masses' and 'masses_at' must be of one length, got {len(masses)} and "
+                f"{len(places)}"
+            )
+        x, y, z = map(float, gravity)
+        both = zip(masses, places, strict=True)
+        carried = [PointMass(float(at), float(mass)) for mass, at in both]
+        return LimbTwin(seed, run, gravity=(x, y, z), masses=carried)
 
     def close(self) -> None:
         """Stop the physics before the publishers go."""
@@ -84,6 +115,27 @@ class LimbTwinNode(Node):
             self._received_at = time.monotonic()
             self._messages += 1
         self._bad_message = ""
+
+    def _on_push(self, message: LimbPush) -> None:
+        """Take a push at the simulated time that its stamp stands for."""
+        stamp = stamps.nanoseconds(message.header.stamp)
+        now = self.get_clock().now().nanoseconds
+        ahead = (stamp - now) / stamps.NANOSECONDS if stamp else 0.0
+        force = message.force
+        try:
+            with self._lock:
+                behind = min(BACKLOG, time.monotonic() - self._loop.simulated_until)
+                self._twin.push(
+                    Push(
+                        self._twin.time + max(0.0, ahead + behind),
+                        message.arc_length,
+                        (force.x, force.y, force.z),
+                        message.mass,
+                        message.duration or math.inf,
+                    )
+                )
+        except TwinError as error:
+            self.get_logger().error(f"{topics.TWIN_PUSH} was not taken: {error}")
 
     def _work(self) -> None:
         try:

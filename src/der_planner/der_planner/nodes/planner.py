@@ -283,7 +283,7 @@ class PlannerNode(Node):
             progress(0.0)
             stamp, start = self._hand_over(request.start, allowance)
             result = plan(
-                self._options.limb, request.motion, request.model, request.method,
+                request.limb, request.motion, request.model, request.method,
                 nodes=self._options.nodes, start=start, progress=progress,
             )  # fmt: skip
             progress(1.0)

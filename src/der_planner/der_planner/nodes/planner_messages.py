@@ -13,10 +13,13 @@ from limb_interfaces.stamps import stamp_from_nanoseconds
 def plan_message(schedule: Schedule) -> PressurePlan:
     """Return the whole plan, stamped with its first setpoint's instant."""
     result = schedule.plan
+    payload, place = result.limb.payload
     message = PressurePlan(
         plan_id=schedule.plan_id, motion=result.motion, model=result.model,
         method=result.method, amplitude=result.amplitude, period=result.period,
-        cycles=result.cycles, limb=result.limb.name, segment_count=result.limb.segment_count,
+        cycles=result.cycles, limb=result.limb.name, gravity=result.limb.gravity,
+        payload=payload, payload_at=place,
+        segment_count=result.limb.segment_count,
         time=result.time.tolist(),
         differential_pressure=result.differential_pressure.ravel().tolist(),
         tip_reference=result.tip_reference.ravel().tolist(),

@@ -13,12 +13,20 @@ from der_planner.planning import METHODS, PathLimits
 from der_planner.planning.inverse import BRANCHES
 from limb_interfaces.parameters import declare
 
+LARGEST_PAYLOAD = 10.0
+"""[kg] More is a mistake in the unit."""
+
 
 @dataclass(frozen=True)
 class PlannerOptions:
-    """The node's parameters, checked; times in ns where they meet stamps, else in s."""
+    """The node's parameters, checked; times in ns where they meet stamps, else in s.
+
+    `limb` is mounted as the parameters say, and does not carry the payload yet.
+    """
 
     limb: Limb
+    payload: float
+    payload_at: float
     model: str
     method: str
     nodes: int
@@ -38,8 +46,25 @@ def read_parameters(node: Node) -> PlannerOptions:
     """
     read: Any = functools.partial(declare, node)
     limb_file = str(read("limb_file", "", "limb file (YAML); empty: the default limb"))
+    limb = Limb.from_yaml(limb_file) if limb_file else Limb.default()
+    mounting = str(
+        read(
+            "mounting",
+            "",
+            "horizontal, hanging, standing, sideways or degrees of tilt; empty: "
+            "gravity as in the limb file",
+        )
+    )
     return PlannerOptions(
-        limb=Limb.from_yaml(limb_file) if limb_file else Limb.default(),
+        limb=limb.mounted(mounting) if mounting else limb,
+        payload=float(
+            read("payload", 0.0, "mass [kg] carried beside the limb's own masses, where a command "
+                 "names none", at_least=0.0, at_most=LARGEST_PAYLOAD)
+        ),
+        payload_at=float(
+            read("payload_at", 0.0, "where, along the limb from its clamp [m]; 0: the tip",
+                 at_least=0.0)
+        ),
         model=str(
             read("default_model", "der", "model for paths and for commands that name none",
                  choices=tuple(METHODS))

@@ -10,7 +10,8 @@ import numpy as np
 from nav_msgs.msg import Path as PathMessage
 
 from der_msgs.msg import MotionCommand
-from der_planner.nodes.planner_parameters import PlannerOptions
+from der_planner.limb import Limb
+from der_planner.nodes.planner_parameters import LARGEST_PAYLOAD, PlannerOptions
 from der_planner.planning import Motion, choose_method
 from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD
 from limb_interfaces import topics
@@ -24,9 +25,13 @@ FURTHEST_STAMP = 600
 
 @dataclass
 class Request:
-    """One thing to plan: what was asked for, and whether it is still wanted."""
+    """One thing to plan: what was asked for, and whether it is still wanted.
+
+    `limb` is mounted as asked for and carries the payload.
+    """
 
     plan_id: str
+    limb: Limb
     motion: Motion
     model: str
     method: str
@@ -37,6 +42,15 @@ class Request:
 def new_plan_id() -> str:
     """Return a name for a plan that was given none."""
     return uuid.uuid4().hex[:8]
+
+
+def loaded(limb: Limb, payload: float, at: float) -> Limb:
+    """Return the limb with a payload [kg] at an arc length [m]; 0 is the tip.
+
+    Raises:
+        LimbError: the payload is negative, or its place is not on the limb.
+    """
+    return limb.carrying(payload, at or None)
 
 
 def start_of(stamp: int, now: int) -> int:
@@ -77,7 +91,13 @@ def from_command(message: MotionCommand, options: PlannerOptions, now: int) -> R
     )
     method = _method(model, message.method, options)
     start = start_of(nanoseconds(message.header.stamp), now)
-    return Request(message.plan_id, motion, model, method, start)
+    limb = options.limb.mounted(message.mounting) if message.mounting else options.limb
+    if message.payload < 0 or message.payload > LARGEST_PAYLOAD:
+        raise ValueError(f"the payload is {message.payload} kg: give 0 to {LARGEST_PAYLOAD:g} kg")
+    carried = message.payload, message.payload_at
+    if message.payload == 0:
+        carried = options.payload, options.payload_at
+    return Request(message.plan_id, loaded(limb, *carried), motion, model, method, start)
 
 
 def from_path(message: PathMessage, plan_id: str, options: PlannerOptions, now: int) -> Request:
@@ -96,7 +116,9 @@ def from_path(message: PathMessage, plan_id: str, options: PlannerOptions, now: 
         time, tip.reshape(-1, 2), branch=options.branch, limits=options.limits
     )
     start = start_of(nanoseconds(message.header.stamp), now)
-    return Request(plan_id, motion, options.model, _method(options.model, "", options), start)
+    limb = loaded(options.limb, options.payload, options.payload_at)
+    method = _method(options.model, "", options)
+    return Request(plan_id, limb, motion, options.model, method, start)
 
 
 def _method(model: str, method: str, options: PlannerOptions) -> str:

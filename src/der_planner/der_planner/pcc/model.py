@@ -28,6 +28,9 @@ MassModel = Literal["distributed", "lumped"]
 
 QUADRATURE_POINTS = 8
 """Gauss-Legendre points a segment: exact to rounding for bends below 180 degrees."""
+RESTING_STEPS = 60
+SMALL = 1e-5
+"""Step of the differences that give the slope of the weight's torque [rad]."""
 LARGEST_PHASE = 1.0
 """Of the limb's fastest mode in one step of the integrator [rad]; it is unstable beyond 2.8."""
 
@@ -168,6 +171,32 @@ class Pcc:
         bend = np.asarray(bend_angles, dtype=float) - self.rest
         torque: Vector = self.stiffness * bend + self.cubic * bend**3
         return torque
+
+    def resting(self, pressures: ArrayLike) -> Vector:
+        """Return the bend angles (n,) [rad] at rest under effective pressures (n,) [Pa] and weight.
+
+        By Newton's method on G u + Q_gravity = K (q − q_rest), with steps of at most 0.3 rad along
+        which the energy falls: beyond the load that buckles the straight limb, a bent one is found.
+        """
+        drive = self.gain * self._check("pressures", pressures)
+        still, turn = np.zeros(self.segment_count), np.eye(self.segment_count)
+
+        def pull(q: Vector) -> Vector:
+            left: Vector = self._inertia(q, still)[3] + drive - self.elastic_torque(q)
+            return left
+
+        q: Vector = self.rest + drive / self.stiffness
+        if not self.arcs.gravity.any() and not self.cubic.any():
+            return q
+        for _ in range(RESTING_STEPS):
+            slope = np.stack([pull(q + SMALL * e) - pull(q - SMALL * e) for e in turn], axis=1)
+            values, vectors = np.linalg.eigh(-0.25 * (slope + slope.T) / SMALL)
+            firm = np.maximum(np.abs(values), 1e-3 * self.stiffness.min())
+            step = vectors @ ((vectors.T @ pull(q)) / firm)
+            q = q + step * min(1.0, 0.3 / max(float(np.abs(step).max()), 1e-12))
+            if np.abs(step).max() < 1e-10:
+                break
+        return q
 
     def energy(self, bend_angles: ArrayLike, rates: ArrayLike) -> float:
         """Return kinetic plus elastic plus gravity's potential energy [J]."""

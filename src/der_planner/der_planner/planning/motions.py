@@ -312,7 +312,7 @@ def quintic(time: Array, x0: Array, v0: Array, a0: Array, x1: Array, v1: Array, 
 
 
 def _led_in(limb: Limb, start: Start, time: Array, angles: Array) -> tuple[Array, Array]:
-    """Return time and angles with the way from another motion to the straight pose before them."""
+    """Return time and angles that begin with the way from another motion to the straight pose."""
     zero = np.zeros(limb.segment_count)
     state = (start.bend_angles, start.rate, start.acceleration)
     lead = _fine_grid(_travel_time(limb, state))

@@ -279,23 +279,9 @@ def limb_mesh(limb: Limb, nodes: int, clamp: str) -> Mesh:
     bend = compliance("bending_stiffness")
     edge_mass = of_edges("mass_per_length") * rest
     polar = 2.0 * of_edges("bending_stiffness") / of_edges("axial_stiffness")
-    viscous, cubic, rest_kappa = np.zeros(nodes), np.zeros(nodes), np.zeros((nodes, 2))
-    tau = np.maximum(*of_nodes("material_damping"))
-    viscous[:] = bend * tau
-    stiffening = np.minimum(*of_nodes("cubic_stiffness"))
-    np.divide(stiffening, cell**3, out=cubic, where=cell > 0)
-    gain = np.zeros(count)
-    for index, (segment, (first, size)) in enumerate(zip(limb.segments, pairs, strict=True)):
-        inner = slice(first + 1, first + size - 1)
-        step = rest[first]
-        turn = segment.rest_curvature * segment.length / (size - 2)
-        rest_kappa[inner, 0] = 2.0 * math.tan(0.5 * turn)
-        # The couples sit in the middle of the first and last edge: size - 2 edges bend, not the
-        # segment.
-        ratio = segment.length / ((size - 2) * step)
-        gain[index] = segment.moment_gain * ratio / step
-        # k3 (κ-κ̄)² against EI is kept when the curvature is spread over the shorter length
-        cubic[inner] /= ratio**2
+    cubic = np.zeros(nodes)
+    np.divide(np.minimum(*of_nodes("cubic_stiffness")), cell**3, out=cubic, where=cell > 0)
+    gain, rest_kappa = _actuation(limb, rest, pairs, cubic)
     return Mesh(
         rest=rest,
         axial=of_edges("axial_stiffness"),
@@ -305,7 +291,7 @@ def limb_mesh(limb: Limb, nodes: int, clamp: str) -> Mesh:
         bend=bend,
         twist=compliance("torsional_stiffness"),
         cubic=cubic,
-        viscous=viscous,
+        viscous=bend * np.maximum(*of_nodes("material_damping")),
         rest_kappa=rest_kappa,
         rest_twist=np.zeros(nodes),
         gravity=np.array(limb.gravity, dtype=float),
@@ -318,6 +304,27 @@ def limb_mesh(limb: Limb, nodes: int, clamp: str) -> Mesh:
         ),
         base=limb.base_length,
     )
+
+
+def _actuation(
+    limb: Limb, rest: Array, pairs: tuple[tuple[int, int], ...], cubic: Array
+) -> tuple[Array, Array]:
+    """Return Λ (M,) [N/Pa] and the integrated curvature at rest (N, 2); change `cubic` (N,).
+
+    The couples of a segment act in the middle of its first and last edge, so that n − 2 edges bend
+    instead of the segment's length. Gain, curvature at rest and cubic stiffness are those at which
+    the shorter length bends by the segment's angle.
+    """
+    gain, rest_kappa = np.zeros(len(pairs)), np.zeros((len(cubic), 2))
+    for index, (segment, (first, size)) in enumerate(zip(limb.segments, pairs, strict=True)):
+        inner = slice(first + 1, first + size - 1)
+        step = rest[first]
+        turn = segment.rest_curvature * segment.length / (size - 2)
+        rest_kappa[inner, 0] = 2.0 * math.tan(0.5 * turn)
+        ratio = segment.length / ((size - 2) * step)
+        gain[index] = segment.moment_gain * ratio / step
+        cubic[inner] /= ratio**2
+    return gain, rest_kappa
 
 
 def _segment_edges(

@@ -37,6 +37,9 @@ class Description:
         limb: name of the limb file.
         bag: path of the bag, empty for a run without.
         namespace: of the limb's topics in the bag, e.g. ``/limb``; empty for a run without a bag.
+        gravity: in `limb_base` that the plan reckons with [m/s²].
+        payload: that it reckons with beside the limb's own masses [kg].
+        payload_at: where, along the limb from its clamp [m]; 0 is the tip.
         extra: everything else that the recorder was told (versions, commit, machine …).
     """
 
@@ -51,6 +54,9 @@ class Description:
     limb: str = ""
     bag: str = ""
     namespace: str = ""
+    gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    payload: float = 0.0
+    payload_at: float = 0.0
     extra: Mapping[str, Any] = field(default_factory=dict)
 
     @property

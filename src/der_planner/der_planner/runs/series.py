@@ -358,6 +358,16 @@ def _board(limb: LimbRecord, setpoints: _Setpoints, origin: int) -> BoardLog | N
     )
 
 
+def _loads(plan: Any) -> dict[str, Any]:
+    """Return the loads of a plan by the fields of `Description`; older bags name none."""
+    x, y, z = (float(value) for value in getattr(plan, "gravity", (0.0, 0.0, 0.0)))
+    return {
+        "gravity": (x, y, z),
+        "payload": float(getattr(plan, "payload", 0.0)),
+        "payload_at": float(getattr(plan, "payload_at", 0.0)),
+    }
+
+
 def _describe(plan: Any, record: BagRecord, namespace: str) -> Description:
     known = {"motion", "model", "method", "trial", "seed", "limb"}
     run = record.run
@@ -375,5 +385,6 @@ def _describe(plan: Any, record: BagRecord, namespace: str) -> Description:
         limb=str(plan.limb or run.get("limb", "")),
         bag=str(record.path),
         namespace=namespace,
+        **_loads(plan),
         extra={key: value for key, value in run.items() if key not in known},
     )

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from der_planner.limb import BEYOND_THE_TIP
+
 Array = NDArray[np.float64]
 
 
@@ -120,7 +122,7 @@ class NodeLoads:
     def _shares(self, arc_length: float) -> Array:
         """Return what each node (E+1,) bears of a load at an arc length [m]."""
         end = float(self._node_arc[-1])
-        if not -1e-9 <= arc_length <= end + 1e-6:
+        if not -1e-9 <= arc_length <= end + BEYOND_THE_TIP:
             raise LoadError(
                 f"a load at {arc_length} m is not on the limb: its arc length is 0 to {end:.3f} m"
             )

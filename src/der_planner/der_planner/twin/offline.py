@@ -12,7 +12,7 @@ from der_planner.limb import PointMass
 from der_planner.model.air import pair_of
 from der_planner.twin.limb_twin import LimbTwin, TwinError
 from der_planner.twin.loads import Push
-from pressure_driver.emulator.pneumatics import Pneumatics
+from pressure_driver.emulator.pneumatics import BoardPneumatics
 
 Array = NDArray[np.float64]
 
@@ -39,6 +39,76 @@ class Playback:
     commanded_differential: Array
     measured_differential: Array
     chamber_pressure: Array
+
+
+class OfflineTwin:
+    """The twin of a seed with its board's air, for a loop that commands it step by step.
+
+    Args:
+        seed: draws limb and pneumatics.
+        run: draws the wandering rest angles of this run of the same hardware.
+        segment_count: M.
+        fine_step: longest time for which the limb feels constant pressures [s].
+        gravity: (3,) acceleration in `limb_base` [m/s²].
+        masses: what the limb carries from the start beside its own mass.
+
+    Attributes:
+        pneumatics, twin: the two of it.
+
+    Raises:
+        TwinError: the twin has another number of segments.
+    """
+
+    def __init__(
+        self,
+        seed: int = 0,
+        run: int = 0,
+        *,
+        segment_count: int = 2,
+        fine_step: float = FINE_STEP,
+        gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        masses: Iterable[PointMass] = (),
+    ) -> None:
+        self.pneumatics = BoardPneumatics(segment_count=segment_count, seed=seed)
+        atmosphere = self.pneumatics.atmosphere
+        self.twin = LimbTwin(seed, run, atmosphere=atmosphere, gravity=gravity, masses=masses)
+        if self.twin.segment_count != segment_count:
+            raise TwinError(
+                f"the twin has {self.twin.segment_count} segments, the pressures {segment_count}"
+            )
+        self._fine_step = fine_step
+
+    @property
+    def differential_pressure(self) -> Array:
+        """(M,) in the chambers [Pa]."""
+        chambers = self.pneumatics.pressure
+        difference: Array = chambers[0::2] - chambers[1::2]
+        return difference
+
+    @property
+    def bend_angles(self) -> Array:
+        """(M,) true ones [rad]."""
+        return self.twin.bend_angles
+
+    @property
+    def tip(self) -> Array:
+        """(2,) true one [m]."""
+        return self.twin.tip
+
+    def command(self, differential: Array) -> None:
+        """Give the board a command (M,) [Pa]."""
+        self.pneumatics.command(self.pneumatics.atmosphere + pair_of(differential).ravel())
+
+    def rest(self, duration: float) -> None:
+        """Let time pass [s] under the last command."""
+        count = max(1, int(np.ceil(duration / self._fine_step - 1e-9)))
+        for _ in range(count):
+            self.twin.step(self.pneumatics.step(duration / count), duration / count)
+
+    def advance(self, command: Array, duration: float) -> None:
+        """Hold a command (M,) [Pa] for a time [s]."""
+        self.command(command)
+        self.rest(duration)
 
 
 def play(
@@ -80,22 +150,24 @@ def play(
         )
     if not np.all(np.isfinite(wanted)) or not np.all(np.diff(instants) > 0):
         raise TwinError("time must rise and pressures must be finite")
-    pneumatics = Pneumatics(segment_count=wanted.shape[1], seed=seed)
-    twin = LimbTwin(seed, run, atmosphere=pneumatics.atmosphere, gravity=gravity, masses=masses)
-    if twin.segment_count != wanted.shape[1]:
-        raise TwinError(
-            f"the twin has {twin.segment_count} segments, the pressures {wanted.shape[1]}"
-        )
+    limb = OfflineTwin(
+        seed,
+        run,
+        segment_count=wanted.shape[1],
+        fine_step=fine_step,
+        gravity=gravity,
+        masses=masses,
+    )
     tip = np.empty((instants.size, 2))
     angles, chambers = np.empty_like(wanted), np.empty((instants.size, 2 * wanted.shape[1]))
     for push in pushes:
-        twin.push(replace(push, instant=push.instant - instants[0] + lead))
-    _advance(pneumatics, twin, lead, fine_step)
+        limb.twin.push(replace(push, instant=push.instant - instants[0] + lead))
+    limb.rest(lead)
     for k, setpoint in enumerate(wanted):
-        tip[k], angles[k], chambers[k] = twin.tip, twin.bend_angles, pneumatics.pressure
-        pneumatics.command(pneumatics.atmosphere + pair_of(setpoint).ravel())
+        tip[k], angles[k], chambers[k] = limb.tip, limb.bend_angles, limb.pneumatics.pressure
+        limb.command(setpoint)
         if k + 1 < instants.size:
-            _advance(pneumatics, twin, instants[k + 1] - instants[k], fine_step)
+            limb.rest(instants[k + 1] - instants[k])
     return Playback(
         time=instants,
         tip=tip,
@@ -104,9 +176,3 @@ def play(
         measured_differential=chambers[:, 0::2] - chambers[:, 1::2],
         chamber_pressure=chambers,
     )
-
-
-def _advance(pneumatics: Pneumatics, twin: LimbTwin, duration: float, fine_step: float) -> None:
-    count = max(1, int(np.ceil(duration / fine_step - 1e-9)))
-    for _ in range(count):
-        twin.step(pneumatics.step(duration / count), duration / count)

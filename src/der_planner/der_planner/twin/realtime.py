@@ -50,6 +50,11 @@ class RealTimeLoop:
         self.behind = False
 
     @property
+    def simulated_until(self) -> float:
+        """Steady time up to which was simulated [s]."""
+        return self._simulated_until
+
+    @property
     def real_time_factor(self) -> float:
         """Simulated over passed time since the start; 1 when nothing was dropped."""
         passed = self._simulated_until - self._begin

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pressure_driver.emulator.faults import Faults
-from pressure_driver.emulator.pneumatics import Pneumatics
+from pressure_driver.emulator.pneumatics import BoardPneumatics
 from pressure_driver.protocols.base import BoardCommand, BoardProtocol, BoardReading
 
 SENSOR_OFFSET = 200.0
@@ -30,7 +30,7 @@ class ReceivedCommand:
 
 
 class EmulatedBoard:
-    """Regulates the chambers of a `Pneumatics` as commanded over the wire.
+    """Regulates the chambers of a `BoardPneumatics` as commanded over the wire.
 
     Args:
         protocol: the firmware's end of the language.
@@ -38,7 +38,7 @@ class EmulatedBoard:
         seed: of sensor errors and of random faults.
     """
 
-    def __init__(self, protocol: BoardProtocol, pneumatics: Pneumatics, seed: int = 0) -> None:
+    def __init__(self, protocol: BoardProtocol, pneumatics: BoardPneumatics, seed: int = 0) -> None:
         self.protocol = protocol
         self.pneumatics = pneumatics
         self.faults = Faults()

@@ -17,7 +17,7 @@ from limb_interfaces.runner import run_node
 from limb_interfaces.stamps import stamp_from_nanoseconds
 from pressure_driver.emulator.board import EmulatedBoard, ReceivedCommand
 from pressure_driver.emulator.faults import FaultError, Faults
-from pressure_driver.emulator.pneumatics import Pneumatics
+from pressure_driver.emulator.pneumatics import BoardPneumatics
 from pressure_driver.emulator.port import EmulatedPort
 from pressure_driver.emulator.runner import BoardRunner
 from pressure_driver.protocols import NAMES, board_protocol
@@ -33,7 +33,7 @@ class BoardEmulator(Node):
         self._declare()
         check_overrides(self)
         segment_count, seed = self._value("segment_count"), self._value("seed")
-        pneumatics = Pneumatics(segment_count, seed)
+        pneumatics = BoardPneumatics(segment_count, seed)
         protocol = board_protocol(self._value("protocol"), 2 * segment_count)
         self._board = EmulatedBoard(protocol, pneumatics, seed)
         faults = self._parse(self._value("faults"))  # before the port stands where others see it

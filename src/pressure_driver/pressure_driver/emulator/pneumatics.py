@@ -29,7 +29,7 @@ REFERENCE_STEP = 7000.0
 
 @dataclass(frozen=True)
 class PneumaticsParameters:
-    """Nominal values; `Pneumatics` draws each chamber's own around them."""
+    """Nominal values; `BoardPneumatics` draws each chamber's own around them."""
 
     fill_rate: float = 9000.0
     """[Pa/s] of the inlet valve, wide open, at nominal supply."""
@@ -53,7 +53,7 @@ class PneumaticsParameters:
     """Relative standard deviation between chambers, cut at two of them."""
 
 
-class Pneumatics:
+class BoardPneumatics:
     """Chamber pressures of a board with one pair of chambers per segment.
 
     All pressures are true absolute pressures in Pa; what the board's sensors make of them is the

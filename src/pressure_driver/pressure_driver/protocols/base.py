@@ -92,6 +92,8 @@ class HostProtocol(ABC):
     """What makes the board drop or finish whatever was sent by halves."""
     echoes: ClassVar[bool] = False
     """Whether the board repeats every command (`Echo`)."""
+    measures_room_at_start: ClassVar[bool] = False
+    """Whether the board takes what it reads when it starts for the room's pressure."""
     assumed_atmosphere: float = 101_325.0
     """[Pa] added to the reports of boards that only know gauge pressures."""
 

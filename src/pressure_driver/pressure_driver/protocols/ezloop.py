@@ -59,6 +59,7 @@ class EzloopHost(LineHost):
         "no checksum: a damaged number can pass for a pressure",
     )
     reports_supply = True
+    measures_room_at_start = True
 
     def __init__(self, chamber_count: int = 4) -> None:
         super().__init__(chamber_count)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import binascii
 
+from cobs import cobs
+
 from pressure_driver.protocols.pieces import StreamCutter
 
 INITIAL = 0xFFFF
-FULL_BLOCK = 254
-"""Bytes without a zero that one length byte can announce; a full block implies no zero."""
 
 
 def crc16(data: bytes) -> int:
@@ -21,38 +21,19 @@ def crc16(data: bytes) -> int:
 
 def stuff(data: bytes) -> bytes:
     """Return ``data`` coded without zero bytes; on the wire one zero byte ends it."""
-    out = bytearray()
-    pieces = data.split(b"\0")
-    for number, piece in enumerate(pieces):
-        last = number == len(pieces) - 1
-        rest = piece
-        while len(rest) >= FULL_BLOCK:
-            out.append(FULL_BLOCK + 1)
-            out += rest[:FULL_BLOCK]
-            rest = rest[FULL_BLOCK:]
-        # A last piece that ended with a full block needs no empty block behind it.
-        if rest or not last or not piece:
-            out.append(len(rest) + 1)
-            out += rest
-    return bytes(out)
+    coded: bytes = cobs.encode(data)
+    return coded
 
 
 def unstuff(coded: bytes) -> bytes | None:
     """Return the data of a coded frame (without its ending zero), or None if it is damaged."""
-    if not coded or 0 in coded:
+    if not coded:
         return None
-    out = bytearray()
-    place = 0
-    while place < len(coded):
-        length = coded[place]
-        end = place + length
-        if end > len(coded):
-            return None
-        out += coded[place + 1 : end]
-        place = end
-        if length != FULL_BLOCK + 1 and place < len(coded):
-            out.append(0)
-    return bytes(out)
+    try:
+        data: bytes = cobs.decode(coded)
+    except cobs.DecodeError:
+        return None
+    return data
 
 
 class FrameSplitter:

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from der_planner.limb import mounting_of
 from der_planner.runs.evaluation.alignment import Settings, error_series, split_error, window
 from der_planner.runs.evaluation.selfcheck import check_board, check_tracker, interpolate
 from der_planner.runs.run import Array, RunSeries
@@ -60,6 +61,10 @@ class RunResult:
     cycles: int = 0
     limb: str = ""
     namespace: str = ""
+    mounting: str = "horizontal"
+    gravity_m_s2: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    payload_kg: float = 0.0
+    payload_at_m: float = 0.0
     lag_s: float = float("nan")
     gain_x: float = float("nan")
     gain_y: float = float("nan")
@@ -74,6 +79,14 @@ class RunResult:
     reference_points_m: tuple[tuple[float, float], ...] = ()
     checks: Mapping[str, float] = field(default_factory=dict)
     extra: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def loads(self) -> str:
+        """Mounting and payload in words; empty for a horizontal limb without payload."""
+        if not self.payload_kg:
+            return "" if self.mounting == "horizontal" else self.mounting
+        place = f" at {self.payload_at_m * 100:.1f} cm" if self.payload_at_m else ""
+        return f"{self.mounting}, {self.payload_kg * 1000:.4g} g{place}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return what ``results.json`` holds; NaN becomes None, which JSON can say."""
@@ -157,6 +170,10 @@ def evaluate_run(run: RunSeries, settings: Settings | None = None) -> RunResult:
         cycles=about.cycles,
         limb=about.limb,
         namespace=about.namespace,
+        mounting=mounting_of(about.gravity),
+        gravity_m_s2=about.gravity,
+        payload_kg=about.payload,
+        payload_at_m=about.payload_at,
         lag_s=split.lag,
         gain_x=split.gain_x,
         gain_y=split.gain_y,

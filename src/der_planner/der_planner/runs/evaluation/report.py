@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import math
 import shutil
@@ -11,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from der_planner.runs.evaluation.figures import plot_error, plot_pressures, plot_tip
+from der_planner.runs.evaluation.html import document, figure, table
 from der_planner.runs.evaluation.metrics import RunResult
 from der_planner.runs.evaluation.overlay import plot_shapes
 from der_planner.runs.evaluation.results import write_results
@@ -22,23 +22,10 @@ from der_planner.runs.evaluation.table import (
     format_value,
     latex_table,
     markdown_table,
+    shows_loads,
     shows_namespace,
 )
 from der_planner.runs.run import RunSeries
-
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem;
-       color: #1a1a1a; background: #fff; }
-h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2rem; }
-.wide { overflow-x: auto; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 0.87rem; }
-th, td { padding: 0.25rem 0.7rem; text-align: right; border-bottom: 1px solid #ddd;
-         white-space: nowrap; }
-th { border-bottom: 1.5px solid #333; } td.name, th.name { text-align: left; }
-img { max-width: 100%; height: auto; } figure { margin: 1rem 0; }
-figcaption, .small { font-size: 0.85rem; color: #555; }
-.problem { color: #a33a00; white-space: normal; text-align: left; }
-"""
 
 _CAPTIONS = {
     "error": "Tip error over time: mean over trials, shaded one standard deviation.",
@@ -135,7 +122,7 @@ def _page(
         f"<h1>{html.escape(title)}</h1>",
         _summary_table(rows),
         "".join(f"<p>{html.escape(format_comparison(entry))}</p>" for entry in comparisons),
-        *(_figure(name, path) for name, path in figures.items()),
+        *(figure(_CAPTIONS[name], path) for name, path in figures.items()),
         "<h2>Every run</h2>",
         _run_table(results),
         _checks_table(results),
@@ -144,43 +131,15 @@ def _page(
         "<h2>Where the numbers come from</h2>",
         _provenance(results),
     ]
-    body = "\n".join(section for section in sections if section)
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head>\n"
-        f"<body>\n{body}\n</body></html>\n"
-    )
-
-
-def _figure(name: str, path: Path) -> str:
-    data = base64.b64encode(path.read_bytes()).decode("ascii")
-    caption = _CAPTIONS[name]
-    return (
-        f'<figure><img alt="{html.escape(caption)}" src="data:image/png;base64,{data}">'
-        f"<figcaption>{html.escape(caption)}</figcaption></figure>"
-    )
-
-
-def _table(header: Sequence[str], lines: Sequence[Sequence[str]], names: int) -> str:
-    """Return a table whose first columns hold names and whose cells are HTML already."""
-
-    def cells(values: Sequence[str], tag: str) -> str:
-        marks = [f'<{tag} class="name">' if i < names else f"<{tag}>" for i in range(len(values))]
-        return "".join(f"{m}{value}</{tag}>" for m, value in zip(marks, values, strict=True))
-
-    body = "".join(f"<tr>{cells(line, 'td')}</tr>" for line in lines)
-    return (
-        f'<div class="wide"><table><thead><tr>{cells(header, "th")}</tr></thead>'
-        f"<tbody>{body}</tbody></table></div>"
-    )
+    return document(title, sections)
 
 
 def _summary_table(rows: Sequence[Summary]) -> str:
-    several = shows_namespace(rows)
+    several, loaded = shows_namespace(rows), shows_loads(rows)
     lines = [
         [
             *([html.escape(row.namespace)] if several else []),
+            *([html.escape(row.loads or "horizontal")] if loaded else []),
             html.escape(CASE.get(row.motion, row.motion)),
             html.escape(row.model.upper()),
             html.escape(row.method),
@@ -195,10 +154,11 @@ def _summary_table(rows: Sequence[Summary]) -> str:
     ]
     header = [
         *(["limb"] if several else []),
+        *(["loads"] if loaded else []),
         *("case", "model", "method", "trials", "E [cm]", "E<sub>x</sub> [cm]"),
         *("E<sub>y</sub> [cm]", "max [cm]", "predicted E [cm]"),
     ]
-    return _table(header, lines, names=4 if several else 3)
+    return table(header, lines, names=3 + several + loaded)
 
 
 def _number(value: float, scale: float = 1.0, digits: int = 2) -> str:
@@ -244,7 +204,7 @@ def _run_table(results: Sequence[RunResult]) -> str:
         *("gain x, y", "bias x, y [cm]", "RMS [cm] without lag, bias, gain"),
         *("pressure RMS [kPa]", "problems"),
     ]
-    return _table(header, lines, names=1)
+    return table(header, lines, names=1)
 
 
 def _checks_table(results: Sequence[RunResult]) -> str:
@@ -270,7 +230,7 @@ def _checks_table(results: Sequence[RunResult]) -> str:
         *("run", "trial", "tracker RMS [mm]", "setpoints", "lost", "out of order"),
         *("late p50 [ms]", "p99 [ms]", "max [ms]"),
     ]
-    return "<h2>Instruments</h2>" + _table(header, lines, names=1)
+    return "<h2>Instruments</h2>" + table(header, lines, names=1)
 
 
 def _count(run: RunResult, name: str) -> str:
@@ -290,4 +250,4 @@ def _provenance(results: Sequence[RunResult]) -> str:
             lines.append(
                 [f"bag of {html.escape(f'{run.model} {run.trial}')}", html.escape(run.bag)]
             )
-    return _table(["", ""], lines, names=2)
+    return table(["", ""], lines, names=2)

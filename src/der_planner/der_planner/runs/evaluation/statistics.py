@@ -44,6 +44,7 @@ class Summary:
     predicted_error_m: float
     problems: tuple[str, ...] = ()
     namespace: str = ""
+    loads: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Return what ``results.json`` holds."""
@@ -65,6 +66,7 @@ class Comparison:
         confidence: of the interval.
         refused: why there is no figure; empty where there is one.
         namespace: of the limb, where the runs are of several; else empty.
+        loads: mounting and payload; empty for a horizontal limb without payload.
     """
 
     motion: str
@@ -79,17 +81,18 @@ class Comparison:
     confidence: float = CONFIDENCE
     refused: str = ""
     namespace: str = ""
+    loads: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Return what ``results.json`` holds."""
         return {key: json_value(value) for key, value in asdict(self).items()}
 
 
-Key = tuple[str, str, str, str]
+Key = tuple[str, str, str, str, str]
 
 
 def group(results: Sequence[RunResult]) -> dict[Key, list[RunResult]]:
-    """Return the runs by (namespace, motion, model, method), in the order of their first run.
+    """Return the runs by namespace, loads, motion, model and method, in the order they came.
 
     The namespace is the same for all where the runs name one only: a run without a bag has none.
     """
@@ -97,13 +100,13 @@ def group(results: Sequence[RunResult]) -> dict[Key, list[RunResult]]:
     only = named[0] if len(named) == 1 else ""
     found: dict[Key, list[RunResult]] = {}
     for result in results:
-        key = (result.namespace or only, result.motion, result.model, result.method)
+        key = (result.namespace or only, result.loads, result.motion, result.model, result.method)
         found.setdefault(key, []).append(result)
     return found
 
 
 def summarise(results: Sequence[RunResult]) -> list[Summary]:
-    """Return one row per limb, motion, model and method: mean and deviation over trials.
+    """Return one row per limb, loads, motion, model and method: mean and deviation over trials.
 
     Runs with problems count as well: they happened. The row names them.
     """
@@ -111,7 +114,7 @@ def summarise(results: Sequence[RunResult]) -> list[Summary]:
 
 
 def _summary(key: Key, runs: Sequence[RunResult]) -> Summary:
-    namespace, motion, model, method = key
+    namespace, loads, motion, model, method = key
     errors = np.array([[r.mean_error_m, r.mean_error_x_m, r.mean_error_y_m] for r in runs])
     mean = errors.mean(axis=0)
     deviation = errors.std(axis=0, ddof=1) if len(runs) > 1 else np.full(3, np.nan)
@@ -131,6 +134,7 @@ def _summary(key: Key, runs: Sequence[RunResult]) -> Summary:
         predicted_error_m=float(np.mean([run.predicted_error_m for run in runs])),
         problems=tuple(f"trial {run.trial}: {text}" for run in runs for text in run.problems),
         namespace=namespace,
+        loads=loads,
     )
 
 
@@ -147,29 +151,29 @@ class _Side:
 
 
 def compare(results: Sequence[RunResult], baseline: str = "pcc") -> list[Comparison]:
-    """Compare every model with the baseline, motion by motion and limb by limb.
+    """Compare every model with the baseline: same limb, same loads, same motion.
 
     Args:
         results: of all runs.
         baseline: name of the model to compare with.
 
     Returns:
-        One comparison per limb, motion and (model, method) against each method of the baseline.
+        One comparison per limb, loads, motion and (model, method) against each baseline method.
         A pair whose runs followed different references, or were not played to the end, is refused.
     """
     groups = group(results)
     several = len({namespace for namespace, *_ in groups}) > 1
     found = []
-    for (namespace, motion, model, method), runs in groups.items():
+    for (namespace, loads, motion, model, method), runs in groups.items():
         if model == baseline:
             continue
-        for (other_namespace, other_motion, other_model, other_method), others in groups.items():
-            same = (other_namespace, other_motion) == (namespace, motion)
-            if same and other_model == baseline:
+        for (*other, other_model, other_method), others in groups.items():
+            if other == [namespace, loads, motion] and other_model == baseline:
                 one = _Side(f"{model} {method}".strip(), runs)
                 two = _Side(f"{other_model} {other_method}".strip(), others)
                 comparison = _compare(motion, one, two)
-                found.append(replace(comparison, namespace=namespace if several else ""))
+                where = namespace if several else ""
+                found.append(replace(comparison, namespace=where, loads=loads))
     return found
 
 

@@ -40,11 +40,22 @@ def shows_namespace(rows: Sequence[Summary] | Sequence[RunResult]) -> bool:
     return len({row.namespace for row in rows} - {""}) > 1
 
 
+def shows_loads(rows: Sequence[Summary] | Sequence[RunResult]) -> bool:
+    """Tell whether a table needs a column of mountings and payloads."""
+    return any(row.loads for row in rows)
+
+
 def _lines(rows: Sequence[Summary]) -> list[list[str]]:
     """Return the header and the rows of a table as text."""
-    several = shows_namespace(rows)
-    header = [*(["limb"] if several else []), *_HEADER]
-    return [header, *([*([row.namespace] if several else []), *_cells(row)] for row in rows)]
+    extra = {}
+    if shows_namespace(rows):
+        extra["limb"] = [row.namespace for row in rows]
+    if shows_loads(rows):
+        extra["loads"] = [row.loads or "horizontal" for row in rows]
+    return [
+        [*extra, *_HEADER],
+        *([*(column[i] for column in extra.values()), *_cells(row)] for i, row in enumerate(rows)),
+    ]
 
 
 def _cells(row: Summary) -> list[str]:
@@ -92,7 +103,8 @@ def format_comparison(comparison: Comparison) -> str:
 
 
 def _named(entry: Summary | Comparison) -> str:
-    return f"{entry.namespace} {entry.motion}".strip()
+    loads = f" ({entry.loads})" if entry.loads else ""
+    return f"{entry.namespace} {entry.motion}{loads}".strip()
 
 
 def markdown_table(rows: Sequence[Summary]) -> str:
@@ -108,7 +120,7 @@ def csv_table(rows: Sequence[Summary]) -> str:
     names = [
         "motion", "model", "method", "trials", "mean_error_m", "mean_error_x_m", "mean_error_y_m",
         "std_error_m", "std_error_x_m", "std_error_y_m", "max_error_m", "valid_fraction",
-        "predicted_error_m", "namespace",
+        "predicted_error_m", "namespace", "loads",
     ]  # fmt: skip
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -132,6 +144,7 @@ def latex_table(rows: Sequence[Summary]) -> str:
     for row in rows:
         name = CASE.get(row.motion, row.motion)
         name = f"{name}, {row.namespace}" if several else name
+        name = f"{name}, {row.loads}" if row.loads else name
         if last and name != last:
             lines.append(r"\addlinespace")
         case = name if name != last else ""

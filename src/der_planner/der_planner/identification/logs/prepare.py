@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
-from der_planner.identification.log import CalibrationLog, LogError
+from der_planner.identification.logs.log import CalibrationLog, LogError
 from der_planner.limb import Limb
 from der_planner.model.series import CONTROL_PERIOD as PERIOD
 
@@ -24,6 +24,10 @@ LEAST_VALID = 0.5
 """Share of a log to fit to in which the tags must be seen."""
 LEAST_SEEN = 0.05
 """Share of a log to predict in which they must be."""
+SWING = np.deg2rad(0.5)
+"""Amplitude of a swing that need not be waited for [rad]."""
+LONGEST_SWING = 12.0
+"""At the beginning of a log that is waited for [s]."""
 _WRONG_WAY = (
     "segment {index} bends the wrong way: positive differential pressure must bend toward +y; "
     "swap the two chambers or the sign in the column map"
@@ -97,9 +101,35 @@ def prepare(
         _check_excitation(pressure, warnings)
         _check_saturation(pressure, limb, warnings)
         _check_match(pressure, bend, warnings)
+    swing = _first_swing(grid, pressure, bend, limb)
+    if swing > 0.0:
+        waited = grid.time < grid.time[0] + swing
+        unseen = [np.where(waited[:, None], np.nan, part) for part in (grid.bend_angles, grid.tip)]
+        grid = replace(grid, bend_angles=unseen[0], tip=unseen[1])
+        valid = valid & ~waited
+        warnings.append(
+            f"the log begins while the limb swings: its first {swing:.1f} s are not used, since no "
+            "pressure tells that motion"
+        )
     count = min(SMOOTHING, len(bend) - (len(bend) + 1) % 2)
     bend = np.asarray(savgol_filter(bend, count, 2, axis=0))
     return Prepared(grid, pressure, bend, valid, tuple(warnings))
+
+
+def _first_swing(grid: CalibrationLog, pressure: Array, bend: Array, limb: Limb) -> float:
+    """Return for how long the limb swings from before the log, at most a fifth of the log [s].
+
+    What the first second of bend moves beyond what the pressures move in it is taken for a swing
+    that decays as the prior says.
+    """
+    first = grid.time < grid.time[0] + 1.0
+    driven = limb.static_gain * np.ptp(pressure[first], axis=0)
+    amplitude = 0.5 * float(np.max(np.ptp(bend[first], axis=0) - 2.0 * driven))
+    if amplitude < 2.0 * SWING:
+        return 0.0
+    decay = 0.5 * max(float(np.mean([s.damping for s in limb.segments])), 0.2)
+    length = float(grid.time[-1] - grid.time[0])
+    return min(float(np.log(amplitude / SWING)) / decay, LONGEST_SWING, 0.2 * length)
 
 
 def _pressures(log: CalibrationLog, least: float) -> Array:

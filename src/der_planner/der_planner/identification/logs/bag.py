@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.identification.log import CalibrationLog, LogError
+from der_planner.identification.logs.log import CalibrationLog, LogError
 from der_planner.model.series import CONTROL_PERIOD, interpolate
 from der_planner.runs.recording.reader import BagError
 from der_planner.runs.run import Stream

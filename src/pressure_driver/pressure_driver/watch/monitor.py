@@ -4,56 +4,17 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pressure_driver.protocols.base import Telemetry
+from pressure_driver.watch.following import Following
+from pressure_driver.watch.limits import MonitorLimits
+from pressure_driver.watch.rest import RestPressures
 
-
-@dataclass(frozen=True)
-class MonitorLimits:
-    """Bounds of normal operation."""
-
-    telemetry_timeout: float = 0.5
-    """[s] without chamber pressures."""
-    over_pressure: float = 30_000.0
-    """[Pa] gauge, in any chamber."""
-    supply_low: float = 115_000.0
-    """[Pa] absolute."""
-    supply_high: float = 200_000.0
-    """[Pa] absolute."""
-    supply_time: float = 0.5
-    """[s] that the supply may be outside its bounds."""
-    follow_tolerance: float = 3_000.0
-    """[Pa] beyond the slowest and fastest response that counts as normal."""
-    follow_time: float = 2.0
-    """[s] that a chamber may be outside."""
-    slowest_fill: float = 4_000.0
-    """[Pa/s] that a working valve reaches."""
-    slowest_vent: float = 2.5
-    """[s] time constant in which a working valve vents."""
-    rest_time: float = 1.0
-    """[s] of steady readings that make a rest measurement."""
-    rest_spread: float = 100.0
-    """[Pa] that readings at rest may differ by."""
-    rest_drift: float = 20.0
-    """[Pa] that the two halves of a rest measurement may differ by in the mean."""
-    supply_required: bool = True
-    """Arm only with a fresh reading of the supply, on boards whose protocol tells it."""
-    vented_tolerance: float = 500.0
-    """[Pa] gauge below which a chamber counts as vented."""
-
-
-PLAUSIBLE_ATMOSPHERE = (70_000.0, 105_000.0)
-"""[Pa] at 3000 m, and above what the barometer reads at sea level but for a few days in a century:
-chambers that rest higher hold trapped air, unless the parameter 'atmosphere' says otherwise."""
 PLAUSIBLE_READING = (30_000.0, 400_000.0)
 """[Pa] A chamber that reads outside has a broken sensor or a damaged line."""
-LARGEST_OFFSET = 1_000.0
-"""[Pa] that the sensors of one board may differ by at rest, and that a chamber may rest higher than
-it did before."""
 BELOW_REST_TIME = 0.5
 """[s] that a chamber may read too little."""
 BELOW_REST = 1_000.0
@@ -67,9 +28,6 @@ MOST_BAD_READINGS = 8
 MOST_DAMAGED = 10
 """Damaged lines or frames in `READING_WINDOW`, if they are also `DAMAGED_SHARE` of all."""
 DAMAGED_SHARE = 0.3
-
-
-NOT_STEADY = "chambers must be vented and steady"
 
 
 class TelemetryMonitor:
@@ -96,26 +54,22 @@ class TelemetryMonitor:
         """(2M,) [Pa] absolute, as measured."""
         self.valve_opening = unknown.copy()
         self.supply_pressure = float("nan")
-        self.rest_pressure = np.full(chamber_count, atmosphere) if atmosphere else unknown.copy()
-        """(2M,) [Pa] absolute, what each sensor reads when vented; NaN until measured."""
-        self._fixed_atmosphere = bool(atmosphere)
+        self._rest = RestPressures(chamber_count, limits, atmosphere)
+        self._following = Following(chamber_count, limits)
         self._last_telemetry: float | None = None
         self._over_count = 0
         self._supply_bad_since: float | None = None
-        self._outside_since: list[float | None] = [None] * chamber_count
-        self._upper = np.zeros(chamber_count)
-        self._lower = np.zeros(chamber_count)
-        self._command = np.zeros(chamber_count)
-        self._envelope_time: float | None = None
-        self._rest_window: list[tuple[float, NDArray[np.float64]]] = []
-        self._rest_problem = NOT_STEADY
-        self._lowest_rest = np.full(chamber_count, np.inf)
         self._below_since: float | None = None
         self._supply_at: float | None = None
         self._tells_supply = tells_supply
         self._bad_readings: deque[float] = deque(maxlen=MOST_BAD_READINGS)
         self._bad_chamber = 0
         self._line_quality: deque[tuple[float, int, int]] = deque()
+
+    @property
+    def rest_pressure(self) -> NDArray[np.float64]:
+        """(2M,) [Pa] absolute, what each sensor reads when vented; NaN until measured."""
+        return self._rest.pressure
 
     @property
     def atmosphere(self) -> float:
@@ -134,13 +88,11 @@ class TelemetryMonitor:
 
     def rest_known(self) -> bool:
         """Tell whether every chamber's rest pressure has been measured or given."""
-        return bool(np.all(np.isfinite(self.rest_pressure)))
+        return self._rest.known
 
     def rest_problem(self) -> str:
         """Return why the rest pressures are not known, or nothing if they are."""
-        if self.rest_known():
-            return ""
-        return f"the rest pressures are not measured yet: {self._rest_problem}"
+        return self._rest.problem
 
     @property
     def heard(self) -> bool:
@@ -184,16 +136,16 @@ class TelemetryMonitor:
         reference = np.where(np.isnan(self.rest_pressure), 101_325.0, self.rest_pressure)
         over = np.max(self.chamber_pressure - reference) > self.limits.over_pressure
         self._over_count = self._over_count + 1 if over else 0
-        if resting and not self._fixed_atmosphere:
-            self._measure_rest(now)
+        if resting:
+            self._rest.receive(reading, now)
         else:
-            self._rest_window.clear()
+            self._rest.forget_readings()
         below = self.rest_known() and bool(np.min(self.gauge) < -BELOW_REST)
         if not below:
             self._below_since = None
         elif self._below_since is None:
             self._below_since = now
-        self._check_following(now)
+        self._following.receive(self.gauge, self.valve_opening, now)
 
     def _take_supply(self, pressure: float, now: float) -> None:
         self.supply_pressure, self._supply_at = pressure, now
@@ -208,57 +160,6 @@ class TelemetryMonitor:
         while now - self._line_quality[0][0] > READING_WINDOW:
             self._line_quality.popleft()
 
-    def _measure_rest(self, now: float) -> None:
-        """Average readings of vented chambers into the rest pressures.
-
-        They must be steady (also in the mean, so that air which leaves slowly is not taken for
-        rest), plausible for a room, about the same in all chambers, and not higher than the rest
-        that was measured before.
-        """
-        window = self._rest_window
-        window.append((now, self.chamber_pressure))
-        while window and now - window[0][0] > self.limits.rest_time * 1.5:
-            window.pop(0)
-        readings = np.array([reading for _, reading in window])
-        self._rest_problem = self._unfit_for_rest(readings)
-        if self._rest_problem:
-            window.clear()
-            return
-        if now - window[0][0] < self.limits.rest_time:
-            self._rest_problem = NOT_STEADY
-            return
-        half = len(readings) // 2
-        drift = np.abs(readings[half:].mean(axis=0) - readings[:half].mean(axis=0))
-        if np.max(drift) > self.limits.rest_drift:
-            self._rest_problem = NOT_STEADY
-            return
-        self.rest_pressure = readings.mean(axis=0)
-        self._lowest_rest = np.minimum(self._lowest_rest, self.rest_pressure)
-
-    def _unfit_for_rest(self, readings: NDArray[np.float64]) -> str:
-        """Return why readings (K, 2M) [Pa] cannot be rest pressures, or nothing."""
-        newest = readings[-1]
-        low, high = PLAUSIBLE_ATMOSPHERE
-        if np.min(newest) < low or np.max(newest) > high:
-            return (
-                f"chambers read {np.min(newest):.0f} to {np.max(newest):.0f} Pa, no room has that "
-                f"({low:.0f} to {high:.0f} Pa): let trapped air out, or set the parameter "
-                "'atmosphere' to what a barometer reads"
-            )
-        if np.ptp(newest) > LARGEST_OFFSET:
-            return (
-                f"chambers read {np.min(newest):.0f} to {np.max(newest):.0f} Pa: vented they agree "
-                f"within {LARGEST_OFFSET:.0f} Pa"
-            )
-        if np.max(np.ptp(readings, axis=0)) > self.limits.rest_spread:
-            return NOT_STEADY
-        if np.max(newest - self._lowest_rest) > LARGEST_OFFSET:
-            return (
-                f"chambers rest {np.max(newest - self._lowest_rest):.0f} Pa higher than before: "
-                "let trapped air out, or start the driver again"
-            )
-        return ""
-
     def command(self, differential: Sequence[float], now: float) -> None:
         """Tell what has just been commanded, for the following check.
 
@@ -266,39 +167,11 @@ class TelemetryMonitor:
             differential: (M,) [Pa].
             now: [s] steady clock.
         """
-        self._move_envelope(now)
-        self._command = chamber_gauge(differential)
-        self._upper = np.maximum(self._upper, self._command)
-        self._lower = np.minimum(self._lower, self._command)
-
-    def _move_envelope(self, now: float) -> None:
-        """Let the slowest admissible response approach the command."""
-        if self._envelope_time is not None:
-            dt = max(now - self._envelope_time, 0.0)
-            decay = np.exp(-dt / self.limits.slowest_vent)
-            self._upper = self._command + (self._upper - self._command) * decay
-            rising = np.minimum(self._lower + dt * self.limits.slowest_fill, self._command)
-            self._lower = np.where(self._lower < self._command, rising, self._command)
-        self._envelope_time = now
-
-    def _check_following(self, now: float) -> None:
-        self._move_envelope(now)
-        gauge = self.gauge
-        tolerance = self.limits.follow_tolerance
-        outside = (gauge > self._upper + tolerance) | (gauge < self._lower - tolerance)
-        for chamber, bad in enumerate(outside):
-            if not bad:
-                self._outside_since[chamber] = None
-            elif self._outside_since[chamber] is None:
-                self._outside_since[chamber] = now
+        self._following.command(differential, now)
 
     def reset_following(self, now: float) -> None:
         """Start the following check afresh from what is measured now."""
-        gauge = np.nan_to_num(self.gauge)
-        self._upper = np.maximum(gauge, self._command)
-        self._lower = np.minimum(gauge, self._command)
-        self._envelope_time = now
-        self._outside_since = [None] * self.chamber_count
+        self._following.restart(self.gauge, now)
 
     def forget(self) -> None:
         """Forget the newest telemetry, as after a disconnect."""
@@ -309,7 +182,7 @@ class TelemetryMonitor:
         self._below_since = None
         self._bad_readings.clear()
         self._line_quality.clear()
-        self._rest_window.clear()
+        self._rest.forget_readings()
         self.chamber_pressure = np.full(self.chamber_count, np.nan)
         self.valve_opening = np.full(self.chamber_count, np.nan)
         self.supply_pressure = float("nan")
@@ -334,15 +207,8 @@ class TelemetryMonitor:
         ]
 
     def following_faults(self, now: float) -> list[str]:
-        """Say which chambers do not follow their commands."""
-        faults = []
-        for chamber, since in enumerate(self._outside_since):
-            if since is not None and now - since >= self.limits.follow_time:
-                faults.append(
-                    f"chamber {chamber} does not follow: {self.gauge[chamber]:.0f} Pa gauge, "
-                    f"commanded {self._command[chamber]:.0f} Pa"
-                )
-        return faults
+        """Say which chambers do not follow their commands, or lose air."""
+        return self._following.faults(self.gauge, now)
 
     def supply_faults(self, now: float) -> list[str]:
         """Say whether the supply has left its bounds, or is told no more."""
@@ -403,9 +269,3 @@ class TelemetryMonitor:
             "a chamber is below its rest pressure: the rest was measured with air trapped; "
             + self.describe_gauge()
         ]
-
-
-def chamber_gauge(differential: Sequence[float]) -> NDArray[np.float64]:
-    """Return the gauge pressures (2M,) [Pa] of pairs: one chamber vented, the other at |u|."""
-    difference = np.asarray(differential, dtype=np.float64)
-    return np.stack([np.maximum(difference, 0.0), np.maximum(-difference, 0.0)], axis=1).ravel()

@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from der_planner.identification.log import CalibrationLog, LogError
+from der_planner.identification.logs.log import CalibrationLog, LogError
 
 Array = NDArray[np.float64]
 

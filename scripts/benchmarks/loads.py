@@ -1,0 +1,213 @@
+"""Rod and arcs under gravity and payload: both planned by the same method on the same data.
+
+Each twin of `FRESH_SEEDS` is calibrated once in each mounting, without payload; then every payload
+is declared and played. Rows are kept in doc/loads_study.csv as they come, and a row of it is
+not played again: a study that was stopped goes on.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import subprocess
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.identification import FRESH_SEEDS
+from der_planner.identification import LogError, calibrate_twin
+from der_planner.limb import Limb, LimbError
+from der_planner.planning import Motion, PlanningError, plan
+from der_planner.rod import ConvergenceError
+from der_planner.runs.evaluation import Comparison, RunResult, compare, format_comparison
+from der_planner.twin.offline import play
+from workspace_setup.basics import ROOT
+
+ROWS = ROOT / "src" / "der_planner" / "doc" / "loads_study.csv"
+LIMBS = ROOT / "log" / "loads_study"
+MOUNTINGS = ("hanging", "sideways", "20", "horizontal", "standing")
+LOADS = (
+    *((0.0, 20.0), (0.02, 20.0), (0.02, 6.0), (0.05, 20.0)),
+    *((0.0, 6.0), (0.05, 6.0), (0.01, 20.0), (0.01, 6.0)),
+)
+"""Payload [kg] and period [s], what is asked for most often first."""
+MOTION = "asynchronous"
+AMPLITUDE = 0.35
+"""Largest change of a segment's bend [rad]: what every twin can do in every mounting with 50 g."""
+METHOD = "optimal"
+MODELS = ("der", "pcc")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One plan on one twin.
+
+    Attributes:
+        mounting: as `gravity_of` takes it.
+        payload_kg, period_s, motion, model, method, seed: of the run.
+        mean_error_m, max_error_m: of the twin's true tip against the reference.
+        predicted_error_m: mean, of the model's tip.
+        plan_s: time that the plan took on a shared machine.
+        refused: why there is no figure.
+        commit: of the program.
+    """
+
+    mounting: str
+    payload_kg: float
+    period_s: float
+    motion: str
+    model: str
+    method: str
+    seed: int
+    mean_error_m: float = float("nan")
+    max_error_m: float = float("nan")
+    predicted_error_m: float = float("nan")
+    plan_s: float = float("nan")
+    refused: str = ""
+    commit: str = ""
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """What tells it from other rows."""
+        return dataclasses.astuple(self)[:7]
+
+
+def read_rows(path: Path = ROWS) -> list[Row]:
+    """Return the rows that were played."""
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return [
+            Row(**{
+                field.name: text[field.name] if field.type == "str" else
+                int(text[field.name]) if field.type == "int" else float(text[field.name] or "nan")
+                for field in dataclasses.fields(Row)
+            })
+            for text in csv.DictReader(file)
+        ]  # fmt: skip
+
+
+def _append(row: Row, path: Path = ROWS) -> None:
+    new = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        if new:
+            writer.writerow([field.name for field in dataclasses.fields(Row)])
+        writer.writerow(
+            [f"{value:.7g}" if isinstance(value, float) else value
+             for value in dataclasses.astuple(row)]
+        )  # fmt: skip
+
+
+def _wanted(seeds: tuple[int, ...]) -> Iterator[Row]:
+    for (payload, period), seed, mounting, model in (
+        (load, seed, mounting, model)
+        for load in LOADS
+        for seed in seeds
+        for mounting in MOUNTINGS
+        for model in MODELS
+    ):
+        yield Row(mounting, payload, period, MOTION, model, METHOD, seed)
+
+
+def _calibrated(seed: int, mounting: str) -> Limb:
+    path = LIMBS / f"seed_{seed}_{mounting}.yaml"
+    if not path.exists():
+        begin = time.process_time()
+        limb, _ = calibrate_twin(seed, Limb.default().mounted(mounting))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        limb.to_yaml(path)
+        spent = time.process_time() - begin
+        print(f"  seed {seed}, {mounting}: calibrated in {spent:.0f} s of CPU", flush=True)
+    return Limb.from_yaml(path)
+
+
+def play_row(row: Row) -> Row:
+    """Return a row with its figures, or with the reason why there are none."""
+    begin = time.process_time()
+    try:
+        limb = _calibrated(row.seed, row.mounting).carrying(row.payload_kg)
+        motion = Motion.named(row.motion, amplitude=AMPLITUDE, period=row.period_s, cycles=1)
+        result = plan(limb, motion, row.model, row.method)
+    except (PlanningError, LogError, LimbError, ConvergenceError) as error:
+        return dataclasses.replace(row, refused=f"{type(error).__name__}: {error}")
+    played = play(
+        result.time,
+        result.differential_pressure,
+        row.seed,
+        gravity=limb.gravity,
+        masses=limb.masses,
+    )
+    error = np.linalg.norm(played.tip - result.tip_reference, axis=1)
+    return dataclasses.replace(
+        row,
+        mean_error_m=float(error.mean()),
+        max_error_m=float(error.max()),
+        predicted_error_m=result.predicted_error,
+        plan_s=time.process_time() - begin,
+    )
+
+
+def comparisons(rows: list[Row]) -> list[tuple[Row, list[Row], Comparison]]:
+    """Return, for each mounting, payload and period: a DER row, all its rows, DER against PCC."""
+    found = []
+    groups: dict[tuple[object, ...], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row.mounting, row.payload_kg, row.period_s), []).append(row)
+    for of_group in groups.values():
+        measured = [row for row in of_group if not row.refused]
+        both = {row.seed for row in measured if row.model == "der"}
+        both &= {row.seed for row in measured if row.model == "pcc"}
+        results = [_as_result(row) for row in measured if row.seed in both]
+        if results:
+            found.append((of_group[0], of_group, compare(results)[0]))
+    return found
+
+
+def _as_result(row: Row) -> RunResult:
+    return RunResult(
+        motion=row.motion,
+        model=row.model,
+        method=row.method,
+        trial=row.seed,
+        seed=row.seed,
+        mean_error_m=row.mean_error_m,
+        mean_error_x_m=0.0,
+        mean_error_y_m=0.0,
+        max_error_m=row.max_error_m,
+        valid_fraction=1.0,
+        bag="",
+        mounting=row.mounting,
+        payload_kg=row.payload_kg,
+        period_s=row.period_s,
+    )
+
+
+def run(quick: bool) -> dict[str, float | str]:
+    """Play what is missing and print the table; ``quick`` plays the first twin only."""
+    seeds = FRESH_SEEDS[:1] if quick else FRESH_SEEDS
+    done = {row.key for row in read_rows()}
+    commit = subprocess.run(
+        ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"],
+        capture_output=True, text=True, check=False,
+    ).stdout.strip()  # fmt: skip
+    for wanted in _wanted(seeds):
+        if wanted.key not in done:
+            row = dataclasses.replace(play_row(wanted), commit=commit)
+            _append(row)
+            said = row.refused or f"{row.mean_error_m * 100:.3f} cm"
+            print(f"  {' '.join(map(str, row.key))}: {said}", flush=True)
+    figures: dict[str, float | str] = {}
+    print("\nMean tip error [cm] over twins: DER, PCC, and their paired difference")
+    for row, rows, found in comparisons(read_rows()):
+        name = f"{row.mounting}_{row.payload_kg * 1000:.0f}g_{row.period_s:.0f}s"
+        for model in MODELS:
+            errors = [r.mean_error_m * 100 for r in rows if r.model == model and not r.refused]
+            figures[f"{name}_{model}_mean_cm"] = float(np.mean(errors))
+        figures[f"{name}_difference_cm"] = found.difference_m * 100
+        der, pcc = (figures[f"{name}_{model}_mean_cm"] for model in MODELS)
+        print(f"  {name}: DER {der:.3f}, PCC {pcc:.3f}; {format_comparison(found)}")
+    return figures

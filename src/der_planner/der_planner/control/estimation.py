@@ -1,0 +1,417 @@
+"""The state estimator: a Kalman filter of what the limb does beside what the model expects.
+
+Its state is the deviation from the model's motion under the plan (`der_planner.control.nominal`):
+
+    x = (δθ, δθ̇, d, g, b)
+
+bend angles [rad] and rates [rad/s], per segment the effective pressure d that the model lacks [Pa]
+and the relative error g of its gain, and a displacement b (2) of the tip that the bend angles do
+not explain [m]. With w the model's effective pressure under the *measured* chamber pressures and w̄
+under the plan,
+
+    M_w δθ̈ + D_w δθ̇ + K_w δθ = (w − w̄) + d + g w
+
+d, g and b wander. Friction and creep remember the model's bend and the slow part of δθ: the noise
+of a measurement must not wear off what friction remembers.
+
+Measurements come late and in any order. The filter runs on a grid of `nominal.STEP` and keeps its
+states of the last seconds; a measurement is put at its own instant, against the model at exactly
+that instant, and what follows is computed again. A measurement that the filter did not expect
+counts less (its covariance grows with its distance); where it happens again and again, something
+has happened to the limb, and what is known of rates and disturbances becomes uncertain.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from der_planner.control.chambers import ChamberLog
+from der_planner.control.nominal import STEP, Nominal
+from der_planner.model import material
+from der_planner.model.drive import STEPS
+from der_planner.model.series import CONTROL_PERIOD
+
+Array = NDArray[np.float64]
+
+HISTORY = 2.0
+"""Measurements older than this, against the newest instant, come too late [s]."""
+_WAITED_FOR = 1.0
+"""The first picture that comes may be so much younger than one that comes later [s]."""
+EARLIEST = 2.0
+"""The limb is watched from so long before the first setpoint on [s]."""
+
+
+@dataclass(frozen=True)
+class EstimatorSettings:
+    """Standard deviations; densities are those of what wanders, per √s.
+
+    Attributes:
+        bend_noise: of a measured bend angle whose covariance is not given [rad].
+        tip_noise: of a coordinate of a tip whose covariance is not given [m].
+        pressure_density: of the effective pressure that is white noise [Pa √s].
+        missing_first, missing_density: of d [Pa], [Pa/√s].
+        gain_first, gain_density: of g [-], [1/√s].
+        tip_first, tip_density: of b [m], [m/√s].
+        tip_time: in which b is forgotten [s].
+        memory_time: low-pass of δθ before friction and creep [s].
+        strange: squared distance per coordinate from where a measurement counts less.
+        event_missing, event_rate, event_gain: what an event adds to d [Pa], rates [rad/s], g.
+    """
+
+    bend_noise: float = 2e-3
+    tip_noise: float = 3e-4
+    pressure_density: float = 15.0
+    missing_first: float = 600.0
+    missing_density: float = 250.0
+    gain_first: float = 0.15
+    gain_density: float = 0.01
+    tip_first: float = 3e-3
+    tip_density: float = 1e-3
+    tip_time: float = 20.0
+    memory_time: float = 0.4
+    strange: float = 6.0
+    event_missing: float = 1000.0
+    event_rate: float = 0.5
+    event_gain: float = 0.05
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What is known of the limb at an instant.
+
+    Attributes:
+        time: [s] of the plan.
+        bend_angle, bend_rate: (M,) [rad], [rad/s].
+        tip: (2,) [m].
+        missing_pressure: (M,) effective pressure that the model lacks, its gain error not counted
+            [Pa].
+        gain_error: (M,) relative error of the model's effective pressure.
+        effective_pressure: (M,) of the model, without either [Pa].
+        tip_offset: (2,) displacement of the tip that the bend does not explain [m].
+        deviation: (4M + 2,) standard deviations of bend_angle, bend_rate, missing_pressure,
+            gain_error and tip_offset, in this order.
+        tip_covariance: (2, 2) [m²].
+        age: time since the newest measurement that it knows [s].
+    """
+
+    time: float
+    bend_angle: Array
+    bend_rate: Array
+    tip: Array
+    missing_pressure: Array
+    gain_error: Array
+    effective_pressure: Array
+    tip_offset: Array
+    deviation: Array
+    tip_covariance: Array
+    age: float
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """The filter at a boundary of fine steps.
+
+    Attributes:
+        mean: (4M + 2,) x.
+        covariance: of x.
+        slow: (M,) slow part of δθ [rad].
+        memory: of friction and creep.
+        taken: (M,) pressure that friction and creep take [Pa].
+        effective: (M,) effective pressure of the model [Pa].
+        strange: squared distances of the last measurements per coordinate, smoothed; 1 is expected.
+        row: measurements in a row that were not expected.
+    """
+
+    mean: Array
+    covariance: Array
+    slow: Array
+    memory: material.Memory
+    taken: Array
+    effective: Array
+    strange: float = 1.0
+    row: int = 0
+
+
+@dataclass(frozen=True)
+class _Measurement:
+    time: float
+    value: Array
+    covariance: Array
+
+
+class Estimator:
+    """See the module.
+
+    Args:
+        nominal: the model's motion under the plan.
+        chambers: what was commanded and measured of the chambers.
+        settings: of the noise.
+
+    Attributes:
+        innovations: (time [s], squared normalised distance, coordinates) of every measurement
+            when it first came.
+        too_late: measurements that were older than the history.
+        newest: stamp of the newest measurement [s].
+    """
+
+    def __init__(
+        self, nominal: Nominal, chambers: ChamberLog, settings: EstimatorSettings | None = None
+    ) -> None:
+        self.nominal, self.chambers = nominal, chambers
+        self.settings = settings or EstimatorSettings()
+        self.inputs = nominal.limb.segment_count
+        self.innovations: list[tuple[float, float, int]] = []
+        self.too_late = 0
+        self.newest = -math.inf
+        self._measurements: dict[int, list[_Measurement]] = {}
+        self._known: dict[int, Knowledge] = {}
+        self._first: int | None = None
+        self._last = 0
+        self._fresh: set[int] = set()
+        self._moves, self._noises = self._prepare()
+
+    # What comes in -------------------------------------------------------------------------
+
+    def begin(self, time: float) -> None:
+        """Start a second before an instant [s], if not started; what is older is not used."""
+        time = max(time - _WAITED_FOR, -EARLIEST)
+        if self._first is None:
+            self._first = self._last = math.floor(time / STEP)
+            self._known[self._first] = self.beginning(self._first)
+
+    def changed(self, time: float) -> None:
+        """Compute again what depends on chamber pressures from an instant on [s]."""
+        self._forget(math.floor(time / STEP))
+
+    def measure(
+        self, time: float, bend_angle: ArrayLike, tip: ArrayLike, covariance: ArrayLike | None
+    ) -> None:
+        """Take in a measurement at its own instant [s]; NaN: not seen. See `Feedback.measure`."""
+        value = np.concatenate([np.ravel(bend_angle), np.ravel(tip)]).astype(float)
+        if value.shape != (self.inputs + 2,):
+            raise ValueError(
+                f"expected {self.inputs} bend angles and a tip (2,), got shapes "
+                f"{np.shape(bend_angle)} and {np.shape(tip)}"
+            )
+        if not np.isfinite(value).any():
+            return
+        self.begin(time)
+        j = round(time / STEP)
+        if self._first is None or j < max(self._first, self._last - round(HISTORY / STEP)):
+            self.too_late += 1
+            return
+        entry = _Measurement(time, value, self._noise(covariance))
+        self._measurements.setdefault(j, []).append(entry)
+        self._fresh.add(id(entry))
+        self.newest = max(self.newest, time)
+        self._forget(j)
+
+    def _noise(self, covariance: ArrayLike | None) -> Array:
+        settings, inputs = self.settings, self.inputs
+        noise = np.diag(np.repeat([settings.bend_noise**2, settings.tip_noise**2], [inputs, 2]))
+        if covariance is not None:
+            given = np.asarray(covariance, dtype=float)
+            if given.shape == noise.shape:
+                noise = given
+            elif given.shape == (2, 2):
+                noise[inputs:, inputs:] = given
+            else:
+                raise ValueError(
+                    f"covariance must be that of the tip (2, 2) or of bend angles and tip "
+                    f"{noise.shape}, got {given.shape}"
+                )
+        return noise
+
+    # What goes out -------------------------------------------------------------------------
+
+    def at(self, time: float) -> Knowledge:
+        """Return what is known at an instant [s], beyond the newest one by the model."""
+        self.begin(time)
+        j = round(time / STEP)
+        if self._first is None:
+            raise AssertionError("the filter has begun")
+        self._run(max(j, self._first))
+        oldest = next(iter(self._known))
+        known = self._known[min(max(j, oldest), self._last)]
+        return self._updated(max(j, oldest), known)
+
+    def estimate(self, time: float) -> Estimate:
+        """Return bend, rates, tip and what the model lacks at an instant [s]."""
+        known = self.at(time)
+        inputs = self.inputs
+        bend, rate, tip = self.nominal.at(time)
+        change, speed, missing, gain, offset = np.split(known.mean, np.arange(1, 5) * inputs)
+        rows = self._output(bend, change)[inputs:]
+        return Estimate(
+            time=time,
+            bend_angle=bend + change,
+            bend_rate=rate + speed,
+            tip=tip + self.nominal.moved_tip(bend, change) + offset,
+            missing_pressure=missing,
+            gain_error=gain,
+            effective_pressure=known.effective,
+            tip_offset=offset,
+            deviation=np.sqrt(np.diag(known.covariance)),
+            tip_covariance=rows @ known.covariance @ rows.T,
+            age=time - self.newest,
+        )
+
+    # The filter ----------------------------------------------------------------------------
+
+    def beginning(self, first: int) -> Knowledge:
+        """Return what is known at fine step ``first`` before anything was measured."""
+        settings, inputs = self.settings, self.inputs
+        deviation = np.repeat(
+            [0.03, 0.03, settings.missing_first, settings.gain_first, settings.tip_first],
+            [inputs, inputs, inputs, inputs, 2],
+        )
+        zero = np.zeros(inputs)
+        here = self.nominal.steps(first)
+        memory = material.Memory(self.nominal.fine_bend[here], zero, zero)
+        mean, effective = np.zeros(4 * inputs + 2), self.nominal.effective[here]
+        return Knowledge(mean, np.diag(deviation**2), zero, memory, zero, effective)
+
+    def _forget(self, j: int) -> None:
+        """Compute again from boundary ``j`` on."""
+        if self._first is None or j >= self._last:
+            return
+        j = max(j, next(iter(self._known)))
+        for later in range(j + 1, self._last + 1):
+            del self._known[later]
+        self._last = j
+
+    def _run(self, last: int) -> None:
+        if last <= self._last:
+            return
+        differential = self.chambers.during(np.arange(self._last, last))
+        begin = self._last
+        for first in range(begin, last):
+            # What friction and creep take changes once a control period.
+            if first > begin and first % STEPS:
+                continue
+            end = min(last, (first // STEPS + 1) * STEPS)
+            self._period(first, differential[first - begin : end - begin])
+        self._last = last
+        oldest = last - round(HISTORY / STEP)
+        for j in list(self._known):
+            if j >= oldest:
+                break
+            del self._known[j]
+            self._measurements.pop(j, None)
+
+    def _updated(self, j: int, known: Knowledge) -> Knowledge:
+        for entry in self._measurements.get(j, ()):
+            known = self._update(entry, known)
+        return known
+
+    def _period(self, first: int, held: Array) -> None:
+        """Go on from boundary ``first`` under a control period's chamber pressures (n, M) [Pa]."""
+        nominal, inputs = self.nominal, self.inputs
+        steps = nominal.steps(first + np.arange(len(held)))
+        k = int(nominal.periods(first // STEPS))
+        known = self._known[first]
+        memory, taken = known.memory, known.taken
+        if first % STEPS == 0:
+            memory, taken = self._remember(known, nominal.fine_bend[steps[0]] + known.slow)
+        effective = material.without_memory(nominal.limb, held, taken)
+        push = nominal.fine_input[k]
+        pushed = (effective - nominal.effective[steps]) @ push.T
+        move, noise = self._moves[k].copy(), self._noises[k]
+        swing = 2 * inputs
+        share = STEP / self.settings.memory_time
+        for i, felt in enumerate(effective):
+            known = self._updated(first + i, self._known[first + i])
+            move[:swing, swing + inputs : swing + 2 * inputs] = push * felt
+            mean = move @ known.mean
+            mean[:swing] += pushed[i]
+            self._known[first + i + 1] = Knowledge(
+                mean,
+                move @ known.covariance @ move.T + noise,
+                known.slow + share * (known.mean[:inputs] - known.slow),
+                memory,
+                taken,
+                felt,
+                known.strange,
+                known.row,
+            )
+
+    def _prepare(self) -> tuple[Array, Array]:
+        """Return F without its column of g, and the covariance that a fine step adds.
+
+        Of each control period, (K', 4M + 2, 4M + 2).
+        """
+        nominal, settings, inputs = self.nominal, self.settings, self.inputs
+        size, swing = 4 * inputs + 2, 2 * inputs
+        moves = np.tile(np.eye(size), (nominal.count, 1, 1))
+        moves[:, :swing, :swing] = nominal.fine_transition
+        moves[:, :swing, swing : swing + inputs] = nominal.fine_input
+        moves[:, -2:, -2:] *= math.exp(-STEP / settings.tip_time)
+        wander = np.repeat(
+            [0.0, settings.missing_density, settings.gain_density, settings.tip_density],
+            [swing, inputs, inputs, 2],
+        )
+        noises = np.tile(np.diag(wander**2 * STEP), (nominal.count, 1, 1))
+        push = nominal.fine_input
+        noises[:, :swing, :swing] += (
+            push @ np.swapaxes(push, 1, 2) * (settings.pressure_density**2 / STEP)
+        )
+        return moves, noises
+
+    def _remember(self, known: Knowledge, bend: Array) -> tuple[material.Memory, Array]:
+        """Return memory and taken pressures once the limb has come to a bend (M,) [rad]."""
+        limb = self.nominal.limb
+        if not any(s.friction_moment > 0 or s.creep_stiffness > 0 for s in limb.segments):
+            return known.memory, known.taken
+        history = material.remember(
+            limb, np.array([0.0, CONTROL_PERIOD]), np.stack([known.memory.bend, bend]), known.memory
+        )
+        return history.at(-1), material.taken_by(limb, history)[-1]
+
+    def _output(self, bend: Array, change: Array) -> Array:
+        """Return ∂(bend angles, tip)/∂x (M + 2, 4M + 2)."""
+        inputs = self.inputs
+        rows = np.zeros((inputs + 2, 4 * inputs + 2))
+        rows[:inputs, :inputs] = np.eye(inputs)
+        rows[inputs:, :inputs] = self.nominal.kinematics.tip_jacobians(bend + change)
+        rows[inputs:, -2:] = np.eye(2)
+        return rows
+
+    def _update(self, entry: _Measurement, known: Knowledge) -> Knowledge:
+        settings, inputs = self.settings, self.inputs
+        bend, _, tip = self.nominal.at(entry.time)
+        change = known.mean[:inputs]
+        moved = self.nominal.moved_tip(bend, change) + known.mean[-2:]
+        seen = np.isfinite(entry.value)
+        gap = (entry.value - np.concatenate([bend + change, tip + moved]))[seen]
+        rows = self._output(bend, change)[seen]
+        noise = entry.covariance[np.ix_(seen, seen)]
+        spread = known.covariance
+        expected = rows @ spread @ rows.T + noise
+        distance = float(gap @ np.linalg.solve(expected, gap)) / len(gap)
+        if id(entry) in self._fresh:
+            self._fresh.discard(id(entry))
+            self.innovations.append((entry.time, distance * len(gap), len(gap)))
+        row = known.row + 1 if distance > settings.strange else 0
+        if row >= 2:
+            # Once may be a bad picture, twice is the limb: a push, a load, a gain that fell.
+            spread = spread + np.diag(
+                np.repeat(
+                    [0.0, settings.event_rate, settings.event_missing, settings.event_gain, 0.0],
+                    [inputs, inputs, inputs, inputs, 2],
+                )
+                ** 2
+            )
+            expected = rows @ spread @ rows.T + noise
+            row = 0
+        elif row:
+            expected = expected + noise * (distance / settings.strange * len(gap))
+        gain = np.linalg.solve(expected, rows @ spread).T
+        mean = known.mean + gain @ gap
+        spread = spread - gain @ expected @ gain.T
+        spread = 0.5 * (spread + spread.T)
+        smooth = known.strange + 0.05 * (distance - known.strange)
+        return replace(known, mean=mean, covariance=spread, strange=smooth, row=row)

@@ -1,0 +1,144 @@
+"""Feedback within a run: commands that follow what camera and chambers show.
+
+    f = Feedback(plan)
+    f.pressures(time, differential)            # as often as the board tells them
+    f.measure(time, bend_angle, tip)           # as pictures come, late and in any order
+    f.command(time)                            # ahead of the instant, every 50 ms
+    f.estimate(time)
+
+All times are seconds since the plan's first setpoint. Nothing here knows the present: a command is
+based on what was told before it was asked for.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from threadpoolctl import ThreadpoolController
+
+from der_planner.control.chambers import ChamberLog
+from der_planner.control.estimation import Estimate, Estimator
+from der_planner.control.horizon import Allowed, Horizon
+from der_planner.control.nominal import Nominal
+from der_planner.control.supervision import Limits, Supervisor, Warned
+from der_planner.model.series import CONTROL_PERIOD
+from der_planner.planning.result import Plan
+
+Array = NDArray[np.float64]
+
+_THREADS = ThreadpoolController()
+
+
+class Feedback:
+    """Corrects a plan while it is played.
+
+    After the plan's end its last pose is held, for as long as commands are asked for.
+
+    Args:
+        plan: what is played; its limb, reference and commands are used.
+        limits: when feedback is taken back, and how much it may add.
+
+    Attributes:
+        plan: as given.
+    """
+
+    def __init__(self, plan: Plan, limits: Limits | None = None) -> None:
+        self.plan = plan
+        self._nominal = Nominal(plan)
+        air = plan.limb.pneumatics
+        limits = limits or Limits()
+        authority = limits.authority * air.pressure_limit
+        self._allowed = Allowed(authority, air.pressure_limit, air.slew_limit * CONTROL_PERIOD)
+        self._supervisor = Supervisor(limits, authority)
+        self._chambers = ChamberLog(self._nominal)
+        self._estimator = Estimator(self._nominal, self._chambers)
+        self._horizon = Horizon(self._nominal, self._chambers)
+        self._horizon.warm_up(self._estimator.beginning(0), self._allowed)
+
+    @property
+    def reason(self) -> str:
+        """Why feedback is out, or going out; empty while it acts."""
+        return self._supervisor.reason
+
+    @property
+    def warnings(self) -> list[Warned]:
+        """Every time that feedback was taken back, with its reason."""
+        return self._supervisor.warnings
+
+    @property
+    def share(self) -> float:
+        """Share of the corrections that is sent, 0 … 1."""
+        return self._supervisor.share
+
+    @property
+    def innovations(self) -> list[tuple[float, float, int]]:
+        """(time [s], squared normalised distance, coordinates) of every measurement."""
+        return self._estimator.innovations
+
+    def pressures(self, time: float, differential: ArrayLike) -> None:
+        """Take in the chambers' differential pressures (M,) [Pa], as measured at an instant [s].
+
+        Raises:
+            ValueError: another shape.
+        """
+        changed = self._chambers.read(time, differential)
+        if changed is not None:
+            self._estimator.changed(changed)
+
+    def measure(
+        self,
+        time: float,
+        bend_angle: ArrayLike,
+        tip: ArrayLike,
+        covariance: ArrayLike | None = None,
+    ) -> None:
+        """Take in what a picture showed. It may come late, and after a later one.
+
+        Args:
+            time: when the picture was taken [s].
+            bend_angle: (M,) [rad]; NaN where a segment was not seen.
+            tip: (2,) [m]; NaN if it was not seen.
+            covariance: of the tip (2, 2) [m²], or of bend angles and tip (M + 2, M + 2).
+
+        Raises:
+            ValueError: another shape.
+        """
+        self._estimator.measure(time, bend_angle, tip, covariance)
+
+    def command(self, time: float) -> Array:
+        """Return the command (M,) [Pa] that takes effect at an instant [s] and holds for 50 ms.
+
+        It keeps the limb's pressure and slew limits. To be asked for ahead of the instant, in
+        order; asked for again, it is computed again.
+        """
+        k = round(time / CONTROL_PERIOD)
+        instant = k * CONTROL_PERIOD
+        supervisor = self._supervisor
+        supervisor.asked(instant, self._chambers.newest - CONTROL_PERIOD)
+        planned, before = self._nominal.command(k), self._chambers.sent(k - 1)
+        correction = np.zeros_like(planned)
+        try:
+            # Matrices of some ten rows: more threads only get into other processes' way.
+            with _THREADS.limit(limits=1, user_api="blas"):
+                known = self._estimator.at(instant)
+                age = instant - self._estimator.newest
+                share = supervisor.advance(instant, age, known.strange)
+                if share > 0.0:
+                    correction = share * self._horizon.solve(k, known, self._allowed)
+        except np.linalg.LinAlgError:
+            correction[:] = np.nan
+        if not np.isfinite(correction).all():
+            supervisor.stop(instant, "inconsistent", np.inf)
+            correction = np.zeros_like(planned)
+        limit, step = self._allowed.limit, self._allowed.step
+        command: Array = np.clip(planned + correction, before - step, before + step)
+        command = np.clip(command, -limit, limit)
+        supervisor.sent(instant, command - planned)
+        self._chambers.send(k, command)
+        self._estimator.changed(instant)
+        return command
+
+    def estimate(self, time: float) -> Estimate:
+        """Return what is known of the limb at an instant [s], past or to come."""
+        with _THREADS.limit(limits=1, user_api="blas"):
+            return self._estimator.estimate(time)

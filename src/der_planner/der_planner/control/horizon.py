@@ -1,0 +1,258 @@
+"""The receding horizon: corrections of the coming commands that bring the tip back to r̄(t).
+
+From the estimate at the instant of the next command on, the linear system of
+`der_planner.control.nominal` is rolled forward under the commands that would be sent without a new
+correction. The corrections c (W, M), added to the plan's commands, then minimise
+
+    Σ |tip − r̄|² + ν² Σ |δθ|² + λ² Σ |r_k − r_{k−1}|² + λ'² Σ |r_k − 2 r_{k−1} + r_{k−2}|²
+
+where r is c less what makes up for the disturbances d and g, which are known ahead, with |command|
+within the pressure limit, its change within the slew limit and |c| within the authority. ν keeps
+the segments near the model's bend where the tip hardly tells them apart. The chambers' law, with
+its slow venting, is linearised about the commands rolled forward. Corrections are straight lines
+between a few knots, close together at first, so that the programme has some twenty unknowns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import piqp
+from numpy.typing import NDArray
+
+from der_planner.control.chambers import ChamberLog
+from der_planner.control.estimation import Knowledge
+from der_planner.control.nominal import Nominal
+from der_planner.model import air, material
+from der_planner.model.drive import STEPS
+from der_planner.model.series import CONTROL_PERIOD
+
+Array = NDArray[np.float64]
+
+_PRESSURE = 1e3
+"""The solver works in kPa …"""
+_LENGTH = 1e-3
+"""… and mm."""
+
+
+@dataclass(frozen=True)
+class HorizonSettings:
+    """Sizes and weights.
+
+    Attributes:
+        knots: control periods at which corrections are free; the last one is the horizon's.
+        bend: ν, tip error that a unit deviation of a bend is worth [m/rad].
+        change: λ, tip error that a unit change of a correction is worth [m/Pa].
+        smoothness: λ' [m/Pa].
+    """
+
+    knots: tuple[int, ...] = (0, 1, 2, 3, 5, 7, 10, 14, 19, 25, 32, 39)
+    bend: float = 0.01
+    change: float = 1e-5
+    smoothness: float = 1e-5
+
+
+@dataclass(frozen=True)
+class Allowed:
+    """What a correction must keep.
+
+    Attributes:
+        authority: largest |correction| [Pa].
+        limit: largest |command| [Pa].
+        step: largest change from one command to the next [Pa].
+    """
+
+    authority: float
+    limit: float
+    step: float
+
+
+class Horizon:
+    """Solves for the coming corrections; see the module.
+
+    Args:
+        nominal: the model's motion under the plan.
+        chambers: what was commanded and measured of the chambers.
+        settings: sizes and weights.
+    """
+
+    def __init__(
+        self, nominal: Nominal, chambers: ChamberLog, settings: HorizonSettings | None = None
+    ) -> None:
+        self._nominal, self._chambers = nominal, chambers
+        self.settings = settings or HorizonSettings()
+        self.window = self.settings.knots[-1] + 1
+        self._hats = _hats(self.settings.knots)
+        self._guess: tuple[int, Array] | None = None
+
+    def solve(self, first: int, known: Knowledge, allowed: Allowed) -> Array:
+        """Return the correction (M,) [Pa] of the command of control period ``first``.
+
+        Args:
+            first: period.
+            known: of the limb at its beginning.
+            allowed: what corrections and commands must keep.
+        """
+        inputs = self._nominal.limb.segment_count
+        last = np.array([self._corrected(first - back) for back in (2, 1)])
+        ahead = self._ahead(first, known)
+        guess = self._begin(first, last[-1] - ahead[1]) + ahead[2:]
+        misses, bends, jacobian, turned = self._roll(first, guess, known)
+        # Unknown is the change of the knots.
+        knots = self._hats.shape[1] * inputs
+        tip = jacobian.reshape(-1, knots)
+        bend = self.settings.bend * turned.reshape(-1, knots)
+        hessian = tip.T @ tip + bend.T @ bend
+        gradient = tip.T @ misses.ravel() + self.settings.bend * (bend.T @ bends.ravel())
+        run = np.concatenate([last, guess]) - ahead
+        for order, weight in ((1, self.settings.change), (2, self.settings.smoothness)):
+            each = np.diff(np.eye(len(run)), order, axis=0)[2 - order :]
+            rows = np.kron(each[:, 2:] @ self._hats, np.eye(inputs))
+            hessian += weight**2 * rows.T @ rows
+            gradient += weight**2 * rows.T @ (each @ run).ravel()
+        change = self._within(hessian, gradient, first, guess, allowed).reshape(-1, inputs)
+        correction = guess + self._hats @ change
+        self._guess = first, correction - ahead[2:]
+        cut: Array = np.clip(correction[0], -allowed.authority, allowed.authority)
+        return cut
+
+    def warm_up(self, known: Knowledge, allowed: Allowed) -> None:
+        """Compile, or load from the cache, what `solve` calls."""
+        self.solve(0, known, allowed)
+        self._guess = None
+
+    def _ahead(self, first: int, known: Knowledge) -> Array:
+        """Return the corrections (W + 2, M) [Pa] that make up for d and g, from two periods before.
+
+        They are led by dead time and lag of the chambers.
+        """
+        nominal, inputs = self._nominal, self._nominal.limb.segment_count
+        air_of = nominal.limb.pneumatics
+        lead = round((air_of.delay + air_of.time_constant) / CONTROL_PERIOD)
+        periods = nominal.periods(first + lead + np.arange(-2, self.window))
+        planned = nominal.effective.reshape(-1, STEPS, inputs)[periods].mean(axis=1)
+        missing, gain = self._disturbance(known)
+        lacking: Array = -(missing + gain * planned) / np.maximum(1.0 + gain, 0.3)
+        return lacking
+
+    def _disturbance(self, known: Knowledge) -> tuple[Array, Array]:
+        """Return d [Pa] and g, (M,) each."""
+        inputs = self._nominal.limb.segment_count
+        _, missing, gain, _ = np.split(known.mean, np.arange(2, 5) * inputs)
+        return missing, gain
+
+    def _corrected(self, k: int) -> Array:
+        """Return the correction (M,) that was sent for a period [Pa]."""
+        return self._chambers.sent(k) - self._nominal.command(k)
+
+    def _begin(self, first: int, last: Array) -> Array:
+        """Return the last solution, moved to begin now, (W, M) [Pa]."""
+        if self._guess is None or not 0 <= first - self._guess[0] < self.window:
+            return np.tile(last, (self.window, 1))
+        gone = first - self._guess[0]
+        before = self._guess[1]
+        return before[np.minimum(np.arange(self.window) + gone, self.window - 1)]
+
+    def _roll(
+        self, first: int, guess: Array, known: Knowledge
+    ) -> tuple[Array, Array, Array, Array]:
+        """Return misses (W, 2) [m] and bends (W, M) [rad] at the ends of the periods.
+
+        And their derivatives by the corrections at the knots (W, 2, knots·M), (W, M, knots·M).
+        """
+        nominal, inputs = self._nominal, self._nominal.limb.segment_count
+        periods = nominal.periods(first + np.arange(self.window))
+        commands = nominal.commands[periods] + guess
+        chambers, before = self._chambers.follow(first, commands)
+        middle = (first * STEPS + np.arange(self.window * STEPS) + 0.5) * CONTROL_PERIOD / STEPS
+        held = chambers.differential[before:] + self._chambers.surprise(middle).reshape(
+            self.window, STEPS, inputs
+        )
+        fine = nominal.steps(first * STEPS + np.arange(self.window * STEPS))
+        here = nominal.steps(first * STEPS)
+        taken = nominal.taken[fine] + (known.taken - nominal.taken[here])
+        effective = material.without_memory(
+            nominal.limb, held, taken.reshape(self.window, STEPS, inputs)
+        )
+        slopes = material.slopes(nominal.limb, held, effective).matrix.mean(axis=1)
+        reached = air.derivative(chambers, before).mean(axis=1)
+        missing, gain = self._disturbance(known)
+        slopes = slopes * (1.0 + gain)[None, :, None]
+        felt = effective.mean(axis=1)
+        planned = nominal.effective[fine].reshape(self.window, STEPS, inputs).mean(axis=1)
+        push = felt * (1.0 + gain) + missing - planned
+        # Pressures by the knots' corrections, then swing by these, period after period.
+        reached = np.einsum("wvb,vn->wnb", reached, self._hats)
+        into = nominal.input[periods]
+        driven = np.einsum("wsb,wnb->wsnb", into @ slopes, reached)
+        driven = driven.reshape(self.window, 2 * inputs, -1)
+        pushed = np.einsum("wsb,wb->ws", into, push)
+        swing, moved = known.mean[: 2 * inputs], np.zeros(driven.shape[1:])
+        bends = np.empty((self.window, inputs))
+        turned = np.empty((self.window, inputs, driven.shape[2]))
+        for i, transition in enumerate(nominal.transition[periods]):
+            swing = transition @ swing + pushed[i]
+            moved = transition @ moved + driven[i]
+            bends[i], turned[i] = swing[:inputs], moved[:inputs]
+        ends = nominal.periods(first + 1 + np.arange(self.window))
+        bend = nominal.bend[ends]
+        misses = nominal.tip[ends] + nominal.moved_tip(bend, bends) - nominal.reference[ends]
+        misses = misses + known.mean[-2:]
+        jacobian = nominal.kinematics.tip_jacobians(bend + bends) @ turned
+        return misses, bends, jacobian, turned
+
+    def _within(
+        self, hessian: Array, gradient: Array, first: int, guess: Array, allowed: Allowed
+    ) -> Array:
+        """Return the change (knots·M,) of the knots [Pa] that is best within what is allowed."""
+        change: Array = np.asarray(np.linalg.solve(hessian, -gradient), dtype=np.float64)
+        inputs = guess.shape[1]
+        periods = self._nominal.periods(first + np.arange(self.window))
+        planned = self._nominal.commands[periods]
+        low = np.maximum(-allowed.authority, -allowed.limit - planned) - guess
+        high = np.minimum(allowed.authority, allowed.limit - planned) - guess
+        bounds: Array = np.sort(np.stack([low, high]), axis=0)
+        low, high = bounds
+        command = np.concatenate([self._chambers.sent(first - 1)[None], planned + guess])
+        steps = np.diff(command, axis=0)
+        rows = np.diff(self._hats, axis=0, prepend=0.0)
+        moved = self._hats @ change.reshape(-1, inputs)
+        stepped = np.abs(steps + rows @ change.reshape(-1, inputs)).max()
+        if np.all(moved >= low) and np.all(moved <= high) and stepped <= allowed.step:
+            return change
+        return _programme(
+            hessian,
+            gradient,
+            np.kron(np.concatenate([self._hats, rows]), np.eye(inputs)),
+            np.concatenate([low, np.minimum(-allowed.step - steps, 0.0)]).ravel(),
+            np.concatenate([high, np.maximum(allowed.step - steps, 0.0)]).ravel(),
+        )
+
+
+def _programme(hessian: Array, gradient: Array, rows: Array, low: Array, high: Array) -> Array:
+    """Return x that minimises ½ xᵀ hessian x + gradientᵀ x with low ≤ rows x ≤ high."""
+    scale = (_PRESSURE / _LENGTH) ** 2
+    solver = piqp.DenseSolver()
+    solver.settings.eps_abs = 1e-5
+    solver.settings.eps_rel = 1e-6
+    solver.setup(
+        np.asfortranarray(hessian * scale),
+        gradient * scale / _PRESSURE,
+        None,
+        None,
+        np.asfortranarray(rows),
+        low / _PRESSURE,
+        high / _PRESSURE,
+        None,
+        None,
+    )
+    if solver.solve() != piqp.PIQP_SOLVED:
+        return np.zeros(len(gradient))
+    return np.asarray(solver.result.x) * _PRESSURE
+
+
+def _hats(knots: tuple[int, ...]) -> Array:
+    """Return the weights (W, knots) of straight lines between knots."""
+    place = np.arange(knots[-1] + 1)
+    return np.stack([np.interp(place, knots, column) for column in np.eye(len(knots))], axis=1)

@@ -1,0 +1,230 @@
+"""A plan played on a simulated limb in one process, with sensors, latency and feedback.
+
+Simulated time is the only clock: the same plan, limb and seed give the same run, however busy the
+machine is. What is asked of feedback is what the graph asks: a command is asked for a lead before
+its instant, of a state that a camera shows some ten milliseconds late.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from der_planner.control.feedback import Feedback
+from der_planner.model.series import CONTROL_PERIOD
+from der_planner.planning.result import Plan
+
+Array = NDArray[np.float64]
+
+
+class Plant(Protocol):
+    """A simulated limb with its air."""
+
+    def advance(self, command: Array, duration: float) -> None:
+        """Hold a command (M,) [Pa] for a time [s]."""
+
+    @property
+    def differential_pressure(self) -> Array:
+        """(M,) in the chambers [Pa]."""
+
+    @property
+    def bend_angles(self) -> Array:
+        """(M,) [rad]."""
+
+    @property
+    def tip(self) -> Array:
+        """(2,) [m]."""
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """What camera and board show, and when it is known.
+
+    Attributes:
+        frame_rate: of the camera [Hz].
+        latency: from a picture to what was seen on it [s].
+        jitter: standard deviation of the latency, which is never below its half [s].
+        lead: a command is asked for so long before its instant [s].
+        bend_noise, tip_noise, pressure_noise: standard deviations [rad], [m], [Pa].
+        seed: of noise and jitter.
+        seen: tells if the limb is seen on a picture of an instant [s].
+    """
+
+    frame_rate: float = 30.0
+    latency: float = 0.07
+    jitter: float = 0.01
+    lead: float = 0.15
+    bend_noise: float = math.radians(0.1)
+    tip_noise: float = 3e-4
+    pressure_noise: float = 5.0
+    seed: int = 0
+    seen: Callable[[float], bool] = lambda _time: True
+
+
+@dataclass(frozen=True)
+class Played:
+    """What happened, at the K instants of the commands.
+
+    Attributes:
+        time: (K,) [s].
+        commanded: (K, M) [Pa].
+        differential_pressure: (K, M) in the chambers [Pa].
+        bend_angles: (K, M) true ones [rad].
+        tip: (K, 2) true one [m].
+        reference: (K, 2) r̄ [m].
+        correction: (K, M) what feedback added to the plan's commands [Pa].
+        estimated_tip: (K, 2) as estimated at its own instant [m]; NaN without feedback.
+        missing_pressure: (K, M) effective pressure that the model was found to lack, the error of
+            its gain included [Pa]; NaN without feedback.
+    """
+
+    time: Array
+    commanded: Array
+    differential_pressure: Array
+    bend_angles: Array
+    tip: Array
+    reference: Array
+    correction: Array
+    estimated_tip: Array
+    missing_pressure: Array
+
+    @property
+    def error(self) -> Array:
+        """(K,) distance of the tip from r̄ [m]."""
+        distance: Array = np.linalg.norm(self.tip - self.reference, axis=1)
+        return distance
+
+
+def play(
+    plan: Plan,
+    plant: Plant,
+    feedback: Feedback | None = None,
+    sensors: Sensors | None = None,
+    held: float = 0.0,
+    event: Callable[[float], None] = lambda _time: None,
+) -> Played:
+    """Play a plan from rest, with feedback or without.
+
+    Args:
+        plan: to play.
+        plant: at rest.
+        feedback: of the plan.
+        sensors: what it is told.
+        held: for so long after its end the plan's last command is held [s].
+        event: called at every instant of a command or a picture, before the limb moves on.
+    """
+    return _Loop(plan, plant, feedback, sensors or Sensors(), event).run(held)
+
+
+class _Loop:
+    def __init__(
+        self,
+        plan: Plan,
+        plant: Plant,
+        feedback: Feedback | None,
+        sensors: Sensors,
+        event: Callable[[float], None],
+    ) -> None:
+        self._plan, self._plant, self._feedback = plan, plant, feedback
+        self._sensors, self._event = sensors, event
+        self._draw = np.random.default_rng([47, sensors.seed])
+        self._pictures: list[tuple[float, float, Array, Array]] = []
+        self._coming: list[Array] = []
+
+    def run(self, held: float) -> Played:
+        plan, sensors = self._plan, self._sensors
+        count = len(plan.time) + round(held / CONTROL_PERIOD)
+        place = np.minimum(np.arange(count), len(plan.time) - 1)
+        planned, reference = plan.differential_pressure[place], plan.tip_reference[place]
+        ahead = max(1, round(sensors.lead / CONTROL_PERIOD))
+        rows = []
+        for k in range(ahead):
+            self._ask(k, planned)
+        for k in range(count):
+            instant = k * CONTROL_PERIOD
+            self._event(instant)
+            if self._feedback is not None:
+                self._tell(instant)
+            self._ask(k + ahead, planned)
+            command = self._coming.pop(0)
+            rows.append(self._look(instant, command))
+            self._advance(instant, command)
+        columns = [np.array(column) for column in zip(*rows, strict=True)]
+        commanded, held_by, bend, tip, estimated, missing = columns
+        return Played(
+            np.arange(count, dtype=np.float64) * CONTROL_PERIOD,
+            commanded,
+            held_by,
+            bend,
+            tip,
+            reference,
+            commanded - planned,
+            estimated,
+            missing,
+        )
+
+    def _ask(self, k: int, planned: Array) -> None:
+        if self._feedback is None:
+            self._coming.append(planned[min(k, len(planned) - 1)])
+        else:
+            self._coming.append(self._feedback.command(k * CONTROL_PERIOD))
+
+    def _tell(self, instant: float) -> None:
+        if self._feedback is None:
+            return
+        noise = self._sensors.pressure_noise * self._draw.standard_normal(
+            self._plan.limb.segment_count
+        )
+        self._feedback.pressures(instant, self._plant.differential_pressure + noise)
+        while self._pictures and self._pictures[0][0] <= instant:
+            _, taken, bend, tip = heapq.heappop(self._pictures)
+            self._feedback.measure(taken, bend, tip)
+
+    def _look(self, instant: float, command: Array) -> tuple[Array, ...]:
+        plant, nothing = self._plant, np.full(2, np.nan)
+        estimated, missing = nothing, np.full(len(command), np.nan)
+        if self._feedback is not None:
+            estimate = self._feedback.estimate(instant)
+            estimated = estimate.tip
+            missing = estimate.missing_pressure + estimate.gain_error * estimate.effective_pressure
+        return (
+            command,
+            plant.differential_pressure,
+            plant.bend_angles,
+            plant.tip,
+            estimated,
+            missing,
+        )
+
+    def _advance(self, instant: float, command: Array) -> None:
+        """Let a control period pass, with a picture at every instant of one."""
+        rate, end = self._sensors.frame_rate, instant + CONTROL_PERIOD
+        first, last = math.ceil(instant * rate - 1e-6), math.ceil(end * rate - 1e-6)
+        now = instant
+        for picture in range(first, last):
+            taken = picture / rate
+            if taken > now:
+                self._plant.advance(command, taken - now)
+                now = taken
+                self._event(now)
+            self._film(taken)
+        if end > now:
+            self._plant.advance(command, end - now)
+
+    def _film(self, taken: float) -> None:
+        sensors, plant = self._sensors, self._plant
+        if self._feedback is None or not sensors.seen(taken):
+            return
+        bend = plant.bend_angles
+        bend = bend + sensors.bend_noise * self._draw.standard_normal(len(bend))
+        tip = plant.tip + sensors.tip_noise * self._draw.standard_normal(2)
+        delay = sensors.latency + sensors.jitter * float(self._draw.standard_normal())
+        heapq.heappush(
+            self._pictures, (taken + max(delay, 0.5 * sensors.latency), taken, bend, tip)
+        )

@@ -1,0 +1,180 @@
+"""What the model expects along a plan, and how small deviations from that move.
+
+The rod is rolled forward once under the plan's own commands. Around this motion the limb is a
+linear system of second order in its M bend angles,
+
+    M_w δθ̈ + D_w δθ̇ + K_w δθ = δw
+
+with δw the change of the effective pressures [Pa]. M_w, D_w and K_w are the derivatives of the
+projected balance of forces (`der_planner.model.balance`) by acceleration, rate and bend along the
+motion, so that weight and pose count. Friction and creep are part of δw.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import make_interp_spline
+from scipy.linalg import expm
+
+from der_planner.model import material
+from der_planner.model.balance import Balance
+from der_planner.model.drive import STEPS
+from der_planner.model.response import RodModel, simulate
+from der_planner.model.series import CONTROL_PERIOD, step_middles
+from der_planner.planning.motions import resting_spline, sample_spline
+from der_planner.planning.result import Plan
+
+Array = NDArray[np.float64]
+Whole = NDArray[np.signedinteger[Any]]
+
+STEP = CONTROL_PERIOD / STEPS
+"""Fine step [s]: the grid of the estimator; `STEPS` of them make a control period."""
+_HELD = 40
+"""Control periods after the plan's end for which the model is rolled on; what comes later is as
+the last of them."""
+_SEGMENTS_KNOWN = 0.02
+"""Where a bend moves the tip by less than this per radian, a tip error says nothing about it
+[m/rad]."""
+_BEND_CHANGE, _RATE_CHANGE, _ACCELERATION_CHANGE = 1e-4, 1e-2, 1e-1
+"""Of the finite differences [rad], [rad/s], [rad/s²]."""
+
+
+class Nominal:
+    """The motion of the model under the commands of a plan, K control periods and a hold after it.
+
+    Instants are counted in fine steps j (`STEP`) or control periods k from the first setpoint;
+    before the first and after the last the limb rests, and every table is read at its end.
+
+    Args:
+        plan: whose commands, reference and limb are taken.
+
+    Attributes:
+        limb: of the plan.
+        kinematics: of the rod's evenly bent segments.
+        commands: (K', M) of the plan, then held [Pa].
+        reference: (K', 2) r̄ [m].
+        tip: (K', 2) of the model at the setpoints, with what a learned plan knows of it [m].
+        bend: (K', M) of the model at the setpoints [rad].
+        before: (M,) command before the first one [Pa].
+        effective: (K'·STEPS, M) effective pressures of the fine steps [Pa].
+        taken: (K'·STEPS, M) pressures that friction and creep take of them [Pa].
+        fine_transition, fine_input: (K', 2M, 2M) and (K', 2M, M) of (δθ, δθ̇) in one fine step.
+        transition, input: the same of a control period.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        self.limb = plan.limb
+        model = RodModel(plan.limb)
+        self.kinematics = model.kinematics
+        held = np.repeat(plan.differential_pressure[-1:], _HELD, axis=0)
+        self.commands = np.concatenate([plan.differential_pressure, held])
+        count = len(self.commands)
+        time = np.arange(count, dtype=np.float64) * CONTROL_PERIOD
+        start = plan.reference.start
+        spline = resting_spline(plan.time, plan.bend_angles, start)
+        self.before = np.zeros(plan.limb.segment_count) if start is None else start.pressure
+        response = simulate(
+            model,
+            time,
+            commands=self.commands,
+            bend=lambda instants: sample_spline(spline, instants)[0],
+            start=None if start is None else model.state(spline(0.0), spline(0.0, 1)),
+            before=self.before,
+        )
+        self.reference = np.concatenate(
+            [plan.tip_reference, np.repeat(plan.tip_reference[-1:], _HELD, axis=0)]
+        )
+        known = self._known_disturbance(plan, response.tip[: len(plan.time)])
+        tip, bend = response.tip[:-1] + known, response.bend_angles[:-1]
+        bend = bend + self._bend_of(bend, known)
+        self.bend, self.tip = bend, tip
+        self._bend_spline = make_interp_spline(time, bend, k=3)
+        self._tip_spline = make_interp_spline(time, tip, k=3)
+        self._last = float(time[-1])
+        inputs = plan.limb.segment_count
+        self.effective = response.effective_pressure.reshape(-1, inputs)
+        middle = step_middles(count, STEPS)
+        self.fine_bend = sample_spline(spline, middle)[0]
+        self.taken = material.memory_pressures(plan.limb, middle, self.fine_bend)
+        self._linearise(Balance(model.rod, model.kinematics), time)
+
+    @property
+    def count(self) -> int:
+        """K', control periods with tables of their own."""
+        return len(self.commands)
+
+    def at(self, time: ArrayLike) -> tuple[Array, Array, Array]:
+        """Return bend angles, rates (…, M) and tip (…, 2) at instants [s]."""
+        instants = np.asarray(time, dtype=float)
+        clipped = np.clip(instants, 0.0, self._last)
+        moving = (instants == clipped)[..., None]
+        rate = np.where(moving, self._bend_spline(clipped, 1), 0.0)
+        return self._bend_spline(clipped), rate, self._tip_spline(clipped)
+
+    def periods(self, k: int | Whole) -> Whole:
+        """Return control periods cut to those with tables."""
+        cut: Whole = np.clip(k, 0, self.count - 1)
+        return cut
+
+    def steps(self, j: int | Whole) -> Whole:
+        """Return fine steps cut to those with tables."""
+        cut: Whole = np.clip(j, 0, self.count * STEPS - 1)
+        return cut
+
+    def command(self, k: int) -> Array:
+        """Return the plan's command (M,) of a control period [Pa]."""
+        return self.before if k < 0 else self.commands[min(k, self.count - 1)]
+
+    def moved_tip(self, bend: Array, change: Array) -> Array:
+        """Return by how much the tip moves (…, 2) [m] if bend angles (…, M) change [rad]."""
+        moved: Array = self.kinematics.tip(bend + change) - self.kinematics.tip(bend)
+        return moved
+
+    def _known_disturbance(self, plan: Plan, model_tip: Array) -> Array:
+        """Return what a learned plan expects beyond the model (K', 2) [m]; the last of it stays."""
+        if plan.model != "der":
+            return np.zeros_like(self.reference)
+        known = plan.tip_predicted - model_tip
+        return np.concatenate([known, np.repeat(known[-1:], _HELD, axis=0)])
+
+    def _bend_of(self, bend: Array, moved: Array) -> Array:
+        """Return changes of bend (K', M) [rad] that move the tip by (K', 2) [m].
+
+        As far as the tip tells them.
+        """
+        jacobian = self.kinematics.tip_jacobians(bend)
+        square = np.einsum("kai,kaj->kij", jacobian, jacobian)
+        square += _SEGMENTS_KNOWN**2 * np.eye(bend.shape[1])
+        load = np.einsum("kai,ka->ki", jacobian, moved)
+        change: Array = np.linalg.solve(square, load[..., None])[..., 0]
+        return change
+
+    def _linearise(self, balance: Balance, time: Array) -> None:
+        q = self._bend_spline(time)
+        v, a = self._bend_spline(time, 1), self._bend_spline(time, 2)
+        count, inputs = q.shape
+        each = []
+        changes = (_BEND_CHANGE, _RATE_CHANGE, _ACCELERATION_CHANGE)
+        for place, size in enumerate(changes):
+            columns = []
+            for i in range(inputs):
+                moved = [q, v, a], [q, v, a]
+                for sign, case in zip((1.0, -1.0), moved, strict=True):
+                    case[place] = case[place] + sign * size * np.eye(inputs)[i]
+                difference = balance.projected(*moved[0]) - balance.projected(*moved[1])
+                columns.append(difference / (2 * size))
+            each.append(np.stack(columns, axis=2))
+        stiffness, damping, mass = each
+        system = np.zeros((count, 3 * inputs, 3 * inputs))
+        rates = slice(inputs, 2 * inputs)
+        system[:, :inputs, rates] = np.eye(inputs)
+        system[:, rates, :inputs] = -np.linalg.solve(mass, stiffness)
+        system[:, rates, rates] = -np.linalg.solve(mass, damping)
+        system[:, rates, 2 * inputs :] = np.linalg.inv(mass)
+        both = 2 * inputs
+        fine, whole = expm(system * STEP), expm(system * CONTROL_PERIOD)
+        self.fine_transition, self.fine_input = fine[:, :both, :both], fine[:, :both, both:]
+        self.transition, self.input = whole[:, :both, :both], whole[:, :both, both:]

@@ -1,0 +1,204 @@
+"""When feedback may act: its share, and the reasons for which it is taken back.
+
+The share goes from 0 to 1 once the limb is seen. It goes back to 0, which is the plan alone, where
+feedback can do harm: the camera sees nothing, or what it sees does not fit the model; corrections
+swing; they stay at what they are allowed; commands are asked for too late. Lost tags may come back;
+after the other reasons the rest of the run is played without feedback.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from der_planner.model.series import CONTROL_PERIOD
+
+Array = NDArray[np.float64]
+
+REASONS = {
+    "tags lost": "the limb has not been seen for {:.1f} s",
+    "inconsistent": "the limb moves as the model cannot, measurements are {:.0f} times too far off",
+    "oscillation": "the corrections swing by {:.0f} Pa and the swing does not die out",
+    "saturation": "a correction has been at its limit of {:.0f} Pa for too long",
+    "late": "commands are asked for {:.2f} s after their instant",
+}
+"""Every reason and what is said of it."""
+
+
+_SHRINKS = 0.7
+"""A swing whose next way is less than this share of the longest before dies out."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """When feedback is taken back.
+
+    Attributes:
+        authority: largest correction, as a share of the limb's pressure limit.
+        ramp: time in which feedback comes in [s].
+        fade: time in which it is taken back [s].
+        blind: without a measurement for longer, the tags are lost [s].
+        kept: for so long after that the last disturbances are still counted with [s].
+        inconsistent: squared distance of measurements per coordinate, smoothed; 1 is expected.
+        patience: for which measurements may be inconsistent [s].
+        saturated: for which a correction may be at its limit [s].
+        swing: from one turn of a swinging correction to the next, as a share of the authority.
+        turns: so many of them are an oscillation, unless it dies out …
+        window: … if they come within this time [s].
+        late: commands in a row that are asked for too late.
+    """
+
+    authority: float = 0.4
+    ramp: float = 1.0
+    fade: float = 1.5
+    blind: float = 0.5
+    kept: float = 1.0
+    inconsistent: float = 20.0
+    patience: float = 2.0
+    saturated: float = 3.0
+    swing: float = 0.1
+    turns: int = 4
+    window: float = 4.0
+    late: int = 4
+
+
+@dataclass(frozen=True)
+class Warned:
+    """A reason for which feedback was taken back.
+
+    Attributes:
+        time: [s] of the plan.
+        name: one of `REASONS`.
+        message: a sentence with its number.
+    """
+
+    time: float
+    name: str
+    message: str
+
+
+class Supervisor:
+    """Decides on the share of the corrections that is sent; see the module.
+
+    Args:
+        limits: when feedback is taken back.
+        authority: largest correction [Pa].
+
+    Attributes:
+        share: 0 … 1.
+        reason: for which feedback is out or going out; empty while it acts.
+        warnings: all that were given.
+    """
+
+    def __init__(self, limits: Limits, authority: float) -> None:
+        self.limits, self.authority = limits, authority
+        self.share = 0.0
+        self.reason = ""
+        self.warnings: list[Warned] = []
+        self._latched = False
+        self._strange_since: float | None = None
+        self._limited_since: float | None = None
+        self._late = 0
+        self._turns: list[_Turns] = []
+
+    def advance(self, time: float, age: float, strange: float) -> float:
+        """Return the share of a command's correction.
+
+        Args:
+            time: instant of the command [s].
+            age: of the newest measurement then [s].
+            strange: squared distance of measurements per coordinate, smoothed.
+        """
+        limits = self.limits
+        if strange > limits.inconsistent:
+            if self._strange_since is None:
+                self._strange_since = time
+            if time - self._strange_since > limits.patience:
+                self.stop(time, "inconsistent", strange)
+        else:
+            self._strange_since = None
+        seen = age <= limits.blind
+        if not seen and not self._latched and self.share > 0.0:
+            self._warn(time, "tags lost", age)
+        if seen and self.reason == "tags lost":
+            self.reason = ""
+        if self._latched or age > limits.blind + limits.kept:
+            self.share = max(0.0, self.share - CONTROL_PERIOD / limits.fade)
+        elif seen:
+            self.share = min(1.0, self.share + CONTROL_PERIOD / limits.ramp)
+        return self.share
+
+    def sent(self, time: float, correction: Array) -> None:
+        """Look at a correction (M,) [Pa] that is sent for an instant [s]."""
+        limits = self.limits
+        if self.share > 0.0 and np.abs(correction).max() > 0.98 * self.authority * self.share:
+            if self._limited_since is None:
+                self._limited_since = time
+            if time - self._limited_since > limits.saturated:
+                self.stop(time, "saturation", self.authority)
+        else:
+            self._limited_since = None
+        if not self._turns:
+            self._turns = [_Turns(limits.swing * self.authority) for _ in correction]
+        for turns, value in zip(self._turns, correction, strict=True):
+            turns.add(time, float(value))
+            way = turns.oscillation(time, limits.turns, limits.window)
+            if way > 0.0:
+                self.stop(time, "oscillation", way)
+
+    def asked(self, time: float, present: float) -> None:
+        """Note that a command of an instant is asked for when so much is known [s]."""
+        self._late = self._late + 1 if time <= present else 0
+        if self._late >= self.limits.late:
+            self.stop(time, "late", present - time)
+
+    def stop(self, time: float, name: str, number: float) -> None:
+        """Play the rest without feedback, for one of `REASONS` and the number in its sentence."""
+        if not self._latched:
+            self._latched = True
+            self._warn(time, name, number)
+
+    def _warn(self, time: float, name: str, number: float) -> None:
+        if self.reason != name:
+            self.reason = name
+            self.warnings.append(Warned(time, name, REASONS[name].format(number)))
+
+
+class _Turns:
+    """Finds where a series turns round by more than a threshold.
+
+    Args:
+        threshold: of the way back from an extreme.
+    """
+
+    def __init__(self, threshold: float) -> None:
+        self._threshold = threshold
+        self._low = self._high = self._last = 0.0
+        self._rising: bool | None = None
+        self.found: deque[tuple[float, float]] = deque(maxlen=16)
+        """Time of each turn and the way since the one before."""
+
+    def add(self, time: float, value: float) -> None:
+        """Look at the next value."""
+        self._low, self._high = min(self._low, value), max(self._high, value)
+        if self._rising is not False and value < self._high - self._threshold:
+            self._turn(time, self._high, rising=False)
+            self._low = value
+        elif self._rising is not True and value > self._low + self._threshold:
+            self._turn(time, self._low, rising=True)
+            self._high = value
+
+    def _turn(self, time: float, extreme: float, *, rising: bool) -> None:
+        if self._rising is not None:
+            self.found.append((time, abs(extreme - self._last)))
+        self._last, self._rising = extreme, rising
+
+    def oscillation(self, time: float, turns: int, window: float) -> float:
+        """Return the way between two turns if they are many and it does not shrink, else 0."""
+        recent = [way for when, way in self.found if when > time - window][-turns:]
+        if len(recent) < turns or recent[-1] < _SHRINKS * max(recent[:-1]):
+            return 0.0
+        return recent[-1]

@@ -1,0 +1,306 @@
+"""A study as it is written: the task, its factors, what is kept and what is drawn."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from der_planner.limb import Limb, LimbError
+from der_planner.studies import draws
+from der_planner.studies.draws import Draw, Spread
+from der_planner.studies.errors import StudyError
+from der_planner.studies.factors import Factor, Value, factor
+from der_planner.studies.tasks import TASKS, Task
+
+SHIPPED = Path(__file__).resolve().parent / "shipped"
+_KEYS = ("name", "about", "task", "limb", "factors", "draw", "keep", "plots")
+_SPREAD = {
+    frozenset({"low", "high"}): "even",
+    frozenset({"low", "high", "scale"}): "",
+    frozenset({"mean", "deviation"}): "normal",
+}
+PLOTS = {
+    "lines": ("x", "y"),
+    "map": ("x", "y", "value"),
+    "scatter": ("x", "y"),
+    "histogram": ("x",),
+    "indices": ("of",),
+}
+"""The kinds of figures, and what each needs."""
+_OPTIONAL = ("kind", "name", "lines", "panels", "title", "per")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One run of a study.
+
+    Attributes:
+        key: digest of everything that the run depends on but the code.
+        values: of the factors that the study names.
+    """
+
+    key: str
+    values: Mapping[str, Value]
+
+
+@dataclass(frozen=True)
+class Study:
+    """A table of runs, from YAML by `Study.read`.
+
+    Attributes:
+        name: of the study, also of its folder.
+        about: what it asks.
+        task: what a row does.
+        grid: factors with their values.
+        spreads: factors that are drawn.
+        draw: how.
+        keep: result columns of the rows.
+        plots: figures, as written.
+        limb: text of the limb file that tasks begin with; empty for the default limb.
+        text: the YAML file.
+    """
+
+    name: str
+    about: str
+    task: Task
+    grid: Mapping[str, list[Value]]
+    spreads: Mapping[str, Spread]
+    draw: Draw
+    keep: tuple[str, ...]
+    plots: tuple[dict[str, str], ...] = ()
+    limb: str = ""
+    text: str = field(default="", repr=False)
+
+    @classmethod
+    def read(cls, given: str | Path) -> Study:
+        """Read a study from a file, or a shipped one by its name.
+
+        Raises:
+            StudyError: the file is missing or something in it is wrong; names file and key.
+        """
+        path = find(given)
+        try:
+            text = path.read_text(encoding="utf-8")
+            content = yaml.safe_load(text)
+        except (OSError, UnicodeDecodeError) as error:
+            raise StudyError(f"cannot read study {path}: {error}") from error
+        except yaml.YAMLError as error:
+            raise StudyError(f"study {path} is not valid YAML: {error}") from error
+        try:
+            return _parse(content, path, text)
+        except StudyError as error:
+            raise StudyError(f"study {path}: {error}") from error
+
+    @property
+    def factors(self) -> dict[str, Factor]:
+        """The factors that the study names."""
+        return {name: factor(name, self.task.name) for name in (*self.grid, *self.spreads)}
+
+    @cached_property
+    def rows(self) -> tuple[Row, ...]:
+        """Every row once, in the order in which they are begun."""
+        made: dict[str, Row] = {}
+        for values in draws.rows(self.grid, self.spreads, self.draw):
+            plain = self.task.plain(values)
+            made.setdefault(key := self.key(plain), Row(key, plain))
+        return tuple(made.values())
+
+    def key(self, values: Mapping[str, Value]) -> str:
+        """Return the digest of a row."""
+        about = {"task": self.task.name, "limb": _digest(self.limb), "values": dict(values)}
+        return _digest(json.dumps(about, sort_keys=True, allow_nan=False))[:20]
+
+
+def find(given: str | Path) -> Path:
+    """Return the path of a study's file; the name of a shipped study is enough.
+
+    Raises:
+        StudyError: there is neither; lists the shipped ones.
+    """
+    path = Path(given)
+    if path.exists():
+        return path
+    shipped = SHIPPED / f"{path.name.removesuffix('.yaml')}.yaml"
+    if path.parent == Path() and shipped.exists():
+        return shipped
+    names = ", ".join(sorted(each.stem for each in SHIPPED.glob("*.yaml")))
+    raise StudyError(f"no file {path}, and no shipped study of that name: there are {names}")
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _parse(content: object, path: Path, text: str) -> Study:
+    body = _mapping(content, "the file", _KEYS)
+    name = body.get("task", "run")
+    if name not in TASKS:
+        raise StudyError(f"task must be one of {', '.join(TASKS)}, got {name!r}")
+    task = TASKS[name]
+    given = _mapping(body.get("factors"), "factors", None)
+    if not given:
+        raise StudyError("factors is missing: name at least one, e.g. 'seed: [1, 2, 3]'")
+    grid, spreads = _factors(given, task)
+    draw = _draw(body.get("draw"), spreads)
+    combinations = 1
+    for values in grid.values():
+        combinations *= len(values)
+    if spreads:
+        draws.check_draw(draw, spreads, combinations)
+    keep = _keep(body.get("keep"), task)
+    study = Study(
+        name=str(body.get("name", path.stem)),
+        about=str(body.get("about", "")).strip(),
+        task=task,
+        grid=grid,
+        spreads=spreads,
+        draw=draw,
+        keep=keep,
+        limb=_limb(body.get("limb"), path),
+        text=text,
+    )
+    plots = _plots(body.get("plots") or [], study)
+    return Study(**{**study.__dict__, "plots": plots})
+
+
+def _mapping(content: object, where: str, known: tuple[str, ...] | None) -> dict[str, Any]:
+    if content is None:
+        return {}
+    if not isinstance(content, Mapping):
+        raise StudyError(f"{where} must be keys with values, got {type(content).__name__}")
+    for key in content:
+        if known is not None and key not in known:
+            raise StudyError(f"{where}: unknown key '{key}'; known: {', '.join(known)}")
+    return {str(key): value for key, value in content.items()}
+
+
+def _factors(
+    given: Mapping[str, Any], task: Task
+) -> tuple[dict[str, list[Value]], dict[str, Spread]]:
+    grid: dict[str, list[Value]] = {}
+    spreads: dict[str, Spread] = {}
+    for name, content in given.items():
+        declared, where = factor(name, task.name), f"factors.{name}"
+        if not isinstance(content, Mapping):
+            values = content if isinstance(content, list) else [content]
+            if not values:
+                raise StudyError(f"{where} is an empty list")
+            grid[name] = [
+                declared.checked(value, f"{where}[{index}]" if len(values) > 1 else where)
+                for index, value in enumerate(values)
+            ]
+        elif set(content) == {"first", "count"}:
+            first = declared.checked(content["first"], f"{where}.first")
+            count = _whole(content["count"], f"{where}.count")
+            if not isinstance(first, int):
+                raise StudyError(f"{where}: first and count are for whole numbers")
+            last = declared.checked(first + count - 1, f"{where}.count")
+            grid[name] = list(range(first, int(last) + 1))
+        else:
+            spreads[name] = _spread(content, declared, where)
+    return grid, spreads
+
+
+def _spread(content: Mapping[str, Any], declared: Factor, where: str) -> Spread:
+    scale = _SPREAD.get(frozenset(content))
+    if scale is None:
+        raise StudyError(
+            f"{where} must be a value, a list, {{first, count}} of whole numbers, {{low, high}} "
+            f"with scale (even or log) if wanted, or {{mean, deviation}}; got the keys "
+            f"{', '.join(map(str, content))}"
+        )
+    if declared.choices:
+        raise StudyError(f"{where}: names cannot be drawn from a range: list them")
+    if scale == "normal":
+        mean = declared.checked(content["mean"], f"{where}.mean")
+        deviation = content["deviation"]
+        if not isinstance(deviation, (int, float)) or not deviation > 0:
+            raise StudyError(f"{where}.deviation must be above 0, got {deviation!r}")
+        return Spread(float(mean), float(deviation), "normal")
+    scale = str(content.get("scale", "even"))
+    low = float(declared.checked(content["low"], f"{where}.low"))
+    high = float(declared.checked(content["high"], f"{where}.high"))
+    if scale not in draws.SCALES[:2] or (scale == "log" and low <= 0):
+        raise StudyError(f"{where}.scale must be even, or log above 0, got {scale!r}")
+    if not low < high:
+        raise StudyError(f"{where}.low must be below {where}.high, got {low:g} and {high:g}")
+    return Spread(low, high, scale, isinstance(declared.default, int))
+
+
+def _draw(content: object, spreads: Mapping[str, Spread]) -> Draw:
+    given = _mapping(content, "draw", ("method", "count", "seed"))
+    if spreads and "count" not in given:
+        raise StudyError(f"draw.count is missing: {', '.join(spreads)} are drawn")
+    if given and not spreads:
+        raise StudyError("draw is given, but no factor has {low, high} or {mean, deviation}")
+    return Draw(
+        str(given.get("method", "sobol")),
+        _whole(given.get("count", 1), "draw.count"),
+        _whole(given.get("seed", 0), "draw.seed", least=0),
+    )
+
+
+def _whole(value: object, where: str, least: int = 1) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or value < least:
+        raise StudyError(f"{where} must be a whole number of {least} or more, got {value!r}")
+    return value
+
+
+def _keep(content: object, task: Task) -> tuple[str, ...]:
+    if content is None:
+        return tuple(task.columns)
+    if not isinstance(content, list) or not content:
+        raise StudyError(f"keep must be a list of columns of {', '.join(task.columns)}")
+    for name in content:
+        if name not in task.columns:
+            raise StudyError(f"keep: unknown column '{name}'; known: {', '.join(task.columns)}")
+    return tuple(dict.fromkeys(map(str, content)))
+
+
+def _limb(content: object, path: Path) -> str:
+    """Return the text of a limb file, given relative to the study's own folder."""
+    if content is None:
+        return ""
+    file = path.parent / str(content)
+    try:
+        Limb.from_yaml(file)
+    except LimbError as error:
+        raise StudyError(f"limb: {error}") from error
+    return file.read_text(encoding="utf-8")
+
+
+def _plots(content: object, study: Study) -> tuple[dict[str, str], ...]:
+    if not isinstance(content, list):
+        raise StudyError("plots must be a list, each with a kind")
+    plots = []
+    for index, item in enumerate(content):
+        where = f"plots[{index}]"
+        plot = {key: str(value) for key, value in _mapping(item, where, None).items()}
+        kind = plot.get("kind", "")
+        if kind not in PLOTS:
+            raise StudyError(f"{where}.kind must be one of {', '.join(PLOTS)}, got {kind!r}")
+        _mapping(plot, where, (*PLOTS[kind], *_OPTIONAL))
+        for need in PLOTS[kind]:
+            if need not in plot:
+                raise StudyError(f"{where}.{need} is missing: a {kind} needs {PLOTS[kind]}")
+        for key in ("x", "y", "value", "of", "lines", "panels", "per"):
+            columns = (*study.factors, *study.keep)
+            if key in plot and plot[key] not in columns:
+                raise StudyError(
+                    f"{where}.{key}: no column '{plot[key]}'; there are {', '.join(columns)}"
+                )
+        if kind == "indices" and study.draw.method != "saltelli":
+            raise StudyError(f"{where}: indices need draw.method saltelli")
+        plots.append({"name": f"{kind}_{index}", **plot})
+    names = [plot["name"] for plot in plots]
+    for name in names:
+        if names.count(name) > 1 or "/" in name:
+            raise StudyError(f"plots: the name '{name}' must be a file's, and come once")
+    return tuple(plots)

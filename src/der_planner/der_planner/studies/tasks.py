@@ -1,0 +1,311 @@
+"""What a row of a study does: from the values of its factors to its results.
+
+A task is a plain function of its rows: no clock, no random state, no thread of a linear algebra
+library, so that a row is the same to the last digit wherever and whenever it is computed.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from der_planner.limb import Limb, Segment
+from der_planner.model.response import simulate_many
+from der_planner.planning import METHODS, Motion, Plan, plan
+from der_planner.studies import twins
+from der_planner.studies.factors import (
+    ERROR,
+    IDENTIFICATION,
+    MODEL,
+    RUN,
+    Value,
+    limb_parameters,
+    split_error,
+    with_defaults,
+)
+
+Array = NDArray[np.float64]
+Values = Mapping[str, Value]
+Result = dict[str, float]
+_UNSEEN_RUN = 2
+"""The run of a twin's hardware on which an identified limb is tried."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One kind of row.
+
+    Attributes:
+        name: in the study's file.
+        text: what a row does.
+        columns: of its result, each with what it is.
+        work: computes rows: a limb file's text and their values, in; one result each, or what went
+            wrong, out.
+        batch: rows that are computed together.
+        calibrated: a row begins with the limb that a calibration of its twin found.
+    """
+
+    name: str
+    text: str
+    columns: Mapping[str, str]
+    work: Callable[[str, Sequence[Values]], list[Result | Exception]]
+    batch: int = 1
+    calibrated: bool = False
+
+    def plain(self, values: Values) -> dict[str, Value]:
+        """Return a row's values in the one way in which they are written."""
+        row = dict(values)
+        if row.get("model") == "pcc" and "method" in row:
+            row["method"] = METHODS["pcc"][0]
+        return row
+
+    def twin(self, values: Values) -> twins.Twin | None:
+        """Return the calibrated twin that a row needs, if any."""
+        row = with_defaults(values, self.name)
+        if not self.calibrated or row["calibration"] == "none":
+            return None
+        return twins.Twin(int(row["seed"]), str(row["calibration"]), float(row["tag_noise"]))
+
+
+# run: a calibrated twin plays a plan ------------------------------------------------------------
+
+_ERRORS = {
+    "mean_error_m": "mean distance of the tip from the reference",
+    "mean_error_x_m": "mean |x − x̄|",
+    "mean_error_y_m": "mean |y − ȳ|",
+    "rms_error_m": "root mean square distance",
+    "max_error_m": "largest distance",
+    "predicted_error_m": "mean distance that the plan's own model expects",
+}
+
+
+def _errors(planned: Plan, tip: Array) -> Result:
+    """Return the errors of a tip (K, 2) at the setpoints [m], as an experiment's table."""
+    error = tip - planned.tip_reference
+    distance = np.linalg.norm(error, axis=1)
+    return {
+        "mean_error_m": float(distance.mean()),
+        "mean_error_x_m": float(np.abs(error[:, 0]).mean()),
+        "mean_error_y_m": float(np.abs(error[:, 1]).mean()),
+        "rms_error_m": float(np.sqrt(np.mean(distance**2))),
+        "max_error_m": float(distance.max()),
+        "predicted_error_m": planned.predicted_error,
+    }
+
+
+def _planned(limb: Limb, row: Mapping[str, Any]) -> Plan:
+    motion = Motion.named(
+        row["motion"], amplitude=row["amplitude"], period=row["period"], cycles=row["cycles"]
+    )
+    method = METHODS["pcc"][0] if row["model"] == "pcc" else row["method"]
+    return plan(limb, motion, model=row["model"], method="" if method == "best" else method)
+
+
+def _run(limb: str, rows: Sequence[Values]) -> list[Result | Exception]:
+    return [_caught(_play, limb, with_defaults(values, RUN)) for values in rows]
+
+
+def _play(limb: str, row: Mapping[str, Any]) -> Result:
+    # PyElastica takes a second to import: only who plays pays for it.
+    from der_planner.twin.offline import play  # noqa: PLC0415
+
+    planned = _planned(with_errors(limb_of(limb), row), row)
+    played = play(planned.time, planned.differential_pressure, seed=row["seed"])
+    pressure = played.measured_differential - played.commanded_differential
+    return {
+        **_errors(planned, played.tip),
+        "pressure_rms_error_pa": float(np.sqrt(np.mean(pressure**2))),
+        "limits_cut": float(len(planned.warnings) > 0),
+    }
+
+
+# model: the rod itself plays a plan that was made for another rod --------------------------------
+
+
+def _model(limb: str, rows: Sequence[Values]) -> list[Result | Exception]:
+    """Plan for the limb, and play on limbs whose parameters are other by the errors.
+
+    All limbs of one plan are simulated in one call, which does not change any of them.
+    """
+    full = [with_defaults(values, MODEL) for values in rows]
+    results: list[Result | Exception] = [ValueError("not computed")] * len(rows)
+    groups: dict[str, list[int]] = {}
+    for place, row in enumerate(full):
+        motion = {name: value for name, value in row.items() if not name.startswith(ERROR)}
+        groups.setdefault(json.dumps(motion, sort_keys=True), []).append(place)
+    for text, places in groups.items():
+        found = _caught(_simulated, limb, text, [full[place] for place in places])
+        if isinstance(found, Exception) and len(places) > 1:
+            # One limb that cannot be simulated must not take the others with it.
+            for place in places:
+                results[place] = _one(_caught(_simulated, limb, text, [full[place]]))
+            continue
+        for place, result in zip(places, _each(found, len(places)), strict=True):
+            results[place] = result
+    return results
+
+
+def _each(found: list[Result] | Exception, count: int) -> Sequence[Result | Exception]:
+    return [found] * count if isinstance(found, Exception) else found
+
+
+def _one(found: list[Result] | Exception) -> Result | Exception:
+    return found if isinstance(found, Exception) else found[0]
+
+
+def _simulated(limb: str, motion: str, rows: Sequence[Mapping[str, Any]]) -> list[Result]:
+    planned = _plan_once(limb, motion)
+    true = [with_errors(limb_of(limb), row) for row in rows]
+    response = simulate_many(true, planned.time, commands=planned.differential_pressure)
+    return [_errors(planned, tip[:-1]) for tip in response.tip]
+
+
+@lru_cache(maxsize=8)
+def _plan_once(limb: str, motion: str) -> Plan:
+    return _planned(limb_of(limb), json.loads(motion))
+
+
+# identification: what a calibration finds of what the twin knows --------------------------------
+
+_RECOVERED = (
+    *("gain", "gain_asymmetry", "pressure_stiffening", "cubic", "friction_pressure"),
+    *("friction_angle", "creep_pressure", "coupling_before", "coupling_after", "rest_angle"),
+)
+
+
+def _identify(limb: str, rows: Sequence[Values]) -> list[Result | Exception]:
+    return [_caught(_recover, limb, with_defaults(values, IDENTIFICATION)) for values in rows]
+
+
+def _recover(limb: str, row: Mapping[str, Any]) -> Result:
+    """Compare what a calibration found with what the seed drew, and predict an unseen motion."""
+    from der_planner.identification import Excitation, predict, record_twin  # noqa: PLC0415
+    from der_planner.twin.hardware import draw  # noqa: PLC0415
+    from der_planner.twin.truth import known_values  # noqa: PLC0415
+
+    prior = limb_of(limb)
+    twin = twins.Twin(row["seed"], row["calibration"], row["tag_noise"])
+    found, report = twins.fit_twin(twin, prior)
+    distances: dict[str, list[float]] = {}
+    for name, known in known_values(draw(row["seed"])).items():
+        unknown = report.value(name)
+        deviation = float(np.hypot(unknown.deviation, known.spread))
+        distances.setdefault(name.split("[", maxsplit=1)[0], []).append(
+            (unknown.value - known.value) / deviation
+        )
+    together = np.abs(np.concatenate(list(distances.values())))
+    instants = np.arange(0.0, 40.0, 0.05)
+    waves = [1.0 - np.cos(instants / 3.0), np.sin(instants / 2.0)]
+    unseen = Excitation(instants, 9000.0 * np.stack(waves, axis=1), ())
+    log = record_twin(row["seed"], unseen, run=_UNSEEN_RUN, noise=0.0)
+    tip = predict(found, log.time, log.measured_differential).tip
+    error = np.linalg.norm(tip - log.tip, axis=1)
+    return {
+        "within_1_deviation": float(np.mean(together < 1)),
+        "within_2_deviations": float(np.mean(together < 2)),
+        "largest_deviations": float(together.max()),
+        "fit_residual_rad": float(np.sqrt(np.mean(report.residual**2))),
+        "unseen_mean_error_m": float(error.mean()),
+        "unseen_max_error_m": float(error.max()),
+        **{
+            f"{name}_deviations": float(np.sqrt(np.mean(np.square(distances.get(name, [np.nan])))))
+            for name in _RECOVERED
+        },
+    }
+
+
+TASKS = {
+    RUN: Task(
+        RUN,
+        "plan for a twin as it was calibrated, play on the twin, compare its true tip with r̄",
+        {
+            **_ERRORS,
+            "pressure_rms_error_pa": "root mean square of chamber less commanded pressures",
+            "limits_cut": "1 where the plan warns: limits, slow venting, or a range that was left",
+        },
+        _run,
+        calibrated=True,
+    ),
+    MODEL: Task(
+        MODEL,
+        "plan for a limb, play on the rod of a limb whose parameters are other by error.…",
+        _ERRORS,
+        _model,
+        batch=16,
+    ),
+    IDENTIFICATION: Task(
+        IDENTIFICATION,
+        "calibrate a twin, compare what is found with what the twin knows",
+        {
+            "within_1_deviation": "share of the known numbers found within one stated deviation",
+            "within_2_deviations": "the same within two",
+            "largest_deviations": "largest error in stated deviations",
+            "fit_residual_rad": "root mean square bend angle error of the calibration",
+            "unseen_mean_error_m": "mean tip error in predicting an unseen motion",
+            "unseen_max_error_m": "largest tip error there",
+            **{
+                f"{name}_deviations": f"error of {name} in stated deviations, root mean square"
+                for name in _RECOVERED
+            },
+        },
+        _identify,
+    ),
+}
+
+
+# Shared ------------------------------------------------------------------------------------------
+
+
+def _caught(work: Callable[..., Any], *arguments: Any) -> Any:
+    """Return the result, or what went wrong: a row that fails must not end a study."""
+    try:
+        return work(*arguments)
+    except Exception as error:
+        return error
+
+
+@lru_cache(maxsize=64)
+def limb_of(text: str) -> Limb:
+    """Return the limb of a limb file's text; the default limb for an empty one."""
+    return twins.read_limb(text) if text else Limb.default()
+
+
+def with_errors(limb: Limb, row: Mapping[str, Any]) -> Limb:
+    """Return a limb whose parameters are larger by the row's relative errors (``error.NAME``).
+
+    Both models get them, where the calibration gave the arcs numbers of their own.
+    """
+    kinds = limb_parameters()
+    for name, value in row.items():
+        if not name.startswith(ERROR):
+            continue
+        parameter, place = split_error(name)
+        if kinds[parameter][0] == "pneumatics":
+            air = limb.pneumatics
+            changed = {parameter: getattr(air, parameter) * (1.0 + value)}
+            limb = replace(limb, pneumatics=replace(air, **changed))
+            continue
+        limb = replace(
+            limb,
+            segments=_larger(limb.segments, parameter, place, value),
+            pcc_segments=_larger(limb.pcc_segments, parameter, place, value),
+        )
+    return limb
+
+
+def _larger(
+    segments: tuple[Segment, ...], parameter: str, place: int | None, error: float
+) -> tuple[Segment, ...]:
+    """Return segments with a parameter larger by a relative error, of one of them or of all."""
+    return tuple(
+        replace(each, **{parameter: getattr(each, parameter) * (1.0 + error)})
+        if place in (None, index)
+        else each
+        for index, each in enumerate(segments)
+    )

@@ -1,0 +1,1 @@
+"""What the driver watches: readings, chambers that follow, a board that hears."""

@@ -1,0 +1,223 @@
+"""Feedback on limbs that the model does not know: chains of links, with the default limb's file."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from link_chain import LinkChain
+
+from der_planner.control import Feedback
+from der_planner.control.lockstep import Played, Sensors, play
+from der_planner.control.supervision import Limits, Supervisor
+from der_planner.limb import Limb
+from der_planner.planning import Motion, Plan, plan
+
+LENGTH = 0.244
+
+
+class Chain:
+    """A chain of links as a plant; what it feels may be changed on the way."""
+
+    def __init__(self, seed: int = 3) -> None:
+        self.chain = LinkChain(seed)
+        self._seen = self.chain.reset()
+
+    def advance(self, command: np.ndarray, duration: float) -> None:
+        self._seen = self.chain.advance(command, duration)
+
+    @property
+    def differential_pressure(self) -> np.ndarray:
+        return self._seen.differential_pressure
+
+    @property
+    def bend_angles(self) -> np.ndarray:
+        return self._seen.bend_angles
+
+    @property
+    def tip(self) -> np.ndarray:
+        return self._seen.tip
+
+
+@pytest.fixture(scope="module")
+def planned() -> Plan:
+    """Return a plan made with a limb file that no calibration has touched."""
+    return plan(Limb.default(), Motion.named("asynchronous", period=12.0, cycles=1))
+
+
+@pytest.fixture(scope="module")
+def corrected(planned: Plan) -> tuple[Played, Feedback]:
+    """Return a run with feedback on the chain."""
+    feedback = Feedback(planned)
+    return play(planned, Chain(), feedback), feedback
+
+
+def at_once(force: float) -> Callable[[Chain], Callable[[float], None]]:
+    """Return an event that pushes a chain's tip for 0.2 s, from 4 s on."""
+
+    def of(plant: Chain) -> Callable[[float], None]:
+        def event(time: float) -> None:
+            plant.chain.push(LENGTH, (0.0, force if 4.0 <= time < 4.2 else 0.0))
+
+        return event
+
+    return of
+
+
+def test_a_limb_that_was_never_calibrated_is_followed(planned, corrected):
+    played, feedback = corrected
+    alone = play(planned, Chain())
+    after = played.time > 1.0
+    assert alone.error[after].mean() > 0.02 * LENGTH
+    assert played.error[after].mean() < 0.012 * LENGTH
+    assert played.error[after].mean() < 0.6 * alone.error[after].mean()
+    assert not feedback.warnings
+
+
+def test_commands_keep_all_limits(planned, corrected):
+    played, _ = corrected
+    air = planned.limb.pneumatics
+    assert np.abs(played.commanded).max() <= air.pressure_limit
+    steps = np.diff(played.commanded, axis=0, prepend=np.zeros((1, 2)))
+    assert np.abs(steps).max() <= air.slew_limit * 0.05 + 1e-6
+    ramp = np.minimum(1.0, (played.time + 0.05) / 1.0)
+    assert np.all(np.abs(played.correction).max(axis=1) <= 0.4 * air.pressure_limit * ramp + 1.0)
+
+
+def test_the_same_run_twice_is_the_same(planned, corrected):
+    again = play(planned, Chain(), Feedback(planned))
+    np.testing.assert_array_equal(again.tip, corrected[0].tip)
+
+
+def test_the_estimate_knows_how_good_it_is(corrected):
+    played, feedback = corrected
+    squares = np.array([square for time, square, _ in feedback.innovations if time > 1.0])
+    coordinates = sum(count for time, _, count in feedback.innovations if time > 1.0)
+    assert 0.3 < squares.sum() / coordinates < 1.5
+    missed = np.linalg.norm(played.estimated_tip - played.tip, axis=1)[played.time > 1.0]
+    assert np.sqrt(np.mean(missed**2)) < 1.5e-3
+    told = feedback.estimate(7.0)
+    assert 1e-5 < np.sqrt(np.trace(told.tip_covariance)) < 2e-3
+
+
+def test_order_of_arrival_does_not_matter(planned):
+    generator = np.random.default_rng(5)
+    pictures = [
+        (0.033 * k, 0.01 * generator.standard_normal(2), [0.24, 0.002 * k]) for k in range(40)
+    ]
+    answers = []
+    late = np.argsort(np.arange(40) + generator.uniform(0.0, 20.0, 40))
+    for order in (np.arange(40), late):
+        feedback = Feedback(planned)
+        for k in range(28):
+            feedback.pressures(0.05 * k, planned.differential_pressure[k] * 0.8)
+        feedback.measure(*pictures[0])
+        for k in order[order > 0]:
+            feedback.measure(*pictures[k])
+            feedback.estimate(0.8)
+        answers.append(feedback.estimate(1.4))
+    np.testing.assert_allclose(answers[0].bend_angle, answers[1].bend_angle, atol=1e-10)
+    np.testing.assert_allclose(answers[0].missing_pressure, answers[1].missing_pressure, atol=1e-5)
+    assert np.abs(answers[0].missing_pressure).max() > 10.0
+
+
+def test_a_push_dies_in_half_the_time(planned, corrected):
+    def swing(feedback: Feedback | None, before: Played) -> float:
+        plant = Chain()
+        event = at_once(0.3)(plant)
+        after = play(planned, plant, feedback, event=event)
+        apart = np.linalg.norm(after.tip - before.tip, axis=1)
+        assert apart.max() > 0.01
+        return float(np.nonzero(apart > 0.2 * apart.max())[0][-1] * 0.05 - 4.2)
+
+    alone = swing(None, play(planned, Chain()))
+    assert swing(Feedback(planned), corrected[0]) < 0.5 * alone
+
+
+def test_a_gain_that_drops_is_made_up_for(planned, corrected):
+    plant = Chain()
+
+    def event(time: float) -> None:
+        if abs(time - 4.0) < 1e-6:
+            plant.chain.change_gain(0.8)
+
+    played = play(planned, plant, Feedback(planned), event=event)
+    without = corrected[0]
+    hit = (played.time > 4.2) & (played.time < 5.0)
+    assert played.error[hit].max() > without.error[hit].max() + 0.004
+    late = played.time > 6.0
+    assert played.error[late].mean() < 1.3 * without.error[late].mean()
+
+
+def test_lost_tags_lead_back_to_the_plan(planned):
+    plant = Chain()
+    plant.chain.change_gain(0.7)
+    feedback = Feedback(planned)
+    sensors = Sensors(seen=lambda time: not 5.0 < time < 9.5)
+    played = play(planned, plant, feedback, sensors)
+    assert [warned.name for warned in feedback.warnings] == ["tags lost"]
+    correction = np.abs(played.correction).max(axis=1)
+    assert correction[round(5.2 / 0.05)] > 300.0
+    assert correction[round(8.9 / 0.05)] < 1.0
+    assert feedback.reason == ""
+    assert feedback.share == 1.0
+
+
+def test_a_limb_that_does_not_follow_is_left_to_the_plan(planned):
+    plant = Chain()
+    plant.chain.change_gain(0.1)
+    feedback = Feedback(planned)
+    played = play(planned, plant, feedback)
+    assert feedback.reason in ("saturation", "inconsistent", "oscillation")
+    assert np.abs(played.correction[-1]).max() < 1.0
+
+
+def swinging(amplitude: float, frequency: float, decay: float) -> Supervisor:
+    """Return what watched a correction that swings [Pa], [Hz], [1/s] for ten seconds."""
+    watch = Supervisor(Limits(), authority=9600.0)
+    for k in range(200):
+        time = 0.05 * k
+        watch.advance(time, age=0.05, strange=1.0)
+        value = amplitude * np.exp(-decay * time) * np.sin(2 * np.pi * frequency * time)
+        watch.sent(time, np.array([value, 0.0]))
+    return watch
+
+
+def test_a_correction_that_swings_on_ends_feedback():
+    assert swinging(1500.0, 1.2, 0.0).reason == "oscillation"
+    assert swinging(1500.0, 1.2, 0.0).share == 0.0
+    assert not swinging(300.0, 1.2, 0.0).reason
+    assert not swinging(4000.0, 1.2, 1.0).reason
+    assert not swinging(4000.0, 1.0 / 3.0, 0.0).reason
+
+
+def test_commands_that_are_asked_for_too_late_end_feedback(planned):
+    feedback = Feedback(planned)
+    for k in range(40):
+        feedback.pressures(0.05 * k, [0.0, 0.0])
+        feedback.measure(0.05 * k, [0.01, 0.01], [0.243, 0.003])
+        feedback.command(0.05 * (k + 2 if k < 20 else k - 2))
+    assert feedback.reason == "late"
+    assert "after their instant" in feedback.warnings[0].message
+
+
+def test_one_segment_and_three(planned):
+    for count in (1, 3):
+        segments = tuple(planned.limb.segments[0] for _ in range(count))
+        limb = replace(planned.limb, segments=segments)
+        motion = Motion.named("same_direction", amplitude=0.3, period=4.0, cycles=1)
+        feedback = Feedback(plan(limb, motion, method="projected"))
+        feedback.measure(0.0, np.full(count, 0.05), [np.nan, np.nan])
+        command = feedback.command(0.2)
+        assert command.shape == (count,)
+        assert np.isfinite(command).all()
+
+
+def test_a_wrong_shape_is_refused(planned):
+    feedback = Feedback(planned)
+    with pytest.raises(ValueError, match="2 bend angles"):
+        feedback.measure(0.0, [0.0], [0.0, 0.0])
+    with pytest.raises(ValueError, match="covariance"):
+        feedback.measure(0.0, [0.0, 0.0], [0.0, 0.0], np.eye(3))
+    with pytest.raises(ValueError, match="2 differential pressures"):
+        feedback.pressures(0.0, [0.0])

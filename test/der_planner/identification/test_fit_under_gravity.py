@@ -1,0 +1,85 @@
+"""Fits of loaded limbs: a chain of links that is not ours, and refusals in place of tracebacks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from chain_calibration import prior
+from link_chain import LinkChain
+
+from der_planner.identification import CalibrationLog, LogError, fit, predict
+from der_planner.identification.excitation import sweep, waves
+from der_planner.identification.logs.prepare import prepare
+from der_planner.limb import Limb, gravity_of
+
+TERMS = ("asymmetry", "friction", "dynamics")
+
+
+def chain_log(gravity, masses=(), swing=(0.0, 0.0), seed=5, amplitude=14_000.0) -> CalibrationLog:
+    pressure = np.concatenate([waves(amplitude, 2, 30.0), sweep(3500.0, 2, 8.0)])
+    time = 0.05 * np.arange(len(pressure))
+    played = LinkChain(seed, gravity, masses).play(time, pressure, 20.0, run=1, swing=swing)
+    return CalibrationLog(
+        played.time,
+        played.commanded_differential,
+        played.measured_differential,
+        played.bend_angles,
+        played.tip,
+    )
+
+
+def test_a_hanging_chain_that_swings_and_carries_a_mass_is_fitted():
+    gravity, masses = gravity_of("hanging"), ((0.244, 0.02),)
+    chain = LinkChain(5, gravity, masses)
+    log = chain_log(gravity, masses, swing=(3.0, -5.0))
+    limb, report = fit(prior(gravity, masses), log, terms=TERMS)
+    assert any("begins while the limb swings" in warning for warning in report.warnings)
+    assert np.degrees(report.residual).max() < 0.7
+    # The weight tells the stiffness of the first segment, which bears it.
+    compliance = np.sum(1.0 / chain._stiffness[:7])
+    truth = 0.122 / compliance
+    known = report.value("log_stiffness[0]")
+    assert known.deviation < 0.06
+    assert limb.segments[0].bending_stiffness == pytest.approx(truth, rel=0.12)
+    assert "EI of segment 0" in report.text()
+    # The lengths do not take up that a heavy limb bends unevenly.
+    assert limb.length == pytest.approx(0.244, abs=4e-3)
+    assert limb.masses[0].arc_length == pytest.approx(limb.length)
+    unseen = chain.play(log.time, 0.8 * log.commanded_differential[::-1], 20.0, noise=0.0)
+    tip = predict(limb, unseen.time, unseen.measured_differential).tip
+    assert np.linalg.norm(tip - unseen.tip, axis=1).mean() < 0.004
+
+
+def test_mass_is_told_where_stiffness_is_given():
+    chain = LinkChain(2, (0.0, -1.7, 0.0))
+    stiffness = [0.122 / np.sum(1.0 / part) for part in chain._stiffness.reshape(2, 7)]
+    known = prior((0.0, -1.7, 0.0))
+    heavy = replace(
+        known,
+        segments=tuple(
+            replace(s, bending_stiffness=float(k), mass_per_length=1.25 * s.mass_per_length)
+            for s, k in zip(known.segments, stiffness, strict=True)
+        ),
+    )
+    limb, report = fit(heavy, chain_log((0.0, -1.7, 0.0), seed=2), terms=(*TERMS, "mass"))
+    assert [s.bending_stiffness for s in limb.segments] == pytest.approx(stiffness)
+    assert report.loads.mass == pytest.approx(1.066 * 0.244, rel=0.1)
+    assert report.loads.first_moment == pytest.approx(1.066 * 0.244**2 / 2, rel=0.1)
+    assert "mass of segment 0 = prior" in report.text()
+
+
+def test_a_prior_that_its_rod_cannot_follow_is_refused_by_name():
+    log = chain_log((0.0, 0.0, 0.0), amplitude=9000.0)
+    rows = log.between(0.0, 6.0)
+    heavy = replace(prior((-9.81, 0.0, 0.0)), masses=()).carrying(1e4)
+    with pytest.raises(LogError, match="check the prior's gravity, mass"):
+        fit(heavy, rows, terms=(), geometry=False)
+    with pytest.raises(LogError, match="cannot follow this log"):
+        predict(heavy, rows.time, rows.measured_differential)
+
+
+def test_a_log_from_rest_is_used_from_its_first_row():
+    log = chain_log((0.0, -1.7, 0.0))
+    prepared = prepare(log, Limb.default().mounted("10"))
+    assert prepared.usable[:20].all()
+    assert not prepared.warnings

@@ -1,0 +1,62 @@
+"""The examples of the page on the rod alone, beside their analytic and published values."""
+
+import importlib.util
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from der_planner.model.bending import bend_angles
+
+FOLDER = Path(__file__).resolve().parents[3] / "src" / "der_planner" / "examples"
+PAGE = FOLDER.parent / "doc" / "rod_alone.md"
+
+
+def example(name: str):
+    spec = importlib.util.spec_from_file_location(f"example_{name}", FOLDER / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_cantilever_converges_to_the_elastica():
+    cantilever = example("cantilever")
+    exact = cantilever.elastica_tip()
+    assert exact == pytest.approx(-66.38e-3, abs=1e-5)
+    errors = [cantilever.rod_tip(nodes, "ghost") - exact for nodes in (21, 41, 81)]
+    assert abs(errors[0]) < 0.005 * abs(exact)
+    orders = np.log2(np.abs(errors[:-1]) / np.abs(errors[1:]))
+    np.testing.assert_allclose(orders, 2.0, atol=0.2)
+    first_order = [cantilever.rod_tip(nodes, "inside") - exact for nodes in (21, 41)]
+    assert np.log2(first_order[0] / first_order[1]) == pytest.approx(1.0, abs=0.15)
+
+
+def test_the_frequencies_converge_to_the_beams():
+    vibration = example("vibration")
+    beam = vibration.beam_frequencies(3)
+    # 1.8751, 4.6941 and 7.8548 are in every textbook
+    roots = 1.8751 * np.sqrt(beam / beam[0])
+    np.testing.assert_allclose(roots, [1.8751, 4.6941, 7.8548], rtol=1e-4)
+    errors = []
+    for nodes in (21, 41):
+        found, damping = vibration.rod_frequencies(nodes, 3)
+        errors.append(np.abs(found / beam - 1))
+        np.testing.assert_allclose(damping, vibration.DAMPING / 2, rtol=1e-6)
+    assert errors[0].max() < 0.025
+    np.testing.assert_allclose(np.log2(errors[0] / errors[1]), 2.0, atol=0.3)
+
+
+@pytest.mark.parametrize("nodes", [24, 48])
+def test_a_twisted_ring_becomes_unstable_at_michells_twist(nodes):
+    ring = example("twisted_ring")
+    rod, state = ring.ring(nodes, ring.CRITICAL)
+    force = rod.internal_force(state)[rod.free]
+    np.testing.assert_allclose(force, 0.0, atol=1e-7)  # the plane ring stays an equilibrium
+    assert np.exp(1j * bend_angles(rod, state.q)) == pytest.approx(1.0, abs=1e-9)
+    assert ring.critical_twist(nodes) == pytest.approx(1.0, abs=8.0 / nodes**2)
+
+
+def test_the_page_names_every_example():
+    named = set(re.findall(r"examples/(\w+)\.py", PAGE.read_text()))
+    assert named == {path.stem for path in FOLDER.glob("*.py")}

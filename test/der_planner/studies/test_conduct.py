@@ -1,0 +1,220 @@
+"""A study is played: on processes of this machine, on a cluster that breaks, and after a stop."""
+
+import signal
+from pathlib import Path
+
+import pyarrow.parquet
+import pytest
+
+from der_planner.experiment.progress import Progress
+from der_planner.studies.conduct import Settings, conduct
+from der_planner.studies.errors import StudyError
+from der_planner.studies.identity import cache
+from der_planner.studies.store import Store
+from der_planner.studies.study import Study
+from der_planner.studies.twins import calibrated
+from der_planner.studies.work import Calibrated, Outcome, compute
+
+from .cluster import Processes, wait_for
+
+# A twin that is planned for without calibration, in motions of a second: a whole run, and short.
+TWINS = """
+task: run
+factors:
+  seed: {{first: 1, count: {count}}}
+  calibration: none
+  motion: same_direction
+  period: 1
+  cycles: 1
+  amplitude: 0.05
+  method: projected
+keep: [mean_error_m, max_error_m]
+"""
+# The rod alone: a plan, and 16 simulations of it in a piece.
+RODS = """
+task: model
+factors:
+  motion: same_direction
+  period: [1, 1.5, 2]
+  cycles: 1
+  amplitude: [0.3, 1.9]
+  method: projected
+  error.moment_gain: {low: -0.1, high: 0.1}
+draw: {method: random, count: 8}
+keep: [mean_error_m, max_error_m]
+plots:
+  - {name: errors, kind: lines, x: period, y: mean_error_m, panels: amplitude}
+"""
+
+
+@pytest.fixture
+def processes(tmp_path):
+    running = Processes(tmp_path)
+    yield running
+    running.close()
+
+
+def write(folder: Path, text: str, name: str = "small.yaml") -> Path:
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def records(folder: Path) -> list[dict]:
+    """Return every record of every file, so that what is there twice shows."""
+    return [
+        record
+        for path in sorted((folder / "rows").glob("*.parquet"))
+        for record in pyarrow.parquet.read_table(path).to_pylist()
+    ]
+
+
+def by_key(folder: Path) -> dict[str, dict]:
+    found = records(folder)
+    assert len({record["key"] for record in found}) == len(found), "a row is there twice"
+    return {record["key"]: record for record in found}
+
+
+def count(folder: Path) -> int:
+    return len(list((folder / "rows").glob("*.parquet")))
+
+
+def test_one_or_two_workers_and_a_row_that_fails(tmp_path, monkeypatch):
+    """The same rows to the last digit, failed ones counted, the page says so; nothing is redone."""
+    monkeypatch.setenv("DER_LIMB_CACHE", str(tmp_path / "cache"))
+    study = Study.read(write(tmp_path, RODS))
+    folders = [tmp_path / "one", tmp_path / "two"]
+    for workers, folder in enumerate(folders, start=1):
+        conduct(study, Settings(folder, workers=workers), Progress())
+    one, two = map(by_key, folders)
+    assert one == two
+    assert set(one) == {row.key for row in study.rows}
+    errors = [record for record in one.values() if record["error"]]
+    # 1.9 rad of bend in a second is beyond the pressures; 0.3 rad is not.
+    assert {record["amplitude"] for record in errors} == {1.9}
+    assert all(record["error"].startswith("UnreachableError: ") for record in errors)
+    assert all(record["mean_error_m"] > 0 for record in one.values() if not record["error"])
+
+
+def test_a_cluster_that_breaks(tmp_path, processes):
+    """A worker is killed, then the scheduler: nothing is lost, nothing comes twice."""
+    path = write(tmp_path, TWINS.format(count=40))
+    study, out = Study.read(path), tmp_path / "out"
+    scheduler = processes.scheduler()
+    doomed, other = processes.worker(), processes.worker()
+    command = processes.study(str(path), "--scheduler", processes.address, "--out", str(out))
+    wait_for(lambda: count(out) >= 4, "four rows")
+    doomed.send_signal(signal.SIGKILL)
+    before = count(out)
+    wait_for(lambda: count(out) >= before + 4, "four rows of the other worker")
+    scheduler.send_signal(signal.SIGKILL)
+    wait_for(lambda: "is gone: waiting for it" in processes.said(), "the client to notice")
+    kept = {name.name: name.stat().st_mtime_ns for name in (out / "rows").iterdir()}
+    assert len(kept) < len(study.rows), "the study was over before its scheduler was killed"
+    assert command.poll() is None
+    other.wait(300)
+    processes.scheduler()
+    processes.worker(), processes.worker()
+    assert command.wait(600) == 0, processes.said()
+    assert set(by_key(out)) == {row.key for row in study.rows}
+    after = {name.name: name.stat().st_mtime_ns for name in (out / "rows").iterdir()}
+    assert {name: after[name] for name in kept} == kept, "a row that was there was done again"
+    assert "40 of 40 rows are done, 0 of them failed" in processes.said()
+    assert "<h1>Study small</h1>" in (out / "report" / "report.html").read_text()
+
+
+def test_a_stopped_study_goes_on(tmp_path, processes):
+    """SIGTERM ends it in order, SIGKILL does not; both go on, with the digits of a run at once."""
+    path = write(tmp_path, TWINS.format(count=12))
+    study, out = Study.read(path), tmp_path / "out"
+    arguments = [str(path), "--out", str(out), "--workers", "2"]
+    for number, code in ((signal.SIGTERM, 130), (signal.SIGKILL, -signal.SIGKILL)):
+        before = count(out) if out.exists() else 0
+        command = processes.study(*arguments)
+        wait_for(lambda least=before + 2: out.exists() and count(out) >= least, "two rows")
+        command.send_signal(number)
+        assert command.wait(300) == code, processes.said()
+    assert f"--out {out} goes on from here" in processes.said()
+    # As a loss of power leaves it: a file without its content.
+    some = sorted((out / "rows").iterdir())[0]
+    some.write_bytes(some.read_bytes()[:100])
+    assert processes.study(*arguments, "--limit", "8").wait(600) == 0, processes.said()
+    assert "1 files of rows were not whole" in processes.said()
+    stopped = by_key(out)
+    assert {row.key for row in study.rows[:8]} <= set(stopped)
+    for row in study.rows[:8]:
+        outcome = compute("run", [row.values], Calibrated()).outcomes[0]
+        for column in study.keep:
+            assert stopped[row.key][column] == outcome.results[column]
+
+
+def test_a_twin_is_calibrated_once(tmp_path, monkeypatch):
+    """Both workers need it at once; whoever asks later gets the same file."""
+    monkeypatch.setenv("DER_LIMB_CACHE", str(tmp_path / "cache"))
+    text = "task: run\nfactors: {seed: 5, period: 1, cycles: 1, amplitude: 0.1, model: [der, pcc]}"
+    study, out = Study.read(write(tmp_path, text)), tmp_path / "out"
+    conduct(study, Settings(out, workers=2), Progress())
+    kept = by_key(out)
+    assert len(kept) == 2
+    assert all(record["error"] is None for record in kept.values())
+    # Below what a twin that was never calibrated leaves, by far.
+    assert max(record["mean_error_m"] for record in kept.values()) < 0.01
+    limbs = list((tmp_path / "cache" / "twins").glob("*.yaml"))
+    assert len(limbs) == 1
+    twin = study.task.twin(study.rows[0].values)
+    written = limbs[0].stat().st_mtime_ns
+    assert calibrated(twin, "") == limbs[0].read_text()
+    assert limbs[0].stat().st_mtime_ns == written
+
+
+def test_rows_that_are_done_again_are_there_once(tmp_path):
+    study = Study.read(write(tmp_path, RODS))
+    store = Store(tmp_path / "out", study)
+    good, bad = Outcome({"mean_error_m": 0.01, "max_error_m": 0.02}), Outcome(error="lost")
+    store.keep(study.rows[:3], [bad, good, good], "sources")
+    store.keep(study.rows[3:4], [bad], "sources")
+    failed = [study.rows[0].key, study.rows[3].key]
+    store.forget(failed)
+    assert set(by_key(tmp_path / "out")) == {row.key for row in study.rows[1:3]}
+    store.keep([study.rows[0], study.rows[3]], [good, good], "sources")
+    kept = store.load()
+    assert list(kept) == [row.key for row in study.rows[:4]]
+    assert by_key(tmp_path / "out") == kept
+    assert {record["error"] for record in kept.values()} == {None}
+
+
+def test_what_cannot_be_written_is_named(tmp_path):
+    study = Study.read(write(tmp_path, RODS))
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StudyError, match=f"cannot write into {tmp_path / 'file'}"):
+        Store(tmp_path / "file", study)
+    store = Store(tmp_path / "out", study)
+    # A file name that is too long for the disk stands for a full one, which no test may make.
+    (tmp_path / "out" / "rows").rmdir()
+    (tmp_path / "out" / "rows").symlink_to("/dev/full")
+    with pytest.raises(StudyError, match="Rows that are there are kept"):
+        store.keep(study.rows[:1], [Outcome({"mean_error_m": 1.0})], "sources")
+
+
+def test_another_study_in_the_folder(tmp_path):
+    Store(tmp_path, Study.read(write(tmp_path, RODS)))
+    with pytest.raises(StudyError, match="holds the study small of task 'model'"):
+        Store(tmp_path, Study.read(write(tmp_path, TWINS.format(count=2), "other.yaml")))
+
+
+def test_no_scheduler(tmp_path, processes):
+    path = write(tmp_path, RODS)
+    command = processes.study(
+        str(path), "--scheduler", processes.address, "--out", str(tmp_path / "out")
+    )
+    assert command.wait(300) == 1
+    assert f"no Dask scheduler answers at {processes.address}" in processes.said()
+
+
+def test_the_cache_is_where_it_is_asked_for(tmp_path, monkeypatch):
+    monkeypatch.setenv("DER_LIMB_CACHE", str(tmp_path / "here"))
+    assert cache() == tmp_path / "here"
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("DER_LIMB_CACHE", str(tmp_path / "file" / "below"))
+    with pytest.raises(OSError, match="set DER_LIMB_CACHE to a folder"):
+        cache()

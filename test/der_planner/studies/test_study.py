@@ -1,0 +1,184 @@
+"""What a study's file says, and what its table, keys and indices are."""
+
+import numpy as np
+import pytest
+
+from der_planner.limb import Limb
+from der_planner.studies.draws import Draw, Spread, rows, saltelli
+from der_planner.studies.errors import StudyError
+from der_planner.studies.indices import sobol_indices
+from der_planner.studies.study import SHIPPED, Study
+from der_planner.studies.tasks import with_errors
+
+GOOD = {"task": "run", "factors": "{seed: [3, 4], period: [2, 3.5]}"}
+
+
+def study(tmp_path, **parts) -> Study:
+    path = tmp_path / "my.yaml"
+    path.write_text("\n".join(f"{key}: {value}" for key, value in {**GOOD, **parts}.items()))
+    return Study.read(path)
+
+
+@pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.yaml")), ids=lambda path: path.stem)
+def test_shipped_studies(path):
+    found = Study.read(path.stem)
+    assert found.about
+    assert found.plots
+    assert len({row.key for row in found.rows}) == len(found.rows) >= 100
+
+
+def test_the_first_factor_changes_slowest(tmp_path):
+    found = study(tmp_path)
+    assert [tuple(row.values.values()) for row in found.rows] == [
+        (3, 2.0),
+        (3, 3.5),
+        (4, 2.0),
+        (4, 3.5),
+    ]
+
+
+def test_a_key_depends_on_what_the_row_does_alone(tmp_path):
+    """Not on its place, the study's name, what is kept, or how a number is written."""
+    first = study(tmp_path)
+    other = study(
+        tmp_path, name="other", keep="[mean_error_m]", factors="{period: [3.5, 2, 9], seed: 3.0}"
+    )
+    mine = {row.key: dict(row.values) for row in first.rows}
+    theirs = {row.key: dict(row.values) for row in other.rows}
+    shared = set(mine) & set(theirs)
+    assert {tuple(sorted(mine[key].items())) for key in shared} == {
+        (("period", 2.0), ("seed", 3)),
+        (("period", 3.5), ("seed", 3)),
+    }
+    assert all(mine[key] == theirs[key] for key in shared)
+    limb = tmp_path / "limb.yaml"
+    Limb.default().to_yaml(limb)
+    assert {row.key for row in study(tmp_path, limb="limb.yaml").rows}.isdisjoint(mine)
+
+
+def test_pcc_has_one_method(tmp_path):
+    """Rows that do the same come once."""
+    found = study(tmp_path, factors="{model: [der, pcc], method: [optimal, projected, paper]}")
+    assert [tuple(row.values.values()) for row in found.rows] == [
+        ("der", "optimal"),
+        ("der", "projected"),
+        ("der", "paper"),
+        ("pcc", "paper"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("parts", "expected"),
+    [
+        ({"task": "fly"}, "task must be one of run, model, identification, got 'fly'"),
+        ({"factors": "{sead: 1}"}, r"factors.sead is unknown .*did you mean seed.*known: seed"),
+        ({"factors": "{period: [2, fast]}"}, r"factors.period\[1\] must be a number .*'fast'"),
+        ({"factors": "{period: 0.1}"}, "factors.period must be a number from 0.5 to 600, got 0.1"),
+        ({"factors": "{seed: 1.5}"}, "factors.seed must be a whole number"),
+        ({"factors": "{motion: waltz}"}, "factors.motion must be one of asynchronous"),
+        ({"factors": "{period: {low: 3, high: 2}}", "draw": "{count: 2}"}, "period.low must be"),
+        ({"factors": "{period: {low: 2}}"}, "factors.period must be a value, a list"),
+        ({"factors": "{period: {low: 2, high: 3}}"}, "draw.count is missing: period"),
+        ({"factors": "{motion: {low: 2, high: 3}}", "draw": "{count: 2}"}, "names cannot be drawn"),
+        ({"factors": "{period: {low: 2, high: 3}}", "draw": "{count: 3}"}, "power of two.*choose"),
+        ({"factors": "{error.mass: 0.1}"}, "no such parameter of a limb.*mass_per_length"),
+        ({"factors": "{'error.vent_rate[0]': 0.1}"}, "vent_rate is one for the limb"),
+        ({"draw": "{count: 4}"}, "draw is given, but no factor"),
+        ({"factors": "{}"}, "factors is missing"),
+        ({"keep": "[error_cm]"}, "keep: unknown column 'error_cm'; known: mean_error_m"),
+        ({"plots": "[{kind: pie}]"}, r"plots\[0\].kind must be one of lines"),
+        ({"plots": "[{kind: lines, x: period}]"}, r"plots\[0\].y is missing"),
+        ({"plots": "[{kind: scatter, x: age, y: max_error_m}]"}, r"plots\[0\].x: no column 'age'"),
+        ({"plots": "[{kind: indices, of: max_error_m}]"}, "indices need draw.method saltelli"),
+        ({"limb": "nothing.yaml"}, "limb: cannot read limb file"),
+        ({"colour": "red"}, "unknown key 'colour'; known: name, about, task"),
+    ],
+)
+def test_mistakes_name_the_key(tmp_path, parts, expected):
+    with pytest.raises(StudyError, match=f"(?s)my.yaml: .*{expected}"):
+        study(tmp_path, **parts)
+
+
+def test_missing_files_and_yaml_that_is_none(tmp_path):
+    with pytest.raises(StudyError, match=r"no shipped study of that name: there are accuracy"):
+        Study.read("acuracy")
+    (tmp_path / "bad.yaml").write_text("factors: [")
+    with pytest.raises(StudyError, match=r"bad\.yaml is not valid YAML"):
+        Study.read(tmp_path / "bad.yaml")
+
+
+@pytest.mark.parametrize("method", ["random", "sobol"])
+def test_draws_fill_the_ranges_and_repeat(method):
+    spreads = {
+        "even": Spread(-1.0, 3.0),
+        "log": Spread(0.1, 10.0, "log"),
+        "normal": Spread(5.0, 2.0, "normal"),
+        "whole": Spread(1, 4, whole=True),
+    }
+    draw = Draw(method, 256, seed=3)
+    table = rows({"name": ["a", "b"]}, spreads, draw)
+    assert table == rows({"name": ["a", "b"]}, spreads, draw)
+    assert table != rows({"name": ["a", "b"]}, spreads, Draw(method, 256, seed=4))
+    assert len(table) == 512
+    assert [row["name"] for row in table] == ["a"] * 256 + ["b"] * 256
+    values = {name: np.array([row[name] for row in table]) for name in spreads}
+    assert values["even"].mean() == pytest.approx(1.0, abs=0.2)
+    assert np.log10(values["log"]).mean() == pytest.approx(0.0, abs=0.1)
+    assert values["normal"].mean() == pytest.approx(5.0, abs=0.3)
+    assert values["normal"].std() == pytest.approx(2.0, abs=0.3)
+    counts = np.bincount(values["whole"])[1:]
+    assert len(counts) == 4
+    assert counts.min() > 90
+
+
+def test_indices_of_a_function_whose_indices_are_known(tmp_path):
+    """Ishigami's function, sin a + 7 sin² b + 0.1 c⁴ sin a on (−π, π)³ (Saltelli 2000)."""
+    factors = ", ".join(f"error.{name}: {{low: -0.5, high: 0.5}}" for name in
+                        ("moment_gain", "length", "damping"))  # fmt: skip
+    found = study(
+        tmp_path,
+        task="model",
+        factors=f"{{{factors}}}",
+        draw="{method: saltelli, count: 1024}",
+        keep="[mean_error_m]",
+    )
+    kept = {}
+    for row in found.rows:
+        a, b, c = (2 * np.pi * value for value in row.values.values())
+        result = np.sin(a) + 7 * np.sin(b) ** 2 + 0.1 * c**4 * np.sin(a)
+        kept[row.key] = {**row.values, "mean_error_m": result, "error": None}
+    indices = {each.factor: each for each in sobol_indices(found, kept, "mean_error_m")}
+    for name, first, total in (
+        ("error.moment_gain", 0.314, 0.558),
+        ("error.length", 0.442, 0.442),
+        ("error.damping", 0.0, 0.244),
+    ):
+        assert indices[name].first == pytest.approx(first, abs=0.03)
+        assert indices[name].total == pytest.approx(total, abs=0.03)
+        low, high = indices[name].total_range
+        assert low < indices[name].total < high
+    kept[found.rows[7].key]["mean_error_m"] = None
+    assert sobol_indices(found, kept, "mean_error_m") == ()
+
+
+def test_saltelli_changes_one_column_at_a_time():
+    table = saltelli(3, 8, seed=1)
+    a, b = table[:8], table[8:16]
+    for column in range(3):
+        mixed = table[16 + 8 * column : 24 + 8 * column]
+        assert np.array_equal(mixed[:, column], b[:, column])
+        others = [k for k in range(3) if k != column]
+        assert np.array_equal(mixed[:, others], a[:, others])
+
+
+def test_errors_of_parameters():
+    limb = Limb.default()
+    row = {"error.moment_gain[1]": 0.2, "error.length": -0.1, "error.time_constant": 0.5}
+    changed = with_errors(limb, {**row, "period": 3.0})
+    for index, factor in ((0, 1.0), (1, 1.2)):
+        mine, its = limb.segments[index], changed.segments[index]
+        assert its.moment_gain == pytest.approx(factor * mine.moment_gain)
+        assert its.length == pytest.approx(0.9 * mine.length)
+        assert its.damping == mine.damping
+    assert changed.pneumatics.time_constant == pytest.approx(1.5 * limb.pneumatics.time_constant)
+    assert with_errors(limb, {"period": 3.0}) == limb
