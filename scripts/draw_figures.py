@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
 """Draw the pictures of the documentation pages.
 
-python3 scripts/draw_figures.py {planning,rod,tracker} [arguments]
+python3 scripts/draw_figures.py {loads,planning,rod,tracker} [arguments]
 """
 
 import sys
 
 import workspace
 
-PAGES = ("planning", "rod", "tracker")
+PAGES = ("loads", "planning", "rod", "tracker")
 
 if __name__ == "__main__":
     if len(sys.argv) < 2 or sys.argv[1] not in PAGES:

@@ -23,6 +23,7 @@ PARTS = (
     "identification",
     "studies",
     "loads",
+    "learning",
 )
 
 

@@ -26,8 +26,9 @@ from der_planner.planning import (
     plan,
     rod_model,
 )
+from der_planner.planning.loads.posed import REFERENCE_PRIOR
 from der_planner.planning.motions import sample_spline
-from der_planner.planning.rod_model import REFERENCE_PRIOR, PlanningRod
+from der_planner.planning.rod_model import PlanningRod
 
 CASES = ("asynchronous", "same_direction", "opposite_direction")
 METHODS_OF = [(model, method) for model, methods in METHODS.items() for method in methods]
@@ -198,7 +199,7 @@ def _rod_under(result: Plan, chambers: np.ndarray) -> np.ndarray:
         result.time,
         pressures=chambers,
         bend=lambda time: sample_spline(spline, time)[0],
-        start=model.state(spline(0.0), spline(0.0, 1)),
+        start=model.begin(spline, result.reference.start),
         steps=STEPS,
     )
     return response.tip

@@ -16,6 +16,7 @@ from apriltag_tracker.synthetic.camera import CameraModel, SyntheticCamera
 from apriltag_tracker.synthetic.shapes import constant_curvature
 from apriltag_tracker.tag_map import TagMap
 from der_planner.limb import Limb
+from der_planner.model.response import simulate_many
 from der_planner.planning import METHODS, Motion, plan
 from der_planner.twin.offline import play
 from workspace_setup.basics import ROOT
@@ -48,6 +49,9 @@ def main() -> int:
         for method in methods
     }
     parts["twin"] = lambda: play(np.array([0.0, 0.05]), np.zeros((2, 2)))
+    parts["many rods"] = lambda: simulate_many(
+        limb, np.array([0.0, 0.05]), commands=np.zeros((2, 2, 2))
+    )
     parts["camera and tracker"] = _track
     for name, use in parts.items():
         begin = time.monotonic()

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from der_planner.limb import gravity_of
 from der_planner.runs.evaluation import load_run
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -147,6 +148,25 @@ def test_a_run_of_both_models_ends_in_a_table_and_leaves_nothing_behind(experime
     assert again.finish() == 0, again.errors
     assert "0 of 2 trials to play" in again.errors
     assert time.monotonic() - begin < 60
+
+
+def test_a_tilted_limb_carries_a_payload_in_every_part_of_the_graph(experiment):
+    loads = ("--mounting", "20", "--payload", "0.02", "--amplitude", "0.3")
+    run = experiment("--models", "der", *loads)
+    assert run.finish() == 0, run.errors
+    (entry,) = json.loads((run.out / "results.json").read_text())["runs"]
+    assert entry["mounting"] == "20°"
+    np.testing.assert_allclose(entry["gravity_m_s2"], gravity_of("20"))
+    assert (entry["payload_kg"], entry["payload_at_m"]) == (0.02, 0.0)
+    assert entry["valid_fraction"] > 0.9
+    assert entry["checks"]["tracker_rms_m"] < 1e-3
+    assert "20°, 20 g" in run.output
+    # The tracker saw a limb that sagged before the motion began, and the plan begins there.
+    played = load_run(run.out / entry["bag"])
+    before = played.tip.value[played.tip.time < 0.0]
+    rest = np.nanmedian(before, axis=0)
+    assert rest[1] < -0.05
+    assert np.linalg.norm(played.reference.value[0] - rest) < 0.03
 
 
 def test_a_path_is_drawn_on_the_graph_as_it_is_in_the_file(experiment, tmp_path: Path):

@@ -12,6 +12,7 @@ IMAGE = "camera/image_raw"
 CAMERA_INFO = "camera/camera_info"
 TAGS = "tags"
 LIMB_STATE = "state"
+ESTIMATE = "estimate"
 SHAPE_MARKERS = "shape_markers"
 DIAGNOSTICS = "/diagnostics"
 

@@ -240,8 +240,8 @@ class Limb:
             provenance=dict(content.get("provenance") or {}),
         )
 
-    def to_yaml(self, path: str | Path) -> None:
-        """Write a limb file that `from_yaml` reads back as an equal limb."""
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the content of a limb file, which `from_mapping` makes an equal limb of."""
         body: dict[str, Any] = {"schema_version": SCHEMA_VERSION, **dataclasses.asdict(self)}
         body["gravity"] = list(self.gravity)
         body["segments"] = list(body["segments"])
@@ -249,6 +249,11 @@ class Limb:
         body["masses"] = list(body["masses"])
         body["calibrated"] = {key: list(value) for key, value in body["calibrated"].items()}
         body["provenance"] = dict(self.provenance)
+        return body
+
+    def to_yaml(self, path: str | Path) -> None:
+        """Write a limb file that `from_yaml` reads back as an equal limb."""
+        body = self.to_mapping()
         text = yaml.safe_dump(body, sort_keys=False, allow_unicode=True)
         head = "# A limb, in SI units. How to choose each: src/der_planner/doc/limb_parameters.md\n"
         Path(path).write_text(head + commented(text, sections()), encoding="utf-8")

@@ -107,14 +107,14 @@ class BagOfRun:
             predicted_error=0.0,
         )
 
-    def setpoint(self, index: int, value, plan_id="p") -> None:
+    def setpoint(self, index: int, value, plan_id="p", revision=0) -> None:
         self.write(
             "/limb/pressure_setpoint",
             "PressureSetpoint",
             TIMES[index],
             plan_id=plan_id,
             index=index,
-            revision=0,
+            revision=revision,
             differential_pressure=np.asarray(value, dtype=float),
         )
 

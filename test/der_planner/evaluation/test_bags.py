@@ -244,3 +244,18 @@ def test_loads_of_a_bag_are_those_of_its_plan(tmp_path: Path):
     assert (written["mounting"], written["gravity_m_s2"]) == ("hanging", [9.81, 0.0, 0.0])
     assert (written["payload_kg"], written["payload_at_m"]) == (0.02, 0.244)
     assert "hanging, 20 g at 24.4 cm" in format_table(summarise([result]))
+
+
+def test_the_last_revision_of_a_setpoint_counts(tmp_path: Path):
+    bag = BagOfRun(tmp_path / "run")
+    bag.plan()
+    for index, time in enumerate(TIMES):
+        for revision, pressure in enumerate((1000.0, 1200.0, 1500.0)):
+            bag.setpoint(index, [pressure, -pressure], revision=revision)
+        bag.pressure(time, [1500.0, -1500.0], [1500.0, -1500.0])
+        bag.command(time + 0.004, [1500.0, -1500.0], index)
+        bag.state(time + 0.01, reference(time + 0.01)[0])
+    bag.bag.close()
+    result = evaluate_bag(tmp_path / "run")
+    assert result.checks["board_lost"] == 0
+    assert result.extra["feedback"]["correction_max_pa"] == [1500.0, 1500.0]

@@ -101,6 +101,16 @@ def test_what_is_not_comparable_is_refused_with_the_reason(change, reason):
     assert "not compared" in format_table(summarise([*DER, *PCC]), [found])
 
 
+def test_a_comparison_under_different_methods_says_so():
+    runs = [dataclasses.replace(run, method="optimal") for run in [*DER, *PCC]]
+    (same,) = compare(runs)
+    assert "methods differ" not in format_table([], [same])
+    (mixed,) = compare([*runs[:3], *(dataclasses.replace(r, method="paper") for r in PCC)])
+    assert "der optimal against pcc paper (methods differ" in format_table(
+        [*summarise(runs)], [mixed]
+    )
+
+
 def test_other_motions_are_not_mixed():
     other = [dataclasses.replace(run, motion="asynchronous") for run in PCC]
     assert compare([*DER, *other]) == []

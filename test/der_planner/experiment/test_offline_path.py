@@ -9,6 +9,7 @@ import pytest
 from der_planner.experiment.errors import GraphError
 from der_planner.experiment.experiment import run
 from der_planner.experiment.options import parse
+from der_planner.limb import Limb
 
 
 def write_arc(file: Path, scale: float = 1.0) -> None:
@@ -31,7 +32,7 @@ def test_a_path_is_drawn_and_reported(tmp_path: Path):
     (result,) = json.loads((out / "results.json").read_text())["runs"]
     assert (result["motion"], result["model"], result["cycles"]) == ("arc", "pcc", 1)
     assert 0.0 < result["mean_error_m"] < 0.05
-    played = np.load(out / "runs" / "arc_pcc_paper_trial1.npz")
+    played = np.load(out / "runs" / "arc_pcc_optimal_trial1.npz")
     start, end = 0.224 * np.array([[np.cos(a), np.sin(a)] for a in (0.46, 0.56)])
     for point in (start, end):
         assert np.linalg.norm(played["tip_reference"] - point, axis=1).min() < 1e-3
@@ -44,5 +45,26 @@ def test_an_unreachable_path_says_where(tmp_path: Path):
     file = tmp_path / "far.csv"
     write_arc(file, scale=2.0)
     options = parse(["--offline", "--no-calibration", "--path", str(file), "--out", str(tmp_path)])
+    nearest = parse(["--offline", "--no-calibration", "--path", str(file), "--nearest"])
+    assert nearest.motion("far").reference(Limb.default()).deviation.mean > 0.1
     with pytest.raises(GraphError, match=r"point \(0\.40\d+, 0\.19\d+\) m at t = 0\.00 s"):
         run(options)
+
+
+@pytest.mark.slow
+def test_feedback_stands_beside_the_open_loop(tmp_path: Path):
+    arguments = ["--offline", "--no-calibration", "--models", "der", "--feedback", "--seed", "3"]
+    arguments += ["--period", "6", "--cycles", "1"]
+    found = []
+    for name in ("first", "again"):
+        out = tmp_path / name
+        run(parse([*arguments, "--out", str(out)]))
+        runs = json.loads((out / "results.json").read_text())["runs"]
+        found.append({result["method"]: result for result in runs})
+    alone, corrected = found[0]["optimal"], found[0]["optimal + feedback"]
+    assert corrected["mean_error_m"] < 0.75 * alone["mean_error_m"]
+    assert max(corrected["extra"]["feedback"]["correction_rms_pa"]) > 100.0
+    assert corrected["mean_error_m"] == found[1]["optimal + feedback"]["mean_error_m"]
+    page = (tmp_path / "first" / "report" / "report.html").read_text()
+    assert "What feedback added" in page
+    assert page.count("optimal + feedback") > 1

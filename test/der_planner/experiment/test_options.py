@@ -6,7 +6,7 @@ import pytest
 
 from der_planner.experiment.experiment import run
 from der_planner.experiment.ledger import Ledger
-from der_planner.experiment.options import OptionError, parse
+from der_planner.experiment.options import METHODS, OptionError, parse
 from der_planner.limb import Limb, PointMass
 from der_planner.planning.motions import NAMES
 
@@ -23,6 +23,9 @@ from der_planner.planning.motions import NAMES
         (["--mounting", "upside"], "--mounting: mounting 'upside' is unknown"),
         (["--payload", "-0.1"], "--payload"),
         (["--payload-at", "0.2"], "give --payload, too"),
+        (["--nearest"], "--nearest is about a path"),
+        (["--page", "70000"], "--page is 70000"),
+        (["--page", "--offline"], "does not go with --offline"),
     ],
 )
 def test_a_bad_option_is_refused_by_its_name(arguments, named):
@@ -48,12 +51,10 @@ def test_trials_share_seeds_between_models_and_differ_between_trials():
     assert len({trial.name for trial in trials}) == len(trials)
 
 
-def test_pcc_is_always_planned_by_its_own_method():
-    trials = parse(["--method", "optimal"]).plan_of_trials()
-    assert [(trial.model, trial.method) for trial in trials] == [
-        ("der", "optimal"),
-        ("pcc", "paper"),
-    ]
+@pytest.mark.parametrize("method", METHODS)
+def test_a_method_counts_for_both_models(method):
+    trials = parse(["--method", method]).plan_of_trials()
+    assert [(trial.model, trial.method) for trial in trials] == [("der", method), ("pcc", method)]
 
 
 def test_a_stopped_experiment_goes_on_and_refuses_other_options(tmp_path: Path):

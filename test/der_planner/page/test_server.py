@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import time
 from concurrent.futures import Future
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,14 +15,17 @@ from fastapi.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
 from apriltag_tracker.tag_map import LimbTag, TagMap
+from der_planner.limb import Limb
 from der_planner.page.access import Binding, Sessions
 from der_planner.page.commands import Answer, MotionRequest, Service
+from der_planner.page.drawing.studio import Studio
 from der_planner.page.guard import Guard
 from der_planner.page.operators import Desk
 from der_planner.page.overlay import Overlay
 from der_planner.page.picture import PictureFeed
 from der_planner.page.server import Parts, create_app
 from der_planner.page.situation import Situation
+from der_planner.planning import PathLimits
 
 HOST = "127.0.0.1:8080"
 ORIGIN = f"http://{HOST}"
@@ -48,6 +52,9 @@ class Calls:
     def play(self, request: MotionRequest) -> Answer:
         return Answer(True, request.motion)
 
+    def play_path(self, tip: Any) -> Future[Answer]:
+        return self.call("start")
+
     def record(self, note: str) -> Future[Answer]:
         return self.call("record_start")
 
@@ -58,7 +65,8 @@ class Rig:
         self.situation = Situation()
         self.picture = PictureFeed(15.0)
         desk = Desk(lambda _: None)
-        parts = Parts(self.situation, self.picture, Overlay(TAGS), desk, self.calls)
+        studio = Studio(Limb.default(), PathLimits(), Path("nowhere"))
+        parts = Parts(self.situation, self.picture, Overlay(TAGS), desk, self.calls, studio)
         sessions = Sessions(password)
         self.app: FastAPI = create_app(parts, sessions, secure=False)
         self.guard = Guard(self.app, Binding().hosts(8080), "http", sessions)

@@ -7,6 +7,7 @@ import pytest
 
 from der_planner.limb import Limb
 from der_planner.pcc import Pcc, kernels
+from der_planner.rod import Rod
 
 SEED = 4
 
@@ -255,3 +256,62 @@ def test_a_stiff_limb_is_not_stepped_over_its_fastest_mode():
     coarse, _ = model.simulate(pressures, 0.01)
     fine, _ = model.simulate(np.repeat(pressures, 20, axis=1), 0.0005)
     np.testing.assert_allclose(coarse, fine, atol=0.15 * np.abs(fine).max())
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_force_slopes_against_finite_differences(count):
+    model = Pcc(loaded(count))
+    rng = np.random.default_rng(SEED)
+    arcs = model.arcs
+
+    def force(q, v, a):
+        M, C, D, weight = kernels.inertia(q, v, arcs)
+        elastic = model.elastic_torque(q) + model.stiffness * model.material_damping * v
+        return M @ a + (C + D) @ v + elastic - weight
+
+    for _ in range(3):
+        q, v, a = rng.normal(size=(3, count))
+        q *= 0.8
+        by_angle, by_rate = kernels.force_slopes(q, v, a, arcs)
+        h = 1e-5
+        for i, step in enumerate(h * np.eye(count)):
+            column = (force(q + step, v, a) - force(q - step, v, a)) / (2 * h)
+            np.testing.assert_allclose(by_angle[:, i], column, rtol=1e-6, atol=1e-8)
+            column = (force(q, v + step, a) - force(q, v - step, a)) / (2 * h)
+            np.testing.assert_allclose(by_rate[:, i], column, rtol=1e-6, atol=1e-8)
+
+
+def test_linearisation_and_its_transpose_against_the_simulation():
+    model = Pcc(loaded(2))
+    rng = np.random.default_rng(SEED)
+    pressures = 4e3 * rng.normal(size=(12, 5, 2))
+    start, rates = np.array([0.4, -0.2]), np.array([1.0, 2.0])
+    _, _, linear = model.linearised(pressures, 0.01, start, rates)
+    change, shift = rng.normal(size=pressures.shape), 1e-4 * rng.normal(size=2)
+    ends = [
+        model.simulate(pressures + s * change, 0.01, start + s * shift, rates)[0]
+        for s in (1.0, -1.0)
+    ]
+    moved = linear.tangent(change, shift)
+    np.testing.assert_allclose(moved, (ends[0] - ends[1]) / 2, rtol=1e-5, atol=1e-10)
+    weights = rng.normal(size=moved.shape)
+    gradient, by_start = linear.adjoint(weights)
+    total = (gradient * change).sum() + by_start @ shift
+    assert total == pytest.approx((weights * moved).sum(), rel=1e-9)
+    pulse = rng.uniform(size=(9, 2))
+    raised = np.zeros((14, 5, 2))
+    raised.reshape(-1, 2)[15:24] = pulse * [0.0, 1.0]
+    column = linear.sensitivity(pulse)[:, :, 3, 1]
+    np.testing.assert_allclose(column, linear.tangent(raised[:12]), rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize("mounting", ["hanging", "sideways", "25"])
+def test_many_arcs_rest_as_the_rod_does(mounting):
+    base = Limb.default()
+    count = 12
+    part = dataclasses.replace(base.segments[0], length=base.length / count)
+    limb = dataclasses.replace(base, segments=(part,) * count).mounted(mounting).carrying(0.03)
+    model = Pcc(limb)
+    tip = model.tip(model.resting(np.zeros(count)))
+    rod = Rod.from_limb(base.mounted(mounting).carrying(0.03), 61)
+    np.testing.assert_allclose(tip, rod.tip(rod.equilibrium(np.zeros(2)))[:2], atol=1e-3)

@@ -182,7 +182,7 @@ def test_gauss_newton_agrees_with_finite_differences_where_chambers_are_limited(
     warm = commands.commands(
         model.limb, *planner.balance(model, spline, reference, "projected"), CONTROL_PERIOD
     )
-    solver = Optimiser(model, spline, reference, warm, STEPS)
+    solver = Optimiser(model, model.rest, spline, reference, warm, STEPS)
     quadratic = solver._linearise(solver.drive.window(warm[:100]), solver.start, 0.0)
     time = np.arange(100) * 0.05
     for direction in (np.column_stack([np.sin(time), np.cos(2 * time)]), np.ones((100, 2))):

@@ -111,7 +111,7 @@ def test_what_cannot_be_done_is_refused_with_a_reason(planner):
     cases = [
         ({"motion": "jump"}, "motion 'jump' is unknown"),
         ({"model": "fem"}, "model 'fem' is unknown"),
-        ({"model": "pcc", "method": "optimal"}, "no method 'optimal'"),
+        ({"model": "pcc", "method": "magic"}, "no method 'magic'"),
         ({"period": -1.0}, "period must be positive"),
         ({"amplitude": float("nan")}, "amplitude must be positive"),
         ({"motion": "same_direction", "amplitude": 1.7}, "out of reach"),

@@ -23,7 +23,8 @@ def solver_for(limb, motion, **settings):
     warm = commands.commands(
         model.limb, *planner.balance(model, spline, reference, "projected"), CONTROL_PERIOD
     )
-    return Optimiser(model, spline, reference, warm, STEPS, Settings(**settings))
+    begin = model.begin(spline, reference.start)
+    return Optimiser(model, begin, spline, reference, warm, STEPS, Settings(**settings))
 
 
 @pytest.fixture(scope="module")

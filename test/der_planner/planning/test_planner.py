@@ -18,6 +18,7 @@ from der_planner.planning import (
     plan,
 )
 from der_planner.planning.inverse import static_pressure
+from der_planner.planning.motions import resting_spline
 from der_planner.planning.rod_model import PlanningRod
 
 LIMB = Limb.default()
@@ -164,10 +165,12 @@ def test_the_papers_gains_add_nothing_without_an_error_and_little_with_one():
     balance = model.balance.paper(q[:1], zero[:1], zero[:1])[0]
     # The rolled rod starts straight, far from the reference: (B Λ)† sees only the few rows beside
     # the couples, so that a distributed error hardly comes back.
-    away = model._paper_beside_the_model(q, zero, zero, 0.025)
+    time = 0.025 * np.arange(40)
+    still = resting_spline(time, q)
+    away = model.pressures("paper", still, time)
     assert 1e-5 < np.abs(away[0] / balance - 1).max() < 1e-2
     model.rest = model.rod.equilibrium(balance)
-    settled = model._paper_beside_the_model(q, zero, zero, 0.025)
+    settled = model.pressures("paper", still, time)
     np.testing.assert_allclose(settled, np.tile(balance, (40, 1)), rtol=1e-6)
 
 
@@ -293,7 +296,7 @@ def test_pcc_uses_its_own_identified_segments():
     [
         ("fem", "", "model 'fem' is unknown: choose der or pcc"),
         ("der", "magic", "no method 'magic': choose paper, projected, optimal"),
-        ("pcc", "optimal", "the model 'pcc' has no method 'optimal': choose paper"),
+        ("pcc", "magic", "the model 'pcc' has no method 'magic': choose paper, projected, optimal"),
     ],
 )
 def test_unknown_models_and_methods_are_named(model_name, method, message):

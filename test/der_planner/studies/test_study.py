@@ -56,6 +56,19 @@ def test_a_key_depends_on_what_the_row_does_alone(tmp_path):
     assert {row.key for row in study(tmp_path, limb="limb.yaml").rows}.isdisjoint(mine)
 
 
+def test_names_that_yaml_takes_for_something_else(tmp_path):
+    """Off and no are not False, and a mounting may be a number of degrees."""
+    factors = "{feedback: [off, on], payload_known: [no], mounting: [hanging, 30, -12.5]}"
+    found = study(tmp_path, factors=factors)
+    assert found.grid == {
+        "feedback": ["off", "on"],
+        "payload_known": ["no"],
+        "mounting": ["hanging", "30", "-12.5"],
+    }
+    with pytest.raises(StudyError, match=r"mounting must be one of horizontal.*or degrees"):
+        study(tmp_path, factors="{mounting: upside}")
+
+
 def test_pcc_has_one_method(tmp_path):
     """Rows that do the same come once."""
     found = study(tmp_path, factors="{model: [der, pcc], method: [optimal, projected, paper]}")

@@ -1,5 +1,7 @@
-"""What is done about the error that a plan leaves: feedback within a run."""
+"""What is done about the error that a plan leaves: learning between runs, feedback within one."""
 
+from der_planner.control.disturbance import LearningError
 from der_planner.control.feedback import Feedback
+from der_planner.control.learning import Learner, LearningRun
 
-__all__ = ["Feedback"]
+__all__ = ["Feedback", "Learner", "LearningError", "LearningRun"]

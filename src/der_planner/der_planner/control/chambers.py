@@ -14,7 +14,7 @@ from der_planner.model.series import CONTROL_PERIOD, interpolate
 
 Array = NDArray[np.float64]
 
-_SURPRISE_TIME = 1.0
+_SURPRISE_TIME = 3.0
 """In which a difference between measured and modelled pressures is forgotten [s]."""
 _LONGEST_HOLD = 40
 """Control periods without a command after which the plan's count again."""
@@ -31,7 +31,7 @@ class ChamberLog:
 
     Between two readings the pressures are on a straight line. After the last one the model's
     pressures under the commands hold, with the difference that the last reading showed, which is
-    forgotten within a second or two.
+    forgotten within some seconds.
 
     Args:
         nominal: of the plan.

@@ -114,7 +114,10 @@ class Feedback:
         k = round(time / CONTROL_PERIOD)
         instant = k * CONTROL_PERIOD
         supervisor = self._supervisor
-        supervisor.asked(instant, self._chambers.newest - CONTROL_PERIOD)
+        if instant <= self._chambers.newest - CONTROL_PERIOD:
+            supervisor.late(instant, self._chambers.newest - instant)
+        else:
+            supervisor.in_time()
         planned, before = self._nominal.command(k), self._chambers.sent(k - 1)
         correction = np.zeros_like(planned)
         try:
@@ -137,6 +140,24 @@ class Feedback:
         self._chambers.send(k, command)
         self._estimator.changed(instant)
         return command
+
+    def coming(self) -> tuple[int, Array]:
+        """Return the control period of the newest command, and corrections (W, M) [Pa] from it on.
+
+        Those after the first are what would follow if nothing new were seen.
+        """
+        first, corrections = self._horizon.solution
+        return first, self._supervisor.share * corrections
+
+    def sent(self, time: float, command: ArrayLike) -> None:
+        """Tell that another command (M,) [Pa] was sent for an instant [s] than was asked for."""
+        k = round(time / CONTROL_PERIOD)
+        self._chambers.send(k, np.asarray(command, dtype=float))
+        self._estimator.changed(k * CONTROL_PERIOD)
+
+    def late(self, time: float, by: float) -> None:
+        """Tell that the command of an instant [s] could not be sent in time, and how late [s]."""
+        self._supervisor.late(time, by)
 
     def estimate(self, time: float) -> Estimate:
         """Return what is known of the limb at an instant [s], past or to come."""

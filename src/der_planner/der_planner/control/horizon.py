@@ -49,8 +49,8 @@ class HorizonSettings:
 
     knots: tuple[int, ...] = (0, 1, 2, 3, 5, 7, 10, 14, 19, 25, 32, 39)
     bend: float = 0.01
-    change: float = 1e-5
-    smoothness: float = 1e-5
+    change: float = 5e-6
+    smoothness: float = 5e-6
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,9 @@ class Horizon:
         nominal: the model's motion under the plan.
         chambers: what was commanded and measured of the chambers.
         settings: sizes and weights.
+
+    Attributes:
+        solution: the newest: its control period, and the corrections (W, M) from it on [Pa].
     """
 
     def __init__(
@@ -85,6 +88,8 @@ class Horizon:
         self.window = self.settings.knots[-1] + 1
         self._hats = _hats(self.settings.knots)
         self._guess: tuple[int, Array] | None = None
+        inputs = nominal.limb.segment_count
+        self.solution = 0, np.zeros((self.window, inputs))
 
     def solve(self, first: int, known: Knowledge, allowed: Allowed) -> Array:
         """Return the correction (M,) [Pa] of the command of control period ``first``.
@@ -114,13 +119,14 @@ class Horizon:
         change = self._within(hessian, gradient, first, guess, allowed).reshape(-1, inputs)
         correction = guess + self._hats @ change
         self._guess = first, correction - ahead[2:]
-        cut: Array = np.clip(correction[0], -allowed.authority, allowed.authority)
-        return cut
+        self.solution = first, np.clip(correction, -allowed.authority, allowed.authority)
+        correction_now: Array = self.solution[1][0]
+        return correction_now
 
     def warm_up(self, known: Knowledge, allowed: Allowed) -> None:
         """Compile, or load from the cache, what `solve` calls."""
         self.solve(0, known, allowed)
-        self._guess = None
+        self._guess, self.solution = None, (0, np.zeros_like(self.solution[1]))
 
     def _ahead(self, first: int, known: Knowledge) -> Array:
         """Return the corrections (W + 2, M) [Pa] that make up for d and g, from two periods before.

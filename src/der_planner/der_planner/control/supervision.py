@@ -23,7 +23,7 @@ REASONS = {
     "inconsistent": "the limb moves as the model cannot, measurements are {:.0f} times too far off",
     "oscillation": "the corrections swing by {:.0f} Pa and the swing does not die out",
     "saturation": "a correction has been at its limit of {:.0f} Pa for too long",
-    "late": "commands are asked for {:.2f} s after their instant",
+    "late": "commands come {:.2f} s after their instant",
 }
 """Every reason and what is said of it."""
 
@@ -48,7 +48,7 @@ class Limits:
         swing: from one turn of a swinging correction to the next, as a share of the authority.
         turns: so many of them are an oscillation, unless it dies out …
         window: … if they come within this time [s].
-        late: commands in a row that are asked for too late.
+        late: commands that come too late; one in time makes up for half of one.
     """
 
     authority: float = 0.4
@@ -62,7 +62,7 @@ class Limits:
     swing: float = 0.1
     turns: int = 4
     window: float = 4.0
-    late: int = 4
+    late: float = 4.0
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class Supervisor:
         self._latched = False
         self._strange_since: float | None = None
         self._limited_since: float | None = None
-        self._late = 0
+        self._late = 0.0
         self._turns: list[_Turns] = []
 
     def advance(self, time: float, age: float, strange: float) -> float:
@@ -149,11 +149,15 @@ class Supervisor:
             if way > 0.0:
                 self.stop(time, "oscillation", way)
 
-    def asked(self, time: float, present: float) -> None:
-        """Note that a command of an instant is asked for when so much is known [s]."""
-        self._late = self._late + 1 if time <= present else 0
+    def late(self, time: float, by: float) -> None:
+        """Note that a command came after its instant [s], and by how much [s]."""
+        self._late += 1.0
         if self._late >= self.limits.late:
-            self.stop(time, "late", present - time)
+            self.stop(time, "late", by)
+
+    def in_time(self) -> None:
+        """Note that a command is in time; it makes up for half a late one."""
+        self._late = max(0.0, self._late - 0.5)
 
     def stop(self, time: float, name: str, number: float) -> None:
         """Play the rest without feedback, for one of `REASONS` and the number in its sentence."""

@@ -28,7 +28,7 @@ def run(options: Options) -> None:
     limb = _check_limb(options)
     trials = options.plan_of_trials()
     ledger = Ledger(options)
-    left = [trial for trial in trials if ledger.finished(trial) is None]
+    left = [trial for trial in trials if not _whole(trial, options, ledger)]
     if options.dry_run:
         _describe(options, trials, left, limb, progress)
         return
@@ -40,12 +40,52 @@ def run(options: Options) -> None:
         if trial not in left:
             continue
         progress.say(
-            f"[{place}/{len(trials)}] {trial.motion}, {trial.model} {trial.method}, "
+            f"[{place}/{len(trials)}] {trial.motion}, {trial.model} {trial.manner}, "
             f"trial {trial.number} (seed {trial.seed})"
         )
-        ledger.record(trial, _play(trial, options, progress))
-    kept = [(trial, ledger.finished(trial) or {}) for trial in trials]
+        if ledger.finished(trial) is None:
+            ledger.record(trial, _play(trial, options, progress))
+        if options.learn:
+            _learn(trial, options, ledger, progress)
+    kept = [(run, entry) for trial in trials for run, entry in _runs_of(trial, ledger)]
     results.conclude(options, kept, progress)
+
+
+def _whole(trial: Trial, options: Options, ledger: Ledger) -> bool:
+    """Tell whether a trial was played, and learned from as often as is asked for."""
+    runs = len(_runs_of(trial, ledger))
+    return runs > options.learn
+
+
+def _runs_of(trial: Trial, ledger: Ledger) -> list[tuple[Trial, dict[str, Any]]]:
+    """Return the finished runs of a trial, the learned ones after the first."""
+    found, run = [], trial
+    while (entry := ledger.finished(run)) is not None:
+        found.append((run, entry))
+        run = run.following()
+    return found
+
+
+def _learn(trial: Trial, options: Options, ledger: Ledger, progress: Progress) -> None:
+    """Play what was learned from the runs before, again and again; finished runs stay finished."""
+    # The learner brings the optimiser along, which an experiment without it need not wait for.
+    from der_planner.experiment.learning import TrialLearning  # noqa: PLC0415
+
+    limb = _limb_file(trial, options, progress)
+    robot = options.loaded(Limb.from_yaml(limb) if limb is not None else Limb.default())
+    learning = TrialLearning(trial, options, robot, progress)
+    run = trial
+    while True:
+        entry = ledger.finished(run)
+        if entry is None:
+            progress.say(f"  run {run.run} of {options.learn + 1}")
+            entry = _play(run, options, progress, learning.next(run.name))
+            ledger.record(run, entry)
+        learning.take(results.load(options.out, run, entry))
+        if learning.stopped or run.run > options.learn:
+            break
+        run = run.following()
+    learning.conclude()
 
 
 def _make_folder(path: Path) -> None:
@@ -105,7 +145,9 @@ def _describe(
     progress.say(f"{len(left)} trials of {each:.0f} s motion each; nothing was started")
 
 
-def _play(trial: Trial, options: Options, progress: Progress) -> dict[str, Any]:
+def _play(
+    trial: Trial, options: Options, progress: Progress, learned: Path | None = None
+) -> dict[str, Any]:
     limb = _limb_file(trial, options, progress)
     robot = options.loaded(Limb.from_yaml(limb) if limb is not None else Limb.default())
     metadata = _metadata(trial, options, limb, robot)
@@ -113,10 +155,10 @@ def _play(trial: Trial, options: Options, progress: Progress) -> dict[str, Any]:
         # ROS-free: the other branch is imported only where it is used.
         from der_planner.experiment.offline_run import play_offline  # noqa: PLC0415
 
-        return play_offline(trial, options, robot, metadata)
+        return play_offline(trial, options, robot, metadata, learned)
     from der_planner.experiment.graph_run import GraphTrial  # noqa: PLC0415
 
-    played = GraphTrial(trial, options, limb, robot, metadata, progress).play()
+    played = GraphTrial(trial, options, limb, robot, metadata, progress, learned).play()
     return {
         "bag": str(played.bag.relative_to(options.out)),
         "plan_id": played.plan_id,
@@ -155,8 +197,9 @@ def _metadata(trial: Trial, options: Options, limb: Path | None, robot: Limb) ->
     return {
         "motion": trial.motion,
         "model": trial.model,
-        "method": trial.method,
+        "method": trial.manner,
         "trial": trial.number,
+        **({"learned_from": trial.run - 1} if trial.run > 1 else {}),
         "seed": trial.seed,
         "amplitude_rad": options.amplitude,
         "period_s": options.period,

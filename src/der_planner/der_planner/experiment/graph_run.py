@@ -136,6 +136,9 @@ class GraphPlayer(ABC):
                 client.wait_for(lambda: os.path.exists(port), 60.0, "the emulated board's port")
         client.wait_ready(self._processes)
         self._progress.say(f"  ready after {time.monotonic() - begin:.1f} s")
+        if "page" in self._processes:
+            address = client.diagnostic_values("page").get("url", "unknown")
+            self._progress.say(f"  the operator's page is at {address}")
 
     def _record(self, client: GraphClient) -> GraphRun:
         bag = Path(client.call("recorder/start"))
@@ -249,6 +252,7 @@ class GraphTrial(GraphPlayer):
         robot: the same limb under the loads of the experiment, which the twin gets.
         metadata: stored in the bag.
         progress: shows what happens.
+        learned: file of a learned plan, which is played in place of a new one.
     """
 
     def __init__(
@@ -259,6 +263,7 @@ class GraphTrial(GraphPlayer):
         robot: Limb,
         metadata: dict[str, Any],
         progress: Progress,
+        learned: Path | None = None,
     ) -> None:
         super().__init__(options.out / "logs" / trial.name, options.hardware, progress)
         self._trial = trial
@@ -266,6 +271,7 @@ class GraphTrial(GraphPlayer):
         self._limb = limb
         self._robot = robot
         self._metadata = metadata
+        self._learned = learned
 
     def _specs(self, port: str) -> list[NodeSpec]:
         return node_specs(
@@ -273,10 +279,12 @@ class GraphTrial(GraphPlayer):
             self._options.out / "bags" / self._trial.name,
             self._metadata,
             seed=self._trial.seed,
+            run=self._trial.run - 1,
             limb=self._robot,
             hardware=self._hardware,
             planner=self._planner_parameters(),
             record_images=self._options.record_images,
+            page=self._options.page,
         )
 
     def _planner_parameters(self) -> dict[str, Any]:
@@ -285,10 +293,14 @@ class GraphTrial(GraphPlayer):
             "mounting": self._options.mounting,
             "payload": self._options.payload,
             "payload_at": self._options.payload_at or 0.0,
+            "feedback": self._trial.feedback,
         }
-        if self._options.path is not None:
+        if self._learned is not None:
+            parameters["learned_plans"] = str(self._learned.parent)
+        elif self._options.path is not None:
             # A path names no model: it gets the planner's defaults.
             parameters["default_model"] = self._trial.model
+            parameters["nearest_path"] = self._options.nearest
             if self._trial.model == "der":
                 parameters["default_method"] = self._trial.method
         return parameters
@@ -298,7 +310,7 @@ class GraphTrial(GraphPlayer):
         client.subscribe(PressurePlan, topics.PLAN, qos.LATCHED)
 
     def _begin(self, client: GraphClient) -> Playing:
-        drawn = self._options.path
+        drawn = self._options.path if self._learned is None else None
         kind, topic = (PathMessage, topics.PATH) if drawn else (MotionCommand, topics.COMMAND)
         publisher = client.node.create_publisher(kind, topic, qos.COMMANDS)
         # The recorder may listen, too.
@@ -335,7 +347,8 @@ class GraphTrial(GraphPlayer):
 
     def _command(self) -> MotionCommand:
         return MotionCommand(
-            motion=self._trial.motion,
+            # A learned plan's name stands in place of the motion's.
+            motion=self._trial.motion if self._learned is None else self._learned.stem,
             model=self._trial.model,
             method=self._trial.method,
             amplitude=self._options.amplitude,

@@ -17,6 +17,7 @@ STOP_ORDER = (
     "limb_twin",
     "recorder",
     "pressure_driver",
+    "page",
     "board_emulator",
 )
 TWIN_NODES = ("board_emulator", "limb_twin", "synthetic_camera")
@@ -38,10 +39,12 @@ def node_specs(
     metadata: dict[str, Any],
     *,
     seed: int = 0,
+    run: int = 0,
     limb: Limb | None = None,
     hardware: Hardware | None = None,
     planner: dict[str, Any] | None = None,
     record_images: bool = False,
+    page: int | None = None,
 ) -> list[NodeSpec]:
     """Return the nodes of a run in the order in which they start.
 
@@ -50,9 +53,11 @@ def node_specs(
         bag: folder that the recorder makes.
         metadata: stored in the bag.
         seed: of the twin.
+        run: of the same twin: its rest angles wander in each in a way of their own.
         limb: whose gravity and masses the twin gets; None: no loads.
         hardware: in place of the twin.
         planner: parameters of the planner; None for a graph without one.
+        page: port of the operator's page; None for a graph without one.
         record_images: whether the bag holds the raw images, too.
     """
     rig = hardware or Hardware()
@@ -66,7 +71,7 @@ def node_specs(
     specs = [
         NodeSpec("pressure_driver", "board_emulator", {"port_link": port, "seed": seed}),
         NodeSpec("pressure_driver", "pressure_driver", driver),
-        NodeSpec("der_planner", "limb_twin", {"seed": seed, **twin_loads(limb)}),
+        NodeSpec("der_planner", "limb_twin", {"seed": seed, "run": run, **twin_loads(limb)}),
         NodeSpec("apriltag_tracker", "synthetic_camera", {"seed": seed}),
         NodeSpec("apriltag_tracker", "apriltag_tracker", dict(rig.tracker)),
     ]
@@ -75,7 +80,19 @@ def node_specs(
     if planner is not None:
         specs.append(NodeSpec("der_planner", "planner", {**planner, **rig.planner}))
     specs.append(NodeSpec("der_planner", "recorder", recorder))
+    if page is not None:
+        specs.append(NodeSpec("der_planner", "page", page_parameters(page, planner or {}, rig)))
     return specs
+
+
+def page_parameters(port: int, planner: dict[str, Any], rig: Hardware) -> dict[str, Any]:
+    """Return the parameters of a page that draws with the planner's limb on the tracker's tags."""
+    shared = ("limb_file", "mounting", "payload", "payload_at", "path_speed", "path_acceleration")
+    all_of_planner = {**planner, **rig.planner}
+    parameters = {name: all_of_planner[name] for name in shared if name in all_of_planner}
+    if "tag_map" in rig.tracker:
+        parameters["tag_map"] = rig.tracker["tag_map"]
+    return {"port": port, **parameters}
 
 
 def twin_loads(limb: Limb | None) -> dict[str, Any]:

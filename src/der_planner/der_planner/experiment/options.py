@@ -24,9 +24,11 @@ from der_planner.planning.motions import (
     JOINT_MOTIONS,
 )
 from der_planner.planning.motions import NAMES as MOTIONS
+from der_planner.runs.run import LEARNED
 
 MODELS = tuple(METHODS_BY_MODEL)
 METHODS = METHODS_BY_MODEL["der"]
+DEFAULT_PAGE_PORT = 8080
 DEFAULT_MOTIONS = ("same_direction",)
 
 
@@ -43,6 +45,8 @@ class Trial:
         model, method: names, see MODELS, METHODS.
         number: of the trial, from 1.
         seed: of the twin; the same for every motion and model of a trial.
+        run: of the trial, from 1; those after the first play what was learned from the ones before.
+        feedback: the commands are corrected while they are played.
     """
 
     motion: str
@@ -50,11 +54,24 @@ class Trial:
     method: str
     number: int
     seed: int
+    feedback: bool = False
+    run: int = 1
 
     @property
     def name(self) -> str:
         """Name of the bag and of every other file of this run."""
-        return f"{self.motion}_{self.model}_{self.method}_trial{self.number}"
+        method = f"{self.method}_feedback" if self.feedback else self.method
+        name = f"{self.motion}_{self.model}_{method}_trial{self.number}"
+        return name if self.run == 1 else f"{name}_run{self.run}"
+
+    def following(self) -> Trial:
+        """Return the next run, which plays what was learned."""
+        return dataclasses.replace(self, method=LEARNED, run=self.run + 1)
+
+    @property
+    def manner(self) -> str:
+        """The method, and if there is feedback: what tables call it."""
+        return f"{self.method} + feedback" if self.feedback else self.method
 
 
 @dataclass(frozen=True)
@@ -125,6 +142,10 @@ class Options:
     record_images: bool
     report: bool
     path: Path | None = None
+    nearest: bool = False
+    page: int | None = None
+    learn: int = 0
+    feedback: bool = False
     mounting: str = ""
     payload: float = 0.0
     payload_at: float | None = None
@@ -152,22 +173,17 @@ class Options:
             PlanningError: the path's file has changed and cannot be read any more.
         """
         if self.path is not None:
-            return Motion.from_csv(self.path)
+            return Motion.from_csv(self.path, nearest=self.nearest)
         return Motion.named(name, amplitude=self.amplitude, period=self.period, cycles=self.cycles)
 
     def plan_of_trials(self) -> list[Trial]:
         """Return every trial in the order in which they are played."""
         return [
-            Trial(
-                motion,
-                model,
-                self.method if model == "der" else "paper",
-                number,
-                self.seed + number - 1,
-            )
+            Trial(motion, model, self.method, number, self.seed + number - 1, feedback)
             for motion in self.motions
             for number in range(1, self.trials + 1)
             for model in self.models
+            for feedback in ((False, True) if self.feedback and model == "der" else (False,))
         ]
 
 
@@ -201,10 +217,23 @@ def _add_motions(what: argparse._ArgumentGroup) -> None:
         "time, with units as in 'time [s], x [cm], y [cm]' (default units: s and m)",
     )
     what.add_argument(
+        "--nearest",
+        action="store_true",
+        help="follow the nearest path that the limb can follow where --path leaves its reach",
+    )
+    what.add_argument(
         "--models", nargs="+", default=list(MODELS), metavar="MODEL", help=f"of {', '.join(MODELS)}"
     )
     what.add_argument(
-        "--method", default="optimal", help=f"of {', '.join(METHODS)}; PCC always uses paper"
+        "--method", default="optimal", help=f"of {', '.join(METHODS)}, for both models"
+    )
+    what.add_argument(
+        "--learn",
+        type=int,
+        default=0,
+        metavar="N",
+        help="after each trial, up to N more runs, each of the plan that was learned "
+        "from the ones before",
     )
     what.add_argument("--trials", type=int, default=1, help="runs of each motion and model")
     what.add_argument(
@@ -252,6 +281,20 @@ def _add_manner(how: argparse._ArgumentGroup) -> None:
         help="folder of bags, logs, figures and results.json; a folder that holds a stopped "
         "experiment goes on with it; without it: experiments/ and the time",
     )
+    how.add_argument(
+        "--feedback",
+        action="store_true",
+        help="play every plan of the rod twice: open loop, and corrected while it moves",
+    )
+    how.add_argument(
+        "--page",
+        type=int,
+        nargs="?",
+        const=DEFAULT_PAGE_PORT,
+        metavar="PORT",
+        help=f"serve the operator's page while the graph runs, at port {DEFAULT_PAGE_PORT} of this "
+        "machine if none is given",
+    )
     how.add_argument("--record-images", action="store_true", help="raw images into the bags, too")
     how.add_argument("--no-report", action="store_true", help="skip the HTML report at the end")
     how.add_argument("--dry-run", action="store_true", help="say what would be done, start nothing")
@@ -273,6 +316,7 @@ def parse(arguments: Sequence[str]) -> Options:
     _check_names("method", (given.method,), METHODS)
     for name, least, most in (
         ("trials", 1, 1000),
+        ("learn", 0, 100),
         ("cycles", 1, 1000),
         ("seed", 0, 2**31 - 1000),
         ("period", 0.5, 600.0),
@@ -283,9 +327,12 @@ def parse(arguments: Sequence[str]) -> Options:
         if not least <= value <= most:
             raise OptionError(f"--{name} is {value}: choose {least} to {most}")
     _check_loads(given)
+    _check_path_and_page(given)
     hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
     if hardware is not None and given.offline:
         raise OptionError("--offline simulates everything: it does not go with --hardware")
+    if given.feedback and "der" not in models:
+        raise OptionError("--feedback corrects plans of the rod: choose --models der")
     limb = given.limb or (Path(hardware.limb) if hardware and hardware.limb else None)
     if hardware is not None and limb is None:
         raise OptionError("--hardware needs a limb file: --limb FILE (scripts/calibrate_limb.py)")
@@ -307,7 +354,11 @@ def parse(arguments: Sequence[str]) -> Options:
         dry_run=given.dry_run,
         record_images=given.record_images,
         report=not given.no_report,
+        learn=given.learn,
         path=given.path.resolve() if given.path is not None else None,
+        nearest=given.nearest,
+        page=given.page,
+        feedback=given.feedback,
         mounting=given.mounting,
         payload=given.payload,
         payload_at=given.payload_at,
@@ -326,7 +377,7 @@ def _motions(given: argparse.Namespace) -> tuple[str, ...]:
     if given.motions:
         raise OptionError("--path is drawn in place of --motions: give one of the two")
     try:
-        Motion.from_csv(given.path)
+        Motion.from_csv(given.path, nearest=given.nearest)
     except PlanningError as error:
         raise OptionError(f"--path: {error}") from error
     return (re.sub(r"[^A-Za-z0-9-]+", "_", given.path.stem).strip("_") or "path",)
@@ -345,6 +396,20 @@ def _check_loads(given: argparse.Namespace) -> None:
         raise OptionError(f"--mounting: {error}") from error
     if given.payload_at is not None and not given.payload:
         raise OptionError("--payload-at is the place of a payload: give --payload, too")
+
+
+def _check_path_and_page(given: argparse.Namespace) -> None:
+    """Refuse --nearest without a path, a port that is none, and a page without a graph.
+
+    Raises:
+        OptionError: names the option.
+    """
+    if given.nearest and given.path is None:
+        raise OptionError("--nearest is about a path: give --path FILE.csv, too")
+    if given.page is not None and not 1 <= given.page <= 65535:
+        raise OptionError(f"--page is {given.page}: choose a port of 1 to 65535")
+    if given.page is not None and given.offline:
+        raise OptionError("--page shows a running graph: it does not go with --offline")
 
 
 def _timestamped() -> Path:

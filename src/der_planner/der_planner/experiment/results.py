@@ -19,6 +19,7 @@ from der_planner.runs.evaluation import (
     format_table,
     load_run,
     plot_error,
+    plot_learning,
     plot_pressures,
     plot_tip,
     summarise,
@@ -44,7 +45,7 @@ def conclude(options: Options, kept: Kept, progress: Progress) -> Path:
         GraphError: a bag is missing or cannot be evaluated; the others are not lost.
     """
     progress.say("evaluating")
-    runs = [_load(options.out, trial, entry) for trial, entry in kept]
+    runs = [load(options.out, trial, entry) for trial, entry in kept]
     found = [evaluate_run(run) for run in runs]
     path = write_results(found, options.out)
     print(format_table(summarise(found), compare(found)))
@@ -52,15 +53,23 @@ def conclude(options: Options, kept: Kept, progress: Progress) -> Path:
     figures = [
         path for plot in (plot_tip, plot_error, plot_pressures) for path in plot(runs, options.out)
     ]
+    learned = plot_learning(found, options.out)
+    figures += learned
     progress.say(f"results: {path}")
     if options.report:
         written = write_report(runs, found, options.out / "report", drawn=figures)
         progress.say(f"report: {written.page}")
-    progress.say(f"figures: {options.out}/tip.png, error.png, pressures.png")
+    more = ", learning.png" if learned else ""
+    progress.say(f"figures: {options.out}/tip.png, error.png, pressures.png{more}")
     return path
 
 
-def _load(folder: Path, trial: Trial, entry: dict[str, Any]) -> RunSeries:
+def load(folder: Path, trial: Trial, entry: dict[str, Any]) -> RunSeries:
+    """Return a finished run of an experiment.
+
+    Raises:
+        GraphError: nothing was kept of it, or it cannot be read.
+    """
     place = entry.get("bag") or entry.get("arrays")
     if place is None:
         raise GraphError(f"nothing was kept of {trial.name}: remove trials/{trial.name}.json")

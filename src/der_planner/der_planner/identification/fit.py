@@ -6,6 +6,7 @@ import datetime
 import time as clock
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +21,9 @@ from der_planner.identification.problem import Problem
 from der_planner.identification.report import FitReport, LoadsFit, Unknown, loads_of
 from der_planner.identification.rod_angles import NODES
 from der_planner.limb import CalibratedRange, Limb
-from der_planner.model.bending import PolylineKinematics
-from der_planner.model.response import NODES as NODES_OF_TIPS
-from der_planner.model.response import simulate
+from der_planner.model.response import RodModel, simulate
 from der_planner.model.series import CONTROL_PERIOD
-from der_planner.rod import ConvergenceError, Rod
+from der_planner.rod import ConvergenceError
 
 Array = NDArray[np.float64]
 
@@ -72,38 +71,90 @@ def fit(
     warnings = list(prepared.warnings)
     air = _try_air(prepared, warnings)
     offset = np.zeros(limb.segment_count) if air is None else air.offset
-    loaded = any(limb.gravity[:2])
-    lengths = fit_geometry(limb, prepared.log) if geometry and not loaded else None
-    if lengths is not None:
-        limb = with_geometry(limb, lengths.lengths, lengths.connector, lengths.base)
-    problem = Problem(limb, prepared, offset, groups, nodes)
-    values, jacobian = problem.solve()
-    if geometry and loaded:
-        limb, lengths, problem, values, jacobian = _with_lengths(
-            limb, prepared, offset, problem, values, jacobian
-        )
-    unknowns, correlation = problem.uncertainties(values, jacobian)
+    fitted = _fit_bends_and_lengths(limb, prepared, offset, groups, nodes, geometry)
+    unknowns, correlation = fitted.problem.uncertainties(fitted.values, fitted.jacobian)
     if "dynamics" in groups and _all_untold(unknowns):
         warnings.append(
-            "the log is too slow to tell the stiffness apart from the gain: stiffness and "
-            "damping keep "
-            "their old values; steps or a sweep would tell them"
+            "the log is too slow to tell the stiffness apart from the gain: stiffness and damping "
+            "keep their old values; steps or a sweep would tell them"
         )
-        problem = Problem(limb, prepared, offset, groups - {"dynamics"}, nodes)
-        values, jacobian = problem.solve()
-        unknowns, correlation = problem.uncertainties(values, jacobian)
-    remaining = problem.remaining(values)
-    found = _finish(limb, to_limb(limb, values), air, prepared, remaining)
+        slow = Problem(fitted.limb, prepared, offset, groups - {"dynamics"}, nodes)
+        fitted = _Fitted(fitted.limb, fitted.lengths, slow, *slow.solve())
+        unknowns, correlation = slow.uncertainties(fitted.values, fitted.jacobian)
+    remaining = fitted.problem.remaining(fitted.values)
+    found = _finish(limb, to_limb(fitted.limb, fitted.values), air, prepared, remaining)
     pcc_residual = np.full(limb.segment_count, np.nan)
-    if "dynamics" in problem.groups or loaded:
-        pcc_segments, pcc_residual = fit_pcc(found, prepared, offset)
-        found = replace(found, pcc_segments=pcc_segments)
+    if "dynamics" in fitted.problem.groups or any(limb.gravity[:2]):
+        found, pcc_residual = _with_arcs(found, prepared, offset, warnings)
     report = _report(
-        log, prepared, unknowns, correlation, remaining, air=air, geometry=lengths,
-        pcc_residual=pcc_residual, evaluations=problem.evaluations,
+        log, prepared, unknowns, correlation, remaining, air=air, geometry=fitted.lengths,
+        pcc_residual=pcc_residual, evaluations=fitted.problem.evaluations,
         fit_time=clock.perf_counter() - begin, warnings=tuple(warnings), loads=loads_of(found),
     )  # fmt: skip
     return found, report
+
+
+class _Fitted(NamedTuple):
+    """A limb with its lengths, and the problem that was solved on it with its solution."""
+
+    limb: Limb
+    lengths: GeometryFit | None
+    problem: Problem
+    values: Array
+    jacobian: Array
+
+
+def _fit_bends_and_lengths(
+    limb: Limb,
+    prepared: Prepared,
+    offset: Array,
+    groups: frozenset[str],
+    nodes: int,
+    geometry: bool,
+) -> _Fitted:
+    """Fit the lengths first, or in turn with the bend angles where weight bends the limb unevenly.
+
+    How unevenly it bends is only known once it is fitted, and how heavy it is depends on its
+    lengths.
+    """
+    loaded = any(limb.gravity[:2])
+    prior = limb
+    lengths = fit_geometry(limb, prepared.log) if geometry and not loaded else None
+    if lengths is not None:
+        limb = with_geometry(prior, lengths.lengths, lengths.connector, lengths.base)
+    problem = Problem(limb, prepared, offset, groups, nodes)
+    fitted = _Fitted(limb, lengths, problem, *problem.solve())
+    for _ in range(MOST_PASSES if geometry and loaded else 0):
+        uneven = _uneven_tip(to_limb(fitted.limb, fitted.values), prepared, offset)
+        lengths = fit_geometry(prior, prepared.log, uneven=uneven)
+        if lengths is None:
+            break
+        limb = with_geometry(prior, lengths.lengths, lengths.connector, lengths.base)
+        problem = Problem(limb, prepared, offset, groups, nodes, start=fitted.values)
+        moved = np.abs(np.subtract(_lengths(limb), _lengths(fitted.limb))).max()
+        fitted = _Fitted(limb, lengths, problem, *problem.solve())
+        if moved < SAME_LENGTH:
+            break
+    return fitted
+
+
+def _uneven_tip(limb: Limb, prepared: Prepared, offset: Array) -> Array:
+    """Return the tip (K, 2) of the limb along the log less that of evenly bent segments [m].
+
+    Raises:
+        LogError: the rod of the planners, which has more nodes than that of the fit, cannot follow.
+    """
+    model = RodModel(limb)
+    try:
+        seen = simulate(model, prepared.log.time, pressures=prepared.pressure - offset)
+    except ConvergenceError as error:
+        raise LogError(f"the fitted rod cannot follow the log with all nodes: {error}") from error
+    uneven: Array = seen.tip - model.kinematics.tip(seen.bend_angles)
+    return uneven
+
+
+def _lengths(limb: Limb) -> list[float]:
+    return [limb.base_length, *(segment.length for segment in limb.segments)]
 
 
 def _all_untold(unknowns: tuple[Unknown, ...]) -> bool:
@@ -111,40 +162,18 @@ def _all_untold(unknowns: tuple[Unknown, ...]) -> bool:
     return bool(stiffness) and all(stiffness)
 
 
-def _with_lengths(
-    limb: Limb,
-    prepared: Prepared,
-    offset: Array,
-    problem: Problem,
-    values: Array,
-    jacobian: Array,
-) -> tuple[Limb, GeometryFit | None, Problem, Array, Array]:
-    """Return the limb with lengths, and the fit to it, where weight bends the limb unevenly.
-
-    How unevenly it bends is only known once it is fitted, and how heavy it is depends on its
-    lengths: both are found in turn.
-    """
-    prior, lengths = limb, None
-    for _ in range(MOST_PASSES):
-        found = to_limb(limb, values)
-        try:
-            seen = simulate(found, prepared.log.time, pressures=prepared.pressure - offset)
-        except ConvergenceError:
-            break
-        uneven = seen.tip - PolylineKinematics.of_rod(Rod.from_limb(found, NODES_OF_TIPS)).tip(
-            seen.bend_angles
-        )
-        lengths = fit_geometry(prior, prepared.log, uneven=uneven)
-        if lengths is None:
-            break
-        before = [limb.base_length, *(s.length for s in limb.segments)]
-        limb = with_geometry(prior, lengths.lengths, lengths.connector, lengths.base)
-        moved = np.abs(np.subtract([limb.base_length, *(s.length for s in limb.segments)], before))
-        problem = Problem(limb, prepared, offset, problem.groups, problem.nodes, start=values)
-        values, jacobian = problem.solve()
-        if moved.max() < SAME_LENGTH:
-            break
-    return limb, lengths, problem, values, jacobian
+def _with_arcs(
+    found: Limb, prepared: Prepared, offset: Array, warnings: list[str]
+) -> tuple[Limb, Array]:
+    """Return the limb with the PCC model's numbers, and that model's errors (M,) [rad]."""
+    segments, residual = fit_pcc(found, prepared, offset)
+    if np.all(np.isfinite(residual)):
+        return replace(found, pcc_segments=segments), residual
+    warnings.append(
+        "arcs of constant curvature cannot follow this log under its loads: the PCC model has the "
+        "rod's numbers"
+    )
+    return found, residual
 
 
 def _report(

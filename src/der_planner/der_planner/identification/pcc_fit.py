@@ -45,7 +45,8 @@ def fit_pcc(limb: Limb, prepared: Prepared, offset: Array) -> tuple[tuple[Segmen
         offset: (M,) of the pressure sensors [Pa].
 
     Returns:
-        The segments for the PCC model, and its root mean square errors (M,) [rad].
+        The segments for the PCC model, and its root mean square errors (M,) [rad]; NaN if the arcs
+        cannot follow the log.
     """
     time = prepared.log.time
     pressure = prepared.pressure - offset
@@ -57,7 +58,10 @@ def fit_pcc(limb: Limb, prepared: Prepared, offset: Array) -> tuple[tuple[Segmen
 
     def angles(x: Array) -> Array:
         arcs = ArcModel(replace(limb, segments=segments_of(limb, x)))
-        return arcs.run(arcs.resting(effective[0]), held, period).bend_angles
+        try:
+            return arcs.run(arcs.resting(effective[0]), held, period).bend_angles
+        except RuntimeError:  # arcs that buckle under their load do not come to rest
+            return np.full(prepared.log.bend_angles.shape, np.nan)
 
     def residual(x: Array) -> Array:
         error = (angles(x) - prepared.log.bend_angles)[rows]
@@ -65,23 +69,17 @@ def fit_pcc(limb: Limb, prepared: Prepared, offset: Array) -> tuple[tuple[Segmen
         data = error / (ANGLE_ERROR * np.sqrt(CORRELATION))
         return np.concatenate([data.ravel(), ((x - centre) / spread)[free]])
 
+    centre, spread, scale, low, high, free = _unknowns(limb)
+    start = centre + np.repeat([0.0, 1e-4, 0.0, 0.0, 0.0], [count, count, count, count, 1])
+
     def put(part: Array) -> Array:
-        x = start.copy()
+        x: Array = start.copy()
         x[free] = part
         return x
 
     def of_part(part: Array) -> Array:
         return residual(put(part))
 
-    def full(values: Array) -> Array:
-        return np.append(np.repeat(values[:4], count), values[4])
-
-    centre = np.zeros(4 * count + 1)
-    centre[count : 2 * count] = [segment.material_damping for segment in limb.segments]
-    spread, scale, low, high = full(SPREAD), full(SCALE), full(LOW), full(HIGH)
-    free = np.ones(len(centre), dtype=bool)
-    free[2 * count : 4 * count] = any(limb.gravity[:2])
-    start = centre + full(np.array([0.0, 1e-4, 0.0, 0.0, 0.0]))
     solution = least_squares(
         of_part,
         start[free],
@@ -95,8 +93,22 @@ def fit_pcc(limb: Limb, prepared: Prepared, offset: Array) -> tuple[tuple[Segmen
         max_nfev=4,
     )
     found = put(solution.x)
-    error = np.sqrt(np.nanmean((angles(found) - prepared.log.bend_angles) ** 2, axis=0))
-    return segments_of(limb, found), np.asarray(error)
+    error = (angles(found) - prepared.log.bend_angles)[rows]
+    return segments_of(limb, found), np.asarray(np.sqrt(np.mean(error**2, axis=0)))
+
+
+def _unknowns(limb: Limb) -> tuple[Array, Array, Array, Array, Array, NDArray[np.bool_]]:
+    """Return centres, spreads, scales and bounds of the (4M + 1,) unknowns, and which are free."""
+    count = limb.segment_count
+
+    def each(values: Array) -> Array:
+        return np.append(np.repeat(values[:4], count), values[4])
+
+    centre = np.zeros(4 * count + 1)
+    centre[count : 2 * count] = [segment.material_damping for segment in limb.segments]
+    free = np.ones(len(centre), dtype=bool)
+    free[2 * count : 4 * count] = any(limb.gravity[:2])
+    return centre, each(SPREAD), each(SCALE), each(LOW), each(HIGH), free
 
 
 def segments_of(limb: Limb, x: Array) -> tuple[Segment, ...]:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from der_planner.identification.logs.log import LogError
 from der_planner.limb import Limb
 from der_planner.model.response import simulate
-from der_planner.rod import ConvergenceError
 
 Array = NDArray[np.float64]
 
@@ -47,13 +46,13 @@ def predict(
         angles are not used.
 
     Raises:
-        LogError: the rod cannot follow the pressures.
+        LogError: the model cannot follow the pressures, or does not come to rest.
     """
     try:
         response = simulate(limb, time, pressures=differential_pressure, model=model)
-    except ConvergenceError as error:
+    except RuntimeError as error:
         raise LogError(
-            f"the rod of the limb '{limb.name}' cannot follow this log ({error}): check that the "
-            "limb file is that of this limb, with its mounting and what it carries"
+            f"the {model} model of the limb '{limb.name}' cannot follow this log ({error}): check "
+            "that the limb file is that of this limb, with its mounting and what it carries"
         ) from error
     return Prediction(response.bend_angles, response.tip)

@@ -35,7 +35,8 @@ UNTOLD = 0.8
 NOT_FOLLOWED = np.pi
 """Error that every row is given where the rod cannot follow a trial of the optimiser [rad]."""
 STIFFER_STARTS = (0.0, 0.25, 0.5, 0.9)
-"""Added to the logarithm of the stiffness until the rod can follow the log from there."""
+"""Added to the logarithm of the stiffness, or taken off that of the mass, until the rod can follow
+the log from there."""
 
 
 class Problem:
@@ -159,13 +160,13 @@ class Problem:
         return values
 
     def _start_where_the_rod_follows(self, low: Array, high: Array) -> None:
-        """Begin with a stiffer limb if the rod cannot follow the log with the first guess."""
+        """Begin stiffer (or lighter) if the rod cannot follow the log with the first guess."""
         begin = self._start.copy()
-        for more in STIFFER_STARTS:
+        name, sign = ("log_mass", -1.0) if "mass" in self.groups else ("log_stiffness", 1.0)
+        fitted = (0, column(name)) in self._wanted
+        for more in STIFFER_STARTS if fitted else STIFFER_STARTS[:1]:
             self._start = begin.copy()
-            self._start[:, column("log_stiffness")] += more
-            if more:
-                self._start[:, column("material_damping")] = 0.02
+            self._start[:, column(name)] += sign * more
             if self._evaluate(np.clip(self._scaled(self._start), low, high))[0] is not None:
                 return
         raise LogError(

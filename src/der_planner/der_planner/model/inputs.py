@@ -9,7 +9,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from der_planner.limb import Limb
 from der_planner.model import air, material
-from der_planner.model.derivative import Chain, Derivative, OfInstants, OfWindow
+from der_planner.model.derivative import (
+    ArcSlopes,
+    Chain,
+    Derivative,
+    OfInstants,
+    OfWindow,
+    RodSlopes,
+)
 from der_planner.model.drive import STEPS, Bend, Drive
 from der_planner.model.physics import ArcModel, Motion, RodModel, State
 from der_planner.model.series import step_middles
@@ -25,7 +32,7 @@ class Case:
     """What a model is to be run with; names as of `response.simulate`.
 
     Attributes:
-        at_rest: where the start is the state at rest under the first pressures: it, and these.
+        rests_under: (M,) the first effective pressures [Pa], where the start rests under them.
     """
 
     boundaries: Array
@@ -33,13 +40,22 @@ class Case:
     chain: Chain
     begin: State
     memory: material.Memory
-    at_rest: tuple[RodState, Array] | None = None
+    rests_under: Array | None = None
 
     def derivative(self, physics: RodModel | ArcModel, motion: Motion) -> Derivative | None:
-        """Return the derivative of a linearised motion; None for the arcs."""
-        if not isinstance(physics, RodModel) or motion.trajectory is None:
+        """Return the derivative of a motion; None if it was not linearised."""
+        if isinstance(physics, ArcModel):
+            if motion.linearisation is None:
+                return None
+            rests = self.rests_under is not None
+            arcs = ArcSlopes(physics.pcc, motion.bend_angles, motion.linearisation, at_rest=rests)
+            return Derivative(arcs, self.chain)
+        if motion.trajectory is None or motion.trajectory.linearisation is None:
             return None
-        return Derivative(physics.rod, motion.trajectory, self.chain, self.at_rest)
+        at_rest = None
+        if self.rests_under is not None and isinstance(self.begin, RodState):
+            at_rest = self.begin, self.rests_under
+        return Derivative(RodSlopes(physics.rod, motion.trajectory, at_rest), self.chain)
 
 
 def prepare(
@@ -67,8 +83,7 @@ def prepare(
     count = steps or (1 if isinstance(physics, RodModel) else max(1, round(period / _ARC_STEP)))
     chain, remembered, first = _from_pressures(physics.limb, times, given, count, bend, memory)
     begin = physics.resting(first) if start is None else start
-    at_rest = (begin, first) if start is None and isinstance(begin, RodState) else None
-    return Case(times, period, chain, begin, remembered, at_rest)
+    return Case(times, period, chain, begin, remembered, first if start is None else None)
 
 
 def _check(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
@@ -17,7 +18,7 @@ from der_planner.model.bending import (
     bend_angles,
     bend_outputs,
 )
-from der_planner.pcc import Pcc
+from der_planner.pcc import Linearisation, Pcc
 from der_planner.rod import Rod, RodState, Trajectory
 
 Array = NDArray[np.float64]
@@ -34,12 +35,31 @@ class Motion:
         tip: (K+1, 2) [m].
         final: state at the end, from which the same model can go on.
         trajectory: of the rod, with all nodes; None for the arcs.
+        linearisation: of the arcs, if asked for; that of the rod is its trajectory's.
     """
 
     bend_angles: Array
     tip: Array
     final: State
     trajectory: Trajectory | None = None
+    linearisation: Linearisation | None = None
+
+
+@dataclass(frozen=True)
+class Shot:
+    """Where the tip went in K intervals, and how the pressures move it.
+
+    Attributes:
+        tip: (K+1, 2) at the beginning of each interval and at the end [m].
+        final: state at the end.
+        sensitivity: returns ∂tip/∂input (K+1, 2, K, M) [m/Pa]; its argument is the pressure (R, M)
+            in the R steps after the start of an interval when its input is raised by one, None for
+            one during its own steps. Only if asked for.
+    """
+
+    tip: Array
+    final: State
+    sensitivity: Callable[[Array | None], Array] | None = None
 
 
 @dataclass(frozen=True)
@@ -72,6 +92,11 @@ class Model(Protocol):
         self, start: State, effective: Array, period: float, *, linearise: bool = False
     ) -> Motion:
         """Simulate K intervals of ``period`` [s] under effective pressures (K, S, M) [Pa]."""
+
+    def shoot(
+        self, start: State, effective: Array, period: float, *, linearise: bool = False
+    ) -> Shot:
+        """Simulate the same for the tip alone; ``linearise`` gives its sensitivity."""
 
 
 class RodModel:
@@ -116,6 +141,15 @@ class RodModel:
             bend_angles(self.rod, trajectory.q), trajectory.tip[:, :2], trajectory.final, trajectory
         )
 
+    def shoot(
+        self, start: State, effective: Array, period: float, *, linearise: bool = False
+    ) -> Shot:
+        """Simulate the rod for its tip alone."""
+        tip = 4 * (self.rod.nodes - 1)
+        motion = self.trajectory(start, effective, period, [tip, tip + 1] if linearise else None)
+        linear = motion.linearisation
+        return Shot(motion.tip[:, :2], motion.final, None if linear is None else linear.sensitivity)
+
     def trajectory(
         self, start: State, effective: Array, period: float, outputs: list[int] | None = None
     ) -> Trajectory:
@@ -140,7 +174,7 @@ class ArcModel:
         self.pcc = Pcc(limb)
         self.kinematics = ArcKinematics(limb)
 
-    @property
+    @cached_property
     def rest(self) -> ArcState:
         """The vented limb at rest."""
         return self.resting(np.zeros(self.limb.segment_count))
@@ -157,18 +191,33 @@ class ArcModel:
     def run(
         self, start: State, effective: Array, period: float, *, linearise: bool = False
     ) -> Motion:
-        """Simulate the arcs.
-
-        Raises:
-            ValueError: a derivative is asked for, which the arcs do not have.
-        """
-        if linearise:
-            raise ValueError("the arcs have no exact derivative: ask for model='der'")
+        """Simulate the arcs; ``linearise`` keeps the derivatives of the bend angles."""
         if not isinstance(start, ArcState):
             raise TypeError("the arcs start from a state of the arcs, got one of the rod")
-        step = period / effective.shape[1]
-        angles, rates = self.pcc.simulate(effective, step, start.angles, start.rates)
-        return Motion(angles, self.pcc.tip(angles), ArcState(angles[-1], rates[-1]))
+        given = effective, period / effective.shape[1], start.angles, start.rates
+        linear = None
+        if linearise:
+            angles, rates, linear = self.pcc.linearised(*given)
+        else:
+            angles, rates = self.pcc.simulate(*given)
+        final = ArcState(angles[-1], rates[-1])
+        return Motion(angles, self.pcc.tip(angles), final, linearisation=linear)
+
+    def shoot(
+        self, start: State, effective: Array, period: float, *, linearise: bool = False
+    ) -> Shot:
+        """Simulate the arcs for their tip alone."""
+        motion = self.run(start, effective, period, linearise=linearise)
+        linear = motion.linearisation
+        if linear is None:
+            return Shot(motion.tip, motion.final)
+        jacobian = self.pcc.tip_jacobian(motion.bend_angles)
+
+        def sensitivity(pulse: Array | None) -> Array:
+            moved: Array = np.einsum("kan,knjm->kajm", jacobian, linear.sensitivity(pulse))
+            return moved
+
+        return Shot(motion.tip, motion.final, sensitivity)
 
 
 def tip_and_bend(rod: Rod) -> list[int]:

@@ -25,6 +25,7 @@ from der_planner.model.physics import (
     Model,
     Motion,
     RodModel,
+    Shot,
     State,
     build,
     tip_and_bend,
@@ -40,6 +41,7 @@ __all__ = [
     "Motion",
     "Response",
     "RodModel",
+    "Shot",
     "State",
     "build",
     "simulate",
@@ -110,7 +112,7 @@ def simulate(
         steps: S, integrator steps an interval; default 5 for commands, for pressures 1 (rod) or one
             of 10 ms (arcs).
         nodes: of the rod, unless ``limb`` is a model.
-        linearise: also give the derivative (of the rod).
+        linearise: also give the derivative.
 
     Raises:
         ValueError: neither or both of commands and pressures, or shapes that do not fit.

@@ -2,24 +2,38 @@
 
 from __future__ import annotations
 
+import dataclasses
 import queue
 import sys
 import threading
-import time
+import time as clock
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import PointStamped
 from nav_msgs.msg import Path as PathMessage
+from numpy.typing import NDArray
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from der_msgs.msg import MotionCommand, PressurePlan, PressureSetpoint, PressureState
+from der_msgs.msg import (
+    LimbEstimate,
+    LimbState,
+    MotionCommand,
+    PressurePlan,
+    PressureSetpoint,
+    PressureState,
+)
+from der_planner.control.estimation import Estimate
+from der_planner.control.feedback import Feedback
 from der_planner.nodes import planner_messages
 from der_planner.nodes.driver_watch import DriverWatch, Ending
 from der_planner.nodes.planner_action import MotionAction
-from der_planner.nodes.planner_markers import limb_marker, path_markers
+from der_planner.nodes.planner_feedback import Corrector, Done
+from der_planner.nodes.planner_markers import estimate_marker, limb_marker, path_markers
 from der_planner.nodes.planner_parameters import read_parameters
 from der_planner.nodes.planner_requests import Request, from_command, from_path, new_plan_id
 from der_planner.nodes.planner_stage import Stage
@@ -31,8 +45,12 @@ from limb_interfaces.overrides import check_overrides
 from limb_interfaces.runner import run_node
 from limb_interfaces.stamps import NANOSECONDS
 
+Array = NDArray[np.float64]
+
 _MARGIN = 100_000_000
 """A plan starts this much [ns] after the earliest instant, so that its message travels first."""
+_FEEDBACK_MARGIN = 500_000_000
+"""What feedback needs to be made ready for a plan takes less than this [ns]."""
 _ARMING_PATIENCE = 0.5
 """[s] for the state of a driver that was armed just now to arrive."""
 _LEVELS = {
@@ -65,7 +83,7 @@ class PlannerNode(Node):
         self._state, self._plan_id, self._reason, self._progress = "starting", "", "", 0.0
         self._last_refusal = ""
         self._request: Request | None = None
-        self._newest: tuple[str, Plan] | None = None
+        self._newest: tuple[str, Plan, bool] | None = None
         self._work: queue.SimpleQueue[Request | None] = queue.SimpleQueue()
         self._plans = self.create_publisher(PressurePlan, topics.PLAN, qos.LATCHED)
         self._setpoints = self.create_publisher(
@@ -74,13 +92,16 @@ class PlannerNode(Node):
         self._references = self.create_publisher(PointStamped, topics.TIP_REFERENCE, qos.STATES)
         self._markers = self.create_publisher(MarkerArray, topics.SHAPE_MARKERS, qos.STATES)
         self._diagnostics = DiagnosticsPublisher(self, self._health)
-        self._driver = DriverWatch(time.monotonic, self._options.driver_timeout)
+        self._driver = DriverWatch(clock.monotonic, self._options.driver_timeout)
         self._stage = Stage(self, self._driver, self._now, self._options.lead)
+        self._estimates = self.create_publisher(LimbEstimate, topics.ESTIMATE, qos.STATES)
+        self._corrector = Corrector(self, self._now)
         self._action = MotionAction(self, self._take_command, self._stop_plan, self._stage.find)
         self._planning = threading.Thread(target=self._run, name="planning", daemon=True)
         self._planning.start()
+        self.create_subscription(PressureState, topics.PRESSURE_STATE, self._on_driver, qos.STATES)
         self.create_subscription(
-            PressureState, topics.PRESSURE_STATE, self._stage.take_state, qos.STATES
+            LimbState, topics.LIMB_STATE, self._corrector.take_state, qos.STATES
         )
         self.create_subscription(MotionCommand, topics.COMMAND, self._on_command, qos.COMMANDS)
         self.create_subscription(PathMessage, topics.PATH, self._on_path, qos.COMMANDS)
@@ -89,6 +110,10 @@ class PlannerNode(Node):
         self.create_timer(0.1, self._show)
 
     # What comes in -------------------------------------------------------------------------
+
+    def _on_driver(self, message: PressureState) -> None:
+        self._stage.take_state(message)
+        self._corrector.take_pressures(message)
 
     def _on_command(self, message: MotionCommand) -> None:
         self._take_command(message, lambda _: None)
@@ -125,7 +150,9 @@ class PlannerNode(Node):
     def _on_path(self, message: PathMessage) -> None:
         plan_id = new_plan_id()
         try:
-            request = from_path(message, plan_id, self._options, self._now())
+            nearest = bool(self.get_parameter("nearest_path").value)
+            options = replace(self._options, nearest_path=nearest)
+            request = from_path(message, plan_id, options, self._now())
         except (ValueError, IndexError) as error:
             self._refuse(plan_id, str(error))
             return
@@ -148,8 +175,9 @@ class PlannerNode(Node):
         elif obstacle is not None:
             response.message = obstacle.reason
         else:
-            plan_id, result = newest
-            schedule = self._play(self._stage.unspent(plan_id), result, start=0)
+            plan_id, result, corrected = newest
+            feedback = Feedback(result) if corrected else None
+            schedule = self._play(self._stage.unspent(plan_id), result, 0, feedback)
             response.success = True
             response.message = f"plan {schedule.plan_id} starts at {schedule.start * 1e-9:.2f} s"
         return response
@@ -204,6 +232,7 @@ class PlannerNode(Node):
             self.get_logger().error(f"{text}: {reason}")
         else:
             self.get_logger().info(f"{text}: {reason}" if reason else text)
+        self._corrector.forget(schedule)
         self._action.end(schedule.plan_id, outcome, reason)
 
     def _refuse(self, plan_id: str, reason: str) -> None:
@@ -261,7 +290,11 @@ class PlannerNode(Node):
             quick = Motion.named("asynchronous", amplitude=0.1, period=2.0, cycles=1)
             for model, methods in METHODS.items():
                 for method in methods:
-                    plan(self._options.limb, quick, model, method, nodes=self._options.nodes)
+                    found = plan(
+                        self._options.limb, quick, model, method, nodes=self._options.nodes
+                    )
+            # The last of them has compiled whatever feedback calls as well.
+            Feedback(found)
         except Exception as error:
             self.get_logger().error(f"the limb cannot be planned for: {error}")
             self._set("error", reason=str(error))
@@ -277,32 +310,49 @@ class PlannerNode(Node):
                 raise Cancelled
             self._progress = share
 
-        # A motion that is being played goes on meanwhile; the new one takes over where it then is.
-        allowance = _MARGIN
-        while True:
-            progress(0.0)
-            stamp, start = self._hand_over(request.start, allowance)
-            result = plan(
-                request.limb, request.motion, request.model, request.method,
-                nodes=self._options.nodes, start=start, progress=progress,
-            )  # fmt: skip
-            progress(1.0)
-            if start is None or stamp - self._options.lead > self._now():
-                break
-            allowance = 2 * round(result.solve_time * 1e9) + _MARGIN
+        stamp, start, result = self._planned(request, progress)
+        feedback = Feedback(result) if request.feedback else None
+        if feedback is not None:
+            result = dataclasses.replace(result, method=f"{result.method} + feedback")
         for warning in result.warnings:
             self.get_logger().warning(f"plan {request.plan_id}: {warning}")
         with self._lock:
-            self._newest = (request.plan_id, result)
+            self._newest = (request.plan_id, result, request.feedback)
         if self._options.auto_start:
             obstacle = self._driver.wait(_ARMING_PATIENCE)
             if obstacle is not None:
                 raise Obstructed(obstacle)
             begin = stamp if start is not None else request.start
-            self._play(request.plan_id, result, begin, request.cancelled)
+            self._play(request.plan_id, result, begin, feedback, request.cancelled)
         else:
             self._publish_plan(Schedule(request.plan_id, result, 0))
             self._set("done", request.plan_id, reason="waits for the service start", progress=1.0)
+
+    def _planned(
+        self, request: Request, progress: Callable[[float], None]
+    ) -> tuple[int, Start | None, Plan]:
+        """Return when a plan can take over, where the limb is then (None: at rest), and the plan.
+
+        A motion that is being played goes on meanwhile; the new one takes over where it then is.
+        """
+        allowance = _MARGIN + (_FEEDBACK_MARGIN if request.feedback else 0)
+        while True:
+            progress(0.0)
+            begun = clock.monotonic()
+            stamp, start = self._hand_over(request.start, allowance)
+            if request.learned is not None:
+                if start is not None:
+                    raise ValueError("a learned plan begins at rest: send it after this motion")
+                return stamp, start, request.learned
+            result = plan(
+                request.limb, request.motion, request.model, request.method,
+                nodes=self._options.nodes, start=start, progress=progress,
+            )  # fmt: skip
+            progress(1.0)
+            spare = _FEEDBACK_MARGIN if request.feedback else 0
+            if start is None or stamp - self._options.lead - spare > self._now():
+                return stamp, start, result
+            allowance = 2 * round((clock.monotonic() - begun) * 1e9) + spare + _MARGIN
 
     def _hand_over(self, wanted: int, allowance: int) -> tuple[int, Start | None]:
         """Return when a plan of now can take over, and where the limb is then; None: at rest."""
@@ -313,12 +363,20 @@ class PlannerNode(Node):
     # Streaming -----------------------------------------------------------------------------
 
     def _play(
-        self, plan_id: str, result: Plan, start: int, cancelled: threading.Event | None = None
+        self,
+        plan_id: str,
+        result: Plan,
+        start: int,
+        feedback: Feedback | None,
+        cancelled: threading.Event | None = None,
     ) -> Schedule:
         with self._stage.lock:
             if cancelled is not None and cancelled.is_set():
                 raise Cancelled
-            return self._stage.play(plan_id, result, start)
+            schedule = self._stage.play(plan_id, result, start)
+            if feedback is not None:
+                self._corrector.follow(schedule, feedback)
+            return schedule
 
     def scheduled(self, schedule: Schedule) -> None:
         """A plan has its instant: publish it before its first setpoint."""
@@ -335,9 +393,28 @@ class PlannerNode(Node):
         """Publish one setpoint and where the tip should be at its instant."""
         if index == 0:
             self.get_logger().info(f"plan {schedule.plan_id} started")
-        self._setpoints.publish(planner_messages.setpoint_message(schedule, index))
+        pressures = self._corrector.pressures(schedule, index)
+        self._setpoints.publish(planner_messages.setpoint_message(schedule, index, pressures))
         self._references.publish(planner_messages.reference_message(schedule, index))
         self._progress = (index + 1) / schedule.count
+
+    def revise(self, schedule: Schedule, index: int, pressures: Array, revision: int) -> None:
+        """Publish a setpoint that was sent already with other pressures (M,) [Pa]."""
+        message = planner_messages.setpoint_message(schedule, index, pressures, revision)
+        self._setpoints.publish(message)
+
+    def estimated(self, schedule: Schedule, instant: int, estimate: Estimate, done: Done) -> None:
+        """Publish what feedback knows of the limb at an instant [ns]."""
+        message = planner_messages.estimate_message(schedule, instant, estimate)
+        message.correction = done.correction.tolist()
+        message.share, message.reason = done.share, done.reason
+        message.solve_time = done.solve_time
+        self._estimates.publish(message)
+        self._markers.publish(estimate_marker(message))
+
+    def warn(self, text: str) -> None:
+        """Say that feedback was taken back."""
+        self.get_logger().warning(text)
 
     def _publish_plan(self, schedule: Schedule) -> None:
         self._plans.publish(planner_messages.plan_message(schedule))
@@ -371,6 +448,7 @@ class PlannerNode(Node):
                 "progress": f"{self._progress:.3f}",
                 "limb": self._options.limb.name,
                 "driver": self._driver.mode or "not heard",
+                "feedback": self._corrector.reason,
             }
             newest = self._newest
         if newest is not None:
@@ -405,6 +483,7 @@ class PlannerNode(Node):
         """Stop streaming and planning; called once before the node goes."""
         self._end_all("stopped", "the planner was ended")
         self._stage.close()
+        self._corrector.close()
         self._work.put(None)
 
 

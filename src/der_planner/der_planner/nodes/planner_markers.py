@@ -9,11 +9,13 @@ from numpy.typing import NDArray
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
+from der_msgs.msg import LimbEstimate
 from der_planner.planning import Plan
 from limb_interfaces import topics
 
 REFERENCE = ColorRGBA(r=0.1, g=0.6, b=0.2, a=1.0)
 PREDICTED = ColorRGBA(r=0.9, g=0.5, b=0.1, a=1.0)
+ESTIMATED = ColorRGBA(r=0.1, g=0.4, b=0.9, a=0.7)
 LIMB = ColorRGBA(r=0.1, g=0.6, b=0.2, a=0.5)
 
 
@@ -43,3 +45,9 @@ def path_markers(plan: Plan, stamp: Time) -> MarkerArray:
 def limb_marker(plan: Plan, index: int, stamp: Time) -> MarkerArray:
     """Return the centreline of the model's reference configuration at a setpoint."""
     return MarkerArray(markers=[_line("limb", plan.curve(index), LIMB, 0.006, stamp)])
+
+
+def estimate_marker(message: LimbEstimate) -> MarkerArray:
+    """Return the centreline of the estimated limb."""
+    points = np.array([(point.x, point.y) for point in message.curve])
+    return MarkerArray(markers=[_line("estimate", points, ESTIMATED, 0.004, message.header.stamp)])

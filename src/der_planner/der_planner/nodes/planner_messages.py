@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import numpy as np
 from geometry_msgs.msg import Point, PointStamped
+from numpy.typing import NDArray
 
-from der_msgs.msg import PressurePlan, PressureSetpoint
+from der_msgs.msg import LimbEstimate, PressurePlan, PressureSetpoint
+from der_planner.control.estimation import Estimate
 from der_planner.planning.streaming import Schedule
 from limb_interfaces import topics
 from limb_interfaces.stamps import stamp_from_nanoseconds
+
+Array = NDArray[np.float64]
 
 
 def plan_message(schedule: Schedule) -> PressurePlan:
@@ -31,12 +36,14 @@ def plan_message(schedule: Schedule) -> PressurePlan:
     return message
 
 
-def setpoint_message(schedule: Schedule, index: int) -> PressureSetpoint:
-    """Return one setpoint, stamped with the instant at which it takes effect."""
-    message = PressureSetpoint(plan_id=schedule.plan_id, index=index)
+def setpoint_message(
+    schedule: Schedule, index: int, pressures: Array, revision: int = 0
+) -> PressureSetpoint:
+    """Return one setpoint (M,) [Pa], stamped with the instant at which it takes effect."""
+    message = PressureSetpoint(plan_id=schedule.plan_id, index=index, revision=revision)
     message.header.stamp = stamp_from_nanoseconds(schedule.stamp(index))
     message.header.frame_id = topics.BASE_FRAME
-    message.differential_pressure = schedule.plan.differential_pressure[index].tolist()
+    message.differential_pressure = pressures.tolist()
     return message
 
 
@@ -45,5 +52,33 @@ def reference_message(schedule: Schedule, index: int) -> PointStamped:
     x, y = schedule.plan.tip_reference[index]
     message = PointStamped(point=Point(x=float(x), y=float(y)))
     message.header.stamp = stamp_from_nanoseconds(schedule.stamp(index))
+    message.header.frame_id = topics.BASE_FRAME
+    return message
+
+
+def estimate_message(schedule: Schedule, instant: int, estimate: Estimate) -> LimbEstimate:
+    """Return what is known of the limb at an instant [ns]."""
+    inputs = len(estimate.bend_angle)
+    sigma = np.split(estimate.deviation, np.arange(1, 5) * inputs)
+    x, y = estimate.tip
+    message = LimbEstimate(
+        plan_id=schedule.plan_id,
+        tip=Point(x=float(x), y=float(y)),
+        tip_covariance=estimate.tip_covariance.ravel(),
+        bend_angle=estimate.bend_angle.tolist(),
+        bend_angle_sigma=sigma[0].tolist(),
+        bend_rate=estimate.bend_rate.tolist(),
+        missing_pressure=estimate.missing_pressure.tolist(),
+        missing_pressure_sigma=sigma[2].tolist(),
+        gain_error=estimate.gain_error.tolist(),
+        gain_error_sigma=sigma[3].tolist(),
+        tip_offset=estimate.tip_offset,
+        curve=[
+            Point(x=float(a), y=float(b))
+            for a, b in schedule.plan.kinematics.curve(estimate.bend_angle)
+        ],
+        age=min(estimate.age, 1e9),
+    )
+    message.header.stamp = stamp_from_nanoseconds(instant)
     message.header.frame_id = topics.BASE_FRAME
     return message

@@ -34,7 +34,10 @@ class PlannerOptions:
     auto_start: bool
     branch: str
     limits: PathLimits
+    nearest_path: bool
     driver_timeout: float
+    learned_plans: str
+    feedback: bool
 
 
 def read_parameters(node: Node) -> PlannerOptions:
@@ -70,7 +73,7 @@ def read_parameters(node: Node) -> PlannerOptions:
                  choices=tuple(METHODS))
         ),
         method=str(
-            read("default_method", "", "method of the rod where none is named; empty: the best",
+            read("default_method", "", "method where none is named; empty: the best",
                  choices=("", *METHODS["der"]))
         ),
         nodes=int(read("nodes", 21, "nodes of the rod", at_least=6, at_most=201)),
@@ -89,8 +92,20 @@ def read_parameters(node: Node) -> PlannerOptions:
             float(read("path_acceleration", 0.05, "acceleration along and across it [m/s^2]",
                        at_least=1e-3, at_most=10.0)),
         ),
+        nearest_path=bool(
+            read("nearest_path", False, "follow the nearest path that the limb can follow where a "
+                 "path on the topic leaves its reach, instead of refusing it", read_only=False)
+        ),
         driver_timeout=float(
             read("driver_timeout", 1.0, "silence of the driver [s] after which it counts as dead",
                  at_least=0.2, at_most=60.0)
+        ),
+        learned_plans=str(
+            read("learned_plans", "", "folder of learned plans: a command of the method 'learned' "
+                 "names one of them in place of its motion")
+        ),
+        feedback=bool(
+            read("feedback", False, "correct plans of the rod while they are played, where a "
+                 "command does not ask for it")
         ),
     )  # fmt: skip

@@ -14,6 +14,8 @@ from der_planner.limb import Limb
 from der_planner.nodes.planner_parameters import LARGEST_PAYLOAD, PlannerOptions
 from der_planner.planning import Motion, choose_method
 from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD
+from der_planner.planning.plan_file import LEARNED, learned_plan
+from der_planner.planning.result import Plan
 from limb_interfaces import topics
 from limb_interfaces.stamps import NANOSECONDS, nanoseconds
 
@@ -27,7 +29,8 @@ FURTHEST_STAMP = 600
 class Request:
     """One thing to plan: what was asked for, and whether it is still wanted.
 
-    `limb` is mounted as asked for and carries the payload.
+    `limb` is mounted as asked for and carries the payload; a plan that was learned is played as it
+    is.
     """
 
     plan_id: str
@@ -36,6 +39,8 @@ class Request:
     model: str
     method: str
     start: int
+    learned: Plan | None = None
+    feedback: bool = False
     cancelled: threading.Event = field(default_factory=threading.Event)
 
 
@@ -81,6 +86,10 @@ def from_command(message: MotionCommand, options: PlannerOptions, now: int) -> R
     Raises:
         ValueError: a field has a value that cannot be planned; names it.
     """
+    start = start_of(nanoseconds(message.header.stamp), now)
+    limb = _asked_for(message, options)
+    if message.method == LEARNED:
+        return _from_learned(message, limb, options, start)
     model = message.model or options.model
     motion = Motion.named(
         message.motion,
@@ -89,15 +98,39 @@ def from_command(message: MotionCommand, options: PlannerOptions, now: int) -> R
         cycles=message.cycles or DEFAULT_CYCLES,
         branch=options.branch,
     )
-    method = _method(model, message.method, options)
-    start = start_of(nanoseconds(message.header.stamp), now)
+    method = choose_method(model, message.method or options.method)
+    feedback = _corrected(message, model, options)
+    return Request(message.plan_id, limb, motion, model, method, start, feedback=feedback)
+
+
+def _from_learned(
+    message: MotionCommand, limb: Limb, options: PlannerOptions, start: int
+) -> Request:
+    """Return the learned plan whose name stands in place of the motion's."""
+    plan = learned_plan(options.learned_plans, message.motion, limb)
+    motion = Motion(plan.motion, plan.amplitude, plan.period, plan.cycles)
+    feedback = _corrected(message, plan.model, options)
+    return Request(message.plan_id, plan.limb, motion, plan.model, LEARNED, start, plan, feedback)
+
+
+def _asked_for(message: MotionCommand, options: PlannerOptions) -> Limb:
+    """Return the limb mounted and loaded as a command says."""
     limb = options.limb.mounted(message.mounting) if message.mounting else options.limb
     if message.payload < 0 or message.payload > LARGEST_PAYLOAD:
         raise ValueError(f"the payload is {message.payload} kg: give 0 to {LARGEST_PAYLOAD:g} kg")
     carried = message.payload, message.payload_at
     if message.payload == 0:
         carried = options.payload, options.payload_at
-    return Request(message.plan_id, loaded(limb, *carried), motion, model, method, start)
+    return loaded(limb, *carried)
+
+
+def _corrected(message: MotionCommand, model: str, options: PlannerOptions) -> bool:
+    """Tell whether a plan of a model is to be corrected while it is played."""
+    if message.feedback and model != "der":
+        raise ValueError(
+            f"feedback corrects plans of the rod, not of the model {model}: ask for der"
+        )
+    return message.feedback or (options.feedback and model == "der")
 
 
 def from_path(message: PathMessage, plan_id: str, options: PlannerOptions, now: int) -> Request:
@@ -113,13 +146,11 @@ def from_path(message: PathMessage, plan_id: str, options: PlannerOptions, now: 
     stamps = [nanoseconds(pose.header.stamp) for pose in message.poses]
     time = (np.array(stamps) - stamps[0]) * 1e-9 if any(stamps) else None
     motion = Motion.from_tip_path(
-        time, tip.reshape(-1, 2), branch=options.branch, limits=options.limits
-    )
+        time, tip.reshape(-1, 2), branch=options.branch, limits=options.limits,
+        nearest=options.nearest_path,
+    )  # fmt: skip
     start = start_of(nanoseconds(message.header.stamp), now)
     limb = loaded(options.limb, options.payload, options.payload_at)
-    method = _method(options.model, "", options)
-    return Request(plan_id, limb, motion, options.model, method, start)
-
-
-def _method(model: str, method: str, options: PlannerOptions) -> str:
-    return choose_method(model, method or (options.method if model == "der" else ""))
+    method = choose_method(options.model, options.method)
+    feedback = options.feedback and options.model == "der"
+    return Request(plan_id, limb, motion, options.model, method, start, feedback=feedback)

@@ -7,16 +7,21 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 Service = Literal["vent", "arm", "start", "stop", "record_start", "record_stop"]
+Request = Service | Literal["path"]
 
 PATIENCE = 3.0
 """[s] to wait for a service's answer."""
 
-OWNERS: dict[Service, str] = {
+OWNERS: dict[Request, str] = {
     "vent": "pressure_driver",
     "arm": "pressure_driver",
     "start": "planner",
     "stop": "planner",
+    "path": "planner",
     "record_start": "recorder",
     "record_stop": "recorder",
 }
@@ -63,12 +68,16 @@ class Commands(Protocol):
         """Ask the planner to plan and play a motion."""
         ...
 
+    def play_path(self, tip: NDArray[np.float64]) -> Future[Answer]:
+        """Ask the planner to play the nearest path to points (P, 2) [m] that it can."""
+        ...
+
     def record(self, note: str) -> Future[Answer]:
         """Start recording, with a note in the bag."""
         ...
 
 
-async def answer_of(service: Service, pending: Future[Answer]) -> Answer:
+async def answer_of(service: Request, pending: Future[Answer]) -> Answer:
     """Wait for a service's answer, and say so if none comes."""
     owner = OWNERS[service]
     try:

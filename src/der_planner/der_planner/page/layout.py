@@ -9,6 +9,7 @@ from fastapi import FastAPI
 from nicegui import Client, ui
 
 from der_planner.page.commands import Answer, MotionRequest, Service, answer_of
+from der_planner.page.drawing.sketch import Sketch
 from der_planner.page.server import STATIC, Parts
 from der_planner.planning import METHODS
 from der_planner.planning.motions import (
@@ -45,7 +46,8 @@ class Window:
         ui.add_head_html('<link rel="stylesheet" href="/static/page.css">')
         ui.add_body_html((STATIC / "frame.html").read_text())
         with ui.element("main").props('id="panels"'):
-            self._panel("view", "Camera", "camera", "view.html")
+            with self._panel("view", "Camera", "camera", "view.html"):
+                self._sketch = Sketch(client, parts, self._may_command, self._tell)
             with self._panel("do", "Command", "", ""):
                 self._controls()
             self._panel("numbers", "Last 30 s", "driver", "plots.html")
@@ -102,6 +104,7 @@ class Window:
         mine = desk.may_command(self._name)
         for element in self._guarded:
             element.set_enabled(mine)  # type: ignore[attr-defined]
+        self._sketch.play.set_enabled(mine and self._sketch.ready)
         self._take.set_text("Give up control" if mine else "Take control")
         self._take.set_enabled(mine or desk.operator is None)
         if mine:

@@ -6,6 +6,7 @@ import functools
 import json
 import sys
 import threading
+from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,8 @@ import cv2
 import numpy as np
 from ament_index_python.packages import get_package_share_directory
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PointStamped
+from geometry_msgs.msg import PointStamped, PoseStamped
+from nav_msgs.msg import Path as PathMessage
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
@@ -28,14 +30,17 @@ from apriltag_tracker.camera.encodings import ImageError, to_grey
 from apriltag_tracker.detection.tag import Tag
 from apriltag_tracker.tag_map import TagMap
 from der_msgs.msg import LimbState, MotionCommand, PressurePlan, PressureState, TagDetectionArray
+from der_planner.limb import Limb
 from der_planner.page.access import Binding, listen, read_password
 from der_planner.page.commands import OWNERS, Answer, MotionRequest, Service
+from der_planner.page.drawing.studio import Studio
 from der_planner.page.layout import lay_out
 from der_planner.page.operators import POLICIES, Desk
 from der_planner.page.overlay import Overlay
 from der_planner.page.picture import PictureFeed
 from der_planner.page.server import PageServer, Parts
 from der_planner.page.situation import DriverState, LimbView, NodeStatus, Situation
+from der_planner.planning import PathLimits
 from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.overrides import check_overrides
@@ -68,13 +73,15 @@ class PageNode(Node):
             service: self.create_client(Trigger, path) for service, path in PATHS.items()
         }
         self._recorder_parameters = self.create_client(SetParameters, "recorder/set_parameters")
+        self._planner_parameters = self.create_client(SetParameters, "planner/set_parameters")
+        self._paths = self.create_publisher(PathMessage, topics.PATH, qos.COMMANDS)
         self._motions = self.create_publisher(MotionCommand, topics.COMMAND, qos.COMMANDS)
         self._situation = Situation()
         self._picture = PictureFeed(self._picture_rate)
         self._overlay = Overlay(self._tag_map)
         self._images = None
         self._desk = Desk(self._on_lost_operator)
-        parts = Parts(self._situation, self._picture, self._overlay, self._desk, self)
+        parts = Parts(self._situation, self._picture, self._overlay, self._desk, self, self._studio)
         self._server = PageServer(binding, listen(binding), parts, lay_out)
         self._subscribe()
         self._diagnostics = DiagnosticsPublisher(self, self._health)
@@ -98,6 +105,7 @@ class PageNode(Node):
                 choices=POLICIES,
             )
         )
+        self._studio = self._read_studio(read)
         names = read("host_names", [""], "further names by which browsers reach the page")
         return Binding(
             address=str(read("address", "127.0.0.1", "IP address to listen on")),
@@ -110,6 +118,21 @@ class PageNode(Node):
             certificate=str(read("certificate", "", "TLS certificate (PEM); empty: no TLS")),
             private_key=str(read("private_key", "", "key of the TLS certificate (PEM)")),
             host_names=tuple(name for name in names if name),  # type: ignore[union-attr]
+        )
+
+    def _read_studio(self, read: Any) -> Studio:
+        limb_file = str(read("limb_file", "", "the planner's limb file; empty: the default limb"))
+        limb = Limb.from_yaml(limb_file) if limb_file else Limb.default()
+        mounting = str(read("mounting", "", "as the planner's; empty: as in the limb file"))
+        payload = float(read("payload", 0.0, "as the planner's [kg]", at_least=0.0))
+        place = float(read("payload_at", 0.0, "as the planner's [m]; 0: the tip", at_least=0.0))
+        speed = float(read("path_speed", 0.03, "as the planner's [m/s]", at_least=1e-3))
+        most = float(read("path_acceleration", 0.05, "as the planner's [m/s^2]", at_least=1e-3))
+        folder = Path(str(read("drawings", "~/limb_drawings", "folder of kept drawings")))
+        if mounting:
+            limb = limb.mounted(mounting)
+        return Studio(
+            limb.carrying(payload, place or None), PathLimits(speed, most), folder.expanduser()
         )
 
     # What comes in -------------------------------------------------------------------------
@@ -250,25 +273,57 @@ class PageNode(Node):
 
     def record(self, note: str) -> Future[Answer]:
         """Start the recorder with the note in the bag's metadata."""
-        answer: Future[Answer] = Future()
-        if not self._recorder_parameters.service_is_ready():
-            answer.set_result(Answer(False, "recorder does not run or cannot be reached"))
-            return answer
         metadata = ParameterValue(
             type=ParameterType.PARAMETER_STRING, string_value=json.dumps({"note": note})
         )
-        request = SetParameters.Request(parameters=[Parameter(name="metadata", value=metadata)])
+        return self._after_setting(
+            "recorder", self._recorder_parameters, "metadata", metadata,
+            lambda: self.call("record_start"),
+        )  # fmt: skip
 
-        def begin(pending: Any) -> None:
+    def play_path(self, tip: np.ndarray[Any, Any]) -> Future[Answer]:
+        """Let the planner play the nearest path that it can to points (P, 2) [m]."""
+
+        def publish() -> Future[Answer]:
+            message = PathMessage()
+            message.header.frame_id = topics.BASE_FRAME
+            for x, y in tip:
+                pose = PoseStamped()
+                pose.pose.position.x, pose.pose.position.y = float(x), float(y)
+                message.poses.append(pose)
+            self._paths.publish(message)
+            answer: Future[Answer] = Future()
+            answer.set_result(Answer(True, f"asked the planner for a path of {len(tip)} points"))
+            return answer
+
+        wanted = ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=True)
+        return self._after_setting(
+            "planner", self._planner_parameters, "nearest_path", wanted, publish
+        )
+
+    def _after_setting(
+        self,
+        owner: str,
+        client: Any,
+        name: str,
+        value: ParameterValue,
+        go_on: Callable[[], Future[Answer]],
+    ) -> Future[Answer]:
+        """Set a parameter of a node, then do the rest and return its answer."""
+        answer: Future[Answer] = Future()
+        if not client.service_is_ready():
+            answer.set_result(Answer(False, f"{owner} does not run or cannot be reached"))
+            return answer
+
+        def then(pending: Any) -> None:
             result = pending.result().results[0]
             if not result.successful:
                 answer.set_result(Answer(False, result.reason))
                 return
-            self.call("record_start").add_done_callback(
-                lambda started: answer.set_result(started.result())
-            )
+            go_on().add_done_callback(lambda done: answer.set_result(done.result()))
 
-        self._recorder_parameters.call_async(request).add_done_callback(begin)
+        request = SetParameters.Request(parameters=[Parameter(name=name, value=value)])
+        client.call_async(request).add_done_callback(then)
         return answer
 
     def _on_lost_operator(self, _window: str) -> None:
@@ -296,6 +351,7 @@ class PageNode(Node):
     def close(self) -> None:
         """Stop serving."""
         self._server.close()
+        self._studio.previewer.close()
 
 
 def main() -> None:

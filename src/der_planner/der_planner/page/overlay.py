@@ -73,6 +73,23 @@ class Overlay:
         with self._lock:
             self._limb = curve
 
+    def pixels_of(self, points: NDArray[np.float64]) -> list[list[float]]:
+        """Return the pixels of points (P, 2) [m] of the limb's plane; none without a pose."""
+        placer = self._placer()
+        return [] if placer is None else placer(points)
+
+    def on_plane(self, pixels: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Return the points (P, 2) [m] of the plane at pixels (P, 2); None without a pose."""
+        placer = self._placer()
+        return None if placer is None else placer.back(pixels)
+
+    def _placer(self) -> _Placer | None:
+        with self._lock:
+            pose = self._world.pose if self._world is not None else None
+            if self._intrinsics is None or pose is None:
+                return None
+            return _Placer(self._intrinsics, pose, self._height)
+
     def at(self, stamp: int, reference: tuple[float, float] | None) -> dict[str, Any]:
         """Return what belongs over the picture of an instant, in pixels.
 
@@ -129,6 +146,9 @@ class _Placer:
             project(self._intrinsics, self._pose, raised), 1
         ).tolist()
         return pixels
+
+    def back(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        return self._pose.onto_plane(self._intrinsics.rays(pixels), self._height)
 
 
 def _of(stamp: int, views: Sequence[LimbView]) -> LimbView | None:

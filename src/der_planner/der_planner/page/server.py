@@ -22,6 +22,7 @@ from fastapi.staticfiles import StaticFiles
 
 from der_planner.page.access import SESSION_LIFE, Binding, Sessions, bracketed
 from der_planner.page.commands import Commands, answer_of
+from der_planner.page.drawing.studio import Studio
 from der_planner.page.guard import COOKIE, LOGIN, Guard
 from der_planner.page.operators import Desk
 from der_planner.page.overlay import Overlay
@@ -44,6 +45,7 @@ class Parts:
     overlay: Overlay
     desk: Desk
     commands: Commands
+    studio: Studio
 
 
 class LiveText:
@@ -85,10 +87,13 @@ def create_app(parts: Parts, sessions: Sessions, secure: bool) -> FastAPI:
     async def send_live(websocket: WebSocket) -> None:
         await websocket.accept()
         listening = asyncio.create_task(_until_closed(websocket))
+        due = time.monotonic()
         try:
             while not listening.done():
                 await websocket.send_text(live())
-                await asyncio.sleep(1.0 / RATE)
+                # On a grid, so that what sending takes does not add up; nothing is made up for.
+                due = max(due + 1.0 / RATE, time.monotonic())
+                await asyncio.sleep(due - time.monotonic())
         except (WebSocketDisconnect, RuntimeError):
             pass  # the browser has gone
         finally:
@@ -101,12 +106,15 @@ def create_app(parts: Parts, sessions: Sessions, secure: bool) -> FastAPI:
         return JSONResponse({"success": answer.success, "message": answer.message})
 
     @app.get("/picture")
-    async def picture(after: int = 0) -> Response:
+    async def picture(after: int = 0, region: bool = False) -> Response:
         encoded = await asyncio.to_thread(parts.picture.take, after)
         if encoded is None:
             return Response(status_code=204)
         reference = parts.situation.reference_at(encoded.stamp)
         drawn = parts.overlay.at(encoded.stamp, reference) | {"number": encoded.number}
+        if region:
+            outlines = await asyncio.to_thread(lambda: parts.studio.region)
+            drawn["region"] = [parts.overlay.pixels_of(outline) for outline in outlines]
         head = json.dumps(drawn, separators=(",", ":")).encode()
         body = struct.pack(">I", len(head)) + head + encoded.jpeg
         return Response(body, media_type="application/octet-stream", headers=_UNCACHED)

@@ -210,3 +210,154 @@ def simulate(
         angles[k + 1] = q
         rates[k + 1] = v
     return angles, rates
+
+
+# The linearisation ------------------------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True)
+def _third(q: Vector, v: Vector, arcs: Arcs, frame: Complex, p: int, point: Any, third: Complex,
+           H: Complex, out: Complex) -> None:  # fmt: skip
+    """Put Σ_kl T_skl v_k v_l into out (n,), T = ∂³P/∂q³ of particle p.
+
+    T_skl = i H of the two larger indices, unless all three are one: everything beyond the segment
+    of the smallest index turns as one body. ``third`` (n,) holds exp(iΦ_i) L_i g‴(q_i).
+    """
+    j, sigma = arcs.owner[p], arcs.place[p]
+    out[:] = 0.0
+    for s in range(j + 1):
+        for k in range(j + 1):
+            for m in range(j + 1):
+                if s == k and k == m:
+                    if s == j:
+                        reach = frame[1, j] * arcs.lengths[j] * sigma**4
+                        value = reach * arc_point(sigma * q[j], 3)
+                        value = value - 1j * frame[1, j + 1] * arcs.beyond[p]
+                    else:
+                        value = third[s] - 1j * (point - frame[2, s])
+                elif s <= k and s <= m:
+                    value = 1j * H[k, m]
+                elif k <= s and k <= m:
+                    value = 1j * H[s, m]
+                else:
+                    value = 1j * H[s, k]
+                out[s] += value * v[k] * v[m]
+
+
+@njit(cache=True, nogil=True)
+def force_slopes(q: Vector, v: Vector, a: Vector, arcs: Arcs) -> tuple[Vector, Vector]:
+    """Return ∂R/∂q and ∂R/∂v (n, n) of R = M a + (C + D) v + K(q) − gravity's torque.
+
+    Exact; with v = a = 0 the first is the stiffness of a resting limb.
+    """
+    n = q.size
+    by_angle, by_rate = np.zeros((n, n)), np.zeros((n, n))
+    J = np.zeros(n, dtype=np.complex128)
+    H = np.zeros((n, n), dtype=np.complex128)
+    third = np.zeros(n, dtype=np.complex128)
+    turning = np.zeros(n, dtype=np.complex128)
+    pushing = np.zeros(n, dtype=np.complex128)
+    frame = joints(q, arcs)
+    slopes = arc_slopes(q, arcs, frame, 3)
+    pull = arcs.gravity[0] + 1j * arcs.gravity[1]
+    for p in range(arcs.owner.size):
+        mass, drag, last = arcs.mass[p], arcs.drag[p], arcs.owner[p] + 1
+        point = point_derivatives(q, arcs, frame, p, slopes, J, H)
+        _third(q, v, arcs, frame, p, point, slopes[2], H, third)
+        speed, acceleration_ = 0.0 + 0.0j, -pull
+        for s in range(last):
+            turn, push = 0.0 + 0.0j, 0.0 + 0.0j
+            for k in range(last):
+                turn += H[s, k] * v[k]
+                push += H[s, k] * a[k]
+            turning[s], pushing[s] = turn, push
+            speed += J[s] * v[s]
+            acceleration_ += J[s] * a[s] + turn * v[s]
+        felt = mass * acceleration_ + drag * speed
+        for i in range(last):
+            for s in range(last):
+                moved = mass * (pushing[s] + third[s]) + drag * turning[s]
+                by_angle[i, s] += H[i, s].real * felt.real + H[i, s].imag * felt.imag
+                by_angle[i, s] += J[i].real * moved.real + J[i].imag * moved.imag
+                moved = 2.0 * mass * turning[s] + drag * J[s]
+                by_rate[i, s] += J[i].real * moved.real + J[i].imag * moved.imag
+    for i in range(n):
+        bend = q[i] - arcs.rest[i]
+        by_angle[i, i] += arcs.stiffness[i] + 3.0 * arcs.cubic[i] * bend**2
+        by_rate[i, i] += arcs.stiffness[i] * arcs.viscous[i]
+    return by_angle, by_rate
+
+
+@njit(cache=True, nogil=True)
+def linearised(
+    q: Vector, v: Vector, pressures: Vector, step: float, parts: int, arcs: Arcs
+) -> tuple[Vector, Vector, Vector, Vector]:
+    """Roll the model forward as `simulate`, and linearise each of its steps.
+
+    Returns also A (K, S, 2n, 2n) and B (K, S, 2n, n): x′ = A x + B u for changes of x = (q, v) and
+    of the step's pressures u.
+    """
+    count, substeps, n = pressures.shape
+    angles, rates = np.zeros((count + 1, n)), np.zeros((count + 1, n))
+    A = np.zeros((count, substeps, 2 * n, 2 * n))
+    B = np.zeros((count, substeps, 2 * n, n))
+    angles[0], rates[0] = q, v
+    h = step / parts
+    inputs = np.zeros((n, 3 * n))
+    for i in range(n):
+        inputs[i, 2 * n + i] = arcs.gain[i]
+    for k in range(count):
+        for s in range(substeps):
+            torque = arcs.gain * pressures[k, s]
+            # Columns: changes by q and v before the step, and by its pressures.
+            dx = np.zeros((2 * n, 3 * n))
+            for i in range(2 * n):
+                dx[i, i] = 1.0
+            for _ in range(parts):
+                q_stage, v_stage, d_stage = q, v, dx
+                q_total, v_total = np.zeros(n), np.zeros(n)
+                d_total = np.zeros((2 * n, 3 * n))
+                for stage in range(4):
+                    M, C, D, weight = inertia(q_stage, v_stage, arcs)
+                    bend = q_stage - arcs.rest
+                    elastic = arcs.stiffness * (bend + arcs.viscous * v_stage)
+                    elastic = elastic + arcs.cubic * bend**3
+                    slope = np.linalg.solve(M, torque + weight - elastic - (C + D) @ v_stage)
+                    by_angle, by_rate = force_slopes(q_stage, v_stage, slope, arcs)
+                    d_slope = np.empty((2 * n, 3 * n))
+                    d_slope[:n] = d_stage[n:]
+                    right = inputs - by_angle @ d_stage[:n] - by_rate @ d_stage[n:]
+                    d_slope[n:] = np.linalg.solve(M, right)
+                    share = 2.0 if stage in (1, 2) else 1.0
+                    q_total += share * v_stage
+                    v_total += share * slope
+                    d_total += share * d_slope
+                    ahead = h if stage == 2 else 0.5 * h
+                    q_stage, v_stage = q + ahead * v_stage, v + ahead * slope
+                    d_stage = dx + ahead * d_slope
+                q = q + h / 6.0 * q_total
+                v = v + h / 6.0 * v_total
+                dx = dx + h / 6.0 * d_total
+            A[k, s], B[k, s] = dx[:, : 2 * n], dx[:, 2 * n :]
+        angles[k + 1], rates[k + 1] = q, v
+    return angles, rates, A, B
+
+
+@njit(cache=True, nogil=True)
+def sensitivity(A: Vector, B: Vector, pulse: Vector) -> Vector:
+    """Return ∂angle/∂input (K + 1, n, K, n) for inputs that raise the R steps after their instant.
+
+    pulse (R, n) is the pressure in these steps when an input is raised by one.
+    """
+    count, substeps, _, n = B.shape
+    result = np.zeros((count + 1, n, count, n))
+    for k in range(count):
+        x = np.zeros((2 * n, n))
+        for m in range(k, count):
+            for s in range(substeps):
+                r = (m - k) * substeps + s
+                x = A[m, s] @ x
+                if r < pulse.shape[0]:
+                    x += B[m, s] * pulse[r]
+            result[m + 1, :, k, :] = x[:n]
+    return result

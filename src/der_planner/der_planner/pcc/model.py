@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from der_planner.limb import Limb
 from der_planner.pcc import kernels
 from der_planner.pcc.kernels import Arcs
+from der_planner.pcc.linearisation import Linearisation
 
 Vector = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -29,8 +30,6 @@ MassModel = Literal["distributed", "lumped"]
 QUADRATURE_POINTS = 8
 """Gauss-Legendre points a segment: exact to rounding for bends below 180 degrees."""
 RESTING_STEPS = 60
-SMALL = 1e-5
-"""Step of the differences that give the slope of the weight's torque [rad]."""
 LARGEST_PHASE = 1.0
 """Of the limb's fastest mode in one step of the integrator [rad]; it is unstable beyond 2.8."""
 
@@ -179,20 +178,15 @@ class Pcc:
         which the energy falls: beyond the load that buckles the straight limb, a bent one is found.
         """
         drive = self.gain * self._check("pressures", pressures)
-        still, turn = np.zeros(self.segment_count), np.eye(self.segment_count)
-
-        def pull(q: Vector) -> Vector:
-            left: Vector = self._inertia(q, still)[3] + drive - self.elastic_torque(q)
-            return left
-
+        still = np.zeros(self.segment_count)
         q: Vector = self.rest + drive / self.stiffness
         if not self.arcs.gravity.any() and not self.cubic.any():
             return q
         for _ in range(RESTING_STEPS):
-            slope = np.stack([pull(q + SMALL * e) - pull(q - SMALL * e) for e in turn], axis=1)
-            values, vectors = np.linalg.eigh(-0.25 * (slope + slope.T) / SMALL)
+            pull = self._inertia(q, still)[3] + drive - self.elastic_torque(q)
+            values, vectors = np.linalg.eigh(self.stiffness_matrix(q))
             firm = np.maximum(np.abs(values), 1e-3 * self.stiffness.min())
-            step = vectors @ ((vectors.T @ pull(q)) / firm)
+            step = vectors @ ((vectors.T @ pull) / firm)
             q = q + step * min(1.0, 0.3 / max(float(np.abs(step).max()), 1e-12))
             if np.abs(step).max() < 1e-10:
                 break
@@ -256,18 +250,41 @@ class Pcc:
         Raises:
             ValueError: wrong shapes.
         """
+        result: tuple[Vector, Vector] = kernels.simulate(*self._run(pressures, step, angles, rates))
+        return result
+
+    def linearised(
+        self,
+        pressures: ArrayLike,
+        step: float,
+        angles: ArrayLike | None = None,
+        rates: ArrayLike | None = None,
+    ) -> tuple[Vector, Vector, Linearisation]:
+        """Roll the model forward as `simulate`, with the exact linearisation of the motion."""
+        q, v, by_state, by_pressure = kernels.linearised(*self._run(pressures, step, angles, rates))
+        return q, v, Linearisation(by_state, by_pressure)
+
+    def _run(
+        self, pressures: ArrayLike, step: float, angles: ArrayLike | None, rates: ArrayLike | None
+    ) -> tuple[Vector, Vector, Vector, float, int, Arcs]:
+        """Return the arguments of the kernels that roll the model forward."""
         inputs = np.ascontiguousarray(pressures, dtype=float)
         if inputs.ndim != 3 or inputs.shape[2] != self.segment_count:
             raise ValueError(f"pressures must be (K, S, {self.segment_count}), got {inputs.shape}")
-        result: tuple[Vector, Vector] = kernels.simulate(
-            self._check("angles", self.rest if angles is None else angles),
-            self._check("rates", np.zeros(self.segment_count) if rates is None else rates),
-            inputs,
-            step,
-            self._parts(step),
-            self.arcs,
-        )
-        return result
+        q = self._check("angles", self.rest if angles is None else angles)
+        v = self._check("rates", np.zeros(self.segment_count) if rates is None else rates)
+        return q, v, inputs, step, self._parts(step), self.arcs
+
+    def firmness(self, bend_angles: ArrayLike) -> float:
+        """Return the smallest eigenvalue of the stiffness of arcs at rest [N·m/rad]."""
+        return float(np.linalg.eigvalsh(self.stiffness_matrix(bend_angles))[0])
+
+    def stiffness_matrix(self, bend_angles: ArrayLike) -> Vector:
+        """Return ∂(elastic less gravity's torque)/∂(bend angles) (n, n) [N·m/rad], symmetric."""
+        q = self._check("bend_angles", bend_angles)
+        zero = np.zeros_like(q)
+        matrix: Vector = kernels.force_slopes(q, zero, zero, self.arcs)[0]
+        return matrix
 
     def _parts(self, step: float) -> int:
         """Return in how many parts the integrator takes a step, by the fastest mode of the limb."""

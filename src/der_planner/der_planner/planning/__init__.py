@@ -4,7 +4,12 @@
 """
 
 from der_planner.model.series import CONTROL_PERIOD
-from der_planner.planning.errors import PlanningError, UnreachableError
+from der_planner.planning.errors import (
+    BucklingError,
+    OverloadError,
+    PlanningError,
+    UnreachableError,
+)
 from der_planner.planning.models import METHODS
 from der_planner.planning.motions import NAMES, Motion, Reference, Start
 from der_planner.planning.paths import PathLimits
@@ -16,7 +21,9 @@ __all__ = [
     "DEFAULT_METHOD",
     "METHODS",
     "NAMES",
+    "BucklingError",
     "Motion",
+    "OverloadError",
     "PathLimits",
     "Plan",
     "PlanningError",

@@ -19,12 +19,16 @@ from scipy.optimize import least_squares
 from der_planner.limb import Limb
 from der_planner.model.bending import Kinematics
 from der_planner.model.series import interpolate
+from der_planner.pcc import Pcc
 from der_planner.planning.errors import PlanningError, UnreachableError
 
 Array = NDArray[np.float64]
 
 TOLERANCE = 1e-3
 """Points missed by less than this [m] count as reached (the models' reach differs by less)."""
+NEAREST_TOLERANCE = 5e-3
+"""The same [m] for a nearest path: along the edge of what arcs reach, a rod's polyline stays behind
+by 1 to 2 mm."""
 PRIOR_WEIGHT = 1e-5
 """Pull toward the first guess [m/rad]: decides what the tip leaves open (straight limb, M > 2)."""
 BRANCHES = ("counter_clockwise", "clockwise")
@@ -78,11 +82,22 @@ def solve(
     return angles, np.linalg.norm(kinematics.tip(angles) - target, axis=-1)
 
 
+def is_loaded(limb: Limb) -> bool:
+    """Tell whether gravity bends the limb."""
+    return any(limb.gravity)
+
+
 def static_pressure(limb: Limb, bend_angles: ArrayLike) -> Array:
     """Return the differential pressures (..., M) [Pa] that hold bend angles (..., M) [rad] at rest.
 
-    moment = EI κ' + k₃ κ'³ = G u with κ' = θ/L − rest curvature; without gravity.
+    moment = EI κ' + k₃ κ'³ = G u + gravity's moment, with κ' = θ/L − rest curvature; the limb's
+    weight acts on arcs.
     """
+    if is_loaded(limb):
+        angles = np.asarray(bend_angles, dtype=float)
+        flat = angles.reshape(-1, angles.shape[-1])
+        held: Array = Pcc(limb).pressures(flat, 0 * flat, 0 * flat)
+        return held.reshape(angles.shape)
     lengths = np.array([s.length for s in limb.segments])
     curvature = np.asarray(bend_angles, dtype=float) / lengths
     curvature = curvature - np.array([s.rest_curvature for s in limb.segments])
@@ -103,6 +118,9 @@ def check_reach(
 ) -> None:
     """Refuse a path whose points are missed or need more pressure than the limb may have.
 
+    Under gravity only what is missed counts here: what pressures have to hold is for
+    `der_planner.planning.loads.overload`.
+
     Args:
         limb: its `pneumatics.pressure_limit` counts.
         kinematics: that solved the path.
@@ -119,7 +137,9 @@ def check_reach(
     solution, misses = np.asarray(angles, dtype=float), np.asarray(distances, dtype=float)
     limit = limb.pneumatics.pressure_limit
     pressures = np.abs(static_pressure(limb, solution)).max(axis=-1)
-    failed = (misses > tolerance) | (pressures > limit)
+    failed = misses > tolerance
+    if not is_loaded(limb):
+        failed |= pressures > limit
     if not failed.any():
         return
     k = int(np.argmax(failed))
@@ -162,11 +182,14 @@ def distance_to_reach(
 
 
 def angle_limits(limb: Limb) -> tuple[Array, Array]:
-    """Return the least and largest bend angles (M,) [rad] that the pressure limit holds at rest."""
+    """Return the least and largest bend angles (M,) [rad] that the pressure limit holds at rest.
+
+    Under gravity they are bounds: as if the whole weight beyond a segment pulled across it.
+    """
     limit = limb.pneumatics.pressure_limit
     bounds = []
-    for segment in limb.segments:
-        moment = segment.moment_gain * limit
+    for segment, weight in zip(limb.segments, _weight_moments(limb), strict=True):
+        moment = segment.moment_gain * limit + weight
         roots = np.roots([segment.cubic_stiffness, 0.0, segment.bending_stiffness, -moment])
         real = roots[np.abs(roots.imag) < 1e-6 * np.abs(roots).max()].real
         positive = real[real > 0]
@@ -178,7 +201,24 @@ def angle_limits(limb: Limb) -> tuple[Array, Array]:
             )
         )
     low, high = np.array(bounds).T
+    if is_loaded(limb):
+        return np.maximum(low, -np.pi), np.minimum(high, np.pi)
     return low, high
+
+
+def _weight_moments(limb: Limb) -> Array:
+    """Return the largest moments (M,) of gravity about where each segment starts [N·m]."""
+    pull = float(np.hypot(*limb.gravity[:2]))
+    if pull == 0:
+        return np.zeros(limb.segment_count)
+    lengths = np.array([s.length for s in limb.segments])
+    starts = np.cumsum(lengths + limb.connector_length) - lengths - limb.connector_length
+    mass = np.array([s.mass_per_length for s in limb.segments]) * lengths
+    where = np.append(starts + lengths / 2, [m.arc_length - limb.base_length for m in limb.masses])
+    mass = np.append(mass, [m.mass for m in limb.masses])
+    arms = np.maximum(where - starts[:, None], 0.0)
+    moments: Array = pull * arms @ mass
+    return moments
 
 
 def _corner_shares(count: int) -> list[Array]:
@@ -197,7 +237,7 @@ class Solution:
         bend_angles: (M,) [rad].
         branch: ``counter_clockwise`` or ``clockwise``; empty for M other than 2.
         distance: that remains [m].
-        pressure: largest |static differential pressure| [Pa].
+        pressure: largest |static differential pressure|, with the weight on arcs [Pa].
     """
 
     bend_angles: Array
@@ -219,6 +259,9 @@ def branch_of(kinematics: Kinematics, bend_angles: ArrayLike) -> str:
 
 def solutions(limb: Limb, kinematics: Kinematics, point: ArrayLike) -> list[Solution]:
     """Return every way found to reach one point within the pressure limit, least pressure first.
+
+    If there is none under gravity, ways beyond the limit are returned: what it takes to hold them
+    is for `der_planner.planning.loads.overload`.
 
     Args:
         limb: for the pressure limit.
@@ -245,7 +288,19 @@ def solutions(limb: Limb, kinematics: Kinematics, point: ArrayLike) -> list[Solu
             continue
         pressure = float(np.abs(static_pressure(limb, theta)).max())
         found.append(Solution(theta, branch_of(kinematics, theta), float(distance), pressure))
-    return sorted(found, key=lambda item: item.pressure)
+    limit = limb.pneumatics.pressure_limit * (1 + 1e-6)
+    held = [item for item in found if item.pressure <= limit]
+    return sorted(held or found, key=lambda item: item.pressure)
+
+
+def check_branch(branch: str) -> None:
+    """Refuse the name of a branch that is neither empty nor one of `BRANCHES`.
+
+    Raises:
+        PlanningError: names the choices.
+    """
+    if branch and branch not in BRANCHES:
+        raise PlanningError(f"branch '{branch}' is unknown: choose {' or '.join(BRANCHES)}")
 
 
 def follow(
@@ -265,8 +320,7 @@ def follow(
         PlanningError: unknown branch, or the first point has no solution on it.
     """
     times, points = np.asarray(time, dtype=float), np.asarray(tip, dtype=float)
-    if branch and branch not in BRANCHES:
-        raise PlanningError(f"branch '{branch}' is unknown: choose {' or '.join(BRANCHES)}")
+    check_branch(branch)
     found = solutions(limb, kinematics, points[0])
     if not found:
         middle = np.add(*angle_limits(limb)) / 2 + 0.1

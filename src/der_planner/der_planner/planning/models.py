@@ -7,33 +7,76 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from der_planner.limb import Limb
-from der_planner.model.response import ArcModel
-from der_planner.planning.errors import PlanningError
-from der_planner.planning.inverse import check_reach
-from der_planner.planning.motions import Reference, sample_spline
+from der_planner.model.material import differential_pressure
+from der_planner.model.response import ArcModel, ArcState
+from der_planner.planning.errors import BucklingError, PlanningError
+from der_planner.planning.inverse import check_reach, is_loaded, solve, static_pressure
+from der_planner.planning.loads.overload import check_load
+from der_planner.planning.loads.posed import REFERENCE_PRIOR
+from der_planner.planning.motions import Reference, Start, resting_spline, sample_spline
 from der_planner.planning.rod_model import PlanningRod
 
 Array = NDArray[np.float64]
 
-METHODS = {"der": ("paper", "projected", "optimal"), "pcc": ("paper",)}
-"""The methods of each model."""
+METHODS = {"der": ("paper", "projected", "optimal"), "pcc": ("paper", "projected", "optimal")}
+"""The methods of each model. Arcs have one unknown a pressure: their two balances are the same."""
+_FALLEN = 1.0
+"""Arcs that rest this far from the rod have buckled [rad]."""
 
 
 class PlanningArcs(ArcModel):
     """The PCC baseline as a planning model."""
 
     def configuration(self, reference: Reference) -> BSpline:
-        """Return q̄(t) itself: the reference is made of arcs."""
-        misses = np.zeros(len(reference.time))
-        check_reach(
-            self.limb, self.kinematics, reference.time, reference.tip, reference.bend_angles, misses
-        )
-        return reference.spline
+        """Return q̄(t) itself: the reference is made of arcs.
+
+        Under gravity the arcs rest elsewhere than the rod whose rest the reference begins with:
+        there they follow r̄(t) from their own rest.
+
+        Raises:
+            UnreachableError: a point is beyond the pressure limit.
+            BucklingError: the arcs do not rest under their load.
+            OverloadError: gravity's load takes more than the pressure limit.
+        """
+        time, tip, angles = reference.time, reference.tip, reference.bend_angles
+        if not is_loaded(self.limb):
+            check_reach(self.limb, self.kinematics, time, tip, angles, np.zeros(len(time)))
+            return reference.spline
+        home = self.rest.angles
+        if np.abs(home - reference.rest).max() > _FALLEN:
+            raise BucklingError(
+                "the arcs fall over under their load where the rod stands: make the limb lighter "
+                "or stiffer, or mount it otherwise"
+            )
+        near = angles + (home - reference.rest)
+        # What arcs miss of the rod's reach is theirs: the plan says it.
+        own = solve(self.kinematics, tip, near, REFERENCE_PRIOR)[0]
+
+        def needed(limb: Limb) -> Array:
+            return differential_pressure(limb, time, static_pressure(limb, own), own)
+
+        falls = np.array([self.pcc.firmness(pose) <= 0 for pose in own])
+        if falls.any():
+            k = int(np.argmax(falls))
+            raise BucklingError(
+                f"the arcs do not stay at their pose of t = {time[k]:.2f} s, tip at "
+                f"({tip[k, 0]:.4f}, {tip[k, 1]:.4f}) m: they would snap through under their load. "
+                "Shrink or move the motion, or mount the limb otherwise"
+            )
+        check_load(self.limb, time, tip, needed(self.limb), needed)
+        return resting_spline(time, own, reference.start)
+
+    def begin(self, spline: BSpline, start: Start | None) -> ArcState:
+        """Return the state in which a motion begins: at rest, or where another one is left."""
+        return self.rest if start is None else self.state(spline(0.0), spline(0.0, 1))
 
     def pressures(self, method: str, spline: BSpline, time: Array) -> Array:
-        """Return u = Λ† (M q̈ + (C + D) q̇ + K q) at instants (K,) [s]."""
-        if method != "paper":
-            raise PlanningError(f"the PCC model has no method '{method}': choose paper")
+        """Return u = Λ† (M q̈ + (C + D) q̇ + K q − Q_gravity) at instants (K,) [s].
+
+        ``paper`` and ``projected`` are the same.
+        """
+        if method not in METHODS["pcc"]:
+            raise PlanningError(f"the PCC model has no balance '{method}'")
         return self.pcc.pressures(*sample_spline(spline, time))
 
 

@@ -1,11 +1,12 @@
 """Motions: what the tip should do, as bend angles first and tip positions after them.
 
 Every motion becomes a `Reference`: smooth bend angles q̄(t) of constant-curvature arcs, which
-begin and end at rest in the straight pose, and the tip r̄(t) of these arcs. The reference belongs
-to no model: all planners get the same r̄(t) and find their own configuration for it, so that their
-errors compare.
+begin and end where the vented limb rests, and the tip r̄(t) of these arcs (of a limb that sags out
+of its plane: the tip of a rod that bends so). The reference belongs to no model: all planners get
+the same r̄(t) and find their own configuration for it, so that their errors compare.
 
-Named motions of the paper, with s(t) = ½ (1 − cos 2πt/T), amplitude A and period T:
+Named motions of the paper, with s(t) = ½ (1 − cos 2πt/T), amplitude A and period T; under gravity
+the angles count from where the loads let the limb sag to:
 
 - ``asynchronous``: segment j follows A s(t − j T/4);
 - ``same_direction``: all segments follow A s(t);
@@ -32,7 +33,10 @@ from der_planner.model.bending import ArcKinematics
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import paths, shapes
 from der_planner.planning.errors import PlanningError
-from der_planner.planning.inverse import follow
+from der_planner.planning.inverse import angle_limits, check_branch, follow
+from der_planner.planning.loads.rest import Rest, rest_of
+from der_planner.planning.loads.sagged import sagged_tips
+from der_planner.planning.nearest import Deviation, line, nearest_path
 
 Array = NDArray[np.float64]
 
@@ -43,11 +47,13 @@ DEFAULT_PERIOD = 20.0
 DEFAULT_CYCLES = 2
 LONGEST = 3600.0
 _GRID = 0.01
+_SAG_ROUNDS = 3
+"""Each leaves some per cent of what the sag's change along a path took."""
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where a motion begins, if not straight and at rest: where another one is left, for instance.
+    """Where a motion begins, if not at rest: where another one is left.
 
     Attributes:
         bend_angles: (M,) of the arcs [rad].
@@ -71,14 +77,18 @@ class Reference:
         tip: (K, 2) r̄ [m].
         bend_angles: (K, M) q̄ of constant-curvature arcs [rad].
         spline: q̄(t), twice continuously differentiable; `sample` reads it.
-        start: where it begins, if not at rest.
+        rest: (M,) bend angles of arcs where the vented limb rests [rad].
+        start: where it begins, if not where the vented limb rests.
+        deviation: from the drawn path, of a motion that follows the nearest one.
     """
 
     time: Array
     tip: Array
     bend_angles: Array
     spline: BSpline
+    rest: Array
     start: Start | None = None
+    deviation: Deviation | None = None
 
     @property
     def duration(self) -> float:
@@ -127,6 +137,9 @@ class Motion:
         path: the tip path of shapes and paths.
         branch: of the arcs at the first point of a path, see `inverse.BRANCHES`; empty: least
             pressure.
+        nearest: follow the nearest path that the limb can follow instead of refusing one that
+            leaves its reach, see `nearest`.
+        limits: of the tip on a nearest path whose times mean nothing; None: its times count.
     """
 
     name: str
@@ -135,6 +148,8 @@ class Motion:
     cycles: int = 1
     path: paths.TipPath | None = None
     branch: str = ""
+    nearest: bool = False
+    limits: paths.PathLimits | None = None
 
     @classmethod
     def named(
@@ -186,11 +201,15 @@ class Motion:
         name: str = "path",
         branch: str = "",
         limits: paths.PathLimits | None = None,
+        nearest: bool = False,
     ) -> Motion:
         """Return a motion along a path of the tip.
 
         The limb first goes from rest to the first point and at the end back, over times of their
-        own.
+        own. With ``nearest``, a path that leaves the limb's reach is not refused: the limb follows
+        the nearest one that it can, a trembling line is smoothed, and times are stretched where
+        pressures cannot change as fast. `Reference.deviation` and the plan's warnings say how far
+        that is from what was drawn.
 
         Args:
             time: (P,) increasing instants [s]; None: the path gets its timing from the limits.
@@ -198,15 +217,25 @@ class Motion:
             name: for tables.
             branch: which way to reach the first point; empty: the one with the least pressure.
             limits: speed and acceleration for a path without times.
+            nearest: follow the nearest path that the limb can follow.
 
         Raises:
-            PlanningError: wrong shapes, not finite, not increasing, too few points.
+            PlanningError: wrong shapes, not finite, not increasing, too few points; unknown branch.
         """
-        return cls(name, path=paths.TipPath.build(time, tip, limits), branch=branch)
+        check_branch(branch)
+        if nearest and time is None:
+            drawn, limits = line(paths.checked_points(tip)), limits or paths.PathLimits()
+            return cls(name, path=drawn, branch=branch, nearest=True, limits=limits)
+        path = paths.TipPath.build(time, tip, limits)
+        return cls(name, path=path, branch=branch, nearest=nearest)
 
     @classmethod
     def from_csv(
-        cls, path: str | Path, branch: str = "", limits: paths.PathLimits | None = None
+        cls,
+        path: str | Path,
+        branch: str = "",
+        limits: paths.PathLimits | None = None,
+        nearest: bool = False,
     ) -> Motion:
         """Return a motion along a path in a CSV file: columns x, y [m] and, if timed, time [s].
 
@@ -214,33 +243,42 @@ class Motion:
             PlanningError: the file cannot be read; the message names line and column.
         """
         time, tip = paths.read_csv(path)
-        return cls.from_tip_path(time, tip, name=Path(path).stem, branch=branch, limits=limits)
+        return cls.from_tip_path(time, tip, Path(path).stem, branch, limits, nearest)
 
     def reference(self, limb: Limb, start: Start | None = None) -> Reference:
         """Return q̄(t) and r̄(t) for a limb.
 
         Args:
             limb: the robot.
-            start: where the limb is if not straight at rest: a quintic leads from there to the
-                straight pose first.
+            start: where the limb is if another motion is left; None: where it rests, vented.
 
         Raises:
             UnreachableError: a point of a tip path is out of reach.
+            BucklingError: the vented limb does not stay where it rests.
             PlanningError: the path cannot be followed.
         """
+        deviation = None
+        rest = rest_of(limb)
         if self.name in JOINT_MOTIONS and self.path is None:
-            time, angles = self._joint_motion(limb.segment_count)
+            time, angles = self._joint_motion(limb.segment_count, rest)
+            if start is None and np.any(angles[0] != rest.bend_angles):
+                zero = np.zeros_like(rest.bend_angles)
+                time, angles = _led_in(limb, (rest.bend_angles, zero, zero), time, angles)
         else:
-            time, angles = self._tip_motion(limb)
+            time, angles, deviation = self._tip_motion(limb, rest)
         if start is not None:
-            time, angles = _led_in(limb, start, time, angles)
+            state = (start.bend_angles, start.rate, start.acceleration)
+            time, angles = _led_in(limb, state, time, angles)
         spline = resting_spline(time, angles, start)
         count = round(time[-1] / CONTROL_PERIOD) + 1
         instants = np.arange(count) * CONTROL_PERIOD
         sampled = sample_spline(spline, instants)[0]
-        return Reference(instants, ArcKinematics(limb).tip(sampled), sampled, spline, start)
+        tip = ArcKinematics(limb).tip(sampled) + rest.offset
+        if limb.gravity[2]:
+            tip = sagged_tips(limb, instants, sampled, rest.bend_angles)
+        return Reference(instants, tip, sampled, spline, rest.bend_angles, start, deviation)
 
-    def _joint_motion(self, segments: int) -> tuple[Array, Array]:
+    def _joint_motion(self, segments: int, rest: Rest) -> tuple[Array, Array]:
         total = self.cycles * self.period
         time = _fine_grid(total)
         place = np.arange(segments)
@@ -248,7 +286,7 @@ class Motion:
         sign = (-1.0) ** place if self.name == "opposite_direction" else 1.0 + 0.0 * place
         phase = 2 * np.pi * (time[:, None] - lag) / self.period
         wave = 0.5 * self.amplitude * sign * (1 - np.cos(phase))
-        angles = wave * smooth_step(time / (self.period / 4))[:, None]
+        angles = rest.sag + wave * smooth_step(time / (self.period / 4))[:, None]
         rate = 2 * np.pi / self.period
         last = phase[-1]
         state = (
@@ -257,35 +295,68 @@ class Motion:
             0.5 * self.amplitude * sign * rate**2 * np.cos(last),
         )
         closing = _fine_grid(_on_grid(self.period / 4))
-        back = quintic(closing, *state, 0 * state[0], 0 * state[0], 0 * state[0])
+        zero = np.zeros(segments)
+        back = quintic(closing, *state, rest.bend_angles, zero, zero)
         return np.append(time, total + closing[1:]), np.concatenate([angles, back[1:]])
 
-    def _tip_motion(self, limb: Limb) -> tuple[Array, Array]:
+    def _tip_motion(self, limb: Limb, rest: Rest) -> tuple[Array, Array, Deviation | None]:
         kinematics = ArcKinematics(limb)
         path = self.path
         if path is None:
-            path = shapes.draw(self.name, kinematics, self.amplitude, self.period, self.cycles)
+            path = shapes.draw(
+                self.name, kinematics, self.amplitude, self.period, self.cycles, rest.sag
+            )
+        if self.nearest:
+            return self._nearest_motion(limb, rest, path)
         time, tip = path.resample(_GRID * 2)
-        angles = follow(limb, kinematics, time, tip, self.branch)
-        inner = make_interp_spline(time, angles, k=5)
-        ends = [(inner(t), inner(t, 1), inner(t, 2)) for t in (time[0], time[-1])]
-        zero = np.zeros(limb.segment_count)
-        lead = _travel_time(limb, ends[0])
-        tail = _travel_time(limb, ends[1])
-        approach = quintic(_fine_grid(lead), zero, zero, zero, *ends[0])
-        back = quintic(_fine_grid(tail), *ends[1], zero, zero, zero)
-        between = _fine_grid(_on_grid(time[-1] - time[0]))
-        middle = inner(np.minimum(time[0] + between, time[-1]))
-        return (
-            np.concatenate(
-                [
-                    _fine_grid(lead),
-                    lead + between[1:],
-                    lead + between[-1] + _fine_grid(tail)[1:],
-                ]
-            ),
-            np.concatenate([approach, middle[1:], back[1:]]),
-        )
+        angles = follow(limb, kinematics, time, tip - rest.offset, self.branch)
+        if limb.gravity[2]:
+            # Arcs reach farther than a limb that sags out of the plane does at the same bend.
+            for _ in range(_SAG_ROUNDS):
+                short = kinematics.tip(angles) - sagged_tips(limb, time, angles, rest.bend_angles)
+                angles = follow(limb, kinematics, time, tip + short, self.branch)
+        return (*_with_ways(limb, time, angles, rest.bend_angles), None)
+
+    def _nearest_motion(
+        self, limb: Limb, rest: Rest, path: paths.TipPath
+    ) -> tuple[Array, Array, Deviation]:
+        kinematics = ArcKinematics(limb)
+        offset = rest.offset
+        found = nearest_path(limb, kinematics, path, offset, self.limits, self.branch)
+        if limb.gravity[2]:
+            # On average: the arcs' reach is longer than that of a limb which sags out of the plane.
+            time, angles = found.time, found.bend_angles
+            sagged = sagged_tips(limb, time, angles, rest.bend_angles)
+            offset = (sagged - kinematics.tip(angles)).mean(axis=0)
+            found = nearest_path(limb, kinematics, path, offset, self.limits, self.branch)
+        ways = _with_ways(limb, found.time, found.bend_angles, rest.bend_angles)
+        low, high = angle_limits(limb)
+        if np.any(ways[1] < low) or np.any(ways[1] > high):
+            # A way that begins or ends in full motion near a limit would swing beyond it.
+            found = nearest_path(
+                limb, kinematics, path, offset, self.limits, self.branch, rest=True
+            )
+            ways = _with_ways(limb, found.time, found.bend_angles, rest.bend_angles)
+        return (*ways, found.deviation)
+
+
+def _with_ways(limb: Limb, time: Array, angles: Array, home: Array) -> tuple[Array, Array]:
+    """Return times and angles with the ways from home to their first and from their last pose."""
+    inner = make_interp_spline(time, angles, k=5)
+    ends = [(inner(t), inner(t, 1), inner(t, 2)) for t in (time[0], time[-1])]
+    zero = np.zeros(limb.segment_count)
+    lead = _travel_time(limb, ends[0], home)
+    tail = _travel_time(limb, ends[1], home)
+    approach = quintic(_fine_grid(lead), home, zero, zero, *ends[0])
+    back = quintic(_fine_grid(tail), *ends[1], home, zero, zero)
+    between = _fine_grid(_on_grid(time[-1] - time[0]))
+    middle = inner(np.minimum(time[0] + between, time[-1]))
+    instants = [
+        _fine_grid(lead),
+        lead + between[1:],
+        lead + between[-1] + _fine_grid(tail)[1:],
+    ]
+    return np.concatenate(instants), np.concatenate([approach, middle[1:], back[1:]])
 
 
 def smooth_step(x: ArrayLike) -> Array:
@@ -311,12 +382,16 @@ def quintic(time: Array, x0: Array, v0: Array, a0: Array, x1: Array, v1: Array, 
     return result
 
 
-def _led_in(limb: Limb, start: Start, time: Array, angles: Array) -> tuple[Array, Array]:
-    """Return time and angles that begin with the way from another motion to the straight pose."""
+def _led_in(
+    limb: Limb, state: tuple[Array, Array, Array], time: Array, angles: Array
+) -> tuple[Array, Array]:
+    """Return time and angles with the way from a state to their first pose, at rest, before them.
+
+    The state is angle [rad], rate [rad/s] and acceleration [rad/s²], each (M,).
+    """
     zero = np.zeros(limb.segment_count)
-    state = (start.bend_angles, start.rate, start.acceleration)
-    lead = _fine_grid(_travel_time(limb, state))
-    way = quintic(lead, *state, zero, zero, zero)
+    lead = _fine_grid(_travel_time(limb, state, angles[0]))
+    way = quintic(lead, *state, angles[0], zero, zero)
     return np.append(lead, lead[-1] + time[1:]), np.concatenate([way, angles[1:]])
 
 
@@ -330,10 +405,13 @@ def _fine_grid(span: float) -> Array:
     return np.linspace(0.0, span, max(2, round(span / _GRID) + 1))
 
 
-def _travel_time(limb: Limb, state: tuple[Array, Array, Array]) -> float:
-    """Return how long the limb takes between rest and a state, at half of its slew limit [s]."""
+def _travel_time(limb: Limb, state: tuple[Array, Array, Array], home: Array) -> float:
+    """Return how long the limb takes between rest at home and a state, at half of its slew limit.
+
+    Angles (M,) in rad, the result in s.
+    """
     fastest = 0.5 * limb.pneumatics.slew_limit * limb.static_gain
-    angle, rate, acceleration = (np.abs(part) for part in state)
+    angle, rate, acceleration = (np.abs(p) for p in (state[0] - home, state[1], state[2]))
     by_angle = np.max(1.875 * angle / fastest)
     by_rate = np.max(2 * rate / fastest)
     by_acceleration = np.max(np.sqrt(acceleration / fastest))

@@ -1,19 +1,20 @@
-"""Optimal pressures: Gauss-Newton on the rod's own discrete dynamics, window after window.
+"""Optimal pressures: Gauss-Newton on a model's own discrete dynamics, window after window.
 
 Unknown are the commands u (K, M) themselves. Minimised is, over the setpoints k,
 
     Σ |tip_k(u) − r̄_k|² + λ Σ |D²(u − u⁰)_k|² + μ Σ |(u − u⁰)_k|²
 
-with u⁰ the `projected` commands (the warm start, smooth and nearly right), D² the second
+with u⁰ the commands of a balance of forces (the warm start, smooth and nearly right: `projected`
+for the rod, `paper` for the arcs), D² the second
 difference, |u_k| within the pressure limit and |u_k − u_{k−1}| within the slew limit. The model is
 that of `der_planner.model`, with friction and creep along the motion's known bend.
 
-tip(u) comes from the rod's integrator, its derivative from the exact linearisation of that
+tip(u) comes from the model's integrator, its derivative from the exact linearisation of that
 integrator, with the chambers' response averaged over each period. A response dies out in seconds,
-so that a long motion is solved as a row of overlapping windows: each starts from the rod's state at
-the end of what the last one settled, and its tail, which does not yet know what follows, is solved
-again by the next. Cost grows with the first power of the motion's length. Where no limit is in the
-way the step is one Cholesky factorisation, else the quadratic programme is handed to
+so that a long motion is solved as a row of overlapping windows: each starts from the model's state
+at the end of what the last one settled, and its tail, which does not yet know what follows, is
+solved again by the next. Cost grows with the first power of the motion's length. Where no limit is
+in the way the step is one Cholesky factorisation, else the quadratic programme is handed to
 `der_planner.planning.quadratic`.
 """
 
@@ -30,11 +31,11 @@ from scipy.linalg import cho_factor, cho_solve
 from der_planner.model import air
 from der_planner.model.commands import within_limits
 from der_planner.model.drive import Drive, Window
+from der_planner.model.response import Model, State
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning.motions import Reference, sample_spline
 from der_planner.planning.quadratic import Band, solve_limited
-from der_planner.planning.rod_model import PlanningRod
-from der_planner.rod import ConvergenceError, RodState
+from der_planner.rod import ConvergenceError
 
 Array = NDArray[np.float64]
 
@@ -109,44 +110,61 @@ class Optimiser:
     """Solves window after window; see the module.
 
     Args:
-        model: the rod.
+        model: rod or arcs.
+        begin: its state where the motion starts.
         spline: bend angles along the motion.
-        reference: r̄, and where the motion starts.
-        warm: (K, M) commands of `projected`, before limits [Pa].
+        reference: r̄, and the command before the motion.
+        warm: (K, M) commands where the search starts and toward which they are pulled: those of a
+            balance, before limits, or the last ones played [Pa].
         substeps: integrator steps a command.
         settings: weights and sizes.
+        offset: (K, 2) what is added to the model's tip at the setpoints before it is compared with
+            r̄, e.g. what a run showed beyond the model [m]; None: nothing.
     """
 
     def __init__(
         self,
-        model: PlanningRod,
+        model: Model,
+        begin: State,
         spline: BSpline,
         reference: Reference,
         warm: Array,
         substeps: int,
         settings: Settings | None = None,
+        offset: Array | None = None,
     ) -> None:
         self.model = model
         self.settings = settings or Settings()
         vented = model.limb.pneumatics.vent_rate > 0
         self.nearness = self.settings.nearness_vented if vented else self.settings.nearness
-        self.target = np.concatenate([reference.tip[1:], reference.tip[-1:]])
+        wanted = reference.tip if offset is None else reference.tip - offset
+        self.target = np.concatenate([wanted[1:], wanted[-1:]])
         self.warm = warm
         count, inputs = warm.shape
         start = reference.start
         self.before = np.zeros(inputs) if start is None else start.pressure
-        self.start = model.rest if start is None else model.state(spline(0.0), spline(0.0, 1))
+        self.start = begin
         self.drive = Drive(
             model.limb, lambda time: sample_spline(spline, time)[0], count, substeps, self.before
         )
         pulse = air.even_pulse(model.limb.pneumatics, CONTROL_PERIOD, substeps)
         self._pulse = np.tile(pulse[:, None], (1, inputs))
 
-    def run(self, progress: Callable[[float], None] = lambda _share: None) -> Outcome:
-        """Solve all windows, one after the other."""
+    def run(
+        self,
+        progress: Callable[[float], None] = lambda _share: None,
+        begin: Array | None = None,
+    ) -> Outcome:
+        """Solve all windows, one after the other.
+
+        Args:
+            progress: called with the share that is done, 0 … 1.
+            begin: (K, M) commands where the search starts, if not at the warm start [Pa].
+        """
         count = len(self.warm)
+        first_guess = self.warm if begin is None else begin
         command, _ = within_limits(
-            self.warm, self.model.limb.pneumatics, CONTROL_PERIOD, self.before
+            first_guess, self.model.limb.pneumatics, CONTROL_PERIOD, self.before
         )
         state = self.start
         tip = np.empty((count, 2))
@@ -159,13 +177,13 @@ class Optimiser:
             used, met = self.improve(command, state, first, last)
             steps, limited = steps + used, limited + met
             window = self.drive.window(command[:keep], first)
-            motion = self.model.trajectory(state, window.effective, CONTROL_PERIOD)
-            tip[first:keep] = motion.tip[:-1, :2]
+            motion = self.model.shoot(state, window.effective, CONTROL_PERIOD)
+            tip[first:keep] = motion.tip[:-1]
             state, first = motion.final, keep
             progress(first / count)
         return Outcome(command, tip, steps, limited)
 
-    def improve(self, command: Array, state: RodState, first: int, last: int) -> tuple[int, bool]:
+    def improve(self, command: Array, state: State, first: int, last: int) -> tuple[int, bool]:
         """Improve ``command[first:last]`` in place; return the steps and if a limit was met."""
         settings = self.settings
         met, damping = False, 0.0
@@ -199,31 +217,30 @@ class Optimiser:
         return settings.iterations, met
 
     def _evaluate(
-        self, command: Array, state: RodState, first: int, last: int
+        self, command: Array, state: State, first: int, last: int
     ) -> tuple[float, Array, Window]:
         """Return the cost, the misses (W, 2) [m] and the pressures of a window."""
         window = self.drive.window(command[:last], first)
-        motion = self.model.trajectory(state, window.effective, CONTROL_PERIOD)
-        misses = motion.tip[1:, :2] - self.target[first:last]
+        motion = self.model.shoot(state, window.effective, CONTROL_PERIOD)
+        misses = motion.tip[1:] - self.target[first:last]
         cost = float((misses**2).sum()) + self._roughness(command, first, last)
         return cost, misses, window
 
-    def _linearise(self, window: Window, state: RodState, damping: float) -> Quadratic:
+    def _linearise(self, window: Window, state: State, damping: float) -> Quadratic:
         """Return the quadratic model of the cost around the commands of a window."""
-        tip = 4 * (self.model.rod.nodes - 1)
-        motion = self.model.trajectory(state, window.effective, CONTROL_PERIOD, [tip, tip + 1])
-        if motion.linearisation is None:
-            raise AssertionError("a linearised motion has a linearisation")
+        motion = self.model.shoot(state, window.effective, CONTROL_PERIOD, linearise=True)
+        if motion.sensitivity is None:
+            raise AssertionError("a linearised motion has its sensitivity")
         slope = window.slopes.own.mean(axis=1)
         if self.model.limb.pneumatics.vent_rate > 0:
             # A chamber that falls as fast as its outlet lets it does not react to its command: the
             # chambers' response differs from command to command.
-            held = motion.linearisation.sensitivity()[1:] * slope
+            held = motion.sensitivity(None)[1:] * slope
             spread = window.by_command().mean(axis=1)
             products = np.moveaxis(held, 3, 0) @ np.moveaxis(spread, 2, 0)[:, None]
             sensitivity = np.moveaxis(products, 0, 3)
         else:
-            sensitivity = motion.linearisation.sensitivity(self._pulse)[1:] * slope
+            sensitivity = motion.sensitivity(self._pulse)[1:] * slope
         size, inputs = slope.shape
         J = sensitivity.reshape(2 * size, size * inputs)
         second = _second_difference(size)

@@ -58,17 +58,18 @@ class TipPath:
         Raises:
             PlanningError: what was expected and what came.
         """
-        points = np.asarray(tip, dtype=float)
-        if points.ndim != 2 or points.shape[1] != 2 or len(points) < 2:
-            raise PlanningError(
-                "a tip path needs two or more points as (P, 2) numbers in m, "
-                f"got shape {points.shape}"
-            )
-        if not np.all(np.isfinite(points)):
-            row = int(np.argmax(~np.isfinite(points).all(axis=1)))
-            raise PlanningError(f"point {row} of the tip path is not finite: {points[row]}")
+        points = checked_points(tip)
         if time is None:
             return time_path(points, limits or PathLimits())
+        return cls.timed(time, points)
+
+    @classmethod
+    def timed(cls, time: ArrayLike, points: Array) -> TipPath:
+        """Check the times of checked points (P, 2) [m].
+
+        Raises:
+            PlanningError: what was expected and what came.
+        """
         instants = np.asarray(time, dtype=float)
         if instants.shape != (len(points),):
             raise PlanningError(
@@ -102,6 +103,23 @@ class TipPath:
         else:
             points = make_interp_spline(self.time, self.tip, k=3)(instants)
         return instants, points
+
+
+def checked_points(tip: ArrayLike) -> Array:
+    """Return the points of a path as (P, 2) numbers [m].
+
+    Raises:
+        PlanningError: another shape, too few points, or one that is not finite.
+    """
+    points = np.asarray(tip, dtype=float)
+    if points.ndim != 2 or points.shape[1] != 2 or len(points) < 2:
+        raise PlanningError(
+            f"a tip path needs two or more points as (P, 2) numbers in m, got shape {points.shape}"
+        )
+    if not np.all(np.isfinite(points)):
+        row = int(np.argmax(~np.isfinite(points).all(axis=1)))
+        raise PlanningError(f"point {row} of the tip path is not finite: {points[row]}")
+    return points
 
 
 def time_path(points: Array, limits: PathLimits) -> TipPath:
@@ -148,7 +166,7 @@ def time_path(points: Array, limits: PathLimits) -> TipPath:
         )
     grid = np.linspace(0.0, time[-1], max(20, round(time[-1] / 0.02) + 1))
     step = float(grid[1])
-    along = _smoothed(PchipInterpolator(time, s)(grid), window=max(1, round(_SOFTNESS / step)))
+    along = running_mean(PchipInterpolator(time, s)(grid), window=max(1, round(_SOFTNESS / step)))
     instants = np.arange(len(along), dtype=np.float64) * step
     return TipPath(instants, spline(along))
 
@@ -172,7 +190,7 @@ def polygon(corners: Array, period: float) -> TipPath:
     return TipPath(np.concatenate(times), np.concatenate(points), exact=True)
 
 
-def _smoothed(values: Array, window: int) -> Array:
+def running_mean(values: Array, window: int) -> Array:
     """Return a running mean over 2 window + 1 samples, longer by as much: from rest to rest."""
     width = 2 * window + 1
     padded = np.concatenate([np.full(width - 1, values[0]), values, np.full(width - 1, values[-1])])

@@ -25,25 +25,22 @@ from der_planner.planning.models import METHODS, PlanningModel
 from der_planner.planning.motions import Motion, Reference, Start, sample_spline
 from der_planner.planning.optimal import Optimiser
 from der_planner.planning.result import Plan
-from der_planner.planning.rod_model import PlanningRod
 from der_planner.rod import ConvergenceError
 
 Array = NDArray[np.float64]
 
-DEFAULT_METHOD = {"der": "optimal", "pcc": "paper"}
+DEFAULT_METHOD = {"der": "optimal", "pcc": "optimal"}
 _THREADS = ThreadpoolController()
 _FINE = 2
 """Points of the balance's grid a control period."""
-
-
-_STRAIGHT = 1e-3
-"""A limb that rests within this bend [rad] of straight starts there."""
 _NOTABLE_CUT = 20.0
 """Cuts by limits are worth a warning from here on [Pa]."""
 _NOTABLE_OPPOSITE = 1000.0
 """So much pressure in the opposite chamber, to make up for slow venting, is worth one [Pa]."""
 _NOTABLE_ERROR = 5e-4
 """What the limits leave is worth a warning from here on [m]."""
+_LARGE_ERROR = 5e-3
+"""A plan whose own model misses the reference by more at any instant says so [m]."""
 
 
 def plan(
@@ -62,8 +59,7 @@ def plan(
         limb: the robot.
         motion: what the tip should do.
         model: ``der`` (discrete elastic rod) or ``pcc`` (constant curvature).
-        method: ``paper``, ``projected`` or ``optimal`` for the rod, ``paper`` for PCC; empty takes
-            the model's default.
+        method: ``paper``, ``projected`` or ``optimal``; empty takes the model's default.
         nodes: of the rod.
         start: where another motion is left; None: where the vented limb rests.
         progress: called with the share that is done, 0 … 1.
@@ -74,23 +70,22 @@ def plan(
     Raises:
         PlanningError: unknown model or method.
         UnreachableError: a point is out of reach or needs more pressure than allowed.
+        OverloadError: holding the limb under its loads takes more pressure than allowed.
+        BucklingError: the limb does not stay where it rests, or on the way.
     """
     begin = clock.perf_counter()
     method = choose_method(model, method)
     report = progress or (lambda _share: None)
-    physics = models.build(limb, model, nodes)
-    reference = motion.reference(limb, start or resting_start(limb))
-    report(0.1)
-    spline = physics.configuration(reference)
-    report(0.3)
-    try:
-        solved = _solve(physics, spline, reference, method, report)
-    except ConvergenceError as error:
-        raise PlanningError(
-            f"the rod cannot be rolled forward along this motion ({error}): take a longer period, "
-            "a smaller amplitude, or check the limb file's stiffness and mass"
-        ) from error
+    # Matrices of a few hundred rows: more threads only get into other processes' way.
+    with _THREADS.limit(limits=1, user_api="blas"):
+        physics = models.build(limb, model, nodes)
+        reference = motion.reference(limb, start)
+        report(0.1)
+        spline = physics.configuration(reference)
+        report(0.3)
+        solved = _followed(physics, spline, reference, method, report)
     bend = sample_spline(spline, reference.time)[0]
+    left = str(reference.deviation or "")
     report(1.0)
     return Plan(
         time=reference.time,
@@ -107,7 +102,9 @@ def plan(
         limb=physics.limb,
         kinematics=physics.kinematics,
         solve_time=clock.perf_counter() - begin,
-        warnings=tuple(solved.warnings + _calibration_warnings(physics.limb, bend)),
+        warnings=tuple(
+            [left] * bool(left) + solved.warnings + _calibration_warnings(physics.limb, bend)
+        ),
         details=solved.details,
     )
 
@@ -120,6 +117,27 @@ class _Solved:
     details: dict[str, float]
 
 
+def _followed(
+    physics: PlanningModel,
+    spline: BSpline,
+    reference: Reference,
+    method: str,
+    report: Callable[[float], None],
+) -> _Solved:
+    """Return what `_solve` does.
+
+    Raises:
+        PlanningError: the rod cannot be simulated along the motion.
+    """
+    try:
+        return _solve(physics, spline, reference, method, report)
+    except ConvergenceError as error:
+        raise PlanningError(
+            f"the rod cannot be rolled forward along this motion ({error}): take a longer "
+            "period, a smaller amplitude, or check the limb file's stiffness and mass"
+        ) from error
+
+
 def _solve(
     physics: PlanningModel,
     spline: BSpline,
@@ -129,14 +147,13 @@ def _solve(
 ) -> _Solved:
     """Return commands that keep the limits, and what the model expects of them."""
     air = physics.limb.pneumatics
-    optimal = method == "optimal" and isinstance(physics, PlanningRod)
+    optimal = method == "optimal"
     time, effective, bend = balance(physics, spline, reference, "projected" if optimal else method)
     wanted = commands_for(physics.limb, time, effective, bend, CONTROL_PERIOD)
-    if optimal and isinstance(physics, PlanningRod):
-        solver = Optimiser(physics, spline, reference, wanted, STEPS)
-        # Matrices of a few hundred rows: more threads only get into other processes' way.
-        with _THREADS.limit(limits=1, user_api="blas"):
-            outcome = solver.run(lambda share: report(0.4 + 0.6 * share))
+    if optimal:
+        begin = physics.begin(spline, reference.start)
+        solver = Optimiser(physics, begin, spline, reference, wanted, STEPS)
+        outcome = solver.run(lambda share: report(0.4 + 0.6 * share))
         commands, tip, said = outcome.commands, outcome.tip, ""
         missed = _mean_distance(tip, reference)
         if outcome.limited and missed > _NOTABLE_ERROR:
@@ -155,16 +172,8 @@ def _solve(
     warnings = _vent_warnings(slow, _mean_distance(tip, reference))
     if said and not (optimal and warnings):
         warnings.insert(0, f"{said}: {_excess(physics.limb, wanted)}")
+    warnings += _error_warnings(tip, reference, method)
     return _Solved(commands, tip, warnings, details)
-
-
-def resting_start(limb: Limb) -> Start | None:
-    """Return the pose of a vented limb that does not rest straight, None for one that does."""
-    rest = np.array([s.rest_curvature * s.length for s in limb.segments])
-    if np.abs(rest).max() < _STRAIGHT:
-        return None
-    zero = np.zeros_like(rest)
-    return Start(rest, zero, zero, zero)
 
 
 def choose_method(model: str, method: str) -> str:
@@ -206,13 +215,12 @@ def tip_under(
         commands: (K, M) [Pa].
         start: where the motion begins; None: at rest.
     """
-    begin = None if start is None else physics.state(spline(0.0), spline(0.0, 1))
     response = simulate(
         physics,
         np.arange(len(commands)) * CONTROL_PERIOD,
         commands=commands,
         bend=lambda time: sample_spline(spline, time)[0],
-        start=begin,
+        start=physics.begin(spline, start),
         before=None if start is None else start.pressure,
     )
     return response.tip[:-1]
@@ -228,6 +236,18 @@ def _calibration_warnings(limb: Limb, bend: Array) -> list[str]:
             f"its calibration covered {np.degrees(seen[j]):.0f}"
         )
     return said
+
+
+def _error_warnings(tip: Array, reference: Reference, method: str) -> list[str]:
+    missed = np.linalg.norm(tip - reference.tip, axis=1)
+    if missed.max() <= _LARGE_ERROR:
+        return []
+    remedy = "" if method == "optimal" else ", or the method optimal,"
+    return [
+        f"the model itself misses the reference by {missed.mean() * 1000:.1f} mm on average and by "
+        f"{missed.max() * 1000:.1f} mm at {reference.time[missed.argmax()]:.1f} s: a longer "
+        f"period{remedy} or a smaller amplitude misses less"
+    ]
 
 
 def _mean_distance(tip: Array, reference: Reference) -> float:

@@ -18,7 +18,12 @@ _POINTS = 50
 
 
 def draw(
-    name: str, kinematics: Kinematics, amplitude: float, period: float, cycles: int
+    name: str,
+    kinematics: Kinematics,
+    amplitude: float,
+    period: float,
+    cycles: int,
+    sag: Array | None = None,
 ) -> TipPath:
     """Return a shape as a timed path around the tip of a limb bent by 1.2 times the amplitude.
 
@@ -31,8 +36,11 @@ def draw(
         amplitude: bend angle that sets place and size [rad].
         period: of one cycle [s].
         cycles: how many.
+        sag: (M,) bend angles from which the amplitude counts [rad]; None: straight.
     """
     bend = np.full(kinematics.segment_count, 1.2 * amplitude)
+    if sag is not None:
+        bend = bend + sag
     centre = kinematics.tip(bend)
     length = float(kinematics.tip(np.zeros(kinematics.segment_count))[0])
     radius = SIZE * length * amplitude / (np.pi / 4)

@@ -287,6 +287,17 @@ class Rod:
         """Return ∂q/∂u (4N-1, M) [m/Pa] of a state that rests under u (M,) [Pa]."""
         return self._backend.linearise_equilibrium(state, array(u, (self.segment_count,), "u"))
 
+    def firmness(self, state: RodState, u: ArrayLike) -> float:
+        """Return the smallest eigenvalue of the static stiffness of a resting state [N/m …].
+
+        Zero or below: the rod under pressures u (M,) [Pa] does not stay there; it buckles.
+        """
+        matrix = self._backend.static_stiffness(state, array(u, (self.segment_count,), "u"))
+        moving = matrix[np.ix_(self.free, self.free)]
+        if self.plane:  # there couples have an energy, and the matrix is symmetric
+            return float(np.linalg.eigvalsh(0.5 * (moving + moving.T))[0])
+        return float(np.linalg.eigvals(moving).real.min())
+
     def linearise_step(
         self,
         state: RodState,

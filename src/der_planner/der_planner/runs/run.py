@@ -14,6 +14,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+LEARNED = "learned"
+"""The method of a plan that was learned; runs of an experiment add from how many runs it was."""
+
+
+def method_name(method: str, learned_from: object = None) -> str:
+    """Return a run's method; for a learned plan with the number of runs, where that is known."""
+    name, _, rest = method.partition(" ")
+    return f"{name} {learned_from} {rest}".strip() if name == LEARNED and learned_from else method
 
 
 class EvaluationError(ValueError):
@@ -103,6 +111,8 @@ class RunSeries:
         predicted: tip that the model expects (K, 2) [m]; may be empty.
         tip: measured tip (F, 2) [m] at the images' stamps, NaN where the tracker found no limb.
         bend_angle: measured (F, M) [rad]; may be empty.
+        tip_covariance: of the tip (F, 4), row by row [m²]; may be empty.
+        setpoints: commands (K, M) as they were sent [Pa]; may be empty.
         commanded, measured: differential pressures (P, M) [Pa]; may be empty.
         truth: simulated tip (T, 2) [m]; only in bags of the twin.
         board: only in bags of the twin.
@@ -116,6 +126,8 @@ class RunSeries:
     predicted: Stream
     tip: Stream
     bend_angle: Stream = field(default_factory=lambda: Stream(_empty(0), _empty(0, 0)))
+    tip_covariance: Stream = field(default_factory=lambda: Stream(_empty(0), _empty(0, 4)))
+    setpoints: Stream = field(default_factory=lambda: Stream(_empty(0), _empty(0, 0)))
     commanded: Stream = field(default_factory=lambda: Stream(_empty(0), _empty(0, 0)))
     measured: Stream = field(default_factory=lambda: Stream(_empty(0), _empty(0, 0)))
     truth: Stream | None = None
@@ -137,6 +149,7 @@ class RunSeries:
         pressure_time: ArrayLike | None = None,
         commanded: ArrayLike | None = None,
         measured: ArrayLike | None = None,
+        setpoints: ArrayLike | None = None,
     ) -> RunSeries:
         """Build a run from arrays.
 
@@ -150,15 +163,16 @@ class RunSeries:
             pressure_time: (P,) [s].
             commanded: (P, M) differential pressures [Pa].
             measured: (P, M) differential pressures [Pa].
+            setpoints: (K, M) commands of the plan [Pa].
 
         Raises:
             EvaluationError: shapes do not fit or times do not rise; the message says which.
         """
         clock = _times(time, "time", description)
-        setpoints = _times(reference_time, "reference_time", description)
-        reference = _rows(tip_reference, len(setpoints), "tip_reference", description)
+        grid = _times(reference_time, "reference_time", description)
+        reference = _rows(tip_reference, len(grid), "tip_reference", description)
         predicted = (
-            Stream(setpoints, _rows(tip_predicted, len(setpoints), "tip_predicted", description))
+            Stream(grid, _rows(tip_predicted, len(grid), "tip_predicted", description))
             if tip_predicted is not None
             else Stream(_empty(0), _empty(0, 2))
         )
@@ -171,11 +185,16 @@ class RunSeries:
                     pressures[name] = Stream(ticks, rows)
         return cls(
             description=description,
-            reference=Stream(setpoints, reference),
+            reference=Stream(grid, reference),
             predicted=predicted,
             tip=Stream(clock, _rows(tip, len(clock), "tip", description)),
             commanded=pressures["commanded"],
             measured=pressures["measured"],
+            setpoints=Stream(
+                grid, _rows(setpoints, len(grid), "setpoints", description, columns=None)
+            )
+            if setpoints is not None
+            else Stream(_empty(0), _empty(0, 0)),
         )
 
 

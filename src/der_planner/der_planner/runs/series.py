@@ -23,6 +23,7 @@ from der_planner.runs.run import (
     EvaluationError,
     RunSeries,
     Stream,
+    method_name,
 )
 
 NANOSECONDS = 1_000_000_000
@@ -44,7 +45,9 @@ class LimbRecord:
         plans: by id, each with its stamp [ns].
         setpoints: by plan id: differential pressures [Pa].
         setpoint_indices: by plan id, in the order of ``setpoints``.
+        revised: ids of the plans of which a setpoint was revised.
         tip, angles: measured tip [m] and bend angles [rad], NaN where the limb was not seen.
+        covariance: of the measured tip [m²], row by row.
         truth: simulated tip [m] (twin only).
         commanded, measured: differential pressures [Pa].
         faults: reasons of the driver with their stamps [ns].
@@ -54,8 +57,10 @@ class LimbRecord:
     plans: dict[str, tuple[int, Any]] = field(default_factory=dict)
     setpoints: dict[str, Columns] = field(default_factory=dict)
     setpoint_indices: dict[str, array[int]] = field(default_factory=dict)
+    revised: set[str] = field(default_factory=set)
     tip: Columns = field(default_factory=lambda: Columns(2))
     angles: Columns = field(default_factory=Columns)
+    covariance: Columns = field(default_factory=lambda: Columns(4))
     truth: Columns = field(default_factory=lambda: Columns(2))
     commanded: Columns = field(default_factory=Columns)
     measured: Columns = field(default_factory=Columns)
@@ -185,12 +190,15 @@ def _take_setpoint(limb: LimbRecord, message: Any) -> None:
     of_plan = limb.setpoints.setdefault(message.plan_id, Columns())
     of_plan.append(_stamp(message), message.differential_pressure)
     limb.setpoint_indices.setdefault(message.plan_id, array("q")).append(int(message.index))
+    if message.revision:
+        limb.revised.add(message.plan_id)
 
 
 def _take_state(limb: LimbRecord, message: Any) -> None:
     stamp, valid = _stamp(message), bool(message.valid)
     limb.tip.append(stamp, (message.tip.x, message.tip.y) if valid else ())
     limb.angles.append(stamp, message.bend_angle if valid else ())
+    limb.covariance.append(stamp, message.tip_covariance if valid else ())
 
 
 def _take_truth(limb: LimbRecord, message: Any) -> None:
@@ -214,7 +222,7 @@ def _take_board(limb: LimbRecord, message: Any) -> None:
 
 @dataclass(frozen=True)
 class _Setpoints:
-    """Setpoints of one plan in the order of their indices, each once."""
+    """Setpoints of one plan in the order of their indices, each as it was revised last."""
 
     index: NDArray[np.int64]
     stamp: NDArray[np.int64]
@@ -226,8 +234,25 @@ def _setpoints(limb: LimbRecord, plan_id: str, segment_count: int) -> _Setpoints
         none = np.empty(0, dtype=np.int64)
         return _Setpoints(none, none, np.empty((0, segment_count)))
     rows = limb.setpoints[plan_id]
-    index, first = np.unique(np.array(limb.setpoint_indices[plan_id]), return_index=True)
-    return _Setpoints(index, rows.stamps()[first], rows.values(segment_count)[first])
+    backward = np.array(limb.setpoint_indices[plan_id])[::-1]
+    index, last = np.unique(backward, return_index=True)
+    last = len(backward) - 1 - last
+    return _Setpoints(index, rows.stamps()[last], rows.values(segment_count)[last])
+
+
+def _feedback(plan: Any, setpoints: _Setpoints) -> dict[str, Any]:
+    """Return what was added to the plan's setpoints, by the key of a run's `extra`."""
+    planned = np.array(plan.differential_pressure).reshape(-1, int(plan.segment_count))
+    usable = setpoints.index < len(planned)
+    added = setpoints.value[usable] - planned[setpoints.index[usable]]
+    if not len(added):
+        return {}
+    return {
+        "feedback": {
+            "correction_rms_pa": np.sqrt(np.mean(added**2, axis=0)).tolist(),
+            "correction_max_pa": np.abs(added).max(axis=0).tolist(),
+        }
+    }
 
 
 def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
@@ -252,6 +277,7 @@ def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
         raise EvaluationError(
             f"{where}: the plan '{chosen}' carries no stamp and none of its setpoints was recorded"
         )
+    about = _feedback(plan, setpoints) if chosen in limb.revised else {}
     end = times[-1]
     played = int(setpoints.index[-1]) if len(setpoints.index) else len(times) - 1
     faults = [text for when, text in limb.faults if 0 <= (when - origin) / NANOSECONDS <= end]
@@ -262,11 +288,13 @@ def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
             f"{_others_seen(record, namespace)}"
         )
     return RunSeries(
-        description=_describe(plan, record, namespace),
+        description=_describe(plan, record, namespace, about),
         reference=Stream(times, np.array(plan.tip_reference).reshape(-1, 2)),
         predicted=Stream(times, np.array(plan.tip_predicted).reshape(-1, 2)),
         tip=tip,
         bend_angle=stream(limb.angles, segment_count, origin),
+        tip_covariance=stream(limb.covariance, 4, origin),
+        setpoints=Stream(times, _commands(plan, setpoints)),
         commanded=stream(limb.commanded, segment_count, origin),
         measured=stream(limb.measured, segment_count, origin),
         truth=stream(limb.truth, 2, origin) if len(limb.truth) else None,
@@ -275,6 +303,16 @@ def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
         finished=played == len(times) - 1 and tip.time[-1] >= end - 1.0,
         origin=origin,
     )
+
+
+def _commands(plan: Any, setpoints: _Setpoints) -> Array:
+    """Return the commands (K, M) [Pa] as they were sent; as planned where none was recorded."""
+    command = np.array(plan.differential_pressure, dtype=float)
+    command = command.reshape(len(plan.time), -1).copy()
+    known = setpoints.index < len(command)
+    known &= np.isfinite(setpoints.value).all(axis=1)
+    command[setpoints.index[known]] = setpoints.value[known]
+    return command
 
 
 def stream(columns: Columns, width: int, origin: int) -> Stream:
@@ -368,7 +406,9 @@ def _loads(plan: Any) -> dict[str, Any]:
     }
 
 
-def _describe(plan: Any, record: BagRecord, namespace: str) -> Description:
+def _describe(
+    plan: Any, record: BagRecord, namespace: str, feedback: dict[str, Any]
+) -> Description:
     known = {"motion", "model", "method", "trial", "seed", "limb"}
     run = record.run
     # A plan along a path is named "path"; the recorder was told which one.
@@ -376,7 +416,7 @@ def _describe(plan: Any, record: BagRecord, namespace: str) -> Description:
     return Description(
         motion=(run.get("motion") if drawn else "") or plan.motion,
         model=plan.model or run.get("model", ""),
-        method=plan.method or run.get("method", ""),
+        method=method_name(plan.method or run.get("method", ""), run.get("learned_from")),
         trial=int(run.get("trial", -1)),
         seed=int(run.get("seed", -1)),
         amplitude=float(plan.amplitude),
@@ -386,5 +426,5 @@ def _describe(plan: Any, record: BagRecord, namespace: str) -> Description:
         bag=str(record.path),
         namespace=namespace,
         **_loads(plan),
-        extra={key: value for key, value in run.items() if key not in known},
+        extra={**{key: value for key, value in run.items() if key not in known}, **feedback},
     )

@@ -6,13 +6,15 @@ values with every default filled in.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from der_planner.limb import MOUNTINGS, LimbError, gravity_of
 from der_planner.limb_declaration import parameters
 from der_planner.limb_parameters import Pneumatics, Segment
 from der_planner.planning import METHODS
@@ -28,6 +30,7 @@ Value = float | int | str
 RUN, MODEL, IDENTIFICATION = "run", "model", "identification"
 PLANNED = (RUN, MODEL)
 TWIN = (RUN, IDENTIFICATION)
+EVERY = (RUN, MODEL, IDENTIFICATION)
 ERROR = "error."
 """How the name of the error of a limb parameter begins."""
 
@@ -44,6 +47,7 @@ class Factor:
             whole numbers, a str for names.
         low, high: range of a number.
         choices: names to choose of.
+        also: what may stand in place of a name, and what raises a `LimbError` for anything else.
     """
 
     unit: str
@@ -53,12 +57,14 @@ class Factor:
     low: float = -math.inf
     high: float = math.inf
     choices: tuple[str, ...] = ()
+    also: tuple[str, Callable[[str], object]] | None = None
 
     @property
     def range(self) -> str:
         """What may be given, in words."""
         if self.choices:
-            return f"one of {', '.join(self.choices)}"
+            other = "" if self.also is None else f", or {self.also[0]}"
+            return f"one of {', '.join(self.choices)}{other}"
         kind = "a whole number" if isinstance(self.default, int) else "a number"
         return f"{kind} from {self.low:g} to {self.high:g}"
 
@@ -69,8 +75,15 @@ class Factor:
             StudyError: it is of another kind or out of range; names ``where``.
         """
         if self.choices:
+            if isinstance(value, bool):  # so YAML reads yes and no, on and off
+                said = {True: ("yes", "on"), False: ("no", "off")}[value]
+                value = next((name for name in said if name in self.choices), value)
             if value in self.choices:
                 return str(value)
+            if self.also is not None and not isinstance(value, bool):
+                with contextlib.suppress(LimbError):
+                    self.also[1](str(value))
+                    return str(value)
         elif isinstance(value, (int, float)) and not isinstance(value, bool):
             whole = isinstance(self.default, int)
             inside = math.isfinite(value) and self.low <= value <= self.high
@@ -102,11 +115,39 @@ FACTORS: dict[str, Factor] = {
     ),
     "tag_noise": Factor(
         "-",
-        "noise of tags and board in the calibration, as a multiple of the usual one",
+        "noise of tags and board, calibrating and in feedback, as a multiple of the usual one",
         TWIN,
         1.0,
         0.0,
         100.0,
+    ),
+    "mounting": Factor(
+        "-",
+        "how the limb is mounted, when it is calibrated and when it plays",
+        EVERY,
+        "horizontal",
+        choices=tuple(MOUNTINGS),
+        also=("degrees by which its plane is tilted about the straight limb", gravity_of),
+    ),
+    "payload": Factor("kg", "carried while it plays, not when calibrated", PLANNED, 0.0, 0.0, 10.0),
+    "payload_at": Factor(
+        "m", "where along the limb, from the clamp; 0: at the tip", PLANNED, 0.0, 0.0, 10.0
+    ),
+    "learning_runs": Factor(
+        "-", "earlier runs of the motion that the plan has learned from (der)", (RUN,), 0, 0, 100
+    ),
+    "feedback": Factor(
+        "-",
+        "whether commands are revised while the limb moves",
+        (RUN,),
+        "off",
+        choices=("off", "on"),
+    ),
+    "latency": Factor(
+        "s", "from a picture to what was seen on it, for feedback", (RUN,), 0.07, 0.0, 2.0
+    ),
+    "payload_known": Factor(
+        "-", "whether the plan reckons with the payload", PLANNED, "yes", choices=("yes", "no")
     ),
 }
 _NOT_VARIED = ("pressure_limit", "slew_limit")

@@ -73,9 +73,23 @@ def _panels(study: Study, plot: Mapping[str, str], rows: Records) -> Figure:
         fill(study, plot, [each for each in rows if not by or each[by] == value], panel)
         if by:
             label, factor = quantity(by, study)
-            panel.set_title(f"{label} = {value * factor:.3g}" if _number(value) else str(value))
+            panel.set_title(f"{label}: {value * factor:.3g}" if _number(value) else str(value))
         if place and plot["kind"] != "map":
             panel.set_ylabel("")
+            if panel.get_legend() is not None:
+                panel.get_legend().remove()
+    # Panels share their axis: where it ends is known when all are drawn.
+    for panel in axes:
+        for axis in plot.get("log", ""):
+            (panel.set_xscale if axis == "x" else panel.set_yscale)("log")
+        if plot["kind"] == "lines" and "y" not in plot.get("log", ""):
+            panel.set_ylim(bottom=0.0)
+        if "x" in plot.get("log", ""):
+            ticks = sorted({each[plot["x"]] * quantity(plot["x"], study)[1] for each in rows})
+            panel.set_xticks(ticks, [f"{tick:.3g}" for tick in ticks], minor=False)
+            panel.set_xticks([], minor=True)
+        if "y" in plot.get("log", ""):
+            panel.yaxis.set_major_formatter("{x:g}")
     if plot.get("title"):
         figure.suptitle(plot["title"])
     return figure
@@ -85,9 +99,11 @@ def _lines(study: Study, plot: Mapping[str, str], rows: Records, panel: Axes) ->
     """Draw the mean of y over x, one line for each value of ``lines``, ± a standard deviation."""
     (x_label, x_factor), (y_label, y_factor) = (quantity(plot[key], study) for key in ("x", "y"))
     by = plot.get("lines")
+    names = [] if _number(rows[0][plot["x"]]) else sorted({each[plot["x"]] for each in rows})
     for place, value in enumerate(sorted({each[by] for each in rows}, key=_order) if by else [""]):
         mine = [each for each in rows if not by or each[by] == value]
-        x, mean, deviation = spread_over(mine, plot["x"], plot["y"])
+        at, mean, deviation = spread_over(mine, plot["x"], plot["y"])
+        x = np.array([names.index(name) if names else name for name in at], dtype=float)
         look: dict[str, Any] = {"color": style.colour(str(value), place)}
         label = value.upper() if by == "model" else f"{by} {value}" if by else None
         panel.plot(
@@ -97,17 +113,18 @@ def _lines(study: Study, plot: Mapping[str, str], rows: Records, panel: Axes) ->
         low, high = (mean - deviation) * y_factor, (mean + deviation) * y_factor
         panel.fill_between(x * x_factor, low, high, alpha=0.18, lw=0, **look)
     panel.set(xlabel=x_label, ylabel=y_label)
-    panel.set_ylim(bottom=0.0)
+    if names:
+        panel.set_xticks(range(len(names)), names, rotation=30, ha="right")
     if by:
         panel.legend()
 
 
-def spread_over(rows: Records, x: str, y: str) -> tuple[Array, Array, Array]:
+def spread_over(rows: Records, x: str, y: str) -> tuple[list[Any], Array, Array]:
     """Return the values of x, and mean and standard deviation of y at each of them."""
     places = sorted({each[x] for each in rows}, key=_order)
     groups = [np.array([each[y] for each in rows if each[x] == place]) for place in places]
     deviation = [group.std(ddof=1) if len(group) > 1 else 0.0 for group in groups]
-    return np.array(places), np.array([group.mean() for group in groups]), np.array(deviation)
+    return places, np.array([group.mean() for group in groups]), np.array(deviation)
 
 
 def _map(study: Study, plot: Mapping[str, str], rows: Records, panel: Axes) -> None:

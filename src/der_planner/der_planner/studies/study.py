@@ -34,7 +34,8 @@ PLOTS = {
     "indices": ("of",),
 }
 """The kinds of figures, and what each needs."""
-_OPTIONAL = ("kind", "name", "lines", "panels", "title", "per")
+_OPTIONAL = ("kind", "name", "lines", "panels", "title", "per", "log")
+_LOG = ("", "x", "y", "xy")
 
 
 @dataclass(frozen=True)
@@ -296,6 +297,8 @@ def _plots(content: object, study: Study) -> tuple[dict[str, str], ...]:
                 raise StudyError(
                     f"{where}.{key}: no column '{plot[key]}'; there are {', '.join(columns)}"
                 )
+        if plot.get("log", "") not in _LOG:
+            raise StudyError(f"{where}.log must be x, y or xy, got {plot['log']!r}")
         if kind == "indices" and study.draw.method != "saltelli":
             raise StudyError(f"{where}: indices need draw.method saltelli")
         plots.append({"name": f"{kind}_{index}", **plot})

@@ -69,7 +69,7 @@ def _groups(study: Study, kept: Mapping[str, Kept]) -> tuple[list[str], list[lis
     """
     by = [name for name, values in study.grid.items() if name != "seed" and len(values) > 1]
     good = [row for row in kept.values() if row["error"] is None]
-    seen = {name: sorted({row[name] for row in good}, key=str) for name in by}
+    seen = {name: sorted({row[name] for row in good}) for name in by}
     while by and math.prod(len(seen[name]) for name in by) > _MOST_GROUPS:
         by.remove(max(by, key=lambda name: len(seen[name])))
     shown = list(study.keep)[:4]

@@ -33,6 +33,10 @@ from der_planner.studies.factors import (
 Array = NDArray[np.float64]
 Values = Mapping[str, Value]
 Result = dict[str, float]
+_VENTED = 1.0
+"""Before a run the twin rests for so long [s], with feedback and without."""
+_FIRST_LEARNING_RUN = 10
+"""Runs of a twin's hardware from here on are learned from; the one that counts is run 0."""
 _UNSEEN_RUN = 2
 """The run of a twin's hardware on which an identified limb is tried."""
 
@@ -70,7 +74,12 @@ class Task:
         row = with_defaults(values, self.name)
         if not self.calibrated or row["calibration"] == "none":
             return None
-        return twins.Twin(int(row["seed"]), str(row["calibration"]), float(row["tag_noise"]))
+        return twin_of(row)
+
+
+def twin_of(row: Mapping[str, Any]) -> twins.Twin:
+    """Return the twin of a row with its defaults, and how it is calibrated."""
+    return twins.Twin(row["seed"], row["calibration"], row["tag_noise"], row["mounting"])
 
 
 # run: a calibrated twin plays a plan ------------------------------------------------------------
@@ -99,7 +108,14 @@ def _errors(planned: Plan, tip: Array) -> Result:
     }
 
 
+def loaded(limb: Limb, row: Mapping[str, Any]) -> Limb:
+    """Return a limb as a row mounts it, with the row's payload."""
+    at = row["payload_at"]
+    return limb.mounted(row["mounting"]).carrying(row["payload"], at if at > 0 else None)
+
+
 def _planned(limb: Limb, row: Mapping[str, Any]) -> Plan:
+    limb = loaded(limb, {**row, "payload": row["payload"] if row["payload_known"] == "yes" else 0})
     motion = Motion.named(
         row["motion"], amplitude=row["amplitude"], period=row["period"], cycles=row["cycles"]
     )
@@ -112,17 +128,69 @@ def _run(limb: str, rows: Sequence[Values]) -> list[Result | Exception]:
 
 
 def _play(limb: str, row: Mapping[str, Any]) -> Result:
+    planned = _planned(with_errors(limb_of(limb), row), row)
+    loads = loaded(limb_of(limb), row)
+    if row["learning_runs"]:
+        planned = _learned(planned, loads, row)
+    tip, held = (_with_feedback if row["feedback"] == "on" else _blind)(planned, loads, row)
+    return {
+        **_errors(planned, tip),
+        "pressure_rms_error_pa": float(np.sqrt(np.mean(held**2))),
+        "limits_cut": float(len(planned.warnings) > 0),
+    }
+
+
+def _learned(planned: Plan, loads: Limb, row: Mapping[str, Any]) -> Plan:
+    """Return the plan after runs of it on the same hardware, as a camera would have seen them."""
+    from der_planner.control import Learner  # noqa: PLC0415
+    from der_planner.identification.offline import TIP_NOISE  # noqa: PLC0415
+
+    learner = Learner(planned)
+    for run in range(_FIRST_LEARNING_RUN, _FIRST_LEARNING_RUN + row["learning_runs"]):
+        tip, _ = _blind(planned, loads, row, run)
+        noise = np.random.default_rng([row["seed"], run]).standard_normal(tip.shape)
+        learner.add(planned.time, tip + row["tag_noise"] * TIP_NOISE * noise)
+        planned = learner.next()
+        if learner.stopped:
+            break
+    return planned
+
+
+def _blind(planned: Plan, loads: Limb, row: Mapping[str, Any], run: int = 0) -> tuple[Array, Array]:
+    """Return the twin's tips (K, 2) [m] and chamber less commanded pressures (K, M) [Pa]."""
     # PyElastica takes a second to import: only who plays pays for it.
     from der_planner.twin.offline import play  # noqa: PLC0415
 
-    planned = _planned(with_errors(limb_of(limb), row), row)
-    played = play(planned.time, planned.differential_pressure, seed=row["seed"])
-    pressure = played.measured_differential - played.commanded_differential
-    return {
-        **_errors(planned, played.tip),
-        "pressure_rms_error_pa": float(np.sqrt(np.mean(pressure**2))),
-        "limits_cut": float(len(planned.warnings) > 0),
-    }
+    played = play(
+        planned.time,
+        planned.differential_pressure,
+        seed=row["seed"],
+        run=run,
+        gravity=loads.gravity,
+        masses=loads.masses,
+    )
+    return played.tip, played.measured_differential - played.commanded_differential
+
+
+def _with_feedback(planned: Plan, loads: Limb, row: Mapping[str, Any]) -> tuple[Array, Array]:
+    """Return the same of a run whose commands are revised by what camera and board tell."""
+    from der_planner.control.feedback import Feedback  # noqa: PLC0415
+    from der_planner.control.lockstep import Sensors, play  # noqa: PLC0415
+    from der_planner.twin.offline import OfflineTwin  # noqa: PLC0415
+
+    usual, noise = Sensors(), row["tag_noise"]
+    sensors = replace(
+        usual,
+        latency=row["latency"],
+        bend_noise=noise * usual.bend_noise,
+        tip_noise=noise * usual.tip_noise,
+        pressure_noise=noise * usual.pressure_noise,
+        seed=row["seed"],
+    )
+    plant = OfflineTwin(row["seed"], gravity=loads.gravity, masses=loads.masses)
+    plant.rest(_VENTED)
+    played = play(planned, plant, Feedback(planned), sensors)
+    return played.tip, played.differential_pressure - played.commanded
 
 
 # model: the rod itself plays a plan that was made for another rod --------------------------------
@@ -161,7 +229,7 @@ def _one(found: list[Result] | Exception) -> Result | Exception:
 
 def _simulated(limb: str, motion: str, rows: Sequence[Mapping[str, Any]]) -> list[Result]:
     planned = _plan_once(limb, motion)
-    true = [with_errors(limb_of(limb), row) for row in rows]
+    true = [loaded(with_errors(limb_of(limb), row), row) for row in rows]
     response = simulate_many(true, planned.time, commands=planned.differential_pressure)
     return [_errors(planned, tip[:-1]) for tip in response.tip]
 
@@ -190,8 +258,7 @@ def _recover(limb: str, row: Mapping[str, Any]) -> Result:
     from der_planner.twin.truth import known_values  # noqa: PLC0415
 
     prior = limb_of(limb)
-    twin = twins.Twin(row["seed"], row["calibration"], row["tag_noise"])
-    found, report = twins.fit_twin(twin, prior)
+    found, report = twins.fit_twin(twin_of(row), prior)
     distances: dict[str, list[float]] = {}
     for name, known in known_values(draw(row["seed"])).items():
         unknown = report.value(name)
@@ -203,7 +270,7 @@ def _recover(limb: str, row: Mapping[str, Any]) -> Result:
     instants = np.arange(0.0, 40.0, 0.05)
     waves = [1.0 - np.cos(instants / 3.0), np.sin(instants / 2.0)]
     unseen = Excitation(instants, 9000.0 * np.stack(waves, axis=1), ())
-    log = record_twin(row["seed"], unseen, run=_UNSEEN_RUN, noise=0.0)
+    log = record_twin(row["seed"], unseen, run=_UNSEEN_RUN, noise=0.0, limb=found)
     tip = predict(found, log.time, log.measured_differential).tip
     error = np.linalg.norm(tip - log.tip, axis=1)
     return {

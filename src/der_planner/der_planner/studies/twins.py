@@ -8,6 +8,7 @@ from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
 import yaml
+from threadpoolctl import threadpool_limits
 
 from der_planner.identification import FitReport, calibration_run, fit, record_twin
 from der_planner.identification.offline import AMPLITUDE
@@ -23,11 +24,13 @@ class Twin:
         seed: of the hardware.
         calibration: "quick" (90 s) or "long" (200 s).
         noise: of tags and board, as a multiple of the usual one.
+        mounting: see `der_planner.limb_loads`.
     """
 
     seed: int
     calibration: str = "quick"
     noise: float = 1.0
+    mounting: str = "horizontal"
 
 
 def fit_twin(twin: Twin, prior: Limb) -> tuple[Limb, FitReport]:
@@ -36,9 +39,10 @@ def fit_twin(twin: Twin, prior: Limb) -> tuple[Limb, FitReport]:
     Raises:
         LogError: the run does not tell the parameters.
     """
+    prior = prior.mounted(twin.mounting)
     amplitude = AMPLITUDE * prior.pneumatics.pressure_limit
     excitation = calibration_run(amplitude, prior.segment_count, twin.calibration == "quick")
-    limb, report = fit(prior, record_twin(twin.seed, excitation, noise=twin.noise))
+    limb, report = fit(prior, record_twin(twin.seed, excitation, noise=twin.noise, limb=prior))
     return replace(limb, name=f"{prior.name}, twin {twin.seed}"), report
 
 
@@ -55,7 +59,7 @@ def calibrated(twin: Twin, prior: str) -> str:
     folder = cache() / "twins"
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{hashlib.sha256(about.encode()).hexdigest()[:32]}.yaml"
-    with locked(path):
+    with locked(path), threadpool_limits(1):  # more threads change the last digits
         if not path.exists():
             limb, _ = fit_twin(twin, read_limb(prior) if prior else Limb.default())
             # What a fit took of the clock differs from run to run; the limb does not.

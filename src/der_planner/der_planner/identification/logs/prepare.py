@@ -101,35 +101,37 @@ def prepare(
         _check_excitation(pressure, warnings)
         _check_saturation(pressure, limb, warnings)
         _check_match(pressure, bend, warnings)
-    swing = _first_swing(grid, pressure, bend, limb)
-    if swing > 0.0:
-        waited = grid.time < grid.time[0] + swing
+    waited = _still_swinging(grid, pressure, bend, limb)
+    if waited.any():
         unseen = [np.where(waited[:, None], np.nan, part) for part in (grid.bend_angles, grid.tip)]
         grid = replace(grid, bend_angles=unseen[0], tip=unseen[1])
-        valid = valid & ~waited
         warnings.append(
-            f"the log begins while the limb swings: its first {swing:.1f} s are not used, since no "
-            "pressure tells that motion"
+            "the log begins while the limb swings: its first "
+            f"{period * waited.sum():.1f} s are not used, since no pressure tells that motion"
         )
     count = min(SMOOTHING, len(bend) - (len(bend) + 1) % 2)
     bend = np.asarray(savgol_filter(bend, count, 2, axis=0))
-    return Prepared(grid, pressure, bend, valid, tuple(warnings))
+    return Prepared(grid, pressure, bend, valid & ~waited, tuple(warnings))
 
 
-def _first_swing(grid: CalibrationLog, pressure: Array, bend: Array, limb: Limb) -> float:
-    """Return for how long the limb swings from before the log, at most a fifth of the log [s].
+def _still_swinging(
+    grid: CalibrationLog, pressure: Array, bend: Array, limb: Limb
+) -> NDArray[np.bool_]:
+    """Return the rows (K,) in which the limb swings from before the log, at most a fifth of all.
 
     What the first second of bend moves beyond what the pressures move in it is taken for a swing
     that decays as the prior says.
     """
-    first = grid.time < grid.time[0] + 1.0
+    elapsed = grid.time - grid.time[0]
+    first = elapsed < 1.0
     driven = limb.static_gain * np.ptp(pressure[first], axis=0)
     amplitude = 0.5 * float(np.max(np.ptp(bend[first], axis=0) - 2.0 * driven))
     if amplitude < 2.0 * SWING:
-        return 0.0
+        return np.zeros(len(elapsed), dtype=bool)
     decay = 0.5 * max(float(np.mean([s.damping for s in limb.segments])), 0.2)
-    length = float(grid.time[-1] - grid.time[0])
-    return min(float(np.log(amplitude / SWING)) / decay, LONGEST_SWING, 0.2 * length)
+    swing = min(float(np.log(amplitude / SWING)) / decay, LONGEST_SWING, 0.2 * elapsed[-1])
+    waited: NDArray[np.bool_] = elapsed < swing
+    return waited
 
 
 def _pressures(log: CalibrationLog, least: float) -> Array:

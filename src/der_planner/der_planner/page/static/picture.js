@@ -44,12 +44,13 @@
     const canvas = document.getElementById("picture");
     if (!canvas || document.hidden) return 300;
     const begin = performance.now();
-    const answer = await fetch(`/picture?after=${number}`, { signal: AbortSignal.timeout(3000) });
+    const answer = await fetch(`/picture?after=${number}${page.sketch.on ? "&region=1" : ""}`, { signal: AbortSignal.timeout(3000) });
     if (answer.status !== 200) return answer.status === 204 ? PATIENCE : 1000;
     const body = await answer.arrayBuffer(), size = new DataView(body).getUint32(0);
     const over = JSON.parse(new TextDecoder().decode(new Uint8Array(body, 4, size)));
     const image = await createImageBitmap(new Blob([new Uint8Array(body, 4 + size)], { type: "image/jpeg" }));
     number = over.number;
+    if (over.region) page.region = over.region;
     draw(canvas, image, over);
     image.close();
     page.pictures += 1;

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.rod import banded_kernel
-from der_planner.rod.backend import Piece, Place, band_to_dense
+from der_planner.rod.backend import Piece, Place, band_to_dense, general_band_to_dense
 from der_planner.rod.mesh import Mesh
 from der_planner.rod.planar import elastic_kernel, step_kernel
 from der_planner.rod.planar.elastic_kernel import PlanarRod, PlanarSpace
@@ -107,13 +107,21 @@ class PlanarBackend:
 
     def linearise_equilibrium(self, state: RodState, u: Array) -> Array:
         """Return ∂q/∂u (4N-1, M) of a resting state."""
+        band, columns = self._static(state, u)
+        banded_kernel.factor_general(band)
+        banded_kernel.solve_columns(band, columns)
+        return self._full(columns)
+
+    def static_stiffness(self, state: RodState, u: Array) -> Array:
+        """Return −∂(F_int + B Λ u)/∂q (4N-1, 4N-1); rows of what is held are those of a unit."""
+        return self._full_matrix(general_band_to_dense(self._static(state, u)[0]))
+
+    def _static(self, state: RodState, u: Array) -> tuple[Array, Array]:
         x = self._extend(state.q)
         space = self.work_space()
         columns = np.zeros((self.size, len(u)))
         step_kernel.linearise(x, x, 0.0, u, columns, space, self.body(0.0 * state.q), self.rod)
-        banded_kernel.factor_general(space.a)
-        banded_kernel.solve_columns(space.a, columns)
-        return self._full(columns)
+        return space.a, columns
 
     def rows(self, indices: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the kernel's rows of indices into q; -1 for what the plane does not have."""

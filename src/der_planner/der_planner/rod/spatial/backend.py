@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.rod import banded_kernel
-from der_planner.rod.backend import Piece, Place, band_to_dense
+from der_planner.rod.backend import Piece, Place, band_to_dense, general_band_to_dense
 from der_planner.rod.mesh import Mesh
 from der_planner.rod.spatial import (
     assembly_kernel,
@@ -117,6 +117,17 @@ class SpatialBackend:
 
     def linearise_equilibrium(self, state: RodState, u: Array) -> Array:
         """Return ∂q/∂u (4N-1, M) of a resting state."""
+        band, columns = self._static(state, u)
+        banded_kernel.factor_general(band)
+        banded_kernel.solve_columns(band, columns)
+        return columns[self.offset :]
+
+    def static_stiffness(self, state: RodState, u: Array) -> Array:
+        """Return −∂(F_int + B Λ u)/∂q (4N-1, 4N-1); rows of what is held are those of a unit."""
+        matrix = general_band_to_dense(self._static(state, u)[0])
+        return matrix[self.offset :, self.offset :]
+
+    def _static(self, state: RodState, u: Array) -> tuple[Array, Array]:
         x = self._extend(state.q)
         space = self.work_space()
         columns, back = np.zeros((self.size, len(u))), np.zeros((self.size, 21))
@@ -124,9 +135,7 @@ class SpatialBackend:
             x, x, 0.0, u, self._base(state), back, columns, space, self.body(0.0 * state.q),
             self.rod,
         )  # fmt: skip
-        banded_kernel.factor_general(space.a)
-        banded_kernel.solve_columns(space.a, columns)
-        return columns[self.offset :]
+        return space.a, columns
 
     def rows(self, indices: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the kernel's rows of indices into q; -1 for indices out of range."""

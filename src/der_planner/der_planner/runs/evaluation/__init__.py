@@ -13,6 +13,7 @@ Example::
 from der_planner.runs.evaluation.alignment import Settings, Split, error_series, split_error
 from der_planner.runs.evaluation.batch import Evaluated, evaluate_bags
 from der_planner.runs.evaluation.figures import plot_error, plot_pressures, plot_tip
+from der_planner.runs.evaluation.learning import plot_learning
 from der_planner.runs.evaluation.metrics import RunResult, evaluate_bag, evaluate_run
 from der_planner.runs.evaluation.report import Report, write_report
 from der_planner.runs.evaluation.results import read_results, results_document, write_results
@@ -53,6 +54,7 @@ __all__ = [
     "load_run",
     "markdown_table",
     "plot_error",
+    "plot_learning",
     "plot_pressures",
     "plot_tip",
     "read_results",

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from der_planner.runs.evaluation.figures import plot_error, plot_pressures, plot_tip
 from der_planner.runs.evaluation.html import document, figure, table
+from der_planner.runs.evaluation.learning import plot_learning
 from der_planner.runs.evaluation.metrics import RunResult
 from der_planner.runs.evaluation.overlay import plot_shapes
 from der_planner.runs.evaluation.results import write_results
@@ -28,6 +29,7 @@ from der_planner.runs.evaluation.table import (
 from der_planner.runs.run import RunSeries
 
 _CAPTIONS = {
+    "learning": "Mean tip error over the runs that a plan was learned from, a line a trial.",
     "error": "Tip error over time: mean over trials, shaded one standard deviation.",
     "tip": "Measured tip against the reference: path in the plane, x and y over time.",
     "shapes": "Planned and measured limb, over the camera's frames where these were recorded.",
@@ -40,7 +42,8 @@ tip that the tracker measured in that image. E is the mean of |r − r̄| over t
 window, E<sub>x</sub> and E<sub>y</sub> are the means of |x − x̄| and |y − ȳ|. The table shows mean ±
 sample standard deviation of these over trials, and the largest |r − r̄| of any trial. Times come
 from stamps; nothing is shifted. The split fits r(t) ≈ g r̄(t − τ) + b: lag τ, gains g, bias b, and
-the RMS error that is left when lag, then bias, then gain are taken out.</p>
+the RMS error that is left when lag, then bias, then gain are taken out. Models are compared under
+the same loads; where a comparison says that methods differ, too, it is not one of models alone.</p>
 """
 
 
@@ -95,6 +98,7 @@ def write_report(
         ("tip", plot_tip),
         ("shapes", plot_shapes),
         ("pressures", plot_pressures),
+        ("learning", lambda _, place: plot_learning(results, place)),
     ):
         ready = [path for path in drawn if path.stem == name]
         if ready:
@@ -125,6 +129,7 @@ def _page(
         *(figure(_CAPTIONS[name], path) for name, path in figures.items()),
         "<h2>Every run</h2>",
         _run_table(results),
+        _feedback_table(results),
         _checks_table(results),
         "<h2>Definitions</h2>",
         _DEFINITIONS,
@@ -207,6 +212,30 @@ def _run_table(results: Sequence[RunResult]) -> str:
     return table(header, lines, names=1)
 
 
+def _feedback_table(results: Sequence[RunResult]) -> str:
+    """List what feedback added to the commands of each run that had it."""
+    corrected = [run for run in results if run.extra.get("feedback")]
+    if not corrected:
+        return ""
+    several, lines = shows_namespace(results), []
+    for run in corrected:
+        about = run.extra["feedback"]
+        lines.append(
+            [
+                html.escape(_run_name(run, several, run.method)),
+                str(run.trial),
+                *(
+                    ", ".join(_number(value, 1e-3) for value in about.get(key, ()))
+                    for key in ("correction_rms_pa", "correction_max_pa")
+                ),
+                _number(about.get("estimate_rms_m", math.nan), 1000),
+                html.escape("; ".join(about.get("warnings", ())) or "none"),
+            ]
+        )
+    header = ["run", "trial", "added, RMS [kPa]", "largest [kPa]", "estimate RMS [mm]", "warnings"]
+    return "<h2>What feedback added</h2>" + table(header, lines, names=1)
+
+
 def _checks_table(results: Sequence[RunResult]) -> str:
     checked = [run for run in results if run.checks]
     if not checked:
@@ -240,7 +269,7 @@ def _count(run: RunResult, name: str) -> str:
 
 def _provenance(results: Sequence[RunResult]) -> str:
     """List what the runs say of themselves: one line where all agree, else every value."""
-    keys = sorted({key for run in results for key in run.extra})
+    keys = sorted({key for run in results for key in run.extra} - {"feedback"})
     lines = []
     for key in keys:
         values = list(dict.fromkeys(str(run.extra.get(key, "–")) for run in results))

@@ -89,6 +89,8 @@ def format_table(rows: Sequence[Summary], comparisons: Sequence[Comparison] = ()
 def format_comparison(comparison: Comparison) -> str:
     """Return one sentence that a reader can quote."""
     who = f"{_named(comparison)}: {comparison.model} against {comparison.baseline}"
+    if comparison.model.partition(" ")[2] != comparison.baseline.partition(" ")[2]:
+        who += " (methods differ, not only models)"
     if comparison.refused:
         return f"{who}: not compared, {comparison.refused}"
     text = f"{who}: {abs(comparison.difference_m) * 100:.2f} cm "

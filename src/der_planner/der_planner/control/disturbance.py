@@ -1,0 +1,207 @@
+"""What one run showed beyond its model: the disturbance d = measured tip − expected tip.
+
+The measured tip comes at the camera's instants, with noise and gaps; d is wanted at the setpoints.
+The expected tip is taken to the camera's instants by a cubic spline, where it is known without
+noise, and the difference, which is small and changes slowly, is smoothed back to the setpoints by
+straight lines fitted in a Gaussian neighbourhood, with the tracker's covariance as weight.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_NEIGHBOURHOOD = 0.05
+"""Standard deviation of the neighbourhood in which a line is fitted [s]."""
+_REACH = 3.0
+"""Samples further away than so many standard deviations do not count."""
+_SEEN_WITHIN = 0.1
+"""A setpoint counts as seen if the nearest image is not further away than this [s]."""
+_LEAST_NOISE = 1e-5
+"""Standard deviation of the best tip that is believed [m]."""
+_FOLLOWS = 0.6
+"""An error of more than this share of the way from the start is that of a limb that stays …"""
+_FAR = 0.02
+"""… where the way is longer than this [m] …"""
+_FOR_LONG = 1.0
+"""… for longer than this [s]; it began when the error was last …"""
+_USUAL = 1.5
+"""… below so many times its median until then."""
+
+
+class LearningError(ValueError):
+    """A run or a plan cannot be learned from; the message names the remedy."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A run's tip as it was filmed.
+
+    Attributes:
+        time: (K,) rising instants since the plan's first setpoint, where the tip was seen [s].
+        tip: (K, 2) [m].
+        variance: (K,) of a coordinate [m²]; None where the tracker gave none.
+    """
+
+    time: Array
+    tip: Array
+    variance: Array | None
+
+    @classmethod
+    def build(cls, time: ArrayLike, tip: ArrayLike, covariance: ArrayLike | None) -> Measured:
+        """Check a run's arrays and leave out what was not seen.
+
+        Args:
+            time: (K,) [s].
+            tip: (K, 2), NaN where unseen [m].
+            covariance: (K, 2, 2) [m²]; None: not known. A row that is not finite is left out.
+
+        Raises:
+            LearningError: shapes that do not fit, or instants that do not rise.
+        """
+        clock, place = np.asarray(time, dtype=float), np.asarray(tip, dtype=float)
+        shapes_fit = clock.ndim == 1 and place.shape == (len(clock), 2)
+        if not shapes_fit or not np.all(np.diff(clock) > 0):
+            raise LearningError(
+                "a run needs rising times (K,) and tips (K, 2), got shapes "
+                f"{clock.shape} and {place.shape}: take both from the same recording"
+            )
+        seen = np.isfinite(place).all(axis=1)
+        if covariance is None:
+            return cls(clock[seen], place[seen], None)
+        spread = np.asarray(covariance, dtype=float)
+        if spread.shape != (len(clock), 2, 2):
+            raise LearningError(
+                f"covariance must have shape ({len(clock)}, 2, 2), got {spread.shape}"
+            )
+        variance = np.trace(spread, axis1=1, axis2=2) / 2
+        seen &= np.isfinite(variance) & (variance >= 0)
+        return cls(clock[seen], place[seen], np.maximum(variance[seen], _LEAST_NOISE**2))
+
+
+@dataclass(frozen=True)
+class Shown:
+    """The disturbance of one run at the K setpoints.
+
+    Attributes:
+        value: (K, 2) measured less expected tip [m]; NaN where the tip was not seen.
+        variance: (K,) of a coordinate, by the camera's noise [m²].
+        seen: (K,).
+    """
+
+    value: Array
+    variance: Array
+    seen: Mask
+
+
+def disturbance(measured: Measured, setpoints: Array, expected: Array) -> Shown:
+    """Return what a run showed beyond its model.
+
+    Args:
+        measured: the run.
+        setpoints: (K,) instants [s].
+        expected: (K, 2) tip of the model under the commands that were played [m].
+    """
+    inside = (measured.time >= setpoints[0]) & (measured.time <= setpoints[-1])
+    time, tip = measured.time[inside], measured.tip[inside]
+    count = len(setpoints)
+    value, variance = np.full((count, 2), np.nan), np.full(count, np.inf)
+    if len(time) < 2:
+        return Shown(value, variance, np.zeros(count, dtype=bool))
+    beyond = tip - CubicSpline(setpoints, expected)(time)
+    given = measured.variance
+    noise = np.full(len(time), _scatter(beyond)) if given is None else given[inside]
+    first = np.searchsorted(time, setpoints - _REACH * _NEIGHBOURHOOD)
+    last = np.searchsorted(time, setpoints + _REACH * _NEIGHBOURHOOD, side="right")
+    for k, (begin, end) in enumerate(zip(first, last, strict=True)):
+        gap = time[begin:end] - setpoints[k]
+        if not len(gap) or np.abs(gap).min() > _SEEN_WITHIN:
+            continue
+        near = np.exp(-0.5 * (gap / _NEIGHBOURHOOD) ** 2)
+        rows = _rows_of_line(gap, near / noise[begin:end])
+        value[k] = rows @ beyond[begin:end]
+        variance[k] = rows**2 @ noise[begin:end]
+    return Shown(value, variance, np.isfinite(value).all(axis=1))
+
+
+def _rows_of_line(gap: Array, weight: Array) -> Array:
+    """Return the weights (n,) by which samples at distances (n,) give a line's value at zero."""
+    total, first, second = weight.sum(), weight @ gap, weight @ gap**2
+    spread = total * second - first**2
+    # Samples on one side only: a line would be drawn out; their mean is not.
+    if spread <= 1e-12 * total * second or gap.min() > 0 or gap.max() < 0:
+        mean: Array = weight / total
+        return mean
+    rows: Array = weight * (second - first * gap) / spread
+    return rows
+
+
+def _scatter(values: Array) -> float:
+    """Return the variance of a coordinate [m²] by which samples (K, 2) leave a smooth curve.
+
+    From their second differences, which have six times the variance of white noise.
+    """
+    if len(values) < 8:
+        return 1e-8
+    bends = np.diff(values, 2, axis=0)
+    deviation = 1.4826 * float(np.median(np.abs(bends))) / np.sqrt(6.0)
+    return float(max(deviation, _LEAST_NOISE) ** 2)
+
+
+def stays_behind(time: Array, tip: Array, wanted: Array) -> float | None:
+    """Return the instant [s] from which a limb does not follow its reference, e.g. vented, or None.
+
+    Args:
+        time: (K,) setpoints [s].
+        tip: (K, 2), NaN where unseen [m].
+        wanted: (K, 2) r̄ [m].
+    """
+    way = np.linalg.norm(wanted - wanted[0], axis=1)
+    missed = np.linalg.norm(tip - wanted, axis=1)
+    with np.errstate(invalid="ignore"):
+        behind = (missed > _FOLLOWS * way) & (way > _FAR)
+    needed = max(2, round(_FOR_LONG / float(time[1] - time[0])))
+    # A gap in between neither ends such a stretch nor makes it longer.
+    run, begin = 0, 0
+    seen = [int(k) for k in np.nonzero(np.isfinite(missed))[0]]
+    for k in seen:
+        if not behind[k]:
+            run = 0
+            continue
+        begin = k if run == 0 else begin
+        run += 1
+        if run >= needed:
+            # It began when the error left what it had been until then.
+            before = missed[:begin][np.isfinite(missed[:begin])]
+            usual = _USUAL * float(np.median(before)) if len(before) else 0.0
+            well = [j for j in seen if j < begin and missed[j] <= usual]
+            return float(time[well[-1]] if well else time[0])
+    return None
+
+
+def without_gaps(value: Array, known: Mask, period: float, fade: float) -> Array:
+    """Return a disturbance (K, 2) with its gaps bridged.
+
+    Between two instants where it is known by a straight line, at the ends by the last known value,
+    which fades away.
+
+    Args:
+        value: (K, 2) [m], anything where it is not known.
+        known: (K,).
+        period: of the instants [s].
+        fade: time in which an end's value falls to a third [s].
+    """
+    if known.all() or not known.any():
+        return np.where(known[:, None], value, 0.0)
+    place = np.arange(len(value))
+    there = place[known]
+    result = np.column_stack([np.interp(place, there, column) for column in value[known].T])
+    outside = np.maximum(there[0] - place, 0) + np.maximum(place - there[-1], 0)
+    faded: Array = result * np.exp(-outside * period / fade)[:, None]
+    return faded

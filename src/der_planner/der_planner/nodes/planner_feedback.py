@@ -1,0 +1,245 @@
+"""Feedback on the graph: revises setpoints that are still to come, whenever something is seen.
+
+A thread of its own works on what came since, in the order in which it came, and revises the next
+setpoint that can still be reached. The player goes on sending every setpoint a lead before its
+stamp, with the corrections that were last thought of for it; it never waits for this thread.
+"""
+
+from __future__ import annotations
+
+import threading
+import time as clock
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from der_msgs.msg import LimbState, PressureState
+from der_planner.control.estimation import Estimate
+from der_planner.control.feedback import Feedback
+from der_planner.planning.streaming import GRID, Schedule
+from limb_interfaces.stamps import NANOSECONDS, nanoseconds
+
+Array = NDArray[np.float64]
+
+_TRAVEL = 0.015
+"""A revision is sent at least so long before its stamp [s], for the driver to have it."""
+_LONGEST_AHEAD = 0.15
+"""However slow this machine is, the setpoint that is revised is at most so far ahead [s]."""
+_SLOWER = 1.5
+"""A solution may take so many times what the last ones took."""
+_SMALLEST_BEND, _SMALLEST_TIP = 1.5e-3, 2e-4
+"""Standard deviations that are believed of a tracker: it tells corner noise alone [rad], [m]."""
+_STALE = 10
+"""Setpoints for which corrections that were thought of before are used in full; then they fade."""
+
+
+class Audience(Protocol):
+    """Who publishes; called from this part's thread."""
+
+    def revise(self, schedule: Schedule, index: int, pressures: Array, revision: int) -> None:
+        """Send a setpoint again with other pressures (M,) [Pa]."""
+
+    def estimated(self, schedule: Schedule, instant: int, estimate: Estimate, done: Done) -> None:
+        """Show what is known at an instant [ns]."""
+
+    def warn(self, text: str) -> None:
+        """Say that feedback was taken back."""
+
+
+@dataclass(frozen=True)
+class Done:
+    """What one revision was.
+
+    Attributes:
+        correction: (M,) [Pa].
+        share: of it that acts.
+        reason: why feedback is out; empty while it acts.
+        solve_time: [s].
+    """
+
+    correction: Array
+    share: float
+    reason: str
+    solve_time: float
+
+
+class _Corrected:
+    """A schedule with its feedback, and what was sent of it."""
+
+    def __init__(self, schedule: Schedule, feedback: Feedback) -> None:
+        self.schedule, self.feedback = schedule, feedback
+        self.coming: tuple[int, Array] = feedback.coming()
+        self.revisions: dict[int, int] = {}
+        self.warned = 0
+
+    def time_of(self, stamp: int) -> float:
+        """Return an instant [ns] in the plan's seconds."""
+        return (stamp - self.schedule.start) / NANOSECONDS
+
+    def pressures(self, index: int) -> Array:
+        """Return the pressures (M,) [Pa] of a setpoint by what was last thought of for it."""
+        planned = self.schedule.plan.differential_pressure[index]
+        first, corrections = self.coming
+        ahead = index - first
+        if ahead < 0:
+            return planned
+        fade = max(0.0, 1.0 - max(0, ahead - _STALE) / _STALE)
+        limit = self.schedule.plan.limb.pneumatics.pressure_limit
+        correction = fade * corrections[min(ahead, len(corrections) - 1)]
+        cut: Array = np.clip(planned + correction, -limit, limit)
+        return cut
+
+
+class Corrector:
+    """Corrects the schedules that are played; see the module.
+
+    Args:
+        audience: publishes.
+        now: present ROS time [ns].
+    """
+
+    def __init__(self, audience: Audience, now: Callable[[], int]) -> None:
+        self._audience, self._now = audience, now
+        self._wake = threading.Condition()
+        self._inbox: deque[Callable[[_Corrected], None]] = deque(maxlen=200)
+        self._open: list[_Corrected] = []
+        self._seen = self._closed = False
+        self._took = 0.01
+        self._thread = threading.Thread(target=self._run, name="feedback", daemon=True)
+        self._thread.start()
+
+    @property
+    def reason(self) -> str:
+        """Why feedback is out for what is played; empty while it acts, or if there is none."""
+        with self._wake:
+            return self._open[-1].feedback.reason if self._open else ""
+
+    def follow(self, schedule: Schedule, feedback: Feedback) -> None:
+        """Correct a schedule from now on."""
+        with self._wake:
+            self._open.append(_Corrected(schedule, feedback))
+            self._wake.notify_all()
+
+    def forget(self, schedule: Schedule) -> None:
+        """Correct a schedule no more."""
+        with self._wake:
+            self._open = [each for each in self._open if each.schedule is not schedule]
+
+    def pressures(self, schedule: Schedule, index: int) -> Array:
+        """Return the pressures (M,) [Pa] with which a setpoint is first sent."""
+        with self._wake:
+            found = next((each for each in self._open if each.schedule is schedule), None)
+        if found is None:
+            return schedule.plan.differential_pressure[index]
+        pressures = found.pressures(index)
+        self._post(lambda each: self._was_sent(each, schedule, index, pressures))
+        return pressures
+
+    def take_pressures(self, state: PressureState) -> None:
+        """Take in what the chambers hold."""
+        measured = np.array(state.measured_differential)
+        if not len(measured) or not np.isfinite(state.telemetry_age):
+            return
+        stamp = nanoseconds(state.header.stamp) - round(state.telemetry_age * NANOSECONDS)
+        self._post(lambda each: each.feedback.pressures(each.time_of(stamp), measured))
+
+    def take_state(self, state: LimbState) -> None:
+        """Take in what a picture showed."""
+        if not state.valid:
+            return
+        stamp = nanoseconds(state.header.stamp)
+        bend, tip = np.array(state.bend_angle), np.array([state.tip.x, state.tip.y])
+        size, told = len(bend), np.array(state.bend_angle_sigma)
+        sigma = np.full(size, _SMALLEST_BEND)
+        if len(told) == size:
+            sigma = np.maximum(np.nan_to_num(told), sigma)
+        spread = np.zeros((size + 2, size + 2))
+        spread[:size, :size] = np.diag(sigma**2)
+        covariance = np.nan_to_num(np.array(state.tip_covariance)).reshape(2, 2)
+        spread[size:, size:] = covariance + _SMALLEST_TIP**2 * np.eye(2)
+        self._post(lambda each: each.feedback.measure(each.time_of(stamp), bend, tip, spread))
+        with self._wake:
+            self._seen = True
+            self._wake.notify_all()
+
+    def close(self) -> None:
+        """End the thread."""
+        with self._wake:
+            self._closed = True
+            self._wake.notify_all()
+        self._thread.join(timeout=2.0)
+
+    def _post(self, item: Callable[[_Corrected], None]) -> None:
+        with self._wake:
+            if self._open:
+                self._inbox.append(item)
+
+    @staticmethod
+    def _was_sent(each: _Corrected, schedule: Schedule, index: int, pressures: Array) -> None:
+        if each.schedule is schedule and index not in each.revisions:
+            each.feedback.sent(index * GRID / NANOSECONDS, pressures)
+
+    def _run(self) -> None:
+        while True:
+            with self._wake:
+                if not self._seen:
+                    self._wake.wait(GRID / NANOSECONDS if self._open else None)
+                if self._closed:
+                    return
+                self._seen = False
+                told = list(self._inbox)
+                self._inbox.clear()
+                following = list(self._open)
+            for each in following:
+                self._correct(each, told)
+
+    def _correct(self, each: _Corrected, told: list[Callable[[_Corrected], None]]) -> None:
+        try:
+            for item in told:
+                item(each)
+            self._revise(each)
+        except Exception as error:
+            # Whatever goes wrong here, the plan goes on without feedback.
+            self.forget(each.schedule)
+            text = f"{type(error).__name__}: {error}"
+            self._audience.warn(f"plan {each.schedule.plan_id}: feedback failed, {text}")
+
+    def _revise(self, each: _Corrected) -> None:
+        """Revise the next setpoint of a schedule that can still be reached."""
+        schedule, feedback = each.schedule, each.feedback
+        begin, now = clock.perf_counter(), self._now()
+        ahead = min(_TRAVEL + _SLOWER * self._took, _LONGEST_AHEAD)
+        index = -(-(now + round(ahead * NANOSECONDS) - schedule.start) // GRID)
+        if not 0 <= index < schedule.count or self._replaced(each, index):
+            return
+        planned = schedule.plan.differential_pressure[index]
+        pressures = feedback.command(index * GRID / NANOSECONDS)
+        took = clock.perf_counter() - begin
+        self._took += 0.1 * (took - self._took)
+        left = (schedule.stamp(index) - self._now()) / NANOSECONDS
+        if left > 0:
+            revision = each.revisions[index] = each.revisions.get(index, 0) + 1
+            each.revisions.pop(index - 100, None)
+            self._audience.revise(schedule, index, pressures, revision)
+        else:
+            feedback.late(index * GRID / NANOSECONDS, -left)
+        each.coming = feedback.coming()
+        for warned in feedback.warnings[each.warned :]:
+            text = f"plan {schedule.plan_id}, {warned.time:.2f} s: feedback is taken back, "
+            self._audience.warn(f"{text}{warned.name}: {warned.message}")
+        each.warned = len(feedback.warnings)
+        instant = max(now, schedule.start)
+        estimate = feedback.estimate(each.time_of(instant))
+        done = Done(pressures - planned, feedback.share, feedback.reason, took)
+        self._audience.estimated(schedule, instant, estimate, done)
+
+    def _replaced(self, each: _Corrected, index: int) -> bool:
+        """Tell whether another schedule has taken over by a setpoint's instant."""
+        stamp = each.schedule.stamp(index)
+        with self._wake:
+            later = self._open[self._open.index(each) + 1 :] if each in self._open else []
+        return any(other.schedule.start <= stamp for other in later)

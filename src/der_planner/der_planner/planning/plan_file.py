@@ -1,0 +1,191 @@
+"""Plans as files that can be read, kept and played again: YAML, SI units, one row a setpoint.
+
+A file holds the limb it was made for (under its loads), the reference and the commands, so that it
+needs neither the limb file nor the motion; model and kinematics are built anew from them.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from der_planner.limb import Limb, LimbError
+from der_planner.model.response import NODES
+from der_planner.model.series import CONTROL_PERIOD
+from der_planner.planning import models
+from der_planner.planning.errors import PlanningError
+from der_planner.planning.motions import Reference, Start, resting_spline, sample_spline
+from der_planner.planning.result import Plan
+
+Array = NDArray[np.float64]
+
+LEARNED = "learned"
+"""The method of plans that were learned."""
+SCHEMA_VERSION = 1
+SUFFIX = ".yaml"
+_SAME = 1e-9
+"""Relative difference of two numbers of limbs that are the same."""
+_NAMES = ("motion", "model", "method")
+_NUMBERS = ("amplitude", "period", "cycles", "solve_time")
+
+
+def write_plan(plan: Plan, path: str | Path, about: Mapping[str, Any] | None = None) -> None:
+    """Write a plan, whole or not at all.
+
+    Args:
+        plan: to keep.
+        path: of the file.
+        about: what else is worth knowing of it, e.g. how it was learned; kept as it is.
+    """
+    file = Path(path)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    start = plan.reference.start
+    content: dict[str, Any] = {
+        "schema_version": SCHEMA_VERSION,
+        **{name: getattr(plan, name) for name in (*_NAMES, *_NUMBERS)},
+        "about": dict(about or {}),
+        "limb": plan.limb.to_mapping(),
+        "start": None
+        if start is None
+        else {key: np.asarray(value).tolist() for key, value in vars(start).items()},
+        "rest_bend_angles_rad": np.asarray(plan.reference.rest).tolist(),
+        # rows of setpoints, 50 ms apart
+        "differential_pressure_pa": plan.differential_pressure.tolist(),
+        "tip_reference_m": plan.reference.tip.tolist(),
+        "tip_predicted_m": plan.tip_predicted.tolist(),
+        "reference_bend_angles_rad": plan.reference.bend_angles.tolist(),
+    }
+    unfinished = file.with_name(f".{file.name}.part")
+    text = "# A plan, in SI units; row by row the setpoints, 50 ms apart.\n"
+    unfinished.write_text(text + yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+    os.replace(unfinished, file)
+
+
+def read_plan(path: str | Path) -> Plan:
+    """Read a plan that `write_plan` wrote.
+
+    Raises:
+        PlanningError: the file cannot be read, or is not a whole plan; names what is wrong.
+    """
+    try:
+        content = yaml.load(Path(path).read_text(encoding="utf-8"), _Loader)
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise PlanningError(f"cannot read the plan {path}: {error}") from error
+    try:
+        return _plan_of(content)
+    except (KeyError, TypeError, ValueError, LimbError) as error:
+        what = f"'{error.args[0]}' is missing" if isinstance(error, KeyError) else str(error)
+        raise PlanningError(
+            f"the plan {path} cannot be used: {what}; write it again with scripts/learn.py"
+        ) from error
+
+
+_Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+def _plan_of(content: Any) -> Plan:
+    if not isinstance(content, Mapping) or content.get("schema_version") != SCHEMA_VERSION:
+        raise ValueError(f"expected a plan of schema_version {SCHEMA_VERSION}")
+    limb = Limb.from_mapping(content["limb"])
+    command = _rows(content, "differential_pressure_pa", limb.segment_count, None)
+    count = len(command)
+    tip, predicted = (
+        _rows(content, key, 2, count) for key in ("tip_reference_m", "tip_predicted_m")
+    )
+    angles = _rows(content, "reference_bend_angles_rad", limb.segment_count, count)
+    start = None
+    if content["start"] is not None:
+        start = Start(**{key: np.array(value, float) for key, value in content["start"].items()})
+    air = limb.pneumatics
+    steps = np.abs(np.diff(command, axis=0)).max(initial=0.0)
+    slack = 1 + 1e-9
+    if np.abs(command).max() > air.pressure_limit * slack:
+        raise ValueError("its pressures are beyond the limb's limit")
+    if steps > air.slew_limit * CONTROL_PERIOD * slack:
+        raise ValueError("its pressures change faster than the limb's limit")
+    time: Array = np.arange(count, dtype=np.float64) * CONTROL_PERIOD
+    rest = np.array(content["rest_bend_angles_rad"], dtype=float)
+    reference = Reference(time, tip, angles, resting_spline(time, angles, start), rest, start)
+    physics = models.build(limb, str(content["model"]), NODES)
+    bend = sample_spline(physics.configuration(reference), time)[0]
+    return Plan(
+        time=time,
+        differential_pressure=command,
+        reference=reference,
+        tip_predicted=predicted,
+        bend_angles=bend,
+        motion=str(content["motion"]),
+        model=str(content["model"]),
+        method=str(content["method"]),
+        amplitude=float(content["amplitude"]),
+        period=float(content["period"]),
+        cycles=int(content["cycles"]),
+        limb=physics.limb,
+        kinematics=physics.kinematics,
+        solve_time=float(content["solve_time"]),
+    )
+
+
+def _rows(content: Mapping[str, Any], key: str, width: int, count: int | None) -> Array:
+    rows = np.array(content[key], dtype=float)
+    wanted = (len(rows) if count is None else count, width)
+    if rows.shape != wanted or len(rows) < 2 or not np.isfinite(rows).all():
+        raise ValueError(f"{key} must be finite numbers of shape {wanted}, got {rows.shape}")
+    return rows
+
+
+def learned_plan(folder: str | Path | None, name: str, limb: Limb) -> Plan:
+    """Return the learned plan of a name from a folder, for the limb as it is now.
+
+    Args:
+        folder: of learned plans.
+        name: of the file, without ``.yaml``.
+        limb: that is to play it, under its loads.
+
+    Raises:
+        PlanningError: there is no such plan, or it was learned on another limb or load.
+    """
+    if not folder:
+        raise PlanningError(
+            f"the learned plan '{name}' has no place: set the planner's learned_plans to a folder"
+        )
+    known = sorted(path.stem for path in Path(folder).glob(f"*{SUFFIX}"))
+    if name not in known:
+        raise PlanningError(
+            f"no learned plan '{name}' in {folder}, only: {', '.join(known) or 'none'}"
+        )
+    plan = read_plan(Path(folder) / f"{name}{SUFFIX}")
+    other = _difference(plan.limb.to_mapping(), limb.for_model(plan.model).to_mapping())
+    if other:
+        raise PlanningError(
+            f"the plan '{name}' was learned on a limb with another {other}: plan the motion by "
+            "another method and learn again"
+        )
+    return plan
+
+
+def _difference(one: Any, other: Any, where: str = "") -> str:
+    """Return the name of the first number of two limbs that differs; empty if they are one."""
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        for key in {**one, **other}:
+            if key in ("name", "provenance", "calibrated", "pcc_segments"):
+                continue
+            found = _difference(one.get(key), other.get(key), f"{where}.{key}".strip("."))
+            if found:
+                return found
+        return ""
+    if isinstance(one, list | tuple) and isinstance(other, list | tuple):
+        if len(one) != len(other):
+            return where
+        pairs = enumerate(zip(one, other, strict=True))
+        found_each = (_difference(a, b, f"{where}[{n}]") for n, (a, b) in pairs)
+        return next((found for found in found_each if found), "")
+    if isinstance(one, int | float) and isinstance(other, int | float):
+        return "" if abs(one - other) <= _SAME * max(abs(one), abs(other)) else where
+    return "" if one == other else where

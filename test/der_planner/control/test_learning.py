@@ -1,0 +1,234 @@
+"""Learning from run to run, on limbs that are not the one of the plan."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from link_chain import LinkChain
+
+from der_planner.control import Learner, LearningError
+from der_planner.limb import Limb
+from der_planner.model.response import simulate
+from der_planner.planning import CONTROL_PERIOD, Motion, plan
+
+LIMB = Limb.default()
+
+
+def other_limb(gain=0.9, rest=0.035):
+    segments = tuple(
+        replace(s, moment_gain=s.moment_gain * gain, rest_curvature=rest / s.length)
+        for s in LIMB.segments
+    )
+    return replace(LIMB, segments=segments)
+
+
+def play(planned, limb):
+    """Return the tip (K, 2) [m] of another limb under the plan's commands."""
+    return simulate(limb, planned.time, commands=planned.differential_pressure).tip[:-1]
+
+
+def mean_error(planned, tip):
+    return np.linalg.norm(tip - planned.tip_reference, axis=1).mean()
+
+
+@pytest.fixture(scope="module")
+def first():
+    return plan(LIMB, Motion.named("same_direction", period=12.0, cycles=1), method="optimal")
+
+
+def learn(first, limb, runs):
+    learner, planned, errors = Learner(first), first, []
+    for _ in range(runs):
+        tip = play(planned, limb)
+        errors.append(mean_error(planned, tip))
+        learner.add(planned.time, tip)
+        planned = learner.next()
+        check_limits(planned)
+    return learner, planned, errors
+
+
+def check_limits(planned):
+    command, air = planned.differential_pressure, planned.limb.pneumatics
+    steps = np.diff(command, axis=0, prepend=np.zeros((1, 2)))
+    assert np.abs(command).max() <= air.pressure_limit
+    assert np.abs(steps).max() <= air.slew_limit * CONTROL_PERIOD * (1 + 1e-12)
+
+
+@pytest.fixture(scope="module")
+def learned(first):
+    return learn(first, other_limb(), 3)
+
+
+def test_the_error_of_a_rod_with_less_gain_falls_by_more_than_five(learned):
+    learner, _, errors = learned
+    assert errors[2] < errors[0] / 5
+    assert [run.mean_error for run in learner.history] == pytest.approx(errors, rel=1e-6)
+    assert all(run.accepted for run in learner.history)
+
+
+def test_what_is_expected_of_the_next_plan_comes_true(learned):
+    _, planned, _ = learned
+    tip = play(planned, other_limb())
+    gap = np.linalg.norm(tip - planned.tip_predicted, axis=1).mean()
+    assert gap < 5e-4
+
+
+def test_the_same_runs_give_the_same_plan(first):
+    one, two = (learn(first, other_limb(), 1)[1] for _ in range(2))
+    assert np.array_equal(one.differential_pressure, two.differential_pressure)
+
+
+def test_a_chain_of_links_that_was_never_calibrated_is_learned_in_two_runs():
+    motion = Motion.named("asynchronous", period=20.0, cycles=1)
+    planned, chain = plan(LIMB, motion, method="optimal"), LinkChain(3)
+    learner, errors = Learner(planned), []
+    for run in range(3):
+        filmed = chain.play(planned.time, planned.differential_pressure, run=run)
+        still = chain.play(planned.time, planned.differential_pressure, 0.0, noise=0.0)
+        errors.append(mean_error(planned, still.tip))
+        learner.add(filmed.time, filmed.tip, np.tile(np.eye(2) * 3e-4**2, (len(filmed.time), 1, 1)))
+        planned = learner.next()
+        check_limits(planned)
+    assert errors[0] > 3e-3
+    assert errors[2] < errors[0] / 4
+
+
+def test_arcs_learn_as_the_rod_does():
+    motion = Motion.named("same_direction", period=8.0, cycles=1)
+    planned, errors = plan(LIMB, motion, model="pcc", method="paper"), []
+    learner = Learner(planned)
+    for _ in range(3):
+        tip = play(planned, other_limb())
+        errors.append(mean_error(planned, tip))
+        learner.add(planned.time, tip)
+        planned = learner.next()
+    assert planned.model == "pcc"
+    assert errors[2] < errors[0] / 3
+
+
+def test_lost_tags_teach_nothing_wrong(first):
+    limb = other_limb()
+    tip = play(first, limb)
+    lost = (first.time > 5.0) & (first.time < 8.0)
+    learner = Learner(first)
+    learner.add(first.time, np.where(lost[:, None], np.nan, tip))
+    after = learner.next()
+    before = np.linalg.norm(tip - first.tip_reference, axis=1)
+    left = np.linalg.norm(play(after, limb) - first.tip_reference, axis=1)
+    assert left[~lost].mean() < before[~lost].mean() / 2
+    assert left[lost].max() < before[lost].max()
+    assert learner.history[0].seen == pytest.approx(1 - lost.mean(), abs=0.03)
+
+
+def test_a_bag_cut_short_is_used_for_what_it_saw(first):
+    limb = other_limb()
+    tip, seen = play(first, limb), first.time < 7.0
+    learner = Learner(first)
+    learner.add(first.time[seen], tip[seen])
+    left = np.linalg.norm(play(learner.next(), limb) - first.tip_reference, axis=1)
+    before = np.linalg.norm(tip - first.tip_reference, axis=1)
+    assert left[seen].mean() < before[seen].mean() / 3
+    assert left.max() < 1.5 * before.max()
+
+
+def test_a_run_that_was_vented_half_way_teaches_what_came_before(first):
+    limb = other_limb()
+    vented = first.differential_pressure.copy()
+    vented[first.time > 6.0] = 0.0
+    tip = simulate(limb, first.time, commands=vented).tip[:-1]
+    learner = Learner(first)
+    learner.add(first.time, tip)
+    assert learner.history[0].accepted
+    assert learner.history[0].seen < 0.6
+    left = np.linalg.norm(play(learner.next(), limb) - first.tip_reference, axis=1)
+    before = np.linalg.norm(play(first, limb) - first.tip_reference, axis=1)
+    assert left.mean() < before.mean()
+
+
+def test_a_run_that_saw_hardly_anything_is_refused(first, learned):
+    tip = play(first, other_limb())
+    learner = Learner(first)
+    for given in (
+        np.where((first.time > 1.0)[:, None], np.nan, tip),
+        np.full_like(tip, np.nan),
+        np.tile(tip[0], (len(tip), 1)),
+    ):
+        learner.add(first.time, given)
+        assert not learner.history[-1].accepted
+        assert "refused: the tip was seen" in learner.history[-1].reason
+        assert learner.next() is first
+
+
+def test_another_limb_is_set_aside_once_and_then_learned_from_the_start(first):
+    learner, planned, errors = learn(first, other_limb(), 2)
+    swapped = other_limb(gain=0.65, rest=-0.05)
+    learner.add(planned.time, play(planned, swapped))
+    assert not learner.history[-1].accepted
+    assert "set aside" in learner.history[-1].reason
+    again = learner.next()
+    assert mean_error(again, play(again, other_limb())) < 2 * min(errors)
+    tip = play(again, swapped)
+    learner.add(again.time, tip)
+    assert learner.history[-1].accepted
+    assert "the limb has changed" in learner.history[-1].reason
+    after = learner.next()
+    assert mean_error(after, play(after, swapped)) < mean_error(again, tip) / 2
+
+
+def test_one_strange_run_is_forgotten(first):
+    learner, planned, _ = learn(first, other_limb(), 2)
+    learner.add(planned.time, play(planned, other_limb(rest=-0.1)))
+    again = learner.next()
+    learner.add(again.time, play(again, other_limb()))
+    assert [run.accepted for run in learner.history] == [True, True, False, True]
+
+
+def test_a_worse_plan_is_left_for_the_best_with_a_smaller_step(first):
+    learner, planned, errors = learn(first, other_limb(), 2)
+    best = planned.differential_pressure
+    learner.add(planned.time, play(planned, other_limb()))
+    worse = 0.97 * best
+    tip = simulate(other_limb(), planned.time, commands=worse).tip[:-1]
+    learner.add(planned.time, tip, commands=worse)
+    assert learner.history[-1].step == 0.5
+    assert "back to it" in learner.history[-1].reason
+    assert mean_error(first, play(learner.next(), other_limb())) <= errors[1]
+
+
+def test_learning_stops_when_only_what_does_not_repeat_is_left(first):
+    learner, rng = Learner(first), np.random.default_rng(3)
+    tip = play(first, LIMB)
+    for _ in range(6):
+        wander = np.interp(first.time, [0, 4, 8, 15], rng.normal(scale=1e-3, size=4))
+        learner.add(first.time, tip + wander[:, None] * [0.3, 1.0])
+    assert 2e-4 < learner.repeatability < 2e-3
+    assert "only noise is left" in learner.stopped
+    assert learner.stopped in learner.history[-1].reason
+    assert learner.next() is first
+
+
+def test_an_uncertain_run_counts_for_less(first):
+    tip = play(first, LIMB)
+    shifts = []
+    for deviation in (1e-4, 1e-2):
+        learner = Learner(first)
+        learner.add(first.time, tip)
+        doubt = np.tile(np.eye(2) * deviation**2, (len(tip), 1, 1))
+        learner.add(first.time, tip + np.array([0.0, 2e-3]), doubt)
+        change = learner.next().differential_pressure - first.differential_pressure
+        shifts.append(np.abs(change).mean())
+    assert shifts[1] < shifts[0] / 2
+
+
+def test_arrays_that_do_not_fit_are_refused(first):
+    learner, tip = Learner(first), first.tip_reference
+    for time, given, covariance, said in (
+        (first.time[:-1], tip, None, "rising times"),
+        (first.time[::-1], tip, None, "rising times"),
+        (first.time, tip, np.eye(2), "covariance must have shape"),
+    ):
+        with pytest.raises(LearningError, match=said):
+            learner.add(time, given, covariance)
+    with pytest.raises(LearningError, match="commands must be finite"):
+        learner.add(first.time, tip, commands=np.zeros((3, 2)))
+    assert learner.history == []

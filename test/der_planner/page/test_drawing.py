@@ -1,0 +1,129 @@
+"""Drawing a path: what is reachable, from pixels to metres, previews, kept drawings."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from apriltag_tracker.camera import CameraPose, Intrinsics
+from apriltag_tracker.camera.pinhole import project
+from apriltag_tracker.detection.tag import Tag
+from apriltag_tracker.tag_map import TagMap
+from der_planner.limb import Limb
+from der_planner.model.bending import ArcKinematics
+from der_planner.page.drawing.kept import DrawingError, Drawings
+from der_planner.page.drawing.preview import Previewer, preview
+from der_planner.page.drawing.region import reachable_region
+from der_planner.page.drawing.sketch import summary
+from der_planner.page.drawing.studio import drawn_pixels
+from der_planner.page.overlay import Overlay
+from der_planner.planning import PathLimits
+from der_planner.planning.inverse import angle_limits, distance_to_reach
+
+LIMB = Limb.default()
+ARCS = ArcKinematics(LIMB)
+TAG_MAP = Path(__file__).parents[3] / "src" / "apriltag_tracker" / "config" / "tags.yaml"
+
+
+def test_the_region_holds_what_the_tip_reaches_and_nothing_else() -> None:
+    outlines = reachable_region(LIMB)
+    low, high = angle_limits(LIMB)
+    poses = np.random.default_rng(2).uniform(low, high, (300, 2))
+
+    def inside(point: np.ndarray, margin: float) -> bool:
+        scaled = [np.float32(outline) for outline in outlines]
+        return any(
+            cv2.pointPolygonTest(outline, (float(point[0]), float(point[1])), True) > -margin
+            for outline in scaled
+        )
+
+    assert all(inside(tip, 1.5e-3) for tip in ARCS.tip(poses))
+    for point in np.random.default_rng(3).uniform((-0.1, -0.3), (0.3, 0.3), (60, 2)):
+        if inside(point, 0.0):
+            assert distance_to_reach(LIMB, ARCS, point, [0.3, 0.3]) < 1.5e-3
+
+
+def test_pixels_become_metres_where_they_are_drawn() -> None:
+    tags = TagMap.from_yaml(str(TAG_MAP))
+    overlay = Overlay(tags)
+    pixels = np.array([[500.0, 300.0], [700.0, 420.0]])
+    assert overlay.on_plane(pixels) is None
+    assert overlay.pixels_of(pixels) == []
+    camera = Intrinsics.create(
+        1280, 720, [1400, 0, 640, 0, 1400, 360, 0, 0, 1], [-0.1, 0.05, 0, 0, 0], "plumb_bob"
+    )
+    pose = CameraPose.looking_down((0.12, 0.0, 0.8), turn=0.2, tilt=(0.05, -0.03))
+    seen = [
+        Tag(entry.id, project(camera, pose, entry.corners()), np.eye(8) * 1e-4, 0.01, 40.0, 1.0)
+        for entry in tags.world
+    ]  # fmt: skip
+    overlay.put_camera(camera)
+    overlay.put_tags(1, seen)
+    on_plane = overlay.on_plane(pixels)
+    assert on_plane is not None
+    height = max(tag.height for tag in tags.limb)
+    back = project(camera, pose, np.column_stack([on_plane, np.full(2, height)]))
+    np.testing.assert_allclose(back, pixels, atol=0.5)
+    np.testing.assert_allclose(overlay.pixels_of(on_plane), pixels, atol=0.2)
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [None, [], "line", [[1, 2]], [[1, 2], [3]], [[1, 2], [3, None]], [[1, 2], [3, 1e400]],
+     [[0, 0]] * 20_001, {"x": 1}],
+)  # fmt: skip
+def test_what_is_no_drawing_is_refused(sent: object) -> None:
+    with pytest.raises(DrawingError):
+        drawn_pixels(sent)
+
+
+def test_a_preview_is_planned_in_another_process() -> None:
+    previewer = Previewer(LIMB, PathLimits())
+    turn = np.linspace(0, 2 * np.pi, 40)
+    ring = ARCS.tip([0.9, 0.9]) + 0.03 * np.column_stack([np.cos(turn), np.sin(turn)])
+    try:
+        found = previewer.ask(ring, "pcc", "paper").result(timeout=120)
+    finally:
+        previewer.close()
+    assert not found.problem
+    assert 0 < found.largest_pressure <= LIMB.pneumatics.pressure_limit
+    assert 0.005 < found.deviation_largest < 0.03
+    text = summary(found)
+    assert "leaves what the limb reaches" in text
+    assert f"{found.duration:.1f} s" in text
+    json.dumps([pose.tolist() for pose in found.poses])
+
+
+def test_a_drawing_that_cannot_be_planned_says_why() -> None:
+    fast = PathLimits(speed=1e-6)
+    turn = np.linspace(0, 2 * np.pi, 40)
+    ring = ARCS.tip([0.9, 0.9]) + 0.01 * np.column_stack([np.cos(turn), np.sin(turn)])
+    found = preview(LIMB, ring, fast, "pcc", "paper")
+    assert "the longest is 3600 s" in summary(found)
+
+
+@pytest.mark.parametrize(
+    "name", ["../up", "a/b", "..", ".hidden", "/etc/passwd", "star\x00", "x.csv"]
+)
+def test_a_name_stays_in_its_folder(tmp_path: Path, name: str) -> None:
+    drawings = Drawings(tmp_path / "kept")
+    points = np.array([[0.1, 0.2], [0.12, 0.21]])
+    try:
+        kept = drawings.save(name, points)
+    except DrawingError:
+        assert name == ".."
+        return
+    assert drawings.names() == [kept]
+    assert [path.parent for path in tmp_path.rglob("*.csv")] == [tmp_path / "kept"]
+    np.testing.assert_allclose(drawings.load(kept), points, atol=1e-6)
+    with pytest.raises(DrawingError, match="already"):
+        drawings.save(name, points)
+
+
+def test_a_missing_drawing_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DrawingError, match=r"none\.csv"):
+        Drawings(tmp_path).load("none")

@@ -1,0 +1,181 @@
+"""Plans under gravity and with payloads: they begin and end at rest, reach, refuse and name."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from der_planner.limb import GRAVITY, Limb
+from der_planner.model.response import RodModel
+from der_planner.planning import (
+    METHODS,
+    BucklingError,
+    Motion,
+    OverloadError,
+    PlanningError,
+    Start,
+    plan,
+)
+
+LIMB = Limb.default()
+SPATIAL = dataclasses.replace(LIMB, gravity=(0.0, 0.0, -4.0))
+
+
+def stiffer(limb, factor):
+    segments = tuple(
+        dataclasses.replace(
+            s,
+            bending_stiffness=factor * s.bending_stiffness,
+            moment_gain=factor * s.moment_gain,
+        )
+        for s in limb.segments
+    )
+    return dataclasses.replace(limb, segments=segments)
+
+
+def rest_tip(limb):
+    model = RodModel(limb)
+    return model.rest.q[-3:-1]
+
+
+MOUNTED = {
+    "hanging": stiffer(LIMB, 1.3).mounted("hanging"),
+    "tilted, with a payload": LIMB.mounted("15").carrying(0.02),
+    "sideways": stiffer(LIMB, 3.0).mounted("sideways"),
+    "standing": stiffer(LIMB, 1.5).mounted("standing").carrying(0.01),
+}
+
+
+@pytest.mark.parametrize("mounting", MOUNTED)
+@pytest.mark.parametrize(
+    ("name", "amplitude"), [("asynchronous", 0.3), ("same_direction", 0.3), ("circle", 0.5)]
+)
+def test_plans_begin_and_end_at_rest_and_reach_their_reference(mounting, name, amplitude):
+    limb = MOUNTED[mounting]
+    period = 12.0 if name == "circle" else 6.0  # a circle is drawn at 1.2 times its amplitude
+    result = plan(limb, Motion.named(name, amplitude, period, cycles=1))
+    # The circle takes the hanging limb to its limit of pressure.
+    assert result.largest_error < (1.2e-3 if result.details["limited_windows"] else 5e-4)
+    assert result.warnings == ()
+    for end in (0, -1):
+        np.testing.assert_allclose(result.tip_reference[end], rest_tip(limb), atol=1e-9)
+    assert np.abs(result.differential_pressure[[0, -1]]).max() < 60.0
+
+
+def test_the_papers_periods_on_a_hanging_limb():
+    result = plan(LIMB.mounted("hanging"), Motion.named("opposite_direction", 0.7, 20.0, 1))
+    assert result.predicted_error < 1e-4
+    assert result.largest_error < 5e-4
+
+
+def test_a_path_is_kept_whatever_the_limb_carries():
+    turn = np.linspace(0.0, 2 * np.pi, 121)
+    path = np.column_stack([0.222 + 0.004 * np.cos(turn), 0.07 + 0.01 * np.sin(turn)])
+    for limb in (LIMB.mounted("hanging"), LIMB.mounted("hanging").carrying(0.03)):
+        result = plan(limb, Motion.from_tip_path(0.05 * np.arange(121), path))
+        assert result.largest_error < 5e-4
+        apart = np.linalg.norm(result.tip_reference[:, None] - path[None], axis=2).min(axis=0)
+        assert apart.max() < 2e-4
+
+
+@pytest.mark.parametrize("method", METHODS["der"])
+@pytest.mark.parametrize("model", METHODS)
+def test_every_method_knows_the_load(model, method):
+    limb = LIMB.mounted("hanging").carrying(0.02)
+    result = plan(limb, Motion.named("opposite_direction", 0.4, 10.0, 1), model, method)
+    assert result.predicted_error < 5e-4
+    unloaded = dataclasses.replace(limb, gravity=(0.0, 0.0, 0.0))
+    light = plan(unloaded, Motion.named("opposite_direction", 0.4, 10.0, 1), model, method)
+    most = [np.abs(p.differential_pressure[:, 0]).max() for p in (result, light)]
+    assert most[0] > 1.5 * most[1]
+
+
+def test_a_plan_takes_over_from_a_moving_hanging_limb():
+    limb = LIMB.mounted("hanging")
+    first = Motion.named("asynchronous", 0.5, 8.0, 1)
+    before = plan(limb, first)
+    k = 70
+    angles, rates, accelerations = before.reference.sample(before.time[k])
+    start = Start(angles, rates, accelerations, before.differential_pressure[k - 1])
+    after = plan(limb, Motion.named("same_direction", 0.4, 8.0, 1), start=start)
+    np.testing.assert_allclose(after.tip_reference[0], before.tip_reference[k], atol=1e-9)
+    step = np.abs(after.differential_pressure[0] - before.differential_pressure[k - 1])
+    assert step.max() <= limb.pneumatics.slew_limit * 0.05 + 1e-6
+    assert after.predicted_error < 3e-4
+    assert after.largest_error < 2e-3
+
+
+# What pressure cannot do ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("model", METHODS)
+def test_a_payload_that_cannot_be_lifted_is_refused_with_what_could_be(model):
+    limb, motion = LIMB.mounted("hanging"), Motion.named("same_direction", 0.6, 12.0, 1)
+    with pytest.raises(OverloadError) as refused:
+        plan(limb.carrying(0.2), motion, model)
+    error = refused.value
+    assert error.required_pressure > error.pressure_limit == LIMB.pneumatics.pressure_limit
+    assert 0.0 < error.possible_mass < 0.2
+    assert f"{error.required_pressure / 1000:.1f} kPa" in str(error)
+    assert f"{error.possible_mass * 1000:.1f} g are possible" in str(error)
+    plan(limb.carrying(0.95 * error.possible_mass), motion, model, "projected")
+    with pytest.raises(OverloadError):
+        plan(limb.carrying(1.1 * error.possible_mass), motion, model, "projected")
+
+
+def test_a_weight_of_its_own_that_is_too_much_is_named_so():
+    with pytest.raises(OverloadError, match=r"Without the 50\.0 g that it carries it is too much"):
+        plan(LIMB.mounted("hanging").carrying(0.05), Motion.named("same_direction", 0.79, 8.0, 1))
+    with pytest.raises(PlanningError, match="out of reach"):
+        plan(LIMB.mounted("hanging"), Motion.from_tip_path(None, [[0.3, 0.0], [0.3, 0.1]]))
+
+
+def test_a_standing_limb_beyond_its_critical_load_is_refused_by_name():
+    """Greenhill: a column under its own weight buckles at q L³ / EI = 7.837."""
+    standing = LIMB.mounted("standing")
+    segment = LIMB.segments[0]
+    weight = segment.mass_per_length * GRAVITY
+    share = 7.837 * segment.bending_stiffness / LIMB.length**3 / weight
+    assert share < 1
+    motion = Motion.named("same_direction", 0.1, 8.0, 1)
+    for model in METHODS:
+        with pytest.raises(BucklingError, match="buckles under") as refused:
+            plan(standing, motion, model)
+        said = float(str(refused.value).split("(")[1].split(" of them")[0])
+        assert said == pytest.approx(share, abs=0.02)
+    assert plan(stiffer(standing, 1.05 / share), motion).largest_error < 5e-4
+
+
+@pytest.mark.parametrize("model", METHODS)
+def test_a_leaning_limb_beyond_its_critical_load_is_refused_by_name(model):
+    """It is bent by its rest curvature, so that Newton's method may find a fallen rest."""
+    for curvature in (0.2, 2.0):
+        segments = tuple(dataclasses.replace(s, rest_curvature=curvature) for s in LIMB.segments)
+        bent = dataclasses.replace(LIMB, segments=segments).mounted("standing").carrying(0.1)
+        with pytest.raises(BucklingError, match=r"does not stay upright|may fall to either side"):
+            plan(bent, Motion.named("same_direction", 0.1, 8.0, 1), model)
+
+
+@pytest.mark.parametrize(("model", "amplitude"), [("der", 2.0), ("pcc", 2.6)])
+def test_a_pose_that_would_snap_through_is_named(model, amplitude):
+    """A soft limb that is bent far up against its weight falls over at some point."""
+    limb = stiffer(LIMB, 0.1).mounted("hanging")
+    limb = dataclasses.replace(
+        limb, pneumatics=dataclasses.replace(limb.pneumatics, pressure_limit=1e7)
+    )
+    with pytest.raises(BucklingError, match="snap through"):
+        plan(limb, Motion.named("same_direction", amplitude, 20.0, 1), model, "projected")
+
+
+# Out of the plane ------------------------------------------------------------------------------
+
+
+def test_a_limb_that_sags_out_of_its_plane_is_planned_from_where_it_rests():
+    motion = Motion.named("opposite_direction", 0.3, 6.0, 1)
+    result = plan(SPATIAL, motion, nodes=13)
+    sag = RodModel(SPATIAL, 13).rest.q[-1]
+    assert sag < -0.04
+    assert result.largest_error < 1.5e-3
+    assert result.predicted_error < 3e-4
+    flat = plan(LIMB, motion, "pcc", "paper")
+    assert np.abs(result.tip_reference - flat.tip_reference)[0].max() > 5e-3

@@ -1,0 +1,140 @@
+"""The nearest path: whatever is drawn, the limb can follow what comes out."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from der_planner.limb import Limb
+from der_planner.model.bending import ArcKinematics
+from der_planner.planning import Motion, PlanningError, plan
+from der_planner.planning.inverse import BRANCHES, angle_limits, distance_to_reach
+
+LIMB = Limb.default()
+ARCS = ArcKinematics(LIMB)
+CENTRE = ARCS.tip([0.9, 0.9])
+TURN = np.linspace(0.0, 2 * np.pi, 90)
+RING = np.column_stack([np.cos(TURN), np.sin(TURN)])
+STAR = np.array([(np.cos(t), np.sin(t)) for t in np.arange(6) * 4 * np.pi / 5])
+NOISE = np.random.default_rng(5).normal(0.0, 3e-4, (10_000, 2))
+MANY = np.linspace(0.0, 2 * np.pi, 10_000)
+TREMBLING = CENTRE + 0.02 * np.column_stack([np.cos(MANY), np.sin(MANY)]) + NOISE
+FOREIGN = {
+    "a circle partly outside": (None, CENTRE + 0.03 * RING),
+    "the same in its own time": (np.linspace(0, 20, 90), CENTRE + 0.03 * RING),
+    "far too fast": (np.linspace(0, 1, 90), CENTRE + 0.03 * RING),
+    "through the fold": (None, [(0.3, 0.0), (0.1, 0.0)]),
+    "from one side to the other": (None, [(0.15, 0.15), (0.15, -0.15)]),
+    "one place": (None, np.tile(CENTRE, (5, 1))),
+    "one place out of reach, for a while": (np.arange(5.0), np.tile([0.3, 0.3], (5, 1))),
+    "a star": (None, CENTRE + 0.03 * STAR),
+    "wholly outside": (None, CENTRE + [0.2, 0.2] + 0.01 * RING),
+    "behind the clamp": (None, [(-0.1, 0.0), (-0.1, 0.05)]),
+    "ten thousand points": (None, TREMBLING),
+    "ten thousand points in time": (np.linspace(0, 20, 10_000), TREMBLING),
+    "in centimetres": (None, 100 * (CENTRE + 0.03 * RING)),
+}
+
+
+@pytest.mark.parametrize("drawn", FOREIGN)
+def test_what_comes_out_can_be_followed(drawn):
+    reference = Motion.from_tip_path(*FOREIGN[drawn], nearest=True).reference(LIMB)
+    low, high = angle_limits(LIMB)
+    assert np.all(reference.bend_angles >= low)
+    assert np.all(reference.bend_angles <= high)
+    steps = np.abs(np.diff(reference.bend_angles, axis=0)).max() / 0.05
+    slew = LIMB.pneumatics.slew_limit * LIMB.static_gain.max()
+    assert steps < 1.1 * slew
+    assert np.abs(np.diff(reference.bend_angles, 2, axis=0)).max() / 0.05**2 < 3.0  # rad/s²
+
+
+def test_a_path_within_reach_stays_as_it_is():
+    named = Motion.named("circle", amplitude=0.7, period=8.0, cycles=1).reference(LIMB)
+    inner = slice(60, 160)
+    time, tip = named.time[inner], named.tip[inner]
+    plain = Motion.from_tip_path(time, tip).reference(LIMB)
+    nearest = Motion.from_tip_path(time, tip, nearest=True).reference(LIMB)
+    assert nearest.deviation.largest < 2e-4
+    assert nearest.deviation.slowed == 1.0
+    assert str(nearest.deviation) == ""
+    assert nearest.duration == plain.duration
+    lead = np.argmin(np.linalg.norm(nearest.tip - tip[0], axis=1))
+    followed = nearest.tip[lead : lead + len(tip)]
+    assert np.linalg.norm(followed - tip, axis=1).max() < 5e-4
+
+
+def test_the_deviation_is_that_of_the_nearest_points():
+    time, tip = FOREIGN["one place out of reach, for a while"]
+    deviation = Motion.from_tip_path(time, tip, nearest=True).reference(LIMB).deviation
+    truth = distance_to_reach(LIMB, ARCS, tip[0], [1.0, 1.0])
+    assert deviation.mean == pytest.approx(truth, rel=0.01)
+    assert deviation.share == 1.0
+
+
+def test_where_the_path_is_left_is_said():
+    line = np.linspace(CENTRE - [0.004, 0.0], CENTRE + np.array([0.06, 0.0]), 40)
+    motion = Motion.from_tip_path(np.linspace(0, 10, 40), line, nearest=True)
+    deviation = motion.reference(LIMB).deviation
+    assert deviation.point == pytest.approx(line[-1], abs=1e-3)
+    assert len(deviation.spans) == 1
+    begin, end = deviation.spans[0]
+    assert 0.5 < begin < 8.0 < end
+    assert "mm" in str(deviation)
+
+
+def test_a_trembling_hand_is_smoothed():
+    radius = np.linalg.norm(TREMBLING - CENTRE, axis=1).std()
+    small = CENTRE + 0.4 * (TREMBLING - NOISE - CENTRE) + NOISE
+    reference = Motion.from_tip_path(None, small, nearest=True).reference(LIMB)
+    on_circle = np.linalg.norm(reference.tip - CENTRE, axis=1)
+    inner = slice(len(on_circle) // 3, 2 * len(on_circle) // 3)
+    assert on_circle[inner].std() < 0.3 * radius
+    assert reference.deviation.largest < 1e-3
+    assert reference.duration < 40.0  # the hand's steps add up to half a minute of path
+
+
+def test_a_branch_that_was_named_is_kept():
+    for branch in BRANCHES:
+        motion = Motion.from_tip_path(None, CENTRE + 0.02 * RING, branch=branch, nearest=True)
+        path = motion.reference(LIMB)
+        inner = path.bend_angles[len(path.time) // 4 : 3 * len(path.time) // 4]
+        sides = np.linalg.det(ARCS.tip_jacobians(inner)) * (1 if branch == BRANCHES[0] else -1)
+        assert sides.min() > -3e-4  # m²/rad²: it may lean on the fold
+        assert sides.max() > 5e-4
+
+
+@pytest.mark.parametrize("segments", [1, 3])
+def test_other_numbers_of_segments(segments):
+    limb = replace(LIMB, segments=(LIMB.segments[0],) * segments)
+    centre = ArcKinematics(limb).tip(np.full(segments, 0.6))
+    reference = Motion.from_tip_path(None, centre + 0.02 * RING, nearest=True).reference(limb)
+    assert reference.bend_angles.shape == (len(reference.time), segments)
+    assert reference.deviation.mean < 0.015
+
+
+@pytest.mark.parametrize("model", ["der", "pcc"])
+def test_the_plan_says_how_far_it_is_from_the_drawing(model):
+    motion = Motion.from_tip_path(None, CENTRE + 0.03 * RING, nearest=True)
+    planned = plan(LIMB, motion, model, "paper" if model == "pcc" else "projected")
+    assert "nearest path leaves" in planned.warnings[0]
+    assert np.abs(planned.differential_pressure).max() <= LIMB.pneumatics.pressure_limit
+    assert planned.predicted_error < 2e-3
+
+
+@pytest.mark.parametrize(
+    ("time", "tip", "message"),
+    [
+        (None, [(0.2, 0.1), (np.nan, 0.1)], "point 1 of the tip path is not finite"),
+        ([0.0, np.nan], [(0.2, 0.1), (0.2, 0.2)], "times of a tip path must increase"),
+        (None, [(0.2, 0.1)], "two or more points"),
+        (None, np.zeros((3, 3)), r"got shape \(3, 3\)"),
+    ],
+)
+def test_nonsense_is_refused(time, tip, message):
+    with pytest.raises(PlanningError, match=message):
+        Motion.from_tip_path(time, tip, nearest=True)
+
+
+def test_an_unknown_branch_is_refused():
+    with pytest.raises(PlanningError, match="branch 'left' is unknown"):
+        Motion.from_tip_path(None, CENTRE + 0.02 * RING, branch="left", nearest=True)
