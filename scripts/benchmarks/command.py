@@ -24,6 +24,7 @@ PARTS = (
     "studies",
     "loads",
     "learning",
+    "feedback",
 )
 
 

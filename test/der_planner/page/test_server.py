@@ -19,6 +19,7 @@ from der_planner.limb import Limb
 from der_planner.page.access import Binding, Sessions
 from der_planner.page.commands import Answer, MotionRequest, Service
 from der_planner.page.drawing.studio import Studio
+from der_planner.page.experiments import Experiments
 from der_planner.page.guard import Guard
 from der_planner.page.operators import Desk
 from der_planner.page.overlay import Overlay
@@ -66,7 +67,15 @@ class Rig:
         self.picture = PictureFeed(15.0)
         desk = Desk(lambda _: None)
         studio = Studio(Limb.default(), PathLimits(), Path("nowhere"))
-        parts = Parts(self.situation, self.picture, Overlay(TAGS), desk, self.calls, studio)
+        parts = Parts(
+            self.situation,
+            self.picture,
+            Overlay(TAGS),
+            desk,
+            self.calls,
+            studio,
+            Experiments(Path("none")),
+        )
         sessions = Sessions(password)
         self.app: FastAPI = create_app(parts, sessions, secure=False)
         self.guard = Guard(self.app, Binding().hosts(8080), "http", sessions)

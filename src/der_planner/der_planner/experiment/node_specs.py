@@ -81,18 +81,24 @@ def node_specs(
         specs.append(NodeSpec("der_planner", "planner", {**planner, **rig.planner}))
     specs.append(NodeSpec("der_planner", "recorder", recorder))
     if page is not None:
-        specs.append(NodeSpec("der_planner", "page", page_parameters(page, planner or {}, rig)))
+        specs.append(
+            NodeSpec(
+                "der_planner", "page", page_parameters(page, planner or {}, rig, bag.parents[2])
+            )
+        )
     return specs
 
 
-def page_parameters(port: int, planner: dict[str, Any], rig: Hardware) -> dict[str, Any]:
+def page_parameters(
+    port: int, planner: dict[str, Any], rig: Hardware, experiments: Path
+) -> dict[str, Any]:
     """Return the parameters of a page that draws with the planner's limb on the tracker's tags."""
     shared = ("limb_file", "mounting", "payload", "payload_at", "path_speed", "path_acceleration")
     all_of_planner = {**planner, **rig.planner}
     parameters = {name: all_of_planner[name] for name in shared if name in all_of_planner}
     if "tag_map" in rig.tracker:
         parameters["tag_map"] = rig.tracker["tag_map"]
-    return {"port": port, **parameters}
+    return {"port": port, "experiments": str(experiments), **parameters}
 
 
 def twin_loads(limb: Limb | None) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from collections.abc import Awaitable, Callable
 from fastapi import FastAPI
 from nicegui import Client, ui
 
+from der_planner.page import afterwards, setup_page
 from der_planner.page.commands import Answer, MotionRequest, Service, answer_of
 from der_planner.page.drawing.sketch import Sketch
 from der_planner.page.server import STATIC, Parts
@@ -32,6 +33,8 @@ def lay_out(app: FastAPI, parts: Parts) -> None:
     def index(client: Client) -> None:
         Window(client, parts)
 
+    afterwards.add_afterwards(parts.experiments)
+    setup_page.add_setup(parts)
     ui.run_with(app, show_welcome_message=False, reconnect_timeout=RECONNECT, tailwind=False)
 
 
@@ -69,6 +72,8 @@ class Window:
         with ui.row().classes("line"):
             self._take = ui.button("Take control", on_click=self._on_take).props('id="take"')
             self._who = ui.label().props('id="who"')
+            ui.link("Experiments", afterwards.ADDRESS, new_tab=True)
+            ui.link("Set-up guide", setup_page.ADDRESS, new_tab=True)
         with ui.row().classes("line"):
             self._button("Arm", "arm", lambda: self._call("arm"), "positive")
             self._button("Stop motion", "stop", lambda: self._call("stop"), "warning")

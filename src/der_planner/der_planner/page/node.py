@@ -34,6 +34,7 @@ from der_planner.limb import Limb
 from der_planner.page.access import Binding, listen, read_password
 from der_planner.page.commands import OWNERS, Answer, MotionRequest, Service
 from der_planner.page.drawing.studio import Studio
+from der_planner.page.experiments import Experiments
 from der_planner.page.layout import lay_out
 from der_planner.page.operators import POLICIES, Desk
 from der_planner.page.overlay import Overlay
@@ -81,7 +82,15 @@ class PageNode(Node):
         self._overlay = Overlay(self._tag_map)
         self._images = None
         self._desk = Desk(self._on_lost_operator)
-        parts = Parts(self._situation, self._picture, self._overlay, self._desk, self, self._studio)
+        parts = Parts(
+            self._situation,
+            self._picture,
+            self._overlay,
+            self._desk,
+            self,
+            self._studio,
+            self._experiments,
+        )
         self._server = PageServer(binding, listen(binding), parts, lay_out)
         self._subscribe()
         self._diagnostics = DiagnosticsPublisher(self, self._health)
@@ -128,6 +137,8 @@ class PageNode(Node):
         place = float(read("payload_at", 0.0, "as the planner's [m]; 0: the tip", at_least=0.0))
         speed = float(read("path_speed", 0.03, "as the planner's [m/s]", at_least=1e-3))
         most = float(read("path_acceleration", 0.05, "as the planner's [m/s^2]", at_least=1e-3))
+        earlier = str(read("experiments", "experiments", "folder of earlier experiments"))
+        self._experiments = Experiments(Path(earlier).expanduser())
         folder = Path(str(read("drawings", "~/limb_drawings", "folder of kept drawings")))
         if mounting:
             limb = limb.mounted(mounting)

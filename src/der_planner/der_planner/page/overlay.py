@@ -73,6 +73,13 @@ class Overlay:
         with self._lock:
             self._limb = curve
 
+    def camera(self) -> tuple[bool, str]:
+        """Tell whether a calibration has come, and why the camera's pose is not known, if so."""
+        with self._lock:
+            if self._world is None:
+                return False, "no calibration of the camera yet"
+            return True, self._world.problem
+
     def pixels_of(self, points: NDArray[np.float64]) -> list[list[float]]:
         """Return the pixels of points (P, 2) [m] of the limb's plane; none without a pose."""
         placer = self._placer()

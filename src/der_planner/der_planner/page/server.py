@@ -17,12 +17,13 @@ from urllib.parse import parse_qs
 
 import uvicorn
 from fastapi import FastAPI, Request, Response, WebSocket, WebSocketDisconnect
-from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse
+from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, RedirectResponse
 from fastapi.staticfiles import StaticFiles
 
 from der_planner.page.access import SESSION_LIFE, Binding, Sessions, bracketed
 from der_planner.page.commands import Commands, answer_of
 from der_planner.page.drawing.studio import Studio
+from der_planner.page.experiments import Experiments
 from der_planner.page.guard import COOKIE, LOGIN, Guard
 from der_planner.page.operators import Desk
 from der_planner.page.overlay import Overlay
@@ -46,6 +47,7 @@ class Parts:
     desk: Desk
     commands: Commands
     studio: Studio
+    experiments: Experiments
 
 
 class LiveText:
@@ -118,6 +120,13 @@ def create_app(parts: Parts, sessions: Sessions, secure: bool) -> FastAPI:
         head = json.dumps(drawn, separators=(",", ":")).encode()
         body = struct.pack(">I", len(head)) + head + encoded.jpeg
         return Response(body, media_type="application/octet-stream", headers=_UNCACHED)
+
+    @app.get("/experiments/{name}/{inside:path}")
+    async def experiment_file(name: str, inside: str) -> Response:
+        found = await asyncio.to_thread(parts.experiments.file, name, inside)
+        if found is None:
+            return Response("no such file of an experiment", status_code=404)
+        return FileResponse(found, headers=_UNCACHED)
 
     _add_login(app, sessions, secure)
     return app

@@ -81,7 +81,7 @@ class Sketch:
         self._run("page.sketch.clear()")
 
     async def _on_drawn(self, event: GenericEventArguments) -> None:
-        sent = event.args[0] if isinstance(event.args, list) else event.args
+        sent = event.args.get("points") if isinstance(event.args, dict) else None
         try:
             tip = self._parts.overlay.on_plane(drawn_pixels(sent))
         except DrawingError as error:

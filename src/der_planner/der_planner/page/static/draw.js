@@ -71,7 +71,7 @@ page.sketch = (() => {
     if (event.pointerId !== pointer) return;
     pointer = null;
     // Whole pixels of the camera's picture over ten are finer than any hand.
-    if (event.type === "pointerup") emitEvent("drawn", points.map(([x, y]) => [Math.round(x * 10) / 10, Math.round(y * 10) / 10]));
+    if (event.type === "pointerup") emitEvent("drawn", { points: points.map(([x, y]) => [Math.round(x * 10) / 10, Math.round(y * 10) / 10]) });
     else points = [];
   }
 
@@ -85,7 +85,7 @@ page.sketch = (() => {
     get on() { return on; },
     get points() { return points; },
     get preview() { return preview; },
-    turn(wanted) { on = wanted; canvas()?.classList.toggle("on", on); if (!on) { points = []; preview = null; } },
+    turn(wanted) { on = wanted; canvas()?.classList.toggle("on", on); document.getElementById("draw-legend")?.toggleAttribute("hidden", !on); if (!on) { points = []; preview = null; } },
     clear() { points = []; preview = null; },
     show(found) { preview = found; begun = performance.now(); if (!points.length || pointer === null) points = found.drawn; },
   };

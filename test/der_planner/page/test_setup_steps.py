@@ -1,0 +1,69 @@
+"""The set-up guide judges each step from what is heard now, never from what was heard once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from der_planner.page.setup_steps import SetupGuide, Step
+from der_planner.page.situation import DriverState, LimbView, NodeStatus, Situation
+
+VENTED = DriverState(
+    mode=0, faults=(), plan_id="", commanded=(0.0, 0.0), measured=(12.0, -40.0),
+    supply=2.5e5, telemetry_age=0.05,
+)  # fmt: skip
+
+
+class Rig:
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.situation = Situation(lambda: self.now)
+        self.guide = SetupGuide(2, "shipped")
+
+    def steps(self, problem: str = "", calibrated: bool = True) -> list[Step]:
+        return self.guide.steps(self.situation.snapshot(), problem, calibrated)
+
+    def done(self) -> list[bool]:
+        return [step.done for step in self.steps()]
+
+
+def test_nothing_is_done_before_anything_is_heard() -> None:
+    steps = Rig().steps("no calibration yet", calibrated=False)
+    assert not any(step.done for step in steps)
+    assert all(step.seen and step.advice for step in steps)
+
+
+def test_a_running_rig_passes_until_it_falls_silent() -> None:
+    rig = Rig()
+    rig.situation.put_driver(VENTED)
+    rig.situation.put_limb(LimbView(1, True, "", (0.2, 0.0), (0.0, 0.0), ((0.0, 0.0),)))
+    rig.situation.put_status(NodeStatus("/limb/planner", 0, "idle", {"limb": "ours"}))
+    assert rig.done() == [True, True, False, True, True, True, True]
+    rig.now = 6.0
+    assert rig.done() == [False, False, False, True, True, False, False]
+
+
+def test_each_chamber_counts_only_if_it_is_driven_alone() -> None:
+    rig = Rig()
+    for measured in ((5e3, 5e3), (2e3, 0.0), (float("nan"), 5e3)):
+        rig.situation.put_driver(replace(VENTED, mode=2, measured=measured))
+        rig.steps()
+    assert "segment 0 left" in rig.steps()[2].seen
+    assert "segment 1 left" not in rig.steps()[2].seen
+    for measured in ((5e3, 0.0), (-5e3, 200.0), (0.0, -4e3)):
+        rig.situation.put_driver(replace(VENTED, mode=2, measured=measured))
+        rig.steps()
+    assert rig.steps()[2].done
+
+
+def test_pressure_that_stays_and_the_shipped_limb_are_no_success() -> None:
+    rig = Rig()
+    rig.situation.put_driver(replace(VENTED, measured=(1500.0, 0.0)))
+    rig.situation.put_status(NodeStatus("/limb/planner", 0, "idle", {"limb": "shipped"}))
+    steps = rig.steps()
+    assert not steps[1].done
+    assert "1.50 kPa" in steps[1].seen
+    assert not steps[6].done
+    rig.situation.put_driver(replace(VENTED, mode=1))
+    assert not rig.steps()[1].done
+    rig.situation.put_driver(replace(VENTED, telemetry_age=float("nan")))
+    assert "never been heard" in rig.steps()[0].seen

@@ -1,0 +1,123 @@
+"""A line drawn in a real browser: what it would look like is shown, and the limb follows it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+import uuid
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+
+from der_msgs.msg import PressurePlan, PressureState
+from limb_interfaces import qos, topics
+
+webdriver = pytest.importorskip("selenium.webdriver")
+CHROMIUM, CHROMEDRIVER = shutil.which("chromium"), shutil.which("chromedriver")
+pytestmark = [
+    pytest.mark.graph,
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        not (CHROMIUM and CHROMEDRIVER),
+        reason="no Chromium to open the page with: sudo apt-get install chromium chromium-driver",
+    ),
+]
+PLACE = """
+const box = document.getElementById('sketch').getBoundingClientRect(), region = page.region[0];
+const right = region.reduce((best, point) => (point[0] > best[0] ? point : best));
+const canvas = document.getElementById('sketch');
+const across = box.width / canvas.width, down = box.height / canvas.height;
+return [box.left + right[0] * across, box.top + right[1] * down];
+"""
+"""Where the region is farthest to the right, in the window."""
+
+
+@pytest.fixture
+def url(graph: Any, tmp_path: Path) -> str:
+    """Start a twin with everything, and return the page's address."""
+    link = f"/tmp/der_limb_page_test_{uuid.uuid4().hex[:8]}"
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    graph.start("pressure_driver", "board_emulator", port_link=link)
+    graph.client.wait_ready(["board_emulator"])
+    graph.start("pressure_driver", "pressure_driver", port=link)
+    nodes = [("der_planner", "limb_twin"), ("apriltag_tracker", "synthetic_camera")]
+    nodes += [("apriltag_tracker", "apriltag_tracker")]
+    for package, executable in nodes:
+        graph.start(package, executable)
+    graph.start("der_planner", "planner", default_method="projected")
+    graph.start("der_planner", "page", port=port, drawings=str(tmp_path / "drawings"))
+    names = [executable for _, executable in nodes]
+    graph.client.wait_ready(["pressure_driver", "planner", "page", *names])
+    return f"http://127.0.0.1:{port}/"
+
+
+@pytest.fixture
+def browser(tmp_path: Path) -> Any:
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    for flag in ("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run",
+                 f"--user-data-dir={tmp_path / 'profile'}", "--window-size=1280,900"):  # fmt: skip
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"performance": "ALL"})
+    window = webdriver.Chrome(options=options, service=webdriver.ChromeService(CHROMEDRIVER))
+    yield window
+    window.quit()
+
+
+def test_a_drawing_is_previewed_played_and_kept(
+    graph: Any, url: str, browser: Any, tmp_path: Path
+) -> None:
+    client = graph.client
+    client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES)
+    client.subscribe(PressurePlan, topics.PLAN, qos.LATCHED)
+    browser.get(url)
+
+    def wait(script: str, what: str) -> Any:
+        return client.wait_for(lambda: browser.execute_script(script), 60.0, what)
+
+    def press(name: str) -> None:
+        client.wait_for(browser.find_element("id", name).is_enabled, 60.0, f"the button {name}")
+        browser.execute_script(f"document.getElementById('{name}').click()")
+
+    wait("return page.pictures > 0 && !!document.getElementById('draw')", "pictures")
+    press("take")
+    press("arm")
+    press("draw")
+    wait("return page.sketch.on && !!page.region", "the reachable region")
+    x, y = browser.execute_script(PLACE)
+    actions = webdriver.ActionChains(browser, duration=20)
+    pointer = actions.w3c_actions.pointer_action
+    pointer.move_to_location(int(x) - 2, int(y) + 20)
+    pointer.pointer_down()
+    for step in range(12):  # out of the region and back
+        pointer.move_to_location(int(x) - 2 + (4 * step if step < 6 else 0), int(y) + 20 - 4 * step)
+    pointer.pointer_up()
+    actions.perform()
+    wait("return !!page.sketch.preview && page.sketch.preview.poses.length > 0", "a preview")
+    said = browser.find_element("id", "preview").text
+    assert "leaves what the limb reaches" in said
+    assert "kPa" in said
+
+    browser.find_element("css selector", "#drawing-name").send_keys("../hand")
+    press("save-drawing")
+    client.wait_for((tmp_path / "drawings" / "hand.csv").exists, 20.0, "the kept drawing")
+    press("play-drawing")
+    client.wait_for(lambda: topics.PLAN in client.newest, 60.0, "the plan")
+    client.wait_for(
+        lambda: client.newest[topics.PRESSURE_STATE].mode == PressureState.TRACKING,
+        20.0,
+        "the driver to follow the drawing",
+    )
+    entries = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
+    asked = [
+        entry["params"]["request"]["url"]
+        for entry in entries
+        if entry["method"] == "Network.requestWillBeSent"
+    ]
+    hosts = {urlsplit(address).netloc for address in asked if address.startswith("http")}
+    assert hosts == {urlsplit(url).netloc}
