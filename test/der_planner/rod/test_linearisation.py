@@ -252,7 +252,9 @@ def test_one_interval_is_the_linearised_step():
     np.testing.assert_allclose(moved, A[:count, :count] @ dq, atol=1e-10)
 
 
-@pytest.mark.parametrize("rod", [limb_rod(cubic_stiffness=1e-5), spatial_rod()], ids=str)
+@pytest.mark.parametrize(
+    "rod", [limb_rod(cubic_stiffness=1e-5), spatial_rod()], ids=["plane", "space"]
+)
 def test_linearised_equilibrium_is_its_derivative(rod):
     u = np.array([4e3, -3e3])
     state = rod.equilibrium(u)
