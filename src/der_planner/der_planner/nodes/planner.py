@@ -12,33 +12,24 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PointStamped
 from nav_msgs.msg import Path as PathMessage
 from numpy.typing import NDArray
 from rclpy.node import Node
 from std_srvs.srv import Trigger
-from visualization_msgs.msg import MarkerArray
 
-from der_msgs.msg import (
-    LimbEstimate,
-    LimbState,
-    MotionCommand,
-    PressurePlan,
-    PressureSetpoint,
-    PressureState,
-)
+from der_msgs.msg import LimbState, MotionCommand, PressureState
 from der_planner.control.estimation import Estimate
 from der_planner.control.feedback import Feedback
-from der_planner.nodes import planner_messages
 from der_planner.nodes.driver_watch import DriverWatch, Ending
 from der_planner.nodes.planner_action import MotionAction
 from der_planner.nodes.planner_feedback import Corrector, Done
-from der_planner.nodes.planner_markers import estimate_marker, limb_marker, path_markers
 from der_planner.nodes.planner_parameters import read_parameters
+from der_planner.nodes.planner_publishers import PlannerPublishers
 from der_planner.nodes.planner_requests import Request, from_command, from_path, new_plan_id
 from der_planner.nodes.planner_stage import Stage
+from der_planner.nodes.planner_status import PlannerStatus
 from der_planner.planning import METHODS, Motion, Plan, Start, plan
-from der_planner.planning.streaming import GRID, Schedule, first_stamp
+from der_planner.planning.streaming import Schedule, first_stamp
 from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.overrides import check_overrides
@@ -53,15 +44,6 @@ _FEEDBACK_MARGIN = 500_000_000
 """What feedback needs to be made ready for a plan takes less than this [ns]."""
 _ARMING_PATIENCE = 0.5
 """[s] for the state of a driver that was armed just now to arrive."""
-_LEVELS = {
-    "starting": "stale",
-    "error": "error",
-    "failed": "error",
-    "fault": "error",
-    "lost": "error",
-    "refused": "warning",
-    "vented": "warning",
-}
 
 
 class Cancelled(Exception):  # noqa: N818 - not an error
@@ -80,21 +62,14 @@ class PlannerNode(Node):
         self._options = read_parameters(self)
         check_overrides(self)
         self._lock = threading.Lock()
-        self._state, self._plan_id, self._reason, self._progress = "starting", "", "", 0.0
-        self._last_refusal = ""
+        self._status = PlannerStatus()
         self._request: Request | None = None
         self._newest: tuple[str, Plan, bool] | None = None
         self._work: queue.SimpleQueue[Request | None] = queue.SimpleQueue()
-        self._plans = self.create_publisher(PressurePlan, topics.PLAN, qos.LATCHED)
-        self._setpoints = self.create_publisher(
-            PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINT_STREAM
-        )
-        self._references = self.create_publisher(PointStamped, topics.TIP_REFERENCE, qos.STATES)
-        self._markers = self.create_publisher(MarkerArray, topics.SHAPE_MARKERS, qos.STATES)
+        self._publishers = PlannerPublishers(self)
         self._diagnostics = DiagnosticsPublisher(self, self._health)
         self._driver = DriverWatch(clock.monotonic, self._options.driver_timeout)
         self._stage = Stage(self, self._driver, self._now, self._options.lead)
-        self._estimates = self.create_publisher(LimbEstimate, topics.ESTIMATE, qos.STATES)
         self._corrector = Corrector(self, self._now)
         self._action = MotionAction(self, self._take_command, self._stop_plan, self._stage.find)
         self._planning = threading.Thread(target=self._run, name="planning", daemon=True)
@@ -185,7 +160,7 @@ class PlannerNode(Node):
     def _on_stop(self, _: Any, response: Any) -> Any:
         """Cancel planning and streaming; the driver holds, then vents."""
         planning, playing = self._end_all("stopped", "the service stop was called")
-        self._set("idle", reason="stopped by the service stop")
+        self._status.set("idle", reason="stopped by the service stop")
         response.success = True
         response.message = {
             (True, True): "cancelled the plan in the making and stopped streaming",
@@ -200,7 +175,7 @@ class PlannerNode(Node):
         with self._stage.lock:
             if self._is_busy(plan_id):
                 self._end_all("stopped", "the action was cancelled")
-                self._set("idle", reason="stopped by a cancelled action")
+                self._status.set("idle", reason="stopped by a cancelled action")
 
     # Ends ----------------------------------------------------------------------------------
 
@@ -218,15 +193,14 @@ class PlannerNode(Node):
     def abandoned(self, plan_id: str, ending: Ending) -> None:
         """Everything was stopped because of the driver: plan nothing to go on with either."""
         self._end_all(ending.outcome, ending.reason)
-        self._set(ending.outcome, plan_id, reason=ending.reason)
+        self._status.set(ending.outcome, plan_id, reason=ending.reason)
         self._diagnostics.publish()
 
     def ended(self, schedule: Schedule, outcome: str, reason: str) -> None:
         """Log how the playing of a plan ended, and tell who asked for it."""
-        with self._lock:
-            current = self._plan_id == schedule.plan_id and self._state == "streaming"
+        current = self._status.read()[:2] == (schedule.plan_id, "streaming")
         if outcome == "finished" and current:
-            self._set("done", schedule.plan_id, progress=1.0)
+            self._status.set("done", schedule.plan_id, progress=1.0)
         text = f"plan {schedule.plan_id} {outcome} after {self._stage.share(schedule)}"
         if outcome in ("vented", "fault", "lost"):
             self.get_logger().error(f"{text}: {reason}")
@@ -238,11 +212,11 @@ class PlannerNode(Node):
     def _refuse(self, plan_id: str, reason: str) -> None:
         """Refuse a plan; what is being planned or played meanwhile stays the state of the node."""
         self.get_logger().warning(f"plan {plan_id} refused: {reason}")
+        self._status.refused(f"plan {plan_id}: {reason}")
         with self._lock:
-            self._last_refusal = f"plan {plan_id}: {reason}"
             planned = self._request is not None and self._request.plan_id != plan_id
         if not planned and not self._stage.busy:
-            self._set("refused", plan_id, reason=reason)
+            self._status.set("refused", plan_id, reason=reason)
         self._action.end(plan_id, "refused", reason)
         self._diagnostics.publish()
 
@@ -251,7 +225,7 @@ class PlannerNode(Node):
     def _accept(self, request: Request) -> None:
         with self._lock:
             replaced, self._request = self._request, request
-            self._last_refusal = ""
+        self._status.refused("")
         if replaced is not None:
             replaced.cancelled.set()
             self._action.end(replaced.plan_id, "replaced", f"by plan {request.plan_id}")
@@ -259,7 +233,7 @@ class PlannerNode(Node):
             f"plan {request.plan_id} accepted: {request.motion.name}, {request.model} "
             f"{request.method}"
         )
-        self._set("planning", request.plan_id, progress=0.0)
+        self._status.set("planning", request.plan_id, progress=0.0)
         self._work.put(request)
 
     def _run(self) -> None:
@@ -297,18 +271,15 @@ class PlannerNode(Node):
             Feedback(found)
         except Exception as error:
             self.get_logger().error(f"the limb cannot be planned for: {error}")
-            self._set("error", reason=str(error))
+            self._status.set("error", reason=str(error))
             return
-        with self._lock:
-            waiting = self._state == "starting"
-        if waiting:
-            self._set("idle")
+        self._status.ready()
 
     def _plan(self, request: Request) -> None:
         def progress(share: float) -> None:
             if request.cancelled.is_set():
                 raise Cancelled
-            self._progress = share
+            self._status.progress = share
 
         stamp, start, result = self._planned(request, progress)
         feedback = Feedback(result) if request.feedback else None
@@ -325,8 +296,10 @@ class PlannerNode(Node):
             begin = stamp if start is not None else request.start
             self._play(request.plan_id, result, begin, feedback, request.cancelled)
         else:
-            self._publish_plan(Schedule(request.plan_id, result, 0))
-            self._set("done", request.plan_id, reason="waits for the service start", progress=1.0)
+            self._publishers.plan(Schedule(request.plan_id, result, 0))
+            self._status.set(
+                "done", request.plan_id, reason="waits for the service start", progress=1.0
+            )
 
     def _planned(
         self, request: Request, progress: Callable[[float], None]
@@ -381,8 +354,10 @@ class PlannerNode(Node):
     def scheduled(self, schedule: Schedule) -> None:
         """A plan has its instant: publish it before its first setpoint."""
         result = schedule.plan
-        self._set("streaming", schedule.plan_id, reason="; ".join(result.warnings), progress=0.0)
-        self._publish_plan(schedule)
+        self._status.set(
+            "streaming", schedule.plan_id, reason="; ".join(result.warnings), progress=0.0
+        )
+        self._publishers.plan(schedule)
         ahead = (schedule.start - self._now()) / NANOSECONDS
         self.get_logger().info(
             f"plan {schedule.plan_id} planned in {result.solve_time:.2f} s: {schedule.count} "
@@ -394,90 +369,44 @@ class PlannerNode(Node):
         if index == 0:
             self.get_logger().info(f"plan {schedule.plan_id} started")
         pressures = self._corrector.pressures(schedule, index)
-        self._setpoints.publish(planner_messages.setpoint_message(schedule, index, pressures))
-        self._references.publish(planner_messages.reference_message(schedule, index))
-        self._progress = (index + 1) / schedule.count
+        self._publishers.setpoint(schedule, index, pressures)
+        self._publishers.reference(schedule, index)
+        self._status.progress = (index + 1) / schedule.count
 
     def revise(self, schedule: Schedule, index: int, pressures: Array, revision: int) -> None:
         """Publish a setpoint that was sent already with other pressures (M,) [Pa]."""
-        message = planner_messages.setpoint_message(schedule, index, pressures, revision)
-        self._setpoints.publish(message)
+        self._publishers.setpoint(schedule, index, pressures, revision)
 
     def estimated(self, schedule: Schedule, instant: int, estimate: Estimate, done: Done) -> None:
         """Publish what feedback knows of the limb at an instant [ns]."""
-        message = planner_messages.estimate_message(schedule, instant, estimate)
-        message.correction = done.correction.tolist()
-        message.share, message.reason = done.share, done.reason
-        message.solve_time = done.solve_time
-        self._estimates.publish(message)
-        self._markers.publish(estimate_marker(message))
+        self._publishers.estimate(schedule, instant, estimate, done)
 
     def warn(self, text: str) -> None:
         """Say that feedback was taken back."""
         self.get_logger().warning(text)
-
-    def _publish_plan(self, schedule: Schedule) -> None:
-        self._plans.publish(planner_messages.plan_message(schedule))
-        self._markers.publish(path_markers(schedule.plan, self.get_clock().now().to_msg()))
 
     def _now(self) -> int:
         return int(self.get_clock().now().nanoseconds)
 
     # What it says of itself ----------------------------------------------------------------
 
-    def _set(
-        self,
-        state: str,
-        plan_id: str | None = None,
-        reason: str = "",
-        progress: float | None = None,
-    ) -> None:
-        with self._lock:
-            self._state, self._reason = state, reason
-            self._plan_id = self._plan_id if plan_id is None else plan_id
-            self._progress = self._progress if progress is None else progress
-
     def _health(self) -> Health:
         with self._lock:
-            state, reason, refusal = self._state, self._reason, self._last_refusal
-            values = {
-                "state": state,
-                "plan_id": self._plan_id,
-                "reason": reason,
-                "last_refusal": refusal,
-                "progress": f"{self._progress:.3f}",
-                "limb": self._options.limb.name,
-                "driver": self._driver.mode or "not heard",
-                "feedback": self._corrector.reason,
-            }
-            newest = self._newest
-        if newest is not None:
-            values["predicted_error_m"] = f"{newest[1].predicted_error:.6f}"
-            values["pressure_margin_pa"] = f"{newest[1].pressure_margin:.0f}"
-            values["slew_margin_pa_per_s"] = f"{newest[1].slew_margin:.0f}"
-            values["solve_time_s"] = f"{newest[1].solve_time:.3f}"
-        if state == "starting":
-            return Health("stale", "waiting for the models to compile", values)
-        if state in _LEVELS:
-            return Health(_LEVELS[state], f"{state}: {reason}", values)
-        if refusal:
-            return Health("warning", f"{state}; refused {refusal}", values)
-        level = "warning" if state == "streaming" and reason else "ok"
-        return Health(level, reason or state, values)
+            newest = None if self._newest is None else self._newest[1]
+        values = {
+            "limb": self._options.limb.name,
+            "driver": self._driver.mode or "not heard",
+            "feedback": self._corrector.reason,
+        }
+        return self._status.health(newest, values)
 
     def _show(self) -> None:
         """Ten times a second: end what is over, tell who asked, show the reference limb."""
         self._stage.end_what_is_over()
-        with self._lock:
-            plan_id, state, progress = self._plan_id, self._state, self._progress
-        self._action.tell(plan_id, state, progress)
+        self._action.tell(*self._status.read())
         position = self._stage.position
-        if position is None:
-            return
-        schedule, index = position
-        index = max(0, index - 1 - self._options.lead // GRID)
-        stamp = self.get_clock().now().to_msg()
-        self._markers.publish(limb_marker(schedule.plan, index, stamp))
+        if position is not None:
+            self._publishers.reference_limb(*position, self._options.lead)
 
     def close(self) -> None:
         """Stop streaming and planning; called once before the node goes."""
