@@ -66,7 +66,7 @@ class PlannerNode(Node):
         self._request: Request | None = None
         self._newest: tuple[str, Plan, bool] | None = None
         self._work: queue.SimpleQueue[Request | None] = queue.SimpleQueue()
-        self._publishers = PlannerPublishers(self)
+        self._output = PlannerPublishers(self)
         self._diagnostics = DiagnosticsPublisher(self, self._health)
         self._driver = DriverWatch(clock.monotonic, self._options.driver_timeout)
         self._stage = Stage(self, self._driver, self._now, self._options.lead)
@@ -296,7 +296,7 @@ class PlannerNode(Node):
             begin = stamp if start is not None else request.start
             self._play(request.plan_id, result, begin, feedback, request.cancelled)
         else:
-            self._publishers.plan(Schedule(request.plan_id, result, 0))
+            self._output.plan(Schedule(request.plan_id, result, 0))
             self._status.set(
                 "done", request.plan_id, reason="waits for the service start", progress=1.0
             )
@@ -357,7 +357,7 @@ class PlannerNode(Node):
         self._status.set(
             "streaming", schedule.plan_id, reason="; ".join(result.warnings), progress=0.0
         )
-        self._publishers.plan(schedule)
+        self._output.plan(schedule)
         ahead = (schedule.start - self._now()) / NANOSECONDS
         self.get_logger().info(
             f"plan {schedule.plan_id} planned in {result.solve_time:.2f} s: {schedule.count} "
@@ -369,17 +369,17 @@ class PlannerNode(Node):
         if index == 0:
             self.get_logger().info(f"plan {schedule.plan_id} started")
         pressures = self._corrector.pressures(schedule, index)
-        self._publishers.setpoint(schedule, index, pressures)
-        self._publishers.reference(schedule, index)
+        self._output.setpoint(schedule, index, pressures)
+        self._output.reference(schedule, index)
         self._status.progress = (index + 1) / schedule.count
 
     def revise(self, schedule: Schedule, index: int, pressures: Array, revision: int) -> None:
         """Publish a setpoint that was sent already with other pressures (M,) [Pa]."""
-        self._publishers.setpoint(schedule, index, pressures, revision)
+        self._output.setpoint(schedule, index, pressures, revision)
 
     def estimated(self, schedule: Schedule, instant: int, estimate: Estimate, done: Done) -> None:
         """Publish what feedback knows of the limb at an instant [ns]."""
-        self._publishers.estimate(schedule, instant, estimate, done)
+        self._output.estimate(schedule, instant, estimate, done)
 
     def warn(self, text: str) -> None:
         """Say that feedback was taken back."""
@@ -406,7 +406,7 @@ class PlannerNode(Node):
         self._action.tell(*self._status.read())
         position = self._stage.position
         if position is not None:
-            self._publishers.reference_limb(*position, self._options.lead)
+            self._output.reference_limb(*position, self._options.lead)
 
     def close(self) -> None:
         """Stop streaming and planning; called once before the node goes."""
