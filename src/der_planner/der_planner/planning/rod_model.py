@@ -26,6 +26,8 @@ POSITION_GAIN = 20.0
 """K_p of the method ``paper`` [1/s²]."""
 VELOCITY_GAIN = 8.0
 """K_d of the method ``paper`` [1/s]: with K_p a damped return at 0.7 Hz."""
+_AT_REST = 1e-9
+"""Below this speed [m/s] of its nodes and tip a reference begins at rest."""
 
 
 class PlanningRod(RodModel):
@@ -120,7 +122,8 @@ class PlanningRod(RodModel):
         """
         result, free = pressures.copy(), self.rod.free
         mass = self.rod.mass_diagonal[free]
-        moving = velocity[0].any()
+        # A reference at rest has rates of rounding errors; a motion that goes on has far more.
+        moving = np.abs(velocity[0]).max() > _AT_REST
         state = self.rod.state(position[0], velocity[0], like=self.rest) if moving else self.rest
         step = float(time[1] - time[0])
         for k in range(len(result)):
