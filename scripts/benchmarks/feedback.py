@@ -3,7 +3,8 @@
 On the whole graph: what estimate and replan took for each setpoint that was revised, and the time
 from the instant of a picture to the first command at the board that knows of it. Then, in one
 process, twins play with the default limb's file, as if nobody had calibrated them, and with their
-own. The cost is that of `measure` and `command` together, as the planner calls them for one setpoint.
+own. The cost is that of `measure` and `command` together, as the planner calls them for one
+setpoint.
 """
 
 from __future__ import annotations
