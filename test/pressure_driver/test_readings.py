@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from pressure_driver.core import LogAllowance
 from pressure_driver.protocols import NAMES
 from pressure_driver.safety import MOST_FAULTS, Mode
 from pressure_driver.watch.limits import MonitorLimits
+from pressure_driver.watch.texts import LogAllowance
 
 # ---------------------------------------------------------------------------------- supply
 
@@ -164,9 +164,10 @@ def test_a_sensor_that_reads_nan_in_three_of_four_lines_is_a_fault(simulate, pro
         if next(count) % 4 == 0:
             return report
         lines = report.splitlines(keepends=True)
-        parts = lines[0].split()
-        separator = b" " if protocol == "ezloop" else b"\t"
-        lines[0] = separator.join([*parts[:-1], word]) + b"\r\n"
+        # The chambers are told first by one board and last by the other.
+        place, separator = (0, b" ") if protocol == "ezloop" else (-1, b"\t")
+        parts = lines[place].split()
+        lines[place] = separator.join([*parts[:-1], word]) + b"\r\n"
         return b"".join(lines)
 
     sim.board.telemetry = broken
