@@ -235,3 +235,14 @@ def test_the_allowance_for_texts_comes_back():
     assert [allowance.allows(0.0) for _ in range(5)] == [True, True, True, False, False]
     assert [allowance.allows(2.0) for _ in range(3)] == [True, True, False]
     assert allowance.withheld == 3
+
+
+def test_reports_of_another_language_are_said_to_be_so(simulate):
+    sim = simulate("ezloop")
+    telemetry = sim.board.telemetry
+    sim.board.telemetry = lambda: telemetry().replace(b".", b",")  # a decimal comma
+    sim.run(3.0)
+    (obstacle,) = sim.core.obstacles()
+    assert "not of this language" in obstacle
+    assert sim.core.protocol.last_damaged.startswith("[VAL]: 0,00")
+    assert not sim.core.arm()[0]

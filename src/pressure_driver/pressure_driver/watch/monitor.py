@@ -200,7 +200,15 @@ class TelemetryMonitor:
         """Say whether the board has gone silent."""
         age = self.telemetry_age(now)
         if self._last_telemetry is None:
-            return ["no telemetry from the board yet"]
+            self._forget_old_lines(now)
+            if self._damaged < MOST_DAMAGED:
+                return ["no telemetry from the board yet"]
+            return [
+                f"no telemetry from the board yet: {self._damaged} lines or frames of the last "
+                f"{READING_WINDOW:g} s are not of this language and number of chambers (see "
+                "'last_damaged_line' in the diagnostics); look at 'protocol', 'baud_rate' and "
+                "'segment_count'"
+            ]
         if age > self.limits.telemetry_timeout:
             return [f"no telemetry: the last came {age:.1f} s ago"]
         return []
