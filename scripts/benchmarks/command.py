@@ -25,6 +25,8 @@ PARTS = (
     "loads",
     "learning",
     "feedback",
+    "page",
+    "page_memory",
 )
 
 

@@ -100,7 +100,7 @@ def _stream(client: GraphClient, seconds: float) -> Setpoints:
     return wanted
 
 
-def _plan(client: GraphClient, seconds: float) -> Setpoints:
+def play_plan(client: GraphClient, seconds: float) -> Setpoints:
     """Have the planner plan and play a motion of at least this length."""
     client.subscribe(PressurePlan, topics.PLAN, qos.LATCHED)
     client.call("recorder/start", 20.0)
@@ -120,7 +120,7 @@ def _plan(client: GraphClient, seconds: float) -> Setpoints:
     return {stamp: tuple(row) for stamp, row in zip(stamps, values.tolist(), strict=True)}
 
 
-def _evaluate(case: str, wanted: Setpoints, seen: Seen) -> dict[str, float | str]:
+def evaluate(case: str, wanted: Setpoints, seen: Seen) -> dict[str, float | str]:
     """Compare what was asked with what the board received, on the board's clock."""
     by_tick: dict[int, ChamberPressures] = {}
     for command in seen.commands:
@@ -169,7 +169,7 @@ def _guardian_cost(figures: dict[str, float | str]) -> dict[str, float | str]:
 
 def _measure(case: str, seconds: float) -> dict[str, float | str]:
     """Start the nodes of a case, play, and return its figures."""
-    play: Callable[[GraphClient, float], Setpoints] = _plan if case == "graph" else _stream
+    play: Callable[[GraphClient, float], Setpoints] = play_plan if case == "graph" else _stream
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="der_limb_driver_")))
         client = stack.enter_context(GraphClient("benchmark"))
@@ -195,7 +195,7 @@ def _measure(case: str, seconds: float) -> dict[str, float | str]:
         begin = time.monotonic()
         wanted = play(client, seconds)
         wall = time.monotonic() - begin
-        figures = _evaluate(case, wanted, seen)
+        figures = evaluate(case, wanted, seen)
         for name, process in processes.items():
             used = 100.0 * (process.measure_cpu() - before[name]) / wall
             figures[f"{case}_cpu_{name}_percent"] = used
