@@ -27,6 +27,8 @@ PARTS = (
     "loads",
     "learning",
     "feedback",
+    "page",
+    "page_memory",
 )
 
 

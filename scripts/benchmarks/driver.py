@@ -105,7 +105,7 @@ def _stream(client: GraphClient, seconds: float) -> Setpoints:
     return wanted
 
 
-def _plan(client: GraphClient, seconds: float) -> Setpoints:
+def play_plan(client: GraphClient, seconds: float) -> Setpoints:
     """Have the planner plan and play a motion of at least this length."""
     client.subscribe(PressurePlan, topics.PLAN, qos.LATCHED)
     client.call("recorder/start", 20.0)
@@ -139,7 +139,7 @@ class Samples:
     """Per cent of one core, by the node's name."""
     ticks: dict[str, float] = field(default_factory=dict)
     """Percentiles [ms] of the driver's own ticks, on its own clock."""
-    real_time_priority: str = "unknown"
+    real_time_priority: str = ""
 
     def first_byte(self, share: str) -> float:
         """Return p50 or p99 [ms] of the latency on the board's clock."""
@@ -187,8 +187,14 @@ def _figures(case: str, played: list[Samples]) -> dict[str, float | str]:
         figures[f"{case}_cpu_{name}_percent"] = mean
     for name in played[0].ticks:
         figures[f"{case}_{name}"] = float(np.median([each.ticks[name] for each in played]))
-    figures[f"{case}_real_time_priority"] = played[0].real_time_priority
+    if played[0].real_time_priority:
+        figures[f"{case}_real_time_priority"] = played[0].real_time_priority
     return figures
+
+
+def evaluate(case: str, wanted: Setpoints, seen: Seen) -> dict[str, float | str]:
+    """Return the figures of one playing of a case."""
+    return _figures(case, [_compare(wanted, seen)])
 
 
 def _percentiles(name: str, values: NDArray[np.float64]) -> dict[str, float | str]:
@@ -219,7 +225,7 @@ def _guardian_cost(turns: dict[str, list[Samples]]) -> dict[str, float | str]:
 
 def _measure(case: str, seconds: float) -> Samples:
     """Start the nodes of a case, play, and return what was seen."""
-    play: Callable[[GraphClient, float], Setpoints] = _plan if case == "graph" else _stream
+    play: Callable[[GraphClient, float], Setpoints] = play_plan if case == "graph" else _stream
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="der_limb_driver_")))
         client = stack.enter_context(GraphClient("benchmark"))

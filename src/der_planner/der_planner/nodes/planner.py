@@ -78,6 +78,9 @@ class PlannerNode(Node):
         )
         self.create_subscription(MotionCommand, topics.COMMAND, self._on_command, qos.COMMANDS)
         self.create_subscription(PathMessage, topics.PATH, self._on_path, qos.COMMANDS)
+        self.create_subscription(
+            PathMessage, topics.NEAREST_PATH, self._on_nearest_path, qos.COMMANDS
+        )
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
         self.create_timer(0.1, self._show)
@@ -121,9 +124,14 @@ class PlannerNode(Node):
             return planned or self._stage.find(plan_id) is not None
 
     def _on_path(self, message: PathMessage) -> None:
+        self._take_path(message, bool(self.get_parameter("nearest_path").value))
+
+    def _on_nearest_path(self, message: PathMessage) -> None:
+        self._take_path(message, nearest=True)
+
+    def _take_path(self, message: PathMessage, nearest: bool) -> None:
         plan_id = new_plan_id()
         try:
-            nearest = bool(self.get_parameter("nearest_path").value)
             options = replace(self._options, nearest_path=nearest)
             request = from_path(message, plan_id, options, self._now())
         except (ValueError, IndexError) as error:
@@ -356,6 +364,7 @@ class PlannerNode(Node):
             "limb": self._options.limb.name,
             "driver": self._driver.mode or "not heard",
             "feedback": self._corrector.reason,
+            "learned_plans": self._options.learned_plans,
         }
         return self._status.health(newest, values)
 
