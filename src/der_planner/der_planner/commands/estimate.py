@@ -18,7 +18,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.commands.outputs import OutputError, check_file
 from der_planner.commands.recorded_plan import check_same, plan_of
 from der_planner.control import LearningError
 from der_planner.control.hindsight import Filmed, Smoothed, smooth
@@ -26,6 +25,7 @@ from der_planner.limb import LimbError
 from der_planner.planning import Plan, PlanningError
 from der_planner.planning.plan_file import read_plan
 from der_planner.runs.evaluation import BagError, EvaluationError, RunSeries, load_run
+from der_planner.runs.outputs import OutputError, check_file
 
 Array = NDArray[np.float64]
 
