@@ -196,7 +196,7 @@ def balance(
     count = int(np.ceil((reference.duration + ahead) / CONTROL_PERIOD * _FINE - 1e-6)) + 1
     fine = np.arange(count, dtype=np.float64) * (CONTROL_PERIOD / _FINE)
     fine[-1] = reference.duration + ahead
-    effective = physics.pressures(method, spline, fine)
+    effective = physics.pressures(method, spline, fine, reference.start)
     return fine, effective, sample_spline(spline, fine)[0]
 
 
