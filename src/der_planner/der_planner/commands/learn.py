@@ -17,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 
-from der_planner.commands.outputs import OutputError, check_file
 from der_planner.control import Learner, LearningError
 from der_planner.experiment.errors import GraphError
 from der_planner.experiment.learning import about, add_run
@@ -26,6 +25,7 @@ from der_planner.planning import Motion, Plan, PlanningError, plan
 from der_planner.planning.motions import NAMES
 from der_planner.planning.plan_file import read_plan, write_plan
 from der_planner.runs.evaluation import BagError, EvaluationError, RunSeries, load_run
+from der_planner.runs.outputs import OutputError, check_file
 
 _SAME_POINT = 2e-3
 """References whose points lie further apart than this [m] are not of one motion."""

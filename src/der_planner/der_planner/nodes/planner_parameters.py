@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from rclpy.node import Node
@@ -90,7 +91,7 @@ def read_parameters(node: Node) -> PlannerOptions:
             read("driver_timeout", 1.0, "silence of the driver [s] after which it counts as dead",
                  at_least=0.2, at_most=60.0)
         ),
-        learned_plans=str(
+        learned_plans=_absolute(
             read("learned_plans", "", "folder of learned plans: a command of the method 'learned' "
                  "names one of them in place of its motion")
         ),
@@ -99,6 +100,11 @@ def read_parameters(node: Node) -> PlannerOptions:
                  "command does not ask for it")
         ),
     )  # fmt: skip
+
+
+def _absolute(folder: object) -> str:
+    """Return a folder as other processes find it; empty stays empty."""
+    return str(Path(str(folder)).expanduser().resolve()) if folder else ""
 
 
 def _read_limb(read: Any) -> Limb:
