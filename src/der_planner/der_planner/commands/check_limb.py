@@ -20,7 +20,6 @@ import dataclasses
 import sys
 from pathlib import Path
 
-from der_planner.commands.outputs import OutputError, check_file
 from der_planner.experiment.load_options import add_load_options, as_loaded
 from der_planner.identification import (
     CalibrationLog,
@@ -32,6 +31,7 @@ from der_planner.identification import (
     update,
 )
 from der_planner.limb import Limb, LimbError
+from der_planner.runs.outputs import OutputError, check_file
 
 
 def main() -> int:

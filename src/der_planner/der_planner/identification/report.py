@@ -1,4 +1,4 @@
-"""What a fit, or an update, says of itself: values, uncertainties, what cannot be told, errors."""
+"""Results of a fit or an update: values, uncertainties, residuals, what a log cannot separate."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Unknown:
 
 @dataclass(frozen=True)
 class LoadsFit:
-    """What gravity pulls at, and what that tells.
+    """The masses that gravity pulls at, and the stiffness that carries them.
 
     Attributes:
         gravity: (2,) in the plane [m/s²].

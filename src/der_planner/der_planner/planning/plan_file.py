@@ -140,6 +140,11 @@ def _rows(content: Mapping[str, Any], key: str, width: int, count: int | None) -
     return rows
 
 
+def learned_names(folder: str | Path) -> list[str]:
+    """Return the names of the learned plans in a folder; none where there is no such folder."""
+    return sorted(path.stem for path in Path(folder).glob(f"*{SUFFIX}"))
+
+
 def learned_plan(folder: str | Path | None, name: str, limb: Limb) -> Plan:
     """Return the learned plan of a name from a folder, for the limb as it is now.
 
@@ -155,7 +160,7 @@ def learned_plan(folder: str | Path | None, name: str, limb: Limb) -> Plan:
         raise PlanningError(
             f"the learned plan '{name}' has no place: set the planner's learned_plans to a folder"
         )
-    known = sorted(path.stem for path in Path(folder).glob(f"*{SUFFIX}"))
+    known = learned_names(folder)
     if name not in known:
         raise PlanningError(
             f"no learned plan '{name}' in {folder}, only: {', '.join(known) or 'none'}"
