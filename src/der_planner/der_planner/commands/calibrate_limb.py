@@ -25,10 +25,10 @@ from pathlib import Path
 
 import numpy as np
 
-from der_planner.experiment.errors import GraphError, NodeError
+from der_planner.experiment.errors import GraphError, NodeError, OptionError
 from der_planner.experiment.interrupts import interrupt_once
 from der_planner.experiment.load_options import add_load_options, as_loaded, without_payload
-from der_planner.experiment.options import Hardware, OptionError
+from der_planner.experiment.node_specs import Hardware
 from der_planner.experiment.progress import Progress
 from der_planner.identification import (
     CalibrationLog,

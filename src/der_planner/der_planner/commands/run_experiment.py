@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import sys
 
-from der_planner.experiment.errors import GraphError, NodeError
+from der_planner.experiment.errors import GraphError, NodeError, OptionError
 from der_planner.experiment.experiment import run
-from der_planner.experiment.options import OptionError, parse
+from der_planner.experiment.options import parse
 from der_planner.runs.outputs import OutputError
 
 

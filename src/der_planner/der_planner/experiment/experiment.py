@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from der_planner.experiment import results
+from der_planner.experiment.errors import OptionError
 from der_planner.experiment.ledger import Ledger
-from der_planner.experiment.options import OptionError, Options, Trial
+from der_planner.experiment.options import Options, Trial
 from der_planner.experiment.progress import Progress
 from der_planner.limb import Limb, LimbError, mounting_of
 from der_planner.runs.outputs import check_folder
