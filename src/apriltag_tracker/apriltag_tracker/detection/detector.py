@@ -16,6 +16,7 @@ from apriltag_tracker import family
 from apriltag_tracker.detection import decoding, edges
 from apriltag_tracker.detection.alignment.aligner import USUAL_BLUR, Aligner, Alignment
 from apriltag_tracker.detection.covered import covered_quads
+from apriltag_tracker.detection.smeared import read_smeared
 from apriltag_tracker.detection.tag import Tag, counter_clockwise, once
 
 MOST_CORRECTED_BITS = 2
@@ -137,8 +138,9 @@ class Detector:
             ids, quads, others = find_quads(image, smallest, faint)
             tags += self.confirm(image, ids, quads, 3.0 * scale, found_by)
             tags += self._read_again(image, others, tags, found_by)
-        covered = covered_quads(image, smallest, dim, [tag.corners for tag in tags])
+        covered = covered_quads(image, smallest, [tag.corners for tag in tags])
         tags += self._read_again(image, covered, tags, found_by)
+        tags += self._read_smeared(image, covered, tags, found_by)
         return once(tags)
 
     def confirm(
@@ -174,7 +176,10 @@ class Detector:
             seen = {tag.id for tag in tags}
             for tag, quad in zip(ids.tolist(), quads, strict=True):
                 if tag not in seen and tag in known:
-                    whole = self._by_pattern(image, tag, quad, known[tag], found_by)
+                    last = known[tag]
+                    whole = self._by_pattern(
+                        image, tag, quad, last.blur, np.array(last.smear), found_by
+                    )
                     tags += [whole] if whole is not None else []
         return tags
 
@@ -203,12 +208,11 @@ class Detector:
         image: NDArray[np.uint8],
         tag: int,
         quad: NDArray[np.float64],
-        before: Tag | None,
+        blur: float,
+        smear: NDArray[np.float64],
         found_by: str,
     ) -> Tag | None:
         """Return a tag that is confirmed by nearly all of its pixels, None if it is not there."""
-        blur = before.blur if before is not None else USUAL_BLUR
-        smear = np.array(before.smear if before is not None else (0.0, 0.0))
         fitted = self._aligner.align(image, tag, quad, blur, smear)
         if fitted is None or not _is_the_tag(fitted, quad):
             return None
@@ -232,9 +236,7 @@ class Detector:
         found_by: str,
     ) -> list[Tag]:
         """Refine quadrilaterals (n, 4, 2) that OpenCV could not read, and read them."""
-        for tag in known:
-            apart = np.hypot(*(quads.mean(axis=1) - tag.corners.mean(axis=0)).T)
-            quads = quads[apart > 0.5 * tag.pixel_size]
+        quads = _elsewhere(quads, known)
         if len(quads) == 0:
             return []
         corners, stats, found = refine(image, quads, 3.0)
@@ -248,7 +250,28 @@ class Detector:
         tags = [self._aligned(image, tag) for tag in tags]
         for i in np.flatnonzero(found & ~good & (distance <= _WRONG_BUT_NEAR)):
             if counter_clockwise(corners[i]):
-                whole = self._by_pattern(image, int(ids[i]), corners[i], None, found_by)
+                whole = self._by_pattern(
+                    image, int(ids[i]), corners[i], USUAL_BLUR, np.zeros(2), found_by
+                )
+                tags += [whole] if whole is not None else []
+        return tags
+
+    def _read_smeared(
+        self,
+        image: NDArray[np.uint8],
+        quads: NDArray[np.float64],
+        known: Sequence[Tag],
+        found_by: str,
+    ) -> list[Tag]:
+        """Read quadrilaterals (n, 4, 2) whose cells run into each other, as a smear makes them."""
+        tags: list[Tag] = []
+        for quad in _elsewhere(quads, known):
+            code = read_smeared(image, quad)
+            if code is not None:
+                start = np.roll(quad, -code.turn, axis=0)
+                whole = self._by_pattern(
+                    image, code.id, start, USUAL_BLUR, code.smear, found_by
+                )
                 tags += [whole] if whole is not None else []
         return tags
 
@@ -278,6 +301,14 @@ class Detector:
             )
             for k, i in enumerate(kept)
         ]
+
+
+def _elsewhere(quads: NDArray[np.float64], known: Sequence[Tag]) -> NDArray[np.float64]:
+    """Return those of quadrilaterals (n, 4, 2) that are not where a tag is known."""
+    for tag in known:
+        apart = np.hypot(*(quads.mean(axis=1) - tag.corners.mean(axis=0)).T)
+        quads = quads[apart > 0.5 * tag.pixel_size]
+    return quads
 
 
 def _is_the_tag(fitted: Alignment, quad: NDArray[np.float64]) -> bool:
