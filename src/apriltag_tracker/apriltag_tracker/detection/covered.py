@@ -1,8 +1,8 @@
 """Dark shapes on white whose outline has four straight sides, whatever lies between the sides.
 
-A square with a corner covered has an outline that runs around what covers it; of one that is smeared
-over the white around it, the outline has gaps and dents. Both still have four straight sides, and
-where these meet are the corners.
+A square with a corner covered has an outline that runs around what covers it; of one that is
+smeared over the white around it, the outline has gaps and dents. Both still have four straight
+sides, and where these meet are the corners.
 """
 
 from __future__ import annotations
@@ -14,22 +14,27 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-_WINDOW = 23
-_DARKER = 3.0
-"""Black is darker than the mean of the window by so much [grey levels]; noise is smoothed first."""
+_WINDOW = 11
+"""In which the mean is taken, in steps of two pixels."""
 
-_OFF_THE_LINE = 1.3
-"""How far an outline may be from a straight side [px]."""
+_DARKER = 3.0
+"""Black is darker than the mean by so much [grey levels]; noise is smoothed first."""
+
+_OFF_THE_LINE, _OFF_THE_SHEET = 1.3, 2.2
+"""How far an outline may be from a straight side of the border, or of the sheet [px]."""
 
 _MOST_SIDES, _MOST_NEXT, _MOST_QUADS = 400, 16, 40
 """Of an outline: sides that are tried, sides that may follow on one, quadrilaterals."""
 
-_LEAST_SHARE, _LEAST_COVERAGE = 0.3, 0.62
+_LEAST_SHARE, _LEAST_COVERAGE = 0.3, 0.54
 """How much of each side, and of all four, the outline must follow."""
 
 _OUTWARD = 1.0
 """An outline goes through the middles of the last black pixels, and black is what is darker than
-half-way: corners lie outside of it by so much along the diagonals [px]."""
+half-way: corners lie outside of it by so much along the diagonals [px], those of a sheet inside."""
+
+_SHEET = 0.8
+"""Size of the black border over that of the white sheet around it."""
 
 _STRAIGHT = 0.35
 """Sine of the least angle between neighbouring sides."""
@@ -48,13 +53,45 @@ def covered_quads(
     Returns:
         Corners (n, 4, 2) px, counter-clockwise as printed.
     """
-    smooth = cv2.GaussianBlur(image, (5, 5), 0.0)
-    black = cv2.adaptiveThreshold(
-        smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, _WINDOW, _DARKER
-    )
+    black = _darker_than_around(image)
     for corners in known:
         # A closed outline may still touch its neighbour's: what is known is taken out of both.
         cv2.fillConvexPoly(black, np.round(corners).astype(np.int32), 0)
+    found = _of_mask(black, smallest)
+    # Where white cells were smeared over the border, its parts are put together again.
+    whole = cv2.morphologyEx(black, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    found += _of_mask(whole, smallest)
+    # Of tags that are smeared to pieces the white sheet still has four sides.
+    sheets = _of_mask(whole, smallest / _SHEET, white=True)
+    inner = [quad.mean(axis=0) + _SHEET * (quad - quad.mean(axis=0)) for quad in sheets]
+    return np.concatenate([_moved(found, _OUTWARD), _moved(inner, -_SHEET * _OUTWARD)])
+
+
+def _moved(quads: Sequence[NDArray[np.float64]], outward: float) -> NDArray[np.float64]:
+    """Return quadrilaterals (n, 4, 2) with the corners moved along the diagonals [px]."""
+    result = np.array(quads).reshape(-1, 4, 2)
+    diagonals = result - np.roll(result, 2, axis=1)
+    result += outward * diagonals / np.linalg.norm(diagonals, axis=2, keepdims=True)
+    return result
+
+
+def _darker_than_around(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return where an image without its noise is darker than the mean around; 255 is dark."""
+    rows, columns = image.shape
+    smooth = cv2.GaussianBlur(image, (5, 5), 0.0)
+    # The mean changes slowly: half the resolution is enough.
+    half = cv2.resize(
+        image, (max(columns // 2, 1), max(rows // 2, 1)), interpolation=cv2.INTER_AREA
+    )
+    around = cv2.resize(cv2.blur(half, (_WINDOW, _WINDOW)), (columns, rows))
+    result: NDArray[np.uint8] = cv2.compare(cv2.add(smooth, _DARKER), around, cv2.CMP_LT)
+    return result
+
+
+def _of_mask(
+    black: NDArray[np.uint8], smallest: float, white: bool = False
+) -> list[NDArray[np.float64]]:
+    """Return the quadrilaterals (4, 2) px that outlines in a mask make, of what is black or not."""
     outlines, _ = cv2.findContours(black, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
     quads = np.empty((_MOST_QUADS, 4, 2))
     found: list[NDArray[np.float64]] = []
@@ -64,13 +101,13 @@ def covered_quads(
         _, _, wide, high = cv2.boundingRect(outline)
         if min(wide, high) < 0.8 * smallest:
             continue
-        shape = cv2.approxPolyDP(outline, _OFF_THE_LINE, True).reshape(-1, 2).astype(np.float64)
+        off = _OFF_THE_SHEET if white else _OFF_THE_LINE
+        shape = cv2.approxPolyDP(outline, off, True).reshape(-1, 2).astype(np.float64)
+        if white:
+            shape = shape[::-1].copy()
         if len(shape) >= 4:
             found += [quads[k].copy() for k in range(_four_sides(shape, smallest, quads))]
-    result = np.array(found).reshape(-1, 4, 2)
-    diagonals = result - np.roll(result, 2, axis=1)
-    result += _OUTWARD * diagonals / np.linalg.norm(diagonals, axis=2, keepdims=True)
-    return result
+    return found
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]

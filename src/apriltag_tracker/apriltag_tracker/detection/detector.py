@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -107,7 +107,12 @@ class Detector:
         if [tag.id for tag in self._read_again(canvas, quad, [], "full")] != [0]:
             raise family.FamilyError("a perfect picture of tag 0 is not read")
 
-    def detect(self, gray: NDArray[np.uint8], thorough: bool = False) -> list[Tag]:
+    def detect(
+        self,
+        gray: NDArray[np.uint8],
+        thorough: bool = False,
+        enough: Collection[int] | None = None,
+    ) -> list[Tag]:
         """Find tags in a grey image (rows, columns) of uint8; duplicates are returned as they are.
 
         Args:
@@ -115,14 +120,21 @@ class Detector:
             thorough: search once more with a lower threshold, for tags in a dark corner of an image
                 that is bright elsewhere. An image that is dark as a whole is searched like that
                 anyway.
+            enough: ids of tags; once all of these are found, covered and smeared tags are not
+                looked for.
 
         Raises:
             ValueError: not such an image, or an empty one.
         """
-        return self.search(grey(gray), "full", thorough=thorough)
+        return self.search(grey(gray), "full", 1, thorough, enough)
 
     def search(
-        self, image: NDArray[np.uint8], found_by: str, scale: int = 1, thorough: bool = False
+        self,
+        image: NDArray[np.uint8],
+        found_by: str,
+        scale: int = 1,
+        thorough: bool = False,
+        enough: Collection[int] | None = None,
     ) -> list[Tag]:
         """Find tags in a grey image that may have been enlarged by a whole number.
 
@@ -138,6 +150,8 @@ class Detector:
             ids, quads, others = find_quads(image, smallest, faint)
             tags += self.confirm(image, ids, quads, 3.0 * scale, found_by)
             tags += self._read_again(image, others, tags, found_by)
+        if enough is not None and {tag.id for tag in tags} >= set(enough):
+            return once(tags)
         covered = covered_quads(image, smallest, [tag.corners for tag in tags])
         tags += self._read_again(image, covered, tags, found_by)
         tags += self._read_smeared(image, covered, tags, found_by)
@@ -269,9 +283,7 @@ class Detector:
             code = read_smeared(image, quad)
             if code is not None:
                 start = np.roll(quad, -code.turn, axis=0)
-                whole = self._by_pattern(
-                    image, code.id, start, USUAL_BLUR, code.smear, found_by
-                )
+                whole = self._by_pattern(image, code.id, start, USUAL_BLUR, code.smear, found_by)
                 tags += [whole] if whole is not None else []
         return tags
 

@@ -2,9 +2,9 @@
 
 A smear is linear: what a point of the picture shows is the mean of the cells that passed it. For a
 smear of known direction and length, the cells' grey levels follow from samples of the picture by
-least squares. A table of such solutions for smears of all directions is tried; how well each of them
-explains the samples tells which smear it was, and the printed code nearest to its cells which tag.
-That it is this tag is for the fit of the whole pattern to say.
+least squares. A table of such solutions for smears of all directions is tried; how well each of
+them explains the samples tells which smear it was, and the printed code nearest to its cells which
+tag. That it is this tag is for the fit of the whole pattern to say.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from apriltag_tracker import family
 from apriltag_tracker.detection import decoding
 from apriltag_tracker.detection.edges import inside, sample
 
-_DIRECTIONS = 12
-_LENGTHS = (0.8, 1.2, 1.6, 2.0, 2.4, 2.8)
+_DIRECTIONS = 10
+_LENGTHS = (1.0, 1.5, 2.0, 2.5)
 """Of the smears that are tried [cells]."""
 
 _SPACING = 0.5
@@ -55,11 +55,11 @@ class SmearedCode:
 
 @dataclass(frozen=True)
 class _Table:
-    """Smears (h, 2) in cells, what cells show (h, samples, 38), and the inverse (h, 38, samples)."""
+    """Smears (h, 2) in cells, and of each solution (38, samples) and normal matrix (38, 38)."""
 
     smears: NDArray[np.float64]
-    shown: NDArray[np.float64]
-    solutions: NDArray[np.float64]
+    solutions: NDArray[np.float32]
+    normals: NDArray[np.float32]
 
 
 def _raster() -> NDArray[np.float64]:
@@ -94,7 +94,7 @@ def _table() -> _Table:
     stacked = np.array(shown)
     normal = np.swapaxes(stacked, 1, 2) @ stacked + _RIDGE * np.eye(38)
     solutions = np.linalg.solve(normal, np.swapaxes(stacked, 1, 2))
-    return _Table(np.array(smears), stacked, solutions)
+    return _Table(np.array(smears), solutions.astype(np.float32), normal.astype(np.float32))
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -119,20 +119,23 @@ def _sample_quad(
 
 
 def read_smeared(image: NDArray[np.uint8], quad: NDArray[np.float64]) -> SmearedCode | None:
-    """Read a quadrilateral (4, 2) px, counter-clockwise as printed; None if it is no smeared tag."""
+    """Read a quadrilateral (4, 2) px that runs as printed; None if it is no smeared tag."""
     table, places = _table(), _raster()
     values = np.empty(len(places) ** 2)
     if not _sample_quad(image, quad, places, values):
         return None
-    middle = float(values.mean())
-    levels = table.solutions @ (values - middle)
-    left = (values - middle) - np.einsum("hsc,hc->hs", table.shown, levels)
-    unexplained = np.sum(left**2, axis=1) / max(float(np.sum((values - middle) ** 2)), 1e-9)
+    values = (values - values.mean()).astype(np.float32)
+    whole = max(float(values @ values), 1e-3)
+    levels = table.solutions @ values
+    # Of a least-squares solution x with normal matrix N, xᵀ N x is what it explains.
+    explained = np.einsum("hc,hcd,hd->h", levels, table.normals, levels) / whole
+    if explained.max() < _LEAST_EXPLAINED:
+        return None
     best: SmearedCode | None = None
     fewest = _MOST_WRONG + 1
-    for k in np.argsort(unexplained)[:_TRIED]:
+    for k in np.argsort(-explained)[:_TRIED]:
         black, white = levels[k, 36:]
-        if unexplained[k] > 1.0 - _LEAST_EXPLAINED or white - black < _LEAST_CONTRAST:
+        if white - black < _LEAST_CONTRAST:
             continue
         tag, turn, wrong = decoding.nearest_code(levels[k, :36] > 0.5 * (black + white))
         if wrong < fewest:
