@@ -81,7 +81,7 @@ class Phase:
 
 
 def lacking(series: Series, begin: float, end: float) -> np.ndarray:
-    """Return the mean missing pressure, gain error included, (M,) [Pa] of the first segment's w."""
+    """Return the mean missing pressure (M,) [Pa] between two instants [s]."""
     told = series.told(begin, end)
     assert told, "no estimates"
     return np.mean([m.missing_pressure for m in told], axis=0)
@@ -115,8 +115,12 @@ def test_the_graph_moves_as_the_lock_step_does(rig):
 
 
 def test_a_motion_gives_way_to_another_without_a_jump(rig):
+    left = Phase(rig, "left")
+    left.until(3.0)
     before = len(rig.heard.states)
     phase = Phase(rig, "changed", motion="opposite_direction")
+    if phase.start >= left.at(left.plan.time[-1]):
+        pytest.skip("this machine is too busy to judge: the motion was over before the next plan")
     phase.until(2.5)
     series = phase.judged(0.0, 2.5)
     # The corrections go on where they were: full share from the first estimate on.
