@@ -70,11 +70,11 @@ class Phase:
         lines = self.rig.planner.log.read_text().splitlines()
         return [line for line in lines if f"plan {self.name}, " in line and "taken back" in line]
 
-    def judged(self, begin: float, end: float) -> Series:
-        """Return what was heard, if pictures came in time between two instants [s]."""
+    def judged(self, begin: float, end: float, late: float = LATE_PICTURES) -> Series:
+        """Return what was heard, if no picture came too late between two instants [s]."""
         series = self.series()
         ages = [message.age for message in series.told(begin, end)]
-        if not ages or max(ages) > LATE_PICTURES:
+        if not ages or max(ages) > late:
             seen = f"{max(ages):.1f} s old" if ages else "missing"
             pytest.skip(f"this machine is too busy to judge: pictures were {seen}")
         return series
@@ -96,7 +96,8 @@ def test_the_graph_moves_as_the_lock_step_does(rig):
 
     phase = Phase(rig, "first")
     phase.until(8.0)
-    series = phase.judged(0.5, 8.0)
+    # The lock-step's pictures come after 0.07 s; what comes much later moves the limb otherwise.
+    series = phase.judged(0.5, 8.0, late=0.2)
     limb = Limb.default().mounted("hanging")
     told = {key: value for key, value in MOTION.items() if key != "motion"}
     planned = plan(limb, Motion.named(MOTION["motion"], **told))
