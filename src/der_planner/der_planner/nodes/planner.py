@@ -18,8 +18,8 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from der_msgs.msg import LimbState, MotionCommand, PressureState
-from der_planner.control.estimation import Estimate
 from der_planner.control.feedback import Feedback
+from der_planner.control.knowledge import Estimate
 from der_planner.nodes.driver_watch import DriverWatch, Ending
 from der_planner.nodes.planner_action import MotionAction
 from der_planner.nodes.planner_feedback import Corrector, Done
