@@ -87,6 +87,17 @@ class Record(NamedTuple):
     tip: Array
     bend_angles: Array
 
+    def log(self, source: str = "") -> CalibrationLog:
+        """Return what `fit` takes."""
+        return CalibrationLog(
+            self.time,
+            self.commanded_differential,
+            self.measured_differential,
+            self.bend_angles,
+            self.tip,
+            source=source,
+        )
+
 
 class LinkChain:
     """The limb of one seed under one mounting.
@@ -340,14 +351,7 @@ class LinkChain:
         """
         excitation = calibration_run(amplitude * self.pressure_limit, SEGMENTS, quick)
         played = self.play(excitation.time, excitation.differential_pressure, run=run, swing=swing)
-        return CalibrationLog(
-            played.time,
-            played.commanded_differential,
-            played.measured_differential,
-            played.bend_angles,
-            played.tip,
-            source=f"chain of links, seed {self.seed}, run {run}",
-        )
+        return played.log(f"chain of links, seed {self.seed}, run {run}")
 
 
 def _first_frequency(links: Links) -> float:

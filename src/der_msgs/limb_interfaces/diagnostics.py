@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
@@ -26,10 +27,12 @@ _LEVELS = {
     "error": DiagnosticStatus.ERROR,
     "stale": DiagnosticStatus.STALE,
 }
+_CPU_INTERVAL = 0.5
+"""[s] over which the CPU time is taken at least: over less, its own ticks show."""
 
 
 class DiagnosticsPublisher:
-    """Calls ``report`` once a second and publishes what it returns.
+    """Calls ``report`` once a second and publishes what it returns, and what CPU time was used.
 
     Args:
         node: the node that the status is about.
@@ -42,18 +45,29 @@ class DiagnosticsPublisher:
         self._report = report
         self._hardware_id = hardware_id
         self._publisher = node.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, qos.STATES)
+        self._used, self._looked = time.process_time(), time.monotonic()
+        self._cpu = 0.0
         self._timer = node.create_timer(1.0, self.publish)
 
     def publish(self) -> None:
         """Publish now, without waiting for the next second."""
         health = self._report()
+        values = {**health.values, "cpu_percent": f"{self._measure_cpu():.0f}"}
         status = DiagnosticStatus(
             level=_LEVELS[health.level],
             name=self._node.get_fully_qualified_name(),
             message=health.message,
             hardware_id=self._hardware_id,
-            values=[KeyValue(key=key, value=str(value)) for key, value in health.values.items()],
+            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
         )
         message = DiagnosticArray(status=[status])
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)
+
+    def _measure_cpu(self) -> float:
+        """Return this process's share of one core [%] since it was last measured."""
+        used, now = time.process_time(), time.monotonic()
+        if now - self._looked >= _CPU_INTERVAL:
+            self._cpu = 100.0 * (used - self._used) / (now - self._looked)
+            self._used, self._looked = used, now
+        return self._cpu

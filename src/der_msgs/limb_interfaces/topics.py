@@ -4,6 +4,7 @@ NAMESPACE = "limb"
 
 COMMAND = "command"
 PATH = "path"
+NEAREST_PATH = "nearest_path"
 PLAN = "plan"
 PRESSURE_SETPOINT = "pressure_setpoint"
 TIP_REFERENCE = "tip_reference"

@@ -8,7 +8,6 @@ from chain_calibration import write_csv
 from link_chain import LinkChain
 
 from der_planner.commands import calibrate_limb, check_limb
-from der_planner.identification import CalibrationLog
 from der_planner.identification.excitation import waves
 from der_planner.limb import Limb, gravity_of
 
@@ -25,14 +24,7 @@ def table(tmp_path_factory):
     time = [0.05 * k for k in range(len(pressure))]
     chain = LinkChain(3, gravity_of("hanging"), [(0.2, 0.05)])
     played = chain.play(time, pressure, 20.0)
-    log = CalibrationLog(
-        played.time,
-        played.commanded_differential,
-        played.measured_differential,
-        played.bend_angles,
-        played.tip,
-    )
-    write_csv(log, folder / "log.csv", folder / "columns.yaml")
+    write_csv(played.log(), folder / "log.csv", folder / "columns.yaml")
     return folder
 
 

@@ -19,13 +19,7 @@ def chain_log(gravity, masses=(), swing=(0.0, 0.0), seed=5, amplitude=14_000.0) 
     pressure = np.concatenate([waves(amplitude, 2, 30.0), sweep(3500.0, 2, 8.0)])
     time = 0.05 * np.arange(len(pressure))
     played = LinkChain(seed, gravity, masses).play(time, pressure, 20.0, run=1, swing=swing)
-    return CalibrationLog(
-        played.time,
-        played.commanded_differential,
-        played.measured_differential,
-        played.bend_angles,
-        played.tip,
-    )
+    return played.log()
 
 
 def test_a_hanging_chain_that_swings_and_carries_a_mass_is_fitted():

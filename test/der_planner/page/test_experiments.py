@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from der_planner.page.experiments import Experiments
+from der_planner.page.afterwards.experiments import Experiments
 
 RUN = {"motion": "circle", "model": "der", "method": "optimal", "trial": 1,
        "mean_error_m": 0.00123, "max_error_m": 0.004, "valid_fraction": 0.98}  # fmt: skip

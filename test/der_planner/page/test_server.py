@@ -17,15 +17,16 @@ from starlette.websockets import WebSocketDisconnect
 from apriltag_tracker.tag_map import LimbTag, TagMap
 from der_planner.limb import Limb
 from der_planner.page.access import Binding, Sessions
+from der_planner.page.afterwards.experiments import Experiments
 from der_planner.page.commands import Answer, MotionRequest, Service
 from der_planner.page.drawing.studio import Studio
-from der_planner.page.experiments import Experiments
 from der_planner.page.guard import Guard
 from der_planner.page.operators import Desk
 from der_planner.page.overlay import Overlay
 from der_planner.page.picture import PictureFeed
 from der_planner.page.server import Parts, create_app
 from der_planner.page.situation import Situation
+from der_planner.page.worker import Worker
 from der_planner.planning import PathLimits
 
 HOST = "127.0.0.1:8080"
@@ -53,8 +54,11 @@ class Calls:
     def play(self, request: MotionRequest) -> Answer:
         return Answer(True, request.motion)
 
-    def play_path(self, tip: Any) -> Future[Answer]:
-        return self.call("start")
+    def play_path(self, tip: Any) -> Answer:
+        return Answer(True, "path")
+
+    def learned_plans(self) -> list[str]:
+        return []
 
     def record(self, note: str) -> Future[Answer]:
         return self.call("record_start")
@@ -75,6 +79,7 @@ class Rig:
             self.calls,
             studio,
             Experiments(Path("none")),
+            Worker(),
         )
         sessions = Sessions(password)
         self.app: FastAPI = create_app(parts, sessions, secure=False)

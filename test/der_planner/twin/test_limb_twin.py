@@ -4,33 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from plain_hardware import plain
 
 from der_planner.twin import LimbTwin, TwinError
 from der_planner.twin.hardware import RANGES, draw
 from der_planner.twin.limb_twin import ATMOSPHERE, TIME_STEP
 
 REST = np.full(4, ATMOSPHERE)
-
-
-def plain(seed: int = 0, **changes: float):
-    """Return hardware without friction, creep and stiffening: an elastic rod."""
-    hardware = draw(seed)
-    segments = tuple(
-        replace(
-            segment,
-            cubic_stiffness=0.0,
-            pressure_stiffening=0.0,
-            elongation=0.0,
-            rest_curvature=0.0,
-            friction_moment=0.0,
-            creep_stiffness=(0.0, 0.0, 0.0),
-            wander=0.0,
-            coupling=0.0,
-            **changes,
-        )
-        for segment in hardware.segments
-    )
-    return replace(hardware, segments=segments)
 
 
 def settled(twin: LimbTwin, pressure: np.ndarray, duration: float = 5.0) -> LimbTwin:

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from plain_hardware import plain
 from scipy.optimize import brentq
 
 from der_planner.limb import PointMass, gravity_of
 from der_planner.twin import LimbTwin, Push, TwinError
 from der_planner.twin.body import AXIAL_STIFFNESS, SHEAR_STIFFNESS
-from der_planner.twin.hardware import draw
 from der_planner.twin.limb_twin import ATMOSPHERE
 from der_planner.twin.offline import play
 
@@ -21,23 +21,7 @@ MOUNTINGS = ("hanging", "standing", "sideways", "10", "-30")
 
 def elastic(**changes: float):
     """Return hardware that is a beam of one stiffness between stiff fittings, without memory."""
-    hardware = draw(0)
-    segments = tuple(
-        replace(
-            segment,
-            bending_stiffness=0.03,
-            cubic_stiffness=0.0,
-            pressure_stiffening=0.0,
-            elongation=0.0,
-            rest_curvature=0.0,
-            friction_moment=0.0,
-            creep_stiffness=(0.0, 0.0, 0.0),
-            wander=0.0,
-            coupling=0.0,
-        )
-        for segment in hardware.segments
-    )
-    return replace(hardware, segments=segments, **changes)
+    return replace(plain(bending_stiffness=0.03), **changes)
 
 
 def beam_tip(hardware, gravity, payload: float = 0.0, at: float = 0.244):

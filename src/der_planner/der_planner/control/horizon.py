@@ -18,22 +18,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import piqp
 from numpy.typing import NDArray
 
 from der_planner.control.chambers import ChamberLog
-from der_planner.control.estimation import Knowledge
+from der_planner.control.knowledge import Knowledge
 from der_planner.control.nominal import Nominal
 from der_planner.model import air, material
 from der_planner.model.drive import STEPS
 from der_planner.model.series import CONTROL_PERIOD
+from der_planner.planning.quadratic import UnsolvedError, minimise
 
 Array = NDArray[np.float64]
-
-_PRESSURE = 1e3
-"""The solver works in kPa …"""
-_LENGTH = 1e-3
-"""… and mm."""
 
 
 @dataclass(frozen=True)
@@ -222,40 +217,20 @@ class Horizon:
         low, high = bounds
         command = np.concatenate([self._chambers.sent(first - 1)[None], planned + guess])
         steps = np.diff(command, axis=0)
-        rows = np.diff(self._hats, axis=0, prepend=0.0)
+        moves = np.diff(self._hats, axis=0, prepend=0.0)
         moved = self._hats @ change.reshape(-1, inputs)
-        stepped = np.abs(steps + rows @ change.reshape(-1, inputs)).max()
+        stepped = np.abs(steps + moves @ change.reshape(-1, inputs)).max()
         if np.all(moved >= low) and np.all(moved <= high) and stepped <= allowed.step:
             return change
-        return _programme(
-            hessian,
-            gradient,
-            np.kron(np.concatenate([self._hats, rows]), np.eye(inputs)),
+        rows = (
+            np.kron(np.concatenate([self._hats, moves]), np.eye(inputs)),
             np.concatenate([low, np.minimum(-allowed.step - steps, 0.0)]).ravel(),
             np.concatenate([high, np.maximum(allowed.step - steps, 0.0)]).ravel(),
         )
-
-
-def _programme(hessian: Array, gradient: Array, rows: Array, low: Array, high: Array) -> Array:
-    """Return x that minimises ½ xᵀ hessian x + gradientᵀ x with low ≤ rows x ≤ high."""
-    scale = (_PRESSURE / _LENGTH) ** 2
-    solver = piqp.DenseSolver()
-    solver.settings.eps_abs = 1e-5
-    solver.settings.eps_rel = 1e-6
-    solver.setup(
-        np.asfortranarray(hessian * scale),
-        gradient * scale / _PRESSURE,
-        None,
-        None,
-        np.asfortranarray(rows),
-        low / _PRESSURE,
-        high / _PRESSURE,
-        None,
-        None,
-    )
-    if solver.solve() != piqp.PIQP_SOLVED:
-        return np.zeros(len(gradient))
-    return np.asarray(solver.result.x) * _PRESSURE
+        try:
+            return minimise(hessian, gradient, rows, None, tolerance=(1e-5, 1e-6))
+        except UnsolvedError:
+            return np.zeros(len(gradient))
 
 
 def _hats(knots: tuple[int, ...]) -> Array:

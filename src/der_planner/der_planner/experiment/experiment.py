@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 import platform
 import subprocess
-import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
 from der_planner.experiment import results
+from der_planner.experiment.errors import OptionError
 from der_planner.experiment.ledger import Ledger
-from der_planner.experiment.options import OptionError, Options, Trial
+from der_planner.experiment.options import Options, Trial
 from der_planner.experiment.progress import Progress
 from der_planner.limb import Limb, LimbError, mounting_of
+from der_planner.runs.outputs import check_folder
 
 
 def run(options: Options) -> None:
@@ -22,6 +23,7 @@ def run(options: Options) -> None:
 
     Raises:
         OptionError: the limb file is not usable, or the folder holds another experiment.
+        OutputError: the folder cannot be written.
         GraphError, NodeError: a trial failed; finished trials stay finished.
     """
     progress = Progress()
@@ -29,10 +31,11 @@ def run(options: Options) -> None:
     trials = options.plan_of_trials()
     ledger = Ledger(options)
     left = [trial for trial in trials if not _whole(trial, options, ledger)]
+    check_folder(options.out)
     if options.dry_run:
         _describe(options, trials, left, limb, progress)
         return
-    _make_folder(options.out)
+    options.out.mkdir(parents=True, exist_ok=True)
     progress.say(
         f"{len(left)} of {len(trials)} trials to play on {_stage(options)}, into {options.out}"
     )
@@ -44,7 +47,8 @@ def run(options: Options) -> None:
             f"trial {trial.number} (seed {trial.seed})"
         )
         if ledger.finished(trial) is None:
-            ledger.record(trial, _play(trial, options, progress))
+            begun = _begin(trial, options, progress) if options.library is not None else None
+            ledger.record(trial, _play(trial, options, progress, begun))
         if options.learn:
             _learn(trial, options, ledger, progress)
     kept = [(run, entry) for trial in trials for run, entry in _runs_of(trial, ledger)]
@@ -88,20 +92,13 @@ def _learn(trial: Trial, options: Options, ledger: Ledger, progress: Progress) -
     learning.conclude()
 
 
-def _make_folder(path: Path) -> None:
-    """Make the folder of the experiment and see that files can be written there.
+def _begin(trial: Trial, options: Options, progress: Progress) -> Path | None:
+    """Return the file of the plan that begins from a near learned one; None: there is none."""
+    from der_planner.experiment.learning import begin_from_library  # noqa: PLC0415
 
-    Raises:
-        OptionError: they cannot.
-    """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path):
-            pass
-    except OSError as error:
-        raise OptionError(
-            f"cannot write into --out {path}: {error.strerror}; choose another folder"
-        ) from error
+    limb = _limb_file(trial, options, progress)
+    robot = options.loaded(Limb.from_yaml(limb) if limb is not None else Limb.default())
+    return begin_from_library(trial, options, robot, progress)
 
 
 def _check_limb(options: Options) -> Limb:
@@ -151,6 +148,8 @@ def _play(
     limb = _limb_file(trial, options, progress)
     robot = options.loaded(Limb.from_yaml(limb) if limb is not None else Limb.default())
     metadata = _metadata(trial, options, limb, robot)
+    if learned is not None and trial.run == 1:
+        metadata["begun_from"] = str(options.library)
     if options.offline:
         # ROS-free: the other branch is imported only where it is used.
         from der_planner.experiment.offline_run import play_offline  # noqa: PLC0415

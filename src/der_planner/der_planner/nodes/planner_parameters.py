@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from rclpy.node import Node
@@ -48,18 +49,8 @@ def read_parameters(node: Node) -> PlannerOptions:
         LimbError: the limb file cannot be used.
     """
     read: Any = functools.partial(declare, node)
-    limb_file = str(read("limb_file", "", "limb file (YAML); empty: the default limb"))
-    limb = Limb.from_yaml(limb_file) if limb_file else Limb.default()
-    mounting = str(
-        read(
-            "mounting",
-            "",
-            "horizontal, hanging, standing, sideways or degrees of tilt; empty: "
-            "gravity as in the limb file",
-        )
-    )
     return PlannerOptions(
-        limb=limb.mounted(mounting) if mounting else limb,
+        limb=_read_limb(read),
         payload=float(
             read("payload", 0.0, "mass [kg] carried beside the limb's own masses, where a command "
                  "names none", at_least=0.0, at_most=LARGEST_PAYLOAD)
@@ -100,7 +91,7 @@ def read_parameters(node: Node) -> PlannerOptions:
             read("driver_timeout", 1.0, "silence of the driver [s] after which it counts as dead",
                  at_least=0.2, at_most=60.0)
         ),
-        learned_plans=str(
+        learned_plans=_absolute(
             read("learned_plans", "", "folder of learned plans: a command of the method 'learned' "
                  "names one of them in place of its motion")
         ),
@@ -109,3 +100,19 @@ def read_parameters(node: Node) -> PlannerOptions:
                  "command does not ask for it")
         ),
     )  # fmt: skip
+
+
+def _absolute(folder: object) -> str:
+    """Return a folder as other processes find it; empty stays empty."""
+    return str(Path(str(folder)).expanduser().resolve()) if folder else ""
+
+
+def _read_limb(read: Any) -> Limb:
+    """Return the limb of the file that is named, mounted as the parameter says."""
+    limb_file = str(read("limb_file", "", "limb file (YAML); empty: the default limb"))
+    mounting = str(
+        read("mounting", "", "horizontal, hanging, standing, sideways or degrees of tilt; empty: "
+             "gravity as in the limb file")
+    )  # fmt: skip
+    limb = Limb.from_yaml(limb_file) if limb_file else Limb.default()
+    return limb.mounted(mounting) if mounting else limb

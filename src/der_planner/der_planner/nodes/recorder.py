@@ -52,6 +52,7 @@ class Recorder(Node):
         self._gaps: dict[str, StampGaps] = {}
         self._session: RecordingSession | None = None
         self._last_failure = ""
+        self._last_bag = ""
         self._subscriptions_by_topic: dict[str, tuple[Subscription, tuple[OfferedQos, ...]]] = {}
         self._specs: dict[str, TopicSpec] = {}
         self._latched: dict[str, tuple[int, bytes]] = {}
@@ -92,8 +93,9 @@ class Recorder(Node):
         declare("topics", ".*", "regular expression that the full topic names must match")
         declare(
             "exclude",
-            ".*/image_annotated",
-            "regular expression of full topic names to leave out; empty: none",
+            ".*/image_annotated|.*/_.*",
+            "regular expression of full topic names to leave out, such as ROS's hidden ones; "
+            "empty: none",
         )
         declare(
             "compression",
@@ -260,6 +262,7 @@ class Recorder(Node):
         status = self._session.stop()
         self._session = None
         self._last_failure = status.failure
+        self._last_bag = str(status.folder)
         if status.failure:
             self.get_logger().error(status.failure)
             return False, status.failure
@@ -322,6 +325,7 @@ class Recorder(Node):
             "not_recorded": "; ".join(f"{k}: {v}" for k, v in self._refused.items()),
         }
         if self._session is None:
+            values["bag"] = self._last_bag
             if self._last_failure:
                 return Health("error", self._last_failure, {**values, "state": "failed"})
             return Health("ok", "not recording", {**values, "state": "idle"})

@@ -11,17 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 Service = Literal["vent", "arm", "start", "stop", "record_start", "record_stop"]
-Request = Service | Literal["path"]
 
 PATIENCE = 3.0
 """[s] to wait for a service's answer."""
 
-OWNERS: dict[Request, str] = {
+OWNERS: dict[Service, str] = {
     "vent": "pressure_driver",
     "arm": "pressure_driver",
     "start": "planner",
     "stop": "planner",
-    "path": "planner",
     "record_start": "recorder",
     "record_stop": "recorder",
 }
@@ -70,8 +68,12 @@ class Commands(Protocol):
         """Ask the planner to plan and play a motion."""
         ...
 
-    def play_path(self, tip: NDArray[np.float64]) -> Future[Answer]:
+    def play_path(self, tip: NDArray[np.float64]) -> Answer:
         """Ask the planner to play the nearest path to points (P, 2) [m] that it can."""
+        ...
+
+    def learned_plans(self) -> list[str]:
+        """Return the names of the learned plans that the planner can play."""
         ...
 
     def record(self, note: str) -> Future[Answer]:
@@ -79,7 +81,7 @@ class Commands(Protocol):
         ...
 
 
-async def answer_of(service: Request, pending: Future[Answer]) -> Answer:
+async def answer_of(service: Service, pending: Future[Answer]) -> Answer:
     """Wait for a service's answer, and say so if none comes."""
     owner = OWNERS[service]
     try:

@@ -9,7 +9,8 @@ from dataclasses import replace
 from fastapi import FastAPI
 from nicegui import Client, ui
 
-from der_planner.page import afterwards, setup_page
+from der_planner.page import setup_page
+from der_planner.page.afterwards import listing, replay
 from der_planner.page.commands import Answer, MotionRequest, Service, answer_of
 from der_planner.page.drawing.sketch import Sketch
 from der_planner.page.server import STATIC, Parts
@@ -26,6 +27,14 @@ RECONNECT = 3.0
 """[s] that a browser's connection may be away before it counts as lost."""
 FAST = 0.3
 """[s] between two looks at who commands."""
+SLOW = 2.0
+"""[s] between two looks at which plans have been learned."""
+NO_PLANS = "Learned plan: the planner has none"
+LINKS = {
+    "Experiments": listing.ADDRESS,
+    "Replay": replay.ADDRESS,
+    "Set-up guide": setup_page.ADDRESS,
+}
 
 
 def lay_out(app: FastAPI, parts: Parts) -> None:
@@ -35,7 +44,8 @@ def lay_out(app: FastAPI, parts: Parts) -> None:
     def index(client: Client) -> None:
         Window(client, parts)
 
-    afterwards.add_afterwards(parts.experiments)
+    listing.add_afterwards(parts.experiments)
+    replay.add_replay(app, parts)
     setup_page.add_setup(parts)
     ui.run_with(app, show_welcome_message=False, reconnect_timeout=RECONNECT, tailwind=False)
 
@@ -59,6 +69,7 @@ class Window:
             self._panel("nodes", "Nodes", "", "nodes.html")
         client.on_delete(lambda: parts.desk.disconnected(self._name))
         ui.timer(FAST, self._show_desk)
+        ui.timer(SLOW, self._offer_learned)
 
     def _panel(self, name: str, title: str, source: str, file: str) -> ui.element:
         panel = ui.element("section").props(f'id="{name}" data-source="{source}"')
@@ -74,8 +85,9 @@ class Window:
         with ui.row().classes("line"):
             self._take = ui.button("Take control", on_click=self._on_take).props('id="take"')
             self._who = ui.label().props('id="who"')
-            ui.link("Experiments", afterwards.ADDRESS, new_tab=True)
-            ui.link("Set-up guide", setup_page.ADDRESS, new_tab=True)
+            for text, address in LINKS.items():
+                ui.link(text, address, new_tab=True)
+        ui.html("<div id='planner-line'></div><div id='recorder-line'></div>", sanitize=False)
         with ui.row().classes("line"):
             self._button("Arm", "arm", lambda: self._call("arm"), "positive")
             self._button("Stop motion", "stop", lambda: self._call("stop"), "warning")
@@ -93,7 +105,7 @@ class Window:
             self._cycles = ui.number("Cycles", value=DEFAULT_CYCLES, min=1, max=100, precision=0)
             self._button("Play motion", "play", self._on_play, "primary")
         with ui.row().classes("line"):
-            self._learned = ui.input("Learned plan (name; empty: the motion)")
+            self._learned = ui.select([], label=NO_PLANS, clearable=True).props('id="learned"')
             self._feedback = ui.switch("Feedback").props('id="feedback"')
         with ui.row().classes("line"):
             self._note = ui.input("Note for the recording")
@@ -108,6 +120,16 @@ class Window:
 
     def _offer_methods(self) -> None:
         self._method.set_options(["", *METHODS[str(self._model.value)]], value="")
+
+    def _offer_learned(self) -> None:
+        """Offer the plans that are in the planner's folder now; a chosen one that is gone goes."""
+        names = self._parts.commands.learned_plans()
+        if names == self._learned.options:
+            return
+        chosen = self._learned.value if self._learned.value in names else None
+        self._learned.set_options(names, value=chosen)
+        label = "Learned plan (in place of the motion)" if names else NO_PLANS
+        self._learned.props(f'label="{label}"')
 
     def _show_desk(self) -> None:
         desk = self._parts.desk
@@ -160,7 +182,7 @@ class Window:
             str(self._motion.value), str(self._model.value), str(self._method.value),
             math.radians(float(amplitude)), float(period), int(cycles), bool(self._feedback.value),
         )  # fmt: skip
-        learned = str(self._learned.value or "").strip()
+        learned = str(self._learned.value or "")
         if learned:
             request = replace(request, motion=learned, method=LEARNED)
         self._tell("play", self._parts.commands.play(request))

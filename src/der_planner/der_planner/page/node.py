@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import functools
-import json
 import sys
 import threading
-from collections.abc import Callable
-from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +12,10 @@ import cv2
 import numpy as np
 from ament_index_python.packages import get_package_share_directory
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PointStamped, PoseStamped
-from nav_msgs.msg import Path as PathMessage
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters
+from geometry_msgs.msg import PointStamped
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, Image
-from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from apriltag_tracker.camera import CameraError, Intrinsics
@@ -32,22 +25,22 @@ from apriltag_tracker.tag_map import TagMap
 from der_msgs.msg import (
     LimbEstimate,
     LimbState,
-    MotionCommand,
     PressurePlan,
     PressureState,
     TagDetectionArray,
 )
 from der_planner.limb import Limb
 from der_planner.page.access import Binding, listen, read_password
-from der_planner.page.commands import OWNERS, Answer, MotionRequest, Service
+from der_planner.page.afterwards.experiments import Experiments
 from der_planner.page.drawing.studio import Studio
-from der_planner.page.experiments import Experiments
+from der_planner.page.graph_commands import GraphCommands
 from der_planner.page.layout import lay_out
 from der_planner.page.operators import POLICIES, Desk
 from der_planner.page.overlay import Overlay
 from der_planner.page.picture import PictureFeed
 from der_planner.page.server import PageServer, Parts
 from der_planner.page.situation import DriverState, LimbView, NodeStatus, Situation
+from der_planner.page.worker import Worker
 from der_planner.planning import PathLimits
 from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
@@ -56,14 +49,6 @@ from limb_interfaces.parameters import declare
 from limb_interfaces.runner import run_node
 from limb_interfaces.stamps import nanoseconds
 
-PATHS: dict[Service, str] = {
-    "vent": "pressure_driver/vent",
-    "arm": "pressure_driver/arm",
-    "start": "planner/start",
-    "stop": "planner/stop",
-    "record_start": "recorder/start",
-    "record_stop": "recorder/stop",
-}
 LIMB_MARKER = "planner/limb"
 
 
@@ -77,14 +62,9 @@ class PageNode(Node):
         # A misspelt name of a protection must not leave the page without it.
         check_overrides(self, refuse=True)
         binding.check()
-        self._service_clients = {
-            service: self.create_client(Trigger, path) for service, path in PATHS.items()
-        }
-        self._recorder_parameters = self.create_client(SetParameters, "recorder/set_parameters")
-        self._planner_parameters = self.create_client(SetParameters, "planner/set_parameters")
-        self._paths = self.create_publisher(PathMessage, topics.PATH, qos.COMMANDS)
-        self._motions = self.create_publisher(MotionCommand, topics.COMMAND, qos.COMMANDS)
         self._situation = Situation()
+        self._commands = GraphCommands(self, self._situation)
+        self._replayer = Worker()
         self._picture = PictureFeed(self._picture_rate)
         self._overlay = Overlay(self._tag_map)
         self._images = None
@@ -94,9 +74,10 @@ class PageNode(Node):
             self._picture,
             self._overlay,
             self._desk,
-            self,
+            self._commands,
             self._studio,
             self._experiments,
+            self._replayer,
         )
         self._server = PageServer(binding, listen(binding), parts, lay_out)
         self._subscribe()
@@ -259,102 +240,12 @@ class PageNode(Node):
             self.destroy_subscription(self._images)
             self._images = None
 
-    # What goes out: `Commands`, called from the server's thread --------------------------------
-
-    def call(self, service: Service) -> Future[Answer]:
-        """Call a service of the driver, the planner or the recorder."""
-        answer: Future[Answer] = Future()
-        client = self._service_clients[service]
-        if not client.service_is_ready():
-            text = f"{OWNERS[service]} does not run or cannot be reached"
-            if service == "vent":
-                text += ": NOT VENTED; close the supply and open the valves by hand"
-            answer.set_result(Answer(False, text))
-            return answer
-
-        def finish(pending: Any) -> None:
-            if answer.cancelled():
-                return
-            result = pending.result()
-            answer.set_result(Answer(bool(result.success), result.message))
-
-        client.call_async(Trigger.Request()).add_done_callback(finish)
-        return answer
-
-    def play(self, request: MotionRequest) -> Answer:
-        """Publish a motion command; the planner's answer is seen in its diagnostics."""
-        if not self._motions.get_subscription_count():
-            return Answer(False, "no planner listens: start it")
-        self._motions.publish(
-            MotionCommand(
-                motion=request.motion, model=request.model, method=request.method,
-                amplitude=request.amplitude, period=request.period, cycles=request.cycles,
-                feedback=request.feedback,
-            )
-        )  # fmt: skip
-        return Answer(True, f"asked the planner for {request.motion} with {request.model}")
-
-    def record(self, note: str) -> Future[Answer]:
-        """Start the recorder with the note in the bag's metadata."""
-        metadata = ParameterValue(
-            type=ParameterType.PARAMETER_STRING, string_value=json.dumps({"note": note})
-        )
-        return self._after_setting(
-            "recorder", self._recorder_parameters, "metadata", metadata,
-            lambda: self.call("record_start"),
-        )  # fmt: skip
-
-    def play_path(self, tip: np.ndarray[Any, Any]) -> Future[Answer]:
-        """Let the planner play the nearest path that it can to points (P, 2) [m]."""
-
-        def publish() -> Future[Answer]:
-            message = PathMessage()
-            message.header.frame_id = topics.BASE_FRAME
-            for x, y in tip:
-                pose = PoseStamped()
-                pose.pose.position.x, pose.pose.position.y = float(x), float(y)
-                message.poses.append(pose)
-            self._paths.publish(message)
-            answer: Future[Answer] = Future()
-            answer.set_result(Answer(True, f"asked the planner for a path of {len(tip)} points"))
-            return answer
-
-        wanted = ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=True)
-        return self._after_setting(
-            "planner", self._planner_parameters, "nearest_path", wanted, publish
-        )
-
-    def _after_setting(
-        self,
-        owner: str,
-        client: Any,
-        name: str,
-        value: ParameterValue,
-        go_on: Callable[[], Future[Answer]],
-    ) -> Future[Answer]:
-        """Set a parameter of a node, then do the rest and return its answer."""
-        answer: Future[Answer] = Future()
-        if not client.service_is_ready():
-            answer.set_result(Answer(False, f"{owner} does not run or cannot be reached"))
-            return answer
-
-        def then(pending: Any) -> None:
-            result = pending.result().results[0]
-            if not result.successful:
-                answer.set_result(Answer(False, result.reason))
-                return
-            go_on().add_done_callback(lambda done: answer.set_result(done.result()))
-
-        request = SetParameters.Request(parameters=[Parameter(name=name, value=value)])
-        client.call_async(request).add_done_callback(then)
-        return answer
-
     def _on_lost_operator(self, _window: str) -> None:
         self.get_logger().warning(f"the operator's browser is gone: {self._policy}")
         if self._policy == "stop":
-            self.call("stop")
+            self._commands.call("stop")
         elif self._policy == "vent":
-            self.call("vent")
+            self._commands.call("vent")
 
     # What it says of itself ----------------------------------------------------------------
 
@@ -375,6 +266,7 @@ class PageNode(Node):
         """Stop serving."""
         self._server.close()
         self._studio.previewer.close()
+        self._replayer.close()
 
 
 def main() -> None:

@@ -21,14 +21,15 @@ from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, Redirect
 from fastapi.staticfiles import StaticFiles
 
 from der_planner.page.access import SESSION_LIFE, Binding, Sessions, bracketed
+from der_planner.page.afterwards.experiments import Experiments
 from der_planner.page.commands import Commands, answer_of
 from der_planner.page.drawing.studio import Studio
-from der_planner.page.experiments import Experiments
 from der_planner.page.guard import COOKIE, LOGIN, Guard
 from der_planner.page.operators import Desk
 from der_planner.page.overlay import Overlay
 from der_planner.page.picture import PictureFeed
 from der_planner.page.situation import Situation
+from der_planner.page.worker import Worker
 
 STATIC = Path(__file__).parent / "static"
 RATE = 10.0
@@ -48,6 +49,7 @@ class Parts:
     commands: Commands
     studio: Studio
     experiments: Experiments
+    replayer: Worker
 
 
 class LiveText:

@@ -124,6 +124,12 @@ class Situation:
         with self._lock:
             self._nodes[status.name] = (status, self._clock())
 
+    def value_of(self, node: str, key: str) -> str:
+        """Return what a node's newest diagnostics say under a key; empty where they do not."""
+        with self._lock:
+            found = [status for status, _ in self._nodes.values() if _short(status.name) == node]
+        return found[0].values.get(key, "") if found else ""
+
     def reference_at(self, stamp: int) -> tuple[float, float] | None:
         """Return where the tip should be [m] at an instant [ns]; None where no plan says it."""
         with self._lock:
@@ -177,6 +183,10 @@ class Situation:
         }
 
 
+def _short(name: str) -> str:
+    return name.rsplit("/", 1)[-1]
+
+
 def _name(entry: tuple[NodeStatus, float]) -> str:
     return entry[0].name
 
@@ -207,7 +217,7 @@ def _node_values(status: NodeStatus, age: float) -> dict[str, Any]:
     if age > LATE:
         level = "dead" if age > DEAD else "late"
     return {
-        "name": status.name.rsplit("/", 1)[-1],
+        "name": _short(status.name),
         "state": level,
         "message": status.message,
         "age": round(age, 1),

@@ -70,7 +70,7 @@ class PlanningArcs(ArcModel):
         """Return the state in which a motion begins: at rest, or where another one is left."""
         return self.rest if start is None else self.state(spline(0.0), spline(0.0, 1))
 
-    def pressures(self, method: str, spline: BSpline, time: Array) -> Array:
+    def pressures(self, method: str, spline: BSpline, time: Array, _: Start | None = None) -> Array:
         """Return u = Λ† (M q̈ + (C + D) q̇ + K q − Q_gravity) at instants (K,) [s].
 
         ``paper`` and ``projected`` are the same.

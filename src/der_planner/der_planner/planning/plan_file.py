@@ -140,6 +140,11 @@ def _rows(content: Mapping[str, Any], key: str, width: int, count: int | None) -
     return rows
 
 
+def learned_names(folder: str | Path) -> list[str]:
+    """Return the names of the learned plans in a folder; none where there is no such folder."""
+    return sorted(path.stem for path in Path(folder).glob(f"*{SUFFIX}"))
+
+
 def learned_plan(folder: str | Path | None, name: str, limb: Limb) -> Plan:
     """Return the learned plan of a name from a folder, for the limb as it is now.
 
@@ -155,13 +160,13 @@ def learned_plan(folder: str | Path | None, name: str, limb: Limb) -> Plan:
         raise PlanningError(
             f"the learned plan '{name}' has no place: set the planner's learned_plans to a folder"
         )
-    known = sorted(path.stem for path in Path(folder).glob(f"*{SUFFIX}"))
+    known = learned_names(folder)
     if name not in known:
         raise PlanningError(
             f"no learned plan '{name}' in {folder}, only: {', '.join(known) or 'none'}"
         )
     plan = read_plan(Path(folder) / f"{name}{SUFFIX}")
-    other = _difference(plan.limb.to_mapping(), limb.for_model(plan.model).to_mapping())
+    other = difference(plan.limb.to_mapping(), limb.for_model(plan.model).to_mapping())
     if other:
         raise PlanningError(
             f"the plan '{name}' was learned on a limb with another {other}: plan the motion by "
@@ -170,13 +175,13 @@ def learned_plan(folder: str | Path | None, name: str, limb: Limb) -> Plan:
     return plan
 
 
-def _difference(one: Any, other: Any, where: str = "") -> str:
+def difference(one: Any, other: Any, where: str = "") -> str:
     """Return the name of the first number of two limbs that differs; empty if they are one."""
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         for key in {**one, **other}:
             if key in ("name", "provenance", "calibrated", "pcc_segments"):
                 continue
-            found = _difference(one.get(key), other.get(key), f"{where}.{key}".strip("."))
+            found = difference(one.get(key), other.get(key), f"{where}.{key}".strip("."))
             if found:
                 return found
         return ""
@@ -184,7 +189,7 @@ def _difference(one: Any, other: Any, where: str = "") -> str:
         if len(one) != len(other):
             return where
         pairs = enumerate(zip(one, other, strict=True))
-        found_each = (_difference(a, b, f"{where}[{n}]") for n, (a, b) in pairs)
+        found_each = (difference(a, b, f"{where}[{n}]") for n, (a, b) in pairs)
         return next((found for found in found_each if found), "")
     if isinstance(one, int | float) and isinstance(other, int | float):
         return "" if abs(one - other) <= _SAME * max(abs(one), abs(other)) else where

@@ -65,29 +65,64 @@ def solve_limited(H: Array, gradient: Array, band: Band) -> Array:
     size, inputs = band.command.shape
     total = size * inputs
     difference = np.eye(total) - np.eye(total, k=-inputs)
-    steps = np.diff(np.vstack([band.before, band.command]), axis=0).ravel() / _PRESSURE
-    room, limit = band.step / _PRESSURE, band.limit / _PRESSURE
-    present = band.command.ravel() / _PRESSURE
+    steps = np.diff(np.vstack([band.before, band.command]), axis=0).ravel()
+    present = band.command.ravel()
+    try:
+        change = minimise(
+            H,
+            gradient,
+            (difference, -band.step - steps, band.step - steps),
+            (-band.limit - present, band.limit - present),
+            tolerance=(1e-6, 1e-8),
+        )
+    except UnsolvedError as error:
+        raise PlanningError(
+            f"the quadratic programme of {size} setpoints was not solved ({error}): "
+            "use the method projected, or a longer period"
+        ) from error
+    return band.cut(change.reshape(size, inputs))
+
+
+class UnsolvedError(Exception):
+    """The solver gave up; the message is its status."""
+
+
+def minimise(
+    hessian: Array,
+    gradient: Array,
+    rows: tuple[Array, Array, Array],
+    box: tuple[Array, Array] | None,
+    tolerance: tuple[float, float],
+) -> Array:
+    """Return the pressures x (n,) [Pa] that minimise ½ xᵀ hessian x + gradientᵀ x under limits.
+
+    Args:
+        hessian: (n, n) positive definite [m²/Pa²].
+        gradient: (n,) [m²/Pa].
+        rows: matrix A (m, n), least and largest A x (m,) [Pa].
+        box: least and largest x (n,) [Pa]; None: not limited.
+        tolerance: of the solver, absolute and relative, in kPa and mm.
+
+    Raises:
+        UnsolvedError: the solver gave up.
+    """
+    matrix, low, high = rows
+    least, largest = (None, None) if box is None else (box[0] / _PRESSURE, box[1] / _PRESSURE)
     scale = (_PRESSURE / _LENGTH) ** 2
     solver = piqp.DenseSolver()
-    solver.settings.eps_abs = 1e-6
-    solver.settings.eps_rel = 1e-8
+    solver.settings.eps_abs, solver.settings.eps_rel = tolerance
     solver.setup(
-        np.asfortranarray(H * scale),
+        np.asfortranarray(hessian * scale),
         gradient * scale / _PRESSURE,
         None,
         None,
-        np.asfortranarray(difference),
-        -room - steps,
-        room - steps,
-        -limit - present,
-        limit - present,
+        np.asfortranarray(matrix),
+        low / _PRESSURE,
+        high / _PRESSURE,
+        least,
+        largest,
     )
     status = solver.solve()
     if status != piqp.PIQP_SOLVED:
-        raise PlanningError(
-            f"the quadratic programme of {size} setpoints was not solved ({status}): "
-            "use the method projected, or a longer period"
-        )
-    change = np.asarray(solver.result.x).reshape(size, inputs) * _PRESSURE
-    return band.cut(change)
+        raise UnsolvedError(status)
+    return np.asarray(solver.result.x) * _PRESSURE

@@ -26,8 +26,6 @@ POSITION_GAIN = 20.0
 """K_p of the method ``paper`` [1/s²]."""
 VELOCITY_GAIN = 8.0
 """K_d of the method ``paper`` [1/s]: with K_p a damped return at 0.7 Hz."""
-_AT_REST = 1e-9
-"""Below this speed [m/s] of its nodes and tip a reference begins at rest."""
 
 
 class PlanningRod(RodModel):
@@ -77,20 +75,24 @@ class PlanningRod(RodModel):
             return self._posed.state(0.0)
         return self.state(spline(0.0), spline(0.0, 1))
 
-    def pressures(self, method: str, spline: BSpline, time: Array) -> Array:
+    def pressures(
+        self, method: str, spline: BSpline, time: Array, start: Start | None = None
+    ) -> Array:
         """Return effective pressures (K, M) [Pa] by ``paper`` or ``projected``.
 
         Args:
             method: of the two.
             spline: bend angles of `configuration` [rad].
-            time: (K,) evenly spaced instants [s].
+            time: (K,) evenly spaced instants from 0 on [s].
+            start: where the motion begins; None: at rest.
         """
         if self._posed is not None:
             position, velocity, _ = self._posed.sample(time)
             if method != "paper":
                 return self._posed.projected(time)
             pressures, inverse = self._posed.paper(time)
-            return self._beside_the_model(pressures, inverse, position, velocity, time)
+            begin = self.begin(spline, start)
+            return self._beside_the_model(pressures, inverse, position, velocity, time, begin)
         q, v, a = sample_spline(spline, time)
         if method != "paper":
             return self.balance.projected(q, v, a)
@@ -101,12 +103,17 @@ class PlanningRod(RodModel):
         position[:, columns] = placed.reshape(len(q), -1)
         velocity[:, columns] = moving.reshape(len(q), -1)
         inverse = self.balance.inverse_inputs(q)
-        return self._beside_the_model(
-            self.balance.paper(q, v, a), inverse, position, velocity, time
-        )
+        pressures, begin = self.balance.paper(q, v, a), self.begin(spline, start)
+        return self._beside_the_model(pressures, inverse, position, velocity, time, begin)
 
     def _beside_the_model(
-        self, pressures: Array, inverse: Array, position: Array, velocity: Array, time: Array
+        self,
+        pressures: Array,
+        inverse: Array,
+        position: Array,
+        velocity: Array,
+        time: Array,
+        begin: RodState,
     ) -> Array:
         """Return the pressures (K, M) with (B Λ)† M (K_d ė + K_p e) added.
 
@@ -119,13 +126,11 @@ class PlanningRod(RodModel):
             position: (K, 4N-1) of the reference.
             velocity: (K, 4N-1) of the reference.
             time: (K,) [s].
+            begin: state of the rod at the first instant.
         """
         result, free = pressures.copy(), self.rod.free
         mass = self.rod.mass_diagonal[free]
-        # A reference at rest has rates of rounding errors; a motion that goes on has far more.
-        moving = np.abs(velocity[0]).max() > _AT_REST
-        state = self.rod.state(position[0], velocity[0], like=self.rest) if moving else self.rest
-        step = float(time[1] - time[0])
+        state, step = begin, float(time[1] - time[0])
         for k in range(len(result)):
             gap, rate = (position[k] - state.q)[free], (velocity[k] - state.v)[free]
             result[k] += inverse[k] @ (mass * (VELOCITY_GAIN * rate + POSITION_GAIN * gap))

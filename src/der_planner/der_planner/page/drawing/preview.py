@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import ctypes
-import multiprocessing
-import signal
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.limb import Limb
+from der_planner.page.worker import Worker
 from der_planner.planning import Motion, PathLimits, PlanningError, plan
 
 Array = NDArray[np.float64]
@@ -19,7 +17,6 @@ Array = NDArray[np.float64]
 FRAMES = 60
 """Poses of the predicted limb that a preview holds."""
 PATH_POINTS = 200
-_PR_SET_PDEATHSIG = 1
 
 
 @dataclass(frozen=True)
@@ -85,28 +82,12 @@ class Previewer:
 
     def __init__(self, limb: Limb, limits: PathLimits) -> None:
         self._limb, self._limits = limb, limits
-        self._pool: ProcessPoolExecutor | None = None
+        self._worker = Worker()
 
     def ask(self, tip: Array, model: str = "der", method: str = "") -> Future[Preview]:
         """Plan a drawing (P, 2) [m]; the first one starts the process and takes longer."""
-        if self._pool is None:
-            self._pool = ProcessPoolExecutor(
-                1, multiprocessing.get_context("spawn"), initializer=_settle_in
-            )
-        return self._pool.submit(preview, self._limb, tip, self._limits, model, method)
+        return self._worker.ask(preview, self._limb, tip, self._limits, model, method)
 
     def close(self) -> None:
         """End the process, also in the middle of a plan."""
-        pool, self._pool = self._pool, None
-        if pool is None:
-            return
-        workers = list((pool._processes or {}).values())
-        pool.shutdown(wait=False, cancel_futures=True)
-        for worker in workers:
-            worker.kill()
-
-
-def _settle_in() -> None:
-    """Leave interrupts to the page, end with it whatever ends it, and let others go first."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        self._worker.close()

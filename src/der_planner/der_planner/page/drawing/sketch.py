@@ -13,7 +13,7 @@ from nicegui import Client, ui
 from nicegui.events import GenericEventArguments
 from numpy.typing import NDArray
 
-from der_planner.page.commands import Answer, answer_of
+from der_planner.page.commands import Answer
 from der_planner.page.drawing.kept import DrawingError
 from der_planner.page.drawing.preview import Preview
 from der_planner.page.drawing.studio import drawn_pixels
@@ -123,14 +123,13 @@ class Sketch:
         }
         self._run(f"page.sketch.show({json.dumps(shown, separators=(',', ':'))})")
 
-    async def _on_play(self) -> None:
+    def _on_play(self) -> None:
         if not self._may_command():
             return
         if self._tip is None:
             ui.notify("draw a line first, and wait for its preview", type="warning")
             return
-        answer = await answer_of("path", self._parts.commands.play_path(self._tip))
-        self._tell("play drawing", answer)
+        self._tell("play drawing", self._parts.commands.play_path(self._tip))
 
     async def _on_load(self) -> None:
         if not self._kept.value:

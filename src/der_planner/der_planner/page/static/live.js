@@ -48,7 +48,7 @@ const page = { data: null, at: -Infinity, listeners: [] };
     put(find("faults"), driver && age !== null ? (old ? `${age.toFixed(1)} s ago  ` : "") + driver.faults.join("; ") : "");
     find("mode")?.classList.toggle("fault", !!driver && driver.mode === "fault");
     find("summary")?.classList.toggle("old", old);
-    if (page.data) { showNodes(page.data.nodes, seconds() - page.at); showSupply(driver); }
+    if (page.data) { showNodes(page.data.nodes, seconds() - page.at); showSupply(driver); showLines(page.data.nodes, lost); }
   }
 
   function showAge(panel, lost, silence) {
@@ -68,7 +68,7 @@ const page = { data: null, at: -Infinity, listeners: [] };
     const rows = find("node-rows");
     if (!rows || !nodes.length) return;
     const table = nodes.map((node) => {
-      const row = document.createElement("tr"), cells = [node.name, node.state, node.message, `${(node.age + waited).toFixed(1)} s`];
+      const row = document.createElement("tr"), cells = [node.name, node.state, node.message, cpuOf(node), `${(node.age + waited).toFixed(1)} s`];
       cells.forEach((text, index) => {
         const cell = row.insertCell();
         cell.textContent = text; // never as HTML: messages come from anywhere
@@ -78,6 +78,26 @@ const page = { data: null, at: -Infinity, listeners: [] };
       return row;
     });
     rows.replaceChildren(...table);
+  }
+
+  const cpuOf = (node) => (node.values.cpu_percent === undefined ? "" : `${node.values.cpu_percent} %`);
+
+  // What planner and recorder do now, beside the buttons that command them.
+  function showLines(nodes, lost) {
+    for (const name of ["planner", "recorder"]) {
+      const line = find(`${name}-line`), node = nodes.find((one) => one.name === name);
+      if (!line) continue;
+      const away = !node ? "not heard" : ["late", "dead"].includes(node.state) ? `${node.state}, last heard ${node.age.toFixed(1)} s ago` : "";
+      put(line, `${name[0].toUpperCase()}${name.slice(1)}: ${away || describe(name, node)}`);
+      line.className = !node || away || lost ? "gone" : node.state;
+    }
+  }
+
+  function describe(name, node) {
+    const values = node.values, megabytes = Number(values.bytes) / 1e6;
+    if (name === "recorder") return node.message + (values.bytes === undefined ? "" : `, ${megabytes.toFixed(1)} MB, ${values.messages} messages`);
+    const done = ["planning", "streaming"].includes(values.state) ? ` ${(100 * Number(values.progress)).toFixed(0)} %` : "";
+    return values.state === undefined || node.message.startsWith(values.state) ? node.message + done : `${values.state}${done}, ${node.message}`;
   }
 
   function showSupply(driver) {

@@ -17,18 +17,19 @@
     context.stroke();
   }
 
-  function draw(canvas, image, over) {
-    if (canvas.width !== image.width) { canvas.width = image.width; canvas.height = image.height; }
-    const context = canvas.getContext("2d"), now = performance.now();
-    context.drawImage(image, 0, 0);
+  // Draws a picture, or a plain background where there is none, and what belongs over it.
+  function draw(canvas, image, over, tips) {
+    const [width, height] = image ? [image.width, image.height] : over.size;
+    if (canvas.width !== width || canvas.height !== height) { canvas.width = width; canvas.height = height; }
+    const context = canvas.getContext("2d");
+    if (image) context.drawImage(image, 0, 0);
+    else { context.fillStyle = "#3a424b"; context.fillRect(0, 0, width, height); }
     line(context, over.path, "#30c060", 2.5);
     line(context, over.planned, "#9be8b4", 5);
     for (const tag of over.tags) line(context, [0, 2, 4, 6].map((i) => [tag[i], tag[i + 1]]), "#2e9bff", 2, true);
     line(context, over.estimate || [], "#ff5fd0", 2);
     line(context, over.curve, "#ff7828", 3);
-    trail = trail.filter((point) => now - point[2] < TRAIL);
-    if (over.tip) trail.push([...over.tip, now]);
-    line(context, trail, "#ffd84a", 2);
+    line(context, tips, "#ffd84a", 2);
     for (const [point, colour] of [[over.tip, "#ff7828"], [over.reference, "#30c060"]]) {
       if (!point) continue;
       context.beginPath();
@@ -37,8 +38,14 @@
       context.lineWidth = 3;
       context.stroke();
     }
-    const note = document.getElementById("view-note");
-    if (note) note.textContent = over.problem;
+  }
+  page.drawOver = draw;
+
+  function trailWith(tip) {
+    const now = performance.now();
+    trail = trail.filter((point) => now - point[2] < TRAIL);
+    if (tip) trail.push([...tip, now]);
+    return trail;
   }
 
   async function next() {
@@ -52,7 +59,9 @@
     const image = await createImageBitmap(new Blob([new Uint8Array(body, 4 + size)], { type: "image/jpeg" }));
     number = over.number;
     if (over.region) page.region = over.region;
-    draw(canvas, image, over);
+    draw(canvas, image, over, trailWith(over.tip));
+    const note = document.getElementById("view-note");
+    if (note) note.textContent = over.problem;
     image.close();
     page.pictures += 1;
     return Math.max(0, INTERVAL - (performance.now() - begin));

@@ -12,20 +12,18 @@ from numpy.typing import NDArray
 
 from der_planner.runs.evaluation import style
 from der_planner.runs.evaluation.figures import CM, FORMATS, by_motion, new_figure
-from der_planner.runs.evaluation.snapshots import (
-    IMAGE_TYPE,
-    Projection,
-    Snapshot,
-    curve_points,
-    fit_projection,
-    gray,
-    stamp_of,
-    take_snapshots,
-    topics_of,
-)
+from der_planner.runs.evaluation.snapshots import Snapshot, fit_projection, take_snapshots
 from der_planner.runs.recording.reader import BagReader
 from der_planner.runs.run import Array, EvaluationError, RunSeries
 from der_planner.runs.series import NANOSECONDS, STATE_TYPE
+from der_planner.runs.sight import (
+    IMAGE_TYPE,
+    Projection,
+    curve_points,
+    gray,
+    stamp_of,
+    topics_of,
+)
 
 INSTANTS = 5
 

@@ -25,12 +25,14 @@ class Experiment:
         name: of the folder.
         rows: a run each, in the order of `COLUMNS`.
         figures: addresses within the folder.
+        bags: of each row, in their order; empty where none is left.
         report: address within the folder; empty if there is none.
         problem: why the results cannot be read; else empty.
     """
 
     name: str
     rows: tuple[tuple[str, ...], ...]
+    bags: tuple[str, ...]
     figures: tuple[str, ...]
     report: str
     problem: str = ""
@@ -58,16 +60,28 @@ class Experiments:
     def load(self, name: str) -> Experiment:
         """Return what is to be shown of one experiment."""
         if name not in self.names():
-            return Experiment(name, (), (), "", f"there is no experiment '{name}' any more")
+            return Experiment(name, (), (), (), "", f"there is no experiment '{name}' any more")
         folder = self.folder / name
         try:
             runs = json.loads((folder / "results.json").read_text())["runs"]
             rows = tuple(_row(run) for run in runs)
+            bags = tuple(_bag(folder, run) for run in runs)
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            return Experiment(name, (), (), "", f"results.json cannot be read: {error}")
+            return Experiment(name, (), (), (), "", f"results.json cannot be read: {error}")
         figures = tuple(sorted(path.name for path in folder.glob("*.png")))
         report = "report/report.html"
-        return Experiment(name, rows, figures, report if (folder / report).is_file() else "")
+        found = report if (folder / report).is_file() else ""
+        return Experiment(name, rows, bags, figures, found)
+
+    def recordings(self) -> dict[str, str]:
+        """Return the bags of all experiments, the newest first: a name for people by its path."""
+        found: dict[str, str] = {}
+        for name in self.names():
+            experiment = self.load(name)
+            for row, bag in zip(experiment.rows, experiment.bags, strict=True):
+                if bag:
+                    found[bag] = f"{name}: {' '.join(row[:3])}, trial {row[3]}"
+        return found
 
     def file(self, name: str, inside: str) -> Path | None:
         """Return a file of an experiment that may be shown; None for any other."""
@@ -80,6 +94,15 @@ class Experiments:
             return None
         inner = path.is_relative_to(folder) and path.suffix.lower() in SHOWN
         return path if inner and path.is_file() else None
+
+
+def _bag(folder: Path, run: dict[str, Any]) -> str:
+    """Return the path of a run's bag, also of an experiment that was moved with its bags."""
+    named = str(run.get("bag") or "")
+    if not named:
+        return ""
+    beside = folder / "bags" / Path(named).name
+    return next((str(path.resolve()) for path in (beside, Path(named)) if path.exists()), "")
 
 
 def _row(run: dict[str, Any]) -> tuple[str, ...]:

@@ -6,7 +6,8 @@ from urllib.parse import quote
 
 from nicegui import ui
 
-from der_planner.page.experiments import COLUMNS, Experiments
+from der_planner.page.afterwards.experiments import COLUMNS, Experiments
+from der_planner.page.afterwards.replay import replay_address
 from der_planner.page.server import STATIC
 
 ADDRESS = "/afterwards"
@@ -44,13 +45,16 @@ def _show(experiments: Experiments, name: str, shown: ui.column) -> None:
             ui.link("Report", place + found.report, new_tab=True)
         with ui.element("table").classes("results"):
             with ui.element("tr"):
-                for column in COLUMNS:
+                for column in (*COLUMNS, ""):
                     with ui.element("th"):
                         ui.label(column)
-            for row in found.rows:
+            for row, bag in zip(found.rows, found.bags, strict=True):
                 with ui.element("tr"):
                     for text in row:
                         with ui.element("td"):
                             ui.label(text)
+                    with ui.element("td"):
+                        if bag:
+                            ui.link("Replay", replay_address(bag))
         for figure in found.figures:
             ui.image(place + quote(figure)).classes("figure").props(f'alt="{figure}"')

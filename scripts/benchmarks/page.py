@@ -1,0 +1,154 @@
+"""The operator's page in a real browser: how fast a vent is, what it costs, whom it disturbs."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from typing import Any
+
+import numpy as np
+
+from benchmarks.driver import PERIOD, Seen, evaluate, play_plan
+from benchmarks.page_rig import BrowserError, Rig, report, running
+from der_msgs.msg import ChamberPressures, MotionCommand, PressureSetpoint, PressureState
+from limb_interfaces import qos, topics
+from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
+
+PRESSURE = 2000.0
+"""[Pa] that both segments hold when vent is pressed."""
+AHEAD = 24
+"""Setpoints sent before a press: 1.2 s."""
+LISTEN = """
+window.presses = [];
+const note = (event) => window.presses.push(performance.timeOrigin + event.timeStamp);
+window.addEventListener('pointerdown', note, true);
+window.addEventListener('keydown', note, true);
+"""
+COUNTS = "return [page.pictures, page.data.count, performance.now()];"
+
+
+def _difference(command: ChamberPressures) -> float:
+    """Return the largest differential pressure of a command [Pa]."""
+    chambers = np.array(command.pressure)
+    return float(np.abs(chambers[0::2] - chambers[1::2]).max())
+
+
+def _hold(rig: Rig, publisher: Any, plan_id: str) -> None:
+    """Put both segments under a small pressure that lasts beyond the next press."""
+    start = (time.time_ns() // PERIOD + 4) * PERIOD
+    for index in range(AHEAD):
+        message = PressureSetpoint(
+            plan_id=plan_id, index=index, differential_pressure=[PRESSURE, PRESSURE]
+        )
+        message.header.stamp = stamp_from_nanoseconds(start + index * PERIOD)
+        publisher.publish(message)
+    del rig.commands[:]
+    rig.wait(
+        lambda: rig.commands and _difference(rig.commands[-1]) > 0.9 * PRESSURE, "the pressure"
+    )
+
+
+def _press(rig: Rig, window: Any, by_key: bool) -> float:
+    """Press vent once; return the time from the browser's event to the board's first byte [s]."""
+    seen = len(window.execute_script("return window.presses;"))
+    if by_key:
+        window.find_element("tag name", "body").send_keys(" ")
+    else:
+        window.find_element("id", "vent").click()
+    pressed = window.execute_script("return window.presses;")[seen] / 1000.0
+
+    def vented() -> ChamberPressures | None:
+        late = (c for c in rig.commands if nanoseconds(c.header.stamp) * 1e-9 >= pressed)
+        return next((c for c in late if _difference(c) < 0.5 * PRESSURE), None)
+
+    return (
+        float(nanoseconds(rig.wait(vented, "the vent at the board").header.stamp)) * 1e-9 - pressed
+    )
+
+
+def measure_vent(rig: Rig, window: Any, count: int) -> dict[str, float]:
+    """Press vent again and again, by mouse and by space bar in turn."""
+    window.execute_script(LISTEN)
+    publisher = rig.client.node.create_publisher(
+        PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS
+    )
+    rig.wait(publisher.get_subscription_count, "the driver to listen")
+    random = np.random.default_rng(1)
+    taken = []
+    for number in range(count):
+        rig.wait_mode(PressureState.DISARMED)
+        rig.client.call("pressure_driver/arm", 20.0)
+        rig.wait_mode(PressureState.ARMED)
+        _hold(rig, publisher, f"vent{number}")
+        rig.client.spin(float(random.uniform(0.0, 0.1)))  # any place between two ticks
+        taken.append(1000.0 * _press(rig, window, by_key=number % 2 == 1))
+    print("presses [ms]: " + " ".join(f"{value:.0f}" for value in sorted(taken)), flush=True)
+    return {
+        "vent_presses": float(count),
+        **{f"vent_press_to_first_byte_p{p}_ms": float(np.percentile(taken, p)) for p in (50, 99)},
+        "vent_press_to_first_byte_max_ms": float(max(taken)),
+    }
+
+
+def measure_rates(rig: Rig, windows: list[Any], seconds: float) -> dict[str, float]:
+    """Count pictures drawn and live data received while a motion is played, and the CPU time."""
+    before = [window.execute_script(COUNTS) for window in windows]
+    cpu = rig.cpu(seconds)
+    after = [window.execute_script(COUNTS) for window in windows]
+    rates = [
+        [(b - a) / (last[2] - first[2]) * 1000.0 for a, b in zip(first[:2], last[:2], strict=True)]
+        for first, last in zip(before, after, strict=True)
+    ]
+    name = f"windows_{len(windows)}"
+    return {
+        f"{name}_pictures_per_s_least": min(rate[0] for rate in rates),
+        f"{name}_live_data_per_s_least": min(rate[1] for rate in rates),
+        f"{name}_page_cpu_percent": cpu,
+    }
+
+
+def _move(rig: Rig, cycles: int) -> None:
+    """Arm, and have the planner play a motion."""
+    rig.wait_mode(PressureState.DISARMED)
+    rig.client.call("pressure_driver/arm", 20.0)
+    publisher = rig.client.node.create_publisher(MotionCommand, topics.COMMAND, qos.COMMANDS)
+    rig.wait(publisher.get_subscription_count, "the planner to listen")
+    publisher.publish(MotionCommand(motion="same_direction", model="der", cycles=cycles))
+    rig.wait_mode(PressureState.TRACKING)
+
+
+def measure_jitter(seconds: float, with_page: bool) -> dict[str, float]:
+    """Play a motion with or without the page and a window that looks; return the wire's jitter."""
+    with running(with_page) as rig:
+        if with_page:
+            rig.browse()
+        rig.client.call("pressure_driver/arm", 20.0)
+        del rig.commands[:], rig.states[:]
+        wanted = play_plan(rig.client, seconds)
+        name = "wire_with_page" if with_page else "wire_without_page"
+        found = evaluate(name, wanted, Seen(rig.commands, rig.states))
+        return {key: float(value) for key, value in found.items()}
+
+
+def run(quick: bool) -> dict[str, float]:
+    """Measure vent, rates, CPU and jitter; ``quick`` presses ten times and plays for 10 s."""
+    figures: dict[str, float] = {}
+    try:
+        with running() as rig:
+            first = rig.browse()
+            print(f"page: vent, load {os.getloadavg()[0]:.1f} …", file=sys.stderr, flush=True)
+            figures |= measure_vent(rig, first, 10 if quick else 100)
+            seconds = 10.0 if quick else 15.0
+            _move(rig, 3)
+            figures |= measure_rates(rig, [first], seconds)
+            figures |= measure_rates(rig, [first, rig.browse()], seconds)
+            report("the page with one and two windows", figures)
+    except BrowserError as error:
+        print(f"page: not measured: {error}")
+        return {}
+    for with_page in (False, True):
+        found = measure_jitter(20.0, with_page)
+        report("driver, whole graph, with the page" if with_page else "without it", found)
+        figures |= found
+    return figures

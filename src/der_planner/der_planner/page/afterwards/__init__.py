@@ -1,0 +1,1 @@
+"""What is looked at afterwards: earlier experiments, and bags replayed in the browser."""

@@ -1,0 +1,122 @@
+"""What the page's buttons do to the graph: the services and topics that a terminal would use."""
+
+from __future__ import annotations
+
+import json
+from concurrent.futures import Future
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Path as PathMessage
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+from der_msgs.msg import MotionCommand
+from der_planner.page.commands import OWNERS, Answer, MotionRequest, Service
+from der_planner.page.situation import Situation
+from der_planner.planning.plan_file import learned_names
+from limb_interfaces import qos, topics
+
+PATHS: dict[Service, str] = {
+    "vent": "pressure_driver/vent",
+    "arm": "pressure_driver/arm",
+    "start": "planner/start",
+    "stop": "planner/stop",
+    "record_start": "recorder/start",
+    "record_stop": "recorder/stop",
+}
+
+
+class GraphCommands:
+    """`Commands` by ROS; called from the server's thread, answered from the executor's.
+
+    Args:
+        node: of the page.
+        situation: what the nodes have said of themselves.
+    """
+
+    def __init__(self, node: Node, situation: Situation) -> None:
+        self._situation = situation
+        self._service_clients = {
+            service: node.create_client(Trigger, path) for service, path in PATHS.items()
+        }
+        self._recorder_parameters = node.create_client(SetParameters, "recorder/set_parameters")
+        self._paths = node.create_publisher(PathMessage, topics.NEAREST_PATH, qos.COMMANDS)
+        self._motions = node.create_publisher(MotionCommand, topics.COMMAND, qos.COMMANDS)
+
+    def call(self, service: Service) -> Future[Answer]:
+        """Call a service of the driver, the planner or the recorder."""
+        answer: Future[Answer] = Future()
+        client = self._service_clients[service]
+        if not client.service_is_ready():
+            text = f"{OWNERS[service]} does not run or cannot be reached"
+            if service == "vent":
+                text += ": NOT VENTED; close the supply and open the valves by hand"
+            answer.set_result(Answer(False, text))
+            return answer
+
+        def finish(pending: Any) -> None:
+            if answer.cancelled():
+                return
+            result = pending.result()
+            answer.set_result(Answer(bool(result.success), result.message))
+
+        client.call_async(Trigger.Request()).add_done_callback(finish)
+        return answer
+
+    def play(self, request: MotionRequest) -> Answer:
+        """Publish a motion command; the planner's answer is seen in its diagnostics."""
+        if not self._motions.get_subscription_count():
+            return Answer(False, "no planner listens: start it")
+        self._motions.publish(
+            MotionCommand(
+                motion=request.motion, model=request.model, method=request.method,
+                amplitude=request.amplitude, period=request.period, cycles=request.cycles,
+                feedback=request.feedback,
+            )
+        )  # fmt: skip
+        return Answer(True, f"asked the planner for {request.motion} with {request.model}")
+
+    def record(self, note: str) -> Future[Answer]:
+        """Start the recorder with the note in the bag's metadata."""
+        answer: Future[Answer] = Future()
+        if not self._recorder_parameters.service_is_ready():
+            answer.set_result(Answer(False, "recorder does not run or cannot be reached"))
+            return answer
+
+        def then(pending: Any) -> None:
+            result = pending.result().results[0]
+            if not result.successful:
+                answer.set_result(Answer(False, result.reason))
+                return
+            self.call("record_start").add_done_callback(
+                lambda done: answer.set_result(done.result())
+            )
+
+        metadata = ParameterValue(
+            type=ParameterType.PARAMETER_STRING, string_value=json.dumps({"note": note})
+        )
+        request = SetParameters.Request(parameters=[Parameter(name="metadata", value=metadata)])
+        self._recorder_parameters.call_async(request).add_done_callback(then)
+        return answer
+
+    def play_path(self, tip: np.ndarray[Any, Any]) -> Answer:
+        """Let the planner play the nearest path that it can to points (P, 2) [m]."""
+        if not self._paths.get_subscription_count():
+            return Answer(False, "no planner listens: start it")
+        message = PathMessage()
+        message.header.frame_id = topics.BASE_FRAME
+        for x, y in tip:
+            pose = PoseStamped()
+            pose.pose.position.x, pose.pose.position.y = float(x), float(y)
+            message.poses.append(pose)
+        self._paths.publish(message)
+        return Answer(True, f"asked the planner for a path of {len(tip)} points")
+
+    def learned_plans(self) -> list[str]:
+        """Return the names of the learned plans in the folder that the planner says it has."""
+        folder = self._situation.value_of("planner", "learned_plans")
+        return learned_names(folder) if folder else []
