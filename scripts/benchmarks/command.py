@@ -26,6 +26,7 @@ PARTS = (
     "learning",
     "feedback",
     "page",
+    "page_wire",
     "page_memory",
 )
 

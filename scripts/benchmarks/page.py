@@ -1,4 +1,4 @@
-"""The operator's page in a real browser: how fast a vent is, what it costs, whom it disturbs."""
+"""The operator's page in a real browser: how fast a vent is, and what the page costs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.driver import PERIOD, Seen, evaluate, play_plan
+from benchmarks.driver import PERIOD
 from benchmarks.page_rig import BrowserError, Rig, report, running
 from der_msgs.msg import ChamberPressures, MotionCommand, PressureSetpoint, PressureState
 from limb_interfaces import qos, topics
@@ -118,37 +118,19 @@ def _move(rig: Rig, cycles: int) -> None:
     rig.wait_mode(PressureState.TRACKING)
 
 
-def measure_jitter(seconds: float, with_page: bool) -> dict[str, float]:
-    """Play a motion with or without the page and a window that looks; return the wire's jitter."""
-    with running(with_page) as rig:
-        if with_page:
-            rig.browse()
-        rig.client.call("pressure_driver/arm", 20.0)
-        del rig.commands[:], rig.states[:]
-        wanted = play_plan(rig.client, seconds)
-        name = "wire_with_page" if with_page else "wire_without_page"
-        found = evaluate(name, wanted, Seen(rig.commands, rig.states))
-        return {key: float(value) for key, value in found.items()}
-
-
 def run(quick: bool) -> dict[str, float]:
-    """Measure vent, rates, CPU and jitter; ``quick`` presses ten times and plays for 10 s."""
-    figures: dict[str, float] = {}
+    """Measure vent, rates and CPU; ``quick`` presses ten times."""
+    seconds = 10.0 if quick else 15.0
     try:
         with running() as rig:
             first = rig.browse()
             print(f"page: vent, load {os.getloadavg()[0]:.1f} …", file=sys.stderr, flush=True)
-            figures |= measure_vent(rig, first, 10 if quick else 100)
-            seconds = 10.0 if quick else 15.0
+            figures = measure_vent(rig, first, 10 if quick else 100)
             _move(rig, 3)
             figures |= measure_rates(rig, [first], seconds)
             figures |= measure_rates(rig, [first, rig.browse()], seconds)
-            report("the page with one and two windows", figures)
     except BrowserError as error:
         print(f"page: not measured: {error}")
         return {}
-    for with_page in (False, True):
-        found = measure_jitter(20.0, with_page)
-        report("driver, whole graph, with the page" if with_page else "without it", found)
-        figures |= found
+    report("the page with one and two windows", figures)
     return figures
