@@ -21,10 +21,13 @@ AHEAD = 24
 """Setpoints sent before a press: 1.2 s."""
 LISTEN = """
 window.presses = [];
-const note = (event) => window.presses.push(performance.timeOrigin + event.timeStamp);
-window.addEventListener('pointerdown', note, true);
-window.addEventListener('keydown', note, true);
+const send = window.fetch;
+window.fetch = (...all) => {
+  if (all[0] === "/vent") window.presses.push(performance.timeOrigin + window.event.timeStamp);
+  return send(...all);
+};
 """
+"""Notes the instant of each press, by the browser's own stamp of the event [ms]."""
 COUNTS = "return [page.pictures, page.data.count, performance.now()];"
 
 
