@@ -11,6 +11,9 @@ import workspace
 PAGES = ("loads", "planning", "rod", "tracker")
 
 if __name__ == "__main__":
+    if sys.argv[1:] in (["-h"], ["--help"]):
+        print(__doc__)
+        sys.exit(0)
     if len(sys.argv) < 2 or sys.argv[1] not in PAGES:
         sys.exit(f"usage: draw_figures.py {{{','.join(PAGES)}}} [arguments]")
     workspace.enter()

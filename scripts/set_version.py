@@ -33,6 +33,9 @@ def versions() -> dict[str, str]:
 
 def main() -> int:
     """Write the version; 2 for one that is not of the form 1.2.3."""
+    if sys.argv[1:] in (["-h"], ["--help"]):
+        print(__doc__)
+        return 0
     if len(sys.argv) != 2 or not re.fullmatch(r"\d+\.\d+\.\d+", sys.argv[1]):
         print("usage: set_version.py MAJOR.MINOR.PATCH, e.g. 0.2.0", file=sys.stderr)
         return 2

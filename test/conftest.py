@@ -55,11 +55,23 @@ class Graph:
         self.client.close()
 
 
+def _domain() -> int:
+    """Return the ROS domain of this process's tests."""
+    # 102 to 231 collides with ephemeral ports on Linux; 0 to 20 is where people work.
+    return int(os.environ.get("TEST_DOMAIN_ID", 21 + os.getpid() % 80))
+
+
 @pytest.fixture
 def graph(tmp_path: Path) -> Iterator[Graph]:
     """Return a `Graph` whose processes end with the test."""
-    # 102 to 231 collides with ephemeral ports on Linux; 0 to 20 is where people work.
-    domain_id = int(os.environ.get("TEST_DOMAIN_ID", 21 + os.getpid() % 80))
-    running = Graph(tmp_path, domain_id)
+    running = Graph(tmp_path, _domain())
+    yield running
+    running.close()
+
+
+@pytest.fixture(scope="module")
+def lasting_graph(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Graph]:
+    """Return a `Graph` that all tests of a module share."""
+    running = Graph(tmp_path_factory.mktemp("graph"), _domain())
     yield running
     running.close()

@@ -14,6 +14,8 @@ import platform
 import time
 from pathlib import Path
 
+from der_planner.runs.outputs import OutputError, check_file
+
 PARTS = (
     "rod",
     "planning",
@@ -61,6 +63,12 @@ def main() -> int:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every figure here, too")
     parser.add_argument("--quick", action="store_true", help="fewer sizes and repetitions")
     options = parser.parse_args()
+    if options.json is not None:
+        try:
+            check_file(options.json, "--json")
+        except OutputError as error:
+            parser.error(str(error))
+        options.json.parent.mkdir(parents=True, exist_ok=True)
     parts = PARTS if "all" in options.parts else options.parts
     where = machine()
     print(", ".join(f"{key} {value}" for key, value in where.items()))

@@ -1,12 +1,20 @@
-"""What feedback takes away of the tip error on twins, and what a command of it costs.
+"""What feedback takes away of the tip error on twins, what it costs, and how soon the board knows.
 
-Twins play with the default limb's file, as if nobody had calibrated them, and with their own. The
-cost is that of `measure` and `command` together, as the planner calls them for one setpoint.
+On the whole graph: what estimate and replan took for each setpoint that was revised, and the time
+from the instant of a picture to the first command at the board that knows of it. Then, in one
+process, twins play with the default limb's file, as if nobody had calibrated them, and with their
+own. The cost is that of `measure` and `command` together, as the planner calls them for one
+setpoint.
 """
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
+import tempfile
 import time
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,6 +25,8 @@ from der_planner.identification.offline import calibrate_twin
 from der_planner.limb import Limb
 from der_planner.planning import Motion, Plan, plan
 from der_planner.planning.motions import JOINT_MOTIONS
+from der_planner.runs.recording.reader import BagReader
+from der_planner.runs.series import ESTIMATE_TYPE
 from der_planner.twin.offline import OfflineTwin
 
 SEEDS = (101, 102, 103)
@@ -58,9 +68,48 @@ def _twin(seed: int) -> OfflineTwin:
     return twin
 
 
+def _on_the_graph() -> dict[str, float]:
+    """Play a motion of 20 s on the whole graph; return its figures."""
+    script = Path(__file__).resolve().parents[1] / "run_experiment.py"
+    options = (
+        "--models der --motions asynchronous --cycles 1 --feedback --no-calibration --seed 101"
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, str(script), *options.split(), "--out", folder]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            raise RuntimeError(f"the graph did not run: {done.stderr.strip()[-500:]}")
+        results = json.loads((Path(folder) / "results.json").read_text())
+        runs = {entry["method"]: entry for entry in results["runs"]}
+        corrected, alone = runs["optimal + feedback"], runs["optimal"]
+        bag = Path(corrected["bag"])
+        took = _solve_times(bag if bag.is_absolute() else Path(folder) / bag)
+        checks = corrected["checks"]
+    told = corrected["extra"]["feedback"]
+    return {
+        "graph_open_loop_m": alone["mean_error_m"],
+        "graph_feedback_m": corrected["mean_error_m"],
+        "graph_replan_median_s": float(np.median(took)),
+        "graph_replan_p99_s": float(np.quantile(took, 0.99)),
+        "graph_picture_to_board_median_s": told["latency_median_s"],
+        "graph_picture_to_board_p99_s": told["latency_p99_s"],
+        "graph_setpoint_late_p99_s": checks["board_lateness_p99_s"],
+    }
+
+
+def _solve_times(bag: Path) -> np.ndarray:
+    """Return what estimate and replan took for each estimate of a bag [s]."""
+    with BagReader(bag) as reader:
+        topics = [name for name, t in reader.topics.items() if t.type_name == ESTIMATE_TYPE]
+        return np.array([message.solve_time for _, _, message in reader.messages(topics)])
+
+
 def run(quick: bool = False) -> dict[str, float]:
     """Print mean tip errors with and without feedback, and the cost of a command; return all."""
-    figures: dict[str, float] = {}
+    figures = _on_the_graph()
+    for name, value in figures.items():
+        unit, scale = ("ms", 1e3) if name.endswith("_s") else ("cm", 1e2)
+        print(f"  {name.rpartition('_')[0]:<42} {value * scale:8.3f} {unit}", flush=True)
     took: list[float] = []
     seeds = SEEDS[:1] if quick else SEEDS
     limbs = {"calibrated": {seed: calibrate_twin(seed, Limb.default())[0] for seed in seeds}}

@@ -18,6 +18,7 @@ from der_planner.limb import Limb
 from der_planner.model.bending import ArcKinematics
 from der_planner.planning import METHODS, Motion, Plan, plan
 from der_planner.planning.inverse import angle_limits, solutions
+from der_planner.runs.outputs import folder_argument
 from workspace_setup.basics import ROOT
 
 matplotlib.use("Agg")
@@ -126,7 +127,9 @@ def _label(axes: Axes, what: str) -> None:
 def main() -> int:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--out", type=Path, default=FOLDER, help="folder for the pictures")
+    parser.add_argument(
+        "--out", type=folder_argument, default=FOLDER, help="folder for the pictures"
+    )
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     for name, draw in (

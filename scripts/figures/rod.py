@@ -16,6 +16,7 @@ from benchmarks.rod import cantilever, run_elastica
 from der_planner.limb import Limb
 from der_planner.model.bending import PolylineKinematics
 from der_planner.rod import Rod, RodState
+from der_planner.runs.outputs import folder_argument
 from workspace_setup.basics import ROOT
 
 matplotlib.use("Agg")
@@ -167,7 +168,7 @@ def stability(folder: Path) -> None:
 def main() -> int:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("folder", nargs="?", type=Path, default=FOLDER)
+    parser.add_argument("folder", nargs="?", type=folder_argument, default=FOLDER)
     folder = parser.parse_args().folder
     folder.mkdir(parents=True, exist_ok=True)
     for draw in (statics, theorem, dynamics, stability):

@@ -25,6 +25,7 @@ from apriltag_tracker.synthetic.camera import (
 )
 from apriltag_tracker.tag_map import TagMap
 from benchmarks.tracker_pictures import CONDITIONS
+from der_planner.runs.outputs import folder_argument
 from der_planner.twin import LimbTwin
 from workspace_setup.basics import ROOT
 
@@ -82,7 +83,7 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--figures", type=Path, help="JSON of scripts/benchmark.py tracker")
-    parser.add_argument("--out", type=Path, default=PACKAGE / "doc", metavar="DIR")
+    parser.add_argument("--out", type=folder_argument, default=PACKAGE / "doc", metavar="DIR")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     draw_frame(options.out / "tracking.png")

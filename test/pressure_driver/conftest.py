@@ -148,3 +148,11 @@ class Simulation:
 def simulate():
     """Return `Simulation`, to be called with a protocol, a seed and settings."""
     return Simulation
+
+
+@pytest.fixture
+def bench(graph):
+    """Return `driver_bench.Bench`, to be called with a protocol and parameters of the driver."""
+    from driver_bench import Bench  # it needs ROS
+
+    return lambda *arguments, **parameters: Bench(graph, *arguments, **parameters)

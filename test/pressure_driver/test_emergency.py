@@ -4,6 +4,7 @@ import contextlib
 import os
 import pty
 import signal
+import subprocess
 import threading
 import time
 import tty
@@ -15,6 +16,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
 from der_msgs.msg import PressureSetpoint, PressureState
+from der_planner.experiment.processes import find_executable
 from limb_interfaces import qos, topics
 
 pytestmark = pytest.mark.graph
@@ -90,17 +92,19 @@ def board():
 class Driver:
     """A running driver on that board, and what it publishes."""
 
-    def __init__(self, graph, board):
+    def __init__(self, graph, board, process=None):
         self.client, self.board, self.states = graph.client, board, []
         self.client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES, self.states.append)
         self.publisher = self.client.node.create_publisher(
             PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS
         )
         # The board has no air: what it reads must not be judged.
-        self.process = graph.start(
-            "pressure_driver", "pressure_driver", port=board.device, follow_time=60.0
-        )
-        self.client.watch([self.process])
+        self.process = process
+        if process is None:
+            self.process = graph.start(
+                "pressure_driver", "pressure_driver", port=board.device, follow_time=60.0
+            )
+            self.client.watch([self.process])
         self.client.wait_ready(["pressure_driver"])
         self.client.wait_for(self.publisher.get_subscription_count, 30.0, "the subscription")
 
@@ -220,3 +224,62 @@ def test_two_publishers_of_a_running_graph_are_not_mixed(graph, board):
         "the count of refused setpoints",
     )
     assert "another publisher" in driver.process.log.read_text()
+
+
+@pytest.fixture
+def logging_to(graph, board):
+    """Return a function that starts a driver whose log goes to a file or pipe."""
+    running = []
+
+    def start(output):
+        driver = str(find_executable("pressure_driver", "pressure_driver"))
+        process = subprocess.Popen(
+            [driver, "--ros-args", "-p", f"port:={board.device}", "-p", "follow_time:=60.0"],
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, "ROS_DOMAIN_ID": str(graph.domain_id)},
+        )
+        running.append(process)
+        return Driver(graph, board, process)
+
+    yield start
+    for process in running:
+        process.kill()
+        process.wait()
+
+
+def test_a_log_that_cannot_be_written_stops_nothing(logging_to):
+    with open("/dev/full", "w") as disk:
+        driver = logging_to(disk)
+    driver.pressurise()
+    until = time.monotonic() + 1.5
+    while time.monotonic() < until:
+        for value in (float("nan"), 3000.0):  # the first is refused, which is logged
+            driver.publisher.publish(PressureSetpoint(differential_pressure=[value, 0.0]))
+        driver.client.spin(0.04)
+    assert driver.states[-1].setpoints_refused > 0
+    assert driver.states[-1].mode == PressureState.TRACKING
+    driver.process.send_signal(signal.SIGINT)
+    assert driver.process.wait(10.0) == 0
+    driver.client.wait_for(lambda: driver.board.asked(0.0)[-3:] == [0.0] * 3, PROMPT, "the vents")
+
+
+def test_a_log_that_nobody_reads_counts_as_a_blocked_executor(logging_to):
+    reader, writer = os.pipe()
+    driver = logging_to(writer)
+    driver.pressurise()
+    os.set_blocking(writer, False)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            os.write(writer, b"x")
+    os.set_blocking(writer, True)
+    end = time.monotonic() + 10.0
+    while driver.process.poll() is None and time.monotonic() < end:
+        driver.publisher.publish(PressureSetpoint(differential_pressure=[float("nan"), 0.0]))
+        driver.client.spin(0.04)
+    assert driver.process.poll() == -signal.SIGKILL
+    driver.client.wait_for(
+        lambda: driver.board.asked(time.monotonic() - 0.5)[-1:] == [0.0], PROMPT, "the vent"
+    )
+    os.close(writer)
+    os.close(reader)

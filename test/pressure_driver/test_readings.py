@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from pressure_driver.core import LogAllowance
 from pressure_driver.protocols import NAMES
 from pressure_driver.safety import MOST_FAULTS, Mode
 from pressure_driver.watch.limits import MonitorLimits
+from pressure_driver.watch.texts import LogAllowance
 
 # ---------------------------------------------------------------------------------- supply
 
@@ -164,9 +164,10 @@ def test_a_sensor_that_reads_nan_in_three_of_four_lines_is_a_fault(simulate, pro
         if next(count) % 4 == 0:
             return report
         lines = report.splitlines(keepends=True)
-        parts = lines[0].split()
-        separator = b" " if protocol == "ezloop" else b"\t"
-        lines[0] = separator.join([*parts[:-1], word]) + b"\r\n"
+        # The chambers are told first by one board and last by the other.
+        place, separator = (0, b" ") if protocol == "ezloop" else (-1, b"\t")
+        parts = lines[place].split()
+        lines[place] = separator.join([*parts[:-1], word]) + b"\r\n"
         return b"".join(lines)
 
     sim.board.telemetry = broken
@@ -234,3 +235,14 @@ def test_the_allowance_for_texts_comes_back():
     assert [allowance.allows(0.0) for _ in range(5)] == [True, True, True, False, False]
     assert [allowance.allows(2.0) for _ in range(3)] == [True, True, False]
     assert allowance.withheld == 3
+
+
+def test_reports_of_another_language_are_said_to_be_so(simulate):
+    sim = simulate("ezloop")
+    telemetry = sim.board.telemetry
+    sim.board.telemetry = lambda: telemetry().replace(b".", b",")  # a decimal comma
+    sim.run(3.0)
+    (obstacle,) = sim.core.obstacles()
+    assert "not of this language" in obstacle
+    assert sim.core.protocol.last_damaged.startswith("[VAL]: 0,00")
+    assert not sim.core.arm()[0]

@@ -1,10 +1,13 @@
 """Boards that start again, forget their settings, or stop answering while a limb is driven."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pressure_driver.protocols import board_protocol, host_protocol
 from pressure_driver.protocols.base import BoardReport, BoardReset
+from pressure_driver.protocols.ctrlp import CtrlpBoard
 from pressure_driver.protocols.native import StatusFlag
 from pressure_driver.safety import Mode
 
@@ -104,6 +107,64 @@ def test_echoes_and_warnings_of_a_ctrlp_board_are_no_reset():
     assert not [e for e in events if isinstance(e, BoardReset)]
     assert host.unsettled == ""
     assert [e for e in host.decode(b"_pressure controller\n") if isinstance(e, BoardReset)]
+
+
+@pytest.mark.parametrize(
+    ("answer", "settled"),
+    [
+        (b"_NEW UNITS: kPa\tkPa\r\n", True),
+        (b"_UNITS: kPa\tkPa\r\n", True),
+        (b"_NEW UNITS: 1\n", True),
+        (b"_NEW UNITS: psi\tpsi\r\n", False),
+        (b"_NEW UNITS: kPa\tpsi\r\n", False),
+        (b"_NEW UNITS: 0\n", False),
+    ],
+)
+def test_units_are_confirmed_by_name_or_number_for_commands_and_reports(answer, settled):
+    host = host_protocol("ctrlp")
+    host.decode(answer)
+    assert (host.unsettled == "") is settled
+    assert settled or answer[1:-2].strip().decode() in host.unsettled
+
+
+def test_lines_of_setpoints_and_of_the_supply_are_no_damage():
+    host = host_protocol("ctrlp")
+    lines = b"50\t0\t0.00\t0.00\t0.00\t0.00\r\n50\t1\t1.00\t0.00\t0.00\t0.00\r\n50\t2\t40.00\r\n"
+    _, measured, supply = host.decode(lines)
+    assert host.rejected == 0
+    assert measured.chamber_pressure == pytest.approx((102_325.0, 101_325.0, 101_325.0, 101_325.0))
+    assert supply.supply_pressure == pytest.approx(141_325.0)
+
+
+class LimitedBoard(CtrlpBoard):
+    """Cuts commands at its own limit, as the firmware does with MAXP; knows its mode."""
+
+    limit = 100_000.0
+    mode = 1
+
+    def _parse(self, place, line):
+        command = super()._parse(place, line)
+        if line.startswith("MODE;"):
+            self.mode = int(line[5:])
+        if command.pressure is None:
+            return command
+        return replace(command, pressure=tuple(min(p, self.limit) for p in command.pressure))
+
+
+def test_a_board_that_cuts_commands_is_a_fault_and_gets_its_mode_at_each_arming(simulate):
+    sim = simulate("ctrlp")
+    board = sim.board.protocol = LimitedBoard(4)
+    sim.board.boot()
+    sim.track()
+    assert board.mode == 3
+    board.limit = 6_000.0
+    board.mode = 0
+    sim.stream(1.0, lambda _: (9_000.0, -5_000.0))
+    assert sim.mode is Mode.FAULT
+    assert "other pressures than it was sent: 6.00" in " ".join(sim.faults)
+    board.limit = 100_000.0
+    sim.track()
+    assert board.mode == 3
 
 
 @pytest.mark.parametrize("flag", [StatusFlag.VENTED, StatusFlag.EXPIRED])

@@ -6,6 +6,7 @@ vectors, so that the edges of the tags are as straight as the printer is.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -57,8 +58,8 @@ class BoardLayout:
     square: float = 0.025
     marker: float = 0.018
 
-    def board(self) -> Any:
-        """Return OpenCV's board.
+    def __post_init__(self) -> None:
+        """Check the measures.
 
         Raises:
             SheetError: there are too few squares, or the markers do not fit into them.
@@ -67,11 +68,18 @@ class BoardLayout:
             raise SheetError(
                 f"a board of {self.columns} x {self.rows} squares: take 2 or more each way"
             )
-        if not 0.0 < self.marker < self.square:
+        if not 0.0 < self.marker < self.square < math.inf:
             raise SheetError(
                 f"markers of {1e3 * self.marker:g} mm do not fit into squares of "
                 f"{1e3 * self.square:g} mm"
             )
+
+    def board(self) -> Any:
+        """Return OpenCV's board.
+
+        Raises:
+            SheetError: there are not so many markers.
+        """
         if self.columns * self.rows // 2 > BOARD_MARKERS:
             raise SheetError(
                 f"a board of {self.columns} x {self.rows} squares needs more than the "

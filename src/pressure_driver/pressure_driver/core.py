@@ -29,37 +29,13 @@ from pressure_driver.watch.following import chamber_gauge
 from pressure_driver.watch.limits import MonitorLimits
 from pressure_driver.watch.monitor import TelemetryMonitor
 from pressure_driver.watch.probe import SteadyProbe
+from pressure_driver.watch.texts import LogAllowance
 
 STANDARD_ATMOSPHERE = 101_325.0
 """[Pa] on the wire until the room's has been measured; only vent commands are sent before."""
 
 LARGEST_CLOCK_STEP = 0.3
 """[s] between two ticks, above slewing and late wakes, that means the wall clock was set."""
-
-
-class LogAllowance:
-    """How many texts of the board may still be logged: some at once, a few a second for ever.
-
-    Args:
-        burst: texts at once, such as those of a boot.
-        rate: [1/s] of the allowance that comes back.
-    """
-
-    def __init__(self, burst: int = 30, rate: float = 3.0) -> None:
-        self.withheld = 0
-        """Texts that were not logged."""
-        self._burst, self._rate = float(burst), rate
-        self._left, self._asked_at = float(burst), 0.0
-
-    def allows(self, now: float) -> bool:
-        """Tell whether one more may be logged now (steady clock [s])."""
-        self._left = min(self._burst, self._left + (now - self._asked_at) * self._rate)
-        self._asked_at = now
-        if self._left < 1.0:
-            self.withheld += 1
-            return False
-        self._left -= 1.0
-        return True
 
 
 @dataclass(frozen=True)
@@ -150,7 +126,13 @@ class DriverCore:
     def arm(self) -> tuple[bool, str]:
         """Allow pressure; returns whether, and a sentence."""
         with self._lock:
-            result = self._machine.arm(self._steady())
+            now = self._steady()
+            was_live = self._machine.mode in LIVE
+            result = self._machine.arm(now)
+            if result[0] and not was_live:
+                # What the board did meanwhile by itself must not be what it goes on with.
+                self.protocol.doubt()
+                self._board.greet_now(now)
             self._note_mode()
             return result
 

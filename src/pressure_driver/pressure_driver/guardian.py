@@ -34,6 +34,7 @@ import signal
 import socket
 import sys
 import termios
+import threading
 import time
 
 HEARTBEAT_TIMEOUT = 0.22
@@ -48,14 +49,28 @@ VENT_TIME = 2.0
 """[s] for which the vent command is repeated: there may be no checksum, and damaged bytes."""
 VENT_PERIOD = 0.05
 """[s] between two vent commands."""
+SAYING_TIME = 0.02
+"""[s] to wait until a message is written while the board is vented; then it is left to itself."""
+LAST_WORDS_TIME = 0.5
+"""[s] the same at the end."""
 ADVICE = "close the air supply"
 _IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 
 
-def _say(text: str) -> None:
-    """Write to standard error, which may have gone together with its terminal."""
-    with contextlib.suppress(OSError):
-        os.write(2, f"guardian: {text}\n".encode())
+def _say(text: str, patience: float = LAST_WORDS_TIME) -> None:
+    """Write to standard error without ever waiting for it.
+
+    It may have gone together with its terminal, or be one that nobody reads: a terminal after
+    Ctrl-S, a full pipe. A vent must not wait for either.
+    """
+
+    def write() -> None:
+        with contextlib.suppress(OSError):
+            os.write(2, f"guardian: {text}\n".encode())
+
+    writer = threading.Thread(target=write, daemon=True)
+    writer.start()
+    writer.join(patience)
 
 
 class Guardian:
@@ -80,7 +95,8 @@ class Guardian:
             self._close_port()
             return 0
         self._end_driver()
-        _say(f"{reason}: the driver was ended")
+        self._flush_and_vent()
+        _say(f"{reason}: the driver was ended", SAYING_TIME)
         self._vent_board()
         return 1
 
@@ -141,13 +157,20 @@ class Guardian:
             if message != b"G":
                 self._take(message, descriptors)
 
-    def _vent_board(self) -> None:
-        """Send the vent command for `VENT_TIME`, before everything that waits to be sent."""
+    def _flush_and_vent(self) -> None:
+        """Send the vent command once, before everything that waits to be sent."""
         if self._port < 0:
-            _say(f"the board cannot be reached: {ADVICE}")
             return
         with contextlib.suppress(termios.error):
             termios.tcflush(self._port, termios.TCOFLUSH)
+        with contextlib.suppress(OSError):
+            os.write(self._port, self._vent)
+
+    def _vent_board(self) -> None:
+        """Send the vent command for `VENT_TIME`."""
+        if self._port < 0:
+            _say(f"the board cannot be reached: {ADVICE}")
+            return
         count, end = 0, time.monotonic() + VENT_TIME
         while time.monotonic() < end:
             try:

@@ -37,6 +37,8 @@ LAST_RETRY = 2.0
 """[s] between looks after a long absence."""
 LONGEST_WAIT = 0.03
 """[s] after which the thread turns at the latest: to look for a lost port, to show life."""
+BEFORE_TICK = 0.003
+"""[s] before a tick in which no sign of life is shown: the guardian would wake beside the tick."""
 UNREAD_TIME = 1.0
 """[s] that bytes may wait in the port's output queue until the board counts as not reading."""
 VENT_REPEATS = 3
@@ -215,7 +217,8 @@ class SerialLink:
                 self._write(self._client.separator + self._client.farewell())
         if self._bytes_waiting is not None and self._bytes_waiting.fileno() in readable:
             self._read()
-        self._keeper.show_life(self._was_venting, self._device)
+        if self.grid.delay(time.time_ns()) > BEFORE_TICK:
+            self._keeper.show_life(self._was_venting, self._device)
 
     def _send_tick(self, instant: int) -> None:
         """Write the tick's command; the first vent command overtakes what waits to be sent."""
@@ -226,9 +229,8 @@ class SerialLink:
             data = self._client.separator + data
         if self._was_venting and not venting:
             self._was_venting = False
-            self._keeper.show_life(
-                self._was_venting, self._device
-            )  # the guardian becomes strict before the first pressure
+            # The guardian becomes strict before the first pressure.
+            self._keeper.show_life(self._was_venting, self._device)
         self._was_venting = venting
         self._watch_queue()
         self._write(data)

@@ -196,6 +196,7 @@ class PressureDriver(Node):
             "telemetry_age_s": f"{snapshot.telemetry_age:.3f}",
             "round_trip_s": f"{snapshot.round_trip:.4f}",
             "damaged_frames": protocol.rejected,
+            "last_damaged_line": protocol.last_damaged or "none",
             "setpoints_waiting": self._core.waiting,
             "setpoints_superseded": snapshot.counters.superseded,
             "setpoints_missing": snapshot.counters.missing,

@@ -63,6 +63,8 @@ def _explain(port: str, error: Exception) -> str:
             f"serial port {port} is in use by another program; find it with 'fuser -v {port}', "
             f"close it, or set the parameter 'port' (ports that exist: {ports})"
         )
+    if number in (errno.EISDIR, errno.ENOTTY, errno.EINVAL) or "ioctl" in str(error):
+        return f"{port} is no serial port; ports that exist: {ports}: set the parameter 'port'"
     if number in (errno.EACCES, errno.EPERM):
         return f"no permission to open {port}: sudo usermod -a -G dialout $USER, then log in again"
     return f"cannot open serial port {port}: {error}; ports that exist: {ports}"

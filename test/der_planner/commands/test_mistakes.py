@@ -14,6 +14,9 @@ from der_planner.runs.recording.scan import parse_run
 SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"
 
 
+LENS = ["intrinsics", "--out", "/tmp/never_written.yaml"]
+
+
 @pytest.fixture
 def call(monkeypatch, capsys, tmp_path):
     """Run a command's main; BUSY in its arguments is a path below a file."""
@@ -44,6 +47,15 @@ def call(monkeypatch, capsys, tmp_path):
         ("apriltag_tracker.commands.make_tags", ["board", "--out", "BUSY"], 1, "out"),
         ("apriltag_tracker.commands.make_tags", ["board", "--columns", "1"], 1, "2 or more"),
         ("apriltag_tracker.commands.make_tags", ["board", "--marker", "0.03"], 1, "do not fit"),
+        ("apriltag_tracker.commands.make_tags", ["board", "--square", "nan"], 1, "do not fit"),
+        ("apriltag_tracker.commands.calibrate_camera", [*LENS, "--columns", "1"], 1, "2 or more"),
+        ("apriltag_tracker.commands.calibrate_camera", [*LENS, "--bag", __file__], 1, "the bag"),
+        ("der_planner.commands.calibrate_limb", ["--offline", "--out", "/proc/x"], 2, "/proc/x"),
+        ("der_planner.commands.run_experiment", ["--dry-run", "--out", "BUSY"], 2, "cannot be"),
+        ("der_planner.commands.write_limb_page", ["--out", "BUSY"], 2, "no folder"),
+        ("der_planner.commands.study", ["accuracy", "--out", "BUSY"], 2, "no folder"),
+        ("benchmarks.command", ["rod", "--json", "BUSY"], 2, "no folder"),
+        ("figures.planning", ["--out", "BUSY"], 2, "no folder"),
     ],
 )
 def test_mistakes_are_said_before_any_work_is_done(call, module, arguments, code, words):

@@ -12,6 +12,7 @@ from der_planner.control.lockstep import Played, Sensors, play
 from der_planner.control.supervision import Limits, Supervisor
 from der_planner.limb import Limb
 from der_planner.planning import Motion, Plan, plan
+from der_planner.planning.streaming import Schedule
 
 LENGTH = 0.244
 
@@ -147,6 +148,37 @@ def test_a_gain_that_drops_is_made_up_for(planned, corrected):
     assert played.error[hit].max() > without.error[hit].max() + 0.004
     late = played.time > 6.0
     assert played.error[late].mean() < 1.3 * without.error[late].mean()
+
+
+def test_another_motion_takes_over_without_a_jump(planned):
+    plant, first = Chain(), Feedback(planned)
+    plant.chain.change_gain(0.8)
+    for k in range(100):
+        first.pressures(0.05 * k, plant.differential_pressure)
+        first.measure(0.05 * k, plant.bend_angles, plant.tip)
+        last = first.command(0.05 * k)
+        plant.advance(last, 0.05)
+    correction = last - planned.differential_pressure[99]
+    assert np.abs(correction).max() > 500.0
+    start = Schedule("left", planned, 0).leave(5_000_000_000)
+    motion = Motion.named("same_direction", amplitude=0.4, period=8.0, cycles=1)
+    following = plan(planned.limb, motion, method="projected", start=start)
+    second = Feedback(following)
+    second.take_over(first, 5.0)
+    errors = []
+    for k in range(60):
+        second.pressures(0.05 * k, plant.differential_pressure)
+        second.measure(0.05 * k, plant.bend_angles, plant.tip)
+        command = second.command(0.05 * k)
+        if k == 0:
+            np.testing.assert_allclose(
+                command - following.differential_pressure[0], correction, atol=400.0
+            )
+        plant.advance(command, 0.05)
+        errors.append(np.linalg.norm(plant.tip - following.tip_reference[k + 1]))
+    assert second.share == 1.0
+    assert not second.warnings
+    assert np.mean(errors) < 0.025 * LENGTH
 
 
 def test_lost_tags_lead_back_to_the_plan(planned):

@@ -4,11 +4,13 @@ from pathlib import Path
 
 import pytest
 
+from der_planner.experiment.errors import OptionError
 from der_planner.experiment.experiment import run
 from der_planner.experiment.ledger import Ledger
-from der_planner.experiment.options import METHODS, OptionError, parse
+from der_planner.experiment.options import METHODS, parse
 from der_planner.limb import Limb, PointMass
 from der_planner.planning.motions import NAMES
+from der_planner.runs.outputs import OutputError
 
 
 @pytest.mark.parametrize(
@@ -122,5 +124,6 @@ def test_another_path_of_the_same_name_is_not_taken_for_done(tmp_path: Path):
 def test_a_folder_that_cannot_be_written_is_refused_before_anything_starts(tmp_path: Path):
     file = tmp_path / "taken"
     file.write_text("not a folder")
-    with pytest.raises(OptionError, match=rf"cannot write into --out {file}.*another folder"):
-        run(parse(["--offline", "--out", str(file)]))
+    for more in ([], ["--dry-run"]):
+        with pytest.raises(OutputError, match=rf"--out {file} cannot be made"):
+            run(parse(["--offline", "--out", str(file), *more]))

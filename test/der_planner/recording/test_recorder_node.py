@@ -69,6 +69,7 @@ def test_records_the_graph_between_start_and_stop(graph, tmp_path: Path):
     talker.topic("latched", talker.qos.LATCHED)
     talker.topic("fast", QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT))
     image = graph.client.node.create_publisher(Image, "camera/image_raw", talker.qos.SENSOR_DATA)
+    graph.client.node.create_publisher(talker.kind, "moves/_action/feedback", 1)
     talker.say("latched", "the plan")
     folder = tmp_path / "run"
     process = start(graph, output=str(folder), metadata='{"motion": "circle", "trial": 3}')
@@ -108,6 +109,7 @@ def test_records_the_graph_between_start_and_stop(graph, tmp_path: Path):
     with BagReader(folder) as bag:
         assert bag.run() == {"motion": "circle", "trial": 3}
         assert "/limb/camera/image_raw" not in bag.topics
+        assert "/limb/moves/_action/feedback" not in bag.topics
         assert "/diagnostics" in bag.topics
         assert bag.topics["/limb/latched"].latched
         assert not bag.topics["/limb/fast"].reliable

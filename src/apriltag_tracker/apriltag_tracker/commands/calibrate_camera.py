@@ -26,7 +26,7 @@ import yaml
 from ament_index_python.packages import get_package_share_directory
 from numpy.typing import NDArray
 from rclpy.node import Node
-from rosbags.highlevel import AnyReader
+from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import Image
 
@@ -41,6 +41,7 @@ from apriltag_tracker.camera.calibration import (
 from apriltag_tracker.camera.encodings import ImageError, to_grey
 from apriltag_tracker.camera.sources import PICTURES
 from apriltag_tracker.commands.calibration_board import add_board_arguments, given_board
+from apriltag_tracker.sheets import SheetError
 from apriltag_tracker.tag_map import TagMap, TagMapError
 from limb_interfaces import qos
 
@@ -69,7 +70,12 @@ def from_bag(path: Path, topic: str, every: float) -> Iterator[Picture]:
     """Yield a picture of a bag's image topic every so many seconds."""
     if not path.exists():
         raise CalibrationError(f"there is no bag {path}")
-    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+    with contextlib.ExitStack() as stack:
+        try:
+            bag = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
+            reader = stack.enter_context(bag)
+        except AnyReaderError as error:
+            raise CalibrationError(f"cannot read the bag {path}: {error}") from error
         wanted = [
             link
             for link in reader.connections
@@ -220,7 +226,7 @@ def main() -> int:
     try:
         _check_output(options.out)
         (intrinsics if options.what == "intrinsics" else mounting)(options)
-    except (CalibrationError, CameraError, ImageError, TagMapError, OSError) as error:
+    except (CalibrationError, CameraError, ImageError, SheetError, TagMapError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     return 0

@@ -25,11 +25,10 @@ from pathlib import Path
 
 import numpy as np
 
-from der_planner.commands.outputs import OutputError, check_file, check_folder
-from der_planner.experiment.errors import GraphError, NodeError
+from der_planner.experiment.errors import GraphError, NodeError, OptionError
 from der_planner.experiment.interrupts import interrupt_once
 from der_planner.experiment.load_options import add_load_options, as_loaded, without_payload
-from der_planner.experiment.options import Hardware, OptionError
+from der_planner.experiment.node_specs import Hardware
 from der_planner.experiment.progress import Progress
 from der_planner.identification import (
     CalibrationLog,
@@ -52,6 +51,7 @@ from der_planner.identification.offline import AMPLITUDE
 from der_planner.identification.parameters import GROUPS
 from der_planner.identification.plots import plot_prediction
 from der_planner.limb import Limb, LimbError
+from der_planner.runs.outputs import OutputError, check_file, check_folder
 from pressure_driver.schedule import ScheduleLimits
 
 

@@ -13,7 +13,6 @@ import argparse
 import sys
 from pathlib import Path
 
-from der_planner.commands.outputs import OutputError, check_file, check_folder
 from der_planner.runs.evaluation import (
     BagError,
     EvaluationError,
@@ -27,6 +26,7 @@ from der_planner.runs.evaluation import (
 )
 from der_planner.runs.evaluation.alignment import WINDOWS
 from der_planner.runs.evaluation.overlay import write_video
+from der_planner.runs.outputs import OutputError, check_file, check_folder
 
 
 def _arguments() -> argparse.Namespace:

@@ -11,24 +11,18 @@ plan. Exit code 0: there is a plan; 1: no run was used; 2: a file cannot be used
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import sys
 from pathlib import Path
 
-import numpy as np
-
-from der_planner.commands.outputs import OutputError, check_file
+from der_planner.commands.recorded_plan import check_same, plan_of
 from der_planner.control import Learner, LearningError
 from der_planner.experiment.errors import GraphError
 from der_planner.experiment.learning import about, add_run
-from der_planner.limb import Limb, LimbError
-from der_planner.planning import Motion, Plan, PlanningError, plan
-from der_planner.planning.motions import NAMES
+from der_planner.limb import LimbError
+from der_planner.planning import PlanningError
 from der_planner.planning.plan_file import read_plan, write_plan
-from der_planner.runs.evaluation import BagError, EvaluationError, RunSeries, load_run
-
-_SAME_POINT = 2e-3
-"""References whose points lie further apart than this [m] are not of one motion."""
+from der_planner.runs.evaluation import BagError, EvaluationError, load_run
+from der_planner.runs.outputs import OutputError, check_file
 
 
 def main() -> int:
@@ -46,10 +40,10 @@ def main() -> int:
     try:
         check_file(given.out)
         runs = [load_run(bag, namespace=given.namespace) for bag in given.bags]
-        first = read_plan(given.plan) if given.plan else _plan_of(runs[0], given.limb)
+        first = read_plan(given.plan) if given.plan else plan_of(runs[0], given.limb)
         learner = Learner(first)
         for run in runs:
-            _check_same(first, run)
+            check_same(first, run)
             add_run(learner, run)
             print(f"{run.description.title}: {_line(learner)}")
         if not any(run.accepted for run in learner.history):
@@ -73,43 +67,3 @@ def main() -> int:
 def _line(learner: Learner) -> str:
     run = learner.history[-1]
     return f"mean error {run.mean_error * 100:.3f} cm; {run.reason}"
-
-
-def _plan_of(run: RunSeries, file: Path) -> Plan:
-    """Return a plan of the motion that a bag holds, for a limb file under the bag's loads.
-
-    Raises:
-        LimbError, PlanningError: the limb cannot be read, or the motion cannot be planned for it.
-    """
-    told = run.description
-    limb = Limb.from_yaml(file)
-    if any(told.gravity):
-        limb = dataclasses.replace(limb, gravity=told.gravity)
-    limb = limb.carrying(told.payload, told.payload_at or None)
-    if told.motion not in NAMES:
-        raise PlanningError(
-            f"{told.title} holds the drawn path '{told.motion}': give the plan that was played by "
-            "--plan FILE (run_experiment.py --learn keeps plans in its folder learned)"
-        )
-    motion = Motion.named(told.motion, told.amplitude, told.period, told.cycles)
-    return plan(limb, motion, model=told.model)
-
-
-def _check_same(plan_: Plan, run: RunSeries) -> None:
-    """Refuse a bag that holds another motion.
-
-    Raises:
-        LearningError: its reference is not that of the plan.
-    """
-    wanted, asked = plan_.tip_reference, run.reference.value
-    if wanted.shape != asked.shape:
-        raise LearningError(
-            f"{run.description.title} holds a motion of {len(asked)} setpoints, the plan has "
-            f"{len(wanted)}: give bags of one motion and the limb file it was planned with"
-        )
-    apart = float(np.linalg.norm(wanted - asked, axis=1).max())
-    if apart > _SAME_POINT:
-        raise LearningError(
-            f"{run.description.title} holds another motion: its reference is up to "
-            f"{apart * 100:.1f} cm from the plan's; give bags of one motion and its limb file"
-        )

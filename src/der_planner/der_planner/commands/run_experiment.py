@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import sys
 
-from der_planner.experiment.errors import GraphError, NodeError
+from der_planner.experiment.errors import GraphError, NodeError, OptionError
 from der_planner.experiment.experiment import run
-from der_planner.experiment.options import OptionError, parse
+from der_planner.experiment.options import parse
+from der_planner.runs.outputs import OutputError
 
 
 def main() -> int:
@@ -27,7 +28,7 @@ def main() -> int:
 
             interrupt_once()
         run(options)
-    except OptionError as error:
+    except (OptionError, OutputError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except (GraphError, NodeError) as error:

@@ -14,6 +14,7 @@ from typing import Any
 
 from der_planner.limb import CalibratedRange, Limb, Pneumatics, PointMass, Segment
 from der_planner.limb_declaration import Parameter, Term, parameters
+from der_planner.runs.outputs import OutputError, check_file
 
 PAGE = Path(__file__).resolve().parents[2] / "doc" / "limb_parameters.md"
 _HEAD = """\
@@ -87,6 +88,12 @@ def main() -> int:
     )
     parser.add_argument("--out", type=Path, default=PAGE, help="file to write")
     out = parser.parse_args().out
+    try:
+        check_file(out)
+    except OutputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(page(), encoding="utf-8")
     print(f"wrote {out}")
     return 0

@@ -16,6 +16,10 @@ Array = NDArray[np.float64]
 
 _SURPRISE_TIME = 3.0
 """In which a difference between measured and modelled pressures is forgotten [s]."""
+_GROWTH_TIME = 0.5
+"""In which the growth of that difference fades [s] …"""
+_GROWTH_SEEN = 0.3
+"""… which is that of the readings of so long [s]."""
 _LONGEST_HOLD = 40
 """Control periods without a command after which the plan's count again."""
 _BEFORE = 60
@@ -30,19 +34,19 @@ class ChamberLog:
     """Chamber pressures of the past as measured, of the future by the law of the air.
 
     Between two readings the pressures are on a straight line. After the last one the model's
-    pressures under the commands hold, with the difference that the last reading showed, which is
-    forgotten within some seconds.
+    pressures under the commands hold, with the difference that the last readings showed.
 
     Args:
         nominal: of the plan.
+        kept: readings are kept for this long [s].
     """
 
-    def __init__(self, nominal: Nominal) -> None:
-        self._nominal = nominal
+    def __init__(self, nominal: Nominal, kept: float = _KEPT) -> None:
+        self._nominal, self._kept = nominal, kept
         self._inputs = nominal.limb.segment_count
         self._times: list[float] = []
         self._readings: list[Array] = []
-        self._gap: Array | None = None
+        self._gap: tuple[Array, Array] | None = None
         self._last: int | None = None
         self._remembered = int(np.ceil(air.memory_of(nominal.limb.pneumatics) / CONTROL_PERIOD))
         self._origin = -self._remembered - _BEFORE
@@ -72,11 +76,18 @@ class ChamberLog:
         else:
             self._times.insert(place, time)
             self._readings.insert(place, values)
-        while self._times[0] < self._times[-1] - _KEPT:
+        while self._times[0] < self._times[-1] - self._kept:
             del self._times[0], self._readings[0]
             place -= 1
         self._gap = None
         return self._times[place - 1] if place > 0 else time
+
+    def take_over(self, other: ChamberLog, periods: int) -> None:
+        """Go on from the log of another plan, whose control period ``periods`` is this one's 0."""
+        self._times = [time - periods * CONTROL_PERIOD for time in other._times]
+        self._readings = list(other._readings)
+        self._commands = np.array([other.sent(periods + k) for k in range(self._origin, 0)])
+        self._last, self._gap = -1, None
 
     def send(self, k: int, command: Array) -> None:
         """Keep the command (M,) [Pa] of control period ``k``; it held since the last one sent."""
@@ -91,7 +102,7 @@ class ChamberLog:
 
     def sent(self, k: int) -> Array:
         """Return the command (M,) of a control period [Pa]; the plan's if none was sent."""
-        row: Array = self._table(k)[k - self._origin]
+        row: Array = self._table(k)[max(k - self._origin, 0)]
         return row
 
     def _table(self, k: int) -> Array:
@@ -149,15 +160,34 @@ class ChamberLog:
         return held[steps - first * STEPS]
 
     def surprise(self, time: Array) -> Array:
-        """Return what the last reading shows beyond the model (n, M) [Pa], at instants after it."""
+        """Return what the last readings show beyond the model (n, M) [Pa], at instants after them.
+
+        What they differ by is forgotten within `_SURPRISE_TIME`; it grows as it did in the last
+        readings, which fades within `_GROWTH_TIME`: a chamber that vents more slowly than its model
+        is left behind further and further.
+        """
         if not self._times:
             return np.zeros((len(time), self._inputs))
-        last = self._times[-1]
         if self._gap is None:
-            place = last / STEP - 0.5
-            step = int(np.floor(place))
-            pair = self.model(np.array([step, step + 1]))
-            between = pair[0] + (place - step) * (pair[1] - pair[0])
-            self._gap = self._readings[-1] - between
-        faded: Array = np.exp(-(time - last) / _SURPRISE_TIME)[:, None] * self._gap
-        return faded
+            self._gap = self._beyond_model()
+        gap, growth = self._gap
+        ahead = (time - self._times[-1])[:, None]
+        grown = _GROWTH_TIME * (1.0 - np.exp(-ahead / _GROWTH_TIME))
+        surprise: Array = np.exp(-ahead / _SURPRISE_TIME) * gap + grown * growth
+        return surprise
+
+    def _beyond_model(self) -> tuple[Array, Array]:
+        """Return what the last reading shows beyond the model (M,) [Pa], and its growth [Pa/s]."""
+        last = self._times[-1]
+        begin = bisect.bisect_left(self._times, last - _GROWTH_SEEN)
+        instants = np.array(self._times[begin:])
+        steps = np.arange(
+            int(np.floor(instants[0] / STEP - 0.5)), int(np.floor(last / STEP - 0.5)) + 2
+        )
+        middles = STEP * (steps.astype(np.float64) + 0.5)
+        gaps = np.array(self._readings[begin:]) - interpolate(instants, middles, self.model(steps))
+        away = instants - last
+        if len(away) < 3 or np.ptp(away) < _GROWTH_SEEN / 2:
+            return gaps[-1], np.zeros(self._inputs)
+        slope = (away - away.mean()) @ (gaps - gaps.mean(axis=0)) / np.var(away) / len(away)
+        return gaps[-1], slope

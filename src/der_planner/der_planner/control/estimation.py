@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from der_planner.control.chambers import ChamberLog
+from der_planner.control.knowledge import Estimate, EstimatorSettings, Knowledge
 from der_planner.control.nominal import STEP, Nominal
 from der_planner.model import material
 from der_planner.model.drive import STEPS
@@ -46,97 +47,6 @@ EARLIEST = 2.0
 
 
 @dataclass(frozen=True)
-class EstimatorSettings:
-    """Standard deviations; densities are those of what wanders, per √s.
-
-    Attributes:
-        bend_noise: of a measured bend angle whose covariance is not given [rad].
-        tip_noise: of a coordinate of a tip whose covariance is not given [m].
-        pressure_density: of the effective pressure that is white noise [Pa √s].
-        missing_first, missing_density: of d [Pa], [Pa/√s].
-        gain_first, gain_density: of g [-], [1/√s].
-        tip_first, tip_density: of b [m], [m/√s].
-        tip_time: in which b is forgotten [s].
-        memory_time: low-pass of δθ before friction and creep [s].
-        strange: squared distance per coordinate from where a measurement counts less.
-        event_missing, event_rate, event_gain: what an event adds to d [Pa], rates [rad/s], g.
-    """
-
-    bend_noise: float = 2e-3
-    tip_noise: float = 3e-4
-    pressure_density: float = 15.0
-    missing_first: float = 600.0
-    missing_density: float = 250.0
-    gain_first: float = 0.15
-    gain_density: float = 0.01
-    tip_first: float = 3e-3
-    tip_density: float = 1e-3
-    tip_time: float = 20.0
-    memory_time: float = 0.4
-    strange: float = 6.0
-    event_missing: float = 1000.0
-    event_rate: float = 0.5
-    event_gain: float = 0.05
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """What is known of the limb at an instant.
-
-    Attributes:
-        time: [s] of the plan.
-        bend_angle, bend_rate: (M,) [rad], [rad/s].
-        tip: (2,) [m].
-        missing_pressure: (M,) effective pressure that the model lacks, its gain error not counted
-            [Pa].
-        gain_error: (M,) relative error of the model's effective pressure.
-        effective_pressure: (M,) of the model, without either [Pa].
-        tip_offset: (2,) displacement of the tip that the bend does not explain [m].
-        deviation: (4M + 2,) standard deviations of bend_angle, bend_rate, missing_pressure,
-            gain_error and tip_offset, in this order.
-        tip_covariance: (2, 2) [m²].
-        age: time since the newest measurement that it knows [s].
-    """
-
-    time: float
-    bend_angle: Array
-    bend_rate: Array
-    tip: Array
-    missing_pressure: Array
-    gain_error: Array
-    effective_pressure: Array
-    tip_offset: Array
-    deviation: Array
-    tip_covariance: Array
-    age: float
-
-
-@dataclass(frozen=True)
-class Knowledge:
-    """The filter at a boundary of fine steps.
-
-    Attributes:
-        mean: (4M + 2,) x.
-        covariance: of x.
-        slow: (M,) slow part of δθ [rad].
-        memory: of friction and creep.
-        taken: (M,) pressure that friction and creep take [Pa].
-        effective: (M,) effective pressure of the model [Pa].
-        strange: squared distances of the last measurements per coordinate, smoothed; 1 is expected.
-        row: measurements in a row that were not expected.
-    """
-
-    mean: Array
-    covariance: Array
-    slow: Array
-    memory: material.Memory
-    taken: Array
-    effective: Array
-    strange: float = 1.0
-    row: int = 0
-
-
-@dataclass(frozen=True)
 class _Measurement:
     time: float
     value: Array
@@ -150,6 +60,7 @@ class Estimator:
         nominal: the model's motion under the plan.
         chambers: what was commanded and measured of the chambers.
         settings: of the noise.
+        history: states and measurements are kept for this long [s].
 
     Attributes:
         innovations: (time [s], squared normalised distance, coordinates) of every measurement
@@ -159,9 +70,14 @@ class Estimator:
     """
 
     def __init__(
-        self, nominal: Nominal, chambers: ChamberLog, settings: EstimatorSettings | None = None
+        self,
+        nominal: Nominal,
+        chambers: ChamberLog,
+        settings: EstimatorSettings | None = None,
+        history: float = HISTORY,
     ) -> None:
         self.nominal, self.chambers = nominal, chambers
+        self._kept = round(history / STEP)
         self.settings = settings or EstimatorSettings()
         self.inputs = nominal.limb.segment_count
         self.innovations: list[tuple[float, float, int]] = []
@@ -183,6 +99,23 @@ class Estimator:
             self._first = self._last = math.floor(time / STEP)
             self._known[self._first] = self.beginning(self._first)
 
+    def take_over(self, other: Estimator, time: float) -> None:
+        """Begin at 0 s with what the estimator of another plan of this limb knows then.
+
+        Args:
+            other: of the plan that was played until now.
+            time: its instant at which this plan begins [s].
+        """
+        known, told = other.at(time), other.estimate(time)
+        inputs, mean = self.inputs, known.mean.copy()
+        bend, rate, _ = self.nominal.at(0.0)
+        mean[:inputs], mean[inputs : 2 * inputs] = told.bend_angle - bend, told.bend_rate - rate
+        slow = known.slow + other.nominal.at(time)[0] - bend
+        self._first = self._last = 0
+        self._known = {0: replace(known, mean=mean, slow=slow)}
+        self._measurements.clear()
+        self.newest = other.newest - time
+
     def changed(self, time: float) -> None:
         """Compute again what depends on chamber pressures from an instant on [s]."""
         self._forget(math.floor(time / STEP))
@@ -201,7 +134,7 @@ class Estimator:
             return
         self.begin(time)
         j = round(time / STEP)
-        if self._first is None or j < max(self._first, self._last - round(HISTORY / STEP)):
+        if self._first is None or j < max(self._first, self._last - self._kept):
             self.too_late += 1
             return
         entry = _Measurement(time, value, self._noise(covariance))
@@ -245,7 +178,7 @@ class Estimator:
         inputs = self.inputs
         bend, rate, tip = self.nominal.at(time)
         change, speed, missing, gain, offset = np.split(known.mean, np.arange(1, 5) * inputs)
-        rows = self._output(bend, change)[inputs:]
+        rows = self.tip_rows(bend, change)
         return Estimate(
             time=time,
             bend_angle=bend + change,
@@ -259,6 +192,27 @@ class Estimator:
             tip_covariance=rows @ known.covariance @ rows.T,
             age=time - self.newest,
         )
+
+    def between(self, first: int, last: int) -> tuple[list[Knowledge], list[Knowledge]]:
+        """Return what was expected and what is known at fine steps ``first`` … ``last``.
+
+        Expected is without the measurements of the step itself; the steps must be in the history.
+        """
+        expected = [self._known[j] for j in range(first, last + 1)]
+        known = [self._updated(j, k) for j, k in zip(range(first, last + 1), expected, strict=True)]
+        return expected, known
+
+    def move(self, j: int, felt: Array) -> Array:
+        """Return F (4M + 2, 4M + 2) of fine step ``j`` under an effective pressure (M,) [Pa]."""
+        k = int(self.nominal.periods(j // STEPS))
+        swing, inputs = 2 * self.inputs, self.inputs
+        move: Array = self._moves[k].copy()
+        move[:swing, swing + inputs : swing + 2 * inputs] = self.nominal.fine_input[k] * felt
+        return move
+
+    def tip_rows(self, bend: Array, change: Array) -> Array:
+        """Return ∂tip/∂x (2, 4M + 2) where the bend deviates by (M,) from the model's [rad]."""
+        return self._output(bend, change)[self.inputs :]
 
     # The filter ----------------------------------------------------------------------------
 
@@ -296,7 +250,7 @@ class Estimator:
             end = min(last, (first // STEPS + 1) * STEPS)
             self._period(first, differential[first - begin : end - begin])
         self._last = last
-        oldest = last - round(HISTORY / STEP)
+        oldest = last - self._kept
         for j in list(self._known):
             if j >= oldest:
                 break

@@ -17,8 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import ThreadpoolController
 
 from der_planner.control.chambers import ChamberLog
-from der_planner.control.estimation import Estimate, Estimator
+from der_planner.control.estimation import Estimator
 from der_planner.control.horizon import Allowed, Horizon
+from der_planner.control.knowledge import Estimate
 from der_planner.control.nominal import Nominal
 from der_planner.control.supervision import Limits, Supervisor, Warned
 from der_planner.model.series import CONTROL_PERIOD
@@ -74,6 +75,21 @@ class Feedback:
     def innovations(self) -> list[tuple[float, float, int]]:
         """(time [s], squared normalised distance, coordinates) of every measurement."""
         return self._estimator.innovations
+
+    def take_over(self, other: Feedback, time: float) -> None:
+        """Go on where the feedback of another plan of this limb was, before anything is told.
+
+        What it knows of the limb, the pressures and the share of its corrections stay, so that no
+        command jumps where one motion gives way to another.
+
+        Args:
+            other: of the plan that is left.
+            time: its instant at which this plan begins [s].
+        """
+        self._chambers.take_over(other._chambers, round(time / CONTROL_PERIOD))
+        with _THREADS.limit(limits=1, user_api="blas"):
+            self._estimator.take_over(other._estimator, time)
+        self._supervisor.take_over(other._supervisor)
 
     def pressures(self, time: float, differential: ArrayLike) -> None:
         """Take in the chambers' differential pressures (M,) [Pa], as measured at an instant [s].

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.control.chambers import ChamberLog
-from der_planner.control.estimation import Knowledge
+from der_planner.control.knowledge import Knowledge
 from der_planner.control.nominal import Nominal
 from der_planner.model import air, material
 from der_planner.model.drive import STEPS

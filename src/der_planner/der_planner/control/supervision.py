@@ -104,6 +104,10 @@ class Supervisor:
         self._late = 0.0
         self._turns: list[_Turns] = []
 
+    def take_over(self, other: Supervisor) -> None:
+        """Go on with the share of another plan's feedback; what ended it does not count here."""
+        self.share = other.share
+
     def advance(self, time: float, age: float, strange: float) -> float:
         """Return the share of a command's correction.
 

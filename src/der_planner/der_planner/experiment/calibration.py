@@ -9,8 +9,7 @@ from typing import Any
 from der_msgs.msg import PressureSetpoint, PressureState
 from der_planner.experiment.client import GraphClient
 from der_planner.experiment.graph_run import GraphPlayer, GraphRun, Playing
-from der_planner.experiment.node_specs import NodeSpec, node_specs
-from der_planner.experiment.options import Hardware
+from der_planner.experiment.node_specs import Hardware, NodeSpec, node_specs
 from der_planner.experiment.progress import Progress
 from der_planner.identification import Excitation
 from der_planner.limb import Limb

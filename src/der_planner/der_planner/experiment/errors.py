@@ -1,4 +1,4 @@
-"""What can go wrong in a run, said so that the reader knows what to do."""
+"""What can go wrong before and in a run, said so that the reader knows what to do."""
 
 
 class NodeError(RuntimeError):
@@ -7,3 +7,7 @@ class NodeError(RuntimeError):
 
 class GraphError(RuntimeError):
     """The graph did not do what was asked; the message says what and why."""
+
+
+class OptionError(ValueError):
+    """The command line or the hardware file asks for something impossible; says what and why."""

@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 import platform
 import subprocess
-import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
 from der_planner.experiment import results
+from der_planner.experiment.errors import OptionError
 from der_planner.experiment.ledger import Ledger
-from der_planner.experiment.options import OptionError, Options, Trial
+from der_planner.experiment.options import Options, Trial
 from der_planner.experiment.progress import Progress
 from der_planner.limb import Limb, LimbError, mounting_of
+from der_planner.runs.outputs import check_folder
 
 
 def run(options: Options) -> None:
@@ -22,6 +23,7 @@ def run(options: Options) -> None:
 
     Raises:
         OptionError: the limb file is not usable, or the folder holds another experiment.
+        OutputError: the folder cannot be written.
         GraphError, NodeError: a trial failed; finished trials stay finished.
     """
     progress = Progress()
@@ -29,10 +31,11 @@ def run(options: Options) -> None:
     trials = options.plan_of_trials()
     ledger = Ledger(options)
     left = [trial for trial in trials if not _whole(trial, options, ledger)]
+    check_folder(options.out)
     if options.dry_run:
         _describe(options, trials, left, limb, progress)
         return
-    _make_folder(options.out)
+    options.out.mkdir(parents=True, exist_ok=True)
     progress.say(
         f"{len(left)} of {len(trials)} trials to play on {_stage(options)}, into {options.out}"
     )
@@ -86,22 +89,6 @@ def _learn(trial: Trial, options: Options, ledger: Ledger, progress: Progress) -
             break
         run = run.following()
     learning.conclude()
-
-
-def _make_folder(path: Path) -> None:
-    """Make the folder of the experiment and see that files can be written there.
-
-    Raises:
-        OptionError: they cannot.
-    """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path):
-            pass
-    except OSError as error:
-        raise OptionError(
-            f"cannot write into --out {path}: {error.strerror}; choose another folder"
-        ) from error
 
 
 def _check_limb(options: Options) -> Limb:

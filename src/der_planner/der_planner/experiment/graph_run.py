@@ -18,8 +18,8 @@ from nav_msgs.msg import Path as PathMessage
 from der_msgs.msg import MotionCommand, PressurePlan, PressureState
 from der_planner.experiment.client import GraphClient
 from der_planner.experiment.errors import GraphError, NodeError
-from der_planner.experiment.node_specs import STOP_ORDER, NodeSpec, node_specs
-from der_planner.experiment.options import Hardware, Options, Trial
+from der_planner.experiment.node_specs import STOP_ORDER, Hardware, NodeSpec, node_specs
+from der_planner.experiment.options import Options, Trial
 from der_planner.experiment.processes import NodeProcess
 from der_planner.experiment.progress import Progress
 from der_planner.limb import Limb

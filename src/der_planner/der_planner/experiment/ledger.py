@@ -8,7 +8,8 @@ import os
 from pathlib import Path
 from typing import Any
 
-from der_planner.experiment.options import OptionError, Options, Trial
+from der_planner.experiment.errors import OptionError
+from der_planner.experiment.options import Options, Trial
 
 
 class Ledger:

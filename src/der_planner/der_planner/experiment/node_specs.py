@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from der_planner.experiment.options import Hardware
+import yaml
+
+from der_planner.experiment.errors import OptionError
 from der_planner.limb import Limb
 
 STOP_ORDER = (
@@ -22,6 +25,53 @@ STOP_ORDER = (
 )
 TWIN_NODES = ("board_emulator", "limb_twin", "synthetic_camera")
 """Nodes that stand in for the hardware."""
+
+
+@dataclass(frozen=True)
+class Hardware:
+    """What stands in place of the twin: parameters of the nodes that touch the hardware.
+
+    Attributes:
+        driver, tracker, planner, recorder: parameters by name for each node.
+        remap: new names of topics by their old ones, for all nodes.
+        limb: the limb file, or None for the one on the command line.
+    """
+
+    driver: dict[str, Any] = field(default_factory=dict)
+    tracker: dict[str, Any] = field(default_factory=dict)
+    planner: dict[str, Any] = field(default_factory=dict)
+    recorder: dict[str, Any] = field(default_factory=dict)
+    remap: dict[str, str] = field(default_factory=dict)
+    limb: str | None = None
+
+    @classmethod
+    def from_yaml(cls, path: Path) -> Hardware:
+        """Read a hardware file (see scripts/hardware_example.yaml).
+
+        Raises:
+            OptionError: the file cannot be read, has unknown keys or no serial port.
+        """
+        try:
+            content = yaml.safe_load(path.read_text())
+        except (OSError, yaml.YAMLError) as error:
+            raise OptionError(f"cannot read hardware file {path}: {error}") from error
+        known = [item.name for item in dataclasses.fields(cls)]
+        if not isinstance(content, dict):
+            raise OptionError(f"hardware file {path}: expected the keys {', '.join(known)}")
+        for key in content:
+            if key not in known:
+                raise OptionError(f"hardware file {path}: unknown key '{key}'; known: {known}")
+        hardware = cls(**{key: value for key, value in content.items() if value is not None})
+        if not hardware.driver.get("port"):
+            raise OptionError(
+                f"hardware file {path}: driver.port is missing; `ls /dev/serial/by-id` shows ports"
+            )
+        if not Path(hardware.driver["port"]).exists():
+            raise OptionError(
+                f"hardware file {path}: no serial device {hardware.driver['port']}; is the valve "
+                "board plugged in? `ls /dev/serial/by-id` shows what is there"
+            )
+        return hardware
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,12 @@ import dataclasses
 import re
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import yaml
-
+from der_planner.experiment.errors import OptionError
 from der_planner.experiment.load_options import add_load_options
+from der_planner.experiment.node_specs import Hardware
 from der_planner.limb import Limb, LimbError, gravity_of
 from der_planner.planning import METHODS as METHODS_BY_MODEL
 from der_planner.planning import Motion, PlanningError
@@ -30,10 +29,6 @@ MODELS = tuple(METHODS_BY_MODEL)
 METHODS = METHODS_BY_MODEL["der"]
 DEFAULT_PAGE_PORT = 8080
 DEFAULT_MOTIONS = ("same_direction",)
-
-
-class OptionError(ValueError):
-    """The command line or the hardware file asks for something impossible; says what and why."""
 
 
 @dataclass(frozen=True)
@@ -72,53 +67,6 @@ class Trial:
     def manner(self) -> str:
         """The method, and if there is feedback: what tables call it."""
         return f"{self.method} + feedback" if self.feedback else self.method
-
-
-@dataclass(frozen=True)
-class Hardware:
-    """What stands in place of the twin: parameters of the nodes that touch the hardware.
-
-    Attributes:
-        driver, tracker, planner, recorder: parameters by name for each node.
-        remap: new names of topics by their old ones, for all nodes.
-        limb: the limb file, or None for the one on the command line.
-    """
-
-    driver: dict[str, Any] = field(default_factory=dict)
-    tracker: dict[str, Any] = field(default_factory=dict)
-    planner: dict[str, Any] = field(default_factory=dict)
-    recorder: dict[str, Any] = field(default_factory=dict)
-    remap: dict[str, str] = field(default_factory=dict)
-    limb: str | None = None
-
-    @classmethod
-    def from_yaml(cls, path: Path) -> Hardware:
-        """Read a hardware file (see scripts/hardware_example.yaml).
-
-        Raises:
-            OptionError: the file cannot be read, has unknown keys or no serial port.
-        """
-        try:
-            content = yaml.safe_load(path.read_text())
-        except (OSError, yaml.YAMLError) as error:
-            raise OptionError(f"cannot read hardware file {path}: {error}") from error
-        known = [item.name for item in dataclasses.fields(cls)]
-        if not isinstance(content, dict):
-            raise OptionError(f"hardware file {path}: expected the keys {', '.join(known)}")
-        for key in content:
-            if key not in known:
-                raise OptionError(f"hardware file {path}: unknown key '{key}'; known: {known}")
-        hardware = cls(**{key: value for key, value in content.items() if value is not None})
-        if not hardware.driver.get("port"):
-            raise OptionError(
-                f"hardware file {path}: driver.port is missing; `ls /dev/serial/by-id` shows ports"
-            )
-        if not Path(hardware.driver["port"]).exists():
-            raise OptionError(
-                f"hardware file {path}: no serial device {hardware.driver['port']}; is the valve "
-                "board plugged in? `ls /dev/serial/by-id` shows what is there"
-            )
-        return hardware
 
 
 @dataclass(frozen=True)
@@ -314,18 +262,7 @@ def parse(arguments: Sequence[str]) -> Options:
         _check_names("motion", motions, (*MOTIONS, "all"))
     _check_names("model", models, MODELS)
     _check_names("method", (given.method,), METHODS)
-    for name, least, most in (
-        ("trials", 1, 1000),
-        ("learn", 0, 100),
-        ("cycles", 1, 1000),
-        ("seed", 0, 2**31 - 1000),
-        ("period", 0.5, 600.0),
-        ("amplitude", 0.01, 2.0),
-        ("payload", 0.0, 10.0),
-    ):
-        value = getattr(given, name)
-        if not least <= value <= most:
-            raise OptionError(f"--{name} is {value}: choose {least} to {most}")
+    _check_ranges(given)
     _check_loads(given)
     _check_path_and_page(given)
     hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
@@ -381,6 +318,26 @@ def _motions(given: argparse.Namespace) -> tuple[str, ...]:
     except PlanningError as error:
         raise OptionError(f"--path: {error}") from error
     return (re.sub(r"[^A-Za-z0-9-]+", "_", given.path.stem).strip("_") or "path",)
+
+
+def _check_ranges(given: argparse.Namespace) -> None:
+    """Refuse numbers that make no sense.
+
+    Raises:
+        OptionError: names the option and what it may be.
+    """
+    for name, least, most in (
+        ("trials", 1, 1000),
+        ("learn", 0, 100),
+        ("cycles", 1, 1000),
+        ("seed", 0, 2**31 - 1000),
+        ("period", 0.5, 600.0),
+        ("amplitude", 0.01, 2.0),
+        ("payload", 0.0, 10.0),
+    ):
+        value = getattr(given, name)
+        if not least <= value <= most:
+            raise OptionError(f"--{name} is {value}: choose {least} to {most}")
 
 
 def _check_loads(given: argparse.Namespace) -> None:

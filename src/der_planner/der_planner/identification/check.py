@@ -16,14 +16,14 @@ from der_planner.limb import Limb
 Array = NDArray[np.float64]
 
 GAIN_DRIFT = 0.08
-"""Relative change of a gain that asks for a new calibration."""
+"""Relative change of a gain above which the limb must be calibrated again."""
 REST_DRIFT = math.radians(1.5)
-"""Change of a rest angle that does [rad]."""
+"""Change of a rest angle above which the limb must be calibrated again [rad]."""
 ERROR_GROWTH = 2.5
-"""Growth of the error over the calibration's own that does."""
+"""Error over the calibration's own error above which the limb must be calibrated again."""
 LEAST_ERROR = math.radians(0.4)
 LEAST_MOTION = math.radians(3.0)
-"""Predicted range of motion from which on a gain can be told [rad]."""
+"""Predicted range of motion above which the gain is checked [rad]."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Check:
     """How a limb file does on a later run.
 
     Attributes:
-        fits: nothing asks for a new calibration.
+        fits: the limb need not be calibrated again.
         findings: sentences; empty where all is well.
         error: (M,) root mean square open-loop error of the bend angles [rad].
         tip_error: mean distance of predicted and measured tips [m]; NaN without tips.

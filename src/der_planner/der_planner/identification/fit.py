@@ -30,9 +30,10 @@ Array = NDArray[np.float64]
 STRONG = 0.9
 """|correlation| above which two unknowns are reported as a pair that the log cannot tell apart."""
 MOST_PASSES = 4
-"""Of bend angles and lengths in turn, for a limb whose weight bends it unevenly."""
+"""Largest number of times that lengths and bend angles are fitted in turn, for a limb that its
+weight bends unevenly."""
 SAME_LENGTH = 5e-4
-"""Change of a length in a pass that is not worth another one [m]."""
+"""A pass that changes no length by more than this is the last one [m]."""
 
 
 def fit(
@@ -50,8 +51,8 @@ def fit(
         limb: geometry, masses, limits and first guesses; mass and axial stiffness are kept.
         log: of a calibration run, or of any run that excites every input.
         terms: model terms to fit beside gain and rest angle, of `GROUPS`; with ``mass`` (of
-            `OPTIONAL`) the mass of each segment in place of its stiffness, which is then the
-            prior's. Only gravity or fast motion tell it.
+            `OPTIONAL`) the mass of each segment is fitted and its stiffness is the prior's. A log
+            shows the mass only under gravity or in fast motion.
         geometry: fit the lengths to the tips as well.
         nodes: of the rod in the fit.
         longest_gap: between two rows of the log that a straight line may bridge [s].
@@ -114,8 +115,9 @@ def _fit_bends_and_lengths(
 ) -> _Fitted:
     """Fit the lengths first, or in turn with the bend angles where weight bends the limb unevenly.
 
-    How unevenly it bends is only known once it is fitted, and how heavy it is depends on its
-    lengths.
+    The lengths follow from tips and bend angles only if it is known how unevenly each segment
+    bends; that follows from a fitted limb, whose weight depends on its lengths. So both are fitted
+    in turn until the lengths stay the same.
     """
     loaded = any(limb.gravity[:2])
     prior = limb

@@ -1,4 +1,4 @@
-"""Lengths of segments and stiff pieces from tips and bend angles: where the tags sit on the rod."""
+"""Lengths of segments and stiff pieces from the tips and bend angles that tags have shown."""
 
 from __future__ import annotations
 

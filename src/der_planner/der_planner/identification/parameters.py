@@ -18,8 +18,8 @@ Array = NDArray[np.float64]
 GROUPS = ("asymmetry", "stiffening", "cubic", "coupling", "friction", "creep", "dynamics")
 """Model terms that may be left out, in the order in which they are explained."""
 OPTIONAL = ("mass",)
-"""Model terms that are fitted only where they are asked for: the mass, in place of the stiffness.
-Stiffness, gain and mass together have no scale in a log without forces: one is given."""
+"""Model terms that are fitted only on request: the mass, in place of the stiffness. A log without
+measured forces shows only ratios of stiffness, gain and mass, so one of them must be given."""
 _ORDER = ("linear", *GROUPS, *OPTIONAL)
 _FITTED: dict[str, Parameter] = {
     key: declared for key, declared in parameters(Segment).items() if declared.fit
@@ -38,7 +38,7 @@ _FIELD = {declared.fit.name: key for key, declared in _FITTED.items() if declare
 
 
 def start_values(limb: Limb) -> Array:
-    """Return the (M, T) values of a limb, with plausible memory where it has none."""
+    """Return the (M, T) values of a limb, with plausible friction and creep where it has none."""
     values = np.array([[_start(segment, term) for term in TERMS] for segment in limb.segments])
     low, high = (np.array([getattr(term, name) for term in TERMS]) for name in ("low", "high"))
     clipped: Array = np.clip(values, low, high)

@@ -1,4 +1,4 @@
-"""Figures of a calibration: measured against predicted, and what is left."""
+"""Figures of a calibration: bend angles measured and predicted, and the difference."""
 
 from __future__ import annotations
 

@@ -29,9 +29,11 @@ ANGLE_ERROR = np.deg2rad(0.3)
 CORRELATION = 20.0
 """Rows over which an error of the model stays the same (1 s)."""
 MOST_EVALUATIONS = 25
-"""Of model and derivatives; what still moves by then moves less than its uncertainty."""
+"""Evaluations of model and derivatives in a fit. Unknowns that still change after so many change by
+less than their uncertainty."""
 UNTOLD = 0.8
-"""Share of its prior spread that must be left of an unknown that the data say nothing about."""
+"""An unknown whose spread is still more than this share of its prior spread was not shown by the
+log."""
 NOT_FOLLOWED = np.pi
 """Error that every row is given where the rod cannot follow a trial of the optimiser [rad]."""
 STIFFER_STARTS = (0.0, 0.25, 0.5, 0.9)
@@ -116,10 +118,10 @@ class Problem:
         """Return the unknowns with standard deviations, and their correlation (P, P)."""
         remaining = self.remaining(values)
         error = float(np.sqrt(np.nanmean(remaining**2)))
-        # Neighbouring errors are alike: as many independent ones as the residual's memory leaves.
+        # Errors of neighbouring rows are correlated: rows / correlation length are independent.
         length = correlation_length(remaining)
         factor = (error / ANGLE_ERROR) ** 2 * length / CORRELATION
-        # A fit of P unknowns takes as many of them out of its residual.
+        # Each fitted unknown uses up one of them (degrees of freedom).
         independent = np.count_nonzero(np.isfinite(remaining)) / length
         factor *= independent / max(independent - len(self._wanted), 0.2 * independent)
         data = jacobian[: -int(self._known.sum()) or None]

@@ -1,4 +1,4 @@
-"""What a fit says of itself: values, uncertainties, what cannot be told apart, residuals."""
+"""Results of a fit: values, uncertainties, residuals, and pairs that the log cannot separate."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Unknown:
 
 @dataclass(frozen=True)
 class LoadsFit:
-    """What gravity pulls at, and what that tells.
+    """The masses that gravity pulls at, and the stiffness that carries them.
 
     Attributes:
         gravity: (2,) in the plane [m/s²].

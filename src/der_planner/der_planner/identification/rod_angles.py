@@ -18,13 +18,14 @@ from der_planner.model.response import Response, RodModel, simulate
 Array = NDArray[np.float64]
 
 NODES = 13
-"""Of the rod in a fit: its statics do not depend on it, its first two frequencies by 2 %."""
+"""Nodes of the rod in a fit. Its statics do not depend on them, its first two natural frequencies
+change by 2 %."""
 SUBSTEPS = 1
-"""Integrator steps of 50 ms: see the convergence on the page of the identification."""
+"""Integrator steps in each row of 50 ms; the page of the identification shows the convergence."""
 _NUDGE = 1e-3
-"""Of an unknown in its scale, for the slope of the effective pressure."""
+"""Change of an unknown, in units of its scale, for the slope of the effective pressure."""
 _STEP = 0.1
-"""Of an unknown in its scale, for the difference of two simulations."""
+"""Change of an unknown, in units of its scale, for the difference of two simulations."""
 
 
 class RodAngles:

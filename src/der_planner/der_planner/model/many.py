@@ -66,10 +66,8 @@ def simulate_many(
 ) -> ManyResponses:
     """Simulate R limbs in one call on all cores; run r is that of `simulate` for limb and input r.
 
-    Arguments are those of `simulate`, and each may be one for all runs or a list of R. The motion
-    of rods in a plane is one compiled loop; what comes before it, from commands to effective
-    pressures, is two compiled calls a run. With ``linearise`` each run keeps its derivative: about
-    10 kB for each integrator step of a rod with 21 nodes.
+    Arguments are those of `simulate`, and each may be one for all runs or a list of R. With
+    ``linearise`` each run keeps its derivative: about 10 kB a step of a rod with 21 nodes.
 
     Args:
         limbs: one limb or model, or a list of R with equal numbers of segments.
@@ -90,47 +88,44 @@ def simulate_many(
         ValueError: as `simulate`, or numbers of runs that do not fit together.
         ConvergenceError: a rod could not be simulated; names the run.
     """
-    if (commands is None) == (pressures is None):
-        raise ValueError("give either commands or pressures")
-    given = np.asarray(pressures if commands is None else commands, dtype=float)
-    runs = len(limbs) if isinstance(limbs, (list, tuple)) else len(given) if given.ndim == 3 else 0
-    if runs == 0 or given.ndim not in (2, 3) or (given.ndim == 3 and len(given) != runs):
-        raise ValueError(
-            "expected commands or pressures (R, K, M), or (K, M) with a list of R limbs, got "
-            f"{given.shape} and {len(limbs) if isinstance(limbs, (list, tuple)) else 'one'} limb(s)"
-        )
-    series = list(given) if given.ndim == 3 else [given] * runs
+    series = _series(limbs, commands, pressures)
+    runs = len(series)
     models = _models(one_each(limbs, runs, "limbs"), model, nodes)
     bends, starts = one_each(bend, runs, "bend"), one_each(start, runs, "start")
     memories = one_each(memory, runs, "memory")
-    earlier = _before(before, (runs, given.shape[-1]))
+    earlier = _before(before, (runs, series[0].shape[-1]))
 
     def case_of(run: int) -> Case:
+        given = (None, series[run]) if commands is None else (series[run], None)
+        begin = (bends[run], starts[run], earlier[run], memories[run])
         with naming(run):
-            return prepare(
-                models[run],
-                time,
-                None if commands is None else series[run],
-                None if pressures is None else series[run],
-                bends[run],
-                starts[run],
-                earlier[run],
-                memories[run],
-                steps,
-            )
+            return prepare(models[run], time, given[0], given[1], *begin, steps)
 
     cases = in_threads(case_of, runs, threads)
     tip, angles, final, derivative = _run_many(models, cases, linearise, threads)
-    return ManyResponses(
-        cases[0].boundaries,
-        np.stack([case.chain.differential for case in cases]),
-        np.stack([case.chain.effective for case in cases]),
-        angles,
-        tip,
-        final,
-        tuple(case.memory for case in cases),
-        derivative,
-    )
+    differential = np.stack([case.chain.differential for case in cases])
+    effective = np.stack([case.chain.effective for case in cases])
+    last, time = tuple(case.memory for case in cases), cases[0].boundaries
+    return ManyResponses(time, differential, effective, angles, tip, final, last, derivative)
+
+
+def _series(limbs: object, commands: ArrayLike | None, pressures: ArrayLike | None) -> list[Array]:
+    """Return the commands or pressures (K, M) [Pa] of each run.
+
+    Raises:
+        ValueError: none or both are given, or their number is not that of the limbs.
+    """
+    if (commands is None) == (pressures is None):
+        raise ValueError("give either commands or pressures")
+    given = np.asarray(pressures if commands is None else commands, dtype=float)
+    listed = len(limbs) if isinstance(limbs, (list, tuple)) else None
+    runs = listed if listed is not None else len(given) if given.ndim == 3 else 0
+    if runs == 0 or given.ndim not in (2, 3) or (given.ndim == 3 and len(given) != runs):
+        raise ValueError(
+            "expected commands or pressures (R, K, M), or (K, M) with a list of R limbs, got "
+            f"{given.shape} and {'one' if listed is None else listed} limb(s)"
+        )
+    return list(given) if given.ndim == 3 else [given] * runs
 
 
 def _before(given: ArrayLike | None, shape: tuple[int, int]) -> list[Array | None]:

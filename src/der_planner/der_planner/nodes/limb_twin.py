@@ -11,7 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 import rclpy
 from geometry_msgs.msg import Point
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from std_msgs.msg import Header
 
 from der_msgs.msg import ChamberPressures, LimbPush, LimbShape, LimbState
@@ -47,7 +49,12 @@ class LimbTwinNode(Node):
             )
         )
         self._twin = self._mount(seed, run)
+        parameters.declare(
+            self, "gain", 1.0, "of the chambers' moments, 1: as drawn; may be set at run time",
+            at_least=0.0, at_most=2.0, read_only=False,
+        )  # fmt: skip
         check_overrides(self)
+        self._twin.gain = float(self.get_parameter("gain").value)
         self._lock = threading.Lock()
         self._pressures: np.ndarray | None = None
         self._received_at = math.nan
@@ -59,6 +66,7 @@ class LimbTwinNode(Node):
             ChamberPressures, topics.TWIN_CHAMBER_PRESSURES, self._on_pressures, qos.STATES
         )
         self.create_subscription(LimbPush, topics.TWIN_PUSH, self._on_push, qos.COMMANDS)
+        self.add_on_set_parameters_callback(self._on_parameters)
         self._loop = RealTimeLoop(self._advance, self._publish, 1.0 / rate)
         self._diagnostics = DiagnosticsPublisher(self, self._report)
         self._stop = threading.Event()
@@ -136,6 +144,14 @@ class LimbTwinNode(Node):
                 )
         except TwinError as error:
             self.get_logger().error(f"{topics.TWIN_PUSH} was not taken: {error}")
+
+    def _on_parameters(self, changed: list[Parameter]) -> SetParametersResult:
+        """Take a gain from the next step on; rclpy has checked its range."""
+        for parameter in changed:
+            if parameter.name == "gain":
+                with self._lock:
+                    self._twin.gain = float(parameter.value)
+        return SetParametersResult(successful=True)
 
     def _work(self) -> None:
         try:

@@ -18,18 +18,19 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from der_msgs.msg import LimbState, MotionCommand, PressureState
-from der_planner.control.estimation import Estimate
 from der_planner.control.feedback import Feedback
+from der_planner.control.knowledge import Estimate
 from der_planner.nodes.driver_watch import DriverWatch, Ending
 from der_planner.nodes.planner_action import MotionAction
 from der_planner.nodes.planner_feedback import Corrector, Done
+from der_planner.nodes.planner_making import PlanMaker
 from der_planner.nodes.planner_parameters import read_parameters
 from der_planner.nodes.planner_publishers import PlannerPublishers
 from der_planner.nodes.planner_requests import Request, from_command, from_path, new_plan_id
 from der_planner.nodes.planner_stage import Stage
 from der_planner.nodes.planner_status import PlannerStatus
-from der_planner.planning import METHODS, Motion, Plan, Start, plan
-from der_planner.planning.streaming import Schedule, first_stamp
+from der_planner.planning import Plan
+from der_planner.planning.streaming import Schedule
 from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.overrides import check_overrides
@@ -38,10 +39,6 @@ from limb_interfaces.stamps import NANOSECONDS
 
 Array = NDArray[np.float64]
 
-_MARGIN = 100_000_000
-"""A plan starts this much [ns] after the earliest instant, so that its message travels first."""
-_FEEDBACK_MARGIN = 500_000_000
-"""What feedback needs to be made ready for a plan takes less than this [ns]."""
 _ARMING_PATIENCE = 0.5
 """[s] for the state of a driver that was armed just now to arrive."""
 
@@ -71,6 +68,7 @@ class PlannerNode(Node):
         self._driver = DriverWatch(clock.monotonic, self._options.driver_timeout)
         self._stage = Stage(self, self._driver, self._now, self._options.lead)
         self._corrector = Corrector(self, self._now)
+        self._maker = PlanMaker(self._options, lambda: self._stage.position, self._now)
         self._action = MotionAction(self, self._take_command, self._stop_plan, self._stage.find)
         self._planning = threading.Thread(target=self._run, name="planning", daemon=True)
         self._planning.start()
@@ -269,14 +267,7 @@ class PlannerNode(Node):
     def _warm_up(self) -> None:
         """Compile every kernel before the node says that it is ready."""
         try:
-            quick = Motion.named("asynchronous", amplitude=0.1, period=2.0, cycles=1)
-            for model, methods in METHODS.items():
-                for method in methods:
-                    found = plan(
-                        self._options.limb, quick, model, method, nodes=self._options.nodes
-                    )
-            # The last of them has compiled whatever feedback calls as well.
-            Feedback(found)
+            self._maker.warm_up()
         except Exception as error:
             self.get_logger().error(f"the limb cannot be planned for: {error}")
             self._status.set("error", reason=str(error))
@@ -289,7 +280,7 @@ class PlannerNode(Node):
                 raise Cancelled
             self._status.progress = share
 
-        stamp, start, result = self._planned(request, progress)
+        stamp, start, result = self._maker.make(request, progress)
         feedback = Feedback(result) if request.feedback else None
         if feedback is not None:
             result = dataclasses.replace(result, method=f"{result.method} + feedback")
@@ -308,38 +299,6 @@ class PlannerNode(Node):
             self._status.set(
                 "done", request.plan_id, reason="waits for the service start", progress=1.0
             )
-
-    def _planned(
-        self, request: Request, progress: Callable[[float], None]
-    ) -> tuple[int, Start | None, Plan]:
-        """Return when a plan can take over, where the limb is then (None: at rest), and the plan.
-
-        A motion that is being played goes on meanwhile; the new one takes over where it then is.
-        """
-        allowance = _MARGIN + (_FEEDBACK_MARGIN if request.feedback else 0)
-        while True:
-            progress(0.0)
-            begun = clock.monotonic()
-            stamp, start = self._hand_over(request.start, allowance)
-            if request.learned is not None:
-                if start is not None:
-                    raise ValueError("a learned plan begins at rest: send it after this motion")
-                return stamp, start, request.learned
-            result = plan(
-                request.limb, request.motion, request.model, request.method,
-                nodes=self._options.nodes, start=start, progress=progress,
-            )  # fmt: skip
-            progress(1.0)
-            spare = _FEEDBACK_MARGIN if request.feedback else 0
-            if start is None or stamp - self._options.lead - spare > self._now():
-                return stamp, start, result
-            allowance = 2 * round((clock.monotonic() - begun) * 1e9) + spare + _MARGIN
-
-    def _hand_over(self, wanted: int, allowance: int) -> tuple[int, Start | None]:
-        """Return when a plan of now can take over, and where the limb is then; None: at rest."""
-        stamp = first_stamp(self._now() + allowance, self._options.lead, wanted)
-        position = self._stage.position
-        return stamp, None if position is None else position[0].leave(stamp)
 
     # Streaming -----------------------------------------------------------------------------
 

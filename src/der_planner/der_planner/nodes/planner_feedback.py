@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_msgs.msg import LimbState, PressureState
-from der_planner.control.estimation import Estimate
 from der_planner.control.feedback import Feedback
+from der_planner.control.knowledge import Estimate
 from der_planner.planning.streaming import GRID, Schedule
 from limb_interfaces.stamps import NANOSECONDS, nanoseconds
 
@@ -68,10 +68,19 @@ class Done:
 
 
 class _Corrected:
-    """A schedule with its feedback, and what was sent of it."""
+    """A schedule with its feedback, and what was sent of it.
 
-    def __init__(self, schedule: Schedule, feedback: Feedback) -> None:
+    Args:
+        schedule: what is played.
+        feedback: of its plan.
+        left: the schedule that gives way to this one; None: this one begins at rest.
+    """
+
+    def __init__(
+        self, schedule: Schedule, feedback: Feedback, left: _Corrected | None = None
+    ) -> None:
         self.schedule, self.feedback = schedule, feedback
+        self._left = left
         self.coming: tuple[int, Array] = feedback.coming()
         self.revisions: dict[int, int] = {}
         self.warned = 0
@@ -80,18 +89,47 @@ class _Corrected:
         """Return an instant [ns] in the plan's seconds."""
         return (stamp - self.schedule.start) / NANOSECONDS
 
+    def begins(self, index: int) -> bool:
+        """Tell whether setpoint ``index`` is one of this schedule, which then has taken over."""
+        if not 0 <= index < self.schedule.count:
+            return False
+        if self._left is not None:
+            left, self._left = self._left, None
+            self.feedback.take_over(left.feedback, left.time_of(self.schedule.start))
+        return True
+
+    def tell(self, told: list[Callable[[_Corrected], None]], alone: bool) -> None:
+        """Take what came, or pass it on to the schedule that has not given way yet.
+
+        Args:
+            told: in the order in which it came.
+            alone: that schedule is corrected no more.
+        """
+        receiver: _Corrected | None = self
+        if self._left is not None:
+            receiver = self._left if alone else None
+        for item in told if receiver is not None else ():
+            item(receiver)
+
     def pressures(self, index: int) -> Array:
         """Return the pressures (M,) [Pa] of a setpoint by what was last thought of for it."""
         planned = self.schedule.plan.differential_pressure[index]
+        limit = self.schedule.plan.limb.pneumatics.pressure_limit
+        cut: Array = np.clip(planned + self._correction(index), -limit, limit)
+        return cut
+
+    def _correction(self, index: int) -> Array:
+        if self._left is not None:
+            return self._left._correction(
+                index + (self.schedule.start - self._left.schedule.start) // GRID
+            )
         first, corrections = self.coming
         ahead = index - first
         if ahead < 0:
-            return planned
+            return np.zeros_like(corrections[0])
         fade = max(0.0, 1.0 - max(0, ahead - _STALE) / _STALE)
-        limit = self.schedule.plan.limb.pneumatics.pressure_limit
-        correction = fade * corrections[min(ahead, len(corrections) - 1)]
-        cut: Array = np.clip(planned + correction, -limit, limit)
-        return cut
+        correction: Array = fade * corrections[min(ahead, len(corrections) - 1)]
+        return correction
 
 
 class Corrector:
@@ -121,7 +159,9 @@ class Corrector:
     def follow(self, schedule: Schedule, feedback: Feedback) -> None:
         """Correct a schedule from now on."""
         with self._wake:
-            self._open.append(_Corrected(schedule, feedback))
+            goes_on = self._open and schedule.plan.reference.start is not None
+            left = self._open[-1] if goes_on else None
+            self._open.append(_Corrected(schedule, feedback, left))
             self._wake.notify_all()
 
     def forget(self, schedule: Schedule) -> None:
@@ -195,12 +235,13 @@ class Corrector:
                 self._inbox.clear()
                 following = list(self._open)
             for each in following:
-                self._correct(each, told)
+                self._correct(each, told, len(following) == 1)
 
-    def _correct(self, each: _Corrected, told: list[Callable[[_Corrected], None]]) -> None:
+    def _correct(
+        self, each: _Corrected, told: list[Callable[[_Corrected], None]], alone: bool
+    ) -> None:
         try:
-            for item in told:
-                item(each)
+            each.tell(told, alone)
             self._revise(each)
         except Exception as error:
             # Whatever goes wrong here, the plan goes on without feedback.
@@ -214,7 +255,7 @@ class Corrector:
         begin, now = clock.perf_counter(), self._now()
         ahead = min(_TRAVEL + _SLOWER * self._took, _LONGEST_AHEAD)
         index = -(-(now + round(ahead * NANOSECONDS) - schedule.start) // GRID)
-        if not 0 <= index < schedule.count or self._replaced(each, index):
+        if self._replaced(each, index) or not each.begins(index):
             return
         planned = schedule.plan.differential_pressure[index]
         pressures = feedback.command(index * GRID / NANOSECONDS)

@@ -7,7 +7,7 @@ from geometry_msgs.msg import Point, PointStamped
 from numpy.typing import NDArray
 
 from der_msgs.msg import LimbEstimate, PressurePlan, PressureSetpoint
-from der_planner.control.estimation import Estimate
+from der_planner.control.knowledge import Estimate
 from der_planner.planning.streaming import Schedule
 from limb_interfaces import topics
 from limb_interfaces.stamps import stamp_from_nanoseconds

@@ -49,18 +49,8 @@ def read_parameters(node: Node) -> PlannerOptions:
         LimbError: the limb file cannot be used.
     """
     read: Any = functools.partial(declare, node)
-    limb_file = str(read("limb_file", "", "limb file (YAML); empty: the default limb"))
-    limb = Limb.from_yaml(limb_file) if limb_file else Limb.default()
-    mounting = str(
-        read(
-            "mounting",
-            "",
-            "horizontal, hanging, standing, sideways or degrees of tilt; empty: "
-            "gravity as in the limb file",
-        )
-    )
     return PlannerOptions(
-        limb=limb.mounted(mounting) if mounting else limb,
+        limb=_read_limb(read),
         payload=float(
             read("payload", 0.0, "mass [kg] carried beside the limb's own masses, where a command "
                  "names none", at_least=0.0, at_most=LARGEST_PAYLOAD)
@@ -115,3 +105,14 @@ def read_parameters(node: Node) -> PlannerOptions:
 def _absolute(folder: object) -> str:
     """Return a folder as other processes find it; empty stays empty."""
     return str(Path(str(folder)).expanduser().resolve()) if folder else ""
+
+
+def _read_limb(read: Any) -> Limb:
+    """Return the limb of the file that is named, mounted as the parameter says."""
+    limb_file = str(read("limb_file", "", "limb file (YAML); empty: the default limb"))
+    mounting = str(
+        read("mounting", "", "horizontal, hanging, standing, sideways or degrees of tilt; empty: "
+             "gravity as in the limb file")
+    )  # fmt: skip
+    limb = Limb.from_yaml(limb_file) if limb_file else Limb.default()
+    return limb.mounted(mounting) if mounting else limb

@@ -9,7 +9,7 @@ from rclpy.node import Node
 from visualization_msgs.msg import MarkerArray
 
 from der_msgs.msg import LimbEstimate, PressurePlan, PressureSetpoint
-from der_planner.control.estimation import Estimate
+from der_planner.control.knowledge import Estimate
 from der_planner.nodes import planner_messages
 from der_planner.nodes.planner_feedback import Done
 from der_planner.nodes.planner_markers import estimate_marker, limb_marker, path_markers

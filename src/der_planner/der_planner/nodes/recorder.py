@@ -93,8 +93,9 @@ class Recorder(Node):
         declare("topics", ".*", "regular expression that the full topic names must match")
         declare(
             "exclude",
-            ".*/image_annotated",
-            "regular expression of full topic names to leave out; empty: none",
+            ".*/image_annotated|.*/_.*",
+            "regular expression of full topic names to leave out, such as ROS's hidden ones; "
+            "empty: none",
         )
         declare(
             "compression",

@@ -59,13 +59,12 @@ def plan(
         limb: the robot.
         motion: what the tip should do.
         model: ``der`` (discrete elastic rod) or ``pcc`` (constant curvature).
-        method: ``paper``, ``projected`` or ``optimal``; empty takes the model's default.
+        method: ``paper``, ``projected`` or ``optimal``; empty: the default.
         nodes: of the rod.
         start: where another motion is left; None: where the vented limb rests.
         progress: called with the share that is done, 0 … 1.
 
-    Returns:
-        The plan; its `warnings` say where limits cut the wanted pressures.
+    The plan's `warnings` say where limits cut the wanted pressures.
 
     Raises:
         PlanningError: unknown model or method.
@@ -76,17 +75,16 @@ def plan(
     begin = clock.perf_counter()
     method = choose_method(model, method)
     report = progress or (lambda _share: None)
-    # Matrices of a few hundred rows: more threads only get into other processes' way.
+    # Its matrices are small: more threads only get into other processes' way.
     with _THREADS.limit(limits=1, user_api="blas"):
         physics = models.build(limb, model, nodes)
         reference = motion.reference(limb, start)
-        report(0.1)
         spline = physics.configuration(reference)
         report(0.3)
         solved = _followed(physics, spline, reference, method, report)
     bend = sample_spline(spline, reference.time)[0]
-    left = str(reference.deviation or "")
-    report(1.0)
+    left = [str(reference.deviation or "")]
+    warnings = filter(None, left + solved.warnings + _calibration_warnings(physics.limb, bend))
     return Plan(
         time=reference.time,
         differential_pressure=solved.commands,
@@ -102,9 +100,7 @@ def plan(
         limb=physics.limb,
         kinematics=physics.kinematics,
         solve_time=clock.perf_counter() - begin,
-        warnings=tuple(
-            [left] * bool(left) + solved.warnings + _calibration_warnings(physics.limb, bend)
-        ),
+        warnings=tuple(warnings),
         details=solved.details,
     )
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.runs.columns import Columns
+from der_planner.runs.corrections import Revisions, described, latencies
 from der_planner.runs.recording.reader import BagError, BagReader
 from der_planner.runs.run import (
     Array,
@@ -31,6 +32,7 @@ PLAN_TYPE = "der_msgs/msg/PressurePlan"
 SETPOINT_TYPE = "der_msgs/msg/PressureSetpoint"
 PRESSURE_TYPE = "der_msgs/msg/PressureState"
 STATE_TYPE = "der_msgs/msg/LimbState"
+ESTIMATE_TYPE = "der_msgs/msg/LimbEstimate"
 TRUTH_SUFFIX = "twin/ground_truth"
 BOARD_SUFFIX = "twin/board_commands"
 FAULT_MODE = 5
@@ -46,6 +48,7 @@ class LimbRecord:
         setpoints: by plan id: differential pressures [Pa].
         setpoint_indices: by plan id, in the order of ``setpoints``.
         revised: ids of the plans of which a setpoint was revised.
+        revisions: by plan id: those setpoints, with what their estimates had seen.
         tip, angles: measured tip [m] and bend angles [rad], NaN where the limb was not seen.
         covariance: of the measured tip [m²], row by row.
         truth: simulated tip [m] (twin only).
@@ -58,6 +61,7 @@ class LimbRecord:
     setpoints: dict[str, Columns] = field(default_factory=dict)
     setpoint_indices: dict[str, array[int]] = field(default_factory=dict)
     revised: set[str] = field(default_factory=set)
+    revisions: dict[str, Revisions] = field(default_factory=dict)
     tip: Columns = field(default_factory=lambda: Columns(2))
     angles: Columns = field(default_factory=Columns)
     covariance: Columns = field(default_factory=lambda: Columns(4))
@@ -71,6 +75,11 @@ class LimbRecord:
     def usable_plans(self) -> dict[str, tuple[int, Any]]:
         """The plans of two setpoints or more, by id."""
         return {name: entry for name, entry in self.plans.items() if len(entry[1].time) > 1}
+
+    def seen(self) -> NDArray[np.int64]:
+        """Return the stamps (K,) of the pictures on which the tip was seen [ns]."""
+        seen: NDArray[np.int64] = self.tip.stamps()[np.isfinite(self.tip.values(2)).all(axis=1)]
+        return seen
 
 
 @dataclass(frozen=True)
@@ -179,6 +188,7 @@ def _taker(topic: str, type_name: str) -> Callable[[LimbRecord, Any], None] | No
         SETPOINT_TYPE: _take_setpoint,
         PRESSURE_TYPE: _take_pressure,
         STATE_TYPE: _take_state,
+        ESTIMATE_TYPE: _take_estimate,
     }.get(type_name)
 
 
@@ -192,6 +202,18 @@ def _take_setpoint(limb: LimbRecord, message: Any) -> None:
     limb.setpoint_indices.setdefault(message.plan_id, array("q")).append(int(message.index))
     if message.revision:
         limb.revised.add(message.plan_id)
+        _, plan = limb.plans.get(message.plan_id, (0, None))
+        planned = () if plan is None else _planned(plan)
+        if message.index < len(planned):
+            added = np.asarray(message.differential_pressure) - planned[message.index]
+            limb.revisions.setdefault(message.plan_id, Revisions()).revised(_stamp(message), added)
+
+
+def _take_estimate(limb: LimbRecord, message: Any) -> None:
+    picture = _stamp(message) - round(message.age * NANOSECONDS)
+    revisions = limb.revisions.get(message.plan_id)
+    if revisions is not None:
+        revisions.estimated(picture, np.asarray(message.correction))
 
 
 def _take_state(limb: LimbRecord, message: Any) -> None:
@@ -240,19 +262,20 @@ def _setpoints(limb: LimbRecord, plan_id: str, segment_count: int) -> _Setpoints
     return _Setpoints(index, rows.stamps()[last], rows.values(segment_count)[last])
 
 
-def _feedback(plan: Any, setpoints: _Setpoints) -> dict[str, Any]:
-    """Return what was added to the plan's setpoints, by the key of a run's `extra`."""
-    planned = np.array(plan.differential_pressure).reshape(-1, int(plan.segment_count))
+def _feedback(limb: LimbRecord, plan: Any, setpoints: _Setpoints) -> dict[str, Any]:
+    """Return what feedback did to a plan's setpoints, by the key of a run's `extra`."""
+    planned = _planned(plan)
     usable = setpoints.index < len(planned)
     added = setpoints.value[usable] - planned[setpoints.index[usable]]
     if not len(added):
         return {}
-    return {
-        "feedback": {
-            "correction_rms_pa": np.sqrt(np.mean(added**2, axis=0)).tolist(),
-            "correction_max_pa": np.abs(added).max(axis=0).tolist(),
-        }
-    }
+    taken = latencies(limb.revisions.get(plan.plan_id, Revisions()), limb.seen())
+    return {"feedback": described(added, taken)}
+
+
+def _planned(plan: Any) -> Array:
+    """Return the commands (K, M) of a plan's message [Pa]."""
+    return np.array(plan.differential_pressure, dtype=float).reshape(-1, int(plan.segment_count))
 
 
 def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
@@ -277,7 +300,7 @@ def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
         raise EvaluationError(
             f"{where}: the plan '{chosen}' carries no stamp and none of its setpoints was recorded"
         )
-    about = _feedback(plan, setpoints) if chosen in limb.revised else {}
+    about = _feedback(limb, plan, setpoints) if chosen in limb.revised else {}
     end = times[-1]
     played = int(setpoints.index[-1]) if len(setpoints.index) else len(times) - 1
     faults = [text for when, text in limb.faults if 0 <= (when - origin) / NANOSECONDS <= end]

@@ -12,9 +12,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from elastica._calculus import difference_kernel_for_block_structure
+from elastica._linalg import _batch_matvec
 from elastica.rod.cosserat_rod import (
     _compute_bending_twist_strains,
-    _compute_internal_forces,
     _compute_internal_torques,
     _compute_shear_stretch_strains,
     _update_accelerations,
@@ -171,57 +172,8 @@ def advance(
         for k in range(vertices):
             # PyElastica's couple is B (κ − κ_rest): this rest curvature makes it the law's moment.
             rod.rest_kappa[0, k] = rod.kappa[0, k] - moment[k] / rod.bend_matrix[0, 0, k]
-        _damp_strains(rod, material, strain, dt)
-        _compute_internal_forces(
-            rod.position,
-            rod.volume,
-            rod.lengths,
-            rod.tangents,
-            rod.radius,
-            rod.rest_lengths,
-            rod.rest_voronoi_lengths,
-            rod.dilatation,
-            rod.voronoi_dilatation,
-            rod.directors,
-            rod.sigma,
-            rod.rest_sigma,
-            rod.shear_matrix,
-            rod.internal_stress,
-            rod.internal_forces,
-            rod.ghost_elements,
-        )
-        _compute_internal_torques(
-            rod.position,
-            rod.velocity,
-            rod.tangents,
-            rod.lengths,
-            rod.rest_lengths,
-            rod.directors,
-            rod.rest_voronoi_lengths,
-            rod.bend_matrix,
-            rod.rest_kappa,
-            rod.kappa,
-            rod.voronoi_dilatation,
-            rod.inertia,
-            rod.omega,
-            rod.internal_stress,
-            rod.internal_couple,
-            rod.dilatation,
-            rod.dilatation_rate,
-            rod.internal_torques,
-            rod.ghost_vertices,
-        )
-        _update_accelerations(
-            rod.acceleration,
-            rod.internal_forces,
-            rod.external_forces,
-            rod.mass,
-            rod.alpha,
-            rod.inverse_inertia,
-            rod.internal_torques,
-            rod.external_torques,
-            rod.dilatation,
-        )
+        _internal_forces(rod, material, strain, dt)
+        _accelerations(rod)
         _kick(rod, dt, keep)
         overload_operator_kinematic_numba(
             0.5 * dt, rod.position, rod.directors, rod.velocity, rod.omega
@@ -229,8 +181,17 @@ def advance(
 
 
 @njit(cache=True)
-def _damp_strains(rod: RodArrays, material: Material, before: Array, dt: float) -> None:
-    """Set the rest strains so that stress = S (σ − rest + τ σ̇); ``before`` (3, E) becomes σ."""
+def _internal_forces(rod: RodArrays, material: Material, before: Array, dt: float) -> None:
+    """Fill the stress S (σ − rest + τ σ̇) (3, E) [N] and the internal forces (3, E+1) [N].
+
+    The same as PyElastica's kernel, which has no σ̇, with the strains computed once.
+
+    Args:
+        rod: changed in place.
+        material: tells the strain at rest.
+        before: (3, E) σ at the last step, becomes σ now.
+        dt: [s] since then.
+    """
     _compute_shear_stretch_strains(
         rod.position,
         rod.volume,
@@ -244,11 +205,54 @@ def _damp_strains(rod: RodArrays, material: Material, before: Array, dt: float) 
         rod.directors,
         rod.sigma,
     )
-    for i in range(3):
-        for k in range(before.shape[1]):
-            rod.rest_sigma[i, k] = VISCOUS_TIME * (before[i, k] - rod.sigma[i, k]) / dt
-            before[i, k] = rod.sigma[i, k]
+    rod.rest_sigma[:] = VISCOUS_TIME * (before - rod.sigma) / dt
     rod.rest_sigma[2, :] += material.rest_stretch
+    before[:] = rod.sigma
+    rod.internal_stress[:] = _batch_matvec(rod.shear_matrix, rod.sigma - rod.rest_sigma)
+    world = np.zeros_like(rod.internal_stress)
+    for i in range(3):
+        for j in range(3):
+            for k in range(world.shape[1]):
+                world[i, k] += rod.directors[j, i, k] * rod.internal_stress[j, k]
+    world /= rod.dilatation
+    rod.internal_forces[:] = difference_kernel_for_block_structure(world, rod.ghost_elements)
+
+
+@njit(cache=True)
+def _accelerations(rod: RodArrays) -> None:
+    """Fill the internal torques from the stress, and both accelerations."""
+    _compute_internal_torques(
+        rod.position,
+        rod.velocity,
+        rod.tangents,
+        rod.lengths,
+        rod.rest_lengths,
+        rod.directors,
+        rod.rest_voronoi_lengths,
+        rod.bend_matrix,
+        rod.rest_kappa,
+        rod.kappa,
+        rod.voronoi_dilatation,
+        rod.inertia,
+        rod.omega,
+        rod.internal_stress,
+        rod.internal_couple,
+        rod.dilatation,
+        rod.dilatation_rate,
+        rod.internal_torques,
+        rod.ghost_vertices,
+    )
+    _update_accelerations(
+        rod.acceleration,
+        rod.internal_forces,
+        rod.external_forces,
+        rod.mass,
+        rod.alpha,
+        rod.inverse_inertia,
+        rod.internal_torques,
+        rod.external_torques,
+        rod.dilatation,
+    )
 
 
 @njit(cache=True)

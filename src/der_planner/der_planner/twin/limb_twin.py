@@ -66,6 +66,10 @@ class LimbTwin:
         gravity: (3,) acceleration in `limb_base` [m/s²].
         masses: point masses that the limb carries beside its own from the start.
 
+    Attributes:
+        gain: by which the moment of all chambers is multiplied, 1 at first; may be changed while
+            the limb moves, as the gain of a real limb does when its silicone warms or tears.
+
     Raises:
         TwinError: a mass is not on the limb, or gravity is not finite.
     """
@@ -81,7 +85,7 @@ class LimbTwin:
     ) -> None:
         self._hardware = draw(seed) if hardware is None else hardware
         self.atmosphere = float(atmosphere)
-        self.time = 0.0
+        self.time, self.gain = 0.0, 1.0
         self._carry = 0.0
         self._pressure = np.full(2 * self.segment_count, self.atmosphere)
         self._ramp_left = 0
@@ -225,7 +229,7 @@ class LimbTwin:
             )
             left, right = gauge[2 * index], gauge[2 * index + 1]
             here = self._vertex_segment == index
-            target["active"][here] = (
+            target["active"][here] = self.gain * (
                 segment.chamber_gain[0] * left
                 - segment.chamber_gain[1] * right
                 + crossing * neighbours

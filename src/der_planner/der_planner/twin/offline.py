@@ -142,14 +142,7 @@ def play(
     Raises:
         TwinError: the arrays do not fit together or to the twin, or a load is not on the limb.
     """
-    instants = np.asarray(time, dtype=float)
-    wanted = np.asarray(differential_pressure, dtype=float)
-    if instants.ndim != 1 or not instants.size or wanted.ndim != 2 or len(wanted) != instants.size:
-        raise TwinError(
-            f"expected time (K,) and pressures (K, M), got {instants.shape} and {wanted.shape}"
-        )
-    if not np.all(np.isfinite(wanted)) or not np.all(np.diff(instants) > 0):
-        raise TwinError("time must rise and pressures must be finite")
+    instants, wanted = _checked(time, differential_pressure)
     limb = OfflineTwin(
         seed,
         run,
@@ -176,3 +169,20 @@ def play(
         measured_differential=chambers[:, 0::2] - chambers[:, 1::2],
         chamber_pressure=chambers,
     )
+
+
+def _checked(time: ArrayLike, differential_pressure: ArrayLike) -> tuple[Array, Array]:
+    """Return time (K,) and pressures (K, M) as arrays.
+
+    Raises:
+        TwinError: they do not fit together, or are not finite and in order.
+    """
+    instants = np.asarray(time, dtype=float)
+    wanted = np.asarray(differential_pressure, dtype=float)
+    if instants.ndim != 1 or not instants.size or wanted.ndim != 2 or len(wanted) != instants.size:
+        raise TwinError(
+            f"expected time (K,) and pressures (K, M), got {instants.shape} and {wanted.shape}"
+        )
+    if not np.all(np.isfinite(wanted)) or not np.all(np.diff(instants) > 0):
+        raise TwinError("time must rise and pressures must be finite")
+    return instants, wanted

@@ -103,6 +103,8 @@ class HostProtocol(ABC):
         self.chamber_count = chamber_count
         self.rejected = 0
         """Frames or lines that were damaged and thrown away."""
+        self.last_damaged = ""
+        """The newest of them, where the protocol has lines."""
         self.unsettled = ""
         """Why no pressure may be commanded yet, though the board talks; empty if it may."""
 

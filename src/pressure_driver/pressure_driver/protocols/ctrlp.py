@@ -5,18 +5,22 @@ To the board, one command a line::
     ECHO;1   UNITS;1 (kPa)   MODE;3 (ramps)   TIME;50 (ms between reports)   ON (reports)
     SET;0.050;7.500;0.000;0.000;7.500     seconds to ramp, then one gauge pressure a channel
 
-From the board, one report a line, numbers separated by tabs::
+From the board, lines of ms since boot, a kind, and gauge pressures, separated by tabs::
 
-    12345<TAB>1<TAB>7.481<TAB>0.002<TAB>-0.003<TAB>7.502     ms since boot, 1, gauge pressures
+    12345<TAB>0<TAB>7.50<TAB>0.00<TAB>0.00<TAB>7.50      what the channels are regulated to
+    12345<TAB>1<TAB>7.48<TAB>0.00<TAB>-0.01<TAB>7.50     what is measured there
+    12345<TAB>2<TAB>140.00                               the supply, if a sensor is fitted
 
-and echoes of commands, which begin with an underscore (``_NEW SET: …``, ``_UNREC: …``). Each
-channel is regulated on its own, so both chambers of a pair are named. There is no checksum and no
-watchdog, and the board does not tell its supply.
+and echoes of commands, which begin with an underscore: ``_NEW SET: 0.05<TAB>7.50<TAB>…``,
+``_NEW UNITS: kPa<TAB>kPa`` (of commands and of reports; older boards may repeat the number),
+``_UNREC: …``. A SET is repeated as the board took it, within its own limits (MAXP). Each channel is
+regulated on its own, so both chambers of a pair are named. There is no checksum and no watchdog. A
+board that has measured more than its limit vents until the next MODE.
 
 After a reset the board works in psi, which would make a setpoint in kPa 6.9 times too high, and
 does not report. So the settings are sent again after every sign of a reset (the board's clock goes
-back, it sends words that are no echo, it has been silent), and no pressure is commanded before the
-board has repeated the units.
+back, it sends words that are no echo, it has been silent) and at every arming, and no pressure is
+commanded before the board has repeated the units.
 """
 
 from __future__ import annotations
@@ -42,14 +46,25 @@ PASCAL_PER_KILOPASCAL = 1000.0
 PASCAL_PER_PSI = 6894.757
 UNITS = {0: PASCAL_PER_PSI, 1: PASCAL_PER_KILOPASCAL}
 """[Pa] by the number of the command UNITS; a board starts with 0."""
+NAMES = {PASCAL_PER_PSI: "psi", PASCAL_PER_KILOPASCAL: "kPa"}
 LARGEST_GAUGE = 500.0
 """[kPa] More is a damaged line."""
 RAMP_TIME = 0.05
 """[s] in which the board moves from one setpoint to the next: one tick."""
 
-_REPORT = re.compile(r"\d{1,10}\t1(?:\t-?\d{1,4}(?:\.\d{1,6})?)+")
+MOST_WRONG_ECHOES = 3
+"""In a row: a line on its way may be damaged, in either direction."""
+ECHO_TOLERANCE = 0.02
+"""[kPa] The board repeats two decimals of what it has converted to psi and back."""
+REMEMBERED_COMMANDS = 32
+"""An echo may be of any of these: lines wait on their way."""
+
+_NUMBERS = r"(?:\t-?(?:\d{1,4}(?:\.\d{1,6})?|nan|inf))+"
+"""Firmware prints nan or inf for a sensor that is broken: the driver judges that."""
+_REPORT = re.compile(r"\d{1,10}\t[012]" + _NUMBERS)
 _ECHO = re.compile(r"(?:NEW )?(?:SET|UNITS|MODE|TIME|ECHO|ON|OFF)\b")
-_UNITS_ECHO = re.compile(r"NEW UNITS:?\s*1(?:\.0*)?\s*")
+_UNITS_ECHO = re.compile(r"(?:NEW )?UNITS:?(?:\s+(?:1(?:\.0*)?|kPa)){1,2}\s*", re.IGNORECASE)
+_SET_ECHO = re.compile(r"NEW SET:?\s*\d{1,4}(?:\.\d{1,6})?(" + _NUMBERS + ")")
 _UNITS_UNKNOWN = "the board has not confirmed that it works in kPa"
 _COMMAND = re.compile(r"[A-Z]{2,12}(?:;-?\d{1,6}(?:\.\d{1,6})?)*")
 
@@ -61,7 +76,7 @@ class CtrlpHost(LineHost):
     weaknesses = (
         "no watchdog: if this computer dies, the board keeps the last pressures",
         "no checksum: a damaged number can pass for a pressure",
-        "the supply pressure is not reported",
+        "the supply pressure is not reported by boards without a sensor for it",
     )
     echoes = True
 
@@ -69,6 +84,8 @@ class CtrlpHost(LineHost):
         super().__init__(chamber_count)
         self.unsettled = _UNITS_UNKNOWN
         self._times: deque[int] = deque(maxlen=4)
+        self._commanded: deque[list[float]] = deque(maxlen=REMEMBERED_COMMANDS)
+        self._wrong_echoes = 0
 
     def doubt(self) -> None:
         """Have the units confirmed again before the next setpoint."""
@@ -78,6 +95,8 @@ class CtrlpHost(LineHost):
         """Forget a half-received line and everything that the board has confirmed."""
         super().reset()
         self._times.clear()
+        self._commanded.clear()
+        self._wrong_echoes = 0
         self.doubt()
 
     def start(self) -> bytes:
@@ -102,11 +121,13 @@ class CtrlpHost(LineHost):
             if not size <= LARGEST_GAUGE:
                 raise ValueError(f"a difference of {difference} Pa does not fit a ctrlp command")
             values += [size, 0.0] if difference >= 0.0 else [0.0, size]
+        self._commanded.append(values)
         numbers = ";".join(f"{value:.3f}" for value in values)
         return f"SET;{RAMP_TIME:.3f};{numbers}\n".encode(), None
 
     def vent(self, atmosphere: float) -> tuple[bytes, int | None]:  # noqa: ARG002
         """Zero gauge pressure on every channel, without a ramp."""
+        self._commanded.append([0.0] * self.chamber_count)
         return ("SET;0.000" + ";0.000" * self.chamber_count + "\n").encode(), None
 
     def decode(self, data: bytes) -> list[Event]:
@@ -135,24 +156,55 @@ class CtrlpHost(LineHost):
             # Words are free text; digits and tabs are the rest of a damaged report.
             words = any(character.isalpha() for character in line) and "\t" not in line
             return self._take_text(line) if words else None
-        values = [float(part) for part in line.split("\t")[2:]]
-        if len(values) != self.chamber_count or max(map(abs, values)) > LARGEST_GAUGE:
+        time, kind, *parts = line.split("\t")
+        values = [float(part) for part in parts]
+        expected = 1 if kind == "2" else self.chamber_count
+        if len(values) != expected or any(abs(value) > LARGEST_GAUGE for value in values):
             return None
-        self._times.append(int(line.split("\t", 1)[0]))
-        return Telemetry(
-            chamber_pressure=tuple(
-                self.assumed_atmosphere + value * PASCAL_PER_KILOPASCAL for value in values
-            )
+        if kind == "0":
+            return Telemetry()  # sound, and nothing that was measured
+        pressure = tuple(
+            self.assumed_atmosphere + value * PASCAL_PER_KILOPASCAL for value in values
         )
+        if kind == "2":
+            return Telemetry(supply_pressure=pressure[0])
+        self._times.append(int(time))
+        return Telemetry(chamber_pressure=pressure)
 
     def _parse_echo(self, text: str) -> Event:
         if text.startswith("NEW SET"):
-            return Echo()
+            return self._take_set_echo(text)
         if text.startswith("UNREC"):
             return BoardReport("a command was not understood", fatal=False)
         if _UNITS_ECHO.fullmatch(text):
             self.unsettled = ""
+        elif "UNITS" in text:
+            self.unsettled = f"{_UNITS_UNKNOWN}: it answers '{text}'"
         return BoardText(text) if _ECHO.match(text) else self._take_text(text)
+
+    def _take_set_echo(self, text: str) -> Event:
+        """Compare what the board repeats with what it was sent, where it tells all numbers."""
+        found = _SET_ECHO.fullmatch(text)
+        values = [float(part) for part in found[1].split("\t")[1:]] if found else []
+        if len(values) != self.chamber_count or self.unsettled or self._was_commanded(values):
+            self._wrong_echoes = 0
+            return Echo()
+        self._wrong_echoes += 1
+        if self._wrong_echoes != MOST_WRONG_ECHOES:
+            return Echo()
+        told = ", ".join(f"{value:.2f}" for value in values)
+        sent = ", ".join(f"{value:.2f}" for value in self._commanded[-1])
+        return BoardReport(
+            f"other pressures than it was sent: {told} kPa, commanded {sent} kPa; see its limits "
+            "(MAXP, MINP) and its firmware",
+            fatal=True,
+        )
+
+    def _was_commanded(self, values: list[float]) -> bool:
+        return any(
+            all(abs(a - b) <= ECHO_TOLERANCE for a, b in zip(values, sent, strict=True))
+            for sent in reversed(self._commanded)
+        )
 
     def _take_text(self, text: str) -> Event:
         """Words that are no echo come from a board that starts; tabs are left by damaged lines."""
@@ -174,10 +226,12 @@ class CtrlpBoard(BoardProtocol):
         self._reports = False
         self._echoes = True
         self._unit = PASCAL_PER_PSI
+        self._setpoint = (0.0,) * chamber_count
 
     def boot(self, atmosphere: float) -> bytes:  # noqa: ARG002 - it measures gauge pressure
         """Reports are off until asked for, and pressures are in psi."""
         self._unit = PASCAL_PER_PSI
+        self._setpoint = (0.0,) * self.chamber_count
         self._reports = False
         self._echoes = True
         return b"_pressure controller\n"
@@ -207,25 +261,34 @@ class CtrlpBoard(BoardProtocol):
                 return BoardCommand("setting", place, text=line)
             if word == "SET" and len(numbers) == self.chamber_count + 1:
                 pressure = tuple(value * self._unit for value in numbers[1:])
+                self._setpoint = pressure
                 return BoardCommand("setpoint", place, pressure=pressure, text=line)
         self._malformed += 1
         return BoardCommand("unknown", place, text=line)
 
     def telemetry(self, reading: BoardReading) -> bytes:
-        """One report line, if reports are on."""
+        """The lines of one report, if reports are on: setpoints and measured pressures."""
         if not self._reports:
             return b""
-        values = "\t".join(
-            f"{(p - reading.atmosphere) / self._unit:.3f}" for p in reading.chamber_pressure
-        )
-        return f"{round(reading.time * 1000.0)}\t1\t{values}\n".encode()
+        time = round(reading.time * 1000.0)
+        gauge = [p - reading.atmosphere for p in reading.chamber_pressure]
+        return (
+            f"{time}\t0\t{self._in_units(self._setpoint)}\r\n{time}\t1\t{self._in_units(gauge)}\r\n"
+        ).encode()
+
+    def _in_units(self, pressure: Sequence[float]) -> str:
+        return "\t".join(f"{value / self._unit:.2f}" for value in pressure)
 
     def reply(self, command: BoardCommand, reading: BoardReading) -> bytes:  # noqa: ARG002
         """The echo."""
         if not self._echoes:
             return b""
         if command.kind == "unknown":
-            return b"_UNREC: Unrecognized Command\n"
+            return b"_UNREC: Unrecognized Command\r\n"
         new = "NEW " if command.kind in ("setpoint", "setting") else ""
         word, _, rest = command.text.partition(";")
-        return f"_{new}{word}: {rest}\n".replace(";", "\t").encode()
+        if command.pressure is not None:
+            rest = f"{float(rest.partition(';')[0]):.2f}\t{self._in_units(command.pressure)}"
+        elif word == "UNITS":
+            rest = f"{NAMES[self._unit]}\t{NAMES[self._unit]}"
+        return f"_{new}{word}: {rest}\r\n".replace(";", "\t").encode()

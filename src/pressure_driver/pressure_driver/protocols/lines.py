@@ -10,6 +10,9 @@ from pressure_driver.protocols.pieces import StreamCutter
 LONGEST_LINE = 512
 """[bytes] A longer line is garbage: its bytes are dropped up to the next line end."""
 
+LONGEST_SHOWN = 80
+"""[characters] of a damaged line that is kept to be shown."""
+
 
 class LineSplitter:
     """Collects bytes and returns complete lines with the place of their first byte.
@@ -59,6 +62,7 @@ class LineHost(HostProtocol):
             event = self._parse(line)
             if event is None:
                 self._malformed += 1
+                self.last_damaged = line[:LONGEST_SHOWN]
             else:
                 events.append(event)
         self.rejected = self._malformed + self._lines.damaged

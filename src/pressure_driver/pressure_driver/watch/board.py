@@ -63,9 +63,13 @@ class BoardWatch:
             now: [s] steady clock.
         """
         self._forget_identity(now)
-        self._asked_at = now - IDENTITY_RETRY
+        self.greet_now(now)
         self._starting = True
         self._at_start = np.nan_to_num(last_reading, nan=-np.inf)
+
+    def greet_now(self, now: float) -> None:
+        """Have what the board does not confirm asked at the next tick (steady clock [s])."""
+        self._asked_at = now - IDENTITY_RETRY
 
     def says_words(self) -> None:
         """The board sends the words of its start."""

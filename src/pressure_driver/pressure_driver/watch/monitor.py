@@ -65,6 +65,7 @@ class TelemetryMonitor:
         self._bad_readings: deque[float] = deque(maxlen=MOST_BAD_READINGS)
         self._bad_chamber = 0
         self._line_quality: deque[tuple[float, int, int]] = deque()
+        self._sound = self._damaged = 0
 
     @property
     def rest_pressure(self) -> NDArray[np.float64]:
@@ -74,7 +75,7 @@ class TelemetryMonitor:
     @property
     def atmosphere(self) -> float:
         """[Pa] mean of the rest pressures; NaN until measured."""
-        return float(np.mean(self.rest_pressure))
+        return self._rest.mean
 
     @property
     def gauge(self) -> NDArray[np.float64]:
@@ -157,8 +158,15 @@ class TelemetryMonitor:
     def note_quality(self, sound: int, damaged: int, now: float) -> None:
         """Count lines or frames that came: with readings, and damaged ones."""
         self._line_quality.append((now, sound, damaged))
-        while now - self._line_quality[0][0] > READING_WINDOW:
-            self._line_quality.popleft()
+        self._sound += sound
+        self._damaged += damaged
+        self._forget_old_lines(now)
+
+    def _forget_old_lines(self, now: float) -> None:
+        while self._line_quality and now - self._line_quality[0][0] > READING_WINDOW:
+            _, sound, damaged = self._line_quality.popleft()
+            self._sound -= sound
+            self._damaged -= damaged
 
     def command(self, differential: Sequence[float], now: float) -> None:
         """Tell what has just been commanded, for the following check.
@@ -182,6 +190,7 @@ class TelemetryMonitor:
         self._below_since = None
         self._bad_readings.clear()
         self._line_quality.clear()
+        self._sound = self._damaged = 0
         self._rest.forget_readings()
         self.chamber_pressure = np.full(self.chamber_count, np.nan)
         self.valve_opening = np.full(self.chamber_count, np.nan)
@@ -191,7 +200,15 @@ class TelemetryMonitor:
         """Say whether the board has gone silent."""
         age = self.telemetry_age(now)
         if self._last_telemetry is None:
-            return ["no telemetry from the board yet"]
+            self._forget_old_lines(now)
+            if self._damaged < MOST_DAMAGED:
+                return ["no telemetry from the board yet"]
+            return [
+                f"no telemetry from the board yet: {self._damaged} lines or frames of the last "
+                f"{READING_WINDOW:g} s are not of this language and number of chambers (see "
+                "'last_damaged_line' in the diagnostics); look at 'protocol', 'baud_rate' and "
+                "'segment_count'"
+            ]
         if age > self.limits.telemetry_timeout:
             return [f"no telemetry: the last came {age:.1f} s ago"]
         return []
@@ -251,9 +268,8 @@ class TelemetryMonitor:
                 f"{READING_WINDOW:g} s were no number or outside {PLAUSIBLE_READING[0]:.0f} to "
                 f"{PLAUSIBLE_READING[1]:.0f} Pa"
             )
-        recent = [entry for entry in self._line_quality if now - entry[0] <= READING_WINDOW]
-        damaged = sum(entry[2] for entry in recent)
-        total = damaged + sum(entry[1] for entry in recent)
+        self._forget_old_lines(now)
+        damaged, total = self._damaged, self._damaged + self._sound
         if damaged >= MOST_DAMAGED and damaged >= DAMAGED_SHARE * total:
             found.append(
                 f"damaged telemetry: {damaged} of {total} lines or frames in the last "

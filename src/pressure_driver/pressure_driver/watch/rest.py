@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,6 +34,8 @@ class RestPressures:
     def __init__(self, chamber_count: int, limits: MonitorLimits, atmosphere: float = 0.0) -> None:
         self.pressure = np.full(chamber_count, atmosphere or np.nan)
         """(2M,) [Pa] absolute, what each sensor reads when vented; NaN until measured."""
+        self.mean = float(np.mean(self.pressure))
+        """[Pa] of them, which every tick asks for; NaN until they are all known."""
         self._limits = limits
         self._given = bool(atmosphere)
         self._window: list[tuple[float, NDArray[np.float64]]] = []
@@ -41,7 +45,7 @@ class RestPressures:
     @property
     def known(self) -> bool:
         """Whether every chamber's rest pressure has been measured or given."""
-        return bool(np.all(np.isfinite(self.pressure)))
+        return math.isfinite(self.mean)
 
     @property
     def problem(self) -> str:
@@ -76,6 +80,7 @@ class RestPressures:
             self._problem = NOT_STEADY
             return
         self.pressure = readings.mean(axis=0)
+        self.mean = float(np.mean(self.pressure))
         self._lowest = np.minimum(self._lowest, self.pressure)
 
     def _unfit(self, readings: NDArray[np.float64]) -> str:

@@ -119,8 +119,8 @@ def _still_swinging(
 ) -> NDArray[np.bool_]:
     """Return the rows (K,) in which the limb swings from before the log, at most a fifth of all.
 
-    What the first second of bend moves beyond what the pressures move in it is taken for a swing
-    that decays as the prior says.
+    In the first second, motion beyond what the pressures explain is taken for a swing, which then
+    decays with the prior's damping.
     """
     elapsed = grid.time - grid.time[0]
     first = elapsed < 1.0

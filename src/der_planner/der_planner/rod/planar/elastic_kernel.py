@@ -122,7 +122,58 @@ def moments(v: Array, rate: float, space: PlanarSpace, rod: PlanarRod) -> None:
 
 
 @inlined_kernel
-def assemble(  # noqa: PLR0915 - scalars, so that nothing is stored between the edges
+def edge_derivatives(
+    j: int, u: Array, convex: bool, space: PlanarSpace, rod: PlanarRod
+) -> tuple[float, float, float, float, float]:
+    """Return gradient (gx, gy) and Hessian (hxx, hxy, hyy) of the forces by the edge's vector e.
+
+    An edge's energy depends on its length and, through the turning of its two nodes, on its
+    direction ψ, with ∇ψ = n̂/|e|: ∇E = T t + (M_j − M_{j+1} − f |e|) n̂/|e| with the tension
+    T = EA (|e|/ē − 1), the nodes' moments M, and f = ∓Λu of the couple at a segment's first or
+    last edge.
+    """
+    first, last, gain = rod.first, rod.last, rod.gain
+    edge, torque = space.edge, space.torque
+    tx, ty, il = edge[j, 0], edge[j, 1], edge[j, 2]
+    nx, ny = -ty * il, tx * il  # ∇ of the edge's direction angle
+    tension = rod.axial[j] * (1.0 / (il * rod.rest[j]) - 1.0)
+    bending = torque[j, 0] - torque[j + 1, 0]
+    curving = torque[j, 1] + torque[j + 1, 1]
+    follower = 0.0
+    for m in range(gain.shape[0]):
+        if j == first[m]:
+            follower -= gain[m] * u[m]
+        elif j == last[m]:
+            follower += gain[m] * u[m]
+    along = rod.axial[j] / rod.rest[j]
+    push = bending - follower / il
+    # t tᵀ, n̂ n̂ᵀ (in nx, ny scaled by 1/|e|), t n̂ᵀ + n̂ tᵀ
+    side = tension / il + curving
+    cross = follower - bending * il
+    if convex:
+        side = max(tension, 0.0) / il + curving
+        cross = 0.0
+    return (
+        tension * tx + push * nx,
+        tension * ty + push * ny,
+        along * tx * tx + side * nx * nx + 2.0 * cross * tx * nx,
+        along * tx * ty + side * nx * ny + cross * (tx * ny + ty * nx),
+        along * ty * ty + side * ny * ny + 2.0 * cross * ty * ny,
+    )
+
+
+@inlined_kernel
+def coupling(j: int, space: PlanarSpace) -> tuple[float, float, float, float]:
+    """Return xx, xy, yx, yy of the Hessian by edges j (rows) and j+1, which turn one node."""
+    edge = space.edge
+    tangent = -space.torque[j + 1, 1]
+    nx, ny = -edge[j, 1] * edge[j, 2], edge[j, 0] * edge[j, 2]
+    mx, my = -edge[j + 1, 1] * edge[j + 1, 2], edge[j + 1, 0] * edge[j + 1, 2]
+    return tangent * nx * mx, tangent * nx * my, tangent * ny * mx, tangent * ny * my
+
+
+@inlined_kernel
+def assemble(
     x: Array,
     v: Array,
     rate: float,
@@ -134,64 +185,24 @@ def assemble(  # noqa: PLR0915 - scalars, so that nothing is stored between the 
 ) -> None:
     """Elastic, viscous and actuating terms of the residual and its symmetric derivative.
 
-    g (2n,) becomes ∇E + viscous force − B(q)Λu; space.s its derivative by x with v = rate·(x −
-    x_n),
-    of which the unsymmetric part is left out or symmetrised (`unsymmetric` adds what is missing).
-    With `convex` the negative geometric terms are left out too: a safer direction far from the
-    solution.
-
-    An edge's energy depends on its length and, through the turning of its two nodes, on its
-    direction
-    ψ, with ∇ψ = n̂/|e|: ∇E = T t + (M_j − M_{j+1} − f |e|) n̂/|e| with the tension T = EA (|e|/ē
-    − 1), the nodes' moments M, and f = ∓Λu of the couple at a segment's first or last edge.
+    g (2n,) becomes ∇E + viscous force − B(q)Λu; space.s its derivative by x with
+    v = rate·(x − x_n), of which the unsymmetric part is left out or symmetrised (`unsymmetric`
+    adds what is missing). With `convex` the negative geometric terms are left out too: a safer
+    direction far from the solution.
     """
-    rest, axial = rod.rest, rod.axial
-    first, last, gain = rod.first, rod.last, rod.gain
-    s, edge, torque = space.s, space.edge, space.torque
+    s = space.s
     n = space.turn.shape[0]
-    edges_and_turns(x, edge, space.turn)
+    edges_and_turns(x, space.edge, space.turn)
     moments(v, rate, space, rod)
     for k in range(2 * n):
         g[k] = 0.0
-    # Edge by edge: gradient (gx, gy) and Hessian (hxx, hxy, hyy) by e; then the coupling of two
-    # edges.
     left_xx = left_xy = left_yx = left_yy = 0.0  # coupling of edges j-1 and j, rows of j-1
     before_xx = before_xy = before_yy = 0.0  # Hessian of edge j-1
     for j in range(n - 1):
-        tx, ty, il = edge[j, 0], edge[j, 1], edge[j, 2]
-        nx, ny = -ty * il, tx * il  # ∇ of the edge's direction angle
-        tension = axial[j] * (1.0 / (il * rest[j]) - 1.0)
-        bending = torque[j, 0] - torque[j + 1, 0]
-        curving = torque[j, 1] + torque[j + 1, 1]
-        follower = 0.0
-        for m in range(gain.shape[0]):
-            if j == first[m]:
-                follower -= gain[m] * u[m]
-            elif j == last[m]:
-                follower += gain[m] * u[m]
-        along = axial[j] / rest[j]
-        push = bending - follower / il
-        gx = tension * tx + push * nx
-        gy = tension * ty + push * ny
-        # t tᵀ, n̂ n̂ᵀ (in nx, ny scaled by 1/|e|), t n̂ᵀ + n̂ tᵀ
-        side = tension / il + curving
-        cross = follower - bending * il
-        if convex:
-            side = max(tension, 0.0) / il + curving
-            cross = 0.0
-        hxx = along * tx * tx + side * nx * nx + 2.0 * cross * tx * nx
-        hxy = along * tx * ty + side * nx * ny + cross * (tx * ny + ty * nx)
-        hyy = along * ty * ty + side * ny * ny + 2.0 * cross * ty * ny
+        gx, gy, hxx, hxy, hyy = edge_derivatives(j, u, convex, space, rod)
+        right_xx = right_xy = right_yx = right_yy = 0.0
         if j < n - 2:
-            next_il = edge[j + 1, 2]
-            mx, my = -edge[j + 1, 1] * next_il, edge[j + 1, 0] * next_il
-            tangent = -torque[j + 1, 1]
-            right_xx = tangent * nx * mx
-            right_xy = tangent * nx * my
-            right_yx = tangent * ny * mx
-            right_yy = tangent * ny * my
-        else:
-            right_xx = right_xy = right_yx = right_yy = 0.0
+            right_xx, right_xy, right_yx, right_yy = coupling(j, space)
         k = 2 * j
         g[k] -= gx
         g[k + 1] -= gy
@@ -214,9 +225,8 @@ def assemble(  # noqa: PLR0915 - scalars, so that nothing is stored between the 
         before_xx, before_xy, before_yy = hxx, hxy, hyy
         left_xx, left_xy, left_yx, left_yy = right_xx, right_xy, right_yx, right_yy
     k = 2 * n - 2
-    for column in range(6):
-        s[k, column] = 0.0
-        s[k + 1, column] = 0.0
+    s[k, :] = 0.0
+    s[k + 1, :] = 0.0
     s[k, 0] = before_xx
     s[k, 1] = before_xy
     s[k + 1, 0] = before_yy
@@ -252,10 +262,15 @@ def unsymmetric(
     Missing in `assemble` are −(Λu/|e|) n̂ tᵀ of a couple that keeps its force while its edge
     stretches, and c κ'² ∇θ (∇²θ v)ᵀ of the viscous moment, c = EI τ/l.
     """
-    viscous, first, last, gain = rod.viscous, rod.first, rod.last, rod.gain
-    a, drag, edge, turn, parts = space.a, space.drag, space.edge, space.turn, space.parts
-    n = turn.shape[0]
-    drag[:] = 0.0
+    add_couples(u, space, rod)
+    add_viscous(v, rate, space, rod)
+
+
+@inlined_kernel
+def add_couples(u: Array, space: PlanarSpace, rod: PlanarRod) -> None:
+    """Add −(Λu/|e|) n̂ tᵀ of each segment's two couples to space.a."""
+    first, last, gain = rod.first, rod.last, rod.gain
+    a, edge = space.a, space.edge
     for m in range(gain.shape[0]):
         for end in range(2):
             j = first[m] if end == 0 else last[m]
@@ -266,8 +281,16 @@ def unsymmetric(
                 for column in range(4):
                     along = (tx if column % 2 == 0 else ty) * (-1.0 if column < 2 else 1.0)
                     a[2 * j + row, 5 + column - row] -= force * normal * along
-    gradient, change = parts[0], parts[1]
-    for i in range(1, n - 1):
+
+
+@inlined_kernel
+def add_viscous(v: Array, rate: float, space: PlanarSpace, rod: PlanarRod) -> None:
+    """Add c κ'² ∇θ (∇²θ v)ᵀ to space.a; fill space.drag with c κ'² ∇θ ∇θᵀ times rate."""
+    viscous = rod.viscous
+    a, drag, edge, turn = space.a, space.drag, space.edge, space.turn
+    gradient, change = space.parts[0], space.parts[1]
+    drag[:] = 0.0
+    for i in range(1, turn.shape[0] - 1):
         if viscous[i] == 0.0:
             continue
         slope = 1.0 + 0.25 * turn[i] * turn[i]

@@ -66,11 +66,10 @@ def assemble(
             for c in range(8):
                 local[r, c] = g1 * gradient[0, c] + g2 * gradient[1, c] + g3 * gradient[2, c]
         add_curvature_hessian(i, c1, c2, c3, frame, strain, vectors, local)
+        for r in range(8):
+            side = i - 1 + r // 4
+            own[side, r % 4, 4] += c1 * gradient[0, r] + c2 * gradient[1, r] + c3 * gradient[2, r]
         for r in range(4):
-            own[i - 1, r, 4] += c1 * gradient[0, r] + c2 * gradient[1, r] + c3 * gradient[2, r]
-            own[i, r, 4] += (
-                c1 * gradient[0, 4 + r] + c2 * gradient[1, 4 + r] + c3 * gradient[2, 4 + r]
-            )
             for c in range(r + 1):
                 own[i - 1, r, c] += local[r, c]
                 own[i, r, c] += local[4 + r, 4 + c]

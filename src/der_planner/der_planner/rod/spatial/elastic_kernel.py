@@ -190,7 +190,7 @@ def node_strains(
 
 
 @kernel
-def add_curvature_hessian(  # noqa: PLR0912 - one loop a block
+def add_curvature_hessian(
     i: int,
     c1: float,
     c2: float,
@@ -204,28 +204,11 @@ def add_curvature_hessian(  # noqa: PLR0912 - one loop a block
 
     With a = c1 m2 − c2 m1 on each edge, c1 κ1 + c2 κ2 = ½ κb·(a_e + a_f): one formula does both.
     """
-    t, a, b, p = vectors[0:2], vectors[2:4], vectors[4:6], vectors[6:8]
-    q, s = vectors[8], vectors[9]
-    chi = strain[3]
-    over = 1.0 / chi
-    value = 0.0
-    kb = strain[4:7]
-    for k in range(3):
-        for side in range(2):
-            j = i - 1 + side
-            t[side, k] = frame[j, k]
-            a[side, k] = c1 * frame[j, 7 + k] - c2 * frame[j, 4 + k]
-            b[side, k] = -c1 * frame[j, 4 + k] - c2 * frame[j, 7 + k]  # ∂a/∂φ
-        q[k] = over * (t[0, k] + t[1, k])
-        s[k] = over * (a[0, k] + a[1, k])
-        value += 0.5 * kb[k] * (a[0, k] + a[1, k])
+    value = curvature_vectors(i, c1, c2, frame, strain, vectors)
+    over = 1.0 / strain[3]
     inverse = (frame[i - 1, 3], frame[i, 3])
-    for side in range(2):  # p is t_f × ã and −t_e × ã
-        other = 1 - side
-        sign = 1.0 if side == 0 else -1.0
-        p[side, 0] = sign * (t[other, 1] * s[2] - t[other, 2] * s[1])
-        p[side, 1] = sign * (t[other, 2] * s[0] - t[other, 0] * s[2])
-        p[side, 2] = sign * (t[other, 0] * s[1] - t[other, 1] * s[0])
+    t, a, p = vectors[0:2], vectors[2:4], vectors[6:8]
+    q, s, kb = vectors[8], vectors[9], strain[4:7]
     for side in range(2):
         square = inverse[side] * inverse[side]
         at = 4 * side
@@ -259,6 +242,44 @@ def add_curvature_hessian(  # noqa: PLR0912 - one loop a block
     h[5, 2] += both * wx
     h[6, 0] += both * wy
     h[6, 1] -= both * wx
+    add_angle_rows(inverse, strain, vectors, h)
+
+
+@kernel
+def curvature_vectors(
+    i: int, c1: float, c2: float, frame: Array, strain: Array, vectors: Array
+) -> float:
+    """Fill vectors (10, 3) with t, a, ∂a/∂φ and p of both edges, t̃ and ã; return ½ κb·(a_e + a_f).
+
+    t̃ = (t_e + t_f)/χ, ã = (a_e + a_f)/χ; p is t_f × ã for e, and −t_e × ã for f.
+    """
+    t, a, b, p = vectors[0:2], vectors[2:4], vectors[4:6], vectors[6:8]
+    q, s, kb = vectors[8], vectors[9], strain[4:7]
+    over, value = 1.0 / strain[3], 0.0
+    for k in range(3):
+        for side in range(2):
+            j = i - 1 + side
+            t[side, k] = frame[j, k]
+            a[side, k] = c1 * frame[j, 7 + k] - c2 * frame[j, 4 + k]
+            b[side, k] = -c1 * frame[j, 4 + k] - c2 * frame[j, 7 + k]  # ∂a/∂φ
+        q[k] = over * (t[0, k] + t[1, k])
+        s[k] = over * (a[0, k] + a[1, k])
+        value += 0.5 * kb[k] * (a[0, k] + a[1, k])
+    for side in range(2):
+        other = 1 - side
+        sign = 1.0 if side == 0 else -1.0
+        p[side, 0] = sign * (t[other, 1] * s[2] - t[other, 2] * s[1])
+        p[side, 1] = sign * (t[other, 2] * s[0] - t[other, 0] * s[2])
+        p[side, 2] = sign * (t[other, 0] * s[1] - t[other, 1] * s[0])
+    return value
+
+
+@kernel
+def add_angle_rows(inverse: tuple[float, float], strain: Array, vectors: Array, h: Array) -> None:
+    """Add the derivatives by the two angles φ to h (8, 8); ``inverse`` holds 1/|e| and 1/|f|."""
+    t, a, b = vectors[0:2], vectors[2:4], vectors[4:6]
+    q, kb = vectors[8], strain[4:7]
+    over = 1.0 / strain[3]
     for side in range(2):
         row = 3 + 4 * side
         half = 0.0

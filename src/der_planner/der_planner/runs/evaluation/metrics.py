@@ -141,12 +141,11 @@ def evaluate_run(run: RunSeries, settings: Settings | None = None) -> RunResult:
     settings = settings or Settings()
     series = error_series(run, settings)
     first, last = window(run, settings)
-    in_window = (run.tip.time >= first) & (run.tip.time <= last)
-    frames = int(in_window.sum())
-    dropped, longest = _gaps(run.tip.time[in_window], series.time, first, last)
+    images = run.tip.time[(run.tip.time >= first) & (run.tip.time <= last)]
+    dropped, longest = _gaps(images, series.time, first, last)
     split = split_error(run, settings)
     about = run.description
-    valid = len(series.time) / max(1, frames)
+    valid = len(series.time) / max(1, len(images))
     return RunResult(
         motion=about.motion,
         model=about.model,
@@ -161,7 +160,7 @@ def evaluate_run(run: RunSeries, settings: Settings | None = None) -> RunResult:
         bag=about.bag,
         rms_error_m=float(np.sqrt(np.mean(series.distance**2))),
         predicted_error_m=_predicted_error(run),
-        frames=frames,
+        frames=len(images),
         dropped_frames=dropped,
         longest_gap_s=longest,
         window_s=(first, last),

@@ -12,6 +12,7 @@ from pathlib import Path
 from der_planner.runs.evaluation.figures import plot_error, plot_pressures, plot_tip
 from der_planner.runs.evaluation.html import document, figure, table
 from der_planner.runs.evaluation.learning import plot_learning
+from der_planner.runs.evaluation.manners import manners_table, plot_latency
 from der_planner.runs.evaluation.metrics import RunResult
 from der_planner.runs.evaluation.overlay import plot_shapes
 from der_planner.runs.evaluation.results import write_results
@@ -29,6 +30,7 @@ from der_planner.runs.evaluation.table import (
 from der_planner.runs.run import RunSeries
 
 _CAPTIONS = {
+    "latency": "From the instant of a picture to the first command at the board that knows of it.",
     "learning": "Mean tip error over the runs that a plan was learned from, a line a trial.",
     "error": "Tip error over time: mean over trials, shaded one standard deviation.",
     "tip": "Measured tip against the reference: path in the plane, x and y over time.",
@@ -99,6 +101,7 @@ def write_report(
         ("shapes", plot_shapes),
         ("pressures", plot_pressures),
         ("learning", lambda _, place: plot_learning(results, place)),
+        ("latency", lambda _, place: plot_latency(results, place)),
     ):
         ready = [path for path in drawn if path.stem == name]
         if ready:
@@ -126,6 +129,7 @@ def _page(
         f"<h1>{html.escape(title)}</h1>",
         _summary_table(rows),
         "".join(f"<p>{html.escape(format_comparison(entry))}</p>" for entry in comparisons),
+        manners_table(results),
         *(figure(_CAPTIONS[name], path) for name, path in figures.items()),
         "<h2>Every run</h2>",
         _run_table(results),
@@ -229,10 +233,17 @@ def _feedback_table(results: Sequence[RunResult]) -> str:
                     for key in ("correction_rms_pa", "correction_max_pa")
                 ),
                 _number(about.get("estimate_rms_m", math.nan), 1000),
+                *(
+                    _number(about.get(key, math.nan), 1000, 0)
+                    for key in ("latency_median_s", "latency_p99_s")
+                ),
                 html.escape("; ".join(about.get("warnings", ())) or "none"),
             ]
         )
-    header = ["run", "trial", "added, RMS [kPa]", "largest [kPa]", "estimate RMS [mm]", "warnings"]
+    header = [
+        *("run", "trial", "added, RMS [kPa]", "largest [kPa]", "estimate RMS [mm]"),
+        *("picture to board, median [ms]", "p99 [ms]", "warnings"),
+    ]
     return "<h2>What feedback added</h2>" + table(header, lines, names=1)
 
 

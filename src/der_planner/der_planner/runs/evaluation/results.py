@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from der_planner.runs.evaluation.manners import side_by_side
 from der_planner.runs.evaluation.metrics import RunResult
 from der_planner.runs.evaluation.statistics import compare, summarise
 
@@ -15,12 +16,13 @@ FORMAT = 1
 
 
 def results_document(results: Sequence[RunResult]) -> dict[str, Any]:
-    """Return the content of ``results.json``: runs, summary over trials, comparisons."""
+    """Return the content of ``results.json``: runs, summary over trials, comparisons, manners."""
     return {
         "format": FORMAT,
         "runs": [result.to_dict() for result in results],
         "summary": [row.to_dict() for row in summarise(results)],
         "comparisons": [entry.to_dict() for entry in compare(results)],
+        "side_by_side": side_by_side(results),
     }
 
 

@@ -1,0 +1,124 @@
+"""What a recorded run shows of the limb: its smoothed motion and what the model lacks, with doubts.
+
+    python3 scripts/estimate.py out/bags/same_direction_der_1 --limb out/limbs/seed_3.yaml
+
+Any bag of a plan will do, played with feedback or without. The estimator of feedback goes over all
+pictures and pressures of the run, forward and backward. The table (CSV) has a row every 50 ms: bend
+angles and rates, tip, and per segment the effective pressure that the model lacks and the relative
+error of its gain, each with its standard deviation. Exit code 0: written; 2: a file cannot be used.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from der_planner.commands.recorded_plan import check_same, plan_of
+from der_planner.control import LearningError
+from der_planner.control.hindsight import Filmed, Smoothed, smooth
+from der_planner.limb import LimbError
+from der_planner.planning import Plan, PlanningError
+from der_planner.planning.plan_file import read_plan
+from der_planner.runs.evaluation import BagError, EvaluationError, RunSeries, load_run
+from der_planner.runs.outputs import OutputError, check_file
+
+Array = NDArray[np.float64]
+
+
+def main() -> int:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("bag", type=Path, metavar="BAG", help="of a run")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="table (CSV) to write")
+    base = parser.add_mutually_exclusive_group(required=True)
+    base.add_argument("--limb", type=Path, metavar="FILE", help="limb file of the plan in the bag")
+    base.add_argument("--plan", type=Path, metavar="FILE", help="learned plan that was played")
+    parser.add_argument("--namespace", default="", help="of the limb, where a bag holds several")
+    given = parser.parse_args()
+    try:
+        if given.out is not None:
+            check_file(given.out)
+        run = load_run(given.bag, namespace=given.namespace)
+        planned = read_plan(given.plan) if given.plan else plan_of(run, given.limb)
+        smoothed = estimate_run(planned, run)
+    except (OutputError, BagError, EvaluationError, LimbError, PlanningError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except (LearningError, ValueError) as error:
+        print(f"error: {given.bag}: {error}", file=sys.stderr)
+        return 2
+    for line in _said(smoothed, run):
+        print(line)
+    if given.out is not None:
+        write_table(smoothed, given.out)
+        print(given.out)
+    return 0
+
+
+def estimate_run(planned: Plan, run: RunSeries) -> Smoothed:
+    """Return the smoothed motion of a recorded run.
+
+    Args:
+        planned: the run's motion, for the limb that is to be judged.
+        run: recorded.
+
+    Raises:
+        LearningError: the run is of another motion.
+        ValueError: it holds no pictures or no measured pressures.
+    """
+    check_same(planned, run)
+    played = dataclasses.replace(planned, differential_pressure=run.setpoints.value)
+    # A learned plan's tip is not that of the model: what is asked here is what the model lacks.
+    played = dataclasses.replace(played, tip_predicted=planned.tip_predicted)
+    filmed = Filmed(
+        run.measured.time, run.measured.value, run.tip.time, run.bend_angle.value, run.tip.value
+    )
+    return smooth(played, filmed)
+
+
+def _said(smoothed: Smoothed, run: RunSeries) -> list[str]:
+    """Return what there is to say of a run, a line each."""
+    deviation = np.sqrt(np.trace(smoothed.tip_covariance, axis1=1, axis2=2).mean())
+    lines = [
+        f"tip known to {deviation * 1000:.2f} mm (standard deviation)",
+        f"pictures against what was expected of them: {smoothed.innovation:.2f} of the variance",
+    ]
+    size = smoothed.bend_angle.shape[1]
+    for i in range(size):
+        missing, gain = smoothed.missing_pressure[:, i], smoothed.gain_error[:, i]
+        lines.append(
+            f"segment {i + 1}: missing pressure {missing.mean():+.0f} Pa (from {missing.min():+.0f}"
+            f" to {missing.max():+.0f}), gain error {gain.mean():+.1%}"
+        )
+    if run.truth is not None:
+        told = smoothed.consistency(run.truth.time, run.truth.value)
+        lines.append(f"true tip against the estimate: {told:.2f} of the variance")
+    return lines
+
+
+def write_table(smoothed: Smoothed, path: Path) -> None:
+    """Write a smoothed run as CSV, units in the names of the columns."""
+    size = smoothed.bend_angle.shape[1]
+    tip_sigma = np.sqrt(np.diagonal(smoothed.tip_covariance, axis1=1, axis2=2))
+    columns: dict[str, Array] = {"time_s": smoothed.time}
+    columns |= {f"tip_{axis}_m": smoothed.tip[:, i] for i, axis in enumerate("xy")}
+    columns |= {f"tip_{axis}_sigma_m": tip_sigma[:, i] for i, axis in enumerate("xy")}
+    quantities = (
+        ("bend_angle", "_rad", smoothed.bend_angle),
+        ("bend_rate", "_rad_s", smoothed.bend_rate),
+        ("missing_pressure", "_pa", smoothed.missing_pressure),
+        ("gain_error", "", smoothed.gain_error),
+    )
+    for place, (name, unit, values) in enumerate(quantities):
+        for i in range(size):
+            columns[f"{name}_{i + 1}{unit}"] = values[:, i]
+            columns[f"{name}_{i + 1}_sigma{unit}"] = smoothed.deviation[:, place * size + i]
+    table = np.column_stack(list(columns.values()))
+    np.savetxt(path, table, delimiter=",", header=",".join(columns), comments="", fmt="%.9g")

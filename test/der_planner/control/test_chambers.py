@@ -1,0 +1,53 @@
+"""What feedback takes the chambers to hold next."""
+
+import numpy as np
+import pytest
+
+from der_planner.control.chambers import ChamberLog
+from der_planner.control.nominal import STEP, Nominal
+from der_planner.limb import Limb
+from der_planner.planning import Motion, plan
+
+FALLS_BEHIND = 500.0
+"""[Pa/s]"""
+
+
+@pytest.fixture(scope="module")
+def nominal() -> Nominal:
+    """Return the motion of a plan of the default limb."""
+    motion = Motion.named("same_direction", amplitude=0.5, period=8.0, cycles=1)
+    return Nominal(plan(Limb.default(), motion, method="projected"))
+
+
+def ahead(nominal: Nominal, readings: int) -> float:
+    """Return how wrong the pressures 0.3 s ahead are [Pa] after so many readings until 2.6 s.
+
+    The real chambers fall behind their model by another `FALLS_BEHIND` each second.
+    """
+
+    def real(steps: np.ndarray) -> np.ndarray:
+        lag = FALLS_BEHIND * (STEP * (steps + 0.5) - 2.0)
+        return ChamberLog(nominal).model(steps) - lag[:, None]
+
+    log = ChamberLog(nominal)
+    for step in 259 - 5 * np.arange(readings)[::-1]:
+        log.read(STEP * (step + 0.5), real(np.array([step]))[0])
+    coming = np.array([289])
+    return float(np.abs(log.during(coming) - real(coming)).max())
+
+
+def test_chambers_that_fall_behind_are_expected_to_fall_behind_further(nominal):
+    assert ahead(nominal, 1) > 0.2 * FALLS_BEHIND
+    assert ahead(nominal, 7) < 0.4 * ahead(nominal, 1)
+
+
+def test_after_a_long_time_the_model_counts_again(nominal):
+    log = ChamberLog(nominal)
+    steps = np.arange(60)
+    for k in range(8):
+        log.read(0.05 * k, log.model(np.array([5 * k]))[0] + 200.0 + 300.0 * 0.05 * k)
+    surprise = log.surprise(log.newest + np.array([0.0, 0.5, 20.0]))
+    assert surprise[0] == pytest.approx(305.0, abs=2.0)
+    assert np.all(surprise[1] > surprise[0])
+    assert np.abs(surprise[2]).max() < 200.0
+    assert np.isfinite(log.during(steps)).all()

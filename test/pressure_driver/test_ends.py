@@ -1,0 +1,185 @@
+"""Every way in which the driver can end: the limb is vented, or it is said that it may not be."""
+
+import contextlib
+import os
+import pty
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from driver_bench import difference
+
+from der_msgs.msg import PressureSetpoint, PressureState
+
+pytestmark = pytest.mark.graph
+
+
+def test_every_exit_vents(bench):
+    run = bench()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
+        run.pressurise()
+        run.client.watch([run.board])
+        run.driver.signal(number)
+        run.wait(lambda: not run.driver.alive, "the end of the driver")
+        assert run.driver.exit_code == 0
+        run.wait(run.vented, "vented chambers", 15.0)
+        assert np.ptp(difference(run.commands[-1])) == 0.0
+        run.start_driver()
+
+
+@pytest.mark.parametrize("guardian", ["auto", "never"])
+def test_a_killed_driver_leaves_boards_without_a_watchdog_vented_if_it_has_a_guardian(
+    bench, guardian
+):
+    run = bench(guardian=guardian)
+    run.pressurise()
+    run.client.watch([run.board])
+    run.driver.signal(signal.SIGKILL)
+    run.wait(lambda: not run.driver.alive, "the end of the driver")
+    if guardian == "never":
+        run.client.spin(1.0)
+        assert not run.vented()
+        run.start_driver(ready=False)
+    run.wait(run.vented, "vented chambers", 30.0)
+
+
+def test_a_stopped_driver_is_ended_and_the_board_vented(bench):
+    run = bench()
+    run.pressurise()
+    run.client.watch([run.board])
+    run.driver.signal(signal.SIGSTOP)
+    run.wait(lambda: not run.driver.alive, "the end of the driver")
+    assert run.driver.exit_code == -signal.SIGKILL
+    run.wait(run.vented, "vented chambers", 15.0)
+
+
+def test_an_end_without_the_board_says_so(bench):
+    run = bench()
+    run.pressurise()
+    run.have("unplug")
+    run.wait_mode(PressureState.FAULT)
+    run.client.watch([run.board])
+    assert run.driver.stop() == 1
+    assert "cannot be reached" in run.driver.last_words()
+    assert "close the air supply" in run.driver.last_words()
+    assert "vented and closed" not in run.driver.log.read_text()
+
+
+def test_a_killed_driver_leaves_native_boards_vented(bench):
+    run = bench("native")
+    run.pressurise()
+    run.client.watch([run.board])
+    run.driver.signal(signal.SIGKILL)
+    run.wait(lambda: not run.driver.alive, "the end of the driver")
+    run.wait(run.vented, "vented chambers", 15.0)
+
+
+CRASHING = """
+import rclpy
+from pressure_driver.node import PressureDriver
+from limb_interfaces.runner import run_node
+
+class Crashing(PressureDriver):
+    def _on_setpoint(self, message, info):
+        if message.plan_id == "crash":
+            raise RuntimeError("a callback failed")
+        super()._on_setpoint(message, info)
+
+raise SystemExit(run_node(Crashing))
+"""
+
+
+def test_an_exception_vents(bench, tmp_path):
+    run = bench()
+    run.driver.stop()
+    run.client.watch([run.board])
+    arguments = ["--ros-args", "-p", f"port:={run.link}"]
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(run.graph.domain_id)}
+    process = subprocess.Popen(
+        [sys.executable, "-c", CRASHING, *arguments], env=environment, stderr=subprocess.PIPE
+    )
+    try:
+        run.states.clear()
+        run.wait(lambda: run.states, "the driver")
+        run.wait(run.publisher.get_subscription_count, "the driver's subscription")
+        run.pressurise()
+        run.publisher.publish(PressureSetpoint(plan_id="crash"))
+        run.wait(lambda: process.poll() is not None, "the end of the driver")
+        assert process.returncode == 1
+        assert b"a callback failed" in process.stderr.read()
+        run.wait(run.vented, "vented chambers", 15.0)
+    finally:
+        process.kill()
+        process.wait()
+
+
+def start_on_terminal(run):
+    """Start the driver in the foreground of a pseudo-terminal of its own, as in a window."""
+    from der_planner.experiment.processes import find_executable
+
+    command = [str(find_executable("pressure_driver", "pressure_driver")), "--ros-args"]
+    for name, value in run.parameters.items():
+        command += ["-p", f"{name}:={value}"]
+    process, terminal = pty.fork()
+    if process == 0:
+        os.environ["ROS_DOMAIN_ID"] = str(run.graph.domain_id)
+        os.execv(command[0], command)
+    return process, terminal
+
+
+def test_a_closed_terminal_vents(bench):
+    """The kernel sends SIGHUP to the driver, and everything that it writes from then on fails."""
+    run = bench(guardian="never")
+    assert run.driver.stop() == 0
+    run.client.watch([run.board])
+    run.states.clear()
+    process, terminal = start_on_terminal(run)
+    try:
+        run.wait(lambda: run.states, "the driver")
+        run.wait(run.publisher.get_subscription_count, "the driver's subscription")
+        run.pressurise()
+        os.close(terminal)
+        run.wait(lambda: os.waitpid(process, os.WNOHANG)[0], "the end of the driver")
+    finally:
+        with contextlib.suppress(OSError):
+            os.kill(process, signal.SIGKILL)
+            os.waitpid(process, 0)
+    run.wait(run.vented, "vented chambers", 15.0)
+    assert np.ptp(difference(run.commands[-1])) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("package", "executable"),
+    [
+        ("pressure_driver", "pressure_driver"),
+        ("pressure_driver", "board_emulator"),
+        ("der_planner", "planner"),
+        ("der_planner", "recorder"),
+        ("apriltag_tracker", "apriltag_tracker"),
+    ],
+)
+def test_a_signal_while_a_node_is_being_loaded_ends_it_without_a_word(graph, package, executable):
+    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
+        node = graph.start(package, executable, name=f"{executable}_{number}")
+        status = f"/proc/{node.pid}/status"
+
+        def caught(bit=1 << number - 1, status=status):
+            with contextlib.suppress(OSError):
+                masks = dict(line.split(":", 1) for line in Path(status).read_text().splitlines())
+                return int(masks["SigCgt"], 16) & bit
+
+        # Python itself catches SIGINT from the start; SIGHUP only once the node's entry runs.
+        deadline = time.monotonic() + 30.0
+        while not caught(1 << signal.SIGHUP - 1):
+            assert time.monotonic() < deadline
+            time.sleep(0.001)
+        node.signal(number)
+        while node.alive:
+            assert time.monotonic() < deadline, "it does not end"
+            time.sleep(0.01)
+        assert node.exit_code == 0, node.last_words()
+        assert "Traceback" not in node.log.read_text()

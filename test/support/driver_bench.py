@@ -1,0 +1,139 @@
+"""A driver and an emulated board as running nodes, for the tests of both."""
+
+import contextlib
+import time
+import uuid
+
+import numpy as np
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+
+from der_msgs.msg import ChamberPressures, PressureSetpoint, PressureState
+from limb_interfaces import qos, topics
+from limb_interfaces.stamps import stamp_from_nanoseconds
+
+PERIOD = 50_000_000
+VENTED = 500.0
+"""[Pa] gauge that counts as vented."""
+QUICK = {
+    "follow_time": 0.6,
+    "follow_tolerance": 1500.0,
+    "hold_time": 0.3,
+    "slowest_fill": 6000.0,
+    "slowest_vent": 1.5,
+}
+"""Bounds tighter than the defaults, so that the tests are short."""
+
+
+class Bench:
+    """A driver and an emulated board in the test's graph, seen through their topics only."""
+
+    def __init__(self, graph, protocol="ezloop", **parameters):
+        self.graph = graph
+        self.client = graph.client
+        self.link = f"/tmp/der_limb_board_test_{uuid.uuid4().hex[:8]}"
+        self.states, self.air, self.commands = [], [], []
+        self.looked_at = 0
+        self.client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES, self.states.append)
+        self.client.subscribe(
+            ChamberPressures, topics.TWIN_CHAMBER_PRESSURES, qos.STATES, self.air.append
+        )
+        self.client.subscribe(
+            ChamberPressures, topics.TWIN_BOARD_COMMANDS, qos.SETPOINTS, self.commands.append
+        )
+        self.publisher = self.client.node.create_publisher(
+            PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS
+        )
+        self.board = graph.start(
+            "pressure_driver", "board_emulator", port_link=self.link, protocol=protocol
+        )
+        self.client.watch([self.board])
+        self.client.wait_ready(["board_emulator"])
+        self.parameters = {"port": self.link, "protocol": protocol, **QUICK, **parameters}
+        self.start_driver()
+
+    def start_driver(self, ready=True):
+        self.driver = self.graph.start("pressure_driver", "pressure_driver", **self.parameters)
+        if ready:
+            self.client.watch([self.board, self.driver])
+            self.client.diagnostics.pop("pressure_driver", None)
+            self.client.wait_ready(["pressure_driver"])
+            self.wait(self.publisher.get_subscription_count, "the driver's subscription")
+            self.wait(lambda: self.air, "the air")
+
+    def wait(self, condition, what, limit=30.0):
+        return self.client.wait_for(condition, limit, what)
+
+    @property
+    def mode(self):
+        return self.states[-1].mode if self.states else -1
+
+    def wait_mode(self, mode, limit=30.0):
+        """Wait for a mode, even if it has been left again before anybody looked."""
+
+        def seen():
+            later = self.states[self.looked_at :]
+            return any(state.mode == mode for state in later)
+
+        self.wait(seen, f"mode {mode}, now {self.mode}", limit)
+        while self.states[self.looked_at].mode != mode:
+            self.looked_at += 1
+
+    def gauge(self):
+        """True gauge pressures from the newest message of the air; the lowest chamber is vented."""
+        pressure = np.array(self.air[-1].pressure)
+        return pressure - self.rest
+
+    def vented(self):
+        return self.gauge().max() < VENTED
+
+    def arm(self):
+        def try_to_arm():
+            with contextlib.suppress(Exception):
+                return self.client.call("pressure_driver/arm", 20.0)
+
+        self.rest = np.array(self.air[-1].pressure)
+        self.wait(try_to_arm, "the driver to arm", 40.0)
+
+    def play(self, count, shape):
+        """Publish setpoints 0.2 s ahead in real time; return stamp -> differential pressures."""
+        start = (time.time_ns() // PERIOD + 8) * PERIOD
+        plan_id = uuid.uuid4().hex  # a plan belongs to one arming
+        wanted = {}
+        for index in range(count):
+            stamp = start + index * PERIOD
+            while time.time_ns() < stamp - 200_000_000:
+                self.client.spin(0.004)
+            message = PressureSetpoint(
+                plan_id=plan_id, index=index, differential_pressure=list(shape(index))
+            )
+            message.header.stamp = stamp_from_nanoseconds(stamp)
+            self.publisher.publish(message)
+            wanted[stamp] = shape(index)
+        return wanted
+
+    def pressurise(self):
+        """Arm and play until a chamber is full; a machine that stalls may need several turns."""
+        self.arm()
+        deadline = time.monotonic() + 40.0
+        while self.gauge().max() < 2000.0:
+            assert time.monotonic() < deadline, "no pressure in any chamber"
+            self.play(8, lambda k: (min(900.0 * (k + 1), 3500.0), -min(500.0 * (k + 1), 2000.0)))
+
+    def have(self, faults):
+        """Tell the emulated board to have these faults and no others."""
+        node = self.client.node
+        service = node.create_client(SetParameters, "board_emulator/set_parameters")
+        self.wait(service.service_is_ready, "the emulator's parameter service")
+        value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=faults)
+        future = service.call_async(
+            SetParameters.Request(parameters=[Parameter(name="faults", value=value)])
+        )
+        self.wait(future.done, "the emulator to take its faults")
+        assert future.result().results[0].successful, future.result().results[0].reason
+        node.destroy_client(service)
+
+
+def difference(command):
+    pressure = np.array(command.pressure)
+    return pressure[0::2] - pressure[1::2]
