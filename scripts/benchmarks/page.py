@@ -28,6 +28,7 @@ window.fetch = (...all) => {
 };
 """
 """Notes the instant of each press, by the browser's own stamp of the event [ms]."""
+NEWEST = "return window.presses ? window.presses.at(-1) : null;"
 COUNTS = "return [page.pictures, page.data.count, performance.now()];"
 
 
@@ -54,12 +55,15 @@ def _hold(rig: Rig, publisher: Any, plan_id: str) -> None:
 
 def _press(rig: Rig, window: Any, by_key: bool) -> float:
     """Press vent once; return the time from the browser's event to the board's first byte [s]."""
-    seen = len(window.execute_script("return window.presses;"))
+    begun = 1000.0 * time.time()
     if by_key:
         window.find_element("tag name", "body").send_keys(" ")
     else:
         window.find_element("id", "vent").click()
-    pressed = window.execute_script("return window.presses;")[seen] / 1000.0
+    newest = rig.wait(
+        lambda: (found := window.execute_script(NEWEST)) and found > begun - 50.0 and found, "the press"
+    )
+    pressed = float(newest) / 1000.0
 
     def vented() -> ChamberPressures | None:
         late = (c for c in rig.commands if nanoseconds(c.header.stamp) * 1e-9 >= pressed)
@@ -72,7 +76,10 @@ def _press(rig: Rig, window: Any, by_key: bool) -> float:
 
 def measure_vent(rig: Rig, window: Any, count: int) -> dict[str, float]:
     """Press vent again and again, by mouse and by space bar in turn."""
-    window.execute_script(LISTEN)
+    # Also in the page that the framework loads anew after a lost connection.
+    window.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": LISTEN})
+    window.refresh()
+    rig.wait(lambda: window.execute_script("return !!page.data"), "live data")
     publisher = rig.client.node.create_publisher(
         PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS
     )
@@ -86,6 +93,7 @@ def measure_vent(rig: Rig, window: Any, count: int) -> dict[str, float]:
         _hold(rig, publisher, f"vent{number}")
         rig.client.spin(float(random.uniform(0.0, 0.1)))  # any place between two ticks
         taken.append(1000.0 * _press(rig, window, by_key=number % 2 == 1))
+        print(f"  {number + 1}: {taken[-1]:.0f} ms", file=sys.stderr, flush=True)
     print("presses [ms]: " + " ".join(f"{value:.0f}" for value in sorted(taken)), flush=True)
     return {
         "vent_presses": float(count),
