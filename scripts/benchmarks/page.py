@@ -61,7 +61,8 @@ def _press(rig: Rig, window: Any, by_key: bool) -> float:
     else:
         window.find_element("id", "vent").click()
     newest = rig.wait(
-        lambda: (found := window.execute_script(NEWEST)) and found > begun - 50.0 and found, "the press"
+        lambda: (found := window.execute_script(NEWEST)) and found > begun - 50.0 and found,
+        "the press",
     )
     pressed = float(newest) / 1000.0
 
