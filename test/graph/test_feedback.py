@@ -70,18 +70,18 @@ class Phase:
         lines = self.rig.planner.log.read_text().splitlines()
         return [line for line in lines if f"plan {self.name}, " in line and "taken back" in line]
 
-    def judged(self, begin: float, end: float) -> Series:
-        """Return what was heard, if pictures came in time between two instants [s]."""
+    def judged(self, begin: float, end: float, late: float = LATE_PICTURES) -> Series:
+        """Return what was heard, if no picture came too late between two instants [s]."""
         series = self.series()
         ages = [message.age for message in series.told(begin, end)]
-        if not ages or max(ages) > LATE_PICTURES:
+        if not ages or max(ages) > late:
             seen = f"{max(ages):.1f} s old" if ages else "missing"
             pytest.skip(f"this machine is too busy to judge: pictures were {seen}")
         return series
 
 
 def lacking(series: Series, begin: float, end: float) -> np.ndarray:
-    """Return the mean missing pressure, gain error included, (M,) [Pa] of the first segment's w."""
+    """Return the mean missing pressure (M,) [Pa] between two instants [s]."""
     told = series.told(begin, end)
     assert told, "no estimates"
     return np.mean([m.missing_pressure for m in told], axis=0)
@@ -96,7 +96,9 @@ def test_the_graph_moves_as_the_lock_step_does(rig):
 
     phase = Phase(rig, "first")
     phase.until(8.0)
-    series = phase.judged(0.5, 8.0)
+    # The lock-step's pictures come after 0.07 s; what comes much later moves the limb otherwise.
+    series = phase.judged(0.5, 8.0, late=0.2)
+    assert not phase.warnings()
     limb = Limb.default().mounted("hanging")
     told = {key: value for key, value in MOTION.items() if key != "motion"}
     planned = plan(limb, Motion.named(MOTION["motion"], **told))
@@ -111,12 +113,15 @@ def test_the_graph_moves_as_the_lock_step_does(rig):
     apart = np.linalg.norm(series.tip[inside] - same, axis=1)
     assert apart.mean() < 1.5e-3
     assert abs(series.error(1.0, 8.0).mean() - steps.error[20:160].mean()) < 1e-3
-    assert not phase.warnings()
 
 
 def test_a_motion_gives_way_to_another_without_a_jump(rig):
+    left = Phase(rig, "left")
+    left.until(3.0)
     before = len(rig.heard.states)
     phase = Phase(rig, "changed", motion="opposite_direction")
+    if phase.start >= left.at(left.plan.time[-1]):
+        pytest.skip("this machine is too busy to judge: the motion was over before the next plan")
     phase.until(2.5)
     series = phase.judged(0.0, 2.5)
     # The corrections go on where they were: full share from the first estimate on.
