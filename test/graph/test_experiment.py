@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from der_planner.limb import gravity_of
+from der_planner.planning.plan_file import read_plan
 from der_planner.runs.evaluation import load_run
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -167,6 +168,22 @@ def test_a_tilted_limb_carries_a_payload_in_every_part_of_the_graph(experiment):
     rest = np.nanmedian(before, axis=0)
     assert rest[1] < -0.05
     assert np.linalg.norm(played.reference.value[0] - rest) < 0.03
+
+
+def test_a_run_on_the_graph_is_learned_from_and_what_was_learned_is_played(experiment):
+    run = experiment("--models", "der", "--learn", "1", "--amplitude", "0.4")
+    assert run.finish() == 0, run.errors
+    first, second = json.loads((run.out / "results.json").read_text())["runs"]
+    assert (first["method"], second["method"]) == ("paper", "learned 1")
+    assert second["valid_fraction"] > 0.9
+    assert second["mean_error_m"] < 0.8 * first["mean_error_m"]
+    assert "run 1: mean error" in run.errors
+    played = load_run(run.out / second["bag"])
+    (kept,) = (run.out / "learned").glob("*_run2.yaml")
+    wanted = read_plan(kept).differential_pressure
+    np.testing.assert_allclose(played.setpoints.value, wanted, atol=1e-3)
+    assert (run.out / "learning.png").stat().st_size > 5000
+    assert run.processes() == {}
 
 
 def test_a_path_is_drawn_on_the_graph_as_it_is_in_the_file(experiment, tmp_path: Path):

@@ -8,6 +8,7 @@ description.
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -252,11 +253,14 @@ class Limb:
         return body
 
     def to_yaml(self, path: str | Path) -> None:
-        """Write a limb file that `from_yaml` reads back as an equal limb."""
+        """Write a limb file that `from_yaml` reads back as an equal limb, whole or not at all."""
         body = self.to_mapping()
         text = yaml.safe_dump(body, sort_keys=False, allow_unicode=True)
         head = "# A limb, in SI units. How to choose each: src/der_planner/doc/limb_parameters.md\n"
-        Path(path).write_text(head + commented(text, sections()), encoding="utf-8")
+        file = Path(path)
+        unfinished = file.with_name(f".{file.name}.part")
+        unfinished.write_text(head + commented(text, sections()), encoding="utf-8")
+        os.replace(unfinished, file)
 
 
 def sections() -> dict[str, dict[str, Parameter]]:

@@ -36,8 +36,23 @@ def test_runs_are_learned_from_and_a_stopped_experiment_goes_on(tmp_path: Path, 
     first = read_plan(tmp_path / "learned" / "same_direction_der_learned_trial1_run2.yaml")
     assert np.array_equal(played["differential_pressure"], first.differential_pressure)
     assert read_plan(kept).method == "learned"
+    near = tmp_path / "near"
+    given = parse(
+        [
+            *("--offline", "--no-calibration", "--period", "4.4", "--cycles", "1"),
+            *("--amplitude", "0.3", "--models", "der", "--no-report", "--out", str(near)),
+            *("--library", str(tmp_path / "learned"), "--learn", "1"),
+        ]
+    )
+    run(given)
+    assert "begins from what was learned in" in capsys.readouterr().err
+    begun, learned = json.loads((near / "results.json").read_text())["runs"]
+    assert begun["mean_error_m"] < 0.8 * errors[0]
+    assert learned["method"] == "learned 1"
 
 
-def test_a_number_of_runs_out_of_range_is_refused(tmp_path: Path):
+def test_what_cannot_be_learned_from_is_refused(tmp_path: Path):
+    with pytest.raises(OptionError, match="is no folder"):
+        options(tmp_path, "--library", str(tmp_path / "none"))
     with pytest.raises(OptionError, match="--learn is -1"):
         options(tmp_path, "--learn", "-1")

@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from der_planner.identification import ColumnMap, calibrate_twin, fit, predict, read_csv
+from der_planner.identification import (
+    ColumnMap,
+    calibrate_twin,
+    check,
+    fit,
+    predict,
+    read_csv,
+    update,
+)
 from der_planner.identification.excitation import PERIOD, Excitation
 from der_planner.identification.offline import record_twin
 from der_planner.limb import Limb
@@ -55,14 +63,28 @@ def test_what_the_twin_knows_is_recovered_within_the_stated_uncertainty():
     assert values.max() < 4.0, distances
 
 
-@pytest.mark.slow
-def test_real_limb_is_fitted(shared_data):
-    folder = shared_data / "real_limb"
-    log = read_csv(folder / "A_calibration.csv", REAL)
+@pytest.fixture(scope="module")
+def real_limb(shared_data):
+    log = read_csv(shared_data / "real_limb" / "A_calibration.csv", REAL)
     # The log is too slow to tell creep and dynamics apart from the rest.
     terms = ("asymmetry", "stiffening", "coupling", "friction")
-    limb, report = fit(Limb.default(), log, terms=terms, longest_gap=10.0)
+    return fit(Limb.default(), log, terms=terms, longest_gap=10.0)
+
+
+@pytest.mark.slow
+def test_real_limb_is_fitted(real_limb):
+    limb, report = real_limb
     assert np.degrees(report.residual).max() < 1.0
     gains = np.degrees(limb.static_gain) * 100
     assert 0.22 < gains[1] < gains[0] < 0.50 or gains[1] == pytest.approx(0.21, abs=0.02)
     assert any("always move together" in warning for warning in report.warnings)
+
+
+@pytest.mark.slow
+def test_real_limb_of_another_day_is_known_after_some_seconds(real_limb, shared_data):
+    limb, _ = real_limb
+    run = read_csv(shared_data / "real_limb" / "C_trajectory.csv", REAL)
+    found, _ = update(limb, run.between(0.0, 20.0))
+    later = run.between(20.0, 30.0)
+    assert np.degrees(check(limb, later).error).max() > 3.0
+    assert np.degrees(check(found, later).error).max() < 3.0

@@ -47,7 +47,8 @@ def run(options: Options) -> None:
             f"trial {trial.number} (seed {trial.seed})"
         )
         if ledger.finished(trial) is None:
-            ledger.record(trial, _play(trial, options, progress))
+            begun = _begin(trial, options, progress) if options.library is not None else None
+            ledger.record(trial, _play(trial, options, progress, begun))
         if options.learn:
             _learn(trial, options, ledger, progress)
     kept = [(run, entry) for trial in trials for run, entry in _runs_of(trial, ledger)]
@@ -89,6 +90,15 @@ def _learn(trial: Trial, options: Options, ledger: Ledger, progress: Progress) -
             break
         run = run.following()
     learning.conclude()
+
+
+def _begin(trial: Trial, options: Options, progress: Progress) -> Path | None:
+    """Return the file of the plan that begins from a near learned one; None: there is none."""
+    from der_planner.experiment.learning import begin_from_library  # noqa: PLC0415
+
+    limb = _limb_file(trial, options, progress)
+    robot = options.loaded(Limb.from_yaml(limb) if limb is not None else Limb.default())
+    return begin_from_library(trial, options, robot, progress)
 
 
 def _check_limb(options: Options) -> Limb:
@@ -138,6 +148,8 @@ def _play(
     limb = _limb_file(trial, options, progress)
     robot = options.loaded(Limb.from_yaml(limb) if limb is not None else Limb.default())
     metadata = _metadata(trial, options, limb, robot)
+    if learned is not None and trial.run == 1:
+        metadata["begun_from"] = str(options.library)
     if options.offline:
         # ROS-free: the other branch is imported only where it is used.
         from der_planner.experiment.offline_run import play_offline  # noqa: PLC0415

@@ -24,6 +24,7 @@ from der_planner.experiment.processes import NodeProcess
 from der_planner.experiment.progress import Progress
 from der_planner.limb import Limb
 from der_planner.planning import paths
+from der_planner.runs.run import LEARNED
 from limb_interfaces import qos, stamps, topics
 
 PLAN_TIMEOUT = 120.0
@@ -350,7 +351,7 @@ class GraphTrial(GraphPlayer):
             # A learned plan's name stands in place of the motion's.
             motion=self._trial.motion if self._learned is None else self._learned.stem,
             model=self._trial.model,
-            method=self._trial.method,
+            method=self._trial.method if self._learned is None else LEARNED,
             amplitude=self._options.amplitude,
             period=self._options.period,
             cycles=self._options.cycles,

@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 
 from der_planner.control import Learner, LearningError
+from der_planner.control.library import carried_over, nearest
 from der_planner.experiment.errors import GraphError
 from der_planner.experiment.options import Options, Trial
 from der_planner.experiment.progress import Progress
 from der_planner.limb import Limb
 from der_planner.planning import Plan, PlanningError, plan
-from der_planner.planning.plan_file import write_plan
+from der_planner.planning.plan_file import read_plan, write_plan
 from der_planner.runs.run import RunSeries
 
 FOLDER = "learned"
@@ -52,6 +53,44 @@ def about(learner: Learner, **more: Any) -> dict[str, Any]:
     }
 
 
+def _fresh(trial: Trial, options: Options, robot: Limb) -> Plan:
+    motion = options.motion(trial.motion)
+    return plan(robot, motion, model=trial.model, method=trial.method)
+
+
+def _file_of_first(trial: Trial, options: Options) -> Path:
+    """Return where the plan of a trial's first run is, if it begins from a library."""
+    return options.out / FOLDER / f"{trial.name}.yaml"
+
+
+def begin_from_library(
+    trial: Trial, options: Options, robot: Limb, progress: Progress
+) -> Path | None:
+    """Write the plan of a first run that begins from a near learned one, and return its file.
+
+    None: no learned plan in the library is near.
+
+    Raises:
+        GraphError: the motion cannot be planned.
+    """
+    if options.library is None:
+        return None
+    try:
+        fresh = _fresh(trial, options, robot)
+        found = nearest(options.library, fresh)
+        if found is None:
+            progress.say(f"  no learned plan in {options.library} is near this motion")
+            return None
+        file, learned = found
+        begun = carried_over(fresh, learned)
+    except PlanningError as error:
+        raise GraphError(f"{trial.name} cannot be planned: {error}") from error
+    path = _file_of_first(trial, options)
+    write_plan(begun, path, {"begun_from": str(file)})
+    progress.say(f"  begins from what was learned in {file}")
+    return path
+
+
 class TrialLearning:
     """The learner of one trial's motion.
 
@@ -67,9 +106,10 @@ class TrialLearning:
 
     def __init__(self, trial: Trial, options: Options, robot: Limb, progress: Progress) -> None:
         self._trial, self._options, self._progress = trial, options, progress
+        begun = _file_of_first(trial, options)
         try:
-            motion = options.motion(trial.motion)
-            self._learner = Learner(plan(robot, motion, model=trial.model, method=trial.method))
+            first = read_plan(begun) if begun.exists() else _fresh(trial, options, robot)
+            self._learner = Learner(first)
         except (PlanningError, LearningError) as error:
             raise GraphError(f"{trial.name} cannot be learned: {error}") from error
 

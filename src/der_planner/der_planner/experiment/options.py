@@ -93,6 +93,7 @@ class Options:
     nearest: bool = False
     page: int | None = None
     learn: int = 0
+    library: Path | None = None
     feedback: bool = False
     mounting: str = ""
     payload: float = 0.0
@@ -182,6 +183,12 @@ def _add_motions(what: argparse._ArgumentGroup) -> None:
         metavar="N",
         help="after each trial, up to N more runs, each of the plan that was learned "
         "from the ones before",
+    )
+    what.add_argument(
+        "--library",
+        type=Path,
+        metavar="FOLDER",
+        help="of learned plans: trials begin from the nearest one, if it is near",
     )
     what.add_argument("--trials", type=int, default=1, help="runs of each motion and model")
     what.add_argument(
@@ -292,6 +299,7 @@ def parse(arguments: Sequence[str]) -> Options:
         record_images=given.record_images,
         report=not given.no_report,
         learn=given.learn,
+        library=_library(given.library),
         path=given.path.resolve() if given.path is not None else None,
         nearest=given.nearest,
         page=given.page,
@@ -367,6 +375,17 @@ def _check_path_and_page(given: argparse.Namespace) -> None:
         raise OptionError(f"--page is {given.page}: choose a port of 1 to 65535")
     if given.page is not None and given.offline:
         raise OptionError("--page shows a running graph: it does not go with --offline")
+
+
+def _library(folder: Path | None) -> Path | None:
+    """Return the folder of learned plans.
+
+    Raises:
+        OptionError: there is none.
+    """
+    if folder is not None and not folder.is_dir():
+        raise OptionError(f"--library {folder} is no folder: name one of learned plans")
+    return folder.resolve() if folder is not None else None
 
 
 def _timestamped() -> Path:

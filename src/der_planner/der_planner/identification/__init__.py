@@ -14,10 +14,12 @@ from der_planner.identification.logs.log import CalibrationLog, LogError
 from der_planner.identification.logs.table import ColumnMap, read_csv
 from der_planner.identification.offline import calibrate_twin, record_twin
 from der_planner.identification.predict import Prediction, predict
-from der_planner.identification.report import FitReport, Unknown
+from der_planner.identification.report import Change, FitReport, Unknown, Update
+from der_planner.identification.update import update
 
 __all__ = [
     "CalibrationLog",
+    "Change",
     "Check",
     "ColumnMap",
     "Excitation",
@@ -25,6 +27,7 @@ __all__ = [
     "LogError",
     "Prediction",
     "Unknown",
+    "Update",
     "calibrate_twin",
     "calibration_run",
     "check",
@@ -34,6 +37,7 @@ __all__ = [
     "read_csv",
     "read_excitation",
     "record_twin",
+    "update",
     "within_limits",
     "write_excitation",
 ]

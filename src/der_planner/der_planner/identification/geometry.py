@@ -25,7 +25,12 @@ BASE_RANGE = (0.0, 3e-2)
 STIFF_PRIOR = 0.01
 """Standard deviation of what is known of connector and base before [m]."""
 TIP_ERROR = 1e-3
-"""Error of an evenly bent limb at single instants [m]: a real one does not bend quite evenly."""
+"""Error of an evenly bent limb at single instants [m], from this bend on: a real one does not bend
+quite evenly …"""
+UNEVEN_BEND = 1.0
+"""… [rad], and the less the straighter it is: the straight limb tells its whole length …"""
+STRAIGHT_ERROR = 1e-4
+"""… as well as the tags do [m]."""
 CORRELATION = 20.0
 """Rows over which that error stays the same (1 s)."""
 NODES = 21
@@ -84,7 +89,9 @@ def fit_geometry(
     start = np.concatenate([prior, [base, connector]])
     low = np.concatenate([0.8 * prior, [BASE_RANGE[0], CONNECTOR_RANGE[0]]])
     high = np.concatenate([1.2 * prior, [BASE_RANGE[1], CONNECTOR_RANGE[1]]])
-    weight = math.sqrt(every / CORRELATION) / TIP_ERROR
+    uneven_share = np.minimum(np.linalg.norm(angles, axis=1) / UNEVEN_BEND, 1.0)
+    error = np.hypot(STRAIGHT_ERROR, TIP_ERROR * uneven_share)[:, None]
+    weight = math.sqrt(every / CORRELATION) / error
     count = len(prior)
     free = count + 2 if several else count + 1
 
@@ -96,7 +103,7 @@ def fit_geometry(
         return with_geometry(limb, x[:count], float(x[-1]) if several else None, float(x[count]))
 
     def residual(x: Array) -> Array:
-        data = weight * difference(candidate(x)).ravel()
+        data = (weight * difference(candidate(x))).ravel()
         return np.concatenate([data, (x - start[:free]) / spread[:free]])
 
     solution = least_squares(

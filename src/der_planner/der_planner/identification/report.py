@@ -1,4 +1,4 @@
-"""Results of a fit: values, uncertainties, residuals, and pairs that the log cannot separate."""
+"""Results of a fit or an update: values, uncertainties, residuals, what a log cannot separate."""
 
 from __future__ import annotations
 
@@ -15,6 +15,9 @@ from der_planner.limb import Limb
 from der_planner.model.sag import weight_of
 
 Array = NDArray[np.float64]
+
+CALIBRATE_AGAIN = math.radians(3.0)
+"""Root mean square error that a limb file should not leave [rad]."""
 
 
 @dataclass(frozen=True)
@@ -243,3 +246,82 @@ def _readable(item: Unknown) -> tuple[float, float, str]:
         "Pa/rad": (0.01 * math.radians(45.0), "hPa at 45 deg"),
     }.get(item.unit, (1.0, item.unit))
     return item.value * factor, item.deviation * factor, unit
+
+
+@dataclass(frozen=True)
+class Change:
+    """One number of a limb file before and after an update.
+
+    Attributes:
+        segment: from 0.
+        name: ``gain`` [rad/Pa], ``rest angle`` [rad] or ``friction`` [N·m].
+        before, after: values.
+        spread: standard deviation before, that of days.
+        deviation: standard deviation after.
+        told: the runs tell it; if not, it keeps its value.
+    """
+
+    segment: int
+    name: str
+    before: float
+    after: float
+    spread: float
+    deviation: float
+    told: bool
+
+    def text(self) -> str:
+        """Return the line for people."""
+        factor, unit = {
+            "gain": (math.degrees(100.0), "°/hPa"),
+            "rest angle": (math.degrees(1.0), "°"),
+            "friction": (1e3, "mN·m"),
+        }[self.name]
+        before, after, spread, deviation = (
+            factor * value for value in (self.before, self.after, self.spread, self.deviation)
+        )
+        line = f"segment {self.segment}, {self.name}: {before:.3g} ± {spread:.2g} {unit}"
+        if not self.told:
+            return f"{line} stays: not told by these runs"
+        line += f" -> {after:.3g} ± {deviation:.2g} {unit}"
+        if self.name == "gain":
+            return f"{line} ({100 * (after / before - 1):+.1f} %)"
+        return f"{line} ({after - before:+.2g} {unit})"
+
+
+@dataclass(frozen=True)
+class Update:
+    """What ordinary runs said of a limb file.
+
+    Attributes:
+        changes: three a segment, in the order gain, rest angle, friction.
+        error_before, error_after: (M,) root mean square open-loop error of the bend angles [rad].
+        duration: of all runs [s].
+        warnings: sentences.
+    """
+
+    changes: tuple[Change, ...]
+    error_before: Array
+    error_after: Array
+    duration: float
+    warnings: tuple[str, ...]
+
+    @property
+    def told(self) -> bool:
+        """Whether the runs told anything."""
+        return any(change.told for change in self.changes)
+
+    @property
+    def enough(self) -> bool:
+        """Whether the updated limb file predicts the runs; if not, the limb must be calibrated."""
+        return bool(np.all(self.error_after < CALIBRATE_AGAIN))
+
+    def text(self) -> str:
+        """Return the result for people."""
+        lines = [change.text() for change in self.changes]
+        pairs = zip(self.error_before, self.error_after, strict=True)
+        lines += [
+            f"segment {index}: open-loop error rms {math.degrees(before):.2f}° -> "
+            f"{math.degrees(after):.2f}°"
+            for index, (before, after) in enumerate(pairs)
+        ]
+        return "\n".join([*lines, *(f"finding: {text}" for text in self.warnings)])

@@ -166,7 +166,7 @@ def learned_plan(folder: str | Path | None, name: str, limb: Limb) -> Plan:
             f"no learned plan '{name}' in {folder}, only: {', '.join(known) or 'none'}"
         )
     plan = read_plan(Path(folder) / f"{name}{SUFFIX}")
-    other = _difference(plan.limb.to_mapping(), limb.for_model(plan.model).to_mapping())
+    other = difference(plan.limb.to_mapping(), limb.for_model(plan.model).to_mapping())
     if other:
         raise PlanningError(
             f"the plan '{name}' was learned on a limb with another {other}: plan the motion by "
@@ -175,13 +175,13 @@ def learned_plan(folder: str | Path | None, name: str, limb: Limb) -> Plan:
     return plan
 
 
-def _difference(one: Any, other: Any, where: str = "") -> str:
+def difference(one: Any, other: Any, where: str = "") -> str:
     """Return the name of the first number of two limbs that differs; empty if they are one."""
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         for key in {**one, **other}:
             if key in ("name", "provenance", "calibrated", "pcc_segments"):
                 continue
-            found = _difference(one.get(key), other.get(key), f"{where}.{key}".strip("."))
+            found = difference(one.get(key), other.get(key), f"{where}.{key}".strip("."))
             if found:
                 return found
         return ""
@@ -189,7 +189,7 @@ def _difference(one: Any, other: Any, where: str = "") -> str:
         if len(one) != len(other):
             return where
         pairs = enumerate(zip(one, other, strict=True))
-        found_each = (_difference(a, b, f"{where}[{n}]") for n, (a, b) in pairs)
+        found_each = (difference(a, b, f"{where}[{n}]") for n, (a, b) in pairs)
         return next((found for found in found_each if found), "")
     if isinstance(one, int | float) and isinstance(other, int | float):
         return "" if abs(one - other) <= _SAME * max(abs(one), abs(other)) else where

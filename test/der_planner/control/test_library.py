@@ -1,0 +1,68 @@
+"""A motion that begins from what a near one has learned."""
+
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from der_planner.control import Learner
+from der_planner.control.library import carried_over, nearest
+from der_planner.limb import Limb
+from der_planner.model.response import simulate
+from der_planner.planning import Motion, plan
+from der_planner.planning.plan_file import write_plan
+
+LIMB = Limb.default()
+OTHER = replace(
+    LIMB,
+    segments=tuple(
+        replace(s, moment_gain=0.9 * s.moment_gain, rest_curvature=0.04 / s.length)
+        for s in LIMB.segments
+    ),
+)
+
+
+def planned(period, amplitude=0.6, motion="same_direction"):
+    given = Motion.named(motion, amplitude=amplitude, period=period, cycles=1)
+    return plan(LIMB, given, method="optimal")
+
+
+def play(planned):
+    return simulate(OTHER, planned.time, commands=planned.differential_pressure).tip[:-1]
+
+
+def mean_error(planned):
+    return np.linalg.norm(play(planned) - planned.tip_reference, axis=1).mean()
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    """A motion of 8 s, once after one run and once after two, beside what is no plan."""
+    folder, following = tmp_path_factory.mktemp("learned"), planned(8.0)
+    learner = Learner(following)
+    for run in (1, 2):
+        learner.add(following.time, play(following))
+        following = learner.next()
+        write_plan(following, folder / f"run_{run}.yaml")
+        os.utime(folder / f"run_{run}.yaml", (run, run))
+    (folder / "notes.yaml").write_text("no: plan\n")
+    return folder
+
+
+@pytest.mark.parametrize(("period", "amplitude"), [(9.0, 0.6), (8.0, 0.5)])
+def test_a_near_motion_begins_with_less_than_half_of_the_error(library, period, amplitude):
+    fresh = planned(period, amplitude)
+    file, learned = nearest(library, fresh)
+    assert file.name == "run_2.yaml"
+    begun = carried_over(fresh, learned)
+    assert begun.method == "learned"
+    assert begun.period == period
+    assert mean_error(begun) < 0.5 * mean_error(fresh)
+    assert np.abs(begun.differential_pressure).max() <= LIMB.pneumatics.pressure_limit
+
+
+def test_what_is_far_or_of_another_limb_is_not_taken(library):
+    assert nearest(library, planned(16.0)) is None
+    assert nearest(library, planned(8.0, motion="opposite_direction")) is None
+    assert nearest(library, replace(planned(8.0), limb=OTHER)) is None

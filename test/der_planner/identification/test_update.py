@@ -1,0 +1,211 @@
+"""A limb file brought up to date from ordinary runs, with what they tell and no more."""
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from chain_calibration import write_csv
+from link_chain import LinkChain
+
+from der_planner.commands import check_limb
+from der_planner.identification import (
+    CalibrationLog,
+    LogError,
+    check,
+    fit,
+    update,
+)
+from der_planner.limb import Limb
+from der_planner.model.response import simulate
+
+LIMB = Limb.default()
+RUBBING = replace(
+    LIMB,
+    segments=tuple(
+        replace(s, friction_moment=300.0 * s.moment_gain, friction_curvature=0.1 / s.length)
+        for s in LIMB.segments
+    ),
+)
+
+
+def another_day(limb, gain=(1.0, 1.0), rest=(0.0, 0.0), friction=(1.0, 1.0)):
+    """Return a limb whose gains, rest angles [rad] and frictions have changed."""
+    segments = zip(limb.segments, gain, rest, friction, strict=True)
+    return replace(
+        limb,
+        segments=tuple(
+            replace(
+                s,
+                moment_gain=s.moment_gain * g,
+                rest_curvature=s.rest_curvature + r / s.length,
+                friction_moment=s.friction_moment * f,
+            )
+            for s, g, r, f in segments
+        ),
+    )
+
+
+def motion(duration=20.0, moves=(1.0, 1.0)):
+    """Return instants [s] and pressures (K, 2) [Pa] of slow waves from rest."""
+    time = np.arange(0.0, duration, 0.05)
+    waves = [8000.0 * np.sin(time / 1.9), 7000.0 * np.sin(time / 1.3)]
+    return time, np.stack(waves, axis=1) * np.minimum(time / 3.0, 1.0)[:, None] * moves
+
+
+def filmed(limb, time, pressure, source="run"):
+    """Return the log of a run of a limb, with the tags' noise."""
+    seen = simulate(limb, time, pressures=pressure)
+    noise = np.deg2rad(0.1) * np.random.default_rng(1).standard_normal(pressure.shape)
+    return CalibrationLog(time, pressure, pressure, seen.bend_angles + noise, seen.tip, source)
+
+
+def numbers(limb):
+    return np.array([[s.moment_gain, s.rest_curvature, s.friction_moment] for s in limb.segments])
+
+
+def test_gain_rest_angle_and_friction_of_another_day_are_found():
+    today = another_day(RUBBING, (0.6, 1.4), (0.08, -0.1), (1.8, 0.5))
+    found, said = update(RUBBING, filmed(today, *motion()))
+    assert numbers(found)[:, 0] == pytest.approx(numbers(today)[:, 0], rel=0.02)
+    assert np.ptp(numbers(found)[:, 1] - numbers(today)[:, 1]) * 0.122 < np.deg2rad(0.5)
+    assert numbers(found)[:, 2] == pytest.approx(numbers(today)[:, 2], rel=0.3)
+    assert np.degrees(said.error_before).min() > 4.0
+    assert np.degrees(said.error_after).max() < 0.3
+    assert all(change.told and change.deviation < change.spread for change in said.changes)
+    distance = [
+        abs(c.after - n) / c.deviation for c, n in zip(said.changes, days(today), strict=True)
+    ]
+    assert max(distance) < 5.0, distance
+    assert "gain" in said.text()
+    assert found.provenance["update"]["source"] == ["run"]
+
+
+def days(limb):
+    for s in limb.segments:
+        yield s.moment_gain * s.length / s.bending_stiffness
+        yield s.rest_curvature * s.length
+        yield s.friction_moment
+
+
+def test_what_a_run_does_not_tell_stays():
+    today = another_day(RUBBING, (0.7, 0.7))
+    found, said = update(RUBBING, filmed(today, *motion(moves=(1.0, 0.0))))
+    told = {(c.segment, c.name): c.told for c in said.changes}
+    assert told[0, "gain"]
+    assert not told[1, "gain"]
+    assert not told[1, "friction"]
+    assert numbers(found)[0, 0] == pytest.approx(0.7 * numbers(RUBBING)[0, 0], rel=0.02)
+    assert numbers(found)[1, 0] == numbers(RUBBING)[1, 0]
+    assert numbers(found)[1, 2] == numbers(RUBBING)[1, 2]
+    assert "segment 1, gain" in said.text()
+    assert "stays" in said.text()
+
+
+def test_two_runs_of_one_segment_each_tell_both():
+    today = another_day(RUBBING, (0.7, 1.3))
+    runs = [filmed(today, *motion(10.0, moves)) for moves in ((1.0, 0.0), (0.0, 1.0))]
+    found, _ = update(RUBBING, runs)
+    assert numbers(found)[:, 0] == pytest.approx(numbers(today)[:, 0], rel=0.03)
+
+
+def test_a_limb_without_friction_gets_it_only_if_it_rubs():
+    smooth, _ = update(LIMB, filmed(LIMB, *motion()))
+    assert numbers(smooth)[:, 2].max() < 50.0 * LIMB.segments[0].moment_gain
+    rubbing, said = update(LIMB, filmed(RUBBING, *motion()))
+    assert numbers(rubbing)[:, 2] == pytest.approx(numbers(RUBBING)[:, 2], rel=0.4)
+    assert np.degrees(said.error_after).max() < 0.5
+
+
+def test_the_arcs_change_alike():
+    arcs = tuple(replace(s, moment_gain=1.1 * s.moment_gain) for s in RUBBING.segments)
+    today = another_day(RUBBING, (0.6, 1.4))
+    found, _ = update(replace(RUBBING, pcc_segments=arcs), filmed(today, *motion()))
+    pairs = zip(found.pcc_segments, found.segments, strict=True)
+    assert [a.moment_gain / s.moment_gain for a, s in pairs] == pytest.approx([1.1, 1.1])
+
+
+def test_another_limb_and_runs_too_short_are_refused():
+    time, pressure = motion()
+    log = filmed(RUBBING, time, pressure)
+    with pytest.raises(LogError, match="segment 0 bends the wrong way"):
+        update(RUBBING, replace(log, bend_angles=-log.bend_angles))
+    with pytest.raises(LogError, match=r"the runs last 3\.0 s"):
+        update(RUBBING, log.between(0.0, 3.0))
+    with pytest.raises(LogError, match="belongs to another limb"):
+        update(replace(RUBBING, segments=RUBBING.segments[:1]), log)
+
+
+def test_what_gain_rest_and_friction_do_not_explain_asks_for_a_calibration():
+    time, pressure = motion()
+    log = filmed(RUBBING, time, pressure)
+    strange = log.bend_angles + 0.2 * np.sign(np.sin(3.0 * time))[:, None]
+    _, said = update(RUBBING, replace(log, bend_angles=strange))
+    assert not said.enough
+    assert "calibrate again" in said.text()
+    _, other = update(another_day(RUBBING, (0.1, 1.0)), log)
+    assert not other.enough
+
+
+@pytest.fixture(scope="module")
+def chain_log():
+    """One chain's run with gains by half and rest angles by 4° from those of its calibration."""
+    chain = LinkChain(3)
+    limb, _ = fit(
+        LIMB, chain.log().between(0.0, 50.0), terms=("asymmetry", "friction"), geometry=False
+    )
+    time, pressure = motion(60.0)
+    played = chain.play(
+        time, 0.8 * pressure, run=7, gains=[(0.0, (0.6, 1.4))], wander=np.deg2rad(4.0)
+    )
+    log = CalibrationLog(
+        played.time,
+        played.commanded_differential,
+        played.measured_differential,
+        played.bend_angles,
+        played.tip,
+        "chain",
+    )
+    return limb, log
+
+
+def test_half_a_minute_of_a_foreign_limb_predicts_the_rest(chain_log):
+    limb, log = chain_log
+    found, said = update(limb, log.between(0.0, 30.0))
+    later = log.between(30.0, 60.0)
+    assert np.degrees(check(limb, later).error).max() > 5.0
+    assert np.degrees(check(found, later).error).max() < 1.5
+    assert said.enough
+
+
+def test_the_command_writes_a_new_file_and_never_the_old_one(
+    chain_log, tmp_path, monkeypatch, capsys
+):
+    limb, log = chain_log
+    old, new = tmp_path / "limb.yaml", tmp_path / "today.yaml"
+    limb.to_yaml(old)
+    write_csv(log.between(0.0, 15.0), tmp_path / "log.csv", tmp_path / "columns.yaml")
+    before = old.read_bytes()
+    given = ["--columns", tmp_path / "columns.yaml", "--limb", old]
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["check_limb.py", *map(str, arguments)])
+        return check_limb.main()
+
+    assert call(tmp_path / "log.csv", *given) == 3
+    assert call("--update", tmp_path / "log.csv", *given) == 0
+    assert "nothing was written" in capsys.readouterr().out
+    assert call("--update", tmp_path / "log.csv", *given, "--out", old) == 1
+    assert "is there already" in capsys.readouterr().err
+    assert old.read_bytes() == before
+    assert call("--update", tmp_path / "log.csv", *given, "--out", new) == 0
+    said = capsys.readouterr().out
+    assert "segment 0, gain" in said
+    assert "->" in said
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "columns.yaml", "limb.yaml", "log.csv", "today.yaml"
+    ]  # fmt: skip
+    assert numbers(Limb.from_yaml(new))[:, 0] / numbers(limb)[:, 0] == pytest.approx(
+        [0.6, 1.4], rel=0.03
+    )
+    assert call(tmp_path / "log.csv", "--columns", tmp_path / "columns.yaml", "--limb", new) == 0
