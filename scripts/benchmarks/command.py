@@ -28,6 +28,7 @@ PARTS = (
     "learning",
     "feedback",
     "page",
+    "page_wire",
     "page_memory",
 )
 

@@ -43,8 +43,7 @@ def run(quick: bool) -> dict[str, float]:
                 rig.client.spin(INTERVAL)
                 times.append(time.monotonic() - begin)
                 values.append(rig.memory())
-                heap = window.execute_script("return performance.memory.usedJSHeapSize;")
-                window_heaps.append(heap / 1e6)
+                window_heaps.append(rig.heap(window))
                 if len(times) % 6 == 0:
                     print(f"  {times[-1] / 60:5.1f} min {values[-1]:8.1f} MB", flush=True)
     except BrowserError as error:
@@ -52,15 +51,15 @@ def run(quick: bool) -> dict[str, float]:
         return {}
     counted = np.array(times) > SETTLING
     slope = np.polyfit(np.array(times)[counted] / 60.0, np.array(values)[counted], 1)[0]
-    last = np.array(window_heaps[-len(window_heaps) // 3 :])
+    third = len(window_heaps) // 3
     figures = {
         "minutes": minutes,
         "page_memory_first_mb": values[0],
         "page_memory_after_settling_mb": float(np.array(values)[counted][0]),
         "page_memory_last_mb": values[-1],
         "page_memory_growth_mb_per_hour": float(60.0 * slope),
-        "window_heap_first_third_least_mb": float(min(window_heaps[: len(window_heaps) // 3])),
-        "window_heap_last_third_least_mb": float(last.min()),
+        "window_heap_first_third_least_mb": float(np.nanmin(window_heaps[:third])),
+        "window_heap_last_third_least_mb": float(np.nanmin(window_heaps[-third:])),
     }
     report("memory of the page's process, and of the window's scripts", figures)
     return figures

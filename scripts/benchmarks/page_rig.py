@@ -109,7 +109,7 @@ class Rig:
             options.add_argument(flag)
         window = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
         self._stack.callback(window.quit)
-        window.set_script_timeout(30)
+        window.set_script_timeout(PATIENCE)
         window.get(self.url)
         self.wait(lambda: window.execute_script("return !!page.data && page.pictures > 0"), "data")
         return window
@@ -135,6 +135,16 @@ class Rig:
         status = Path(f"/proc/{self.processes[name].pid}/status").read_text()
         line = next(line for line in status.splitlines() if line.startswith("VmRSS:"))
         return int(line.split()[1]) / 1000.0
+
+    @staticmethod
+    def heap(window: Any) -> float:
+        """Return what the scripts of a window have in memory [MB]; NaN if it does not answer."""
+        from selenium.common.exceptions import TimeoutException  # noqa: PLC0415 - as in `browse`
+
+        try:
+            return float(window.execute_script("return performance.memory.usedJSHeapSize;")) / 1e6
+        except TimeoutException:
+            return float("nan")
 
     def close(self) -> None:
         """End the browsers and the nodes."""

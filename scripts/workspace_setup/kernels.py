@@ -17,7 +17,9 @@ from apriltag_tracker.synthetic.shapes import constant_curvature
 from apriltag_tracker.tag_map import TagMap
 from der_planner.limb import Limb
 from der_planner.model.response import simulate_many
+from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import METHODS, Motion, plan
+from der_planner.rod import Rod
 from der_planner.twin.offline import play
 from workspace_setup.basics import ROOT
 
@@ -35,6 +37,14 @@ def _track() -> None:
         tracker.observe(picture, stamp)
 
 
+def _in_space() -> None:
+    rod = Rod.from_limb(replace(Limb.default(), gravity=(0.0, 0.0, -9.81)))
+    state, pressures = rod.straight_state(), np.zeros((2, 2))
+    for method in ("backward_euler", "sdirk2"):
+        rod.simulate(state, pressures, CONTROL_PERIOD, method=method, linearise=True)
+        rod.linearise_step(state, pressures[0], CONTROL_PERIOD, method=method)
+
+
 def main() -> int:
     """Use every kernel once and say how long each part took."""
     limb = Limb.default()
@@ -48,6 +58,7 @@ def main() -> int:
         for model, methods in METHODS.items()
         for method in methods
     }
+    parts["rod in space"] = _in_space
     parts["twin"] = lambda: play(np.array([0.0, 0.05]), np.zeros((2, 2)))
     parts["many rods"] = lambda: simulate_many(
         limb, np.array([0.0, 0.05]), commands=np.zeros((2, 2, 2))

@@ -11,6 +11,7 @@ from apriltag_tracker.detection import detector as detection
 from apriltag_tracker.synthetic.camera import CameraModel, Optics, SyntheticCamera
 from apriltag_tracker.synthetic.shapes import constant_curvature
 from apriltag_tracker.tag_map import LimbTag, TagMap, WorldTag
+from benchmarks.tracker_renderer import Scene, render
 
 pyapriltags = pytest.importorskip("pyapriltags")
 
@@ -166,3 +167,25 @@ def test_more_forgiven_cells_than_are_safe_are_refused(bits):
 def test_empty_and_saturated_images_have_no_tags(detector):
     for level in (0, 128, 255):
         assert detector.detect(np.full((480, 640), level, np.uint8)) == []
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        Scene("small tags with a corner covered", pixels=20.0, corner=0.25),
+        Scene("tags with a corner covered", corner=0.25),
+        Scene("large tags with a corner covered", pixels=45.0, corner=0.25),
+        Scene("a smear of more than one and a half cells", smear=6.0),
+    ],
+    ids=lambda scene: scene.name,
+)
+def test_covered_and_smeared_tags_are_found(detector, scene):
+    asked, gaps = 0, []
+    for seed in (40, 41):
+        image, truth = render(scene, seed, (320, 240))
+        found = {tag.id: tag.corners for tag in detector.detect(image)}
+        assert found.keys() <= truth.keys()
+        asked += len(truth)
+        gaps += [corners - truth[tag] for tag, corners in found.items()]
+    assert len(gaps) >= 0.9 * asked
+    assert np.abs(gaps).max() < 0.5

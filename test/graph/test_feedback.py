@@ -70,21 +70,22 @@ class Phase:
         lines = self.rig.planner.log.read_text().splitlines()
         return [line for line in lines if f"plan {self.name}, " in line and "taken back" in line]
 
-    def judged(self, begin: float, end: float) -> Series:
-        """Return what was heard, if pictures came in time between two instants [s]."""
+    def judged(self, begin: float, end: float, late: float = LATE_PICTURES) -> Series:
+        """Return what was heard, if no picture came too late between two instants [s]."""
         series = self.series()
         ages = [message.age for message in series.told(begin, end)]
-        if not ages or max(ages) > LATE_PICTURES:
+        if not ages or max(ages) > late:
             seen = f"{max(ages):.1f} s old" if ages else "missing"
             pytest.skip(f"this machine is too busy to judge: pictures were {seen}")
         return series
 
 
 def lacking(series: Series, begin: float, end: float) -> np.ndarray:
-    """Return the mean missing pressure, gain error included, (M,) [Pa] of the first segment's w."""
+    """Return mean missing pressures and gain errors (2M,) [kPa], [0.1] in a time [s]."""
     told = series.told(begin, end)
     assert told, "no estimates"
-    return np.mean([m.missing_pressure for m in told], axis=0)
+    missing = np.mean([m.missing_pressure for m in told], axis=0) * 1e-3
+    return np.concatenate([missing, 10.0 * np.mean([m.gain_error for m in told], axis=0)])
 
 
 def test_the_graph_moves_as_the_lock_step_does(rig):
@@ -96,7 +97,9 @@ def test_the_graph_moves_as_the_lock_step_does(rig):
 
     phase = Phase(rig, "first")
     phase.until(8.0)
-    series = phase.judged(0.5, 8.0)
+    # The lock-step's pictures come after 0.07 s; what comes much later moves the limb otherwise.
+    series = phase.judged(0.5, 8.0, late=0.2)
+    assert not phase.warnings()
     limb = Limb.default().mounted("hanging")
     told = {key: value for key, value in MOTION.items() if key != "motion"}
     planned = plan(limb, Motion.named(MOTION["motion"], **told))
@@ -111,12 +114,15 @@ def test_the_graph_moves_as_the_lock_step_does(rig):
     apart = np.linalg.norm(series.tip[inside] - same, axis=1)
     assert apart.mean() < 1.5e-3
     assert abs(series.error(1.0, 8.0).mean() - steps.error[20:160].mean()) < 1e-3
-    assert not phase.warnings()
 
 
 def test_a_motion_gives_way_to_another_without_a_jump(rig):
+    left = Phase(rig, "left")
+    left.until(3.0)
     before = len(rig.heard.states)
     phase = Phase(rig, "changed", motion="opposite_direction")
+    if phase.start >= left.at(left.plan.time[-1]):
+        pytest.skip("this machine is too busy to judge: the motion was over before the next plan")
     phase.until(2.5)
     series = phase.judged(0.0, 2.5)
     # The corrections go on where they were: full share from the first estimate on.
@@ -129,11 +135,11 @@ def test_a_motion_gives_way_to_another_without_a_jump(rig):
 
 def test_a_push_is_felt_and_its_swing_dies(rig):
     phase = Phase(rig, "push")
-    rig.push(phase.at(1.5), force=0.3, duration=0.2)
+    rig.push(phase.at(1.5), force=0.08, duration=0.2)
     phase.until(5.5)
     series = phase.judged(0.5, 5.5)
     before, after = series.error(0.3, 1.5).mean(), series.error(1.5, 2.5)
-    assert after.max() > before + 0.05 * LENGTH
+    assert after.max() > before + 0.015 * LENGTH
     assert series.error(4.0, 5.5).mean() < 0.02 * LENGTH
     assert not phase.warnings()
 
@@ -143,7 +149,7 @@ def test_a_payload_that_is_put_on_is_carried(rig):
     rig.push(phase.at(1.5), mass=0.02)
     phase.until(6.0)
     series = phase.judged(0.5, 6.0)
-    assert np.abs(lacking(series, 4.0, 6.0) - lacking(series, 0.5, 1.5)).max() > 200.0
+    assert np.abs(lacking(series, 4.0, 6.0) - lacking(series, 0.5, 1.5)).max() > 0.1
     assert series.error(3.5, 6.0).mean() < 0.025 * LENGTH
     assert not phase.warnings()
 

@@ -20,7 +20,7 @@ from visualization_msgs.msg import MarkerArray
 
 from apriltag_tracker.camera import CameraError, Intrinsics
 from apriltag_tracker.camera.encodings import ImageReader
-from apriltag_tracker.camera.sources import Grabbed, SourceError, open_source
+from apriltag_tracker.camera.sources import Grabbed, Source, SourceError, open_source
 from apriltag_tracker.detection import MOST_CORRECTED_BITS, Detector
 from apriltag_tracker.detection.tracking import TrackingOptions
 from apriltag_tracker.image_watch import NO_CALIBRATION, ImageWatch
@@ -99,18 +99,11 @@ class TrackerNode(Node):
         if calibration:
             self._use(Intrinsics.from_yaml(str(calibration)))
         self._source_name = source
-        self._source = None
+        self._source: Source | None = None
         if source == "topic":
             self._subscribe(needs_info=not calibration)
         else:
-            if not calibration:
-                raise CameraError(
-                    f"source '{source}' brings no camera_info: set the parameter calibration_file "
-                    "(scripts/calibrate_camera.py writes one)"
-                )
-            assert self._tracker is not None
-            lens = self._tracker.intrinsics
-            self._source = open_source(source, rate, size=(lens.width, lens.height))
+            self._source = self._open_source(source, rate)
             self._source_timer = self.create_timer(0.002, self._poll_source)
         self._diagnostics = DiagnosticsPublisher(self, self._health, source)
 
@@ -120,6 +113,16 @@ class TrackerNode(Node):
             self._source.close()
 
     # Set-up
+
+    def _open_source(self, source: str, rate: float) -> Source:
+        """Open a camera, a video file or a folder for images of the calibration's size."""
+        if self._tracker is None:
+            raise CameraError(
+                f"source '{source}' brings no camera_info: set the parameter calibration_file "
+                "(scripts/calibrate_camera.py writes one)"
+            )
+        lens = self._tracker.intrinsics
+        return open_source(source, rate, size=(lens.width, lens.height))
 
     def _declare_options(self) -> TrackerOptions:
         def number(name: str, default: float, description: str, at_most: float) -> float:

@@ -21,6 +21,7 @@ from der_planner.page.drawing.region import reachable_region
 from der_planner.page.drawing.sketch import summary
 from der_planner.page.drawing.studio import drawn_pixels
 from der_planner.page.overlay import Overlay
+from der_planner.page.situation import LimbView
 from der_planner.planning import PathLimits
 from der_planner.planning.inverse import angle_limits, distance_to_reach
 
@@ -70,9 +71,20 @@ def test_pixels_become_metres_where_they_are_drawn() -> None:
     np.testing.assert_allclose(back, pixels, atol=0.5)
     np.testing.assert_allclose(overlay.pixels_of(on_plane), pixels, atol=0.2)
     overlay.put_estimate(on_plane)
+    overlay.put_planned(on_plane)
     np.testing.assert_allclose(overlay.at(1, None)["estimate"], pixels, atol=0.2)
     now = 1.0
-    assert overlay.at(1, None)["estimate"] == []  # feedback has ended
+    shown = overlay.at(1, None)
+    assert (shown["estimate"], shown["planned"]) == ([], [])  # nobody plans or corrects any more
+
+    # A picture that the tracker says nothing of shows neither limb nor tags of an earlier one.
+    x, y = (float(value) for value in on_plane[0])
+    overlay.put_limb(LimbView(1, True, "", (x, y), (0.0, 0.0), ((0.0, 0.0), (x, y))))
+    near, far = overlay.at(200_000_000, None), overlay.at(2_000_000_000, None)
+    assert near["tip"] is not None
+    assert len(near["tags"]) == len(seen)
+    assert (far["tip"], far["curve"], far["tags"]) == (None, [], [])
+    assert "tracker" in far["problem"]
 
 
 @pytest.mark.parametrize(

@@ -128,6 +128,16 @@ def test_reading_by_another_name_is_refused(rig: Rig, host: str) -> None:
     assert "host_names" in answer.text
 
 
+@pytest.mark.parametrize("site", ["cross-site", "same-site"])
+def test_other_pages_read_nothing_but_may_link_here(rig: Rig, site: str) -> None:
+    reading = {"sec-fetch-site": site, "sec-fetch-mode": "no-cors"}
+    assert rig.client(**reading).get("/picture").status_code == 403
+    following = {"sec-fetch-site": site, "sec-fetch-mode": "navigate"}
+    assert rig.client(**following).get("/picture").status_code == 204
+    own = {"sec-fetch-site": "same-origin", "sec-fetch-mode": "cors"}
+    assert rig.client(**own).get("/picture").status_code == 204
+
+
 def test_answers_forbid_frames_and_other_machines(rig: Rig) -> None:
     headers = rig.client().get("/static/live.js").headers
     assert headers["x-frame-options"] == "DENY"

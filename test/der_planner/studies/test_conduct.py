@@ -1,5 +1,6 @@
 """A study is played: on processes of this machine, on a cluster that breaks, and after a stop."""
 
+import contextlib
 import signal
 from pathlib import Path
 
@@ -7,6 +8,8 @@ import pyarrow.parquet
 import pytest
 
 from der_planner.experiment.progress import Progress
+from der_planner.studies import cluster
+from der_planner.studies import conduct as conducting
 from der_planner.studies.conduct import Settings, conduct
 from der_planner.studies.errors import StudyError
 from der_planner.studies.identity import cache
@@ -94,6 +97,26 @@ def test_one_or_two_workers_and_a_row_that_fails(tmp_path, monkeypatch):
     assert {record["amplitude"] for record in errors} == {1.9}
     assert all(record["error"].startswith("UnreachableError: ") for record in errors)
     assert all(record["mean_error_m"] > 0 for record in one.values() if not record["error"])
+
+
+def test_worker_processes_that_are_gone_are_replaced(tmp_path, monkeypatch):
+    """As after an overload that made the scheduler give all of them up."""
+    monkeypatch.setattr(conducting, "ALONE", 0.3)
+    real, started = cluster.local, []
+
+    @contextlib.contextmanager
+    def losing(workers):
+        with real(workers) as client:
+            started.append(client)
+            if len(started) == 1:
+                client.cluster.scale(0)
+            yield client
+
+    monkeypatch.setattr(cluster, "local", losing)
+    study = Study.read(write(tmp_path, RODS))
+    kept = conduct(study, Settings(tmp_path / "out", workers=1), Progress())
+    assert len(started) == 2
+    assert set(kept) == {row.key for row in study.rows}
 
 
 def test_a_cluster_that_breaks(tmp_path, processes):

@@ -128,6 +128,27 @@ def calibrate_camera(
             "by 20 to 40 degrees"
         )
     covered = _coverage(used, width, height)
+    return CameraCalibration(
+        intrinsics=Intrinsics.create(
+            width, height, matrix, distortion, "rational_polynomial" if rational else "plumb_bob"
+        ),
+        rms=rms,
+        per_view={view.name: float(error) for view, error in zip(used, errors, strict=True)},
+        left_out=left_out,
+        sigma=(float(sigma[0]), float(sigma[1]), float(sigma[2]), float(sigma[3])),
+        covered=covered,
+        remarks=_remarks(covered, spread, rms),
+    )
+
+
+def _remarks(covered: float, spread: float, rms: float) -> list[str]:
+    """Say what would make a calibration better.
+
+    Args:
+        covered: share of the image that the board's corners covered.
+        spread: range of the board's tilts [degrees].
+        rms: error of its corners [px].
+    """
     remarks = []
     if covered < 0.9:
         remarks.append(
@@ -138,17 +159,7 @@ def calibrate_camera(
         remarks.append(f"the board was tilted by {spread:.0f} degrees only: 40 and more is better")
     if rms > 0.3:
         remarks.append(f"error of {rms:.2f} px: is the board flat, sharp, and printed to scale?")
-    return CameraCalibration(
-        intrinsics=Intrinsics.create(
-            width, height, matrix, distortion, "rational_polynomial" if rational else "plumb_bob"
-        ),
-        rms=rms,
-        per_view={view.name: float(error) for view, error in zip(used, errors, strict=True)},
-        left_out=left_out,
-        sigma=(float(sigma[0]), float(sigma[1]), float(sigma[2]), float(sigma[3])),
-        covered=covered,
-        remarks=remarks,
-    )
+    return remarks
 
 
 def _solve(

@@ -195,10 +195,28 @@ def identify(
         if not found[i]:
             continue
         readable, code = read_code(image, corners[i])
-        if not readable:
-            continue
-        for turn in range(4):
-            for tag in range(table.shape[1]):
-                wrong = count_bits(code ^ table[turn, tag])
-                if wrong < distance[i]:
-                    distance[i], ids[i], turns[i] = wrong, tag, (4 - turn) % 4
+        if readable:
+            ids[i], turns[i], distance[i] = _nearest(code, table)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _nearest(code: np.uint64, table: NDArray[np.uint64]) -> tuple[int, int, int]:
+    """Return the tag nearest to a code, which corner is its lower left, and the wrong cells."""
+    nearest, corner, distance = 0, 0, UNREADABLE
+    for turn in range(4):
+        for tag in range(table.shape[1]):
+            wrong = count_bits(code ^ table[turn, tag])
+            if wrong < distance:
+                nearest, corner, distance = tag, (4 - turn) % 4, wrong
+    return nearest, corner, distance
+
+
+def nearest_code(cells: NDArray[np.bool_]) -> tuple[int, int, int]:
+    """Find the tag nearest to cells (36,) that were read, white is true, from the upper left.
+
+    Returns:
+        The tag, which corner of the quadrilateral is its printed lower left, and the wrong cells.
+    """
+    weights = np.uint64(1) << np.arange(35, -1, -1, dtype=np.uint64)
+    tag, turn, wrong = _nearest((cells * weights).sum(dtype=np.uint64), code_table())
+    return int(tag), int(turn), int(wrong)

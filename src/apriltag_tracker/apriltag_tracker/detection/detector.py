@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +16,7 @@ from apriltag_tracker import family
 from apriltag_tracker.detection import decoding, edges
 from apriltag_tracker.detection.alignment.aligner import USUAL_BLUR, Aligner, Alignment
 from apriltag_tracker.detection.covered import covered_quads
+from apriltag_tracker.detection.smeared import read_smeared
 from apriltag_tracker.detection.tag import Tag, counter_clockwise, once
 
 MOST_CORRECTED_BITS = 2
@@ -106,7 +107,12 @@ class Detector:
         if [tag.id for tag in self._read_again(canvas, quad, [], "full")] != [0]:
             raise family.FamilyError("a perfect picture of tag 0 is not read")
 
-    def detect(self, gray: NDArray[np.uint8], thorough: bool = False) -> list[Tag]:
+    def detect(
+        self,
+        gray: NDArray[np.uint8],
+        thorough: bool = False,
+        enough: Collection[int] | None = None,
+    ) -> list[Tag]:
         """Find tags in a grey image (rows, columns) of uint8; duplicates are returned as they are.
 
         Args:
@@ -114,14 +120,21 @@ class Detector:
             thorough: search once more with a lower threshold, for tags in a dark corner of an image
                 that is bright elsewhere. An image that is dark as a whole is searched like that
                 anyway.
+            enough: ids of tags; once all of these are found, covered and smeared tags are not
+                looked for.
 
         Raises:
             ValueError: not such an image, or an empty one.
         """
-        return self.search(grey(gray), "full", thorough=thorough)
+        return self.search(grey(gray), "full", 1, thorough, enough)
 
     def search(
-        self, image: NDArray[np.uint8], found_by: str, scale: int = 1, thorough: bool = False
+        self,
+        image: NDArray[np.uint8],
+        found_by: str,
+        scale: int = 1,
+        thorough: bool = False,
+        enough: Collection[int] | None = None,
     ) -> list[Tag]:
         """Find tags in a grey image that may have been enlarged by a whole number.
 
@@ -137,8 +150,11 @@ class Detector:
             ids, quads, others = find_quads(image, smallest, faint)
             tags += self.confirm(image, ids, quads, 3.0 * scale, found_by)
             tags += self._read_again(image, others, tags, found_by)
-        covered = covered_quads(image, smallest, dim, [tag.corners for tag in tags])
+        if enough is not None and {tag.id for tag in tags} >= set(enough):
+            return once(tags)
+        covered = covered_quads(image, smallest, [tag.corners for tag in tags])
         tags += self._read_again(image, covered, tags, found_by)
+        tags += self._read_smeared(image, covered, tags, found_by)
         return once(tags)
 
     def confirm(
@@ -174,7 +190,10 @@ class Detector:
             seen = {tag.id for tag in tags}
             for tag, quad in zip(ids.tolist(), quads, strict=True):
                 if tag not in seen and tag in known:
-                    whole = self._by_pattern(image, tag, quad, known[tag], found_by)
+                    last = known[tag]
+                    whole = self._by_pattern(
+                        image, tag, quad, last.blur, np.array(last.smear), found_by
+                    )
                     tags += [whole] if whole is not None else []
         return tags
 
@@ -203,12 +222,11 @@ class Detector:
         image: NDArray[np.uint8],
         tag: int,
         quad: NDArray[np.float64],
-        before: Tag | None,
+        blur: float,
+        smear: NDArray[np.float64],
         found_by: str,
     ) -> Tag | None:
         """Return a tag that is confirmed by nearly all of its pixels, None if it is not there."""
-        blur = before.blur if before is not None else USUAL_BLUR
-        smear = np.array(before.smear if before is not None else (0.0, 0.0))
         fitted = self._aligner.align(image, tag, quad, blur, smear)
         if fitted is None or not _is_the_tag(fitted, quad):
             return None
@@ -232,9 +250,7 @@ class Detector:
         found_by: str,
     ) -> list[Tag]:
         """Refine quadrilaterals (n, 4, 2) that OpenCV could not read, and read them."""
-        for tag in known:
-            apart = np.hypot(*(quads.mean(axis=1) - tag.corners.mean(axis=0)).T)
-            quads = quads[apart > 0.5 * tag.pixel_size]
+        quads = _elsewhere(quads, known)
         if len(quads) == 0:
             return []
         corners, stats, found = refine(image, quads, 3.0)
@@ -248,7 +264,26 @@ class Detector:
         tags = [self._aligned(image, tag) for tag in tags]
         for i in np.flatnonzero(found & ~good & (distance <= _WRONG_BUT_NEAR)):
             if counter_clockwise(corners[i]):
-                whole = self._by_pattern(image, int(ids[i]), corners[i], None, found_by)
+                whole = self._by_pattern(
+                    image, int(ids[i]), corners[i], USUAL_BLUR, np.zeros(2), found_by
+                )
+                tags += [whole] if whole is not None else []
+        return tags
+
+    def _read_smeared(
+        self,
+        image: NDArray[np.uint8],
+        quads: NDArray[np.float64],
+        known: Sequence[Tag],
+        found_by: str,
+    ) -> list[Tag]:
+        """Read quadrilaterals (n, 4, 2) whose cells run into each other, as a smear makes them."""
+        tags: list[Tag] = []
+        for quad in _elsewhere(quads, known):
+            code = read_smeared(image, quad)
+            if code is not None:
+                start = np.roll(quad, -code.turn, axis=0)
+                whole = self._by_pattern(image, code.id, start, USUAL_BLUR, code.smear, found_by)
                 tags += [whole] if whole is not None else []
         return tags
 
@@ -278,6 +313,14 @@ class Detector:
             )
             for k, i in enumerate(kept)
         ]
+
+
+def _elsewhere(quads: NDArray[np.float64], known: Sequence[Tag]) -> NDArray[np.float64]:
+    """Return those of quadrilaterals (n, 4, 2) that are not where a tag is known."""
+    for tag in known:
+        apart = np.hypot(*(quads.mean(axis=1) - tag.corners.mean(axis=0)).T)
+        quads = quads[apart > 0.5 * tag.pixel_size]
+    return quads
 
 
 def _is_the_tag(fitted: Alignment, quad: NDArray[np.float64]) -> bool:

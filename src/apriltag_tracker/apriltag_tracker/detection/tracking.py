@@ -145,7 +145,8 @@ class TagTracker:
         if thorough:
             self._last_thorough = stamp
         self.counts.full_searches += 1
-        self._merge(found, self._detector.detect(image, thorough), predicted)
+        enough = self._wanted - found.keys()
+        self._merge(found, self._detector.detect(image, thorough, enough), predicted)
 
     @staticmethod
     def _predict(track: _Track, stamp: float) -> NDArray[np.float64]:

@@ -39,6 +39,47 @@ def _cumulative(x: float, table: NDArray[np.float32]) -> float:
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
+def _seen(
+    m: NDArray[np.float64],
+    x: float,
+    y: float,
+    spread: NDArray[np.float64],
+    cells: NDArray[np.uint8],
+    weights: NDArray[np.float64],
+    table: NDArray[np.float32],
+) -> tuple[float, float]:
+    """Return which share of a pixel sees the tag, and which its white cells, at one instant.
+
+    `weights` (n,) is room to work in; the rest is as in `draw_tag`.
+    """
+    count = cells.shape[0]
+    w = m[2, 0] * x + m[2, 1] * y + m[2, 2]
+    u = (m[0, 0] * x + m[0, 1] * y + m[0, 2]) / w
+    v = (m[1, 0] * x + m[1, 1] * y + m[1, 2]) / w
+    u0 = max(math.floor(u - 3.0 * spread[0]), 0)
+    u1 = min(math.floor(u + 3.0 * spread[0]), count - 1)
+    v0 = max(math.floor(v - 3.0 * spread[1]), 0)
+    v1 = min(math.floor(v + 3.0 * spread[1]), count - 1)
+    if u0 > u1 or v0 > v1:
+        return 0.0, 0.0
+    last = _cumulative((u0 - u) / spread[0], table)
+    for i in range(u0, u1 + 1):
+        following = _cumulative((i + 1 - u) / spread[0], table)
+        weights[i] = following - last
+        last = following
+    cover, bright = 0.0, 0.0
+    last = _cumulative((v0 - v) / spread[1], table)
+    for j in range(v0, v1 + 1):
+        following = _cumulative((j + 1 - v) / spread[1], table)
+        share = following - last
+        last = following
+        for i in range(u0, u1 + 1):
+            cover += share * weights[i]
+            bright += share * weights[i] * cells[j, i]
+    return cover, bright
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
 def draw_tag(
     canvas: NDArray[np.uint8],
     rays: NDArray[np.float32],
@@ -70,39 +111,17 @@ def draw_tag(
         white: grey level of white cells in nominal light.
         table: of `cumulative_table`.
     """
-    count = cells.shape[0]
     instants = maps.shape[0]
-    reach_u, reach_v = 3.0 * spread[0], 3.0 * spread[1]
-    weights = np.empty(count)
+    weights = np.empty(cells.shape[0])
     position = noise_start
     for row in range(box[0], box[1]):
         for column in range(box[2], box[3]):
             x, y = rays[row, column, 0], rays[row, column, 1]
             cover, bright = 0.0, 0.0
             for k in range(instants):
-                m = maps[k]
-                w = m[2, 0] * x + m[2, 1] * y + m[2, 2]
-                u = (m[0, 0] * x + m[0, 1] * y + m[0, 2]) / w
-                v = (m[1, 0] * x + m[1, 1] * y + m[1, 2]) / w
-                u0 = max(math.floor(u - reach_u), 0)
-                u1 = min(math.floor(u + reach_u), count - 1)
-                v0 = max(math.floor(v - reach_v), 0)
-                v1 = min(math.floor(v + reach_v), count - 1)
-                if u0 > u1 or v0 > v1:
-                    continue
-                last = _cumulative((u0 - u) / spread[0], table)
-                for i in range(u0, u1 + 1):
-                    following = _cumulative((i + 1 - u) / spread[0], table)
-                    weights[i] = following - last
-                    last = following
-                last = _cumulative((v0 - v) / spread[1], table)
-                for j in range(v0, v1 + 1):
-                    following = _cumulative((j + 1 - v) / spread[1], table)
-                    share = following - last
-                    last = following
-                    for i in range(u0, u1 + 1):
-                        cover += share * weights[i]
-                        bright += share * weights[i] * cells[j, i]
+                more, whiter = _seen(maps[k], x, y, spread, cells, weights, table)
+                cover += more
+                bright += whiter
             if cover <= 0.0:
                 continue
             cover /= instants

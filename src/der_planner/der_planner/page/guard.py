@@ -80,6 +80,10 @@ class Guard:
             )
         if any(not same_origin(origin, hosts[0], self._scheme) for origin in origins):
             return f"requests from {', '.join(origins)} are refused: only the page itself may ask"
+        site = _values(scope, b"sec-fetch-site")
+        navigates = _values(scope, b"sec-fetch-mode") == ["navigate"]
+        if any(value not in ("same-origin", "none") for value in site) and not navigates:
+            return "requests from other pages are refused: only the page itself may ask"
         changes = scope["type"] == "websocket" or scope["method"] not in SAFE_METHODS
         if changes and len(origins) != 1:
             return "a command or a websocket must say its origin: use the page in a browser"

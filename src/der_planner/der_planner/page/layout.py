@@ -29,7 +29,8 @@ FAST = 0.3
 """[s] between two looks at who commands."""
 SLOW = 2.0
 """[s] between two looks at which plans have been learned."""
-NO_PLANS = "Learned plan: the planner has none"
+NO_PLANS = "No learned plans"
+BEST = "the best"
 LINKS = {
     "Experiments": listing.ADDRESS,
     "Replay": replay.ADDRESS,
@@ -96,7 +97,7 @@ class Window:
             self._motion = ui.select(list(NAMES), value=NAMES[0], label="Motion")
             self._model = ui.select(list(METHODS), value="der", label="Model")
             self._model.on_value_change(self._offer_methods)
-            self._method = ui.select([""], value="", label="Method (empty: best)")
+            self._method = ui.select({"": BEST}, value="", label="Method")
             self._offer_methods()
         with ui.row().classes("line"):
             degrees = round(math.degrees(DEFAULT_AMPLITUDE), 3)
@@ -119,7 +120,8 @@ class Window:
         self._guarded.append(button)
 
     def _offer_methods(self) -> None:
-        self._method.set_options(["", *METHODS[str(self._model.value)]], value="")
+        names = METHODS[str(self._model.value)]
+        self._method.set_options({"": BEST, **{name: name for name in names}}, value="")
 
     def _offer_learned(self) -> None:
         """Offer the plans that are in the planner's folder now; a chosen one that is gone goes."""
@@ -128,7 +130,7 @@ class Window:
             return
         chosen = self._learned.value if self._learned.value in names else None
         self._learned.set_options(names, value=chosen)
-        label = "Learned plan (in place of the motion)" if names else NO_PLANS
+        label = "Learned plan instead" if names else NO_PLANS
         self._learned.props(f'label="{label}"')
 
     def _show_desk(self) -> None:

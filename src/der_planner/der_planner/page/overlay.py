@@ -6,7 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,14 +15,18 @@ from apriltag_tracker.camera import CameraPose, Intrinsics, project
 from apriltag_tracker.detection.tag import Tag
 from apriltag_tracker.pose.world import WorldPose
 from apriltag_tracker.tag_map import TagMap
-from der_planner.page.situation import LimbView
+from der_planner.page.situation import NANOSECONDS, LimbView
 
 KEPT = 60
 """Views of the limb kept, so that each picture gets its own: 2 s at 30 Hz."""
 PATH_POINTS = 200
 LASTING = 0.5
-"""[s] that an estimate is shown after it came."""
+"""[s] that an estimate or a planned limb is shown after it came, and how far the tracker's view may
+be from the picture that it is drawn over."""
 CURVE_POINTS = 40
+SILENT = "The tracker says nothing of these pictures: neither limb nor tags are drawn."
+
+Value = TypeVar("Value")
 
 
 class Overlay:
@@ -43,7 +47,7 @@ class Overlay:
         self._views: deque[LimbView] = deque(maxlen=KEPT)
         self._corners: deque[tuple[int, list[list[float]]]] = deque(maxlen=KEPT)
         self._path: NDArray[np.float64] = np.empty((0, 2))
-        self._limb: NDArray[np.float64] = np.empty((0, 2))
+        self._limb: tuple[float, NDArray[np.float64]] = (-np.inf, np.empty((0, 2)))
         self._estimate: tuple[float, NDArray[np.float64]] = (-np.inf, np.empty((0, 2)))
 
     def put_camera(self, intrinsics: Intrinsics) -> None:
@@ -75,9 +79,9 @@ class Overlay:
             self._path = tip[::step]
 
     def put_planned(self, curve: NDArray[np.float64]) -> None:
-        """Take the centreline (N, 2) m of the planned limb of now; empty: none."""
+        """Take the centreline (N, 2) m of the planned limb; shown for `LASTING` seconds."""
         with self._lock:
-            self._limb = curve
+            self._limb = (self._clock(), curve)
 
     def put_estimate(self, curve: NDArray[np.float64]) -> None:
         """Take the centreline (N, 2) m that feedback estimates; shown for `LASTING` seconds."""
@@ -121,19 +125,19 @@ class Overlay:
             picture; `problem`: why nothing can be placed, else empty.
         """
         with self._lock:
-            view = _of(stamp, self._views)
-            newest = self._corners[-1][1] if self._corners else []
-            corners = next((c for s, c in reversed(self._corners) if s == stamp), newest)
+            view = _of(stamp, [view.stamp for view in self._views], self._views)
+            corners = _of(stamp, [s for s, _ in self._corners], [c for _, c in self._corners])
             pose = self._world.pose if self._world is not None else None
-            intrinsics, path, planned = self._intrinsics, self._path, self._limb
-            heard, estimate = self._estimate
+            intrinsics, path = self._intrinsics, self._path
+            (shown, planned), (heard, estimate) = self._limb, self._estimate
+            silent = bool(self._views) and view is None
             problem = "no calibration of the camera yet"
             if self._world is not None:
                 problem = self._world.problem
         answer: dict[str, Any] = {
-            "tags": corners,
+            "tags": corners or [],
             "matched": view is not None and view.stamp == stamp,
-            "problem": problem,
+            "problem": SILENT if silent else problem,
             "curve": [],
             "path": [],
             "planned": [],
@@ -148,8 +152,10 @@ class Overlay:
             curve = np.array(view.curve).reshape(-1, 2)
             answer["curve"] = place(curve[:: max(1, len(curve) // CURVE_POINTS)])
             answer["tip"] = place(np.array([view.tip]))[0]
-        answer["path"], answer["planned"] = place(path), place(planned)
-        if self._clock() - heard <= LASTING:
+        answer["path"], now = place(path), self._clock()
+        if now - shown <= LASTING:
+            answer["planned"] = place(planned)
+        if now - heard <= LASTING:
             answer["estimate"] = place(estimate)
         if reference is not None:
             answer["reference"] = place(np.array([reference]))[0]
@@ -173,9 +179,11 @@ class _Placer:
         return self._pose.onto_plane(self._intrinsics.rays(pixels), self._height)
 
 
-def _of(stamp: int, views: Sequence[LimbView]) -> LimbView | None:
-    """Return the view of this picture, or the newest one."""
-    for view in reversed(views):
-        if view.stamp == stamp:
-            return view
-    return views[-1] if views else None
+def _of(stamp: int, stamps: Sequence[int], values: Sequence[Value]) -> Value | None:
+    """Return the value of this picture's stamp [ns], or the newest unless it is too far from it."""
+    for known, value in zip(reversed(stamps), reversed(values), strict=True):
+        if known == stamp:
+            return value
+    if stamps and abs(stamps[-1] - stamp) <= LASTING * NANOSECONDS:
+        return values[-1]
+    return None

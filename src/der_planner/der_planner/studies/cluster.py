@@ -20,6 +20,10 @@ class SchedulerLostError(ConnectionError):
     """The scheduler is gone, and with it what had not come back."""
 
 
+class WorkersLostError(ConnectionError):
+    """The processes of this machine are gone, and none has come in their place."""
+
+
 class NoSchedulerError(StudyError):
     """Nothing answers at the address of a scheduler."""
 

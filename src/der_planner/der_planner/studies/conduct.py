@@ -17,7 +17,7 @@ from distributed.scheduler import KilledWorker
 
 from der_planner.experiment.progress import Progress
 from der_planner.studies import cluster, identity, work
-from der_planner.studies.cluster import NoSchedulerError, SchedulerLostError
+from der_planner.studies.cluster import NoSchedulerError, SchedulerLostError, WorkersLostError
 from der_planner.studies.errors import StudyError
 from der_planner.studies.store import Kept, Store
 from der_planner.studies.study import Row, Study
@@ -31,6 +31,10 @@ _LOOK = 0.5
 """Longest time without a look at the cluster [s]."""
 _RETRY = 2.0
 """Between two attempts to find a lost scheduler [s]."""
+ALONE = 30.0
+"""Time without any worker after which new ones are started, or asked for [s]."""
+_STARTS = 3
+"""Starts of workers, one after the other, that may bring no row at all."""
 
 
 @dataclass(frozen=True)
@@ -134,13 +138,25 @@ def _play(
             return cluster.remote(settings.scheduler)
         return cluster.local(settings.workers)
 
-    lost = False
+    lost, starts = False, 0
     while state.left:
+        made = state.made
         try:
             with join() as client:
                 _welcome(client, settings, progress)
                 lost = False
-                _Session(study, store, state, client, progress).run()
+                _Session(study, store, state, client, progress, settings.scheduler).run()
+        except WorkersLostError as error:
+            starts = 1 if state.made > made else starts + 1
+            if starts == _STARTS:
+                raise StudyError(
+                    f"the worker processes of this machine ended {starts} times before a row was "
+                    "done: see that memory and disk are not full. Rows that are there are kept"
+                ) from error
+            progress.say(
+                "the worker processes of this machine are gone: starting new ones. "
+                f"{state.done} of {state.total} rows are kept"
+            )
         except SchedulerLostError:
             progress.say(
                 f"the scheduler at {settings.scheduler} is gone: waiting for it to come back. "
@@ -162,10 +178,11 @@ def _welcome(client: Client, settings: Settings, progress: Progress) -> None:
         f"dashboard: {_dashboard(client)}"
     )
     if not workers:
-        progress.say(
-            "no worker has joined yet: python3 scripts/workspace.py exec dask worker "
-            f"{settings.scheduler} --nthreads 1"
-        )
+        progress.say(f"no worker has joined yet: {_how_to_join(settings.scheduler)}")
+
+
+def _how_to_join(scheduler: str) -> str:
+    return f"python3 scripts/workspace.py exec dask worker {scheduler} --nthreads 1"
 
 
 def _dashboard(client: Client) -> str:
@@ -180,13 +197,24 @@ def _dashboard(client: Client) -> str:
 
 
 class _Session:
-    """The work on one cluster until nothing is left or its scheduler is lost."""
+    """The work on one cluster until nothing is left or its scheduler is lost.
+
+    ``scheduler`` is the address of a cluster of others, empty for processes of this machine.
+    """
 
     def __init__(
-        self, study: Study, store: Store, state: _State, client: Client, progress: Progress
+        self,
+        study: Study,
+        store: Store,
+        state: _State,
+        client: Client,
+        progress: Progress,
+        scheduler: str,
     ) -> None:
         self._study, self._store, self._state = study, store, state
-        self._client, self._progress = client, progress
+        self._client, self._progress, self._scheduler = client, progress, scheduler
+        self._manned = time.monotonic()
+        self._asked = False
         self._back: queue.SimpleQueue[Future] = queue.SimpleQueue()
         self._threads = 0
         self._looked = -1e9
@@ -196,6 +224,7 @@ class _Session:
 
         Raises:
             SchedulerLostError: the scheduler is gone; what had not come back is left again.
+            WorkersLostError: the same of all processes of this machine.
             StudyError: the disk is full, or a worker has other sources.
         """
         state = self._state
@@ -224,7 +253,19 @@ class _Session:
         except (OSError, TimeoutError, RuntimeError, ValueError) as error:
             raise SchedulerLostError(str(error)) from error
         self._looked = time.monotonic()
+        self._miss_workers()
         self._show()
+
+    def _miss_workers(self) -> None:
+        """Start again, or ask for workers, when there has been none for `ALONE`."""
+        if self._threads:
+            self._manned, self._asked = self._looked, False
+        elif self._looked - self._manned > ALONE:
+            if not self._scheduler:
+                raise WorkersLostError("no process of this machine is left")
+            if not self._asked:
+                self._progress.say(f"no worker is there any more: {_how_to_join(self._scheduler)}")
+            self._asked = True
 
     def _send(self) -> None:
         """Keep enough work under way."""

@@ -38,6 +38,9 @@ _QUANTISATION = 0.3
 _SETTLED = 0.015
 """Steps end when no corner moves further [px]; Gauss-Newton gains another digit with it."""
 
+_BESIDE = 2
+"""What covers a tag is blurred: pixels so near to what does not fit count no more either [px]."""
+
 _MODEL_ERROR = 0.004
 """What the model leaves out, whatever the noise, moves a corner by so much [px]."""
 
@@ -49,17 +52,22 @@ def _weighted_normal(
     weights: NDArray[np.float64],
     first: int,
     count: int,
+    held: bool,
     normal: NDArray[np.float64],
     right: NDArray[np.float64],
 ) -> None:
-    """Accumulate the normal equations of the unknowns from `first` on."""
+    """Accumulate the normal equations from `first` on, without the smear if it is `held`."""
     for a in range(first, rows.shape[0]):
+        if held and _SMEAR <= a < _LINEAR:
+            continue
         scaled = rows[a, :count] * weights[:count]
         total = 0.0
         for i in range(count):
             total += scaled[i] * residual[i]
         right[a] = total
         for b in range(first, a + 1):
+            if held and _SMEAR <= b < _LINEAR:
+                continue
             total = 0.0
             for i in range(count):
                 total += scaled[i] * rows[b, i]
@@ -78,7 +86,7 @@ def _linear_terms(
     """Fit offset, gain and slopes, which are linear, for the present geometry."""
     normal = np.zeros((UNKNOWNS, UNKNOWNS))
     right = np.zeros(UNKNOWNS)
-    _weighted_normal(rows, values, weights, _LINEAR, count, normal, right)
+    _weighted_normal(rows, values, weights, _LINEAR, count, False, normal, right)
     block = normal[_LINEAR:, _LINEAR:].copy()
     for k in range(4):
         block[k, k] = block[k, k] * (1.0 + 1e-9) + 1e-6
@@ -114,10 +122,36 @@ def _neighbours_alike(
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
+def _weigh_beside(
+    residual: NDArray[np.float64],
+    limit: float,
+    where: NDArray[np.int64],
+    count: int,
+    weights: NDArray[np.float64],
+) -> None:
+    """Take the weight from the pixels around those whose residual is above a limit."""
+    top, left = where[0, 0], where[1, :count].min()
+    marked = np.zeros(
+        (where[0, count - 1] - top + 1, where[1, :count].max() - left + 1), dtype=np.bool_
+    )
+    for i in range(count):
+        if abs(residual[i]) > limit:
+            row, column = where[0, i] - top, where[1, i] - left
+            marked[
+                max(row - _BESIDE, 0) : row + _BESIDE + 1,
+                max(column - _BESIDE, 0) : column + _BESIDE + 1,
+            ] = True
+    for i in range(count):
+        if marked[where[0, i] - top, where[1, i] - left]:
+            weights[i] = min(weights[i], 0.01)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
 def _weigh(
     residual: NDArray[np.float64],
     values: NDArray[np.float64],
     weights: NDArray[np.float64],
+    where: NDArray[np.int64],
     count: int,
     result: NDArray[np.float64],
 ) -> None:
@@ -132,10 +166,7 @@ def _weigh(
         weights[i] = 1.0 if off <= limit else (limit / off) ** 4
         all_square += off * off
         mean += values[i]
-    for i in range(count):
-        if abs(residual[i]) > 2.0 * limit:
-            for k in range(max(i - 2, 0), min(i + 3, count)):
-                weights[k] = min(weights[k], 0.1)
+    _weigh_beside(residual, 2.0 * limit, where, count, weights)
     for i in range(count):
         kept += weights[i]
         square += weights[i] * residual[i] ** 2
@@ -154,6 +185,7 @@ def _prepare(
     values: NDArray[np.float64],
     weights: NDArray[np.float64],
     residual: NDArray[np.float64],
+    where: NDArray[np.int64],
     count: int,
     result: NDArray[np.float64],
 ) -> bool:
@@ -167,7 +199,7 @@ def _prepare(
     for i in range(count):
         seen = linear[0] + gain * rows[12, i] + linear[2] * rows[13, i] + linear[3] * rows[14, i]
         residual[i] = values[i] - seen
-    _weigh(residual, values, weights, count, result)
+    _weigh(residual, values, weights, where, count, result)
     # The slopes of the light are small: derivatives take the gain of the tag's middle.
     for a in range(_LINEAR):
         for i in range(count):
@@ -218,6 +250,50 @@ def _finish(
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
+def _write_normal(
+    rows: NDArray[np.float64],
+    residual: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    count: int,
+    free_smear: bool,
+    normal: NDArray[np.float64],
+    right: NDArray[np.float64],
+) -> None:
+    """Write the normal equations of all unknowns that are free."""
+    _weighted_normal(rows, residual, weights, 0, count, not free_smear, normal, right)
+    if not free_smear:
+        _hold_smear(normal, right)
+    for a in range(UNKNOWNS):
+        normal[a, a] = normal[a, a] * (1.0 + 1e-9) + 1e-9
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _rows_and_room(start: NDArray[np.float64], free_smear: bool) -> tuple[int, int]:
+    """Return of how many rows one is used, and for how many pixels there must be room.
+
+    Of a large tag every second or third row of pixels is enough, if its smear is not fitted.
+    """
+    wide = (start[:, 0].max() - start[:, 0].min()) * 1.3 + 4.0
+    high = (start[:, 1].max() - start[:, 1].min()) * 1.3 + 4.0
+    stride = 1 + int(wide * high / _MOST_PIXELS) if not free_smear else 1
+    return stride, int(wide + 4.0) * int(high / stride + 4.0)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _begin(
+    corners: NDArray[np.float64], result: NDArray[np.float64], free_smear: bool
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the homography (9,), and blur and smear (3,) px, that a fit starts from."""
+    h = np.empty(9)
+    h[:8] = square_to_quad(corners)
+    h[8] = 1.0
+    state = np.array([min(max(result[0], _LEAST_BLUR), _MOST_BLUR), result[1], result[2]])
+    if not free_smear:
+        state[1:] = 0.0
+    return h, state
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
 def align(
     image: NDArray[np.uint8],
     table: NDArray[np.float32],
@@ -248,19 +324,9 @@ def align(
     """
     centre = np.array([start[:, 0].mean(), start[:, 1].mean()])
     corners[:] = start - centre
-    h = np.empty(9)
-    h[:8] = square_to_quad(corners)
-    h[8] = 1.0
-    state = np.array([min(max(result[0], _LEAST_BLUR), _MOST_BLUR), result[1], result[2]])
-    if not free_smear:
-        state[1:] = 0.0
+    h, state = _begin(corners, result, free_smear)
     side = side_length(start)
-    cell = side / BORDER
-    wide = (start[:, 0].max() - start[:, 0].min()) * 1.3 + 4.0
-    high = (start[:, 1].max() - start[:, 1].min()) * 1.3 + 4.0
-    # Of a large tag every second or third row of pixels is enough.
-    stride = 1 + int(wide * high / _MOST_PIXELS) if not free_smear else 1
-    room = int(wide + 4.0) * int(high / stride + 4.0)
+    stride, room = _rows_and_room(start, free_smear)
     rows, values = np.empty((UNKNOWNS, room)), np.empty(room)
     where = np.empty((2, room), dtype=np.int64)
     weights, residual = np.ones(room), np.empty(room)
@@ -269,19 +335,15 @@ def align(
     for step in range(passes + 1):
         before = count
         count = sample_model(
-            image, h, state, table, table_blur, cell, stride, centre, rows, values, where
+            image, h, state, table, table_blur, side / BORDER, stride, centre, rows, values, where
         )
         if count < 60:
             return False
         if count != before:
             weights[:count] = 1.0
-        if not _prepare(rows, values, weights, residual, count, result):
+        if not _prepare(rows, values, weights, residual, where, count, result):
             return False
-        _weighted_normal(rows, residual, weights, 0, count, normal, right)
-        if not free_smear:
-            _hold_smear(normal, right)
-        for a in range(UNKNOWNS):
-            normal[a, a] = normal[a, a] * (1.0 + 1e-9) + 1e-9
+        _write_normal(rows, residual, weights, count, free_smear, normal, right)
         if settled or step == passes:
             break
         last = corners.copy()
@@ -291,7 +353,7 @@ def align(
         if not moved < 0.5 * side:
             return False
         settled = moved < _SETTLED and widened < 0.03 * state[0]
-    result[0], result[1], result[2] = state[0], state[1], state[2]
+    result[:3] = state
     result[7] = _neighbours_alike(residual, weights, where, count)
     _finish(h, normal, result[4], result[7], covariance)
     corners += centre

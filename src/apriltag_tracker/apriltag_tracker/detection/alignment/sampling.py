@@ -136,6 +136,37 @@ def _look_up(
     )
 
 
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _pixels_of(
+    image: NDArray[np.uint8], h: NDArray[np.float64], centre: NDArray[np.float64]
+) -> tuple[int, int, int, int]:
+    """Return the first and last row and column of the image that a tag with its margin covers."""
+    low_x, high_x, low_y, high_y = _bounds(h)
+    return (
+        max(int(low_y + centre[1]), 0),
+        min(int(high_y + centre[1]) + 1, image.shape[0] - 1),
+        max(int(low_x + centre[0]), 0),
+        min(int(high_x + centre[0]) + 1, image.shape[1] - 1),
+    )
+
+
+@njit(cache=True, fastmath=True, inline="always")  # type: ignore[untyped-decorator]
+def _write_homography(
+    rows: NDArray[np.float64],
+    i: int,
+    gx: float,
+    gy: float,
+    u: float,
+    v: float,
+    w: float,
+    along: float,
+) -> None:
+    """Write derivatives of one pixel by the homography, from those by its place (gx, gy)."""
+    rows[0, i], rows[1, i], rows[2, i] = -gx * u * w, -gx * v * w, -gx * w
+    rows[3, i], rows[4, i], rows[5, i] = -gy * u * w, -gy * v * w, -gy * w
+    rows[6, i], rows[7, i] = along * u * w, along * v * w
+
+
 @njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
 def sample_model(
     image: NDArray[np.uint8],
@@ -162,11 +193,7 @@ def sample_model(
     instants = 1 if travel < 1e-9 else int(travel / 0.6) + 3
     back = inverse(h)
     reach = 2.0 * state[0] / cell
-    low_x, high_x, low_y, high_y = _bounds(h)
-    first_row = max(int(low_y + centre[1]), 0)
-    last_row = min(int(high_y + centre[1]) + 1, image.shape[0] - 1)
-    first = max(int(low_x + centre[0]), 0)
-    last = min(int(high_x + centre[0]) + 1, image.shape[1] - 1)
+    first_row, last_row, first, last = _pixels_of(image, h, centre)
     count = 0
     change = state[0] / cell - table_blur
     for row in range(first_row, last_row + 1, stride):
@@ -197,10 +224,7 @@ def sample_model(
             # Derivatives by the pixel.
             gx, gy = by_c * ux - by_r * vx, by_c * uy - by_r * vy
             w = 1.0 / (h[6] * u + h[7] * v + 1.0)
-            along = gx * x + gy * y
-            rows[0, count], rows[1, count], rows[2, count] = -gx * u * w, -gx * v * w, -gx * w
-            rows[3, count], rows[4, count], rows[5, count] = -gy * u * w, -gy * v * w, -gy * w
-            rows[6, count], rows[7, count] = along * u * w, along * v * w
+            _write_homography(rows, count, gx, gy, u, v, w, gx * x + gy * y)
             rows[8, count] = by_blur / cell
             rows[9, count] = along_c * ux - along_r * vx
             rows[10, count] = along_c * uy - along_r * vy

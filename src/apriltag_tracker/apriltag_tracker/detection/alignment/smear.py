@@ -21,6 +21,16 @@ _LEAST_BLUR = 0.32
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
+def _write_terms(grid: NDArray[np.float64], y: int, x: int, row: NDArray[np.float64]) -> None:
+    """Write half the second derivatives by x and y, the mixed one, 1, and the picture (5,)."""
+    row[0] = 0.5 * (grid[y, x + 1] + grid[y, x - 1]) - grid[y, x]
+    row[1] = 0.5 * (grid[y + 1, x] + grid[y - 1, x]) - grid[y, x]
+    row[2] = 0.25 * (grid[y + 1, x + 1] + grid[y - 1, x - 1])
+    row[2] -= 0.25 * (grid[y + 1, x - 1] + grid[y - 1, x + 1])
+    row[3], row[4] = 1.0, grid[y, x]
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
 def guess_smear(
     image: NDArray[np.uint8],
     table: NDArray[np.float32],
@@ -70,11 +80,7 @@ def guess_smear(
         y, x = where[0, i] - low_y, where[1, i] - low_x
         if not (0 < y < grid.shape[0] - 1 and 0 < x < grid.shape[1] - 1):
             continue
-        row[0] = 0.5 * (grid[y, x + 1] + grid[y, x - 1]) - grid[y, x]
-        row[1] = 0.5 * (grid[y + 1, x] + grid[y - 1, x]) - grid[y, x]
-        row[2] = 0.25 * (grid[y + 1, x + 1] + grid[y - 1, x - 1])
-        row[2] -= 0.25 * (grid[y + 1, x - 1] + grid[y - 1, x + 1])
-        row[3], row[4] = 1.0, grid[y, x]
+        _write_terms(grid, y, x, row)
         if not np.all(np.isfinite(row)):
             continue
         for a in range(5):
@@ -84,8 +90,13 @@ def guess_smear(
     for a in range(5):
         design[a, a] += 1e-6
     best = np.linalg.solve(design, right)
-    gain = max(best[4], 4.0)
-    xx, yy, xy = best[0] / gain, best[1] / gain, best[2] / gain
+    return float(_split(best / max(best[4], 4.0), blur, smear))
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _split(wider: NDArray[np.float64], blur: float, smear: NDArray[np.float64]) -> float:
+    """Split a change of the blur's covariance, xx yy xy [px²], into smear and blur (returned)."""
+    xx, yy, xy = wider[0], wider[1], wider[2]
     half, difference = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
     length = math.sqrt(24.0 * difference)
     angle = 0.5 * math.atan2(2.0 * xy, xx - yy)

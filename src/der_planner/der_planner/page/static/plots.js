@@ -36,7 +36,7 @@
     context.strokeStyle = "#dde2e7";
     context.font = "11px system-ui";
     for (const value of [low, (low + high) / 2, high]) {
-      context.fillText(value.toFixed(high - low < 10 ? 1 : 0), 2, y(value) + 4);
+      context.fillText(value.toFixed(high - low < 10 ? 1 : 0).replace(/^-(?=0(\.0+)?$)/, ""), 2, y(value) + 4);
       context.beginPath(); context.moveTo(left, y(value)); context.lineTo(width, y(value)); context.stroke();
     }
     for (const [name, dashed] of curves) for (let part = 0; part < 4; part += 1) {

@@ -1,0 +1,146 @@
+"""Read the code of a tag that moved by more than a cell during the exposure.
+
+A smear is linear: what a point of the picture shows is the mean of the cells that passed it. For a
+smear of known direction and length, the cells' grey levels follow from samples of the picture by
+least squares. A table of such solutions for smears of all directions is tried; how well each of
+them explains the samples tells which smear it was, and the printed code nearest to its cells which
+tag. That it is this tag is for the fit of the whole pattern to say.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from apriltag_tracker import family
+from apriltag_tracker.detection import decoding
+from apriltag_tracker.detection.edges import inside, sample
+
+_DIRECTIONS = 10
+_LENGTHS = (1.0, 1.5, 2.0, 2.5)
+"""Of the smears that are tried [cells]."""
+
+_SPACING = 0.5
+_FIRST = -0.75
+"""Samples lie in this raster [cells], from so far outside of the border."""
+
+_RIDGE = 0.02
+_TRIED = 8
+"""Of the smears that explain the samples best."""
+
+_LEAST_EXPLAINED = 0.8
+_LEAST_CONTRAST = 12.0
+_MOST_WRONG = 5
+
+
+@dataclass(frozen=True)
+class SmearedCode:
+    """What a smeared quadrilateral may be.
+
+    Attributes:
+        id: of the tag whose code is nearest.
+        turn: which corner is its printed lower left.
+        smear: (2,) px, the way during the exposure.
+    """
+
+    id: int
+    turn: int
+    smear: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Table:
+    """Smears (h, 2) in cells, and of each solution (38, samples) and normal matrix (38, 38)."""
+
+    smears: NDArray[np.float64]
+    solutions: NDArray[np.float32]
+    normals: NDArray[np.float32]
+
+
+def _raster() -> NDArray[np.float64]:
+    """Return where samples lie along one side [cells]."""
+    return np.arange(_FIRST, family.BORDER_CELLS - _FIRST + 1e-9, _SPACING)
+
+
+@functools.cache
+def _table() -> _Table:
+    """Return the solutions for all smears.
+
+    Unknown are the grey levels of the 36 inner cells row by row from the upper left, of the border
+    and of the margin.
+    """
+    places = _raster()
+    across, up = np.meshgrid(places, places)
+    smears, shown = [], []
+    instants = (np.arange(15) + 0.5) / 15 - 0.5
+    for length in _LENGTHS:
+        for k in range(_DIRECTIONS):
+            angle = math.pi * k / _DIRECTIONS
+            smear = length * np.array([math.cos(angle), math.sin(angle)])
+            design = np.zeros((across.size, 38))
+            for t in instants:
+                column = np.floor(across + t * smear[0]).astype(np.int64).ravel()
+                row = 7 - np.floor(up + t * smear[1]).astype(np.int64).ravel()
+                ring = np.minimum(np.minimum(column, 7 - column), np.minimum(row, 7 - row))
+                cell = np.where(ring >= 1, (row - 1) * 6 + column - 1, np.where(ring < 0, 37, 36))
+                design[np.arange(across.size), cell] += 1.0 / len(instants)
+            smears.append(smear)
+            shown.append(design)
+    stacked = np.array(shown)
+    normal = np.swapaxes(stacked, 1, 2) @ stacked + _RIDGE * np.eye(38)
+    solutions = np.linalg.solve(normal, np.swapaxes(stacked, 1, 2))
+    return _Table(np.array(smears), solutions.astype(np.float32), normal.astype(np.float32))
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _sample_quad(
+    image: NDArray[np.uint8],
+    corners: NDArray[np.float64],
+    places: NDArray[np.float64],
+    values: NDArray[np.float64],
+) -> bool:
+    """Sample a quadrilateral at `places` [cells] along both sides, upwards and to the right."""
+    h = decoding.square_to_quad(corners)
+    for row in range(len(places)):
+        v = places[row] / 8.0
+        for column in range(len(places)):
+            u = places[column] / 8.0
+            w = h[6] * u + h[7] * v + 1.0
+            x, y = (h[0] * u + h[1] * v + h[2]) / w, (h[3] * u + h[4] * v + h[5]) / w
+            if not inside(image, x, y):
+                return False
+            values[row * len(places) + column] = sample(image, x, y)
+    return True
+
+
+def read_smeared(image: NDArray[np.uint8], quad: NDArray[np.float64]) -> SmearedCode | None:
+    """Read a quadrilateral (4, 2) px that runs as printed; None if it is no smeared tag."""
+    table, places = _table(), _raster()
+    values = np.empty(len(places) ** 2)
+    if not _sample_quad(image, quad, places, values):
+        return None
+    values = (values - values.mean()).astype(np.float32)
+    whole = max(float(values @ values), 1e-3)
+    levels = table.solutions @ values
+    # Of a least-squares solution x with normal matrix N, xᵀ N x is what it explains.
+    explained = np.einsum("hc,hcd,hd->h", levels, table.normals, levels) / whole
+    if explained.max() < _LEAST_EXPLAINED:
+        return None
+    best: SmearedCode | None = None
+    fewest = _MOST_WRONG + 1
+    for k in np.argsort(-explained)[:_TRIED]:
+        black, white = levels[k, 36:]
+        if white - black < _LEAST_CONTRAST:
+            continue
+        tag, turn, wrong = decoding.nearest_code(levels[k, :36] > 0.5 * (black + white))
+        if wrong < fewest:
+            side = 0.5 * (quad[1] - quad[0] + quad[2] - quad[3]) / family.BORDER_CELLS
+            rise = 0.5 * (quad[3] - quad[0] + quad[2] - quad[1]) / family.BORDER_CELLS
+            smear = table.smears[k, 0] * side + table.smears[k, 1] * rise
+            best, fewest = SmearedCode(tag, turn, smear), wrong
+    return best
