@@ -29,7 +29,7 @@ window.fetch = (...all) => {
 """
 """Notes the instant of each press, by the browser's own stamp of the event [ms]."""
 NEWEST = "return window.presses ? window.presses.at(-1) : null;"
-COUNTS = "return [page.pictures, page.data.count, performance.now()];"
+COUNTS = "return [page.pictures, page.received, performance.now()];"
 
 
 def _difference(command: ChamberPressures) -> float:

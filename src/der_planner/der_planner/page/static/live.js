@@ -1,7 +1,7 @@
 // Keeps the page honest: shows what the server sends ten times a second, greys what is old, also when
 // nothing comes any more, and sends the vent. It needs nothing of the page's framework.
 "use strict";
-const page = { data: null, at: -Infinity, listeners: [] };
+const page = { data: null, at: -Infinity, received: 0, listeners: [] };
 (() => {
   const LOST = 0.7; // seconds without live data after which the connection counts as lost
   const seconds = () => performance.now() / 1000;
@@ -17,6 +17,7 @@ const page = { data: null, at: -Infinity, listeners: [] };
       if (socket !== mine) return;
       page.data = JSON.parse(event.data);
       page.at = seconds();
+      page.received += 1;
       show();
       page.listeners.forEach((listener) => listener(page.data));
     };
