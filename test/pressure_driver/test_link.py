@@ -188,7 +188,7 @@ def test_a_port_in_use_is_named_with_the_remedy(rig):
 def test_a_file_is_no_port(tmp_path):
     path = tmp_path / "file"
     path.write_text("text")
-    with pytest.raises(PortError, match="cannot open serial port"):
+    with pytest.raises(PortError, match="is no serial port"):
         open_port(str(path), 115_200)
 
 
