@@ -1,4 +1,4 @@
-"""One diagnostics publisher for every node: `/diagnostics`, three times a second."""
+"""One diagnostics publisher for every node: `/diagnostics`, once a second."""
 
 from __future__ import annotations
 
@@ -27,15 +27,12 @@ _LEVELS = {
     "error": DiagnosticStatus.ERROR,
     "stale": DiagnosticStatus.STALE,
 }
-REPEATS = 3
-"""Messages a second: the node's report of that second, and the same again, so that whoever listens
-notices within a second that the node has died."""
 _CPU_INTERVAL = 0.5
 """[s] over which the CPU time is taken at least: over less, its own ticks show."""
 
 
 class DiagnosticsPublisher:
-    """Calls ``report`` once a second, and publishes it `REPEATS` times, with the CPU time used.
+    """Calls ``report`` once a second and publishes what it returns, and what CPU time was used.
 
     Args:
         node: the node that the status is about.
@@ -50,32 +47,20 @@ class DiagnosticsPublisher:
         self._publisher = node.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, qos.STATES)
         self._used, self._looked = time.process_time(), time.monotonic()
         self._cpu = 0.0
-        self._status = DiagnosticStatus()
-        self._ticks = 0
-        self._timer = node.create_timer(1.0 / REPEATS, self._tick)
-
-    def _tick(self) -> None:
-        self._ticks += 1
-        if self._ticks % REPEATS == 0:
-            self.publish()
-        elif self._status.name:
-            self._send()
+        self._timer = node.create_timer(1.0, self.publish)
 
     def publish(self) -> None:
-        """Report and publish now, without waiting for the next second."""
+        """Publish now, without waiting for the next second."""
         health = self._report()
         values = {**health.values, "cpu_percent": f"{self._measure_cpu():.0f}"}
-        self._status = DiagnosticStatus(
+        status = DiagnosticStatus(
             level=_LEVELS[health.level],
             name=self._node.get_fully_qualified_name(),
             message=health.message,
             hardware_id=self._hardware_id,
             values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
         )
-        self._send()
-
-    def _send(self) -> None:
-        message = DiagnosticArray(status=[self._status])
+        message = DiagnosticArray(status=[status])
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)
 

@@ -16,8 +16,8 @@ CENTIMETRES = 100.0
 NANOSECONDS = 1_000_000_000
 FRESH = {"driver": 0.5, "tracker": 0.5, "camera": 0.7}
 """[s] that the newest message of a source may be old before the page greys it."""
-LATE, DEAD = 0.7, 5.0
-"""[s] without diagnostics, which every node sends three times a second."""
+LATE, DEAD = 1.6, 5.0
+"""[s] without diagnostics, which every node sends once a second."""
 MODES = ("disarmed", "armed", "tracking", "holding", "venting", "fault")
 LEVELS = ("ok", "warning", "error", "stale")
 REFERENCES_KEPT = 200
