@@ -172,9 +172,9 @@ def test_a_signal_while_a_node_is_being_loaded_ends_it_without_a_word(graph, pac
                 masks = dict(line.split(":", 1) for line in Path(status).read_text().splitlines())
                 return int(masks["SigCgt"], 16) & bit
 
-        # Python itself catches SIGINT from the start; SIGHUP only once the node's entry runs.
+        # Python itself catches SIGINT from the start; the others only once the node's entry runs.
         deadline = time.monotonic() + 30.0
-        while not caught(1 << signal.SIGHUP - 1):
+        while not (caught(1 << signal.SIGHUP - 1) and caught()):
             assert time.monotonic() < deadline
             time.sleep(0.001)
         node.signal(number)

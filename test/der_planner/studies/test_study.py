@@ -69,13 +69,14 @@ def test_names_that_yaml_takes_for_something_else(tmp_path):
         study(tmp_path, factors="{mounting: upside}")
 
 
-def test_pcc_has_one_method(tmp_path):
-    """Rows that do the same come once."""
+def test_both_models_have_every_method(tmp_path):
     found = study(tmp_path, factors="{model: [der, pcc], method: [optimal, projected, paper]}")
     assert [tuple(row.values.values()) for row in found.rows] == [
         ("der", "optimal"),
         ("der", "projected"),
         ("der", "paper"),
+        ("pcc", "optimal"),
+        ("pcc", "projected"),
         ("pcc", "paper"),
     ]
 

@@ -98,7 +98,7 @@ FACTORS: dict[str, Factor] = {
     "model": Factor("-", "planned with", PLANNED, "der", choices=tuple(METHODS)),
     "method": Factor(
         "-",
-        "of planning; best: optimal for der; pcc has one, whatever is named",
+        "of planning, the same for both models; best: optimal",
         PLANNED,
         "best",
         choices=("best", *METHODS["der"]),

@@ -109,7 +109,7 @@ class Study:
         """Every row once, in the order in which they are begun."""
         made: dict[str, Row] = {}
         for values in draws.rows(self.grid, self.spreads, self.draw):
-            plain = self.task.plain(values)
+            plain = dict(values)
             made.setdefault(key := self.key(plain), Row(key, plain))
         return tuple(made.values())
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from der_planner.limb import Limb, Segment
 from der_planner.model.response import simulate_many
-from der_planner.planning import METHODS, Motion, Plan, plan
+from der_planner.planning import Motion, Plan, plan
 from der_planner.studies import twins
 from der_planner.studies.factors import (
     ERROR,
@@ -61,13 +61,6 @@ class Task:
     work: Callable[[str, Sequence[Values]], list[Result | Exception]]
     batch: int = 1
     calibrated: bool = False
-
-    def plain(self, values: Values) -> dict[str, Value]:
-        """Return a row's values in the one way in which they are written."""
-        row = dict(values)
-        if row.get("model") == "pcc" and "method" in row:
-            row["method"] = METHODS["pcc"][0]
-        return row
 
     def twin(self, values: Values) -> twins.Twin | None:
         """Return the calibrated twin that a row needs, if any."""
@@ -119,8 +112,8 @@ def _planned(limb: Limb, row: Mapping[str, Any]) -> Plan:
     motion = Motion.named(
         row["motion"], amplitude=row["amplitude"], period=row["period"], cycles=row["cycles"]
     )
-    method = METHODS["pcc"][0] if row["model"] == "pcc" else row["method"]
-    return plan(limb, motion, model=row["model"], method="" if method == "best" else method)
+    method = "" if row["method"] == "best" else row["method"]
+    return plan(limb, motion, model=row["model"], method=method)
 
 
 def _run(limb: str, rows: Sequence[Values]) -> list[Result | Exception]:
