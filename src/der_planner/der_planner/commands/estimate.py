@@ -75,8 +75,6 @@ def estimate_run(planned: Plan, run: RunSeries) -> Smoothed:
     """
     check_same(planned, run)
     played = dataclasses.replace(planned, differential_pressure=run.setpoints.value)
-    # A learned plan's tip is not that of the model: what is asked here is what the model lacks.
-    played = dataclasses.replace(played, tip_predicted=planned.tip_predicted)
     filmed = Filmed(
         run.measured.time, run.measured.value, run.tip.time, run.bend_angle.value, run.tip.value
     )

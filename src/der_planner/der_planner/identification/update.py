@@ -128,6 +128,7 @@ class _Days:
         self._limb, self._runs = limb, runs
         self._size = 3 * limb.segment_count
         self._weight = 1.0 / (ANGLE_ERROR * math.sqrt(CORRELATION))
+        self._last: tuple[bytes, list[Array] | None] | None = None
         gain, rest = math.log(LARGEST_GAIN_CHANGE) / GAIN_SPREAD, LARGEST_REST_CHANGE / REST_SPREAD
         self._high = np.tile([gain, rest, _LARGEST_FRICTION_CHANGE], limb.segment_count)
         self._low = -self._high
@@ -267,7 +268,16 @@ class _Days:
         return np.stack(columns, axis=1) if columns else np.zeros((rows, 0))
 
     def _angles(self, x: Array) -> list[Array] | None:
-        """Return the predicted bend angles (K, M) [rad] of each run; None: not followed."""
+        """Return the predicted bend angles (K, M) [rad] of each run; None: not followed.
+
+        The last ones are kept: errors and slopes are asked for at the same unknowns.
+        """
+        key = x.tobytes()
+        if self._last is None or self._last[0] != key:
+            self._last = (key, self._predicted(x))
+        return self._last[1]
+
+    def _predicted(self, x: Array) -> list[Array] | None:
         model = RodModel(self.limb(x), NODES)
         try:
             angles = [

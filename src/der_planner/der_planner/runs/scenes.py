@@ -22,6 +22,7 @@ from der_planner.runs.series import (
     PRESSURE_TYPE,
     STATE_TYPE,
     TRUTH_SUFFIX,
+    header_stamp,
     namespace_of,
 )
 from der_planner.runs.sight import (
@@ -258,18 +259,18 @@ def _read(bag: BagReader, namespace: str, sights: TagSights) -> Tracks:
         if len(sights.pixels) < ENOUGH_SIGHTS:
             sights.add(message)
         corners = [np.asarray(tag.corners) for tag in message.detections]
-        tracks.tags.add(_stamp(message), np.array(corners, dtype=np.float32).reshape(-1, 8))
+        tracks.tags.add(header_stamp(message), np.array(corners, dtype=np.float32).reshape(-1, 8))
 
     takers: dict[str, Callable[[Any], None]] = {
-        STATE_TYPE: lambda message: tracks.limb.add(_stamp(message), _limb(message)),
-        PRESSURE_TYPE: lambda message: tracks.driver.add(_stamp(message), _driver(message)),
-        PLAN_TYPE: lambda message: tracks.plan.add(_stamp(message), _plan(message)),
+        STATE_TYPE: lambda message: tracks.limb.add(header_stamp(message), _limb(message)),
+        PRESSURE_TYPE: lambda message: tracks.driver.add(header_stamp(message), _driver(message)),
+        PLAN_TYPE: lambda message: tracks.plan.add(header_stamp(message), _plan(message)),
         MARKERS_TYPE: lambda message: _take_planned(tracks, message),
-        ESTIMATE_TYPE: lambda message: tracks.estimate.add(_stamp(message), _curve(message)),
+        ESTIMATE_TYPE: lambda message: tracks.estimate.add(header_stamp(message), _curve(message)),
         TAGS_TYPE: take_tags,
         CAMERA_TYPE: take_camera,
         POINT_TYPE: lambda message: tracks.reference.add(
-            _stamp(message), (float(message.point.x), float(message.point.y))
+            header_stamp(message), (float(message.point.x), float(message.point.y))
         ),
     }
     wanted: dict[str, Callable[[Any], None]] = {}
@@ -280,10 +281,6 @@ def _read(bag: BagReader, namespace: str, sights: TagSights) -> Tracks:
     for name, _, message in bag.messages(list(wanted)):
         wanted[name](message)
     return tracks
-
-
-def _stamp(message: Any) -> int:
-    return int(message.header.stamp.sec) * NANOSECONDS + int(message.header.stamp.nanosec)
 
 
 def _curve(message: Any) -> NDArray[np.float32]:
@@ -324,8 +321,6 @@ def _plan(message: Any) -> PlanScene:
 def _take_planned(tracks: Tracks, message: Any) -> None:
     for marker in message.markers:
         if marker.ns == LIMB_MARKER:
-            stamp = stamp_of(message)
-            if stamp is not None:
-                points = curve_points(marker.points).astype(np.float32)
-                tracks.planned.add(stamp, points)
+            points = curve_points(marker.points).astype(np.float32)
+            tracks.planned.add(header_stamp(marker), points)
             return

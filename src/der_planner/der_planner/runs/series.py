@@ -155,7 +155,8 @@ def namespace_of(topic: str) -> str:
     return topic.rsplit("/", levels)[0] or "/"
 
 
-def _stamp(message: Any) -> int:
+def header_stamp(message: Any) -> int:
+    """Return the stamp of a recorded message [ns]."""
     return int(message.header.stamp.sec) * NANOSECONDS + int(message.header.stamp.nanosec)
 
 
@@ -193,12 +194,12 @@ def _taker(topic: str, type_name: str) -> Callable[[LimbRecord, Any], None] | No
 
 
 def _take_plan(limb: LimbRecord, message: Any) -> None:
-    limb.plans[message.plan_id] = (_stamp(message), message)
+    limb.plans[message.plan_id] = (header_stamp(message), message)
 
 
 def _take_setpoint(limb: LimbRecord, message: Any) -> None:
     of_plan = limb.setpoints.setdefault(message.plan_id, Columns())
-    of_plan.append(_stamp(message), message.differential_pressure)
+    of_plan.append(header_stamp(message), message.differential_pressure)
     limb.setpoint_indices.setdefault(message.plan_id, array("q")).append(int(message.index))
     if message.revision:
         limb.revised.add(message.plan_id)
@@ -206,18 +207,20 @@ def _take_setpoint(limb: LimbRecord, message: Any) -> None:
         planned = () if plan is None else _planned(plan)
         if message.index < len(planned):
             added = np.asarray(message.differential_pressure) - planned[message.index]
-            limb.revisions.setdefault(message.plan_id, Revisions()).revised(_stamp(message), added)
+            limb.revisions.setdefault(message.plan_id, Revisions()).revised(
+                header_stamp(message), added
+            )
 
 
 def _take_estimate(limb: LimbRecord, message: Any) -> None:
-    picture = _stamp(message) - round(message.age * NANOSECONDS)
+    picture = header_stamp(message) - round(message.age * NANOSECONDS)
     revisions = limb.revisions.get(message.plan_id)
     if revisions is not None:
         revisions.estimated(picture, np.asarray(message.correction))
 
 
 def _take_state(limb: LimbRecord, message: Any) -> None:
-    stamp, valid = _stamp(message), bool(message.valid)
+    stamp, valid = header_stamp(message), bool(message.valid)
     limb.tip.append(stamp, (message.tip.x, message.tip.y) if valid else ())
     limb.angles.append(stamp, message.bend_angle if valid else ())
     limb.covariance.append(stamp, message.tip_covariance if valid else ())
@@ -225,11 +228,11 @@ def _take_state(limb: LimbRecord, message: Any) -> None:
 
 def _take_truth(limb: LimbRecord, message: Any) -> None:
     if message.valid:
-        limb.truth.append(_stamp(message), (message.tip.x, message.tip.y))
+        limb.truth.append(header_stamp(message), (message.tip.x, message.tip.y))
 
 
 def _take_pressure(limb: LimbRecord, message: Any) -> None:
-    stamp = _stamp(message)
+    stamp = header_stamp(message)
     limb.commanded.append(stamp, message.commanded_differential)
     limb.measured.append(stamp, message.measured_differential)
     if message.mode == FAULT_MODE:
@@ -239,7 +242,7 @@ def _take_pressure(limb: LimbRecord, message: Any) -> None:
 
 def _take_board(limb: LimbRecord, message: Any) -> None:
     chambers = np.asarray(message.pressure)
-    limb.board.append(_stamp(message), chambers[0::2] - chambers[1::2])
+    limb.board.append(header_stamp(message), chambers[0::2] - chambers[1::2])
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,13 @@ from numpy.typing import NDArray
 
 from der_planner.runs.recording.reader import BagReader
 from der_planner.runs.run import Array
-from der_planner.runs.series import NANOSECONDS, PLAN_TYPE, STATE_TYPE, TRUTH_SUFFIX, namespace_of
+from der_planner.runs.series import (
+    PLAN_TYPE,
+    STATE_TYPE,
+    TRUTH_SUFFIX,
+    header_stamp,
+    namespace_of,
+)
 
 IMAGE_TYPE = "sensor_msgs/msg/Image"
 CAMERA_TYPE = "sensor_msgs/msg/CameraInfo"
@@ -63,7 +69,7 @@ def stamp_of(message: Any) -> int | None:
         if not lines:
             return None
         message = lines[0]
-    return int(message.header.stamp.sec) * NANOSECONDS + int(message.header.stamp.nanosec)
+    return header_stamp(message)
 
 
 def curve_points(points: Sequence[Any]) -> Array:

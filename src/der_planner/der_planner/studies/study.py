@@ -109,8 +109,7 @@ class Study:
         """Every row once, in the order in which they are begun."""
         made: dict[str, Row] = {}
         for values in draws.rows(self.grid, self.spreads, self.draw):
-            plain = dict(values)
-            made.setdefault(key := self.key(plain), Row(key, plain))
+            made.setdefault(key := self.key(values), Row(key, dict(values)))
         return tuple(made.values())
 
     def key(self, values: Mapping[str, Value]) -> str:
