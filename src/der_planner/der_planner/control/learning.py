@@ -45,7 +45,7 @@ _UNLIKE = 4.0
 """A run that differs from the others by so many standard deviations is not one of them …"""
 _NOTABLE = 1.5e-3
 """… if it also differs by more than this, root mean square [m]."""
-PULL = 0.03
+PULL = 0.015
 """Pull toward the best commands, over the tip's way per pressure: the model's answer to a change of
 commands is wrong by some per cent of the movement of each segment, even where they cancel at the
 tip. (A weaker pull lets segments wander against each other near the straight pose, where the tip
