@@ -11,9 +11,9 @@ from der_planner.model.air import (
     chamber_pressures,
     derivative,
     follow_commands,
-    slow_venting,
     vent_memory,
 )
+from der_planner.model.commands import slow_venting
 from der_planner.model.drive import STEPS
 from der_planner.model.material import differential_pressure
 from der_planner.model.series import CONTROL_PERIOD

@@ -150,8 +150,9 @@ def _delayed(command: Array, start: Array, delay: float, steps: int) -> Array:
 
 def memory_of(air: Pneumatics) -> float:
     """Return for how long after a command its chambers can still tell of it [s]."""
-    lag = max(air.time_constant, 1.0 / lag_rate(_REMEMBERED, law_of(air)) / 10)
-    return air.delay + 25 * max(lag, air.vent_lag) + vent_memory(air)
+    little_left = 1.0 / float(lag_rate(_REMEMBERED, law_of(air)))
+    lag = max(air.time_constant, air.vent_lag, 0.1 * little_left)
+    return air.delay + 25 * lag + vent_memory(air)
 
 
 def vent_memory(air: Pneumatics) -> float:
@@ -324,121 +325,3 @@ def even_pulse(air: Pneumatics, period: float, steps: int) -> Array:
     command[0] = 1.0
     even = replace(air, time_constant=mean, vent_time_constant=0.0, vent_rate=0.0)
     return follow_commands(even, command, period, steps).differential.ravel()
-
-
-# The inverse -----------------------------------------------------------------------------------
-
-
-def leading_commands(air: Pneumatics, time: Array, pressure: Array) -> Array:
-    """Return what the chambers have to be commanded (F, M) [Pa] to hold wanted pressures in time.
-
-    The inverse of lag and venting; the dead time is the caller's, who asks for later pressures.
-    Where a chamber cannot fall as fast as is wanted, its neighbour is filled by the difference.
-
-    Args:
-        air: lag and venting.
-        time: (F,) rising instants [s].
-        pressure: (F, M) wanted differential pressures [Pa].
-    """
-    fill, vent = air.time_constant, air.vent_lag
-    if air.vent_rate == 0:
-        slope = np.gradient(pressure, time, axis=0)
-        led: Array = pressure + np.where(pressure * slope >= 0, fill, vent) * slope
-        return led
-    chambers, second = least_pairs(air, time, pressure)
-    slope = np.gradient(chambers, time, axis=1)
-    if air.vent_lag_exponent > 0:
-        # Below a tenth of the reference a lag would ask for less than nothing.
-        vent = vent * np.maximum(chambers / VENT_REFERENCE, 0.1) ** -air.vent_lag_exponent
-    pair = np.maximum(chambers + np.where(slope >= 0, fill, vent) * slope, 0.0)
-    filled: Array = np.where(second, -pair[1], pair[0])
-    return filled
-
-
-def least_pairs(air: Pneumatics, time: Array, pressure: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the least gauge pressures (2, F, M) [Pa] of chambers whose difference is wanted.
-
-    Also which chamber the command has to fill (F, M): the second, or the first. Arguments as of
-    `leading_commands`.
-    """
-    pairs: tuple[Array, NDArray[np.bool_]] = _least_pairs(
-        np.ascontiguousarray(pressure), np.diff(time), law_of(air)
-    )
-    return pairs
-
-
-@njit(cache=True, nogil=True)
-def _least_pairs(wanted: Array, steps: Array, law: AirLaw) -> tuple[Array, NDArray[np.bool_]]:
-    count, inputs = wanted.shape
-    chambers = np.empty((2, count, inputs))
-    second = np.zeros((count, inputs), dtype=np.bool_)
-    for m in range(inputs):
-        left, right = max(wanted[0, m], 0.0), max(-wanted[0, m], 0.0)
-        for k in range(count):
-            if k > 0:
-                h = steps[k - 1]
-                left = fallen(left, 0.0, h, law)[0]
-                right = fallen(right, 0.0, h, law)[0]
-            gap = wanted[k, m] + right - left
-            second[k, m] = gap < 0.0
-            left, right = left + max(gap, 0.0), right + max(-gap, 0.0)
-            chambers[0, k, m], chambers[1, k, m] = left, right
-    return chambers, second
-
-
-@dataclass(frozen=True)
-class SlowVenting:
-    """Where a motion wants one pressure to fall faster than its chamber is vented.
-
-    Attributes:
-        index: of the pressure.
-        time: when it should fall fastest in comparison with what its chamber does by itself [s].
-        wanted: rate at which it should fall then [Pa/s].
-        possible: rate at which the chamber falls then [Pa/s].
-        opposite: the largest pressure that the opposite chamber needs to balance the slow one [Pa].
-    """
-
-    index: int
-    time: float
-    wanted: float
-    possible: float
-    opposite: float
-
-
-def slow_venting(air: Pneumatics, time: Array, pressure: Array) -> SlowVenting | None:
-    """Return the worst of the pressures (F, M) [Pa] that should fall too fast at times (F,) [s].
-
-    None for a limb whose outlets never hold a chamber up.
-    """
-    if air.vent_rate == 0:
-        return None
-    chambers, _ = least_pairs(air, time, pressure)
-    both = np.minimum(chambers[0], chambers[1])
-    j = int(np.argmax(both.max(axis=0)))
-    fall = -np.gradient(np.abs(pressure[:, j]), time)
-    held = np.maximum(chambers[0, :, j], chambers[1, :, j])
-    possible = air.vent_rate * (held / VENT_REFERENCE) ** air.vent_exponent
-    k = int(np.argmax(fall - possible))
-    return SlowVenting(
-        j, float(time[k]), float(fall[k]), float(possible[k]), float(both[:, j].max())
-    )
-
-
-__all__ = [
-    "AirLaw",
-    "Chambers",
-    "SlowVenting",
-    "chamber_pressures",
-    "derivative",
-    "even_pulse",
-    "follow_commands",
-    "law_of",
-    "leading_commands",
-    "least_pairs",
-    "memory_of",
-    "pair_of",
-    "pressures_at_commands",
-    "slow_venting",
-    "vent_memory",
-    "vented",
-]

@@ -154,7 +154,8 @@ class Correction:
         """Return what is best for wanted tips (K, 2) [m], and the steps of all windows.
 
         Args:
-            commands, pull: as of `plan`.
+            commands: (K, M) toward which the plan is pulled [Pa].
+            pull: as of `plan`.
             wanted: of the model without what friction changes.
             begin: where the search starts; None: at ``commands``.
         """
