@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import time as clock
 from typing import NamedTuple
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
+from der_planner.limb import Limb
 from der_planner.model.drive import STEPS, Bend
 from der_planner.model.response import NODES, simulate
 from der_planner.model.series import CONTROL_PERIOD
@@ -64,11 +66,27 @@ class Correction:
         self._physics = physics
         self._spline = physics.configuration(plan.reference)
         self._plan = plan
+        self._limb = plan.limb
+
+    def of(self, limb: Limb) -> Correction:
+        """Return the same with another limb's model; what it plans names the plan's own limb.
+
+        Args:
+            limb: with as many segments.
+        """
+        other = copy.copy(self)
+        other._limb, other._physics = limb, models.build(limb, self._plan.model, NODES)
+        return other
+
+    @property
+    def limb(self) -> Limb:
+        """The limb whose model it is."""
+        return self._limb
 
     @property
     def lever(self) -> float:
         """Largest movement of the tip per differential pressure of a segment at rest [m/Pa]."""
-        limb = self._plan.limb
+        limb = self._limb
         ahead = np.cumsum([s.length for s in limb.segments][::-1])[::-1]
         return float(np.max(limb.static_gain * ahead))
 
