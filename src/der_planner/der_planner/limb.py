@@ -142,8 +142,8 @@ class Limb:
 
     @property
     def static_gain(self) -> NDArray[np.float64]:
-        """(M,) bend angle per differential pressure of a linear segment, G L / EI [rad/Pa]."""
-        return np.array([s.moment_gain * s.length / s.bending_stiffness for s in self.segments])
+        """(M,) `Segment.static_gain` [rad/Pa]."""
+        return np.array([segment.static_gain for segment in self.segments])
 
     def for_model(self, model: str) -> Limb:
         """Return the limb as a model sees it: "pcc" with its own segments, if any."""
