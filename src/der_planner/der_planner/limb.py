@@ -8,6 +8,7 @@ description.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -207,6 +208,7 @@ class Limb:
             raise LimbError(f"limb file {path}: {error}") from error
 
     @classmethod
+    @functools.cache
     def default(cls) -> Limb:
         """Return the limb that comes with the package: two silicone segments of 0.122 m."""
         return cls.from_yaml(DEFAULT_LIMB_FILE)
