@@ -16,9 +16,16 @@ sys.path.insert(0, str(ROOT / "test" / "support"))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run files with slow tests first: in parallel, none of them is then waited for at the end."""
+    """Run files with slow tests first: in parallel, none of them is then waited for at the end.
+
+    Of the tests that run the whole graph, no two run at once; other files go to any worker.
+    """
+    whole = ROOT / "test" / "graph"
     slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
+    items.sort(key=lambda item: item.path not in slow and whole not in item.path.parents)
+    for item in items:
+        group = "whole graph" if whole in item.path.parents else str(item.path)
+        item.add_marker(pytest.mark.xdist_group(group))
 
 
 @pytest.fixture(scope="session")
@@ -61,16 +68,12 @@ class Graph:
         self.client.close()
 
 
-def _domain() -> int:
-    """Return the ROS domain of this process's tests."""
-    # 102 to 231 collides with ephemeral ports on Linux; 0 to 20 is where people work.
-    return int(os.environ.get("TEST_DOMAIN_ID", 21 + os.getpid() % 80))
-
-
 @pytest.fixture
 def graph(tmp_path: Path) -> Iterator[Graph]:
     """Return a `Graph` whose processes end with the test."""
-    running = Graph(tmp_path, _domain())
+    from domain import own_domain
+
+    running = Graph(tmp_path, own_domain())
     yield running
     running.close()
 
@@ -78,6 +81,8 @@ def graph(tmp_path: Path) -> Iterator[Graph]:
 @pytest.fixture(scope="module")
 def lasting_graph(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Graph]:
     """Return a `Graph` that all tests of a module share."""
-    running = Graph(tmp_path_factory.mktemp("graph"), _domain())
+    from domain import own_domain
+
+    running = Graph(tmp_path_factory.mktemp("graph"), own_domain())
     yield running
     running.close()
