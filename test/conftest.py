@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -15,19 +16,29 @@ sys.path.insert(0, str(ROOT / "scripts"))
 sys.path.insert(0, str(ROOT / "test" / "support"))
 
 
-# Before xdist reads the groups.
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run files with slow tests first: in parallel, none of them is then waited for at the end.
+WHOLE_GRAPH = "test/graph/"
+"""Tests that run the whole graph, where each node is timed by the others."""
 
-    Of the tests that run the whole graph, no two run at once; other files go to any worker.
-    """
-    whole = ROOT / "test" / "graph"
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Run files with slow tests first: in parallel, none of them is then waited for at the end."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow and whole not in item.path.parents)
-    for item in items:
-        group = "whole graph" if whole in item.path.parents else str(item.path)
-        item.add_marker(pytest.mark.xdist_group(group))
+    items.sort(key=lambda item: item.path not in slow and WHOLE_GRAPH not in item.nodeid)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Give each file to one worker, and all tests of the whole graph to the same one.
+
+    pytest-xdist's own groups do nothing under pytest 9.2 (its issue 1386).
+    """
+    from xdist.scheduler import LoadFileScheduling
+
+    class OneGraphAtATime(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return WHOLE_GRAPH if nodeid.startswith(WHOLE_GRAPH) else super()._split_scope(nodeid)
+
+    return OneGraphAtATime(config, log) if config.getvalue("dist") == "loadfile" else None
 
 
 @pytest.fixture(scope="session")
