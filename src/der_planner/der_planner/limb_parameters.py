@@ -222,6 +222,11 @@ class Segment:
         ),
     )
 
+    @property
+    def static_gain(self) -> float:
+        """Bend angle per differential pressure where the segment is linear, G L / EI [rad/Pa]."""
+        return self.moment_gain * self.length / self.bending_stiffness
+
 
 @dataclass(frozen=True)
 class Pneumatics:

@@ -389,23 +389,3 @@ def slow_venting(air: Pneumatics, time: Array, pressure: Array) -> SlowVenting |
     return SlowVenting(
         j, float(time[k]), float(fall[k]), float(possible[k]), float(both[:, j].max())
     )
-
-
-__all__ = [
-    "AirLaw",
-    "Chambers",
-    "SlowVenting",
-    "chamber_pressures",
-    "derivative",
-    "even_pulse",
-    "follow_commands",
-    "law_of",
-    "leading_commands",
-    "least_pairs",
-    "memory_of",
-    "pair_of",
-    "pressures_at_commands",
-    "slow_venting",
-    "vent_memory",
-    "vented",
-]

@@ -16,9 +16,9 @@ from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import models
 from der_planner.planning.errors import PlanningError
 from der_planner.planning.inverse import solve
-from der_planner.planning.motions import sample_spline
 from der_planner.planning.optimal import Optimiser, Outcome, Settings
 from der_planner.planning.result import Plan
+from der_planner.planning.ways import sample_spline
 from der_planner.rod import ConvergenceError
 
 Array = NDArray[np.float64]

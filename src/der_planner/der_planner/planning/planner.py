@@ -22,9 +22,10 @@ from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import models
 from der_planner.planning.errors import PlanningError
 from der_planner.planning.models import METHODS, PlanningModel
-from der_planner.planning.motions import Motion, Reference, Start, sample_spline
+from der_planner.planning.motions import Motion, Reference
 from der_planner.planning.optimal import Optimiser
 from der_planner.planning.result import Plan
+from der_planner.planning.ways import Start, sample_spline
 from der_planner.rod import ConvergenceError
 
 Array = NDArray[np.float64]
