@@ -26,6 +26,7 @@ PARTS = (
     "studies",
     "loads",
     "learning",
+    "learning_draws",
     "feedback",
     "page",
     "page_wire",

@@ -48,6 +48,7 @@ def test_runs_are_learned_from_and_a_stopped_experiment_goes_on(tmp_path: Path, 
     assert "begins from what was learned in" in capsys.readouterr().err
     begun, learned = json.loads((near / "results.json").read_text())["runs"]
     assert begun["mean_error_m"] < 0.8 * errors[0]
+    assert begun["method"] == "learned"
     assert learned["method"] == "learned 1"
 
 

@@ -16,6 +16,7 @@ from der_planner.experiment.options import Options, Trial
 from der_planner.experiment.progress import Progress
 from der_planner.limb import Limb, LimbError, mounting_of
 from der_planner.runs.outputs import check_folder
+from der_planner.runs.run import LEARNED
 
 
 def run(options: Options) -> None:
@@ -150,6 +151,7 @@ def _play(
     metadata = _metadata(trial, options, limb, robot)
     if learned is not None and trial.run == 1:
         metadata["begun_from"] = str(options.library)
+        metadata["method"] = metadata["method"].replace(trial.method, LEARNED, 1)
     if options.offline:
         # ROS-free: the other branch is imported only where it is used.
         from der_planner.experiment.offline_run import play_offline  # noqa: PLC0415

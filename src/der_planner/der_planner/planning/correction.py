@@ -31,7 +31,7 @@ _WINDOWS = (100, 150, 150)
 where limits bind: they are felt from further ahead than a plan's first window reaches, …"""
 _NOTABLE_ERROR = 5e-4
 """… and where they leave more than this of mean tip error [m]."""
-_ROUNDS = 3
+_ROUNDS = 2
 """With friction along the bend of the last round's commands; each leaves a fifth of its change …"""
 _SETTLED = 2e-5
 """… and a smaller mean change of the tip is not worth another [m]."""
