@@ -5,7 +5,7 @@ from the instant of a picture to the first command at the board that knows of it
 process, calibrated twins play every motion in open loop, with feedback, as learned from two runs,
 and as learned with feedback; and the first motion with the default limb's file, as if nobody had
 calibrated them. The cost is that of `measure` and `command` together, as the planner calls them for
-one setpoint. Idle, it all takes seven minutes.
+one setpoint.
 """
 
 from __future__ import annotations
