@@ -7,10 +7,11 @@ import pytest
 from chain_calibration import prior
 from link_chain import LinkChain
 
-from der_planner.identification import CalibrationLog, LogError, fit, predict
+from der_planner.identification import CalibrationLog, LogError, fit, predict, update
 from der_planner.identification.excitation import sweep, waves
 from der_planner.identification.logs.prepare import prepare
 from der_planner.limb import Limb, gravity_of
+from der_planner.planning import Motion, plan
 
 TERMS = ("asymmetry", "friction", "dynamics")
 
@@ -36,12 +37,35 @@ def test_a_hanging_chain_that_swings_and_carries_a_mass_is_fitted():
     assert known.deviation < 0.06
     assert limb.segments[0].bending_stiffness == pytest.approx(truth, rel=0.12)
     assert "EI of segment 0" in report.text()
+    assert "check_limb.py --update --payload" not in report.text()
     # The lengths do not take up that a heavy limb bends unevenly.
     assert limb.length == pytest.approx(0.244, abs=4e-3)
     assert limb.masses[0].arc_length == pytest.approx(limb.length)
     unseen = chain.play(log.time, 0.8 * log.commanded_differential[::-1], 20.0, noise=0.0)
     tip = predict(limb, unseen.time, unseen.measured_differential).tip
     assert np.linalg.norm(tip - unseen.tip, axis=1).mean() < 0.004
+
+
+def test_a_stiffness_that_only_the_swing_tells_is_named_and_a_run_with_the_payload_helps():
+    gravity, payload = gravity_of("sideways"), (0.244, 0.02)
+    limb, report = fit(prior(gravity), chain_log(gravity, seed=1), terms=TERMS)
+    assert ("log_stiffness[0]", "rest_angle[0]") in {
+        tuple(sorted(pair[:2])) for pair in report.strongly_correlated
+    }
+    assert "rest angle of segment 0" in report.text()
+    chain = LinkChain(1, gravity, [payload])
+    time = np.arange(0.0, 30.0, 0.05)
+    pressure = 8000.0 * np.minimum(time / 3.0, 1.0)[:, None]
+    pressure = pressure * np.sin(2.0 * np.pi * time[:, None] / np.array([11.0, 7.3]))
+    loaded, _ = update(limb.carrying(payload[1]), chain.play(time, pressure, 20.0, run=5).log())
+    motion = Motion.named("same_direction", amplitude=0.2, period=20.0, cycles=1)
+
+    def error(planned: Limb) -> float:
+        chosen = plan(planned, motion, "der", "optimal")
+        played = chain.play(chosen.time, chosen.differential_pressure, 0)
+        return float(np.linalg.norm(played.tip - chosen.tip_reference, axis=1).mean())
+
+    assert error(loaded) < min(0.0035, 0.6 * error(limb.carrying(payload[1])))
 
 
 def test_mass_is_told_where_stiffness_is_given():

@@ -225,6 +225,24 @@ class FitReport:
             f"loads: weight tells stiffness from gain: {', '.join(told)}",
             f"loads: stiffness, gain and mass scale together, {kept} was given; condition of "
             f"gains, rest angles and stiffness or mass: {self.condition:.0f}",
+            *self._stiffness_of_the_swing(),
+        ]
+
+    def _stiffness_of_the_swing(self) -> list[str]:
+        """Say of which segments the stiffness under a payload is not known, and what would tell."""
+        alike = {frozenset(pair[:2]) for pair in self.strongly_correlated}
+        found = [
+            str(index)
+            for index in range(len(self.residual))
+            if {f"log_stiffness[{index}]", f"rest_angle[{index}]"} in alike
+        ]
+        if not found:
+            return []
+        return [
+            f"loads: stiffness and rest angle of segment {', '.join(found)} do the same here, so "
+            "that the stiffness is that of the swing, which friction makes too large, by a "
+            "third on some limbs: before a motion with a payload, record half a minute of waves "
+            "with it and give them to check_limb.py --update --payload"
         ]
 
     @property
