@@ -7,7 +7,7 @@ import pytest
 from chain_calibration import prior
 from link_chain import LinkChain
 
-from der_planner.identification import CalibrationLog, LogError, fit, predict, update
+from der_planner.identification import CalibrationLog, LogError, fit, predict
 from der_planner.identification.excitation import sweep, waves
 from der_planner.identification.logs.prepare import prepare
 from der_planner.limb import Limb, gravity_of
@@ -37,7 +37,6 @@ def test_a_hanging_chain_that_swings_and_carries_a_mass_is_fitted():
     assert known.deviation < 0.06
     assert limb.segments[0].bending_stiffness == pytest.approx(truth, rel=0.12)
     assert "EI of segment 0" in report.text()
-    assert "check_limb.py --update --payload" not in report.text()
     # The lengths do not take up that a heavy limb bends unevenly.
     assert limb.length == pytest.approx(0.244, abs=4e-3)
     assert limb.masses[0].arc_length == pytest.approx(limb.length)
@@ -46,26 +45,24 @@ def test_a_hanging_chain_that_swings_and_carries_a_mass_is_fitted():
     assert np.linalg.norm(tip - unseen.tip, axis=1).mean() < 0.004
 
 
-def test_a_stiffness_that_only_the_swing_tells_is_named_and_a_run_with_the_payload_helps():
-    gravity, payload = gravity_of("sideways"), (0.244, 0.02)
+def test_a_payload_that_was_not_on_the_limb_when_it_was_calibrated_is_carried():
+    gravity = gravity_of("sideways")
+    chain = LinkChain(1, gravity, [(0.244, 0.02)])
     limb, report = fit(prior(gravity), chain_log(gravity, seed=1), terms=TERMS)
-    assert ("log_stiffness[0]", "rest_angle[0]") in {
-        tuple(sorted(pair[:2])) for pair in report.strongly_correlated
-    }
-    assert "rest angle of segment 0" in report.text()
-    chain = LinkChain(1, gravity, [payload])
-    time = np.arange(0.0, 30.0, 0.05)
-    pressure = 8000.0 * np.minimum(time / 3.0, 1.0)[:, None]
-    pressure = pressure * np.sin(2.0 * np.pi * time[:, None] / np.array([11.0, 7.3]))
-    loaded, _ = update(limb.carrying(payload[1]), chain.play(time, pressure, 20.0, run=5).log())
+    # The swing of this chain is stiffer than its rest, by its friction: a fit that took one for
+    # the other found 1.4 times the stiffness and a rest angle that was off by 12°.
+    first = limb.segments[0]
+    truth = 0.122 / np.sum(1.0 / chain._stiffness[:7])
+    assert first.bending_stiffness == pytest.approx(truth, rel=0.12)
+    rest = first.rest_curvature * first.length
+    assert np.degrees(rest) == pytest.approx(np.degrees(chain._rest[0]), abs=4.0)
+    assert first.swing_inertia < 0.95
+    assert "weight and rest angle bend segment 0, 1 alike" in report.text()
     motion = Motion.named("same_direction", amplitude=0.2, period=20.0, cycles=1)
-
-    def error(planned: Limb) -> float:
-        chosen = plan(planned, motion, "der", "optimal")
-        played = chain.play(chosen.time, chosen.differential_pressure, 0)
-        return float(np.linalg.norm(played.tip - chosen.tip_reference, axis=1).mean())
-
-    assert error(loaded) < min(0.0035, 0.6 * error(limb.carrying(payload[1])))
+    chosen = plan(limb.carrying(0.02), motion, "der", "optimal")
+    played = chain.play(chosen.time, chosen.differential_pressure, 0)
+    error = np.linalg.norm(played.tip - chosen.tip_reference, axis=1)
+    assert error.mean() < 0.0025
 
 
 def test_mass_is_told_where_stiffness_is_given():

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from der_planner.identification.air import AirFit
 from der_planner.identification.geometry import GeometryFit
 from der_planner.limb import Limb
+from der_planner.limb_parameters import REST_SPREAD
 from der_planner.model.sag import weight_of
 
 Array = NDArray[np.float64]
@@ -225,11 +226,11 @@ class FitReport:
             f"loads: weight tells stiffness from gain: {', '.join(told)}",
             f"loads: stiffness, gain and mass scale together, {kept} was given; condition of "
             f"gains, rest angles and stiffness or mass: {self.condition:.0f}",
-            *self._stiffness_of_the_swing(),
+            *self._made_straight(),
         ]
 
-    def _stiffness_of_the_swing(self) -> list[str]:
-        """Say of which segments the stiffness under a payload is not known, and what would tell."""
+    def _made_straight(self) -> list[str]:
+        """Say of which segments the stiffness rests on what is known of rest angles beforehand."""
         alike = {frozenset(pair[:2]) for pair in self.strongly_correlated}
         found = [
             str(index)
@@ -239,10 +240,8 @@ class FitReport:
         if not found:
             return []
         return [
-            f"loads: stiffness and rest angle of segment {', '.join(found)} do the same here, so "
-            "that the stiffness is that of the swing, which friction makes too large, by a "
-            "third on some limbs: before a motion with a payload, record half a minute of waves "
-            "with it and give them to check_limb.py --update --payload"
+            f"loads: weight and rest angle bend segment {', '.join(found)} alike here: the "
+            f"stiffness holds for a limb that was made straight, ± {math.degrees(REST_SPREAD):.0f}°"
         ]
 
     @property
