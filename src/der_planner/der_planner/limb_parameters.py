@@ -291,6 +291,18 @@ class Pneumatics:
         ),
     )
 
+    vent_lag_exponent: float = field(
+        default=0.0,
+        metadata=parameter(
+            "-",
+            "vent_time_constant is that at 10 kPa and falls with this power of the chamber's gauge "
+            "pressure; 0: the same at all pressures",
+            "as vent_exponent for a valve that opens in proportion to its error; calibration",
+            least=0.0,
+            most=1.0,
+        ),
+    )
+
     @property
     def vent_lag(self) -> float:
         """First-order lag while |differential pressure| falls [s]."""
