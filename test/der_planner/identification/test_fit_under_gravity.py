@@ -13,6 +13,8 @@ from der_planner.identification.logs.prepare import prepare
 from der_planner.limb import Limb, gravity_of
 from der_planner.planning import Motion, plan
 
+pytestmark = pytest.mark.slow
+
 TERMS = ("asymmetry", "friction", "dynamics")
 
 
