@@ -168,7 +168,7 @@ def acceleration(q: Vector, v: Vector, torque: Vector, arcs: Arcs) -> Vector:
             turning += H[i, i] * v[i] * v[i]
             for k in range(i):
                 turning += 2.0 * H[i, k] * v[i] * v[k]
-        felt = mass * (pull - turning) - arcs.drag[p] * velocity
+        felt = arcs.weight[p] * pull - mass * turning - arcs.drag[p] * velocity
         for i in range(last):
             force[i] += J[i].real * felt.real + J[i].imag * felt.imag
             for k in range(i + 1):
