@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from apriltag_tracker.camera import CameraPose, Intrinsics
 from apriltag_tracker.detection import Detector, enlarged_tag
-from apriltag_tracker.detection.tag import Tag
+from apriltag_tracker.detection.tag import ExpectedTag, Tag
 from apriltag_tracker.detection.tracking import TagTracker, TrackingOptions
+from apriltag_tracker.pose.expected import TagPredictor
 from apriltag_tracker.pose.plane import centreline_pose, locate, pose_moves
 from apriltag_tracker.pose.shape import LimbEstimate, PlanarTag, ShapeFitter, ShapePrior
 from apriltag_tracker.pose.world import WorldPose
@@ -122,6 +123,7 @@ class LimbTracker:
             uncertainty.mounting,
             uncertainty.mounting_angle,
         )
+        self._predictor = TagPredictor(tags, intrinsics, self.fitter)
         self._history: list[tuple[float, LimbEstimate]] = []
         self._bridged = 0
         self.misplaced = 0
@@ -143,7 +145,7 @@ class LimbTracker:
                 f"the image has {gray.shape[1]} x {gray.shape[0]} px but the calibration is for "
                 f"{size.width} x {size.height}: calibrate at the resolution that is used"
             )
-        found = self.tracker.track(gray, stamp)
+        found = self.tracker.track(gray, stamp, lambda tags: self._expect(tags, stamp))
         pose = self.world.update(found)
         placed, planar, common, shared_noise = self._place(found, pose)
         if pose is None:
@@ -151,6 +153,7 @@ class LimbTracker:
         estimate = self.fitter.fit(planar, common, shared_noise) if planar else None
         if estimate is None:
             return self._bridge(placed, stamp, bool(planar))
+        self._predictor.remember(stamp, self.fitter.parameters)
         self.misplaced += len(estimate.rejected)
         sigma = estimate.tip_sigma
         if sigma > self.options.largest_tip_sigma:
@@ -162,6 +165,11 @@ class LimbTracker:
             self._history.clear()
         self._history = [*self._history[-1:], (stamp, estimate)]
         return LimbObservation(placed, estimate, self._remark(estimate))
+
+    def _expect(self, found: Sequence[Tag], stamp: float) -> list[ExpectedTag]:
+        """Return where the limb's other tags are, if the camera's pose is known."""
+        pose = self.world.pose
+        return [] if pose is None else self._predictor.predict(found, pose, stamp)
 
     def _place(
         self, found: Sequence[Tag], pose: CameraPose | None

@@ -17,7 +17,7 @@ from apriltag_tracker.detection import decoding, edges
 from apriltag_tracker.detection.alignment.aligner import USUAL_BLUR, Aligner, Alignment
 from apriltag_tracker.detection.covered import covered_quads
 from apriltag_tracker.detection.smeared import read_smeared
-from apriltag_tracker.detection.tag import Tag, counter_clockwise, once
+from apriltag_tracker.detection.tag import ExpectedTag, Tag, counter_clockwise, once
 
 MOST_CORRECTED_BITS = 2
 """At three forgiven cells 19 of 1000 pictures of noise show a tag."""
@@ -30,6 +30,9 @@ _FROM_OPENCV = (1, 0, 3, 2)
 
 _LINES_ALONE = 0.15
 """Standard deviation that lines have where the whole pattern could not be fitted [px]."""
+
+_USUAL = (USUAL_BLUR, np.zeros(2))
+"""Blur and smear where nothing is known of them [px]."""
 
 _EXPLAINED = 0.93
 _WRONG_BUT_NEAR = 5
@@ -164,7 +167,7 @@ class Detector:
         quads: NDArray[np.float64],
         search: float,
         found_by: str,
-        before: Mapping[int, Tag] | None = None,
+        before: Mapping[int, tuple[float, NDArray[np.float64]]] | None = None,
     ) -> list[Tag]:
         """Refine candidates and keep those whose border is straight and whose code is right.
 
@@ -174,8 +177,7 @@ class Detector:
             quads: (n, 4, 2) px, from the printed lower left counter-clockwise.
             search: how far a side may be from where the candidate says [px].
             found_by: noted in the tags.
-            before: tags as they were last seen: where blur and smear start from. One that is
-                `tracked` may also be confirmed by its whole pattern, if its border is too smeared.
+            before: blur and smear (2,) px of tags, where they are known about: fits start there.
         """
         if len(ids) == 0:
             return []
@@ -183,28 +185,51 @@ class Detector:
         corners, stats, found = refine(image, quads, search)
         distance = np.empty(len(ids), dtype=np.int64)
         decoding.distances(image, corners, decoding.code_table()[0, ids], found, distance)
-        forgiven = self.correct_bits + (found_by == "tracked")
+        forgiven = self.correct_bits + (found_by in {"tracked", "expected"})
         tags = self._collect(ids, corners, stats, found & (distance <= forgiven), found_by)
-        tags = [self._aligned(image, tag, known.get(tag.id)) for tag in tags]
-        if found_by == "tracked":
-            seen = {tag.id for tag in tags}
-            for tag, quad in zip(ids.tolist(), quads, strict=True):
-                if tag not in seen and tag in known:
-                    last = known[tag]
-                    whole = self._by_pattern(
-                        image, tag, quad, last.blur, np.array(last.smear), found_by
-                    )
-                    tags += [whole] if whole is not None else []
-        return tags
+        return [self._aligned(image, tag, *known.get(tag.id, _USUAL)) for tag in tags]
 
-    def _aligned(self, image: NDArray[np.uint8], tag: Tag, before: Tag | None = None) -> Tag:
+    def confirm_expected(
+        self, image: NDArray[np.uint8], expected: ExpectedTag, blur: float
+    ) -> Tag | None:
+        """Return a tag that is where, and smeared as, it is expected; None if it is not there.
+
+        Args:
+            image: grey image.
+            expected: the tag.
+            blur: of other tags in the picture [px].
+        """
+        smear = expected.smears[0]
+        cell = math.dist(*expected.corners[:2].tolist()) / family.BORDER_CELLS
+        if math.hypot(*smear) > cell:
+            whole = self.confirm_pattern(image, expected, blur, "expected")
+            if whole is not None:
+                return whole
+        ids, quads = np.array([expected.id]), expected.corners[None].copy()
+        lines = self.confirm(image, ids, quads, 3.0, "expected", {expected.id: (blur, smear)})
+        return lines[0] if lines else None
+
+    def confirm_pattern(
+        self, image: NDArray[np.uint8], expected: ExpectedTag, blur: float, found_by: str
+    ) -> Tag | None:
+        """Return a tag whose whole pattern fits from where it is expected, None if none does.
+
+        It may be too smeared for lines. Arguments are those of `confirm_expected`.
+        """
+        for smear in expected.smears:
+            fitted = self._aligner.align_once(image, expected.id, expected.corners, blur, smear)
+            if fitted is not None and _is_the_tag(fitted, expected.corners):
+                return _tag_of(expected.id, fitted, found_by)
+        return None
+
+    def _aligned(
+        self, image: NDArray[np.uint8], tag: Tag, blur: float, smear: NDArray[np.float64]
+    ) -> Tag:
         """Return a tag with the corners of its whole pattern, which a smear does not shift."""
-        near = before or tag
-        fitted = self._aligner.align(
-            image, tag.id, tag.corners, near.blur, np.array(near.smear, dtype=np.float64)
-        )
+        fitted = self._aligner.align(image, tag.id, tag.corners, blur, smear)
         cell = tag.pixel_size / family.BORDER_CELLS
-        if fitted is None or np.abs(fitted.corners - tag.corners).max() > 0.3 * cell + 1.0:
+        far = fitted is None or np.abs(fitted.corners - tag.corners).max() > 0.3 * cell + 1.0
+        if fitted is None or (far and not _is_the_tag(fitted, tag.corners)):
             # Lines alone: blur and smear may have moved them, by how much is not known.
             unsure = 4.0 * tag.covariance + _LINES_ALONE**2 * np.eye(8)
             return replace(tag, covariance=unsure)
@@ -230,17 +255,7 @@ class Detector:
         fitted = self._aligner.align(image, tag, quad, blur, smear)
         if fitted is None or not _is_the_tag(fitted, quad):
             return None
-        return Tag(
-            id=tag,
-            corners=fitted.corners,
-            covariance=fitted.covariance,
-            line_residual=math.nan,
-            edge_share=0.0,
-            contrast=fitted.contrast,
-            found_by=found_by,
-            blur=fitted.blur,
-            smear=(float(fitted.smear[0]), float(fitted.smear[1])),
-        )
+        return _tag_of(tag, fitted, found_by)
 
     def _read_again(
         self,
@@ -261,12 +276,10 @@ class Detector:
             stats[i] = np.roll(stats[i], -turns[i], axis=0)
         good = found & (distance <= self.correct_bits)
         tags = self._collect(ids, corners, stats, good, found_by)
-        tags = [self._aligned(image, tag) for tag in tags]
+        tags = [self._aligned(image, tag, *_USUAL) for tag in tags]
         for i in np.flatnonzero(found & ~good & (distance <= _WRONG_BUT_NEAR)):
             if counter_clockwise(corners[i]):
-                whole = self._by_pattern(
-                    image, int(ids[i]), corners[i], USUAL_BLUR, np.zeros(2), found_by
-                )
+                whole = self._by_pattern(image, int(ids[i]), corners[i], *_USUAL, found_by)
                 tags += [whole] if whole is not None else []
         return tags
 
@@ -321,6 +334,21 @@ def _elsewhere(quads: NDArray[np.float64], known: Sequence[Tag]) -> NDArray[np.f
         apart = np.hypot(*(quads.mean(axis=1) - tag.corners.mean(axis=0)).T)
         quads = quads[apart > 0.5 * tag.pixel_size]
     return quads
+
+
+def _tag_of(tag: int, fitted: Alignment, found_by: str) -> Tag:
+    """Return a tag of whose border no lines were fitted."""
+    return Tag(
+        id=tag,
+        corners=fitted.corners,
+        covariance=fitted.covariance,
+        line_residual=math.nan,
+        edge_share=0.0,
+        contrast=fitted.contrast,
+        found_by=found_by,
+        blur=fitted.blur,
+        smear=(float(fitted.smear[0]), float(fitted.smear[1])),
+    )
 
 
 def _is_the_tag(fitted: Alignment, quad: NDArray[np.float64]) -> bool:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from apriltag_tracker import family
 from apriltag_tracker.detection.alignment import fit
 from apriltag_tracker.detection.alignment.pattern import tabulate
+from apriltag_tracker.detection.alignment.sampling import BORDER, side_length
 from apriltag_tracker.detection.alignment.smear import guess_smear
 
 USUAL_BLUR = 0.65
@@ -30,7 +31,7 @@ _SMEARED = 0.12
 _SHORTEST = 0.9
 """A shorter smear cannot be told from blur, and is counted as such [px]."""
 
-_PASSES = 8
+_PASSES = 9
 
 
 @dataclass(frozen=True)
@@ -105,8 +106,21 @@ class Aligner:
                 best = searched
         return best
 
+    def align_once(
+        self,
+        image: NDArray[np.uint8],
+        tag: int,
+        corners: NDArray[np.float64],
+        blur: float,
+        smear: NDArray[np.float64],
+    ) -> Alignment | None:
+        """Fit one tag from where it is expected, with its smear; nothing else is tried."""
+        known = smear if math.hypot(*smear) >= _SHORTEST else None
+        found = self._fit(image, tag, corners, blur, known)
+        return None if found is None else found[0]
+
     def _smeared(self, image: NDArray[np.uint8], tag: int, plain: Alignment) -> Alignment | None:
-        cell = _cell(plain.corners)
+        cell = side_length(plain.corners) / BORDER
         table, table_blur = self._table(tag, plain.blur / cell)
         guess = np.zeros(2)
         blur = guess_smear(image, table, table_blur, plain.corners, plain.blur, guess)
@@ -120,7 +134,7 @@ class Aligner:
     ) -> Alignment | None:
         """Try smears in eight directions of half a turn; the best fit counts."""
         best: Alignment | None = None
-        length = 1.6 * _cell(corners)
+        length = 1.6 * side_length(corners) / BORDER
         for k in range(8):
             angle = k * math.pi / 8.0
             smear = length * np.array([math.cos(angle), math.sin(angle)])
@@ -141,7 +155,7 @@ class Aligner:
         result = np.zeros(fit.RESULT_VALUES)
         placed, covariance = np.empty((4, 2)), np.empty((8, 8))
         start = np.ascontiguousarray(corners)
-        cell = _cell(corners)
+        cell = side_length(corners) / BORDER
         result[0] = blur
         if smear is not None:
             result[1:3] = smear
@@ -188,9 +202,3 @@ class Aligner:
         if len(self._tables) > _TABLES:
             self._tables.popitem(last=False)
         return entry
-
-
-def _cell(corners: NDArray[np.float64]) -> float:
-    """Return the mean edge of a cell [px]."""
-    sides = np.hypot(*(np.roll(corners, -1, axis=0) - corners).T)
-    return float(sides.mean()) / 8.0

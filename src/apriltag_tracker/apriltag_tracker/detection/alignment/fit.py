@@ -18,7 +18,10 @@ from numpy.typing import NDArray
 from apriltag_tracker.detection.alignment.sampling import (
     BORDER,
     UNKNOWNS,
+    Pixels,
+    View,
     corner_slopes,
+    new_pixels,
     sample_model,
     side_length,
     write_corners,
@@ -30,13 +33,18 @@ RESULT_VALUES = 8
 weight that was kept, gain [grey levels], correlation of neighbouring residuals."""
 
 _BLUR, _SMEAR, _LINEAR = 8, 9, 11
-_MOST_PIXELS = 1700.0
+_MOST_PIXELS, _MOST_SMEARED = 1700.0, 2600.0
+"""Of the rectangle around a tag; a smear takes more of them to be told."""
+
 _LEAST_BLUR, _MOST_BLUR = 0.32, 4.0
 _QUANTISATION = 0.3
 """Standard deviation of the rounding to whole grey levels."""
 
-_SETTLED = 0.015
-"""Steps end when no corner moves further [px]; Gauss-Newton gains another digit with it."""
+_SETTLED = 0.03
+"""Steps end when no corner moves further [px]; what is left after such a step is a tenth of it."""
+
+_FEWEST = 60
+"""Pixels that a fit needs."""
 
 _BESIDE = 2
 """What covers a tag is blurred: pixels so near to what does not fit count no more either [px]."""
@@ -149,57 +157,62 @@ def _weigh_beside(
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def _weigh(
     residual: NDArray[np.float64],
-    values: NDArray[np.float64],
     weights: NDArray[np.float64],
     where: NDArray[np.int64],
     count: int,
-    result: NDArray[np.float64],
 ) -> None:
-    """Take weight from what is far off; writes share explained, residual and weight kept.
+    """Take weight from what is far off.
 
     Something that covers a part of the tag is blurred, too: what is beside it counts less as well.
     """
     limit = 3.5 * _typical(residual, count)
-    kept, square, all_square, mean = 0.0, 0.0, 0.0, 0.0
+    largest = 0.0
     for i in range(count):
         off = abs(residual[i])
         weights[i] = 1.0 if off <= limit else (limit / off) ** 4
-        all_square += off * off
-        mean += values[i]
-    _weigh_beside(residual, 2.0 * limit, where, count, weights)
+        largest = max(largest, off)
+    if largest > 2.0 * limit:
+        _weigh_beside(residual, 2.0 * limit, where, count, weights)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _judge(
+    pixels: Pixels, count: int, move: NDArray[np.float64], result: NDArray[np.float64]
+) -> None:
+    """Take the last step off the residuals; write shares explained and kept, and the residual."""
+    values, weights, residual = pixels.values, pixels.weights, pixels.residual
+    for a in range(UNKNOWNS):
+        if move[a] != 0.0:
+            for i in range(count):
+                residual[i] -= move[a] * pixels.rows[a, i]
+    mean = values[:count].mean()
+    kept, square, all_square, whole = 0.0, 0.0, 0.0, 1e-9
     for i in range(count):
+        off = residual[i] ** 2
         kept += weights[i]
-        square += weights[i] * residual[i] ** 2
-    mean /= count
-    whole = 1e-9
-    for i in range(count):
+        square += weights[i] * off
+        all_square += off
         whole += (values[i] - mean) ** 2
     result[3] = 1.0 - all_square / whole
     result[4] = max(math.sqrt(square / max(kept - UNKNOWNS, 10.0)), _QUANTISATION)
     result[5] = kept / count
+    result[7] = _neighbours_alike(residual, weights, pixels.where, count)
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def _prepare(
-    rows: NDArray[np.float64],
-    values: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    residual: NDArray[np.float64],
-    where: NDArray[np.int64],
-    count: int,
-    result: NDArray[np.float64],
-) -> bool:
+def _prepare(pixels: Pixels, count: int, result: NDArray[np.float64]) -> bool:
     """Fit the light, write residuals and weights; derivatives become those of the grey level."""
+    rows, residual = pixels.rows, pixels.residual
     linear = np.zeros(4)
-    _linear_terms(rows, values, weights, count, linear)
+    _linear_terms(rows, pixels.values, pixels.weights, count, linear)
     gain = linear[1]
     result[6] = gain
     if gain < 4.0:
         return False
     for i in range(count):
         seen = linear[0] + gain * rows[12, i] + linear[2] * rows[13, i] + linear[3] * rows[14, i]
-        residual[i] = values[i] - seen
-    _weigh(residual, values, weights, where, count, result)
+        residual[i] = pixels.values[i] - seen
+    _weigh(residual, pixels.weights, pixels.where, count)
     # The slopes of the light are small: derivatives take the gain of the tag's middle.
     for a in range(_LINEAR):
         for i in range(count):
@@ -251,16 +264,16 @@ def _finish(
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def _write_normal(
-    rows: NDArray[np.float64],
-    residual: NDArray[np.float64],
-    weights: NDArray[np.float64],
+    pixels: Pixels,
     count: int,
     free_smear: bool,
     normal: NDArray[np.float64],
     right: NDArray[np.float64],
 ) -> None:
     """Write the normal equations of all unknowns that are free."""
-    _weighted_normal(rows, residual, weights, 0, count, not free_smear, normal, right)
+    _weighted_normal(
+        pixels.rows, pixels.residual, pixels.weights, 0, count, not free_smear, normal, right
+    )
     if not free_smear:
         _hold_smear(normal, right)
     for a in range(UNKNOWNS):
@@ -271,11 +284,11 @@ def _write_normal(
 def _rows_and_room(start: NDArray[np.float64], free_smear: bool) -> tuple[int, int]:
     """Return of how many rows one is used, and for how many pixels there must be room.
 
-    Of a large tag every second or third row of pixels is enough, if its smear is not fitted.
+    Of a large tag every second or third row of pixels is enough.
     """
     wide = (start[:, 0].max() - start[:, 0].min()) * 1.3 + 4.0
     high = (start[:, 1].max() - start[:, 1].min()) * 1.3 + 4.0
-    stride = 1 + int(wide * high / _MOST_PIXELS) if not free_smear else 1
+    stride = 1 + int(wide * high / (_MOST_SMEARED if free_smear else _MOST_PIXELS))
     return stride, int(wide + 4.0) * int(high / stride + 4.0)
 
 
@@ -327,34 +340,31 @@ def align(
     h, state = _begin(corners, result, free_smear)
     side = side_length(start)
     stride, room = _rows_and_room(start, free_smear)
-    rows, values = np.empty((UNKNOWNS, room)), np.empty(room)
-    where = np.empty((2, room), dtype=np.int64)
-    weights, residual = np.ones(room), np.empty(room)
+    view = View(image, table, table_blur, side / BORDER, stride, centre)
+    pixels = new_pixels(room)
     normal, right = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS)
-    settled, moved, count = False, 0.0, 0
-    for step in range(passes + 1):
+    moved, count = 0.0, 0
+    for _ in range(passes):
         before = count
-        count = sample_model(
-            image, h, state, table, table_blur, side / BORDER, stride, centre, rows, values, where
-        )
-        if count < 60:
+        count = sample_model(view, h, state, pixels)
+        if count < _FEWEST:
             return False
         if count != before:
-            weights[:count] = 1.0
-        if not _prepare(rows, values, weights, residual, where, count, result):
+            pixels.weights[:count] = 1.0
+        if not _prepare(pixels, count, result):
             return False
-        _write_normal(rows, residual, weights, count, free_smear, normal, right)
-        if settled or step == passes:
-            break
+        _write_normal(pixels, count, free_smear, normal, right)
+        move = np.linalg.solve(normal, right)
         last = corners.copy()
-        widened = _advance(state, h, np.linalg.solve(normal, right))
+        widened = _advance(state, h, move)
         write_corners(h, corners)
         moved = np.abs(corners - last).max()
         if not moved < 0.5 * side:
             return False
-        settled = moved < _SETTLED and widened < 0.03 * state[0]
+        if moved < _SETTLED and widened < 0.03 * state[0]:
+            break
+    _judge(pixels, count, move, result)
     result[:3] = state
-    result[7] = _neighbours_alike(residual, weights, where, count)
     _finish(h, normal, result[4], result[7], covariance)
     corners += centre
     return moved < 0.1

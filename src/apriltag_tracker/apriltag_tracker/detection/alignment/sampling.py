@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -13,8 +14,62 @@ from apriltag_tracker.detection.alignment.pattern import MARGIN
 UNKNOWNS = 15
 """Homography (8), blur [px], smear x, y [px], offset, gain, slopes of the gain along both sides."""
 
+_SPACING = 0.9
+"""Between the instants of a smear [px]; a blur of two thirds of it hides the steps."""
+
 BORDER = 8.0
 """Cells along the black border."""
+
+
+class View(NamedTuple):
+    """A tag in a picture.
+
+    Attributes:
+        image: grey image.
+        table: of `pattern.tabulate`.
+        table_blur: blur of the table [cells].
+        cell: edge of a cell [px].
+        stride: of so many rows of pixels one is used.
+        centre: (2,) px, the origin of the homography's coordinates.
+    """
+
+    image: NDArray[np.uint8]
+    table: NDArray[np.float32]
+    table_blur: float
+    cell: float
+    stride: int
+    centre: NDArray[np.float64]
+
+
+class Pixels(NamedTuple):
+    """What is known of the pixels of a tag.
+
+    Attributes:
+        rows: (15, n) derivatives of the bare pattern by homography, blur and smear (not times the
+            gain), and the linear terms themselves.
+        values: (n,) grey levels.
+        where: (2, n) row and column in the image.
+        weights: (n,) of the fit.
+        residual: (n,) grey level less what the fit says.
+    """
+
+    rows: NDArray[np.float64]
+    values: NDArray[np.float64]
+    where: NDArray[np.int64]
+    weights: NDArray[np.float64]
+    residual: NDArray[np.float64]
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def new_pixels(room: int) -> Pixels:
+    """Return room for the pixels of a tag."""
+    return Pixels(
+        np.empty((UNKNOWNS, room)),
+        np.empty(room),
+        np.empty((2, room), dtype=np.int64),
+        np.ones(room),
+        np.empty(room),
+    )
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -167,52 +222,58 @@ def _write_homography(
     rows[6, i], rows[7, i] = along * u * w, along * v * w
 
 
+@njit(cache=True, fastmath=True, inline="always")  # type: ignore[untyped-decorator]
+def _square_at(
+    back: NDArray[np.float64], x: float, y: float
+) -> tuple[float, float, float, float, float, float]:
+    """Return u, v of a pixel in the unit square, and their derivatives in cells a pixel."""
+    scale = 1.0 / (back[6] * x + back[7] * y + back[8])
+    u = (back[0] * x + back[1] * y + back[2]) * scale
+    v = (back[3] * x + back[4] * y + back[5]) * scale
+    cells = scale * BORDER
+    return (
+        u,
+        v,
+        (back[0] - u * back[6]) * cells,
+        (back[1] - u * back[7]) * cells,
+        (back[3] - v * back[6]) * cells,
+        (back[4] - v * back[7]) * cells,
+    )
+
+
 @njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
 def sample_model(
-    image: NDArray[np.uint8],
-    h: NDArray[np.float64],
-    state: NDArray[np.float64],
-    table: NDArray[np.float32],
-    table_blur: float,
-    cell: float,
-    stride: int,
-    centre: NDArray[np.float64],
-    rows: NDArray[np.float64],
-    values: NDArray[np.float64],
-    where: NDArray[np.int64],
+    view: View, h: NDArray[np.float64], state: NDArray[np.float64], pixels: Pixels
 ) -> int:
-    """Write derivatives (15, n), grey levels (n,) and pixels (2, n) of what the tag covers.
+    """Write derivatives, linear terms, grey levels and places of the pixels that the tag covers.
 
-    Derivatives are those of the bare pattern by homography, blur and smear (not times the gain),
-    and the linear terms themselves; returns how many pixels there are.
+    Args:
+        view: the tag.
+        h: (9,) homography from the unit square to pixels about the view's centre.
+        state: (3,) blur and smear [px].
+        pixels: output.
+
+    Returns:
+        How many pixels there are.
     """
-    size = table.shape[0]
-    resolution = (size - 1) // 10
+    table, centre, cell, rows = view.table, view.centre, view.cell, pixels.rows
+    resolution = (table.shape[0] - 1) // 10
     smear_x, smear_y = state[1], state[2]
     travel = math.hypot(smear_x, smear_y)
-    instants = 1 if travel < 1e-9 else int(travel / 0.6) + 3
+    instants = 1 if travel < 1e-9 else int(travel / _SPACING) + 3
     back = inverse(h)
-    reach = 2.0 * state[0] / cell
-    first_row, last_row, first, last = _pixels_of(image, h, centre)
+    reach, change = 2.0 * state[0] / cell, state[0] / cell - view.table_blur
+    first_row, last_row, first, last = _pixels_of(view.image, h, centre)
     count = 0
-    change = state[0] / cell - table_blur
-    for row in range(first_row, last_row + 1, stride):
+    for row in range(first_row, last_row + 1, view.stride):
         y = row - centre[1]
         for column in range(first, last + 1):
-            if count >= values.shape[0]:
+            if count >= pixels.values.shape[0]:
                 return count
             x = column - centre[0]
-            scale = 1.0 / (back[6] * x + back[7] * y + back[8])
-            u = (back[0] * x + back[1] * y + back[2]) * scale
-            v = (back[3] * x + back[4] * y + back[5]) * scale
-            # Derivatives of u, v by the pixel, in cells.
-            ux = (back[0] - u * back[6]) * scale * BORDER
-            uy = (back[1] - u * back[7]) * scale * BORDER
-            vx = (back[3] - v * back[6]) * scale * BORDER
-            vy = (back[4] - v * back[7]) * scale * BORDER
+            u, v, ux, uy, vx, vy = _square_at(back, x, y)
             # In the table columns run to the right and rows down, from the margin's corner.
-            c = u * BORDER + MARGIN
-            r = (1.0 - v) * BORDER + MARGIN
+            c, r = u * BORDER + MARGIN, (1.0 - v) * BORDER + MARGIN
             dc, dr = ux * smear_x + uy * smear_y, -(vx * smear_x + vy * smear_y)
             edge_c, edge_r = 0.5 * abs(dc) + reach, 0.5 * abs(dr) + reach
             if c < edge_c or c > 10.0 - edge_c or r < edge_r or r > 10.0 - edge_r:
@@ -228,11 +289,9 @@ def sample_model(
             rows[8, count] = by_blur / cell
             rows[9, count] = along_c * ux - along_r * vx
             rows[10, count] = along_c * uy - along_r * vy
-            rows[11, count] = 1.0
-            rows[12, count] = value
-            rows[13, count] = value * (u - 0.5)
-            rows[14, count] = value * (v - 0.5)
-            values[count] = image[row, column]
-            where[0, count], where[1, count] = row, column
+            rows[11, count], rows[12, count] = 1.0, value
+            rows[13, count], rows[14, count] = value * (u - 0.5), value * (v - 0.5)
+            pixels.values[count] = view.image[row, column]
+            pixels.where[0, count], pixels.where[1, count] = row, column
             count += 1
     return count

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from apriltag_tracker.detection.alignment.sampling import (
     BORDER,
-    UNKNOWNS,
+    View,
+    new_pixels,
     sample_model,
     side_length,
 )
@@ -65,10 +66,10 @@ def guess_smear(
     high_x, high_y = int(corners[:, 0].max() + cell + 3), int(corners[:, 1].max() + cell + 3)
     room = (high_x - low_x + 1) * (high_y - low_y + 1)
     smear[:] = 0.0
-    rows, values = np.empty((UNKNOWNS, room)), np.empty(room)
-    where = np.empty((2, room), dtype=np.int64)
-    state = np.array([blur, 0.0, 0.0])
-    count = sample_model(image, h, state, table, table_blur, cell, 1, centre, rows, values, where)
+    pixels = new_pixels(room)
+    rows, values, where = pixels.rows, pixels.values, pixels.where
+    view = View(image, table, table_blur, cell, 1, centre)
+    count = sample_model(view, h, np.array([blur, 0.0, 0.0]), pixels)
     if count < 60:
         return blur
     grid = np.full((high_y - low_y + 1, high_x - low_x + 1), np.nan)
