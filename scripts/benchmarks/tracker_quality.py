@@ -41,6 +41,9 @@ SCENES = (
     Scene("corner_covered_20px", corner=0.25, pixels=20.0),
     Scene("corner_covered_30px", corner=0.25),
     Scene("corner_covered_45px", corner=0.25, pixels=45.0),
+    Scene("white_on_corner_20px", corner=0.25, pixels=20.0, cover=0.95),
+    Scene("white_on_corner_30px", corner=0.25, cover=0.95),
+    Scene("white_on_corner_45px", corner=0.25, pixels=45.0, cover=0.95),
 )
 
 _FIRST_SEED = 900

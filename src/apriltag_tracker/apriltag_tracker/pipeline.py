@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apriltag_tracker.camera import CameraPose, Intrinsics
-from apriltag_tracker.detection import Detector, enlarged_tag
+from apriltag_tracker.detection import Detector
 from apriltag_tracker.detection.tag import ExpectedTag, Tag
 from apriltag_tracker.detection.tracking import TagTracker, TrackingOptions
 from apriltag_tracker.pose.expected import TagPredictor
@@ -113,6 +113,12 @@ class LimbTracker:
         self._flat.update({tag.id: (tag.position[2], tag.size) for tag in tags.world})
         self._world_positions = np.array([tag.position[:2] for tag in tags.world]).reshape(-1, 2)
         self._world_size = max((tag.size for tag in tags.world), default=1.0)
+        detector = detector or Detector(family=tags.family)
+        if detector.family != tags.family:
+            raise ValueError(
+                f"the detector reads {detector.family.name} but the tag map is of "
+                f"{tags.family.name}: make it by Detector(family=tag_map.family)"
+            )
         self.tracker = TagTracker(self._flat, detector, self.options.tracking)
         self.world = WorldPose(tags, intrinsics)
         uncertainty = self.options.uncertainty
@@ -286,16 +292,15 @@ class LimbTracker:
 def warm_up(detector: Detector) -> None:
     """Follow a tiny still limb through two images, so that no kernel is compiled in a run."""
     detector.warm_up()
-    side, f = 40, 500.0
-    tags = TagMap(
-        (0.02,),
-        (LimbTag(0, 0.01, 0.0, 0.01),),
-        (WorldTag(1, (0.03, 0.0, 0.0), 0.0, 0.01),),
-    )
+    family, f = detector.family, 500.0
+    side = 5 * family.border_cells
     # 125 mm above the plane, a pixel is a quarter of a millimetre.
+    size = 0.00025 * side
+    limb, world = (LimbTag(0, 0.01, 0.0, size),), (WorldTag(1, (0.03, 0.0, 0.0), 0.0, size),)
+    tags = TagMap((0.02,), limb, world, family=family)
     image = np.full((120, 240), 255, dtype=np.uint8)
     for tag, left in ((0, 40), (1, 120)):
-        image[40 : 40 + side, left : left + side] = enlarged_tag(tag, side // 8)
+        image[40 : 40 + side, left : left + side] = family.enlarged_tag(tag, 5)
     matrix = [f, 0.0, 59.5, 0.0, f, 59.5, 0.0, 0.0, 1.0]
     tracker = LimbTracker(tags, Intrinsics.create(240, 120, matrix, []), detector=detector)
     for stamp in (0.0, 0.03):
