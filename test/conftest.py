@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,6 +14,31 @@ ROOT = Path(__file__).resolve().parent.parent
 SHARED = ROOT.parent / "shared"
 sys.path.insert(0, str(ROOT / "scripts"))
 sys.path.insert(0, str(ROOT / "test" / "support"))
+
+
+WHOLE_GRAPH = "test/graph/"
+"""Tests that run the whole graph, where each node is timed by the others."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Run files with slow tests first: in parallel, none of them is then waited for at the end."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow and WHOLE_GRAPH not in item.nodeid)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Give each file to one worker, and all tests of the whole graph to the same one.
+
+    pytest-xdist's own groups do nothing under pytest 9.2 (its issue 1386).
+    """
+    from xdist.scheduler import LoadFileScheduling
+
+    class OneGraphAtATime(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return WHOLE_GRAPH if nodeid.startswith(WHOLE_GRAPH) else super()._split_scope(nodeid)
+
+    return OneGraphAtATime(config, log) if config.getvalue("dist") == "loadfile" else None
 
 
 @pytest.fixture(scope="session")
@@ -55,16 +81,12 @@ class Graph:
         self.client.close()
 
 
-def _domain() -> int:
-    """Return the ROS domain of this process's tests."""
-    # 102 to 231 collides with ephemeral ports on Linux; 0 to 20 is where people work.
-    return int(os.environ.get("TEST_DOMAIN_ID", 21 + os.getpid() % 80))
-
-
 @pytest.fixture
 def graph(tmp_path: Path) -> Iterator[Graph]:
     """Return a `Graph` whose processes end with the test."""
-    running = Graph(tmp_path, _domain())
+    from domain import own_domain
+
+    running = Graph(tmp_path, own_domain())
     yield running
     running.close()
 
@@ -72,6 +94,8 @@ def graph(tmp_path: Path) -> Iterator[Graph]:
 @pytest.fixture(scope="module")
 def lasting_graph(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Graph]:
     """Return a `Graph` that all tests of a module share."""
-    running = Graph(tmp_path_factory.mktemp("graph"), _domain())
+    from domain import own_domain
+
+    running = Graph(tmp_path_factory.mktemp("graph"), own_domain())
     yield running
     running.close()

@@ -25,8 +25,8 @@ from der_planner.identification.offline import calibrate_twin
 from der_planner.limb import Limb
 from der_planner.planning import Motion, Plan, plan
 from der_planner.planning.motions import JOINT_MOTIONS
+from der_planner.runs.record import ESTIMATE_TYPE
 from der_planner.runs.recording.reader import BagReader
-from der_planner.runs.series import ESTIMATE_TYPE
 from der_planner.twin.offline import OfflineTwin
 
 SEEDS = (101, 102, 103)

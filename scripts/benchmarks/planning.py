@@ -27,8 +27,8 @@ from der_planner.planning import (
     rod_model,
 )
 from der_planner.planning.loads.posed import REFERENCE_PRIOR
-from der_planner.planning.motions import sample_spline
 from der_planner.planning.rod_model import PlanningRod
+from der_planner.planning.ways import sample_spline
 
 CASES = ("asynchronous", "same_direction", "opposite_direction")
 METHODS_OF = [(model, method) for model, methods in METHODS.items() for method in methods]

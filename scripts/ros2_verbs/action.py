@@ -8,12 +8,11 @@ import sys
 from typing import Any
 
 import rclpy
-import yaml
 from action_msgs.msg import GoalStatus
 from rclpy.action import ActionClient, get_action_names_and_types
 
 from ros2_verbs.cli import CommandError, add_verb, add_verbs
-from ros2_verbs.filling import Filler
+from ros2_verbs.filling import Filler, values_of
 from ros2_verbs.messages import interface, to_yaml
 from ros2_verbs.session import Session, add_session_arguments
 
@@ -51,10 +50,7 @@ def _list(options: argparse.Namespace) -> None:
 
 def _send_goal(options: argparse.Namespace) -> int:
     kind = interface(options.action_type, "action")
-    try:
-        values = yaml.safe_load(options.goal)
-    except yaml.YAMLError as error:
-        raise CommandError(f"The passed value is no YAML: {error}") from error
+    values = values_of(options.goal)
     goal = Filler(kind.Goal(), values).message
     with Session(options) as session:
         client = ActionClient(session.node, kind, options.action_name)

@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import yaml
 from rosidl_parser.definition import (
     AbstractNestedType,
     AbstractString,
@@ -24,6 +25,18 @@ _FLOATS = ("float", "double", "long double")
 _FLOAT_LIMIT = float(np.finfo(np.float32).max)
 _HEADER = ("std_msgs", "msg", "Header")
 _TIME = ("builtin_interfaces", "msg", "Time")
+
+
+def values_of(text: str) -> Any:
+    """Return the values of a message as they were written in YAML.
+
+    Raises:
+        CommandError: it is no YAML.
+    """
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise CommandError(f"The passed value is no YAML: {error}") from error
 
 
 class Filler:

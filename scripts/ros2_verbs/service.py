@@ -5,10 +5,8 @@ from __future__ import annotations
 import argparse
 import time
 
-import yaml
-
 from ros2_verbs.cli import CommandError, add_verb, add_verbs
-from ros2_verbs.filling import Filler
+from ros2_verbs.filling import Filler, values_of
 from ros2_verbs.messages import interface
 from ros2_verbs.session import Session, add_session_arguments, is_hidden, print_types
 
@@ -67,10 +65,7 @@ def _call(options: argparse.Namespace) -> None:
     if options.rate is not None and options.rate <= 0:
         raise CommandError("rate must be greater than zero")
     kind = interface(options.service_type, "srv")
-    try:
-        values = yaml.safe_load(options.values)
-    except yaml.YAMLError as error:
-        raise CommandError(f"The passed value is no YAML: {error}") from error
+    values = values_of(options.values)
     request = Filler(kind.Request(), values).message
     with Session(options) as session:
         client = session.node.create_client(kind, options.service_name)

@@ -7,11 +7,10 @@ import time
 from typing import Any
 
 import rclpy
-import yaml
 from rclpy.duration import Duration
 
 from ros2_verbs.cli import CommandError, add_verb
-from ros2_verbs.filling import Filler
+from ros2_verbs.filling import Filler, values_of
 from ros2_verbs.messages import interface
 from ros2_verbs.qos import add_qos_arguments, given_qos, preset
 from ros2_verbs.session import Session
@@ -111,10 +110,7 @@ def _wait(publisher: Any, wanted: int, at_most: float | None) -> None:
 
 def _pub(options: argparse.Namespace) -> None:
     kind = interface(options.message_type, "msg")
-    try:
-        values = yaml.safe_load(options.values)
-    except yaml.YAMLError as error:
-        raise CommandError(f"The passed value is no YAML: {error}") from error
+    values = values_of(options.values)
     if not isinstance(values, dict):
         raise CommandError("The passed value needs to be a dictionary in YAML format")
     times = 1 if options.once else options.times

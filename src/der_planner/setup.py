@@ -26,7 +26,7 @@ setup(
         "recording": ["mcap", "rosbags"],
         "evaluation": ["mcap", "rosbags", "matplotlib", "opencv-python-headless"],
         "studies": ["pyelastica", "distributed", "pyarrow", "matplotlib"],
-        "page": ["nicegui==3.18.*", "opencv-python-headless"],
+        "page": ["nicegui==3.18.*", "opencv-python-headless", "psutil==7.2.*"],
         "test": ["pytest"],
     },
     zip_safe=False,

@@ -13,6 +13,8 @@ from apriltag_tracker.synthetic.shapes import constant_curvature
 from apriltag_tracker.tag_map import LimbTag, TagMap, WorldTag
 from benchmarks.tracker_renderer import Scene, render
 
+pytestmark = pytest.mark.slow
+
 pyapriltags = pytest.importorskip("pyapriltags")
 
 

@@ -1,6 +1,7 @@
 """Which part of der_planner may import which: downward only, without cycles, also for types."""
 
 import ast
+import functools
 from pathlib import Path
 
 import der_planner
@@ -21,6 +22,7 @@ LAYERS = {
 """Parts with a place in the order; an import must go to a lower one, or stay inside its part."""
 
 
+@functools.cache
 def modules() -> dict[str, Path]:
     return {
         "der_planner." + ".".join(path.relative_to(ROOT).with_suffix("").parts): path
@@ -29,7 +31,8 @@ def modules() -> dict[str, Path]:
     }
 
 
-def imports(path: Path) -> set[str]:
+@functools.cache
+def imports(path: Path) -> frozenset[str]:
     """Return every dotted name that a file imports, at any depth and under TYPE_CHECKING."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):
@@ -37,7 +40,7 @@ def imports(path: Path) -> set[str]:
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
             found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
-    return {name for name in found if name.startswith("der_planner.")}
+    return frozenset(name for name in found if name.startswith("der_planner."))
 
 
 def part(name: str) -> str:

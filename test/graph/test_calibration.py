@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from domain import own_domain
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 SEED = 3
@@ -17,7 +18,7 @@ pytestmark = pytest.mark.graph
 
 
 def calibrate(out: Path, excitation: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    domain = os.environ.get("TEST_DOMAIN_ID", str(21 + os.getpid() % 80))
+    domain = str(own_domain())
     return subprocess.run(
         [
             sys.executable,

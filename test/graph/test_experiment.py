@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from domain import own_domain
 
 from der_planner.limb import gravity_of
 from der_planner.planning.plan_file import read_plan
@@ -37,7 +38,7 @@ class Experiment:
     def __init__(self, folder: Path, *arguments: str) -> None:
         self.out = folder / "out"
         self.marker = f"TEST_EXPERIMENT={folder}"
-        domain = str(21 + os.getpid() % 80)
+        domain = str(own_domain())
         name, value = self.marker.split("=", 1)
         self._process = subprocess.Popen(
             [

@@ -168,6 +168,8 @@ def test_what_died_is_not_shown_as_live(rig: Rig) -> None:
     killed = silent_after(browser, rig.driver, signal.SIGKILL, old)
     assert_soon(stopped, killed)
     assert "ago" in browser.find_element("id", "faults").text
+    row = "return document.querySelector('[data-node=pressure_driver]').textContent"
+    rig.wait(lambda: "its process has ended" in browser.execute_script(row), "its row to say why")
     browser.find_element("id", "vent").click()
     rig.wait(
         lambda: "VENT FAILED" in browser.find_element("id", "notice").text, "the failure to show"

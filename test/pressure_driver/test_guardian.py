@@ -17,6 +17,8 @@ from pressure_driver.emulator.port import EmulatedPort
 from pressure_driver.emulator.runner import BoardRunner
 from pressure_driver.protocols import board_protocol
 
+pytestmark = pytest.mark.slow
+
 PROMISED = 0.3
 """[s] from the last sign of life to the vent command on the wire."""
 ATTEMPTS = 4

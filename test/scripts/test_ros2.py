@@ -15,10 +15,11 @@ from types import SimpleNamespace
 
 import pytest
 import yaml
+from domain import own_domain
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMAND = ROOT / "scripts" / "ros2"
-DOMAIN = int(os.environ.get("TEST_DOMAIN_ID", 21 + os.getpid() % 80))
+DOMAIN = own_domain()
 TIMEOUT = 120.0
 # Where the real tool is installed, the stand-in is tested all the same.
 ENVIRONMENT = {**os.environ, "ROS_DOMAIN_ID": str(DOMAIN), "DER_LIMB_ROS2_HANDED_OVER": "1"}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import socket
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -32,7 +34,7 @@ _CPU_INTERVAL = 0.5
 
 
 class DiagnosticsPublisher:
-    """Calls ``report`` once a second and publishes what it returns, and what CPU time was used.
+    """Calls ``report`` once a second and publishes what it returns, the CPU time and the process.
 
     Args:
         node: the node that the status is about.
@@ -52,7 +54,11 @@ class DiagnosticsPublisher:
     def publish(self) -> None:
         """Publish now, without waiting for the next second."""
         health = self._report()
-        values = {**health.values, "cpu_percent": f"{self._measure_cpu():.0f}"}
+        values = {
+            **health.values,
+            "cpu_percent": f"{self._measure_cpu():.0f}",
+            "process": f"{socket.gethostname()}:{os.getpid()}",
+        }
         status = DiagnosticStatus(
             level=_LEVELS[health.level],
             name=self._node.get_fully_qualified_name(),

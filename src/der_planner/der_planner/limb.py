@@ -8,6 +8,7 @@ description.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -142,8 +143,8 @@ class Limb:
 
     @property
     def static_gain(self) -> NDArray[np.float64]:
-        """(M,) bend angle per differential pressure of a linear segment, G L / EI [rad/Pa]."""
-        return np.array([s.moment_gain * s.length / s.bending_stiffness for s in self.segments])
+        """(M,) `Segment.static_gain` [rad/Pa]."""
+        return np.array([segment.static_gain for segment in self.segments])
 
     def for_model(self, model: str) -> Limb:
         """Return the limb as a model sees it: "pcc" with its own segments, if any."""
@@ -207,6 +208,7 @@ class Limb:
             raise LimbError(f"limb file {path}: {error}") from error
 
     @classmethod
+    @functools.cache
     def default(cls) -> Limb:
         """Return the limb that comes with the package: two silicone segments of 0.122 m."""
         return cls.from_yaml(DEFAULT_LIMB_FILE)

@@ -222,6 +222,11 @@ class Segment:
         ),
     )
 
+    @property
+    def static_gain(self) -> float:
+        """Bend angle per differential pressure where the segment is linear, G L / EI [rad/Pa]."""
+        return self.moment_gain * self.length / self.bending_stiffness
+
 
 @dataclass(frozen=True)
 class Pneumatics:
@@ -282,6 +287,18 @@ class Pneumatics:
             "the fall grows with this power of the chamber's gauge pressure",
             "1/2 is an orifice, 1 a tube (one exponential); a real limb had 2/3; calibration",
             above=0.0,
+            most=1.0,
+        ),
+    )
+
+    vent_lag_exponent: float = field(
+        default=0.0,
+        metadata=parameter(
+            "-",
+            "vent_time_constant is that at 10 kPa and falls with this power of the chamber's gauge "
+            "pressure; 0: the same at all pressures",
+            "as vent_exponent for a valve that opens in proportion to its error; calibration",
+            least=0.0,
             most=1.0,
         ),
     )

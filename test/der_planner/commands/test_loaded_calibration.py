@@ -11,6 +11,8 @@ from der_planner.commands import calibrate_limb, check_limb
 from der_planner.identification.excitation import waves
 from der_planner.limb import Limb, gravity_of
 
+pytestmark = pytest.mark.slow
+
 
 def run(command, *arguments: object, monkeypatch) -> int:
     monkeypatch.setattr(sys, "argv", ["command", *map(str, arguments)])

@@ -204,14 +204,25 @@ def test_a_limb_that_does_not_follow_is_left_to_the_plan(planned):
     assert np.abs(played.correction[-1]).max() < 1.0
 
 
-def swinging(amplitude: float, frequency: float, decay: float) -> Supervisor:
-    """Return what watched a correction that swings [Pa], [Hz], [1/s] for ten seconds."""
+def swinging(
+    amplitude: float, frequency: float, decay: float, limb_decay: float | None = None
+) -> Supervisor:
+    """Return what watched a correction that swings for ten seconds, as the limb does.
+
+    Args:
+        amplitude: of the correction [Pa], which is cut at the authority.
+        frequency: of both [Hz].
+        decay: of the correction [1/s].
+        limb_decay: of the limb's swing [1/s]; that of the correction if None.
+    """
     watch = Supervisor(Limits(), authority=9600.0)
     for k in range(200):
         time = 0.05 * k
         watch.advance(time, age=0.05, strange=1.0)
         value = amplitude * np.exp(-decay * time) * np.sin(2 * np.pi * frequency * time)
-        watch.sent(time, np.array([value, 0.0]))
+        swing = np.exp(-(decay if limb_decay is None else limb_decay) * time)
+        rate = swing * abs(np.cos(2 * np.pi * frequency * time))
+        watch.sent(time, np.array([np.clip(value, -9600.0, 9600.0), 0.0]), rate)
     return watch
 
 
@@ -221,6 +232,29 @@ def test_a_correction_that_swings_on_ends_feedback():
     assert not swinging(300.0, 1.2, 0.0).reason
     assert not swinging(4000.0, 1.2, 1.0).reason
     assert not swinging(4000.0, 1.0 / 3.0, 0.0).reason
+
+
+def test_a_correction_at_its_limit_that_damps_the_limb_goes_on():
+    # Cut at the limit for four seconds, so that its way does not shrink; the limb comes to rest.
+    assert not swinging(60000.0, 1.2, 0.45, 1.0).reason
+    # The limb has long been at rest: the loop swings by itself.
+    assert swinging(9000.0, 1.2, 0.0, -0.05).reason == "oscillation"
+
+
+@pytest.mark.parametrize("force", [0.2, 0.3])
+def test_pushes_do_not_end_feedback(planned, force):
+    plant, feedback = Chain(), Feedback(planned)
+
+    def event(time: float) -> None:
+        pushed = 4.0 <= time < 4.2 or 7.0 <= time < 7.2
+        plant.chain.push(LENGTH, (0.0, force if pushed else 0.0))
+
+    played = play(planned, plant, feedback, event=event)
+    assert not feedback.warnings
+    assert feedback.share == 1.0
+    pushed = played.error[80:100].max()
+    assert pushed > 0.02
+    assert played.error[115:140].max() < 0.25 * pushed
 
 
 def test_commands_that_are_asked_for_too_late_end_feedback(planned):

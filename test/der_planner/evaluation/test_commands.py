@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from runs import FRAMES, TIMES, BagOfRun, reference
 
+pytestmark = pytest.mark.slow
+
 SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"
 
 

@@ -14,6 +14,8 @@ from der_planner.limb import Limb
 from der_planner.model.bending import PolylineKinematics
 from der_planner.rod import Rod
 
+pytestmark = pytest.mark.slow
+
 NOISE = np.deg2rad(0.1)
 STATIC = ("gain", "rest_angle", "gain_asymmetry", "pressure_stiffening", "cubic")
 

@@ -12,6 +12,8 @@ from der_planner.identification.excitation import sweep, waves
 from der_planner.identification.logs.prepare import prepare
 from der_planner.limb import Limb, gravity_of
 
+pytestmark = pytest.mark.slow
+
 TERMS = ("asymmetry", "friction", "dynamics")
 
 

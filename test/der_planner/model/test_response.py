@@ -16,8 +16,8 @@ from der_planner.model.drive import STEPS
 from der_planner.model.response import RodModel, simulate
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import Motion, plan
-from der_planner.planning.motions import sample_spline
 from der_planner.planning.rod_model import PlanningRod
+from der_planner.planning.ways import sample_spline
 
 
 def everything() -> Limb:

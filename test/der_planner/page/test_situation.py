@@ -4,6 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
 
 import pytest
 
@@ -84,6 +90,52 @@ def test_nodes_turn_late_and_dead(situation: Situation, clock: Clock) -> None:
     assert (first["state"], second["state"]) == ("ok", "late")
     clock.now += DEAD
     assert situation.snapshot()["nodes"][1]["state"] == "dead"
+
+
+def test_a_process_that_ends_or_stops_is_dead_at_once(situation: Situation) -> None:
+    """Its last diagnostics are not yet late: the operating system tells."""
+    process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    here = f"{socket.gethostname()}:{process.pid}"
+
+    def state() -> tuple[str, str]:
+        (node,) = situation.snapshot()["nodes"]
+        return node["state"], node["message"]
+
+    def becomes(wanted: tuple[str, str]) -> None:
+        deadline = time.monotonic() + 20.0
+        while state() != wanted:
+            assert time.monotonic() < deadline, state()
+            time.sleep(0.01)
+
+    try:
+        situation.put_status(NodeStatus("/limb/planner", 0, "idle", {"process": here}))
+        becomes(("ok", "idle"))
+        process.send_signal(signal.SIGSTOP)
+        becomes(("dead", "its process is stopped"))
+        process.send_signal(signal.SIGCONT)
+        becomes(("ok", "idle"))
+    finally:
+        process.kill()
+    # Also before anybody has waited for it.
+    becomes(("dead", "its process has ended"))
+    process.wait()
+    assert state() == ("dead", "its process has ended")
+    # The node was started again.
+    again = {"process": f"{socket.gethostname()}:{os.getpid()}"}
+    situation.put_status(NodeStatus("/limb/planner", 0, "idle", again))
+    assert state() == ("ok", "idle")
+
+
+@pytest.mark.parametrize("identity", ["elsewhere:{ended}", "{host}:{ended}", "", "x", "{host}:-1"])
+def test_a_process_that_was_never_seen_here_has_not_ended(
+    situation: Situation, identity: str
+) -> None:
+    """As that of another computer, or of a container of the same name."""
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    named = identity.format(host=socket.gethostname(), ended=process.pid)
+    situation.put_status(NodeStatus("/limb/planner", 0, "idle", {"process": named}))
+    assert situation.snapshot()["nodes"][0]["state"] == "ok"
 
 
 def test_the_error_is_against_the_reference_at_the_image(situation: Situation) -> None:

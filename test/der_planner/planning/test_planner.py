@@ -18,8 +18,8 @@ from der_planner.planning import (
     plan,
 )
 from der_planner.planning.inverse import static_pressure
-from der_planner.planning.motions import resting_spline
 from der_planner.planning.rod_model import PlanningRod
+from der_planner.planning.ways import resting_spline
 
 LIMB = Limb.default()
 CASES = ("asynchronous", "same_direction", "opposite_direction")

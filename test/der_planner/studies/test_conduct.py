@@ -20,6 +20,8 @@ from der_planner.studies.work import Calibrated, Outcome, compute
 
 from .cluster import Processes, wait_for
 
+pytestmark = pytest.mark.slow
+
 # A twin that is planned for without calibration, in motions of a second: a whole run, and short.
 TWINS = """
 task: run

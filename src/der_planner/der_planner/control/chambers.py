@@ -14,7 +14,7 @@ from der_planner.model.series import CONTROL_PERIOD, interpolate
 
 Array = NDArray[np.float64]
 
-_SURPRISE_TIME = 3.0
+_SURPRISE_TIME = 10.0
 """In which a difference between measured and modelled pressures is forgotten [s]."""
 _GROWTH_TIME = 0.5
 """In which the growth of that difference fades [s] …"""

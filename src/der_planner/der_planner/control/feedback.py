@@ -135,12 +135,13 @@ class Feedback:
         else:
             supervisor.in_time()
         planned, before = self._nominal.command(k), self._chambers.sent(k - 1)
-        correction = np.zeros_like(planned)
+        correction, swing = np.zeros_like(planned), 0.0
         try:
             # Matrices of some ten rows: more threads only get into other processes' way.
             with _THREADS.limit(limits=1, user_api="blas"):
                 known = self._estimator.at(instant)
                 age = instant - self._estimator.newest
+                swing = float(np.linalg.norm(known.rate))
                 share = supervisor.advance(instant, age, known.strange)
                 if share > 0.0:
                     correction = share * self._horizon.solve(k, known, self._allowed)
@@ -152,7 +153,7 @@ class Feedback:
         limit, step = self._allowed.limit, self._allowed.step
         command: Array = np.clip(planned + correction, before - step, before + step)
         command = np.clip(command, -limit, limit)
-        supervisor.sent(instant, command - planned)
+        supervisor.sent(instant, command - planned, swing)
         self._chambers.send(k, command)
         self._estimator.changed(instant)
         return command

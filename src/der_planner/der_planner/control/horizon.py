@@ -43,7 +43,7 @@ class HorizonSettings:
     """
 
     knots: tuple[int, ...] = (0, 1, 2, 3, 5, 7, 10, 14, 19, 25, 32, 39)
-    bend: float = 0.01
+    bend: float = 0.004
     change: float = 5e-6
     smoothness: float = 5e-6
 

@@ -37,7 +37,7 @@ class EstimatorSettings:
     gain_first: float = 0.15
     gain_density: float = 0.01
     tip_first: float = 3e-3
-    tip_density: float = 2e-4
+    tip_density: float = 4e-4
     tip_time: float = 20.0
     memory_time: float = 0.4
     strange: float = 6.0
@@ -101,3 +101,9 @@ class Knowledge:
     effective: Array
     strange: float = 1.0
     row: int = 0
+
+    @property
+    def rate(self) -> Array:
+        """(M,) δθ̇ [rad/s]."""
+        inputs = len(self.taken)
+        return self.mean[inputs : 2 * inputs]

@@ -24,8 +24,8 @@ from der_planner.model.balance import Balance
 from der_planner.model.drive import STEPS
 from der_planner.model.response import RodModel, simulate
 from der_planner.model.series import CONTROL_PERIOD, step_middles
-from der_planner.planning.motions import resting_spline, sample_spline
 from der_planner.planning.result import Plan
+from der_planner.planning.ways import resting_spline, sample_spline
 
 Array = NDArray[np.float64]
 Whole = NDArray[np.signedinteger[Any]]

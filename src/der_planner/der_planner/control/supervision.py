@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 REASONS = {
     "tags lost": "the limb has not been seen for {:.1f} s",
     "inconsistent": "the limb moves as the model cannot, measurements are {:.0f} times too far off",
-    "oscillation": "the corrections swing by {:.0f} Pa and the swing does not die out",
+    "oscillation": "corrections swing by {:.0f} Pa, and neither they nor the limb come to rest",
     "saturation": "a correction has been at its limit of {:.0f} Pa for too long",
     "late": "commands come {:.2f} s after their instant",
 }
@@ -30,6 +30,9 @@ REASONS = {
 
 _SHRINKS = 0.7
 """A swing whose next way is less than this share of the longest before dies out."""
+_JUMP = 1.5
+"""Where a correction's way, or the limb's swing, is so many times what it was before, it was not
+the loop but an event, as a push is: what swung before it does not count."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,7 @@ class Limits:
     patience: float = 2.0
     saturated: float = 3.0
     swing: float = 0.1
-    turns: int = 4
+    turns: int = 6
     window: float = 4.0
     late: float = 4.0
 
@@ -135,8 +138,14 @@ class Supervisor:
             self.share = min(1.0, self.share + CONTROL_PERIOD / limits.ramp)
         return self.share
 
-    def sent(self, time: float, correction: Array) -> None:
-        """Look at a correction (M,) [Pa] that is sent for an instant [s]."""
+    def sent(self, time: float, correction: Array, swing: float) -> None:
+        """Look at a correction that is sent.
+
+        Args:
+            time: instant of the command [s].
+            correction: (M,) [Pa].
+            swing: rate at which the limb deviates from the model's motion then [rad/s].
+        """
         limits = self.limits
         if self.share > 0.0 and np.abs(correction).max() > 0.98 * self.authority * self.share:
             if self._limited_since is None:
@@ -148,7 +157,7 @@ class Supervisor:
         if not self._turns:
             self._turns = [_Turns(limits.swing * self.authority) for _ in correction]
         for turns, value in zip(self._turns, correction, strict=True):
-            turns.add(time, float(value))
+            turns.add(time, float(value), swing)
             way = turns.oscillation(time, limits.turns, limits.window)
             if way > 0.0:
                 self.stop(time, "oscillation", way)
@@ -175,6 +184,25 @@ class Supervisor:
             self.warnings.append(Warned(time, name, REASONS[name].format(number)))
 
 
+@dataclass(frozen=True)
+class _Turn:
+    """Where a correction turned round.
+
+    Attributes:
+        time: [s].
+        way: from the turn before [Pa].
+        swing: largest rate of the limb's deviation since the turn before [rad/s].
+    """
+
+    time: float
+    way: float
+    swing: float
+
+    def jumps(self, before: _Turn) -> bool:
+        """Tell if this turn is much larger than the one before."""
+        return self.way > _JUMP * before.way or self.swing > _JUMP * before.swing
+
+
 class _Turns:
     """Finds where a series turns round by more than a threshold.
 
@@ -184,14 +212,14 @@ class _Turns:
 
     def __init__(self, threshold: float) -> None:
         self._threshold = threshold
-        self._low = self._high = self._last = 0.0
+        self._low = self._high = self._last = self._swing = 0.0
         self._rising: bool | None = None
-        self.found: deque[tuple[float, float]] = deque(maxlen=16)
-        """Time of each turn and the way since the one before."""
+        self._found: deque[_Turn] = deque(maxlen=16)
 
-    def add(self, time: float, value: float) -> None:
-        """Look at the next value."""
+    def add(self, time: float, value: float, swing: float) -> None:
+        """Look at the next value, and at the rate with which the limb swings then."""
         self._low, self._high = min(self._low, value), max(self._high, value)
+        self._swing = max(self._swing, swing)
         if self._rising is not False and value < self._high - self._threshold:
             self._turn(time, self._high, rising=False)
             self._low = value
@@ -201,12 +229,23 @@ class _Turns:
 
     def _turn(self, time: float, extreme: float, *, rising: bool) -> None:
         if self._rising is not None:
-            self.found.append((time, abs(extreme - self._last)))
-        self._last, self._rising = extreme, rising
+            turn = _Turn(time, abs(extreme - self._last), self._swing)
+            if self._found and turn.jumps(self._found[-1]):
+                self._found.clear()
+            self._found.append(turn)
+        self._last, self._rising, self._swing = extreme, rising, 0.0
 
     def oscillation(self, time: float, turns: int, window: float) -> float:
-        """Return the way between two turns if they are many and it does not shrink, else 0."""
-        recent = [way for when, way in self.found if when > time - window][-turns:]
-        if len(recent) < turns or recent[-1] < _SHRINKS * max(recent[:-1]):
+        """Return the way between two turns if they are many and nothing dies out, else 0.
+
+        A correction that is cut at its limit keeps its way while the limb's swing dies out.
+        """
+        recent = [turn for turn in self._found if turn.time > time - window][-turns:]
+        if len(recent) < turns:
             return 0.0
-        return recent[-1]
+        last, before = recent[-1], recent[:-1]
+        if last.way < _SHRINKS * max(turn.way for turn in before):
+            return 0.0
+        if last.swing < _SHRINKS * max(turn.swing for turn in before):
+            return 0.0
+        return last.way

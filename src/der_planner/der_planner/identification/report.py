@@ -175,8 +175,11 @@ class FitReport:
                 f"a vented chamber falls by at most {air.vent_rate:.0f} ± {speed:.0f} Pa/s at "
                 f"10 kPa, with the pressure to the power {air.vent_exponent:.2f} ± {exponent:.2f}"
             )
+        lag = f"{air.vent_lag:.3f} s venting"
+        if air.vent_lag_exponent > 0:
+            lag += f" at 10 kPa · (10 kPa / pressure)^{air.vent_lag_exponent:.2f}"
         return [
-            f"air: lag {air.fill_lag:.3f} s filling, {air.vent_lag:.3f} s venting, dead time "
+            f"air: lag {air.fill_lag:.3f} s filling, {lag}, dead time "
             f"{air.delay:.3f} s, fill rate {rate}, residual {air.residual:.0f} Pa",
             f"air: {venting}",
         ]

@@ -305,9 +305,9 @@ class _Days:
         """Return what was said of a segment."""
         old = self._limb.segments[m]
         new = _moved(old, x[3 * m : 3 * m + 3])
-        spreads = (GAIN_SPREAD * _gain(old), REST_SPREAD, _friction_spread(old))
+        spreads = (GAIN_SPREAD * old.static_gain, REST_SPREAD, _friction_spread(old))
         # That of a gain is a share of the gain, which is another one now.
-        units = (GAIN_SPREAD * _gain(new), *spreads[1:])
+        units = (GAIN_SPREAD * new.static_gain, *spreads[1:])
         columns = (_NAMES, _day(old), _day(new), spreads, units)
         return tuple(
             Change(
@@ -320,11 +320,7 @@ class _Days:
 
 def _day(segment: Segment) -> tuple[float, float, float]:
     """Return gain [rad/Pa], rest angle [rad] and friction [N·m]."""
-    return _gain(segment), segment.rest_curvature * segment.length, segment.friction_moment
-
-
-def _gain(segment: Segment) -> float:
-    return segment.moment_gain * segment.length / segment.bending_stiffness
+    return segment.static_gain, segment.rest_curvature * segment.length, segment.friction_moment
 
 
 def _friction_spread(segment: Segment) -> float:

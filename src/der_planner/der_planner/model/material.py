@@ -302,7 +302,7 @@ def resting_law(limb: Limb) -> RestingLaw:
     """Return what the bend at rest depends on."""
     columns = [
         (
-            s.moment_gain * s.length / s.bending_stiffness,
+            s.static_gain,
             s.cubic_stiffness / s.bending_stiffness / s.length**2,
             s.rest_curvature * s.length,
             s.friction_moment / s.moment_gain,

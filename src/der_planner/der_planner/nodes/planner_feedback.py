@@ -31,7 +31,7 @@ _LONGEST_AHEAD = 0.15
 """However slow this machine is, the setpoint that is revised is at most so far ahead [s]."""
 _SLOWER = 1.5
 """A solution may take so many times what the last ones took."""
-_SMALLEST_BEND, _SMALLEST_TIP = 1.5e-3, 2e-4
+_SMALLEST_BEND, _SMALLEST_TIP = 1e-3, 1e-4
 """Standard deviations that are believed of a tracker: it tells corner noise alone [rad], [m]."""
 _STALE = 10
 """Setpoints for which corrections that were thought of before are used in full; then they fade."""

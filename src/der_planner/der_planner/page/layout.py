@@ -15,12 +15,7 @@ from der_planner.page.commands import Answer, MotionRequest, Service, answer_of
 from der_planner.page.drawing.sketch import Sketch
 from der_planner.page.server import STATIC, Parts
 from der_planner.planning import METHODS
-from der_planner.planning.motions import (
-    DEFAULT_AMPLITUDE,
-    DEFAULT_CYCLES,
-    DEFAULT_PERIOD,
-    NAMES,
-)
+from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD, NAMES
 from der_planner.planning.plan_file import LEARNED
 
 RECONNECT = 3.0

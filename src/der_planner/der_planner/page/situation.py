@@ -11,13 +11,16 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from der_planner.page.processes import Processes
+
 PASCAL_PER_KILOPASCAL = 1000.0
 CENTIMETRES = 100.0
 NANOSECONDS = 1_000_000_000
 FRESH = {"driver": 0.5, "tracker": 0.5, "camera": 0.7}
 """[s] that the newest message of a source may be old before the page greys it."""
 LATE, DEAD = 1.6, 5.0
-"""[s] without diagnostics, which every node sends once a second."""
+"""[s] without diagnostics, which every node sends once a second; a process that has ended on this
+computer is dead at once."""
 MODES = ("disarmed", "armed", "tracking", "holding", "venting", "fault")
 LEVELS = ("ok", "warning", "error", "stale")
 REFERENCES_KEPT = 200
@@ -93,6 +96,7 @@ class Situation:
         self._driver: DriverState | None = None
         self._limb: LimbView | None = None
         self._nodes: dict[str, tuple[NodeStatus, float]] = {}
+        self._processes = Processes()
         self._references: deque[tuple[int, float, float]] = deque(maxlen=REFERENCES_KEPT)
 
     def hear(self, source: str) -> None:
@@ -123,6 +127,7 @@ class Situation:
         """Take a node's diagnostics."""
         with self._lock:
             self._nodes[status.name] = (status, self._clock())
+            self._processes.note(status.name, status.values.get("process", ""))
 
     def value_of(self, node: str, key: str) -> str:
         """Return what a node's newest diagnostics say under a key; empty where they do not."""
@@ -154,6 +159,7 @@ class Situation:
             now = self._clock()
             heard, nodes = dict(self._heard), list(self._nodes.values())
             driver, limb = self._driver, self._limb
+            troubles = {status.name: self._processes.trouble(status.name) for status, _ in nodes}
         ages = {
             name: {
                 "age": _number(now - heard[name], 2) if name in heard else None,
@@ -166,7 +172,10 @@ class Situation:
             "sources": ages,
             "driver": None if driver is None else _driver_values(driver),
             "limb": None if limb is None else self._limb_values(limb),
-            "nodes": [_node_values(status, now - at) for status, at in sorted(nodes, key=_name)],
+            "nodes": [
+                _node_values(status, now - at, troubles[status.name])
+                for status, at in sorted(nodes, key=_name)
+            ],
         }
 
     def _limb_values(self, limb: LimbView) -> dict[str, Any]:
@@ -212,14 +221,14 @@ def _driver_values(driver: DriverState) -> dict[str, Any]:
     }
 
 
-def _node_values(status: NodeStatus, age: float) -> dict[str, Any]:
+def _node_values(status: NodeStatus, age: float, trouble: str) -> dict[str, Any]:
     level = LEVELS[status.level] if 0 <= status.level < len(LEVELS) else "error"
-    if age > LATE:
-        level = "dead" if age > DEAD else "late"
+    if trouble or age > LATE:
+        level = "dead" if trouble or age > DEAD else "late"
     return {
         "name": _short(status.name),
         "state": level,
-        "message": status.message,
+        "message": trouble or status.message,
         "age": round(age, 1),
         "values": dict(status.values),
     }

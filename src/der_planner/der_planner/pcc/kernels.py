@@ -5,8 +5,7 @@ reaches, at the fraction σ of its length, the point L σ g(σ θ) of its own fr
 
     g(z) = ∫₀¹ exp(i z η) dη = sin z / z + i (1 − cos z) / z.
 
-Its derivatives are g⁽ᵏ⁾(z) = iᵏ ∫₀¹ ηᵏ exp(i z η) dη, smooth through z = 0: a power series is used
-there instead of the quotient, so that a straight limb is an ordinary configuration.
+A straight limb is an ordinary configuration, see `arc_kernel`.
 
 Symbols: q (n,) bend angles [rad], P position of a particle as a function of q, J_i = ∂P/∂q_i,
 H_ik = ∂²P/∂q_i∂q_k. With the particles' masses m, M_ij = Σ m ⟨J_i, J_j⟩, C_ij = Σ m ⟨J_i, Σ_k H_jk
@@ -23,11 +22,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from der_planner.pcc.arc_kernel import arc_point, solve_symmetric
+
 Vector = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-
-SERIES_BELOW = 0.5
-_SERIES_TERMS = 14
 
 
 class Arcs(NamedTuple):
@@ -49,36 +47,6 @@ class Arcs(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def arc_moment(z: float, k: int) -> Any:
-    """Return ∫₀¹ ηᵏ exp(i z η) dη for k = 0 … 3, to rounding for every real z."""
-    if abs(z) < SERIES_BELOW:
-        total = 0.0 + 0.0j
-        term = 1.0 + 0.0j
-        for m in range(_SERIES_TERMS):
-            total += term / (m + k + 1)
-            term *= 1j * z / (m + 1)
-        return total
-    phase = np.cos(z) + 1j * np.sin(z)
-    value = (phase - 1.0) / (1j * z)
-    for order in range(1, k + 1):
-        value = (phase - order * value) / (1j * z)
-    return value
-
-
-@njit(cache=True, nogil=True)
-def arc_point(z: float, k: int) -> Any:
-    """Return the k-th derivative of g at z (k = 0 … 3)."""
-    value = arc_moment(z, k)
-    if k == 1:
-        return 1j * value
-    if k == 2:
-        return -value
-    if k == 3:
-        return -1j * value
-    return value
-
-
-@njit(cache=True, nogil=True)
 def joints(q: Vector, arcs: Arcs) -> Complex:
     """Return (3, n + 1): where each segment starts, its first heading, and where it ends."""
     n = q.size
@@ -86,7 +54,7 @@ def joints(q: Vector, arcs: Arcs) -> Complex:
     position, heading = 0.0 + 0.0j, 1.0 + 0.0j
     for i in range(n):
         result[0, i], result[1, i] = position, heading
-        position = position + heading * arcs.lengths[i] * arc_point(q[i], 0)
+        position = position + heading * arcs.lengths[i] * arc_point(q[i])[0]
         result[2, i] = position
         heading = heading * (np.cos(q[i]) + 1j * np.sin(q[i]))
         position = position + heading * arcs.connector
@@ -110,9 +78,10 @@ def point_derivatives(
     j, sigma = arcs.owner[p], arcs.place[p]
     z, reach = sigma * q[j], frame[1, j] * arcs.lengths[j] * sigma
     past = frame[1, j + 1] * arcs.beyond[p]
-    point = frame[0, j] + reach * arc_point(z, 0) + past
-    J[j] = reach * sigma * arc_point(z, 1) + 1j * past
-    H[j, j] = reach * sigma**2 * arc_point(z, 2) - past
+    bent, slope, curve, _ = arc_point(z)
+    point = frame[0, j] + reach * bent + past
+    J[j] = reach * sigma * slope + 1j * past
+    H[j, j] = reach * sigma**2 * curve - past
     for i in range(j):
         past = point - frame[2, i]
         J[i] = slopes[0, i] + 1j * past
@@ -126,12 +95,15 @@ def point_derivatives(
 
 @njit(cache=True, nogil=True)
 def arc_slopes(q: Vector, arcs: Arcs, frame: Complex, order: int) -> Complex:
-    """Return exp(iΦ_i) L_i times the derivatives 1 … order of g at each bend angle."""
+    """Return exp(iΦ_i) L_i times the derivatives 1 … order (2 or 3) of g at each bend angle."""
     n = q.size
     result = np.zeros((order, n), dtype=np.complex128)
-    for k in range(order):
-        for i in range(n):
-            result[k, i] = frame[1, i] * arcs.lengths[i] * arc_point(q[i], k + 1)
+    for i in range(n):
+        _, first, second, third = arc_point(q[i])
+        turned = frame[1, i] * arcs.lengths[i]
+        result[0, i], result[1, i] = turned * first, turned * second
+        if order > 2:
+            result[2, i] = turned * third
     return result
 
 
@@ -169,12 +141,38 @@ def inertia(q: Vector, v: Vector, arcs: Arcs) -> tuple[Vector, Vector, Vector, V
 
 @njit(cache=True, nogil=True)
 def acceleration(q: Vector, v: Vector, torque: Vector, arcs: Arcs) -> Vector:
-    """Return q̈ from M q̈ + C q̇ + D q̇ + K(q) = torque + gravity's torque, all (n,)."""
-    M, C, D, weight = inertia(q, v, arcs)
-    bend = q - arcs.rest
-    elastic = arcs.stiffness * (bend + arcs.viscous * v) + arcs.cubic * bend**3
-    force = torque + weight - elastic - (C + D) @ v
-    return np.linalg.solve(M, force)
+    """Return q̈ from M q̈ + C q̇ + D q̇ + K(q) = torque + gravity's torque, all (n,).
+
+    The forces are summed particle by particle: m (g − Σ_kl H_kl q̇_k q̇_l) less the drag on its
+    velocity, by the particle's J. C and D, of which only the products with q̇ count, are not formed.
+    """
+    n = q.size
+    M = np.zeros((n, n))
+    J, H = np.zeros(n, dtype=np.complex128), np.zeros((n, n), dtype=np.complex128)
+    pull = complex(arcs.gravity[0], arcs.gravity[1])
+    frame = joints(q, arcs)
+    slopes = arc_slopes(q, arcs, frame, 2)
+    force = np.empty(n)
+    for i in range(n):
+        bend = q[i] - arcs.rest[i]
+        force[i] = torque[i] - arcs.stiffness[i] * (bend + arcs.viscous[i] * v[i])
+        force[i] -= arcs.cubic[i] * bend**3
+    for p in range(arcs.owner.size):
+        mass, last = arcs.mass[p], arcs.owner[p] + 1
+        point_derivatives(q, arcs, frame, p, slopes, J, H)
+        velocity, turning = 0.0 + 0.0j, 0.0 + 0.0j
+        for i in range(last):
+            velocity += J[i] * v[i]
+            turning += H[i, i] * v[i] * v[i]
+            for k in range(i):
+                turning += 2.0 * H[i, k] * v[i] * v[k]
+        felt = mass * (pull - turning) - arcs.drag[p] * velocity
+        for i in range(last):
+            force[i] += J[i].real * felt.real + J[i].imag * felt.imag
+            for k in range(i + 1):
+                M[i, k] += mass * (J[i].real * J[k].real + J[i].imag * J[k].imag)
+    solve_symmetric(M, force)
+    return force
 
 
 @njit(cache=True, nogil=True)
@@ -231,7 +229,7 @@ def _third(q: Vector, v: Vector, arcs: Arcs, frame: Complex, p: int, point: Any,
                 if s == k and k == m:
                     if s == j:
                         reach = frame[1, j] * arcs.lengths[j] * sigma**4
-                        value = reach * arc_point(sigma * q[j], 3)
+                        value = reach * arc_point(sigma * q[j])[3]
                         value = value - 1j * frame[1, j + 1] * arcs.beyond[p]
                     else:
                         value = third[s] - 1j * (point - frame[2, s])

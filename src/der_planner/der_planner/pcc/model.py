@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from der_planner.limb import Limb
-from der_planner.pcc import kernels
+from der_planner.pcc import arc_kernel, kernels
 from der_planner.pcc.kernels import Arcs
 from der_planner.pcc.linearisation import Linearisation
 
@@ -306,7 +306,7 @@ def _arc(angle: Vector) -> Complex:
 
 def _arc_slope(angle: Vector) -> Complex:
     """Return g′(angle) = i ∫₀¹ η exp(i angle η) dη; by its series where the quotient cancels."""
-    small = np.abs(angle) < kernels.SERIES_BELOW
+    small = np.abs(angle) < arc_kernel.SERIES_BELOW
     safe = np.where(small, 1.0, angle)
     quotient = (np.exp(1j * safe) - _arc(safe)) / safe
     series = np.zeros(np.shape(angle), dtype=complex)

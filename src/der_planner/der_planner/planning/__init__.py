@@ -11,10 +11,11 @@ from der_planner.planning.errors import (
     UnreachableError,
 )
 from der_planner.planning.models import METHODS
-from der_planner.planning.motions import NAMES, Motion, Reference, Start
+from der_planner.planning.motions import NAMES, Motion, Reference
 from der_planner.planning.paths import PathLimits
 from der_planner.planning.planner import DEFAULT_METHOD, choose_method, plan
 from der_planner.planning.result import Plan
+from der_planner.planning.ways import Start
 
 __all__ = [
     "CONTROL_PERIOD",

@@ -13,8 +13,9 @@ from der_planner.planning.errors import BucklingError, PlanningError
 from der_planner.planning.inverse import check_reach, is_loaded, solve, static_pressure
 from der_planner.planning.loads.overload import check_load
 from der_planner.planning.loads.posed import REFERENCE_PRIOR
-from der_planner.planning.motions import Reference, Start, resting_spline, sample_spline
+from der_planner.planning.motions import Reference
 from der_planner.planning.rod_model import PlanningRod
+from der_planner.planning.ways import Start, resting_spline, sample_spline
 
 Array = NDArray[np.float64]
 

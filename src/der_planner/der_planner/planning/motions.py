@@ -22,11 +22,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import BSpline, make_interp_spline
+from scipy.interpolate import BSpline
 
 from der_planner.limb import Limb
 from der_planner.model.bending import ArcKinematics
@@ -37,6 +36,18 @@ from der_planner.planning.inverse import angle_limits, check_branch, follow
 from der_planner.planning.loads.rest import Rest, rest_of
 from der_planner.planning.loads.sagged import sagged_tips
 from der_planner.planning.nearest import Deviation, line, nearest_path
+from der_planner.planning.ways import (
+    FINE_PERIOD,
+    Start,
+    fine_grid,
+    led_in,
+    on_grid,
+    quintic,
+    resting_spline,
+    sample_spline,
+    smooth_step,
+    with_ways,
+)
 
 Array = NDArray[np.float64]
 
@@ -46,26 +57,8 @@ DEFAULT_AMPLITUDE = math.pi / 4
 DEFAULT_PERIOD = 20.0
 DEFAULT_CYCLES = 2
 LONGEST = 3600.0
-_GRID = 0.01
 _SAG_ROUNDS = 3
 """Each leaves some per cent of what the sag's change along a path took."""
-
-
-@dataclass(frozen=True)
-class Start:
-    """Where a motion begins, if not at rest: where another one is left.
-
-    Attributes:
-        bend_angles: (M,) of the arcs [rad].
-        rate: (M,) [rad/s].
-        acceleration: (M,) [rad/s²].
-        pressure: (M,) command in force [Pa].
-    """
-
-    bend_angles: Array
-    rate: Array
-    acceleration: Array
-    pressure: Array
 
 
 @dataclass(frozen=True)
@@ -98,29 +91,6 @@ class Reference:
     def sample(self, time: ArrayLike) -> tuple[Array, Array, Array]:
         """Return q̄, its rate and acceleration (…, M) at instants, at rest outside the motion."""
         return sample_spline(self.spline, time)
-
-
-def sample_spline(spline: BSpline, time: ArrayLike) -> tuple[Array, Array, Array]:
-    """Return value, rate and acceleration of a spline; beyond its ends it rests."""
-    instants = np.asarray(time, dtype=float)
-    first, last = spline.t[spline.k], spline.t[-spline.k - 1]
-    inside = ((instants >= first) & (instants <= last))[..., None]
-    clipped = np.clip(instants, first, last)
-    value: Array = spline(clipped)
-    return (
-        value,
-        np.where(inside, spline(clipped, 1), 0.0),
-        np.where(inside, spline(clipped, 2), 0.0),
-    )
-
-
-def resting_spline(time: ArrayLike, values: ArrayLike, start: Start | None = None) -> BSpline:
-    """Return the quintic spline through (K, M) values that ends at rest and starts as given."""
-    samples = np.asarray(values, dtype=float)
-    rest = np.zeros(samples.shape[1:])
-    begin = (rest, rest) if start is None else (start.rate, start.acceleration)
-    ends: Any = ([(1, begin[0]), (2, begin[1])], [(1, rest), (2, rest)])
-    return make_interp_spline(np.asarray(time), samples, k=5, bc_type=ends)
 
 
 @dataclass(frozen=True)
@@ -263,12 +233,12 @@ class Motion:
             time, angles = self._joint_motion(limb.segment_count, rest)
             if start is None and np.any(angles[0] != rest.bend_angles):
                 zero = np.zeros_like(rest.bend_angles)
-                time, angles = _led_in(limb, (rest.bend_angles, zero, zero), time, angles)
+                time, angles = led_in(limb, (rest.bend_angles, zero, zero), time, angles)
         else:
             time, angles, deviation = self._tip_motion(limb, rest)
         if start is not None:
             state = (start.bend_angles, start.rate, start.acceleration)
-            time, angles = _led_in(limb, state, time, angles)
+            time, angles = led_in(limb, state, time, angles)
         spline = resting_spline(time, angles, start)
         count = round(time[-1] / CONTROL_PERIOD) + 1
         instants = np.arange(count) * CONTROL_PERIOD
@@ -280,7 +250,7 @@ class Motion:
 
     def _joint_motion(self, segments: int, rest: Rest) -> tuple[Array, Array]:
         total = self.cycles * self.period
-        time = _fine_grid(total)
+        time = fine_grid(total)
         place = np.arange(segments)
         lag = place * self.period / 4 if self.name == "asynchronous" else 0.0 * place
         sign = (-1.0) ** place if self.name == "opposite_direction" else 1.0 + 0.0 * place
@@ -294,7 +264,7 @@ class Motion:
             0.5 * self.amplitude * sign * rate * np.sin(last),
             0.5 * self.amplitude * sign * rate**2 * np.cos(last),
         )
-        closing = _fine_grid(_on_grid(self.period / 4))
+        closing = fine_grid(on_grid(self.period / 4))
         zero = np.zeros(segments)
         back = quintic(closing, *state, rest.bend_angles, zero, zero)
         return np.append(time, total + closing[1:]), np.concatenate([angles, back[1:]])
@@ -308,14 +278,14 @@ class Motion:
             )
         if self.nearest:
             return self._nearest_motion(limb, rest, path)
-        time, tip = path.resample(_GRID * 2)
+        time, tip = path.resample(FINE_PERIOD * 2)
         angles = follow(limb, kinematics, time, tip - rest.offset, self.branch)
         if limb.gravity[2]:
             # Arcs reach farther than a limb that sags out of the plane does at the same bend.
             for _ in range(_SAG_ROUNDS):
                 short = kinematics.tip(angles) - sagged_tips(limb, time, angles, rest.bend_angles)
                 angles = follow(limb, kinematics, time, tip + short, self.branch)
-        return (*_with_ways(limb, time, angles, rest.bend_angles), None)
+        return (*with_ways(limb, time, angles, rest.bend_angles), None)
 
     def _nearest_motion(
         self, limb: Limb, rest: Rest, path: paths.TipPath
@@ -329,90 +299,12 @@ class Motion:
             sagged = sagged_tips(limb, time, angles, rest.bend_angles)
             offset = (sagged - kinematics.tip(angles)).mean(axis=0)
             found = nearest_path(limb, kinematics, path, offset, self.limits, self.branch)
-        ways = _with_ways(limb, found.time, found.bend_angles, rest.bend_angles)
+        ways = with_ways(limb, found.time, found.bend_angles, rest.bend_angles)
         low, high = angle_limits(limb)
         if np.any(ways[1] < low) or np.any(ways[1] > high):
             # A way that begins or ends in full motion near a limit would swing beyond it.
             found = nearest_path(
                 limb, kinematics, path, offset, self.limits, self.branch, rest=True
             )
-            ways = _with_ways(limb, found.time, found.bend_angles, rest.bend_angles)
+            ways = with_ways(limb, found.time, found.bend_angles, rest.bend_angles)
         return (*ways, found.deviation)
-
-
-def _with_ways(limb: Limb, time: Array, angles: Array, home: Array) -> tuple[Array, Array]:
-    """Return times and angles with the ways from home to their first and from their last pose."""
-    inner = make_interp_spline(time, angles, k=5)
-    ends = [(inner(t), inner(t, 1), inner(t, 2)) for t in (time[0], time[-1])]
-    zero = np.zeros(limb.segment_count)
-    lead = _travel_time(limb, ends[0], home)
-    tail = _travel_time(limb, ends[1], home)
-    approach = quintic(_fine_grid(lead), home, zero, zero, *ends[0])
-    back = quintic(_fine_grid(tail), *ends[1], home, zero, zero)
-    between = _fine_grid(_on_grid(time[-1] - time[0]))
-    middle = inner(np.minimum(time[0] + between, time[-1]))
-    instants = [
-        _fine_grid(lead),
-        lead + between[1:],
-        lead + between[-1] + _fine_grid(tail)[1:],
-    ]
-    return np.concatenate(instants), np.concatenate([approach, middle[1:], back[1:]])
-
-
-def smooth_step(x: ArrayLike) -> Array:
-    """Return the quintic that goes from 0 to 1 with zero rate and acceleration at both ends."""
-    t = np.clip(np.asarray(x, dtype=float), 0.0, 1.0)
-    step: Array = t**3 * (10 + t * (6 * t - 15))
-    return step
-
-
-def quintic(time: Array, x0: Array, v0: Array, a0: Array, x1: Array, v1: Array, a1: Array) -> Array:
-    """Return (K, M) samples of the quintic between two states over the span of ``time`` (K,)."""
-    span = float(time[-1])
-    t = (time / span)[:, None]
-    start = (x0, span * v0, span**2 * a0)
-    end = (x1, span * v1, span**2 * a1)
-    difference = end[0] - start[0] - start[1] - 0.5 * start[2]
-    slope = end[1] - start[1] - start[2]
-    bow = end[2] - start[2]
-    c3 = 10 * difference - 4 * slope + 0.5 * bow
-    c4 = -15 * difference + 7 * slope - bow
-    c5 = 6 * difference - 3 * slope + 0.5 * bow
-    result: Array = start[0] + t * (start[1] + t * (0.5 * start[2] + t * (c3 + t * (c4 + t * c5))))
-    return result
-
-
-def _led_in(
-    limb: Limb, state: tuple[Array, Array, Array], time: Array, angles: Array
-) -> tuple[Array, Array]:
-    """Return time and angles with the way from a state to their first pose, at rest, before them.
-
-    The state is angle [rad], rate [rad/s] and acceleration [rad/s²], each (M,).
-    """
-    zero = np.zeros(limb.segment_count)
-    lead = _fine_grid(_travel_time(limb, state, angles[0]))
-    way = quintic(lead, *state, angles[0], zero, zero)
-    return np.append(lead, lead[-1] + time[1:]), np.concatenate([way, angles[1:]])
-
-
-def _on_grid(span: float) -> float:
-    """Return a span rounded up to whole control periods."""
-    return math.ceil(span / CONTROL_PERIOD - 1e-9) * CONTROL_PERIOD
-
-
-def _fine_grid(span: float) -> Array:
-    """Return evenly spaced instants from 0 to span, about 10 ms apart."""
-    return np.linspace(0.0, span, max(2, round(span / _GRID) + 1))
-
-
-def _travel_time(limb: Limb, state: tuple[Array, Array, Array], home: Array) -> float:
-    """Return how long the limb takes between rest at home and a state, at half of its slew limit.
-
-    Angles (M,) in rad, the result in s.
-    """
-    fastest = 0.5 * limb.pneumatics.slew_limit * limb.static_gain
-    angle, rate, acceleration = (np.abs(p) for p in (state[0] - home, state[1], state[2]))
-    by_angle = np.max(1.875 * angle / fastest)
-    by_rate = np.max(2 * rate / fastest)
-    by_acceleration = np.max(np.sqrt(acceleration / fastest))
-    return _on_grid(max(1.0, by_angle, by_rate, by_acceleration))

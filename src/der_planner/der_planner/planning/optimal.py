@@ -33,8 +33,9 @@ from der_planner.model.commands import within_limits
 from der_planner.model.drive import Drive, Window
 from der_planner.model.response import Model, State
 from der_planner.model.series import CONTROL_PERIOD
-from der_planner.planning.motions import Reference, sample_spline
+from der_planner.planning.motions import Reference
 from der_planner.planning.quadratic import Band, solve_limited
+from der_planner.planning.ways import sample_spline
 from der_planner.rod import ConvergenceError
 
 Array = NDArray[np.float64]

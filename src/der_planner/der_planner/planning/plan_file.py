@@ -20,8 +20,9 @@ from der_planner.model.response import NODES
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import models
 from der_planner.planning.errors import PlanningError
-from der_planner.planning.motions import Reference, Start, resting_spline, sample_spline
+from der_planner.planning.motions import Reference
 from der_planner.planning.result import Plan
+from der_planner.planning.ways import Start, resting_spline, sample_spline
 
 Array = NDArray[np.float64]
 

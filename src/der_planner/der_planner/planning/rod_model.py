@@ -17,7 +17,8 @@ from der_planner.planning.inverse import (
     solve,
 )
 from der_planner.planning.loads.posed import REFERENCE_PRIOR, PosedMotion, posed_motion
-from der_planner.planning.motions import Reference, Start, resting_spline, sample_spline
+from der_planner.planning.motions import Reference
+from der_planner.planning.ways import Start, resting_spline, sample_spline
 from der_planner.rod import RodState
 
 Array = NDArray[np.float64]

@@ -15,8 +15,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.runs.recording.reader import BagError, BagReader
-from der_planner.runs.series import (
+from der_planner.runs.record import (
     NANOSECONDS,
     PLAN_TYPE,
     PRESSURE_TYPE,
@@ -25,6 +24,7 @@ from der_planner.runs.series import (
     header_stamp,
     namespace_of,
 )
+from der_planner.runs.recording.reader import BagError, BagReader
 from der_planner.runs.sight import (
     CAMERA_TYPE,
     IMAGE_TYPE,

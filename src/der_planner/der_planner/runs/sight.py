@@ -16,15 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from der_planner.runs.record import PLAN_TYPE, STATE_TYPE, TRUTH_SUFFIX, header_stamp, namespace_of
 from der_planner.runs.recording.reader import BagReader
 from der_planner.runs.run import Array
-from der_planner.runs.series import (
-    PLAN_TYPE,
-    STATE_TYPE,
-    TRUTH_SUFFIX,
-    header_stamp,
-    namespace_of,
-)
 
 IMAGE_TYPE = "sensor_msgs/msg/Image"
 CAMERA_TYPE = "sensor_msgs/msg/CameraInfo"

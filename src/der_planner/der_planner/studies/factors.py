@@ -18,12 +18,7 @@ from der_planner.limb import MOUNTINGS, LimbError, gravity_of
 from der_planner.limb_declaration import parameters
 from der_planner.limb_parameters import Pneumatics, Segment
 from der_planner.planning import METHODS
-from der_planner.planning.motions import (
-    DEFAULT_AMPLITUDE,
-    DEFAULT_CYCLES,
-    DEFAULT_PERIOD,
-    NAMES,
-)
+from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD, NAMES
 from der_planner.studies.errors import StudyError
 
 Value = float | int | str

@@ -9,16 +9,10 @@ from numpy.typing import NDArray
 
 from der_planner.identification.logs.log import CalibrationLog, LogError
 from der_planner.model.series import CONTROL_PERIOD, interpolate
+from der_planner.runs.record import PRESSURE_TYPE, STATE_TYPE, BagRecord, LimbRecord, read_record
 from der_planner.runs.recording.reader import BagError
 from der_planner.runs.run import Stream
-from der_planner.runs.series import (
-    PRESSURE_TYPE,
-    STATE_TYPE,
-    BagRecord,
-    LimbRecord,
-    read_record,
-    stream,
-)
+from der_planner.runs.series import stream
 
 Array = NDArray[np.float64]
 

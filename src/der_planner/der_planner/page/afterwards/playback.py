@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from apriltag_tracker.camera.encodings import ImageError, to_grey
 from der_planner.page.overlay import CURVE_POINTS, PATH_POINTS
 from der_planner.page.situation import CENTIMETRES, MODES, PASCAL_PER_KILOPASCAL
+from der_planner.runs.record import NANOSECONDS
 from der_planner.runs.recording.reader import BagError
 from der_planner.runs.scenes import Scenes
-from der_planner.runs.series import NANOSECONDS
 
 KEPT = 2
 """Bags that stay open, one for each of two windows."""

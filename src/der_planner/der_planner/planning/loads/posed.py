@@ -28,7 +28,8 @@ from der_planner.model.response import RodModel
 from der_planner.planning.errors import BucklingError, PlanningError, UnreachableError
 from der_planner.planning.loads.overload import check_load
 from der_planner.planning.loads.rest import stable_rest
-from der_planner.planning.motions import Reference, Start, resting_spline, sample_spline
+from der_planner.planning.motions import Reference
+from der_planner.planning.ways import Start, resting_spline, sample_spline
 from der_planner.rod import ConvergenceError, Rod, RodState
 
 Array = NDArray[np.float64]

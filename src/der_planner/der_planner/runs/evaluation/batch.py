@@ -11,9 +11,10 @@ from pathlib import Path
 
 from der_planner.runs.evaluation.alignment import Settings
 from der_planner.runs.evaluation.metrics import RunResult, evaluate_run
+from der_planner.runs.record import read_record
 from der_planner.runs.recording.reader import BagError
 from der_planner.runs.run import EvaluationError, RunSeries
-from der_planner.runs.series import read_record, run_of
+from der_planner.runs.series import run_of
 
 WORTH_WHILE = 64 << 20
 """Bags of fewer bytes in total are read by one process."""

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from der_planner.runs.evaluation import style
 from der_planner.runs.evaluation.figures import CM, FORMATS, by_motion, new_figure
 from der_planner.runs.evaluation.snapshots import Snapshot, fit_projection, take_snapshots
+from der_planner.runs.record import NANOSECONDS, STATE_TYPE
 from der_planner.runs.recording.reader import BagReader
 from der_planner.runs.run import Array, EvaluationError, RunSeries
-from der_planner.runs.series import NANOSECONDS, STATE_TYPE
 from der_planner.runs.sight import (
     IMAGE_TYPE,
     Projection,

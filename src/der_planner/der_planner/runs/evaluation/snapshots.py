@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from der_planner.runs.record import NANOSECONDS, STATE_TYPE
 from der_planner.runs.recording.reader import BagReader
 from der_planner.runs.run import Array, RunSeries
-from der_planner.runs.series import NANOSECONDS, STATE_TYPE
 from der_planner.runs.sight import (
     CAMERA_TYPE,
     IMAGE_TYPE,
