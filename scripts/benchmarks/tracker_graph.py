@@ -15,7 +15,6 @@ from der_planner.experiment.processes import NodeProcess
 from limb_interfaces import qos, topics
 from limb_interfaces.stamps import nanoseconds
 
-
 _PERIODS = (3.0, 3.0)
 """Of the two segments' pressures [s]."""
 
