@@ -232,3 +232,41 @@ def test_arrays_that_do_not_fit_are_refused(first):
     with pytest.raises(LearningError, match="commands must be finite"):
         learner.add(first.time, tip, commands=np.zeros((3, 2)))
     assert learner.history == []
+
+
+def test_a_limb_far_from_its_file_is_used_since_it_moves_with_its_commands(first):
+    """It misses its path by more than half of the way nearly everywhere."""
+    strange = other_limb(gain=1.7, rest=0.2)
+    learner, _, errors = learn(first, strange, 2)
+    assert errors[0] > 0.05
+    assert learner.history[0].accepted
+    assert "gains and rest angles of the model were taken from it" in learner.history[0].reason
+    assert errors[1] < errors[0] / 20
+
+
+def test_a_strange_limb_swapped_in_between_is_learned_from_the_start(first):
+    learner, planned, _ = learn(first, other_limb(), 2)
+    strange, errors = other_limb(gain=1.7, rest=0.2), []
+    for _ in range(3):
+        tip = play(planned, strange)
+        errors.append(mean_error(planned, tip))
+        learner.add(planned.time, tip)
+        planned = learner.next()
+        check_limits(planned)
+    assert [run.accepted for run in learner.history] == [True, True, False, True, True]
+    assert "the limb has changed" in learner.history[3].reason
+    assert errors[2] < errors[0] / 5
+
+
+def test_a_run_that_does_not_move_with_its_commands_is_refused(first):
+    for limb, until in ((other_limb(), 1.2), (other_limb(), 2.5), (other_limb(1.4, 0.2), 2.5)):
+        vented = first.differential_pressure.copy()
+        vented[first.time > until] = 0.0
+        learner = Learner(first)
+        learner.add(first.time, simulate(limb, first.time, commands=vented).tip[:-1])
+        assert not learner.history[0].accepted
+        assert "refused" in learner.history[0].reason
+    crossed = -0.7 * first.differential_pressure
+    learner.add(first.time, simulate(other_limb(), first.time, commands=crossed).tip[:-1])
+    assert "does not move with the commands" in learner.history[1].reason
+    assert learner.next() is first

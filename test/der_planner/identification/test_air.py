@@ -75,6 +75,19 @@ def test_law_of_venting_is_recovered_within_its_uncertainty(rate, exponent):
     assert found.fill_lag + found.delay == pytest.approx(0.34, abs=0.02)
 
 
+def test_a_valve_that_opens_in_proportion_to_its_error_is_recognised():
+    valve = {"vent_rate": 5000.0, "vent_exponent": 0.5, "vent_time_constant": 0.3}
+    air = replace(AIR, vent_lag_exponent=0.5, **valve)
+    command = np.concatenate([waves(14_000.0, 2, 40.0), steps(7_000.0)])
+    found = fit_air(synthetic_log(air, command), PERIOD)
+    assert found.vent_lag_exponent == pytest.approx(0.5, abs=0.05)
+    assert found.vent_lag == pytest.approx(0.3, abs=0.03)
+    assert found.residual < 15.0
+    one_lag = fit_air(synthetic_log(replace(air, vent_lag_exponent=0.0), command), PERIOD)
+    assert one_lag.vent_lag_exponent == 0.0
+    assert one_lag.vent_lag == pytest.approx(0.3, abs=0.03)
+
+
 def test_a_log_that_never_waits_for_an_outlet_leaves_venting_open():
     air = replace(AIR, vent_rate=5300.0)
     slow = waves(1_500.0, 2, 300.0)

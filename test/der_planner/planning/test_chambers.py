@@ -11,9 +11,9 @@ from der_planner.model.air import (
     chamber_pressures,
     derivative,
     follow_commands,
-    slow_venting,
     vent_memory,
 )
+from der_planner.model.commands import slow_venting
 from der_planner.model.drive import STEPS
 from der_planner.model.material import differential_pressure
 from der_planner.model.series import CONTROL_PERIOD
@@ -80,9 +80,9 @@ def test_the_opposite_chamber_makes_up_for_a_slow_one():
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.037])
-@pytest.mark.parametrize("exponent", [2 / 3, 1.0])
-def test_derivatives_by_commands_against_finite_differences(delay, exponent):
-    air = slow(delay=delay, vent_exponent=exponent).pneumatics
+@pytest.mark.parametrize(("exponent", "valve"), [(2 / 3, 0.0), (1.0, 0.0), (0.5, 0.6)])
+def test_derivatives_by_commands_against_finite_differences(delay, exponent, valve):
+    air = slow(delay=delay, vent_exponent=exponent, vent_lag_exponent=valve).pneumatics
     rng = np.random.default_rng(3)
     time = np.arange(120) * 0.05
     command = 6e3 * np.column_stack([np.sin(2 * time) ** 3, np.cos(1.3 * time)])
@@ -103,8 +103,24 @@ def test_derivatives_by_commands_against_finite_differences(delay, exponent):
         np.testing.assert_allclose(moved, slope, atol=1e-6)
 
 
-def test_what_lies_longer_back_than_the_memory_is_forgotten():
-    air = slow().pneumatics
+def test_a_valve_that_opens_in_proportion_to_its_error_by_small_explicit_steps():
+    """From 12 kPa toward 0.7 kPa, where its lag is four times that at 10 kPa, then to nothing."""
+    air = slow(vent_exponent=0.5, vent_lag_exponent=0.5, delay=0.0).pneumatics
+    command = np.repeat([700.0, 0.0], [140, 60])[:, None]
+    chambers = chamber_pressures(air, command, 0.05, 5, [12_000.0]).ravel()
+    pressure, h = 12_000.0, 1e-4
+    for k, goal in enumerate(np.repeat(command.ravel(), 500)):
+        if k % 100 == 50:
+            assert chambers[k // 100] == pytest.approx(pressure, abs=15.0)
+        share = (pressure / VENT_REFERENCE) ** 0.5
+        opening = np.inf if goal == 0 else (pressure - goal) / air.vent_time_constant
+        pressure -= h * share * min(opening, air.vent_rate)
+        pressure = max(pressure, 0.0)
+
+
+@pytest.mark.parametrize("valve", [0.0, 0.5])
+def test_what_lies_longer_back_than_the_memory_is_forgotten(valve):
+    air = slow(vent_lag_exponent=valve).pneumatics
     count = int(np.ceil((vent_memory(air) + 25 * 0.13) / 0.05))
     full = np.full(1, air.pressure_limit)
     pressure = chamber_pressures(air, np.zeros((count, 1)), 0.05, 5, full)
@@ -207,6 +223,7 @@ def test_limb_file_carries_the_law_and_refuses_what_it_cannot_be(tmp_path):
         ("vent_rate", -1.0, r"pneumatics\.vent_rate must be at least 0 Pa/s, got -1"),
         ("vent_exponent", 0.0, r"pneumatics\.vent_exponent must be above 0 and at most 1, got 0"),
         ("vent_exponent", 1.5, r"pneumatics\.vent_exponent must be above 0 and at most 1, got 1.5"),
+        ("vent_lag_exponent", 1.5, r"vent_lag_exponent must be at least 0 and at most 1, got 1.5"),
     ):
         with pytest.raises(LimbError, match=message):
             slow(**{key: value})

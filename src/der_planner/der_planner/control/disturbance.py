@@ -39,6 +39,14 @@ class LearningError(ValueError):
     """A run or a plan cannot be learned from; the message names the remedy."""
 
 
+_MOVES = 0.5
+"""Least correlation of measured and expected tip of a limb that moves with its commands …"""
+_AT_ALL = 0.15
+"""… and least share of the expected way."""
+_STILL = 5e-3
+"""A tip that is expected to move by less, root mean square, tells nothing of that [m]."""
+
+
 @dataclass(frozen=True)
 class Measured:
     """A run's tip as it was filmed.
@@ -183,6 +191,32 @@ def stays_behind(time: Array, tip: Array, wanted: Array) -> float | None:
             well = [j for j in seen if j < begin and missed[j] <= usual]
             return float(time[well[-1]] if well else time[0])
     return None
+
+
+def moves_with(tip: Array, expected: Array) -> str:
+    """Return why a limb cannot be said to move with its commands; empty if it does.
+
+    One with another gain or rest angle misses its path by far and still moves with its commands;
+    one that is vented, stuck or not connected does not.
+
+    Args:
+        tip: (K, 2), NaN where unseen [m].
+        expected: (K, 2) tip of the model under the commands [m].
+    """
+    seen = np.isfinite(tip).all(axis=1)
+    if not seen.any():
+        return ""
+    one = tip[seen] - tip[seen].mean(axis=0)
+    other = expected[seen] - expected[seen].mean(axis=0)
+    way, wanted = (float(np.sqrt((part**2).sum() / seen.sum())) for part in (one, other))
+    if wanted < _STILL:
+        return ""
+    if way < _AT_ALL * wanted:
+        return f"the tip moved {way / wanted:.0%} of its way"
+    alike = float((one * other).sum() / seen.sum()) / (way * wanted)
+    if alike < _MOVES:
+        return f"the tip does not move with the commands (correlation {alike:.2f})"
+    return ""
 
 
 def without_gaps(value: Array, known: Mask, period: float, fade: float) -> Array:

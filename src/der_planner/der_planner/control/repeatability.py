@@ -9,6 +9,8 @@ change makes:
 Runs of one plan have Δ = 0 and show N alone. N and ε are those of the largest likelihood over all
 pairs, on a grid, with a prior for ε. A disturbance wanders slowly, so that the mean square of a
 pair counts as that of a few independent numbers only.
+
+`Runs` holds the runs of one motion and weighs them against each other by this.
 """
 
 from __future__ import annotations
@@ -18,6 +20,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from der_planner.control.disturbance import Shown, without_gaps
+from der_planner.planning.correction import Expected
+
 Array = NDArray[np.float64]
 
 _DEGREES = 4.0
@@ -26,6 +31,12 @@ _PRIOR_SHARE = 0.1
 """ε that is expected before runs were compared: hysteresis makes small changes stiffer."""
 _PRIOR_FACTOR = 3.0
 """One standard deviation of ln ε is the logarithm of this."""
+_FADE = 2.0
+"""Time in which what was learned fades beyond the first and last picture [s]."""
+_UNLIKE = 4.0
+"""A run that differs from the others by so many standard deviations is not one of them …"""
+_NOTABLE = 1.5e-3
+"""… if it also differs by more than this, root mean square [m]."""
 _SHARES = np.geomspace(0.003, 3.0, 61)
 _DEVIATIONS = np.geomspace(3e-6, 3e-2, 81)
 
@@ -85,3 +96,135 @@ def estimate(pairs: list[Pair]) -> Repeatability:
         likelihood += weight * 0.5 * _DEGREES * (np.log(ratio) - ratio)
     best = np.unravel_index(int(np.argmax(likelihood)), likelihood.shape)
     return Repeatability(float(deviation[best]), float(share[best]), len(pairs))
+
+
+# The runs themselves ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Played:
+    """A run that can be used.
+
+    Attributes:
+        commands: (K, M) that were in force [Pa].
+        expected: what the model expects under them.
+        shown: what the run showed beyond that.
+    """
+
+    commands: Array
+    expected: Expected
+    shown: Shown
+
+
+@dataclass(frozen=True)
+class Known:
+    """What all runs together say of the disturbance under one plan.
+
+    Attributes:
+        value: D (K, 2), with gaps bridged [m].
+        seen: (K,) where it was measured.
+        runs: number of runs that it is worth, had they all been of this plan.
+        variance: of a coordinate, mean over the motion [m²].
+    """
+
+    value: Array
+    seen: NDArray[np.bool_]
+    runs: float
+    variance: float
+
+
+class Runs:
+    """All runs of one motion of one limb, and what they say together.
+
+    Args:
+        reference: r̄ (K, 2) at the setpoints [m].
+        period: of the setpoints [s].
+        lever: way of the tip per pressure [m/Pa].
+    """
+
+    def __init__(self, reference: Array, period: float, lever: float) -> None:
+        self._reference, self._period, self._lever = reference, period, lever
+        self._all: list[Played] = []
+        self.repeats = Repeatability()
+
+    def add(self, run: Played) -> None:
+        """Take in a run."""
+        self._all.append(run)
+        self.repeats = estimate(self._pairs())
+
+    def expected(self, commands: Array) -> Expected | None:
+        """Return what the model expects under commands that were played; None: never played."""
+        for run in self._all:
+            if np.array_equal(run.commands, commands):
+                return run.expected
+        return None
+
+    def known(self, about: Played) -> Known:
+        """Return what all runs say of the disturbance under the commands of one run."""
+        count = len(self._reference)
+        total, weights, squares = np.zeros((count, 2)), np.zeros(count), np.zeros(count)
+        for run in self._all:
+            doubt = self.repeats.variance(self._movement(run, about)) + run.shown.variance
+            weight = np.where(run.shown.seen, 1.0 / np.maximum(doubt, 1e-14), 0.0)
+            total += weight[:, None] * np.nan_to_num(run.shown.value)
+            weights += weight
+            squares += weight**2
+        seen = weights > 0
+        value = total / np.where(seen, weights, 1.0)[:, None]
+        runs = float((weights[seen] ** 2 / squares[seen]).mean()) if seen.any() else 0.0
+        variance = float((1.0 / weights[seen]).mean()) if seen.any() else 0.0
+        return Known(without_gaps(value, seen, self._period, _FADE), seen, runs, variance)
+
+    def error(self, run: Played) -> Array:
+        """Return what all runs say that the commands of one leave: tip less r̄ (K, 2) [m]."""
+        error: Array = run.expected.tip + self.known(run).value - self._reference
+        return error
+
+    def level(self, run: Played) -> float:
+        """Return the mean distance from r̄ that all runs say the commands of one leave [m]."""
+        return float(np.linalg.norm(self.error(run), axis=1).mean())
+
+    def unlike(self, run: Played) -> str:
+        """Return how a run differs from all others; empty if it is one of them."""
+        if not self._all:
+            return ""
+        known = self.known(run)
+        both = known.seen & run.shown.seen
+        if not both.any():
+            return ""
+        apart = _rms(run.shown.value[both] - known.value[both])
+        noise = self.repeats.deviation**2 + known.variance + run.shown.variance[both].mean()
+        if len(self._all) == 1:
+            # What repeats is not known yet: no worse, surely, than the first run's error shows.
+            noise += _rms(self.error(self._all[0])[both]) ** 2
+        if apart < max(_UNLIKE * np.sqrt(noise), _NOTABLE):
+            return ""
+        return f"it differs from the runs before by {apart * 100:.2f} cm"
+
+    def differ(self, one: Played, other: Played) -> bool:
+        """Tell whether two runs that are unlike the others are unlike each other, too."""
+        both = one.shown.seen & other.shown.seen
+        known = self.known(one)
+        from_others = _rms((one.shown.value - known.value)[both & known.seen])
+        return _rms((one.shown.value - other.shown.value)[both]) > 0.5 * from_others
+
+    def _movement(self, one: Played, other: Played) -> float:
+        """Return how far a change of commands moves the tip, segment by segment, squared [m²]."""
+        change = one.expected.pressure - other.expected.pressure
+        return float((change**2).sum(axis=1).mean()) / 2 * self._lever**2
+
+    def _pairs(self) -> list[Pair]:
+        result = []
+        for place, one in enumerate(self._all):
+            for other in self._all[:place]:
+                both = one.shown.seen & other.shown.seen
+                if both.any():
+                    apart = one.shown.value[both] - other.shown.value[both]
+                    noise = one.shown.variance[both].mean() + other.shown.variance[both].mean()
+                    result.append(Pair(_rms(apart) ** 2, float(noise), self._movement(one, other)))
+        return result
+
+
+def _rms(values: Array) -> float:
+    """Return the root mean square of a coordinate."""
+    return float(np.sqrt(np.mean(values**2))) if values.size else 0.0

@@ -23,12 +23,23 @@ SHOWN = (0.25, 0.15)
 relative, and of the exponent."""
 BETTER = 0.7
 """Share of the residual of lags alone that slow venting may leave to be believed."""
-_LOWEST = (0.005, 0.005, 0.0, 300.0, 0.3)
-_HIGHEST = (1.5, 1.5, 1.9, 60e3, 1.0)
-_NAMES = ("time_constant", "vent_time_constant", "delay", "vent_rate", "vent_exponent")
-_START = (0.2, 0.2, 0.05, 5000.0, 0.7)
-_STEP = (2e-3, 2e-3, 2e-3, 20.0, 2e-3)
-_SCALE = (0.1, 0.1, 0.1, 1000.0, 0.1)
+VALVE_BETTER = 0.85
+"""Share of the residual of one lag that a lag which changes with the pressure may leave."""
+_LAGS, _VENTING = 3, 5
+"""How many of the numbers below are fitted with lags alone, and with slow venting."""
+_LOWEST = (0.005, 0.005, 0.0, 300.0, 0.3, 0.0)
+_HIGHEST = (1.5, 1.5, 1.9, 60e3, 1.0, 1.0)
+_NAMES = (
+    "time_constant",
+    "vent_time_constant",
+    "delay",
+    "vent_rate",
+    "vent_exponent",
+    "vent_lag_exponent",
+)
+_START = (0.2, 0.2, 0.05, 5000.0, 0.7, 0.5)
+_STEP = (2e-3, 2e-3, 2e-3, 20.0, 2e-3, 2e-3)
+_SCALE = (0.1, 0.1, 0.1, 1000.0, 0.1, 0.1)
 
 
 @dataclass(frozen=True)
@@ -47,6 +58,8 @@ class AirFit:
             does not show it.
         vent_exponent: its growth with the pressure [-]; NaN where the log does not show it.
         vent_uncertainty: (2,) standard deviations of the two.
+        vent_lag_exponent: with which power of the pressure `vent_lag`, which is that at 10 kPa,
+            falls [-]; 0 where one lag explains the log as well.
     """
 
     fill_lag: float
@@ -59,6 +72,7 @@ class AirFit:
     vent_rate: float = float("nan")
     vent_exponent: float = float("nan")
     vent_uncertainty: Array = field(default_factory=lambda: np.full(2, np.nan))
+    vent_lag_exponent: float = 0.0
 
 
 def fit_air(log: CalibrationLog, period: float) -> AirFit:
@@ -84,11 +98,17 @@ def fit_air(log: CalibrationLog, period: float) -> AirFit:
             "record the calibration run, or a plan"
         )
     falling = known & _after_no_step(np.abs(command), period, rising=True)
-    found = _solve(command, measured - offset, falling, period, len(_START))
-    lags = _solve(command, measured - offset, smooth, period, 3)
+    found = _solve(command, measured - offset, falling, period, _START[:_VENTING])
+    lags = _solve(command, measured - offset, smooth, period, _START[:_LAGS])
     without = (pressures_at_commands(_air(lags.x), command, period) + offset - measured)[falling]
     venting = _shown(found) and found.spread < BETTER * float(np.sqrt(np.mean(without**2)))
     found = found if venting else lags
+    valve = None
+    if venting:
+        start = (*found.x, _START[-1])
+        valve = _solve(command, measured - offset, falling, period, start)
+        valve = valve if _shown(valve) and valve.spread < VALVE_BETTER * found.spread else None
+    found = valve or found
     return AirFit(
         fill_lag=float(found.x[0]),
         vent_lag=float(found.x[1]),
@@ -99,7 +119,8 @@ def fit_air(log: CalibrationLog, period: float) -> AirFit:
         uncertainty=found.deviation[:3],
         vent_rate=float(found.x[3]) if venting else float("nan"),
         vent_exponent=float(found.x[4]) if venting else float("nan"),
-        vent_uncertainty=found.deviation[3:] if venting else np.full(2, np.nan),
+        vent_uncertainty=found.deviation[_LAGS:_VENTING] if venting else np.full(2, np.nan),
+        vent_lag_exponent=float(valve.x[-1]) if valve else 0.0,
     )
 
 
@@ -111,9 +132,14 @@ class _Solution:
 
 
 def _solve(
-    command: Array, measured: Array, rows: NDArray[np.bool_], period: float, count: int
+    command: Array,
+    measured: Array,
+    rows: NDArray[np.bool_],
+    period: float,
+    start: tuple[float, ...],
 ) -> _Solution:
-    """Fit the first ``count`` of lags, dead time, vent rate and exponent to rows of a log."""
+    """Fit as many of the numbers `_NAMES` as ``start`` has to rows of a log."""
+    count = len(start)
 
     def residual(x: Array) -> Array:
         difference: Array = (pressures_at_commands(_air(x), command, period) - measured)[rows]
@@ -130,7 +156,7 @@ def _solve(
 
     solution = least_squares(
         residual,
-        _START[:count],
+        start,
         jac=jacobian,
         bounds=(_LOWEST[:count], _HIGHEST[:count]),
         loss="soft_l1",
@@ -146,14 +172,14 @@ def _solve(
 
 
 def _air(x: Array) -> Pneumatics:
-    """Return the law for lags, dead time and, if they are there, vent rate and exponent."""
+    """Return the law for the numbers `_NAMES`, as many as there are."""
     values = dict(zip(_NAMES, (float(value) for value in x), strict=False))
     return replace(Limb.default().pneumatics, **{"vent_rate": 0.0, **values})
 
 
 def _shown(solution: _Solution) -> bool:
     """Tell whether rate and exponent of venting are known well, the rate inside its bounds."""
-    rate, of_rate, of_exponent = solution.x[3], *solution.deviation[3:]
+    rate, of_rate, of_exponent = solution.x[_LAGS], *solution.deviation[_LAGS:_VENTING]
     known = 0.0 < of_rate < SHOWN[0] * rate and 0.0 < of_exponent < SHOWN[1]
     return bool(known and _LOWEST[3] < 0.9 * rate < 0.8 * _HIGHEST[3])
 

@@ -246,7 +246,10 @@ def _finish(
         )
         if np.isfinite(air.vent_rate):
             pneumatics = replace(
-                pneumatics, vent_rate=air.vent_rate, vent_exponent=air.vent_exponent
+                pneumatics,
+                vent_rate=air.vent_rate,
+                vent_exponent=air.vent_exponent,
+                vent_lag_exponent=air.vent_lag_exponent,
             )
     rows = prepared.usable
     error = np.degrees(np.sqrt(np.nanmean(remaining**2, axis=0)))

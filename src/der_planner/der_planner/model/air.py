@@ -9,6 +9,12 @@ falls faster than its outlet lets it:
 An orifice would have n = 1/2, a tube n = 1 (an exponential). Logs of a real limb fit n = 0.65 with
 a tenth of the error that an exponential leaves.
 
+A valve that opens in proportion to the error p − p_goal passes (p / p_ref)ⁿ of it, so that its lag
+grows as the pressure falls, and is wide open only where nothing is to be left:
+
+    dp/dt = −(p / p_ref)ᵐ (p − p_goal) / τ       τ `vent_time_constant`, m `vent_lag_exponent`
+    dp/dt = −R (p / p_ref)ⁿ                      where p_goal = 0 and m > 0
+
 The differential pressure of a pair is the first chamber's pressure less the second's, so that a
 chamber that falls too slowly can be balanced by filling its neighbour.
 """
@@ -31,6 +37,8 @@ _TUBE = 1e-3
 """Exponents closer to 1 than this fall exponentially."""
 _EMPTY = 0.1
 """A chamber with less pressure than this counts as empty [Pa]."""
+_REMEMBERED = 100.0
+"""Pressure [Pa] at whose lag a chamber is remembered."""
 
 
 class AirLaw(NamedTuple):
@@ -40,12 +48,17 @@ class AirLaw(NamedTuple):
     vent_lag: float  # [s]
     vent_speed: float  # R / p_ref [1/s]; 0 = outlets never hold a chamber up
     vent_exponent: float  # n
+    lag_exponent: float  # m; 0 = the lag is the same at all pressures
 
 
 def law_of(air: Pneumatics) -> AirLaw:
     """Return the numbers of a limb's air that its compiled law takes."""
     return AirLaw(
-        air.time_constant, air.vent_lag, air.vent_rate / VENT_REFERENCE, air.vent_exponent
+        air.time_constant,
+        air.vent_lag,
+        air.vent_rate / VENT_REFERENCE,
+        air.vent_exponent,
+        air.vent_lag_exponent if air.vent_rate > 0 else 0.0,
     )
 
 
@@ -137,7 +150,9 @@ def _delayed(command: Array, start: Array, delay: float, steps: int) -> Array:
 
 def memory_of(air: Pneumatics) -> float:
     """Return for how long after a command its chambers can still tell of it [s]."""
-    return air.delay + 25 * max(air.time_constant, air.vent_time_constant) + vent_memory(air)
+    little_left = 1.0 / float(lag_rate(_REMEMBERED, law_of(air)))
+    lag = max(air.time_constant, air.vent_lag, 0.1 * little_left)
+    return air.delay + 25 * lag + vent_memory(air)
 
 
 def vent_memory(air: Pneumatics) -> float:
@@ -167,13 +182,30 @@ def vented(pressure: float, fall: float, exponent: float) -> float:
 
 
 @njit(cache=True, nogil=True)
+def lag_rate(pressure: float, law: AirLaw) -> float:
+    """Return 1 / lag [1/s] of a chamber that is vented, at its pressure [Pa]."""
+    if law.lag_exponent == 0.0:
+        return float(1.0 / law.vent_lag)
+    return float((max(pressure, _EMPTY) / VENT_REFERENCE) ** law.lag_exponent / law.vent_lag)
+
+
+@njit(cache=True, nogil=True)
+def fallen(pressure: float, goal: float, span: float, law: AirLaw) -> tuple[float, bool]:
+    """Return the pressure [Pa] of a vented chamber after a time [s], and if its outlet held it."""
+    held = vented(pressure, law.vent_speed * span, law.vent_exponent)
+    if law.lag_exponent > 0.0 and goal == 0.0:
+        return held, True
+    led = goal + (pressure - goal) * np.exp(-span * lag_rate(pressure, law))
+    return max(held, led), held > led
+
+
+@njit(cache=True, nogil=True)
 def _chamber_pressures(target: Array, start: Array, h: float, law: AirLaw) -> tuple[Array, Array]:
     """Return differential pressures (N, M) amid the steps and both chambers' (N, M, 2) after."""
     count, inputs, _ = target.shape
     middle = np.empty((count, inputs))
     pair = np.empty((count, inputs, 2))
     filling, half_filling = np.exp(-h / law.fill_lag), np.exp(-0.5 * h / law.fill_lag)
-    venting, half_venting = np.exp(-h / law.vent_lag), np.exp(-0.5 * h / law.vent_lag)
     for m in range(inputs):
         for side in range(2):
             sign = 1.0 - 2.0 * side
@@ -184,13 +216,8 @@ def _chamber_pressures(target: Array, start: Array, h: float, law: AirLaw) -> tu
                 if gap <= 0.0:
                     between, state = goal + gap * half_filling, goal + gap * filling
                 else:
-                    between = max(
-                        goal + gap * half_venting,
-                        vented(state, 0.5 * law.vent_speed * h, law.vent_exponent),
-                    )
-                    state = max(
-                        goal + gap * venting, vented(state, law.vent_speed * h, law.vent_exponent)
-                    )
+                    between = fallen(state, goal, 0.5 * h, law)[0]
+                    state = fallen(state, goal, h, law)[0]
                 pair[k, m, side] = state
                 middle[k, m] = between if side == 0 else middle[k, m] + sign * between
     return middle, pair
@@ -235,12 +262,17 @@ def _slopes(before: Array, target: Array, h: float, law: AirLaw) -> Array:
                 state, goal = before[k, m, side], target[k, m, side]
                 for half in range(2):
                     span = 0.5 * h if half == 0 else h
-                    share = np.exp(-span / (law.fill_lag if state <= goal else law.vent_lag))
-                    left = 0.0
+                    share, choked = np.exp(-span / law.fill_lag), False
+                    by_state = share
                     if state > goal:
-                        left = vented(state, law.vent_speed * span, law.vent_exponent)
-                    choked = left > goal + (state - goal) * share
-                    by_state = (left / state) ** law.vent_exponent if choked else share
+                        left, choked = fallen(state, goal, span, law)
+                        rate = lag_rate(state, law)
+                        share = np.exp(-span * rate)
+                        # The lag itself changes with the pressure.
+                        grows = (state - goal) * span * rate * law.lag_exponent / state
+                        by_state = share * (1.0 - grows)
+                        if choked:
+                            by_state = (left / state) ** law.vent_exponent
                     result[2 * half, k, m, side] = by_state
                     result[2 * half + 1, k, m, side] = 0.0 if choked else 1.0 - share
     return result
@@ -293,99 +325,3 @@ def even_pulse(air: Pneumatics, period: float, steps: int) -> Array:
     command[0] = 1.0
     even = replace(air, time_constant=mean, vent_time_constant=0.0, vent_rate=0.0)
     return follow_commands(even, command, period, steps).differential.ravel()
-
-
-# The inverse -----------------------------------------------------------------------------------
-
-
-def leading_commands(air: Pneumatics, time: Array, pressure: Array) -> Array:
-    """Return what the chambers have to be commanded (F, M) [Pa] to hold wanted pressures in time.
-
-    The inverse of lag and venting; the dead time is the caller's, who asks for later pressures.
-    Where a chamber cannot fall as fast as is wanted, its neighbour is filled by the difference.
-
-    Args:
-        air: lag and venting.
-        time: (F,) rising instants [s].
-        pressure: (F, M) wanted differential pressures [Pa].
-    """
-    fill, vent = air.time_constant, air.vent_lag
-    if air.vent_rate == 0:
-        slope = np.gradient(pressure, time, axis=0)
-        led: Array = pressure + np.where(pressure * slope >= 0, fill, vent) * slope
-        return led
-    chambers, second = least_pairs(air, time, pressure)
-    slope = np.gradient(chambers, time, axis=1)
-    pair = np.maximum(chambers + np.where(slope >= 0, fill, vent) * slope, 0.0)
-    filled: Array = np.where(second, -pair[1], pair[0])
-    return filled
-
-
-def least_pairs(air: Pneumatics, time: Array, pressure: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the least gauge pressures (2, F, M) [Pa] of chambers whose difference is wanted.
-
-    Also which chamber the command has to fill (F, M): the second, or the first. Arguments as of
-    `leading_commands`.
-    """
-    pairs: tuple[Array, NDArray[np.bool_]] = _least_pairs(
-        np.ascontiguousarray(pressure), np.diff(time), law_of(air)
-    )
-    return pairs
-
-
-@njit(cache=True, nogil=True)
-def _least_pairs(wanted: Array, steps: Array, law: AirLaw) -> tuple[Array, NDArray[np.bool_]]:
-    count, inputs = wanted.shape
-    chambers = np.empty((2, count, inputs))
-    second = np.zeros((count, inputs), dtype=np.bool_)
-    for m in range(inputs):
-        left, right = max(wanted[0, m], 0.0), max(-wanted[0, m], 0.0)
-        for k in range(count):
-            if k > 0:
-                h = steps[k - 1]
-                keep = np.exp(-h / law.vent_lag)
-                left = max(keep * left, vented(left, law.vent_speed * h, law.vent_exponent))
-                right = max(keep * right, vented(right, law.vent_speed * h, law.vent_exponent))
-            gap = wanted[k, m] + right - left
-            second[k, m] = gap < 0.0
-            left, right = left + max(gap, 0.0), right + max(-gap, 0.0)
-            chambers[0, k, m], chambers[1, k, m] = left, right
-    return chambers, second
-
-
-@dataclass(frozen=True)
-class SlowVenting:
-    """Where a motion wants one pressure to fall faster than its chamber is vented.
-
-    Attributes:
-        index: of the pressure.
-        time: when it should fall fastest in comparison with what its chamber does by itself [s].
-        wanted: rate at which it should fall then [Pa/s].
-        possible: rate at which the chamber falls then [Pa/s].
-        opposite: the largest pressure that the opposite chamber needs to balance the slow one [Pa].
-    """
-
-    index: int
-    time: float
-    wanted: float
-    possible: float
-    opposite: float
-
-
-def slow_venting(air: Pneumatics, time: Array, pressure: Array) -> SlowVenting | None:
-    """Return the worst of the pressures (F, M) [Pa] that should fall too fast at times (F,) [s].
-
-    None for a limb whose outlets never hold a chamber up.
-    """
-    if air.vent_rate == 0:
-        return None
-    chambers, _ = least_pairs(air, time, pressure)
-    both = np.minimum(chambers[0], chambers[1])
-    j = int(np.argmax(both.max(axis=0)))
-    fall = -np.gradient(np.abs(pressure[:, j]), time)
-    held = np.maximum(chambers[0, :, j], chambers[1, :, j])
-    possible = air.vent_rate * (held / VENT_REFERENCE) ** air.vent_exponent
-    k = int(np.argmax(fall - possible))
-    return SlowVenting(
-        j, float(time[k]), float(fall[k]), float(possible[k]), float(both[:, j].max())
-    )

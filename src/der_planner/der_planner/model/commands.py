@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from der_planner.limb import Limb, Pneumatics
+from der_planner.limb import VENT_REFERENCE, Limb, Pneumatics
 from der_planner.model import air as law
 from der_planner.model import material
 from der_planner.model.series import interpolate
@@ -34,7 +36,7 @@ def commands(limb: Limb, time: Array, effective: Array, bend: Array, period: flo
     """
     pressure = material.differential_pressure(limb, time, effective, bend)
     air = limb.pneumatics
-    led = law.leading_commands(air, time, pressure)
+    led = leading_commands(air, time, pressure)
     last = time[-1] - period - air.delay
     instants = np.arange(round(last / period) + 1) * period + period / 2 + air.delay
     wanted = interpolate(instants, time, led)
@@ -101,3 +103,103 @@ def _limit_slew(wanted: Array, start: Array, step: float) -> Array:
             last = min(max(wanted[k, m], last - step), last + step)
             result[k, m] = last
     return result
+
+
+# The inverse of lag and venting ----------------------------------------------------------------
+
+
+def leading_commands(air: Pneumatics, time: Array, pressure: Array) -> Array:
+    """Return what the chambers have to be commanded (F, M) [Pa] to hold wanted pressures in time.
+
+    The inverse of lag and venting; the dead time is the caller's, who asks for later pressures.
+    Where a chamber cannot fall as fast as is wanted, its neighbour is filled by the difference.
+
+    Args:
+        air: lag and venting.
+        time: (F,) rising instants [s].
+        pressure: (F, M) wanted differential pressures [Pa].
+    """
+    fill, vent = air.time_constant, air.vent_lag
+    if air.vent_rate == 0:
+        slope = np.gradient(pressure, time, axis=0)
+        led: Array = pressure + np.where(pressure * slope >= 0, fill, vent) * slope
+        return led
+    chambers, second = least_pairs(air, time, pressure)
+    slope = np.gradient(chambers, time, axis=1)
+    # Below a tenth of the reference a lag would ask for less than nothing.
+    full = np.maximum(chambers / VENT_REFERENCE, 0.1)
+    lag = np.where(slope >= 0, fill, vent * full**-air.vent_lag_exponent)
+    pair = np.maximum(chambers + lag * slope, 0.0)
+    filled: Array = np.where(second, -pair[1], pair[0])
+    return filled
+
+
+def least_pairs(air: Pneumatics, time: Array, pressure: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the least gauge pressures (2, F, M) [Pa] of chambers whose difference is wanted.
+
+    Also which chamber the command has to fill (F, M): the second, or the first. Arguments as of
+    `leading_commands`.
+    """
+    pairs: tuple[Array, NDArray[np.bool_]] = _least_pairs(
+        np.ascontiguousarray(pressure), np.diff(time), law.law_of(air)
+    )
+    return pairs
+
+
+@njit(cache=True, nogil=True)
+def _least_pairs(
+    wanted: Array, steps: Array, numbers: law.AirLaw
+) -> tuple[Array, NDArray[np.bool_]]:
+    count, inputs = wanted.shape
+    chambers = np.empty((2, count, inputs))
+    second = np.zeros((count, inputs), dtype=np.bool_)
+    for m in range(inputs):
+        left, right = max(wanted[0, m], 0.0), max(-wanted[0, m], 0.0)
+        for k in range(count):
+            if k > 0:
+                h = steps[k - 1]
+                left = law.fallen(left, 0.0, h, numbers)[0]
+                right = law.fallen(right, 0.0, h, numbers)[0]
+            gap = wanted[k, m] + right - left
+            second[k, m] = gap < 0.0
+            left, right = left + max(gap, 0.0), right + max(-gap, 0.0)
+            chambers[0, k, m], chambers[1, k, m] = left, right
+    return chambers, second
+
+
+@dataclass(frozen=True)
+class SlowVenting:
+    """Where a motion wants one pressure to fall faster than its chamber is vented.
+
+    Attributes:
+        index: of the pressure.
+        time: when it should fall fastest in comparison with what its chamber does by itself [s].
+        wanted: rate at which it should fall then [Pa/s].
+        possible: rate at which the chamber falls then [Pa/s].
+        opposite: the largest pressure that the opposite chamber needs to balance the slow one [Pa].
+    """
+
+    index: int
+    time: float
+    wanted: float
+    possible: float
+    opposite: float
+
+
+def slow_venting(air: Pneumatics, time: Array, pressure: Array) -> SlowVenting | None:
+    """Return the worst of the pressures (F, M) [Pa] that should fall too fast at times (F,) [s].
+
+    None for a limb whose outlets never hold a chamber up.
+    """
+    if air.vent_rate == 0:
+        return None
+    chambers, _ = least_pairs(air, time, pressure)
+    both = np.minimum(chambers[0], chambers[1])
+    j = int(np.argmax(both.max(axis=0)))
+    fall = -np.gradient(np.abs(pressure[:, j]), time)
+    held = np.maximum(chambers[0, :, j], chambers[1, :, j])
+    possible = air.vent_rate * (held / VENT_REFERENCE) ** air.vent_exponent
+    k = int(np.argmax(fall - possible))
+    return SlowVenting(
+        j, float(time[k]), float(fall[k]), float(possible[k]), float(both[:, j].max())
+    )

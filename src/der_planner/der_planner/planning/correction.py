@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import time as clock
 from typing import NamedTuple
@@ -10,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
-from der_planner.model.drive import STEPS
+from der_planner.limb import Limb
+from der_planner.model.drive import STEPS, Bend
 from der_planner.model.response import NODES, simulate
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import models
@@ -29,6 +31,10 @@ _WINDOWS = (100, 150, 150)
 where limits bind: they are felt from further ahead than a plan's first window reaches, …"""
 _NOTABLE_ERROR = 5e-4
 """… and where they leave more than this of mean tip error [m]."""
+_ROUNDS = 3
+"""With friction along the bend of the last round's commands; each leaves a fifth of its change …"""
+_SETTLED = 2e-5
+"""… and a smaller mean change of the tip is not worth another [m]."""
 _PRIOR = 3e-4
 """Pull toward the plan's bend angles where the tip hardly tells them [m/rad]."""
 
@@ -60,27 +66,49 @@ class Correction:
         self._physics = physics
         self._spline = physics.configuration(plan.reference)
         self._plan = plan
+        self._limb = plan.limb
+
+    def of(self, limb: Limb) -> Correction:
+        """Return the same with another limb's model; what it plans names the plan's own limb.
+
+        Args:
+            limb: with as many segments.
+        """
+        other = copy.copy(self)
+        other._limb, other._physics = limb, models.build(limb, self._plan.model, NODES)
+        return other
+
+    @property
+    def limb(self) -> Limb:
+        """The limb whose model it is."""
+        return self._limb
 
     @property
     def lever(self) -> float:
         """Largest movement of the tip per differential pressure of a segment at rest [m/Pa]."""
-        limb = self._plan.limb
+        limb = self._limb
         ahead = np.cumsum([s.length for s in limb.segments][::-1])[::-1]
         return float(np.max(limb.static_gain * ahead))
 
     def expected(self, commands: Array) -> Expected:
         """Return what the model expects under commands (K, M) [Pa].
 
+        Friction and creep act along the bend that these commands lead to.
+
         Raises:
             PlanningError: the model cannot be rolled forward under them.
         """
+        return self._simulated(commands, None)
+
+    def _simulated(self, commands: Array, bend: Bend | None) -> Expected:
+        """Return what the model expects, with friction along this bend or its own (None)."""
         start = self._plan.reference.start
         try:
             response = simulate(
                 self._physics,
                 np.arange(len(commands)) * CONTROL_PERIOD,
                 commands=commands,
-                bend=lambda time: sample_spline(self._spline, time)[0],
+                bend=bend,
                 start=self._physics.begin(self._spline, start),
                 before=None if start is None else start.pressure,
             )
@@ -90,6 +118,9 @@ class Correction:
 
     def plan(self, commands: Array, disturbance: Array, pull: float) -> Plan:
         """Return the optimum of |tip(u) + d − r̄|² under all limits, near given commands.
+
+        The optimiser keeps friction along the plan's own bend. What friction along the bend of the
+        commands changes of the tip is computed with each round and added to d.
 
         Args:
             commands: (K, M) toward which the plan is pulled, usually played ones [Pa].
@@ -104,25 +135,49 @@ class Correction:
         """
         begin = clock.perf_counter()
         wanted = self._reachable(self._plan.tip_reference - disturbance)
+        tip = self.expected(commands).tip
+        rubbed = tip - self._simulated(commands, self._own_bend).tip
+        best: Outcome | None = None
+        steps = 0
         try:
             # Matrices of a few hundred rows: more threads only get into other processes' way.
             with _THREADS.limit(limits=1, user_api="blas"):
-                best, steps = self._solve(commands, wanted, pull)
+                for _ in range(_ROUNDS):
+                    best, used = self._solve(commands, wanted - rubbed, pull, best)
+                    steps += used
+                    tip = self.expected(best.commands).tip
+                    before, rubbed = rubbed, tip - best.tip
+                    if np.linalg.norm(rubbed - before, axis=1).mean() < _SETTLED:
+                        break
         except ConvergenceError as error:
             raise _not_followed(error) from error
+        if best is None:
+            raise AssertionError("there is a first round")
         return dataclasses.replace(
             self._plan,
             differential_pressure=best.commands,
-            tip_predicted=best.tip + disturbance,
+            tip_predicted=tip + disturbance,
             method="learned",
             solve_time=clock.perf_counter() - begin,
             details={"steps": steps, "limited_windows": best.limited},
         )
 
-    def _solve(self, commands: Array, wanted: Array, pull: float) -> tuple[Outcome, int]:
-        """Return what is best for wanted tips (K, 2) [m], and the steps of all rounds."""
-        best: Outcome | None = None
-        missed, steps = np.inf, 0
+    def _own_bend(self, time: Array) -> Array:
+        """Return the bend of the plan's reference (n, M) [rad] at instants (n,) [s]."""
+        return sample_spline(self._spline, time)[0]
+
+    def _solve(
+        self, commands: Array, wanted: Array, pull: float, begin: Outcome | None
+    ) -> tuple[Outcome, int]:
+        """Return what is best for wanted tips (K, 2) [m], and the steps of all windows.
+
+        Args:
+            commands: (K, M) toward which the plan is pulled [Pa].
+            pull: as of `plan`.
+            wanted: of the model without what friction changes.
+            begin: where the search starts; None: at ``commands``.
+        """
+        best, missed, steps = begin, np.inf, 0
         for window in _WINDOWS:
             settings = Settings(nearness=pull, nearness_vented=pull, window=window)
             offset = self._plan.tip_reference - wanted
@@ -144,7 +199,7 @@ class Correction:
             if not outcome.limited or left < _NOTABLE_ERROR:
                 break
         if best is None:
-            raise AssertionError("there is a first round")
+            raise AssertionError("there is a first window")
         return best, steps
 
     def _reachable(self, wanted: Array) -> Array:

@@ -12,9 +12,8 @@ from scipy.interpolate import BSpline
 from threadpoolctl import ThreadpoolController
 
 from der_planner.limb import Limb
-from der_planner.model import air as air_law
+from der_planner.model.commands import SlowVenting, slow_venting, within_limits
 from der_planner.model.commands import commands as commands_for
-from der_planner.model.commands import within_limits
 from der_planner.model.drive import STEPS
 from der_planner.model.material import differential_pressure
 from der_planner.model.response import NODES, simulate
@@ -165,7 +164,7 @@ def _solve(
         )
         details = {}
     pressure = differential_pressure(physics.limb, time, effective, bend)
-    slow = air_law.slow_venting(air, time, pressure)
+    slow = slow_venting(air, time, pressure)
     warnings = _vent_warnings(slow, _mean_distance(tip, reference))
     if said and not (optimal and warnings):
         warnings.insert(0, f"{said}: {_excess(physics.limb, wanted)}")
@@ -251,7 +250,7 @@ def _mean_distance(tip: Array, reference: Reference) -> float:
     return float(np.linalg.norm(tip - reference.tip, axis=1).mean())
 
 
-def _vent_warnings(slow: air_law.SlowVenting | None, missed: float) -> list[str]:
+def _vent_warnings(slow: SlowVenting | None, missed: float) -> list[str]:
     if slow is None or slow.opposite < _NOTABLE_OPPOSITE:
         return []
     left = f", which leaves {missed * 1000:.1f} mm of mean error on the model itself"

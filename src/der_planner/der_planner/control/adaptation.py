@@ -1,0 +1,120 @@
+"""Gain and rest angle of a limb, roughly, from the tip of one run.
+
+Learning plans with the model's answer to a change of commands. Where the limb is far from its file,
+of another day or another limb altogether, that answer is wrong as well, and a step by it may make
+things worse. What the tip tells of gain and rest angle of each segment is then put into the model
+first:
+
+    minimise  Σ |measured − model tip|² / (e² ℓ)  +  Σ x²
+
+with x an unknown's distance from the limb file in the spreads of a day, and e² ℓ what the model
+leaves anyhow, over as many setpoints as it stays alike. The limb file itself is not touched:
+`check_limb.py --update` does that from bend angles and measured pressures, which tell more.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from der_planner.limb import Limb, LimbError, Segment
+from der_planner.planning.correction import Correction
+from der_planner.planning.errors import PlanningError
+
+Array = NDArray[np.float64]
+
+GAIN_SPREAD = 0.35
+"""From one day to another, of the logarithm of a gain: a real limb's changed by up to a half."""
+REST_SPREAD = math.radians(6.0)
+"""Of a rest angle: those of a real limb wander by so much [rad]."""
+LARGEST_GAIN_CHANGE = 4.0
+"""Factor beyond which no fit looks."""
+LARGEST_REST_CHANGE = math.radians(35.0)
+FAR = 3e-3
+"""Mean distance [m] between measured and expected tip beyond which a model is adapted."""
+_ERROR = 2e-3
+"""What the model leaves anyhow [m] …"""
+_ALIKE = 20.0
+"""… and over how many setpoints it stays alike."""
+_STEP = 1e-3
+"""Of an unknown in its spread, for a difference of two simulations."""
+_BETTER = 0.7
+"""Share of the distance that an adapted model may leave to be used."""
+_EVALUATIONS = 12
+_UNFOLLOWED = 1.0
+"""Distance that stands for a rod that cannot be simulated [m]."""
+
+
+def adapted(correction: Correction, commands: Array, tip: Array) -> Correction | None:
+    """Return a model with gains and rest angles under which its tip comes nearest to a run's.
+
+    Args:
+        correction: model of the plan.
+        commands: (K, M) that were in force [Pa].
+        tip: (K, 2) measured, NaN where it was not seen [m].
+
+    Returns:
+        None where the model is near the run already, or nothing much is gained.
+    """
+    seen = np.isfinite(tip).all(axis=1)
+    limb = correction.limb
+    size = 2 * limb.segment_count
+
+    def missed(x: Array) -> Array:
+        try:
+            gap = correction.of(moved(limb, x)).expected(commands).tip[seen] - tip[seen]
+        except (PlanningError, LimbError):
+            gap = np.full((int(seen.sum()), 2), np.nan)
+        return np.where(np.isfinite(gap), gap, _UNFOLLOWED)
+
+    def residual(x: Array) -> Array:
+        return np.concatenate([missed(x).ravel() / (_ERROR * np.sqrt(_ALIKE)), x])
+
+    def jacobian(x: Array) -> Array:
+        here = residual(x)
+        return np.stack([(residual(x + step) - here) / _STEP for step in _STEP * np.eye(size)], 1)
+
+    def far(x: Array) -> float:
+        return float(np.linalg.norm(missed(x), axis=1).mean())
+
+    before = far(np.zeros(size))
+    if before < FAR:
+        return None
+    largest = (math.log(LARGEST_GAIN_CHANGE) / GAIN_SPREAD, LARGEST_REST_CHANGE / REST_SPREAD)
+    bound = np.tile(largest, limb.segment_count)
+    found = least_squares(
+        residual,
+        np.zeros(size),
+        jac=jacobian,
+        bounds=(-bound, bound),
+        max_nfev=_EVALUATIONS,
+        xtol=1e-3,
+        ftol=1e-3,
+    )
+    return correction.of(moved(limb, found.x)) if far(found.x) < _BETTER * before else None
+
+
+def moved(limb: Limb, x: Array) -> Limb:
+    """Return a limb, its arcs too, with the logarithm of gains and the rest angles moved.
+
+    Args:
+        limb: to begin with.
+        x: (2 M,) gain and rest angle of each segment, in the spreads of a day.
+    """
+
+    def each(segments: tuple[Segment, ...]) -> tuple[Segment, ...]:
+        return tuple(
+            replace(
+                segment,
+                moment_gain=segment.moment_gain * float(np.exp(GAIN_SPREAD * gain)),
+                rest_curvature=segment.rest_curvature + float(REST_SPREAD * rest) / segment.length,
+            )
+            for segment, (gain, rest) in zip(segments, x.reshape(-1, 2), strict=True)
+        )
+
+    arcs = each(limb.pcc_segments) if limb.pcc_segments else ()
+    return replace(limb, segments=each(limb.segments), pcc_segments=arcs)
