@@ -15,6 +15,9 @@ from der_planner.experiment.processes import NodeProcess
 from limb_interfaces import qos, topics
 from limb_interfaces.stamps import nanoseconds
 
+_PERIODS = (3.0, 3.0)
+"""Of the two segments' pressures [s]."""
+
 
 def measure_graph(seconds: float) -> dict[str, float]:
     """Run twin, camera and tracker as nodes and compare the tracker's tip with the twin's own."""
@@ -87,7 +90,7 @@ def _press(client: GraphClient) -> None:
 
     def publish() -> None:
         moment = time.monotonic() - begin
-        swing = 12e3 * np.sin(2.0 * np.pi * moment / np.array([6.0, 4.5]))
+        swing = 12e3 * np.sin(2.0 * np.pi * moment / np.array(_PERIODS))
         chambers = 101325.0 + np.array(
             [max(swing[0], 0.0), max(-swing[0], 0.0), max(swing[1], 0.0), max(-swing[1], 0.0)]
         ) * min(moment / 3.0, 1.0)

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from apriltag_tracker import family
+from apriltag_tracker.family import TAG36H11, Family
 
 FINE = 6
 """Parts of a pixel along each side."""
@@ -39,6 +39,8 @@ class Scene:
         rolling: way of every tag from the first to the last row of its picture [px].
         corner: share of both sides at one corner that is covered.
         side: share of one side that is covered.
+        cover: brightness of what covers it; the sheet has 1, its surroundings 0.55.
+        family: of the tags.
     """
 
     name: str
@@ -52,6 +54,8 @@ class Scene:
     rolling: float = 0.0
     corner: float = 0.0
     side: float = 0.0
+    cover: float = 0.34
+    family: Family = TAG36H11
 
 
 def render(
@@ -68,11 +72,13 @@ def render(
     picture = np.full((height, width), _FLOOR)
     truth = {}
     room = 1.3 * scene.pixels + 0.5 * (scene.smear + scene.rolling) + 3.0 * scene.blur
-    half = int(np.ceil(0.5 * 1.45 * scene.pixels + scene.smear + scene.rolling + 4.0))
+    # The sheet of a family of few cells is wider against its border.
+    sheet = max(1.0, (scene.family.border_cells + 2) / scene.family.border_cells / 1.25)
+    half = int(np.ceil(0.5 * 1.45 * sheet * scene.pixels + scene.smear + scene.rolling + 4.0))
     pitch = max(2 * half + 2, int(room))
     for top in range(0, height - pitch + 1, pitch):
         for left in range(0, width - pitch + 1, pitch):
-            tag = int(random.integers(0, family.TAG_COUNT))
+            tag = int(random.integers(0, scene.family.tag_count))
             if tag in truth:
                 continue
             middle = np.array([left, top]) + 0.5 * pitch + random.uniform(-0.5, 0.5, 2)
@@ -111,10 +117,12 @@ def _patch(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the picture (pitch, pitch) of one tag, 1 is white, and the direction it goes."""
     left, top, pitch = box
-    cells = np.full((12, 12), _FLOOR)
-    cells[1:-1, 1:-1] = np.where(family.printed_cells(tag, 1) > 0, _WHITE, _BLACK)
+    across = scene.family.border_cells + 4
+    cells = np.full((across, across), _FLOOR)
+    cells[1:-1, 1:-1] = np.where(scene.family.printed_cells(tag, 1) > 0, _WHITE, _BLACK)
     # Corners of the border in cells, columns to the right and rows down.
-    target = np.array([[2.0, 10.0], [10.0, 10.0], [10.0, 2.0], [2.0, 2.0]], dtype=np.float32)
+    end = across - 2.0
+    target = np.array([[2.0, end], [end, end], [end, 2.0], [2.0, 2.0]], dtype=np.float32)
     to_cells = cv2.getPerspectiveTransform(corners.astype(np.float32), target).astype(np.float64)
     # float32 corners lose some 1e-5 px; what is rendered is what the truth says to 1e-3 px.
     fine = (np.arange(pitch * FINE) + 0.5) / FINE - 0.5
@@ -135,8 +143,8 @@ def _patch(
         w = to_cells[2, 0] * px + to_cells[2, 1] * py + to_cells[2, 2]
         column = (to_cells[0, 0] * px + to_cells[0, 1] * py + to_cells[0, 2]) / w
         row = (to_cells[1, 0] * px + to_cells[1, 1] * py + to_cells[1, 2]) / w
-        i = np.clip(np.floor(row).astype(np.int64), 0, 11)
-        j = np.clip(np.floor(column).astype(np.int64), 0, 11)
+        i = np.clip(np.floor(row).astype(np.int64), 0, across - 1)
+        j = np.clip(np.floor(column).astype(np.int64), 0, across - 1)
         total += cells[i, j]
     total /= instants
     _cover(total, scene, corners - (left, top))
@@ -158,7 +166,7 @@ def _as_rolled(
 
 
 def _cover(total: NDArray[np.float64], scene: Scene, corners: NDArray[np.float64]) -> None:
-    """Lay something dark over a corner or the middle of a side."""
+    """Lay something over a corner or the middle of a side."""
     a, b, _, d = corners
     polygon = None
     if scene.corner > 0.0:
@@ -177,7 +185,7 @@ def _cover(total: NDArray[np.float64], scene: Scene, corners: NDArray[np.float64
         polygon = [start + out, end + out, end - 0.25 * out, start - 0.25 * out]
     if polygon is not None:
         points = np.round((np.array(polygon) + 0.5) * FINE - 0.5).astype(np.int32)
-        cv2.fillPoly(total, [points], 0.34)
+        cv2.fillPoly(total, [points], scene.cover)
 
 
 def _lens(total: NDArray[np.float64], scene: Scene) -> NDArray[np.float64]:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from apriltag_tracker import family
 from apriltag_tracker.detection.alignment.aligner import Aligner
 from apriltag_tracker.detection.alignment.pattern import tabulate
+from apriltag_tracker.family import TAG36H11
 from benchmarks.tracker_renderer import Scene, render
 
 
@@ -52,7 +52,7 @@ def test_corners_and_their_covariance_are_honest(scene, limit):
 
 
 def test_the_table_is_the_pattern_and_its_derivatives():
-    cells = family.printed_cells(3, 1)
+    cells = TAG36H11.printed_cells(3, 1)
     table = tabulate(cells, 10, 0.2).astype(float)
     assert table[55, 55, 0] == pytest.approx(cells[5, 5], abs=0.03)
     step = 0.1
@@ -67,5 +67,5 @@ def test_a_pattern_of_another_tag_explains_little():
     image, truth = render(Scene("sharp"), 0, (320, 240))
     aligner = Aligner()
     for tag, corners in truth.items():
-        other = aligner.align(image, (tag + 1) % family.TAG_COUNT, corners)
+        other = aligner.align(image, (tag + 1) % TAG36H11.tag_count, corners)
         assert other is None or other.explained < 0.9

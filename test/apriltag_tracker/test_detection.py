@@ -7,7 +7,7 @@ import pytest
 from apriltag_tracker import family
 from apriltag_tracker.camera import CameraPose, Intrinsics
 from apriltag_tracker.detection import Detector
-from apriltag_tracker.detection import detector as detection
+from apriltag_tracker.detection import quads as detection
 from apriltag_tracker.synthetic.camera import CameraModel, Optics, SyntheticCamera
 from apriltag_tracker.synthetic.shapes import constant_curvature
 from apriltag_tracker.tag_map import LimbTag, TagMap, WorldTag
@@ -52,17 +52,17 @@ def corner_errors(camera: SyntheticCamera, detector: Detector, frames: int = 2):
 
 
 def test_conventions_of_this_opencv():
-    detection.check_orientation()
+    detection.check_orientation(family.TAG36H11)
 
 
 def test_another_corner_order_is_noticed(monkeypatch):
     detection.check_orientation.cache_clear()
     monkeypatch.setattr(detection, "_FROM_OPENCV", (0, 1, 2, 3))
     with pytest.raises(family.FamilyError, match="conventions"):
-        detection.check_orientation()
+        detection.check_orientation(family.TAG36H11)
     monkeypatch.undo()
     detection.check_orientation.cache_clear()
-    detection.check_orientation()
+    detection.check_orientation(family.TAG36H11)
 
 
 @pytest.mark.parametrize(

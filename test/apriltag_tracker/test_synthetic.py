@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from apriltag_tracker import family
 from apriltag_tracker.camera import CameraError
+from apriltag_tracker.family import TAG36H11
 from apriltag_tracker.synthetic.camera import (
     CameraModel,
     Errors,
@@ -31,7 +31,7 @@ def brute_force(model, tag, shape, optics, rows, columns, oversampling=6, reach=
     place = shape.at(tag.arc_length)
     cosine, sine = np.cos(place[2]), np.sin(place[2])
     local = (plane - place[:2]) @ np.array([[cosine, -sine], [sine, cosine]])
-    cells = family.printed_cells(tag.id, 1)
+    cells = TAG36H11.printed_cells(tag.id, 1)
     column = np.floor(local[:, 0] / tag.size * 8 + 5).astype(int)
     row = np.floor(5 - local[:, 1] / tag.size * 8).astype(int)
     inside = (column >= 0) & (column < 10) & (row >= 0) & (row < 10)

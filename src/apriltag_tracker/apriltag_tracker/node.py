@@ -21,7 +21,7 @@ from visualization_msgs.msg import MarkerArray
 from apriltag_tracker.camera import CameraError, Intrinsics
 from apriltag_tracker.camera.encodings import ImageReader
 from apriltag_tracker.camera.sources import Grabbed, Source, SourceError, open_source
-from apriltag_tracker.detection import MOST_CORRECTED_BITS, Detector
+from apriltag_tracker.detection import Detector
 from apriltag_tracker.detection.tracking import TrackingOptions
 from apriltag_tracker.image_watch import NO_CALIBRATION, ImageWatch
 from apriltag_tracker.node_messages import limb_markers, tag_message
@@ -179,6 +179,7 @@ class TrackerNode(Node):
         )
 
     def _make_detector(self) -> Detector:
+        family = self._map.family
         return Detector(
             float(
                 declare(
@@ -194,12 +195,13 @@ class TrackerNode(Node):
                 declare(
                     self,
                     "correct_bits",
-                    1,
+                    family.correct_bits,
                     "wrong bits of a code that are forgiven in a search",
                     at_least=0,
-                    at_most=MOST_CORRECTED_BITS,
+                    at_most=family.most_corrected,
                 )
             ),
+            family=family,
         )
 
     def _warm_up(self) -> None:

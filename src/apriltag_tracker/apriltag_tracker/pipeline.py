@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apriltag_tracker.camera import CameraPose, Intrinsics
-from apriltag_tracker.detection import Detector, enlarged_tag
-from apriltag_tracker.detection.tag import Tag
+from apriltag_tracker.detection import Detector
+from apriltag_tracker.detection.tag import ExpectedTag, Tag
 from apriltag_tracker.detection.tracking import TagTracker, TrackingOptions
+from apriltag_tracker.pose.expected import TagPredictor
 from apriltag_tracker.pose.plane import centreline_pose, locate, pose_moves
 from apriltag_tracker.pose.shape import LimbEstimate, PlanarTag, ShapeFitter, ShapePrior
 from apriltag_tracker.pose.world import WorldPose
@@ -112,6 +113,12 @@ class LimbTracker:
         self._flat.update({tag.id: (tag.position[2], tag.size) for tag in tags.world})
         self._world_positions = np.array([tag.position[:2] for tag in tags.world]).reshape(-1, 2)
         self._world_size = max((tag.size for tag in tags.world), default=1.0)
+        detector = detector or Detector(family=tags.family)
+        if detector.family != tags.family:
+            raise ValueError(
+                f"the detector reads {detector.family.name} but the tag map is of "
+                f"{tags.family.name}: make it by Detector(family=tag_map.family)"
+            )
         self.tracker = TagTracker(self._flat, detector, self.options.tracking)
         self.world = WorldPose(tags, intrinsics)
         uncertainty = self.options.uncertainty
@@ -122,6 +129,7 @@ class LimbTracker:
             uncertainty.mounting,
             uncertainty.mounting_angle,
         )
+        self._predictor = TagPredictor(tags, intrinsics, self.fitter)
         self._history: list[tuple[float, LimbEstimate]] = []
         self._bridged = 0
         self.misplaced = 0
@@ -143,7 +151,7 @@ class LimbTracker:
                 f"the image has {gray.shape[1]} x {gray.shape[0]} px but the calibration is for "
                 f"{size.width} x {size.height}: calibrate at the resolution that is used"
             )
-        found = self.tracker.track(gray, stamp)
+        found = self.tracker.track(gray, stamp, lambda tags: self._expect(tags, stamp))
         pose = self.world.update(found)
         placed, planar, common, shared_noise = self._place(found, pose)
         if pose is None:
@@ -151,6 +159,7 @@ class LimbTracker:
         estimate = self.fitter.fit(planar, common, shared_noise) if planar else None
         if estimate is None:
             return self._bridge(placed, stamp, bool(planar))
+        self._predictor.remember(stamp, self.fitter.parameters)
         self.misplaced += len(estimate.rejected)
         sigma = estimate.tip_sigma
         if sigma > self.options.largest_tip_sigma:
@@ -162,6 +171,11 @@ class LimbTracker:
             self._history.clear()
         self._history = [*self._history[-1:], (stamp, estimate)]
         return LimbObservation(placed, estimate, self._remark(estimate))
+
+    def _expect(self, found: Sequence[Tag], stamp: float) -> list[ExpectedTag]:
+        """Return where the limb's other tags are, if the camera's pose is known."""
+        pose = self.world.pose
+        return [] if pose is None else self._predictor.predict(found, pose, stamp)
 
     def _place(
         self, found: Sequence[Tag], pose: CameraPose | None
@@ -278,16 +292,15 @@ class LimbTracker:
 def warm_up(detector: Detector) -> None:
     """Follow a tiny still limb through two images, so that no kernel is compiled in a run."""
     detector.warm_up()
-    side, f = 40, 500.0
-    tags = TagMap(
-        (0.02,),
-        (LimbTag(0, 0.01, 0.0, 0.01),),
-        (WorldTag(1, (0.03, 0.0, 0.0), 0.0, 0.01),),
-    )
+    family, f = detector.family, 500.0
+    side = 5 * family.border_cells
     # 125 mm above the plane, a pixel is a quarter of a millimetre.
+    size = 0.00025 * side
+    limb, world = (LimbTag(0, 0.01, 0.0, size),), (WorldTag(1, (0.03, 0.0, 0.0), 0.0, size),)
+    tags = TagMap((0.02,), limb, world, family=family)
     image = np.full((120, 240), 255, dtype=np.uint8)
     for tag, left in ((0, 40), (1, 120)):
-        image[40 : 40 + side, left : left + side] = enlarged_tag(tag, side // 8)
+        image[40 : 40 + side, left : left + side] = family.enlarged_tag(tag, 5)
     matrix = [f, 0.0, 59.5, 0.0, f, 59.5, 0.0, 0.0, 1.0]
     tracker = LimbTracker(tags, Intrinsics.create(240, 120, matrix, []), detector=detector)
     for stamp in (0.0, 0.03):

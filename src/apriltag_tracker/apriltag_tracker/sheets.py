@@ -21,7 +21,7 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path as MatplotlibPath
 from numpy.typing import NDArray
 
-from apriltag_tracker import family
+from apriltag_tracker.family import Family
 from apriltag_tracker.tag_map import TagMap
 
 PAPERS = {"a4": (210.0, 297.0), "letter": (215.9, 279.4)}
@@ -108,7 +108,7 @@ def tag_pages(tags: TagMap, paper: str = "a4") -> list[Page]:
     ]
     entries += [(tag.id, tag.size, "fixed") for tag in tags.world]
     for tag, size, note in entries:
-        sheet = 1e3 * size * (family.BORDER_CELLS + 2) / family.BORDER_CELLS
+        sheet = 1e3 * size * (tags.family.border_cells + 2) / tags.family.border_cells
         step = max(sheet, 46.0) + 8.0
         if sheet > width - 2.0 * _MARGIN or sheet > height - 60.0:
             raise SheetError(f"tag {tag} of {1e3 * size:.0f} mm does not fit on {paper} paper")
@@ -117,7 +117,7 @@ def tag_pages(tags: TagMap, paper: str = "a4") -> list[Page]:
         if y + sheet + 16.0 > height - 22.0:
             pages.append(_new_page(width, height, "tags of the limb and around it"))
             x, y, row = _MARGIN, 24.0, 0.0
-        _add_tag(pages[-1], tag, 1e3 * size, x, y, note)
+        _add_tag(pages[-1], tags.family, tag, (1e3 * size, x, y), note)
         x += step
         row = max(row, sheet + 18.0)
     return pages
@@ -159,14 +159,18 @@ def _new_page(width: float, height: float, title: str) -> Page:
     return page
 
 
-def _add_tag(page: Page, tag: int, size: float, x: float, y: float, note: str) -> None:
+def _add_tag(
+    page: Page, family: Family, tag: int, place: tuple[float, float, float], note: str
+) -> None:
+    """Add a tag, `place` being its size and its sheet's left and upper edges [mm]."""
+    size, x, y = place
     cells = family.printed_cells(tag, 1)
-    cell = size / family.BORDER_CELLS
+    cell = size / family.border_cells
     for column, row, w, h in _black_rectangles(cells == 0):
         page.rectangles.append((x + column * cell, y + row * cell, w * cell, h * cell))
     sheet = cell * len(cells)
     page.cuts.append((x, y, sheet, sheet))
-    page.labels.append((x, y + sheet + 4.0, 3.2, f"{tag}: {size:.1f} mm, {note}"))
+    page.labels.append((x, y + sheet + 4.0, 3.2, f"{family.name} {tag}: {size:.1f} mm, {note}"))
     page.labels.append((x, y + sheet + 8.0, 2.6, "right-hand side: along the limb, or along x"))
 
 

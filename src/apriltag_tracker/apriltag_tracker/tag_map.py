@@ -11,7 +11,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from apriltag_tracker import family
+from apriltag_tracker import family as families
+from apriltag_tracker.family import TAG36H11, Family
 
 SCHEMA_VERSION = 1
 
@@ -71,12 +72,14 @@ class TagMap:
         limb: tags on it.
         world: fixed tags.
         stiff: stretches of the limb that cannot bend, from and to in arc length [m].
+        family: of all tags.
     """
 
     segment_lengths: tuple[float, ...]
     limb: tuple[LimbTag, ...]
     world: tuple[WorldTag, ...]
     stiff: tuple[tuple[float, float], ...] = ()
+    family: Family = TAG36H11
 
     def __post_init__(self) -> None:
         twice = sorted({tag for tag in self.ids if self.ids.count(tag) > 1})
@@ -104,8 +107,12 @@ class TagMap:
         return next((entry for entry in self.world if entry.id == tag), None)
 
     @classmethod
-    def from_yaml(cls, path: str | Path) -> TagMap:
+    def from_yaml(cls, path: str | Path, family: str | None = None) -> TagMap:
         """Read a tag map.
+
+        Args:
+            path: of the file.
+            family: name of the tags' family, None for the one that the file names.
 
         Raises:
             TagMapError: the file is missing, is no YAML, or a key is missing or impossible.
@@ -118,6 +125,8 @@ class TagMap:
         except yaml.YAMLError as error:
             raise TagMapError(f"the tag map {path} is not YAML: {error}") from error
         try:
+            if family is not None and isinstance(data, dict):
+                data["family"] = family
             return cls.from_dict(data)
         except TagMapError as error:
             raise TagMapError(f"{path}: {error}") from error
@@ -127,19 +136,22 @@ class TagMap:
         """Build a tag map from the content of its file; raises `TagMapError`."""
         if not isinstance(data, dict) or data.get("schema") != SCHEMA_VERSION:
             raise TagMapError(f"'schema: {SCHEMA_VERSION}' expected at the top of a tag map")
-        if data.get("family") != family.FAMILY:
-            raise TagMapError(f"family '{data.get('family')}': only {family.FAMILY} is supported")
+        try:
+            family = families.named(data.get("family"))
+        except ValueError as error:
+            raise TagMapError(str(error)) from error
         limb = _section(data, "limb")
         world = _section(data, "world")
         lengths = tuple(_floats(limb.get("segment_lengths"), None, "limb.segment_lengths"))
         if not lengths or min(lengths) <= 0.0:
             raise TagMapError("limb.segment_lengths: a list of positive lengths in m expected")
         total = sum(lengths)
-        limb_tags = tuple(_limb_tag(entry, total) for entry in limb.get("tags") or [])
+        limb_tags = tuple(_limb_tag(entry, total, family) for entry in limb.get("tags") or [])
         if not limb_tags:
             raise TagMapError("limb.tags is empty: at least one tag must be on the limb")
-        world_tags = tuple(_world_tag(entry) for entry in world.get("tags") or [])
-        return cls(lengths, limb_tags, world_tags, _stiff(limb.get("stiff") or [], lengths))
+        world_tags = tuple(_world_tag(entry, family) for entry in world.get("tags") or [])
+        stiff = _stiff(limb.get("stiff") or [], lengths)
+        return cls(lengths, limb_tags, world_tags, stiff, family)
 
 
 def _section(data: dict[str, Any], name: str) -> dict[str, Any]:
@@ -179,12 +191,15 @@ def _stiff(value: Any, lengths: tuple[float, ...]) -> tuple[tuple[float, float],
     return tuple(result)
 
 
-def _common(entry: Any, where: str) -> tuple[int, float, str]:
+def _common(entry: Any, where: str, family: Family) -> tuple[int, float, str]:
     if not isinstance(entry, dict):
         raise TagMapError(f"{where}: an entry 'id: …, size: …' expected, not {entry!r}")
     tag = entry.get("id")
-    if not isinstance(tag, int) or not 0 <= tag < family.TAG_COUNT:
-        raise TagMapError(f"{where}: id {tag!r} is not one of 0 to {family.TAG_COUNT - 1}")
+    if not isinstance(tag, int) or not 0 <= tag < family.tag_count:
+        raise TagMapError(
+            f"{where}: id {tag!r} is not one of 0 to {family.tag_count - 1}, which "
+            f"{family.name} has"
+        )
     name = f"{where} {tag}"
     size = _number(entry.get("size"), f"{name}: size")
     if size <= 0.0:
@@ -192,8 +207,8 @@ def _common(entry: Any, where: str) -> tuple[int, float, str]:
     return tag, size, name
 
 
-def _limb_tag(entry: Any, total: float) -> LimbTag:
-    tag, size, name = _common(entry, "limb tag")
+def _limb_tag(entry: Any, total: float, family: Family) -> LimbTag:
+    tag, size, name = _common(entry, "limb tag", family)
     arc_length = _number(entry.get("arc_length"), f"{name}: arc_length")
     if not 0.0 <= arc_length <= total:
         raise TagMapError(f"{name}: arc_length {arc_length} m is not on the limb (0 to {total} m)")
@@ -202,8 +217,8 @@ def _limb_tag(entry: Any, total: float) -> LimbTag:
     return LimbTag(tag, arc_length, height, size, (offset[0], offset[1], offset[2]))
 
 
-def _world_tag(entry: Any) -> WorldTag:
-    tag, size, name = _common(entry, "world tag")
+def _world_tag(entry: Any, family: Family) -> WorldTag:
+    tag, size, name = _common(entry, "world tag", family)
     position = _floats(entry.get("position"), 3, f"{name}: position")
     yaw = _number(entry.get("yaw", 0.0), f"{name}: yaw")
     return WorldTag(tag, (position[0], position[1], position[2]), yaw, size)

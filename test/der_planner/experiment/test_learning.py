@@ -19,7 +19,7 @@ def options(out: Path, *more: str):
 
 @pytest.mark.slow
 def test_runs_are_learned_from_and_a_stopped_experiment_goes_on(tmp_path: Path, capsys):
-    run(options(tmp_path, "--learn", "1"))
+    run(options(tmp_path, "--learn", "1", "--no-report"))
     run(options(tmp_path, "--learn", "2"))
     said = capsys.readouterr().err
     assert said.count("run 1: mean error") == 2

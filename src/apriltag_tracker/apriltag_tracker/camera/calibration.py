@@ -226,7 +226,7 @@ def calibrate_mounting(
     Raises:
         CalibrationError: no picture gave a camera pose, or a limb tag was never seen.
     """
-    tracker = LimbTracker(tags, intrinsics, detector=Detector())
+    tracker = LimbTracker(tags, intrinsics, detector=Detector(family=tags.family))
     seen: dict[int, list[NDArray[np.float64]]] = {tag.id: [] for tag in tags.limb}
     count = 0
     for count, image in enumerate(images, 1):

@@ -13,6 +13,7 @@ from pathlib import Path
 from ament_index_python.packages import get_package_share_directory
 
 from apriltag_tracker.commands.calibration_board import add_board_arguments, given_board
+from apriltag_tracker.family import FAMILIES
 from apriltag_tracker.sheets import (
     PAPERS,
     Page,
@@ -52,12 +53,16 @@ def main() -> int:
     common.add_argument("--out", type=Path, default=Path("sheets"), metavar="DIR")
     tags = what.add_parser("tags", parents=[common], help="every tag of a tag map")
     tags.add_argument("--tag-map", type=Path, default=DEFAULT_MAP, metavar="FILE")
+    tags.add_argument(
+        "--family", choices=sorted(FAMILIES), help="print this one and not that of the tag map"
+    )
     board = what.add_parser("board", parents=[common], help="a calibration board")
     add_board_arguments(board)
     options = parser.parse_args()
     try:
         if options.what == "tags":
-            _write(tag_pages(TagMap.from_yaml(options.tag_map), options.paper), "tags", options)
+            tag_map = TagMap.from_yaml(options.tag_map, options.family)
+            _write(tag_pages(tag_map, options.paper), "tags", options)
         else:
             _write([board_page(given_board(options), options.paper)], "board", options)
     except (TagMapError, SheetError, OSError) as error:

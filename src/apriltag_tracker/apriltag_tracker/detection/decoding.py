@@ -13,28 +13,28 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from apriltag_tracker import family
 from apriltag_tracker.detection.edges import inside, sample
+from apriltag_tracker.family import Family
 
 SHARPENING = 0.25
 """Share of the difference between a cell and its neighbours that is added to it."""
 
 UNREADABLE = 64
 
-_GRID = 10
 _LEAST_CONTRAST = 12.0
 
 
 @functools.cache
-def code_table() -> NDArray[np.uint64]:
-    """Return the codes of all printed tags in four directions as integers, (4, 587).
+def code_table(family: Family) -> NDArray[np.uint64]:
+    """Return the codes of all printed tags in four directions as integers, (4, tags).
 
     Row r holds what is read when the corners start r corners late: at the printed lower right for
     r = 1, and so on counter-clockwise.
     """
-    weights = np.uint64(1) << np.arange(35, -1, -1, dtype=np.uint64)
+    bits = family.code_cells**2
+    weights = np.uint64(1) << np.arange(bits - 1, -1, -1, dtype=np.uint64)
     rows = [
-        (np.rot90(family.codes(), -turn, axes=(1, 2)).reshape(family.TAG_COUNT, -1) * weights).sum(
+        (np.rot90(family.codes(), -turn, axes=(1, 2)).reshape(-1, bits) * weights).sum(
             axis=1, dtype=np.uint64
         )
         for turn in range(4)
@@ -68,12 +68,14 @@ def square_to_quad(c: NDArray[np.float64]) -> NDArray[np.float64]:
 def _sample_cells(
     image: NDArray[np.uint8], corners: NDArray[np.float64], values: NDArray[np.float64]
 ) -> bool:
-    """Sample the 10 x 10 cells of a tag with its margin; row 0 is the upper one."""
+    """Sample the n x n cells of a tag with its margin; row 0 is the upper one."""
     h = square_to_quad(corners)
-    for row in range(_GRID):
-        v = 1.0 - (row - 0.5) / 8.0
-        for column in range(_GRID):
-            u = (column - 0.5) / 8.0
+    grid = len(values)
+    border = grid - 2.0
+    for row in range(grid):
+        v = 1.0 - (row - 0.5) / border
+        for column in range(grid):
+            u = (column - 0.5) / border
             w = h[6] * u + h[7] * v + 1.0
             x = (h[0] * u + h[1] * v + h[2]) / w
             y = (h[3] * u + h[4] * v + h[5]) / w
@@ -86,9 +88,9 @@ def _sample_cells(
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def _ring_plane(values: NDArray[np.float64], ring: int) -> tuple[float, float, float]:
     """Return mean and slopes a row and a column of one ring of cells around the middle."""
-    last = _GRID - 1 - ring
+    last = len(values) - 1 - ring
     total, along_row, along_column, weight, count = 0.0, 0.0, 0.0, 0.0, 0.0
-    middle = 0.5 * (_GRID - 1)
+    middle = 0.5 * (len(values) - 1)
     for row in range(ring, last + 1):
         for column in range(ring, last + 1):
             if row not in {ring, last} and column not in {ring, last}:
@@ -103,17 +105,22 @@ def _ring_plane(values: NDArray[np.float64], ring: int) -> tuple[float, float, f
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def read_code(image: NDArray[np.uint8], corners: NDArray[np.float64]) -> tuple[bool, np.uint64]:
-    """Read the 36 cells of one tag as an integer, upper left cell first.
+def read_code(
+    image: NDArray[np.uint8], corners: NDArray[np.float64], code_cells: int
+) -> tuple[bool, np.uint64]:
+    """Read the cells of one tag's code as an integer, upper left cell first.
 
     Args:
         image: grey image.
         corners: (4, 2) px, counter-clockwise as printed; the first is taken for the lower left.
+        code_cells: along the edge of the code.
 
     Returns:
         Whether there is a tag (white margin, black border, contrast), and the code.
     """
-    values = np.empty((_GRID, _GRID))
+    grid = code_cells + 4
+    middle = 0.5 * (grid - 1)
+    values = np.empty((grid, grid))
     code = np.uint64(0)
     if not _sample_cells(image, corners, values):
         return False, code
@@ -124,18 +131,19 @@ def read_code(image: NDArray[np.uint8], corners: NDArray[np.float64]) -> tuple[b
     mean = 0.5 * (white + black)
     slope_row, slope_column = 0.5 * (white_row + black_row), 0.5 * (white_column + black_column)
     wrong = 0
-    for row in range(1, _GRID - 1):
-        for column in range(1, _GRID - 1):
-            threshold = mean + slope_row * (row - 4.5) + slope_column * (column - 4.5)
+    for row in range(1, grid - 1):
+        for column in range(1, grid - 1):
+            threshold = mean + slope_row * (row - middle) + slope_column * (column - middle)
             value = values[row, column]
-            if row in {1, _GRID - 2} or column in {1, _GRID - 2}:
+            if row in {1, grid - 2} or column in {1, grid - 2}:
                 wrong += value > threshold
                 continue
             neighbours = values[row - 1, column] + values[row + 1, column]
             neighbours += values[row, column - 1] + values[row, column + 1]
             value += SHARPENING * (4.0 * value - neighbours)
             code = (code << np.uint64(1)) | np.uint64(value > threshold)
-    return wrong <= 2, code
+    # One cell of 14 of the border may be wrong.
+    return wrong <= 4 * (code_cells + 1) // 14, code
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -152,6 +160,7 @@ def count_bits(value: np.uint64) -> int:
 def distances(
     image: NDArray[np.uint8],
     corners: NDArray[np.float64],
+    code_cells: int,
     expected: NDArray[np.uint64],
     found: NDArray[np.bool_],
     distance: NDArray[np.int64],
@@ -164,7 +173,7 @@ def distances(
         distance[i] = UNREADABLE
         if not found[i]:
             continue
-        readable, code = read_code(image, corners[i])
+        readable, code = read_code(image, corners[i], code_cells)
         if readable:
             distance[i] = count_bits(code ^ expected[i])
 
@@ -173,6 +182,7 @@ def distances(
 def identify(
     image: NDArray[np.uint8],
     corners: NDArray[np.float64],
+    code_cells: int,
     table: NDArray[np.uint64],
     found: NDArray[np.bool_],
     ids: NDArray[np.int64],
@@ -184,6 +194,7 @@ def identify(
     Args:
         image: grey image.
         corners: (n, 4, 2) px, counter-clockwise as printed, starting anywhere.
+        code_cells: along the edge of a code.
         table: of `code_table`.
         found: (n,) which to read.
         ids: (n,) output.
@@ -194,7 +205,7 @@ def identify(
         distance[i] = UNREADABLE
         if not found[i]:
             continue
-        readable, code = read_code(image, corners[i])
+        readable, code = read_code(image, corners[i], code_cells)
         if readable:
             ids[i], turns[i], distance[i] = _nearest(code, table)
 
@@ -211,12 +222,12 @@ def _nearest(code: np.uint64, table: NDArray[np.uint64]) -> tuple[int, int, int]
     return nearest, corner, distance
 
 
-def nearest_code(cells: NDArray[np.bool_]) -> tuple[int, int, int]:
-    """Find the tag nearest to cells (36,) that were read, white is true, from the upper left.
+def nearest_code(cells: NDArray[np.bool_], family: Family) -> tuple[int, int, int]:
+    """Find the tag nearest to cells (n,) that were read, white is true, from the upper left.
 
     Returns:
         The tag, which corner of the quadrilateral is its printed lower left, and the wrong cells.
     """
-    weights = np.uint64(1) << np.arange(35, -1, -1, dtype=np.uint64)
-    tag, turn, wrong = _nearest((cells * weights).sum(dtype=np.uint64), code_table())
+    weights = np.uint64(1) << np.arange(len(cells) - 1, -1, -1, dtype=np.uint64)
+    tag, turn, wrong = _nearest((cells * weights).sum(dtype=np.uint64), code_table(family))
     return int(tag), int(turn), int(wrong)

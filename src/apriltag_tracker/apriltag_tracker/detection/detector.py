@@ -1,8 +1,7 @@
-"""Find AprilTags (36h11) in a grey image: OpenCV finds them, line fits place their corners."""
+"""Find AprilTags in a grey image: OpenCV finds them, fits of lines and patterns place them."""
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
@@ -12,41 +11,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from apriltag_tracker import family
 from apriltag_tracker.detection import decoding, edges
 from apriltag_tracker.detection.alignment.aligner import USUAL_BLUR, Aligner, Alignment
 from apriltag_tracker.detection.covered import covered_quads
+from apriltag_tracker.detection.quads import check_orientation, find_quads, refine
 from apriltag_tracker.detection.smeared import read_smeared
-from apriltag_tracker.detection.tag import Tag, counter_clockwise, once
-
-MOST_CORRECTED_BITS = 2
-"""At three forgiven cells 19 of 1000 pictures of noise show a tag."""
+from apriltag_tracker.detection.tag import ExpectedTag, Tag, counter_clockwise, once
+from apriltag_tracker.family import Family, FamilyError, named
 
 SMALLEST_TAG = 12.0
 """Shortest side that is looked for [px]; a cell is 1.5 px then."""
 
-_FROM_OPENCV = (1, 0, 3, 2)
-"""OpenCV's corners run clockwise from what is the printed tag's lower right."""
-
 _LINES_ALONE = 0.15
 """Standard deviation that lines have where the whole pattern could not be fitted [px]."""
 
-_EXPLAINED = 0.93
-_WRONG_BUT_NEAR = 5
+_USUAL = (USUAL_BLUR, np.zeros(2))
+"""Blur and smear where nothing is known of them [px]."""
+
 _DIM = 60.0
-_THRESHOLD, _FAINT_THRESHOLD = 7.0, 3.0
-"""By how much a pixel must be darker than its surroundings to be black [grey levels]."""
-
-
-def refine(
-    gray: NDArray[np.uint8], quads: NDArray[np.float64], search: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Refine corners (n, 4, 2) px; returns corners, side statistics (n, 4, 6) and success (n,)."""
-    corners = np.empty_like(quads)
-    stats = np.zeros((len(quads), 4, edges.EDGE_VALUES))
-    found = np.zeros(len(quads), dtype=np.bool_)
-    edges.refine_quads(gray, quads, search, corners, stats, found)
-    return corners, stats, found
 
 
 def grey(image: Any) -> NDArray[np.uint8]:
@@ -73,39 +55,51 @@ class Detector:
     Args:
         smallest: shortest side of a tag to look for [px].
         correct_bits: wrong cells of a code that are forgiven in a search; one more where the tag is
-            expected. A random square passes for a tag once in 790 000 at 1, once in 44 000 at 2.
+            expected; None for what suits the family. A random square passes for a tag of tag36h11
+            once in 790 000 at 1, once in 44 000 at 2; of tag25h9 once in 240 000 at 0; of tag16h5
+            once in 550 at 0.
         largest_residual: RMS residual of the border's lines above which a candidate is dropped
             [px].
+        family: of the tags, or its name.
 
     Raises:
         ValueError: a tag smaller than can be read, or more forgiven cells than are safe.
     """
 
     def __init__(
-        self, smallest: float = SMALLEST_TAG, correct_bits: int = 1, largest_residual: float = 0.4
+        self,
+        smallest: float = SMALLEST_TAG,
+        correct_bits: int | None = None,
+        largest_residual: float = 0.4,
+        family: Family | str = "tag36h11",
     ) -> None:
         if smallest < 8.0:
             raise ValueError(f"smallest tag of {smallest} px: 8 px or more can be read")
-        if not 0 <= correct_bits <= MOST_CORRECTED_BITS:
+        self.family = named(family) if isinstance(family, str) else family
+        if correct_bits is None:
+            correct_bits = self.family.correct_bits
+        if not 0 <= correct_bits <= self.family.most_corrected:
             raise ValueError(
-                f"correct_bits {correct_bits}: 0 to {MOST_CORRECTED_BITS}; with more, pictures "
-                "without a tag show some"
+                f"correct_bits {correct_bits}: 0 to {self.family.most_corrected} with "
+                f"{self.family.name}; with more, pictures without a tag show some"
             )
         self.smallest = smallest
         self.correct_bits = correct_bits
         self.largest_residual = largest_residual
-        self._aligner = Aligner()
-        check_orientation()
+        self._aligner = Aligner(self.family)
+        check_orientation(self.family)
 
     def warm_up(self) -> None:
         """Load or compile everything a first image would wait for."""
         canvas = np.full((96, 96), 255, dtype=np.uint8)
-        canvas[28:68, 28:68] = enlarged_tag(0, 5)
+        end = 28 + 5 * self.family.border_cells
+        canvas[28:end, 28:end] = self.family.enlarged_tag(0, 5)
         if [tag.id for tag in self.detect(canvas)] != [0]:
-            raise family.FamilyError("a perfect picture of tag 0 is not detected")
-        quad = np.array([[[27.5, 67.5], [67.5, 67.5], [67.5, 27.5], [27.5, 27.5]]])
+            raise FamilyError(f"a perfect picture of {self.family.name} 0 is not detected")
+        low, high = 27.5, end - 0.5
+        quad = np.array([[[low, high], [high, high], [high, low], [low, low]]])
         if [tag.id for tag in self._read_again(canvas, quad, [], "full")] != [0]:
-            raise family.FamilyError("a perfect picture of tag 0 is not read")
+            raise FamilyError(f"a perfect picture of {self.family.name} 0 is not read")
 
     def detect(
         self,
@@ -147,7 +141,7 @@ class Detector:
         passes = (True,) if dim else (False, True) if thorough else (False,)
         tags: list[Tag] = []
         for faint in passes:
-            ids, quads, others = find_quads(image, smallest, faint)
+            ids, quads, others = find_quads(image, self.family, smallest, faint)
             tags += self.confirm(image, ids, quads, 3.0 * scale, found_by)
             tags += self._read_again(image, others, tags, found_by)
         if enough is not None and {tag.id for tag in tags} >= set(enough):
@@ -164,7 +158,7 @@ class Detector:
         quads: NDArray[np.float64],
         search: float,
         found_by: str,
-        before: Mapping[int, Tag] | None = None,
+        before: Mapping[int, tuple[float, NDArray[np.float64]]] | None = None,
     ) -> list[Tag]:
         """Refine candidates and keep those whose border is straight and whose code is right.
 
@@ -174,37 +168,72 @@ class Detector:
             quads: (n, 4, 2) px, from the printed lower left counter-clockwise.
             search: how far a side may be from where the candidate says [px].
             found_by: noted in the tags.
-            before: tags as they were last seen: where blur and smear start from. One that is
-                `tracked` may also be confirmed by its whole pattern, if its border is too smeared.
+            before: blur and smear (2,) px of tags, where they are known about: fits start there.
         """
         if len(ids) == 0:
             return []
         known = before or {}
         corners, stats, found = refine(image, quads, search)
         distance = np.empty(len(ids), dtype=np.int64)
-        decoding.distances(image, corners, decoding.code_table()[0, ids], found, distance)
-        forgiven = self.correct_bits + (found_by == "tracked")
+        expected = decoding.code_table(self.family)[0, ids]
+        cells = self.family.code_cells
+        decoding.distances(image, corners, cells, expected, found, distance)
+        forgiven = self.correct_bits + (found_by in {"tracked", "expected"})
         tags = self._collect(ids, corners, stats, found & (distance <= forgiven), found_by)
-        tags = [self._aligned(image, tag, known.get(tag.id)) for tag in tags]
-        if found_by == "tracked":
-            seen = {tag.id for tag in tags}
-            for tag, quad in zip(ids.tolist(), quads, strict=True):
-                if tag not in seen and tag in known:
-                    last = known[tag]
-                    whole = self._by_pattern(
-                        image, tag, quad, last.blur, np.array(last.smear), found_by
-                    )
-                    tags += [whole] if whole is not None else []
-        return tags
+        aligned = (self._aligned(image, tag, *known.get(tag.id, _USUAL)) for tag in tags)
+        return [tag for tag in aligned if tag is not None]
 
-    def _aligned(self, image: NDArray[np.uint8], tag: Tag, before: Tag | None = None) -> Tag:
-        """Return a tag with the corners of its whole pattern, which a smear does not shift."""
-        near = before or tag
-        fitted = self._aligner.align(
-            image, tag.id, tag.corners, near.blur, np.array(near.smear, dtype=np.float64)
-        )
-        cell = tag.pixel_size / family.BORDER_CELLS
-        if fitted is None or np.abs(fitted.corners - tag.corners).max() > 0.3 * cell + 1.0:
+    def confirm_expected(
+        self, image: NDArray[np.uint8], expected: ExpectedTag, blur: float
+    ) -> Tag | None:
+        """Return a tag that is where, and smeared as, it is expected; None if it is not there.
+
+        Args:
+            image: grey image.
+            expected: the tag.
+            blur: of other tags in the picture [px].
+        """
+        smear = expected.smears[0]
+        cell = math.dist(*expected.corners[:2].tolist()) / self.family.border_cells
+        if math.hypot(*smear) > cell:
+            whole = self.confirm_pattern(image, expected, blur, "expected")
+            if whole is not None:
+                return whole
+        ids, quads = np.array([expected.id]), expected.corners[None].copy()
+        lines = self.confirm(image, ids, quads, 3.0, "expected", {expected.id: (blur, smear)})
+        return lines[0] if lines else None
+
+    def confirm_pattern(
+        self, image: NDArray[np.uint8], expected: ExpectedTag, blur: float, found_by: str
+    ) -> Tag | None:
+        """Return a tag whose whole pattern fits from where it is expected, None if none does.
+
+        It may be too smeared for lines. Arguments are those of `confirm_expected`.
+        """
+        for smear in expected.smears:
+            fitted = self._aligner.align_once(image, expected.id, expected.corners, blur, smear)
+            if fitted is not None and self._is_the_tag(fitted, expected.corners):
+                return _tag_of(expected.id, fitted, found_by)
+        return None
+
+    def _aligned(
+        self, image: NDArray[np.uint8], tag: Tag, blur: float, smear: NDArray[np.float64]
+    ) -> Tag | None:
+        """Return a tag with the corners of its whole pattern, which a smear does not shift.
+
+        None if the family's codes are too weak without the pattern, and that is not there.
+        """
+        fitted = self._aligner.align(image, tag.id, tag.corners, blur, smear)
+        if self.family.needs_pattern and (
+            fitted is None or not self._is_the_tag(fitted, tag.corners)
+        ):
+            return None
+        cell = tag.pixel_size / self.family.border_cells
+        if fitted is None or not (
+            np.abs(fitted.corners - tag.corners).max() < 0.3 * cell + 1.0
+            or self._is_the_tag(fitted, tag.corners)
+            or _fits_but_for_a_cover(fitted, tag.corners, cell)
+        ):
             # Lines alone: blur and smear may have moved them, by how much is not known.
             unsure = 4.0 * tag.covariance + _LINES_ALONE**2 * np.eye(8)
             return replace(tag, covariance=unsure)
@@ -228,19 +257,9 @@ class Detector:
     ) -> Tag | None:
         """Return a tag that is confirmed by nearly all of its pixels, None if it is not there."""
         fitted = self._aligner.align(image, tag, quad, blur, smear)
-        if fitted is None or not _is_the_tag(fitted, quad):
+        if fitted is None or not self._is_the_tag(fitted, quad):
             return None
-        return Tag(
-            id=tag,
-            corners=fitted.corners,
-            covariance=fitted.covariance,
-            line_residual=math.nan,
-            edge_share=0.0,
-            contrast=fitted.contrast,
-            found_by=found_by,
-            blur=fitted.blur,
-            smear=(float(fitted.smear[0]), float(fitted.smear[1])),
-        )
+        return _tag_of(tag, fitted, found_by)
 
     def _read_again(
         self,
@@ -255,18 +274,18 @@ class Detector:
             return []
         corners, stats, found = refine(image, quads, 3.0)
         ids, turns, distance = (np.zeros(len(quads), dtype=np.int64) for _ in range(3))
-        decoding.identify(image, corners, decoding.code_table(), found, ids, turns, distance)
+        table, cells = decoding.code_table(self.family), self.family.code_cells
+        decoding.identify(image, corners, cells, table, found, ids, turns, distance)
         for i in np.flatnonzero(distance < decoding.UNREADABLE):
             corners[i] = np.roll(corners[i], -turns[i], axis=0)
             stats[i] = np.roll(stats[i], -turns[i], axis=0)
         good = found & (distance <= self.correct_bits)
         tags = self._collect(ids, corners, stats, good, found_by)
-        tags = [self._aligned(image, tag) for tag in tags]
-        for i in np.flatnonzero(found & ~good & (distance <= _WRONG_BUT_NEAR)):
+        aligned = (self._aligned(image, tag, *_USUAL) for tag in tags)
+        tags = [tag for tag in aligned if tag is not None]
+        for i in np.flatnonzero(found & ~good & (distance <= self.family.most_wrong)):
             if counter_clockwise(corners[i]):
-                whole = self._by_pattern(
-                    image, int(ids[i]), corners[i], USUAL_BLUR, np.zeros(2), found_by
-                )
+                whole = self._by_pattern(image, int(ids[i]), corners[i], *_USUAL, found_by)
                 tags += [whole] if whole is not None else []
         return tags
 
@@ -280,12 +299,24 @@ class Detector:
         """Read quadrilaterals (n, 4, 2) whose cells run into each other, as a smear makes them."""
         tags: list[Tag] = []
         for quad in _elsewhere(quads, known):
-            code = read_smeared(image, quad)
+            code = read_smeared(image, quad, self.family)
             if code is not None:
                 start = np.roll(quad, -code.turn, axis=0)
                 whole = self._by_pattern(image, code.id, start, USUAL_BLUR, code.smear, found_by)
                 tags += [whole] if whole is not None else []
         return tags
+
+    def _is_the_tag(self, fitted: Alignment, quad: NDArray[np.float64]) -> bool:
+        """Tell whether a pattern explains nearly all pixels, close to where it was looked for."""
+        cell = math.dist(quad[0].tolist(), quad[2].tolist()) / (
+            math.sqrt(2.0) * self.family.border_cells
+        )
+        return (
+            fitted.explained > self.family.explained
+            and fitted.contrast > 12.0
+            and counter_clockwise(fitted.corners)
+            and bool(np.abs(fitted.corners - quad).max() < 1.5 * cell)
+        )
 
     def _collect(
         self,
@@ -323,17 +354,30 @@ def _elsewhere(quads: NDArray[np.float64], known: Sequence[Tag]) -> NDArray[np.f
     return quads
 
 
-def _is_the_tag(fitted: Alignment, quad: NDArray[np.float64]) -> bool:
-    """Tell whether a pattern explains nearly all pixels, close to where it was looked for.
+def _tag_of(tag: int, fitted: Alignment, found_by: str) -> Tag:
+    """Return a tag of whose border no lines were fitted."""
+    return Tag(
+        id=tag,
+        corners=fitted.corners,
+        covariance=fitted.covariance,
+        line_residual=math.nan,
+        edge_share=0.0,
+        contrast=fitted.contrast,
+        found_by=found_by,
+        blur=fitted.blur,
+        smear=(float(fitted.smear[0]), float(fitted.smear[1])),
+    )
 
-    A pattern with two other cells of 100 explains 92 % at most, however sharp the picture is.
+
+def _fits_but_for_a_cover(fitted: Alignment, lines: NDArray[np.float64], cell: float) -> bool:
+    """Tell whether a pattern fits closely where nothing covers it, though lines are elsewhere.
+
+    A light cover on a corner takes lines along its own edge.
     """
-    cell = math.dist(quad[0].tolist(), quad[2].tolist()) / (math.sqrt(2.0) * family.BORDER_CELLS)
     return (
-        fitted.explained > _EXPLAINED
-        and fitted.contrast > 12.0
-        and counter_clockwise(fitted.corners)
-        and bool(np.abs(fitted.corners - quad).max() < 1.5 * cell)
+        fitted.kept > 0.8
+        and fitted.residual < 0.06 * fitted.contrast
+        and bool(np.abs(fitted.corners - lines).max() < 1.5 * cell)
     )
 
 
@@ -341,90 +385,3 @@ def _is_dim(image: NDArray[np.uint8]) -> bool:
     """Tell from 1 pixel of 64 whether nothing stands out against OpenCV's usual threshold."""
     low, high = np.percentile(image[::8, ::8], (1.0, 99.0))
     return bool(high - low < _DIM)
-
-
-def find_quads(
-    image: NDArray[np.uint8], smallest: float, faint: bool = False
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Let OpenCV find tags.
-
-    Args:
-        image: grey image.
-        smallest: shortest side [px].
-        faint: whether to look for tags of little contrast.
-
-    Returns:
-        ids (n,) and corners (n, 4, 2) px of tags, printed lower left first; and corners (m, 4, 2)
-        of quadrilaterals that it could not read, counter-clockwise as printed.
-    """
-    detector = _opencv_detector(max(image.shape), smallest, faint)
-    if faint:
-        image = cv2.GaussianBlur(image, (3, 3), 0.0)
-    found, ids, others = detector.detectMarkers(image)
-    rest = _quads(others)
-    if ids is None or len(ids) == 0:
-        return np.empty(0, dtype=np.int64), np.empty((0, 4, 2)), rest
-    return np.asarray(ids, dtype=np.int64).ravel(), _quads(found), rest
-
-
-def _quads(found: Sequence[Any]) -> NDArray[np.float64]:
-    """Return OpenCV's quadrilaterals as an array (n, 4, 2) that runs as printed."""
-    if len(found) == 0:
-        return np.empty((0, 4, 2))
-    table = np.array([np.asarray(quad, dtype=np.float64).reshape(4, 2) for quad in found])
-    return np.ascontiguousarray(table[:, _FROM_OPENCV])
-
-
-@functools.lru_cache(maxsize=32)
-def _opencv_detector(extent: int, smallest: float, faint: bool) -> Any:
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
-    parameters.minMarkerPerimeterRate = 0.8 * 4.0 * smallest / extent
-    parameters.maxMarkerPerimeterRate = 4.0
-    parameters.adaptiveThreshConstant = _FAINT_THRESHOLD if faint else _THRESHOLD
-    parameters.adaptiveThreshWinSizeMin = 13
-    parameters.adaptiveThreshWinSizeMax = 13
-    parameters.adaptiveThreshWinSizeStep = 10
-    parameters.minCornerDistanceRate = 0.05
-    # Else the outline of the white sheet takes the place of the black border inside of it.
-    parameters.minMarkerDistanceRate = 0.02
-    parameters.minDistanceToBorder = 2
-    # Loose, so that a border with a dent where something covers it is still taken for four sides.
-    parameters.polygonalApproxAccuracyRate = 0.08
-    parameters.perspectiveRemovePixelPerCell = 4
-    parameters.errorCorrectionRate = 1.0
-    return cv2.aruco.ArucoDetector(family.dictionary(), parameters)
-
-
-def enlarged_tag(tag: int, scale: int) -> NDArray[np.uint8]:
-    """Return a perfect picture of a tag without its margin, (8 scale, 8 scale) of 0 and 255."""
-    cells = family.printed_cells(tag, margin=0) * np.uint8(255)
-    return np.repeat(np.repeat(cells, scale, axis=0), scale, axis=1)
-
-
-@functools.cache
-def check_orientation() -> None:
-    """Detect one known tag and check id, corner order, rotation and pixel convention.
-
-    Raises:
-        family.FamilyError: this OpenCV answers otherwise than this package expects.
-    """
-    family.check_code_of_tag_0()
-    scale, left, top = 5, 30, 20
-    canvas = np.full((100, 110), 255, dtype=np.uint8)
-    canvas[top : top + 8 * scale, left : left + 8 * scale] = enlarged_tag(0, scale)
-    ids, quads, _ = find_quads(canvas, 20.0)
-    right, bottom = left + 8 * scale, top + 8 * scale
-    expected = np.array([[left, bottom], [right, bottom], [right, top], [left, top]]) - 0.5
-    if list(ids) != [0] or np.abs(quads[0] - expected).max() > 2.0:
-        raise family.FamilyError(
-            f"OpenCV {cv2.__version__} finds ids {list(ids)} with corners {quads.tolist()} in a "
-            f"picture of tag 0 with corners {expected.tolist()}: its conventions changed; "
-            "install opencv-python-headless 4.14 or 5.0"
-        )
-    corners, _, found = refine(canvas, quads, 3.0)
-    if not found[0] or np.abs(corners[0] - expected).max() > 0.05:
-        raise family.FamilyError(
-            f"the line fit places the corners of a perfect tag at {corners[0].tolist()}, not at "
-            f"{expected.tolist()}"
-        )

@@ -17,9 +17,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from apriltag_tracker import family
 from apriltag_tracker.detection import decoding
 from apriltag_tracker.detection.edges import inside, sample
+from apriltag_tracker.family import Family
 
 _DIRECTIONS = 10
 _LENGTHS = (1.0, 1.5, 2.0, 2.5)
@@ -35,7 +35,6 @@ _TRIED = 8
 
 _LEAST_EXPLAINED = 0.8
 _LEAST_CONTRAST = 12.0
-_MOST_WRONG = 5
 
 
 @dataclass(frozen=True)
@@ -55,26 +54,28 @@ class SmearedCode:
 
 @dataclass(frozen=True)
 class _Table:
-    """Smears (h, 2) in cells, and of each solution (38, samples) and normal matrix (38, 38)."""
+    """Smears (h, 2) in cells, and of each solution (n, samples) and normal matrix (n, n)."""
 
     smears: NDArray[np.float64]
     solutions: NDArray[np.float32]
     normals: NDArray[np.float32]
 
 
-def _raster() -> NDArray[np.float64]:
+def _raster(border: int) -> NDArray[np.float64]:
     """Return where samples lie along one side [cells]."""
-    return np.arange(_FIRST, family.BORDER_CELLS - _FIRST + 1e-9, _SPACING)
+    return np.arange(_FIRST, border - _FIRST + 1e-9, _SPACING)
 
 
 @functools.cache
-def _table() -> _Table:
+def _table(code_cells: int) -> _Table:
     """Return the solutions for all smears.
 
-    Unknown are the grey levels of the 36 inner cells row by row from the upper left, of the border
+    Unknown are the grey levels of the inner cells row by row from the upper left, of the border
     and of the margin.
     """
-    places = _raster()
+    inner = code_cells**2
+    last = code_cells + 1
+    places = _raster(code_cells + 2)
     across, up = np.meshgrid(places, places)
     smears, shown = [], []
     instants = (np.arange(15) + 0.5) / 15 - 0.5
@@ -82,17 +83,18 @@ def _table() -> _Table:
         for k in range(_DIRECTIONS):
             angle = math.pi * k / _DIRECTIONS
             smear = length * np.array([math.cos(angle), math.sin(angle)])
-            design = np.zeros((across.size, 38))
+            design = np.zeros((across.size, inner + 2))
             for t in instants:
                 column = np.floor(across + t * smear[0]).astype(np.int64).ravel()
-                row = 7 - np.floor(up + t * smear[1]).astype(np.int64).ravel()
-                ring = np.minimum(np.minimum(column, 7 - column), np.minimum(row, 7 - row))
-                cell = np.where(ring >= 1, (row - 1) * 6 + column - 1, np.where(ring < 0, 37, 36))
+                row = last - np.floor(up + t * smear[1]).astype(np.int64).ravel()
+                ring = np.minimum(np.minimum(column, last - column), np.minimum(row, last - row))
+                code = (row - 1) * code_cells + column - 1
+                cell = np.where(ring >= 1, code, np.where(ring < 0, inner + 1, inner))
                 design[np.arange(across.size), cell] += 1.0 / len(instants)
             smears.append(smear)
             shown.append(design)
     stacked = np.array(shown)
-    normal = np.swapaxes(stacked, 1, 2) @ stacked + _RIDGE * np.eye(38)
+    normal = np.swapaxes(stacked, 1, 2) @ stacked + _RIDGE * np.eye(inner + 2)
     solutions = np.linalg.solve(normal, np.swapaxes(stacked, 1, 2))
     return _Table(np.array(smears), solutions.astype(np.float32), normal.astype(np.float32))
 
@@ -106,10 +108,12 @@ def _sample_quad(
 ) -> bool:
     """Sample a quadrilateral at `places` [cells] along both sides, upwards and to the right."""
     h = decoding.square_to_quad(corners)
+    # Places are as far outside on one side as on the other.
+    border = places[0] + places[-1]
     for row in range(len(places)):
-        v = places[row] / 8.0
+        v = places[row] / border
         for column in range(len(places)):
-            u = places[column] / 8.0
+            u = places[column] / border
             w = h[6] * u + h[7] * v + 1.0
             x, y = (h[0] * u + h[1] * v + h[2]) / w, (h[3] * u + h[4] * v + h[5]) / w
             if not inside(image, x, y):
@@ -118,9 +122,12 @@ def _sample_quad(
     return True
 
 
-def read_smeared(image: NDArray[np.uint8], quad: NDArray[np.float64]) -> SmearedCode | None:
+def read_smeared(
+    image: NDArray[np.uint8], quad: NDArray[np.float64], family: Family
+) -> SmearedCode | None:
     """Read a quadrilateral (4, 2) px that runs as printed; None if it is no smeared tag."""
-    table, places = _table(), _raster()
+    inner = family.code_cells**2
+    table, places = _table(family.code_cells), _raster(family.border_cells)
     values = np.empty(len(places) ** 2)
     if not _sample_quad(image, quad, places, values):
         return None
@@ -132,15 +139,15 @@ def read_smeared(image: NDArray[np.uint8], quad: NDArray[np.float64]) -> Smeared
     if explained.max() < _LEAST_EXPLAINED:
         return None
     best: SmearedCode | None = None
-    fewest = _MOST_WRONG + 1
+    fewest = family.most_wrong + 1
     for k in np.argsort(-explained)[:_TRIED]:
-        black, white = levels[k, 36:]
+        black, white = levels[k, inner:]
         if white - black < _LEAST_CONTRAST:
             continue
-        tag, turn, wrong = decoding.nearest_code(levels[k, :36] > 0.5 * (black + white))
+        tag, turn, wrong = decoding.nearest_code(levels[k, :inner] > 0.5 * (black + white), family)
         if wrong < fewest:
-            side = 0.5 * (quad[1] - quad[0] + quad[2] - quad[3]) / family.BORDER_CELLS
-            rise = 0.5 * (quad[3] - quad[0] + quad[2] - quad[1]) / family.BORDER_CELLS
+            side = 0.5 * (quad[1] - quad[0] + quad[2] - quad[3]) / family.border_cells
+            rise = 0.5 * (quad[3] - quad[0] + quad[2] - quad[1]) / family.border_cells
             smear = table.smears[k, 0] * side + table.smears[k, 1] * rise
             best, fewest = SmearedCode(tag, turn, smear), wrong
     return best

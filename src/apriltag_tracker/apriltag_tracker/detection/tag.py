@@ -24,7 +24,7 @@ class Tag:
             border was too smeared for lines.
         edge_share: share of the border's profiles that took part, of the worst side.
         contrast: white minus black [grey levels].
-        found_by: `full`, `tracked` or `region`.
+        found_by: `full`, `tracked`, `expected` or `region`.
         blur: standard deviation of lens and pixel together [px].
         smear: way during the exposure, x and y [px]; its sign is not known.
     """
@@ -55,6 +55,21 @@ class Tag:
         """Mean length of the sides [px]."""
         a, b, c, d = self.corners.tolist()
         return (math.dist(a, b) + math.dist(b, c) + math.dist(c, d) + math.dist(d, a)) / 4.0
+
+
+@dataclass(frozen=True)
+class ExpectedTag:
+    """Where a tag that was not found yet should be.
+
+    Attributes:
+        id: of the tag.
+        corners: (4, 2) px.
+        smears: (2,) px each, guesses of its way during the exposure, the likeliest first.
+    """
+
+    id: int
+    corners: NDArray[np.float64]
+    smears: tuple[NDArray[np.float64], ...]
 
 
 def once(tags: Sequence[Tag]) -> list[Tag]:

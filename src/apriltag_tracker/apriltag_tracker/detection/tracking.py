@@ -2,7 +2,8 @@
 
 A tag that was seen is looked for at its predicted corners by the line fit itself, and its code is
 read there. A tag too smeared for lines is confirmed by its whole pattern, from the blur and smear
-it had. When one is missing, the whole image is searched at once, which costs less than a search
+it had. A tag of the limb that is missing is looked for where the limb's other tags say that it is.
+When one is still missing, the whole image is searched at once, which costs less than a search
 around several predictions. What is still missing is looked for in regions around the predictions,
 put together into one mosaic, as it is and then sharpened and enlarged. While all tags are tracked,
 a full search runs once a second.
@@ -10,7 +11,7 @@ a full search runs once a second.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -18,7 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apriltag_tracker.detection.detector import Detector, grey
-from apriltag_tracker.detection.tag import Tag
+from apriltag_tracker.detection.tag import ExpectedTag, Tag
+
+Expect = Callable[[Sequence[Tag]], Sequence[ExpectedTag]]
+"""Says from the tags that were found in an image where others are, the surest first."""
 
 _TILE = 16
 """Tiles of the mosaic are padded to a multiple of this [px]."""
@@ -70,6 +74,7 @@ class TrackingCounts:
     tracked: int = 0
     by_region: int = 0
     by_full: int = 0
+    by_expectation: int = 0
     duplicates: int = 0
     unknown: dict[int, int] = field(default_factory=dict)
 
@@ -101,12 +106,15 @@ class TagTracker:
         self._tracks.clear()
         self._last_full = self._last_thorough = -np.inf
 
-    def track(self, gray: NDArray[np.uint8], stamp: float) -> list[Tag]:
+    def track(
+        self, gray: NDArray[np.uint8], stamp: float, expect: Expect | None = None
+    ) -> list[Tag]:
         """Find the tags of one frame.
 
         Args:
             gray: image (rows, columns) of uint8.
             stamp: when it was taken [s]; must grow from call to call, or tracking starts anew.
+            expect: says where tags are that were not found, None if nothing is known of that.
 
         Returns:
             Tags of the map, each id once.
@@ -119,12 +127,42 @@ class TagTracker:
             self.reset()
         predicted = {tag: self._predict(track, stamp) for tag, track in self._tracks.items()}
         found = self._by_prediction(image, predicted)
+        if expect is None:
+            self._by_pattern(image, predicted, found)
         self.counts.tracked += len(found)
+        self._by_expectation(image, stamp, found, expect)
+        known = len(found)
         self._search_in_full(image, stamp, found, predicted)
         if lost := [tag for tag in predicted if tag not in found]:
             self._merge(found, self._by_regions(image, lost, predicted), predicted)
+        if len(found) > known:
+            self._by_expectation(image, stamp, found, expect)
         self._remember(found, stamp)
         return [found[tag] for tag in sorted(found)]
+
+    def _by_expectation(
+        self,
+        image: NDArray[np.uint8],
+        stamp: float,
+        found: dict[int, Tag],
+        expect: Expect | None,
+    ) -> None:
+        """Add tags that are where those that were found say; each one says more about the next.
+
+        A tag that has been hidden for long is not looked for in every frame.
+        """
+        if expect is None or not found:
+            return
+        every = stamp - self._last_thorough >= self.options.absent_search_period
+        looked_for = self._wanted if every else self._wanted & self._tracks.keys()
+        blur = float(np.median([tag.blur for tag in found.values()]))
+        more = True
+        while more and looked_for - found.keys():
+            expected = [tag for tag in expect(list(found.values())) if tag.id in looked_for]
+            seen = [self._detector.confirm_expected(image, tag, blur) for tag in expected]
+            found.update({tag.id: tag for tag in seen if tag is not None})
+            more = 0 < sum(tag is not None for tag in seen) < len(seen)
+            self.counts.by_expectation += sum(tag is not None for tag in seen)
 
     def _search_in_full(
         self,
@@ -160,9 +198,23 @@ class TagTracker:
             return {}
         quads = np.ascontiguousarray([predicted[tag] for tag in fresh])
         ids = np.array(fresh, dtype=np.int64)
-        before = {tag: self._tracks[tag].tag for tag in fresh}
+        last = {tag: self._tracks[tag].tag for tag in fresh}
+        before = {tag: (seen.blur, np.array(seen.smear)) for tag, seen in last.items()}
         tags = self._detector.confirm(image, ids, quads, self.options.search, "tracked", before)
         return {tag.id: tag for tag in tags}
+
+    def _by_pattern(
+        self,
+        image: NDArray[np.uint8],
+        predicted: dict[int, NDArray[np.float64]],
+        found: dict[int, Tag],
+    ) -> None:
+        """Add tags that are too smeared for lines, with the blur and smear that they had."""
+        for tag, track in self._tracks.items():
+            if tag not in found and track.missed == 0:
+                there = ExpectedTag(tag, predicted[tag], (np.array(track.tag.smear),))
+                seen = self._detector.confirm_pattern(image, there, track.tag.blur, "tracked")
+                found.update({tag: seen} if seen is not None else {})
 
     def _by_regions(
         self,

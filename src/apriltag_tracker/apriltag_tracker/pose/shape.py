@@ -152,6 +152,11 @@ class ShapeFitter:
         self._evaluations: dict[tuple[int, tuple[float, ...]], Evaluation] = {}
         self._last = np.zeros(self._smooth.size)
 
+    @property
+    def parameters(self) -> NDArray[np.float64]:
+        """Parameters of the last smooth fit."""
+        return self._last
+
     def reset(self) -> None:
         """Forget the last shape, from which the next fit would start."""
         self._last = np.zeros(self._smooth.size)
@@ -184,6 +189,33 @@ class ShapeFitter:
             for moves in (common, shared_noise)
         )
         return self._estimate(fit, arcs, kept, rejected, shared[0], shared[1])
+
+    def elsewhere(
+        self,
+        tags: Sequence[PlanarTag],
+        arc_lengths: Sequence[float],
+        usual: NDArray[np.float64] | None = None,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return where other points of the limb are on the smooth fit of some tags.
+
+        Args:
+            tags: of the limb, one at least.
+            arc_lengths: (n,) m.
+            usual: parameters of the shape to which what the tags leave open is near; a straight
+                limb if it is None.
+
+        Returns:
+            x, y [m] and heading [rad] of the centreline, (n, 3), and their derivatives by the
+            curvature of each segment, (n, 3, M).
+        """
+        fit = self._solve(self._smooth, tags, self._last, usual)
+        evaluation = self._evaluation(self._smooth, tuple(arc_lengths))
+        places, slopes = evaluation.places(fit.parameters)
+        return places, slopes[:, :, 4 : 4 + self._smooth.segments]
+
+    def bends(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the mean curvatures (M,) among the parameters of a shape."""
+        return parameters[4 : 4 + self._smooth.segments]
 
     def _consistent(
         self, tags: list[PlanarTag]
@@ -225,11 +257,13 @@ class ShapeFitter:
         rest = [_furthest(fit) for fit in fits]
         outside = int(np.argmin(rest))
         tag = tags[outside]
-        place, _ = self._evaluation(self._constant, [tag]).places(fits[outside].parameters)
+        place, _ = self._evaluation(self._constant, (tag.arc_length,)).places(
+            fits[outside].parameters
+        )
         return outside, float(np.hypot(*(place[0, :2] - tag.pose[:2]))), rest[outside]
 
-    def _evaluation(self, curve: Curve, tags: Sequence[PlanarTag]) -> Evaluation:
-        key = (curve.size, tuple(tag.arc_length for tag in tags))
+    def _evaluation(self, curve: Curve, arc_lengths: tuple[float, ...]) -> Evaluation:
+        key = (curve.size, arc_lengths)
         if key not in self._evaluations:
             if len(self._evaluations) > 200:
                 self._evaluations.clear()
@@ -242,9 +276,15 @@ class ShapeFitter:
         mean = [prior.curvature] * curve.segments
         return np.array(base + mean + list(prior.corrections[: curve.degrees]) * curve.segments)
 
-    def _solve(self, curve: Curve, tags: Sequence[PlanarTag], start: NDArray[np.float64]) -> _Fit:
+    def _solve(
+        self,
+        curve: Curve,
+        tags: Sequence[PlanarTag],
+        start: NDArray[np.float64],
+        usual: NDArray[np.float64] | None = None,
+    ) -> _Fit:
         """Find the most probable parameters and the gain (size, n, 3) from measurements to them."""
-        evaluation = self._evaluation(curve, tags)
+        evaluation = self._evaluation(curve, tuple(tag.arc_length for tag in tags))
         measured = np.array([tag.pose for tag in tags])
         prior = self.prior
         slack = (
@@ -257,6 +297,7 @@ class ShapeFitter:
             [np.linalg.inv(np.linalg.cholesky(tag.covariance + np.diag(extra))) for tag in tags]
         )
         weak = 1.0 / self._prior_sigma(curve)
+        expected = np.zeros(curve.size) if usual is None else usual[: curve.size]
         parameters = start[: curve.size].copy()
         count = PLACE * len(tags)
         for _ in range(12):
@@ -265,7 +306,7 @@ class ShapeFitter:
             gap[:, 2] = wrap(gap[:, 2])
             rows = np.vstack([(whiten @ jacobian).reshape(count, -1), np.diag(weak)])
             right = np.concatenate(
-                [np.einsum("nij,nj->ni", whiten, gap).ravel(), -weak * parameters]
+                [np.einsum("nij,nj->ni", whiten, gap).ravel(), weak * (expected - parameters)]
             )
             normal = rows.T @ rows
             move = np.linalg.solve(normal, rows.T @ right)

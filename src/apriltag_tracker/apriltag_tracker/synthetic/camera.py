@@ -12,7 +12,6 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from apriltag_tracker import family
 from apriltag_tracker.camera import CameraError, CameraPose, Intrinsics, project
 from apriltag_tracker.camera.lens import ray_map
 from apriltag_tracker.synthetic import render
@@ -178,7 +177,7 @@ class SyntheticCamera:
         size = model.intrinsics
         self._rays = ray_map(size.width, size.height, size.matrix, size.distortion)
         self._table = render.cumulative_table()
-        self._cells = {tag: family.printed_cells(tag, MARGIN_CELLS) for tag in tags.ids}
+        self._cells = {tag: tags.family.printed_cells(tag, MARGIN_CELLS) for tag in tags.ids}
         self._light = self._make_light()
         self._noise = self._make_noise()
         self._mounting = self._draw_mounting()
@@ -268,7 +267,9 @@ class SyntheticCamera:
         first, last = self._corners(placements[0]), self._corners(placements[-1])
         both = np.concatenate([first, last])
         middle = both.mean(axis=0)
-        grown = middle + (both - middle) * (1.0 + 2.0 * MARGIN_CELLS / family.BORDER_CELLS)
+        grown = middle + (both - middle) * (
+            1.0 + 2.0 * MARGIN_CELLS / self.tags.family.border_cells
+        )
         blur = np.sqrt(self.optics.blur**2 + render.PIXEL_VARIANCE)
         low = np.floor(grown.min(axis=0) - 3.0 * blur - 1.0).astype(np.int64)
         high = np.ceil(grown.max(axis=0) + 3.0 * blur + 2.0).astype(np.int64)
@@ -277,7 +278,7 @@ class SyntheticCamera:
         if box[0] >= box[1] or box[2] >= box[3]:
             return None
         maps = np.array([self._to_cells(placement) for placement in placements])
-        cell = 1.0 / family.BORDER_CELLS
+        cell = 1.0 / self.tags.family.border_cells
         side = 0.5 * (np.hypot(*(last[1] - last[0])) + np.hypot(*(last[2] - last[3]))) * cell
         other = 0.5 * (np.hypot(*(last[3] - last[0])) + np.hypot(*(last[2] - last[1]))) * cell
         render.draw_tag(
@@ -300,7 +301,7 @@ class SyntheticCamera:
         """Return the map from rays to cells (columns, rows downward) of one placed tag."""
         x, y, z, yaw, size = placement
         cosine, sine = np.cos(yaw), np.sin(yaw)
-        cell = size / family.BORDER_CELLS
+        cell = size / self.tags.family.border_cells
         half = 0.5 * self._cells_across()
         # Homogeneous (column, row, 1) -> point on the tag's plane in limb_base.
         plane = np.array(
@@ -315,9 +316,8 @@ class SyntheticCamera:
         result: NDArray[np.float64] = np.linalg.inv(pose @ plane)
         return result
 
-    @staticmethod
-    def _cells_across() -> int:
-        return family.BORDER_CELLS + 2 * MARGIN_CELLS
+    def _cells_across(self) -> int:
+        return self.tags.family.border_cells + 2 * MARGIN_CELLS
 
     def _draw_body(self, image: NDArray[np.uint8], shape: Shape) -> None:
         """Draw the limb's silhouette: dark silicone at half the height of its tags."""

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apriltag_tracker import family
 from apriltag_tracker.detection.alignment import fit
 from apriltag_tracker.detection.alignment.pattern import tabulate
+from apriltag_tracker.detection.alignment.sampling import side_length
 from apriltag_tracker.detection.alignment.smear import guess_smear
+from apriltag_tracker.family import TAG36H11, Family
 
 USUAL_BLUR = 0.65
 """Of a sharp picture, lens and pixel together: where the first fit starts [px]."""
@@ -30,7 +31,7 @@ _SMEARED = 0.12
 _SHORTEST = 0.9
 """A shorter smear cannot be told from blur, and is counted as such [px]."""
 
-_PASSES = 8
+_PASSES = 9
 
 
 @dataclass(frozen=True)
@@ -59,9 +60,15 @@ class Alignment:
 
 
 class Aligner:
-    """Fits patterns of tags to pictures; remembers the tables that this takes."""
+    """Fits patterns of tags to pictures; remembers the tables that this takes.
 
-    def __init__(self) -> None:
+    Args:
+        family: of the tags.
+    """
+
+    def __init__(self, family: Family = TAG36H11) -> None:
+        self._family = family
+        self._border = float(family.border_cells)
         self._tables: OrderedDict[tuple[int, int], tuple[NDArray[np.float32], float]] = (
             OrderedDict()
         )
@@ -97,6 +104,8 @@ class Aligner:
         if alike < _SMEARED:
             return best
         smeared = self._smeared(image, tag, best)
+        if smeared is None:
+            smeared = self._turned(image, tag, best)
         if smeared is not None and smeared.residual < 0.98 * best.residual:
             best = smeared
         if best.explained < 0.93 and best.kept > 0.97 and alike > 0.5:
@@ -105,14 +114,33 @@ class Aligner:
                 best = searched
         return best
 
+    def align_once(
+        self,
+        image: NDArray[np.uint8],
+        tag: int,
+        corners: NDArray[np.float64],
+        blur: float,
+        smear: NDArray[np.float64],
+    ) -> Alignment | None:
+        """Fit one tag from where it is expected, with its smear; nothing else is tried."""
+        known = smear if math.hypot(*smear) >= _SHORTEST else None
+        found = self._fit(image, tag, corners, blur, known)
+        return None if found is None else found[0]
+
     def _smeared(self, image: NDArray[np.uint8], tag: int, plain: Alignment) -> Alignment | None:
-        cell = _cell(plain.corners)
+        cell = side_length(plain.corners) / self._border
         table, table_blur = self._table(tag, plain.blur / cell)
         guess = np.zeros(2)
-        blur = guess_smear(image, table, table_blur, plain.corners, plain.blur, guess)
+        blur = guess_smear(image, table, table_blur, self._border, plain.corners, plain.blur, guess)
         if math.hypot(*guess) < _SHORTEST:
             return None
         found = self._fit(image, tag, plain.corners, max(blur, 0.5), guess)
+        return None if found is None else found[0]
+
+    def _turned(self, image: NDArray[np.uint8], tag: int, plain: Alignment) -> Alignment | None:
+        """Try a turn without a smear, by which the corners went two pixels."""
+        turn = 2.0 / (math.sqrt(0.5) * side_length(plain.corners))
+        found = self._fit(image, tag, plain.corners, plain.blur, np.zeros(2), turn)
         return None if found is None else found[0]
 
     def _from_all_sides(
@@ -120,7 +148,7 @@ class Aligner:
     ) -> Alignment | None:
         """Try smears in eight directions of half a turn; the best fit counts."""
         best: Alignment | None = None
-        length = 1.6 * _cell(corners)
+        length = 1.6 * side_length(corners) / self._border
         for k in range(8):
             angle = k * math.pi / 8.0
             smear = length * np.array([math.cos(angle), math.sin(angle)])
@@ -136,20 +164,30 @@ class Aligner:
         corners: NDArray[np.float64],
         blur: float,
         smear: NDArray[np.float64] | None,
+        turn: float = 0.0,
     ) -> tuple[Alignment, float] | None:
-        """Fit with or without a smear; returns the fit and the correlation of its residuals."""
+        """Fit with or without smear and turn; also returns how alike its residuals are."""
         result = np.zeros(fit.RESULT_VALUES)
         placed, covariance = np.empty((4, 2)), np.empty((8, 8))
         start = np.ascontiguousarray(corners)
-        cell = _cell(corners)
+        cell = side_length(corners) / self._border
         result[0] = blur
         if smear is not None:
-            result[1:3] = smear
+            result[1:3], result[8] = smear, turn
         for attempt in range(3):
             table, table_blur = self._table(tag, result[0] / cell)
             free = smear is not None
             settled = fit.align(
-                image, table, table_blur, start, free, _PASSES, placed, covariance, result
+                image,
+                table,
+                table_blur,
+                self._border,
+                start,
+                free,
+                _PASSES,
+                placed,
+                covariance,
+                result,
             )
             if not settled and attempt > 0:
                 return None
@@ -160,6 +198,10 @@ class Aligner:
             start = placed.copy() if settled else start
         if not settled or not np.all(np.isfinite(covariance)):
             return None
+        # Of an arc by an angle a, the mean is nearer to its middle by a² / 24 than the tangent is:
+        # through the arc a pixel sees more of the tag's middle, so that the tag looks larger.
+        middle = placed.mean(axis=0)
+        placed = middle + (placed - middle) * (1.0 - result[8] ** 2 / 24.0)
         return (
             Alignment(
                 placed,
@@ -183,14 +225,8 @@ class Aligner:
             return self._tables[key]
         near = _STEP**level
         resolution = min(max(round(_POINTS / near), 5), 16)
-        entry = tabulate(family.printed_cells(tag, 1), resolution, near), near
+        entry = tabulate(self._family.printed_cells(tag, 1), resolution, near), near
         self._tables[key] = entry
         if len(self._tables) > _TABLES:
             self._tables.popitem(last=False)
         return entry
-
-
-def _cell(corners: NDArray[np.float64]) -> float:
-    """Return the mean edge of a cell [px]."""
-    sides = np.hypot(*(np.roll(corners, -1, axis=0) - corners).T)
-    return float(sides.mean()) / 8.0

@@ -16,33 +16,51 @@ from numba import njit
 from numpy.typing import NDArray
 
 from apriltag_tracker.detection.alignment.sampling import (
-    BORDER,
+    RUN,
     UNKNOWNS,
+    Pixels,
+    View,
     corner_slopes,
+    new_pixels,
     sample_model,
     side_length,
     write_corners,
 )
 from apriltag_tracker.detection.decoding import square_to_quad
 
-RESULT_VALUES = 8
+RESULT_VALUES = 9
 """Blur, smear x, smear y [px], explained share of all pixels, residual [grey levels], share of the
-weight that was kept, gain [grey levels], correlation of neighbouring residuals."""
+weight that was kept, gain [grey levels], correlation of neighbouring residuals, turn [rad]."""
 
-_BLUR, _SMEAR, _LINEAR = 8, 9, 11
-_MOST_PIXELS = 1700.0
+_BLUR, _SMEAR, _TURN, _LINEAR = 8, 9, 11, 12
+_LARGEST_STEP = 0.04
+"""Of the turn [rad]."""
+
+_MOST_PIXELS, _MOST_SMEARED = 1700.0, 2600.0
+"""Of the rectangle around a tag; a smear takes more of them to be told."""
+
 _LEAST_BLUR, _MOST_BLUR = 0.32, 4.0
 _QUANTISATION = 0.3
 """Standard deviation of the rounding to whole grey levels."""
 
-_SETTLED = 0.015
-"""Steps end when no corner moves further [px]; Gauss-Newton gains another digit with it."""
+_SETTLED = 0.03
+"""Steps end when no corner moves further [px]; what is left after such a step is a tenth of it."""
+
+_FEWEST = 60
+"""Pixels that a fit needs."""
 
 _BESIDE = 2
 """What covers a tag is blurred: pixels so near to what does not fit count no more either [px]."""
 
 _MODEL_ERROR = 0.004
 """What the model leaves out, whatever the noise, moves a corner by so much [px]."""
+
+_WIDE, _WIDE_ERROR = 0.8, 0.02
+"""Beyond this blur [px], what the model leaves out grows by so much a pixel of blur: lenses out of
+focus are no Gaussians, and what lies beyond the sheet's edge is blurred into the sheet."""
+
+_CAREFUL = 4
+"""Steps after which weights change by half only, so that they cannot go to and fro for ever."""
 
 
 @njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
@@ -56,7 +74,7 @@ def _weighted_normal(
     normal: NDArray[np.float64],
     right: NDArray[np.float64],
 ) -> None:
-    """Accumulate the normal equations from `first` on, without the smear if it is `held`."""
+    """Accumulate the normal equations from `first` on; smear and turn may be `held`."""
     for a in range(first, rows.shape[0]):
         if held and _SMEAR <= a < _LINEAR:
             continue
@@ -149,57 +167,64 @@ def _weigh_beside(
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def _weigh(
     residual: NDArray[np.float64],
-    values: NDArray[np.float64],
     weights: NDArray[np.float64],
     where: NDArray[np.int64],
     count: int,
-    result: NDArray[np.float64],
+    share: float,
 ) -> None:
-    """Take weight from what is far off; writes share explained, residual and weight kept.
+    """Take weight from what is far off; the new weights count by a share.
 
     Something that covers a part of the tag is blurred, too: what is beside it counts less as well.
     """
     limit = 3.5 * _typical(residual, count)
-    kept, square, all_square, mean = 0.0, 0.0, 0.0, 0.0
+    largest = 0.0
     for i in range(count):
         off = abs(residual[i])
-        weights[i] = 1.0 if off <= limit else (limit / off) ** 4
-        all_square += off * off
-        mean += values[i]
-    _weigh_beside(residual, 2.0 * limit, where, count, weights)
+        fresh = 1.0 if off <= limit else (limit / off) ** 4
+        weights[i] += share * (fresh - weights[i])
+        largest = max(largest, off)
+    if largest > 2.0 * limit:
+        _weigh_beside(residual, 2.0 * limit, where, count, weights)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _judge(
+    pixels: Pixels, count: int, move: NDArray[np.float64], result: NDArray[np.float64]
+) -> None:
+    """Take the last step off the residuals; write shares explained and kept, and the residual."""
+    values, weights, residual = pixels.values, pixels.weights, pixels.residual
+    for a in range(UNKNOWNS):
+        if move[a] != 0.0:
+            for i in range(count):
+                residual[i] -= move[a] * pixels.rows[a, i]
+    mean = values[:count].mean()
+    kept, square, all_square, whole = 0.0, 0.0, 0.0, 1e-9
     for i in range(count):
+        off = residual[i] ** 2
         kept += weights[i]
-        square += weights[i] * residual[i] ** 2
-    mean /= count
-    whole = 1e-9
-    for i in range(count):
+        square += weights[i] * off
+        all_square += off
         whole += (values[i] - mean) ** 2
     result[3] = 1.0 - all_square / whole
     result[4] = max(math.sqrt(square / max(kept - UNKNOWNS, 10.0)), _QUANTISATION)
     result[5] = kept / count
+    result[7] = _neighbours_alike(residual, weights, pixels.where, count)
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def _prepare(
-    rows: NDArray[np.float64],
-    values: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    residual: NDArray[np.float64],
-    where: NDArray[np.int64],
-    count: int,
-    result: NDArray[np.float64],
-) -> bool:
+def _prepare(pixels: Pixels, count: int, share: float, result: NDArray[np.float64]) -> bool:
     """Fit the light, write residuals and weights; derivatives become those of the grey level."""
+    rows, residual = pixels.rows, pixels.residual
     linear = np.zeros(4)
-    _linear_terms(rows, values, weights, count, linear)
+    _linear_terms(rows, pixels.values, pixels.weights, count, linear)
     gain = linear[1]
     result[6] = gain
     if gain < 4.0:
         return False
     for i in range(count):
-        seen = linear[0] + gain * rows[12, i] + linear[2] * rows[13, i] + linear[3] * rows[14, i]
-        residual[i] = values[i] - seen
-    _weigh(residual, values, weights, where, count, result)
+        seen = linear[0] + gain * rows[13, i] + linear[2] * rows[14, i] + linear[3] * rows[15, i]
+        residual[i] = pixels.values[i] - seen
+    _weigh(residual, pixels.weights, pixels.where, count, share)
     # The slopes of the light are small: derivatives take the gain of the tag's middle.
     for a in range(_LINEAR):
         for i in range(count):
@@ -209,7 +234,7 @@ def _prepare(
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def _hold_smear(normal: NDArray[np.float64], right: NDArray[np.float64]) -> None:
-    """Take the smear out of the unknowns."""
+    """Take smear and turn out of the unknowns."""
     for a in range(_SMEAR, _LINEAR):
         normal[a, :] = 0.0
         normal[:, a] = 0.0
@@ -228,6 +253,7 @@ def _advance(
     share = min(1.0, 1.5 / max(math.hypot(move[_SMEAR], move[_SMEAR + 1]), 1e-9))
     state[1] += share * move[_SMEAR]
     state[2] += share * move[_SMEAR + 1]
+    state[3] += min(max(move[_TURN], -_LARGEST_STEP), _LARGEST_STEP)
     h[:8] += move[:8]
     return float(abs(state[0] - before))
 
@@ -236,61 +262,81 @@ def _advance(
 def _finish(
     h: NDArray[np.float64],
     normal: NDArray[np.float64],
-    residual: float,
-    alike: float,
+    blur: float,
+    result: NDArray[np.float64],
     covariance: NDArray[np.float64],
 ) -> None:
     """Write the covariance of the corners."""
+    residual, alike = result[4], result[7]
     slopes = corner_slopes(h)
     spread = np.ascontiguousarray(np.linalg.inv(normal)[:8, :8])
     variance = residual**2 * ((1.0 + alike) / (1.0 - alike)) ** 2
     covariance[:] = variance * (slopes @ spread @ np.ascontiguousarray(slopes.T))
     for a in range(8):
-        covariance[a, a] += _MODEL_ERROR**2
+        covariance[a, a] += _MODEL_ERROR**2 + (_WIDE_ERROR * max(blur - _WIDE, 0.0)) ** 2
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def _write_normal(
-    rows: NDArray[np.float64],
-    residual: NDArray[np.float64],
-    weights: NDArray[np.float64],
+    pixels: Pixels,
     count: int,
     free_smear: bool,
     normal: NDArray[np.float64],
     right: NDArray[np.float64],
 ) -> None:
     """Write the normal equations of all unknowns that are free."""
-    _weighted_normal(rows, residual, weights, 0, count, not free_smear, normal, right)
+    _weighted_normal(
+        pixels.rows, pixels.residual, pixels.weights, 0, count, not free_smear, normal, right
+    )
     if not free_smear:
         _hold_smear(normal, right)
     for a in range(UNKNOWNS):
         normal[a, a] = normal[a, a] * (1.0 + 1e-9) + 1e-9
+    # Of a tag that hardly moves the turn's sign, and so the turn, is open.
+    normal[_TURN, _TURN] += 4.0
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def _rows_and_room(start: NDArray[np.float64], free_smear: bool) -> tuple[int, int]:
-    """Return of how many rows one is used, and for how many pixels there must be room.
-
-    Of a large tag every second or third row of pixels is enough, if its smear is not fitted.
-    """
+def _stride_and_room(start: NDArray[np.float64], free_smear: bool) -> tuple[int, int]:
+    """Return of how many runs of pixels one is used, and for how many there must be room."""
     wide = (start[:, 0].max() - start[:, 0].min()) * 1.3 + 4.0
     high = (start[:, 1].max() - start[:, 1].min()) * 1.3 + 4.0
-    stride = 1 + int(wide * high / _MOST_PIXELS) if not free_smear else 1
-    return stride, int(wide + 4.0) * int(high / stride + 4.0)
+    stride = 1 + int(wide * high / (_MOST_SMEARED if free_smear else _MOST_PIXELS))
+    return stride, int(high + 4.0) * int(wide / stride + 2.0 * RUN)
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def _begin(
     corners: NDArray[np.float64], result: NDArray[np.float64], free_smear: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the homography (9,), and blur and smear (3,) px, that a fit starts from."""
+    """Return the homography (9,), and blur, smear [px] and turn [rad] (4,), to start from."""
     h = np.empty(9)
     h[:8] = square_to_quad(corners)
     h[8] = 1.0
-    state = np.array([min(max(result[0], _LEAST_BLUR), _MOST_BLUR), result[1], result[2]])
+    blur = min(max(result[0], _LEAST_BLUR), _MOST_BLUR)
+    state = np.array([blur, result[1], result[2], result[8]])
     if not free_smear:
         state[1:] = 0.0
     return h, state
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _take(
+    view: View,
+    h: NDArray[np.float64],
+    state: NDArray[np.float64],
+    pixels: Pixels,
+    before: int,
+    step: int,
+    result: NDArray[np.float64],
+) -> int:
+    """Sample the pixels, fit the light and weigh; returns how many there are, 0 if too few."""
+    count = sample_model(view, h, state, pixels)
+    if count < _FEWEST:
+        return 0
+    if count != before:
+        pixels.weights[:count] = 1.0
+    return count if _prepare(pixels, count, 1.0 if step < _CAREFUL else 0.5, result) else 0
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -298,6 +344,7 @@ def align(
     image: NDArray[np.uint8],
     table: NDArray[np.float32],
     table_blur: float,
+    border: float,
     start: NDArray[np.float64],
     free_smear: bool,
     passes: int,
@@ -311,13 +358,14 @@ def align(
         image: grey image.
         table: of `pattern.tabulate`.
         table_blur: blur of the table [cells]; the fit's may differ by a few percent.
+        border: cells along the black border.
         start: (4, 2) px, corners to start from, from the printed lower left counter-clockwise.
-        free_smear: whether the smear is fitted; it cannot start from zero, where both of its
-            directions are alike.
+        free_smear: whether smear and turn are fitted; they cannot both start from zero, where the
+            directions of a smear are alike.
         passes: at most so many steps of Gauss-Newton.
         corners: (4, 2) px, output.
         covariance: (8, 8) px² of the corners x0 y0 x1 …, output.
-        result: (8,) output, see `RESULT_VALUES`; its first three say where to start.
+        result: (9,) output, see `RESULT_VALUES`; blur, smear and turn in it say where to start.
 
     Returns:
         Whether the fit settled.
@@ -326,35 +374,29 @@ def align(
     corners[:] = start - centre
     h, state = _begin(corners, result, free_smear)
     side = side_length(start)
-    stride, room = _rows_and_room(start, free_smear)
-    rows, values = np.empty((UNKNOWNS, room)), np.empty(room)
-    where = np.empty((2, room), dtype=np.int64)
-    weights, residual = np.ones(room), np.empty(room)
+    stride, room = _stride_and_room(start, free_smear)
+    cell = side / border
+    # The pixels that count stay the same while the blur changes: it is the start's.
+    view = View(image, table, table_blur, border, cell, 2.0 * state[0] / cell, stride, centre)
+    pixels = new_pixels(room)
     normal, right = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS)
-    settled, moved, count = False, 0.0, 0
-    for step in range(passes + 1):
-        before = count
-        count = sample_model(
-            image, h, state, table, table_blur, side / BORDER, stride, centre, rows, values, where
-        )
-        if count < 60:
+    moved, count = 0.0, 0
+    for step in range(passes):
+        count = _take(view, h, state, pixels, count, step, result)
+        if count == 0:
             return False
-        if count != before:
-            weights[:count] = 1.0
-        if not _prepare(rows, values, weights, residual, where, count, result):
-            return False
-        _write_normal(rows, residual, weights, count, free_smear, normal, right)
-        if settled or step == passes:
-            break
+        _write_normal(pixels, count, free_smear, normal, right)
+        move = np.linalg.solve(normal, right)
         last = corners.copy()
-        widened = _advance(state, h, np.linalg.solve(normal, right))
+        widened = _advance(state, h, move)
         write_corners(h, corners)
         moved = np.abs(corners - last).max()
         if not moved < 0.5 * side:
             return False
-        settled = moved < _SETTLED and widened < 0.03 * state[0]
-    result[:3] = state
-    result[7] = _neighbours_alike(residual, weights, where, count)
-    _finish(h, normal, result[4], result[7], covariance)
+        if moved < _SETTLED and widened < 0.03 * state[0]:
+            break
+    _judge(pixels, count, move, result)
+    result[:3], result[8] = state[:3], state[3]
+    _finish(h, normal, state[0], result, covariance)
     corners += centre
     return moved < 0.1

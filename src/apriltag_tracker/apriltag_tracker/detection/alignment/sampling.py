@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -10,11 +11,71 @@ from numpy.typing import NDArray
 
 from apriltag_tracker.detection.alignment.pattern import MARGIN
 
-UNKNOWNS = 15
-"""Homography (8), blur [px], smear x, y [px], offset, gain, slopes of the gain along both sides."""
+UNKNOWNS = 16
+"""Homography (8), blur [px], smear x, y [px], turn during the exposure [rad], and what is linear:
+offset, gain, slopes of the gain along both sides."""
 
-BORDER = 8.0
-"""Cells along the black border."""
+RUN = 4
+"""Neighbouring pixels of a row that are used or left out together."""
+
+_SPACING = 0.9
+"""Between the instants of a smear [px]; a blur of two thirds of it hides the steps."""
+
+
+class View(NamedTuple):
+    """A tag in a picture.
+
+    Attributes:
+        image: grey image.
+        table: of `pattern.tabulate`.
+        table_blur: blur of the table [cells].
+        border: cells along the black border.
+        cell: edge of a cell [px].
+        reach: so far from the edge of its margin a tag is looked at [cells].
+        stride: of so many runs of pixels one is used, another one in every row, so that edges of
+            all directions are seen.
+        centre: (2,) px, the origin of the homography's coordinates.
+    """
+
+    image: NDArray[np.uint8]
+    table: NDArray[np.float32]
+    table_blur: float
+    border: float
+    cell: float
+    reach: float
+    stride: int
+    centre: NDArray[np.float64]
+
+
+class Pixels(NamedTuple):
+    """What is known of the pixels of a tag.
+
+    Attributes:
+        rows: (16, n) derivatives of the bare pattern by homography, blur, smear and turn (not times
+            the gain), and the linear terms themselves.
+        values: (n,) grey levels.
+        where: (2, n) row and column in the image.
+        weights: (n,) of the fit.
+        residual: (n,) grey level less what the fit says.
+    """
+
+    rows: NDArray[np.float64]
+    values: NDArray[np.float64]
+    where: NDArray[np.int64]
+    weights: NDArray[np.float64]
+    residual: NDArray[np.float64]
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def new_pixels(room: int) -> Pixels:
+    """Return room for the pixels of a tag."""
+    return Pixels(
+        np.empty((UNKNOWNS, room)),
+        np.empty(room),
+        np.empty((2, room), dtype=np.int64),
+        np.ones(room),
+        np.empty(room),
+    )
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -75,13 +136,13 @@ def side_length(corners: NDArray[np.float64]) -> float:
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def _bounds(h: NDArray[np.float64]) -> tuple[float, float, float, float]:
+def _bounds(h: NDArray[np.float64], margin: float) -> tuple[float, float, float, float]:
     """Return the range of x and of y that a tag with its margin covers."""
     low_x = low_y = 1e9
     high_x = high_y = -1e9
     for k in range(4):
-        u = 1.0 + MARGIN / BORDER if k in {1, 2} else -MARGIN / BORDER
-        v = 1.0 + MARGIN / BORDER if k in {2, 3} else -MARGIN / BORDER
+        u = 1.0 + margin if k in {1, 2} else -margin
+        v = 1.0 + margin if k in {2, 3} else -margin
         w = h[6] * u + h[7] * v + 1.0
         x, y = (h[0] * u + h[1] * v + h[2]) / w, (h[3] * u + h[4] * v + h[5]) / w
         low_x, high_x = min(low_x, x), max(high_x, x)
@@ -137,11 +198,10 @@ def _look_up(
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def _pixels_of(
-    image: NDArray[np.uint8], h: NDArray[np.float64], centre: NDArray[np.float64]
-) -> tuple[int, int, int, int]:
+def _pixels_of(view: View, h: NDArray[np.float64]) -> tuple[int, int, int, int]:
     """Return the first and last row and column of the image that a tag with its margin covers."""
-    low_x, high_x, low_y, high_y = _bounds(h)
+    image, centre = view.image, view.centre
+    low_x, high_x, low_y, high_y = _bounds(h, MARGIN / view.border)
     return (
         max(int(low_y + centre[1]), 0),
         min(int(high_y + centre[1]) + 1, image.shape[0] - 1),
@@ -167,72 +227,80 @@ def _write_homography(
     rows[6, i], rows[7, i] = along * u * w, along * v * w
 
 
+@njit(cache=True, fastmath=True, inline="always")  # type: ignore[untyped-decorator]
+def _square_at(
+    back: NDArray[np.float64], x: float, y: float, border: float
+) -> tuple[float, float, float, float, float, float]:
+    """Return u, v of a pixel in the unit square, and their derivatives in cells a pixel."""
+    scale = 1.0 / (back[6] * x + back[7] * y + back[8])
+    u = (back[0] * x + back[1] * y + back[2]) * scale
+    v = (back[3] * x + back[4] * y + back[5]) * scale
+    cells = scale * border
+    return (
+        u,
+        v,
+        (back[0] - u * back[6]) * cells,
+        (back[1] - u * back[7]) * cells,
+        (back[3] - v * back[6]) * cells,
+        (back[4] - v * back[7]) * cells,
+    )
+
+
 @njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
 def sample_model(
-    image: NDArray[np.uint8],
-    h: NDArray[np.float64],
-    state: NDArray[np.float64],
-    table: NDArray[np.float32],
-    table_blur: float,
-    cell: float,
-    stride: int,
-    centre: NDArray[np.float64],
-    rows: NDArray[np.float64],
-    values: NDArray[np.float64],
-    where: NDArray[np.int64],
+    view: View, h: NDArray[np.float64], state: NDArray[np.float64], pixels: Pixels
 ) -> int:
-    """Write derivatives (15, n), grey levels (n,) and pixels (2, n) of what the tag covers.
+    """Write derivatives, linear terms, grey levels and places of the pixels that the tag covers.
 
-    Derivatives are those of the bare pattern by homography, blur and smear (not times the gain),
-    and the linear terms themselves; returns how many pixels there are.
+    Args:
+        view: the tag.
+        h: (9,) homography from the unit square to pixels about the view's centre.
+        state: (4,) blur and smear [px], turn during the exposure [rad].
+        pixels: output.
+
+    Returns:
+        How many pixels there are.
     """
-    size = table.shape[0]
-    resolution = (size - 1) // 10
-    smear_x, smear_y = state[1], state[2]
-    travel = math.hypot(smear_x, smear_y)
-    instants = 1 if travel < 1e-9 else int(travel / 0.6) + 3
+    table, centre, cell, rows = view.table, view.centre, view.cell, pixels.rows
+    border, whole = view.border, view.border + 2.0 * MARGIN
+    resolution = (table.shape[0] - 1) // int(whole)
     back = inverse(h)
-    reach = 2.0 * state[0] / cell
-    first_row, last_row, first, last = _pixels_of(image, h, centre)
+    change = state[0] / cell - view.table_blur
+    first_row, last_row, first, last = _pixels_of(view, h)
     count = 0
-    change = state[0] / cell - table_blur
-    for row in range(first_row, last_row + 1, stride):
+    for row in range(first_row, last_row + 1):
         y = row - centre[1]
-        for column in range(first, last + 1):
-            if count >= values.shape[0]:
-                return count
-            x = column - centre[0]
-            scale = 1.0 / (back[6] * x + back[7] * y + back[8])
-            u = (back[0] * x + back[1] * y + back[2]) * scale
-            v = (back[3] * x + back[4] * y + back[5]) * scale
-            # Derivatives of u, v by the pixel, in cells.
-            ux = (back[0] - u * back[6]) * scale * BORDER
-            uy = (back[1] - u * back[7]) * scale * BORDER
-            vx = (back[3] - v * back[6]) * scale * BORDER
-            vy = (back[4] - v * back[7]) * scale * BORDER
-            # In the table columns run to the right and rows down, from the margin's corner.
-            c = u * BORDER + MARGIN
-            r = (1.0 - v) * BORDER + MARGIN
-            dc, dr = ux * smear_x + uy * smear_y, -(vx * smear_x + vy * smear_y)
-            edge_c, edge_r = 0.5 * abs(dc) + reach, 0.5 * abs(dr) + reach
-            if c < edge_c or c > 10.0 - edge_c or r < edge_r or r > 10.0 - edge_r:
-                continue
-            value, by_c, by_r, by_blur, along_c, along_r = _look_up(
-                table, resolution, c, r, dc, dr, instants
-            )
-            value += by_blur * change
-            # Derivatives by the pixel.
-            gx, gy = by_c * ux - by_r * vx, by_c * uy - by_r * vy
-            w = 1.0 / (h[6] * u + h[7] * v + 1.0)
-            _write_homography(rows, count, gx, gy, u, v, w, gx * x + gy * y)
-            rows[8, count] = by_blur / cell
-            rows[9, count] = along_c * ux - along_r * vx
-            rows[10, count] = along_c * uy - along_r * vy
-            rows[11, count] = 1.0
-            rows[12, count] = value
-            rows[13, count] = value * (u - 0.5)
-            rows[14, count] = value * (v - 0.5)
-            values[count] = image[row, column]
-            where[0, count], where[1, count] = row, column
-            count += 1
+        start = first // RUN
+        for block in range(start + (-start - row) % view.stride, last // RUN + 1, view.stride):
+            for column in range(max(block * RUN, first), min(block * RUN + RUN - 1, last) + 1):
+                if count >= pixels.values.shape[0]:
+                    return count
+                x = column - centre[0]
+                u, v, ux, uy, vx, vy = _square_at(back, x, y, border)
+                # In the table columns run to the right and rows down, from the margin's corner.
+                c, r = u * border + MARGIN, (1.0 - v) * border + MARGIN
+                smear_x, smear_y = state[1] - state[3] * y, state[2] + state[3] * x
+                dc, dr = ux * smear_x + uy * smear_y, -(vx * smear_x + vy * smear_y)
+                edge_c, edge_r = 0.5 * abs(dc) + view.reach, 0.5 * abs(dr) + view.reach
+                if c < edge_c or c > whole - edge_c or r < edge_r or r > whole - edge_r:
+                    continue
+                travel = math.hypot(smear_x, smear_y)
+                instants = 1 if travel < 1e-9 else int(travel / _SPACING) + 3
+                value, by_c, by_r, by_blur, along_c, along_r = _look_up(
+                    table, resolution, c, r, dc, dr, instants
+                )
+                value += by_blur * change
+                # Derivatives by the pixel.
+                gx, gy = by_c * ux - by_r * vx, by_c * uy - by_r * vy
+                w = 1.0 / (h[6] * u + h[7] * v + 1.0)
+                _write_homography(rows, count, gx, gy, u, v, w, gx * x + gy * y)
+                rows[8, count] = by_blur / cell
+                rows[9, count] = along_c * ux - along_r * vx
+                rows[10, count] = along_c * uy - along_r * vy
+                rows[11, count] = x * rows[10, count] - y * rows[9, count]
+                rows[12, count], rows[13, count] = 1.0, value
+                rows[14, count], rows[15, count] = value * (u - 0.5), value * (v - 0.5)
+                pixels.values[count] = view.image[row, column]
+                pixels.where[0, count], pixels.where[1, count] = row, column
+                count += 1
     return count

@@ -9,8 +9,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from apriltag_tracker.detection.alignment.sampling import (
-    BORDER,
-    UNKNOWNS,
+    Pixels,
+    View,
+    new_pixels,
     sample_model,
     side_length,
 )
@@ -31,10 +32,39 @@ def _write_terms(grid: NDArray[np.float64], y: int, x: int, row: NDArray[np.floa
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
+def _best_change(
+    grid: NDArray[np.float64],
+    pixels: Pixels,
+    count: int,
+    low_x: int,
+    low_y: int,
+    best: NDArray[np.float64],
+) -> None:
+    """Fit the terms (5,) of `_write_terms` to the grey levels; the grid has the picture, or NaN."""
+    design, right = np.zeros((5, 5)), np.zeros(5)
+    row = np.empty(5)
+    for i in range(count):
+        y, x = pixels.where[0, i] - low_y, pixels.where[1, i] - low_x
+        if not (0 < y < grid.shape[0] - 1 and 0 < x < grid.shape[1] - 1):
+            continue
+        _write_terms(grid, y, x, row)
+        if not np.all(np.isfinite(row)):
+            continue
+        for a in range(5):
+            right[a] += row[a] * pixels.values[i]
+            for b in range(5):
+                design[a, b] += row[a] * row[b]
+    for a in range(5):
+        design[a, a] += 1e-6
+    best[:] = np.linalg.solve(design, right)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
 def guess_smear(
     image: NDArray[np.uint8],
     table: NDArray[np.float32],
     table_blur: float,
+    border: float,
     corners: NDArray[np.float64],
     blur: float,
     smear: NDArray[np.float64],
@@ -49,6 +79,7 @@ def guess_smear(
         image: grey image.
         table: of `pattern.tabulate`.
         table_blur: its blur [cells].
+        border: cells along the black border.
         corners: (4, 2) px of the fit.
         blur: of the fit [px].
         smear: (2,) px, output.
@@ -60,36 +91,22 @@ def guess_smear(
     h = np.empty(9)
     h[:8] = square_to_quad(corners - centre)
     h[8] = 1.0
-    cell = side_length(corners) / BORDER
+    cell = side_length(corners) / border
     low_x, low_y = int(corners[:, 0].min() - cell - 2), int(corners[:, 1].min() - cell - 2)
     high_x, high_y = int(corners[:, 0].max() + cell + 3), int(corners[:, 1].max() + cell + 3)
     room = (high_x - low_x + 1) * (high_y - low_y + 1)
     smear[:] = 0.0
-    rows, values = np.empty((UNKNOWNS, room)), np.empty(room)
-    where = np.empty((2, room), dtype=np.int64)
-    state = np.array([blur, 0.0, 0.0])
-    count = sample_model(image, h, state, table, table_blur, cell, 1, centre, rows, values, where)
+    pixels = new_pixels(room)
+    rows, where = pixels.rows, pixels.where
+    view = View(image, table, table_blur, border, cell, 2.0 * blur / cell, 1, centre)
+    count = sample_model(view, h, np.array([blur, 0.0, 0.0, 0.0]), pixels)
     if count < 60:
         return blur
     grid = np.full((high_y - low_y + 1, high_x - low_x + 1), np.nan)
     for i in range(count):
-        grid[where[0, i] - low_y, where[1, i] - low_x] = rows[12, i]
-    design, right = np.zeros((5, 5)), np.zeros(5)
-    row = np.empty(5)
-    for i in range(count):
-        y, x = where[0, i] - low_y, where[1, i] - low_x
-        if not (0 < y < grid.shape[0] - 1 and 0 < x < grid.shape[1] - 1):
-            continue
-        _write_terms(grid, y, x, row)
-        if not np.all(np.isfinite(row)):
-            continue
-        for a in range(5):
-            right[a] += row[a] * values[i]
-            for b in range(5):
-                design[a, b] += row[a] * row[b]
-    for a in range(5):
-        design[a, a] += 1e-6
-    best = np.linalg.solve(design, right)
+        grid[where[0, i] - low_y, where[1, i] - low_x] = rows[13, i]
+    best = np.empty(5)
+    _best_change(grid, pixels, count, low_x, low_y, best)
     return float(_split(best / max(best[4], 4.0), blur, smear))
 
 
