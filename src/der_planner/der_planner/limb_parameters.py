@@ -10,6 +10,10 @@ from dataclasses import dataclass, field
 
 from der_planner.limb_declaration import Term, parameter
 
+REST_SPREAD = math.radians(5.0)
+"""Of the rest angles of limbs that are made straight [rad]. Without gravity a log tells them to a
+fraction of this; under it a rest angle and a compliance bend the resting limb alike."""
+
 
 @dataclass(frozen=True)
 class Segment:
@@ -99,7 +103,7 @@ class Segment:
             "signed curvature at zero differential pressure, positive toward +y",
             "bend angle at rest / length; leave it to the calibration",
             fit=Term(
-                *("rest_angle", "rad", 0.02, -0.6, 0.6, math.inf, "linear"), per={"length": 1}
+                *("rest_angle", "rad", 0.02, -0.6, 0.6, REST_SPREAD, "linear"), per={"length": 1}
             ),
         ),
     )
@@ -123,6 +127,21 @@ class Segment:
             "0.01 takes away ringing that a real limb does not show; calibration with fast motion",
             least=0.0,
             fit=Term(*("material_damping", "s", 0.01, 0.0, 0.1, 0.02, "dynamics"), kept=True),
+        ),
+    )
+    swing_inertia: float = field(
+        default=1.0,
+        metadata=parameter(
+            "-",
+            "mass that resists acceleration over mass that weighs",
+            "1; less stands for friction, which stiffens small fast strokes; calibration",
+            above=0.0,
+            fit=Term(
+                *("log_inertia", "-", 0.1, -0.7, 0.7, 0.2, "dynamics"),
+                shared=True,
+                relative=True,
+                kept=True,
+            ),
         ),
     )
     gain_asymmetry: float = field(

@@ -210,3 +210,26 @@ def test_wrong_input_is_named():
         simulate(LIMB, TIME, commands=COMMANDS[:-1])
     with pytest.raises(ValueError, match="evenly spaced"):
         simulate(LIMB, TIME**2, commands=COMMANDS)
+
+
+@pytest.mark.parametrize("model", ["der", "pcc"])
+def test_mass_that_resists_and_mass_that_weighs_are_told_apart(model):
+    # What weighs 1 and resists 0.8 is what resists 0.8 and is pulled at 1 / 0.8 as strongly.
+    limb = everything().mounted("30")
+    slow = replace(limb, segments=tuple(replace(s, swing_inertia=0.8) for s in limb.segments))
+    same = replace(
+        limb,
+        gravity=tuple(g / 0.8 for g in limb.gravity),
+        segments=tuple(
+            replace(s, mass_per_length=0.8 * s.mass_per_length, damping=s.damping / 0.8)
+            for s in limb.segments
+        ),
+    )
+    time = np.arange(0.0, 2.0, 0.05)
+    pressures = 6000.0 * np.sin(np.outer(time, [3.0, 7.0]))
+    tips = [
+        simulate(each, time, pressures=pressures, model=model).tip for each in (slow, same, limb)
+    ]
+    assert tips[0] == pytest.approx(tips[1], abs=1e-8)
+    assert tips[0][0] == pytest.approx(tips[2][0], abs=1e-8)  # at rest it does not count
+    assert np.abs(tips[0] - tips[2]).max() > 1e-3

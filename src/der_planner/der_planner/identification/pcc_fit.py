@@ -90,7 +90,7 @@ def fit_pcc(limb: Limb, prepared: Prepared, offset: Array) -> tuple[tuple[Segmen
         diff_step=np.full(int(free.sum()), 1e-3),
         xtol=1e-3,
         ftol=1e-4,
-        max_nfev=4,
+        max_nfev=8,
     )
     found = put(solution.x)
     error = (angles(found) - prepared.log.bend_angles)[rows]

@@ -71,6 +71,8 @@ class Problem:
             if (term.group == "linear" or term.group in groups)
             and exists(segment, index, limb.segment_count)
             and not (term.name == "log_stiffness" and "mass" in groups)
+            # Without weight, or with an unknown mass, it is one scale with the stiffness.
+            and not (term.name == "log_inertia" and ("mass" in groups or not any(limb.gravity[:2])))
         ]
         self._scale = np.array([TERMS[index].scale for _, index in self._wanted])
         self._spread = np.array([TERMS[index].spread for _, index in self._wanted])

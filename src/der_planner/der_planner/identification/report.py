@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from der_planner.identification.air import AirFit
 from der_planner.identification.geometry import GeometryFit
 from der_planner.limb import Limb
+from der_planner.limb_parameters import REST_SPREAD
 from der_planner.model.sag import weight_of
 
 Array = NDArray[np.float64]
@@ -228,6 +229,22 @@ class FitReport:
             f"loads: weight tells stiffness from gain: {', '.join(told)}",
             f"loads: stiffness, gain and mass scale together, {kept} was given; condition of "
             f"gains, rest angles and stiffness or mass: {self.condition:.0f}",
+            *self._made_straight(),
+        ]
+
+    def _made_straight(self) -> list[str]:
+        """Say of which segments the stiffness rests on what is known of rest angles beforehand."""
+        alike = {frozenset(pair[:2]) for pair in self.strongly_correlated}
+        found = [
+            str(index)
+            for index in range(len(self.residual))
+            if {f"log_stiffness[{index}]", f"rest_angle[{index}]"} in alike
+        ]
+        if not found:
+            return []
+        return [
+            f"loads: weight and rest angle bend segment {', '.join(found)} alike here: the "
+            f"stiffness holds for a limb that was made straight, ± {math.degrees(REST_SPREAD):.0f}°"
         ]
 
     @property

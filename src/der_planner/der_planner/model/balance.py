@@ -71,7 +71,8 @@ class Balance:
         couple = self._edge_couples(q, v)
         normal = self.kinematics.edge_normals(q) / mesh.rest[:, None]
         pair = couple[..., None] * normal
-        force = mesh.node_mass[:, None] * (acceleration - mesh.gravity[:2])
+        force = mesh.swung_node_mass[:, None] * acceleration
+        force -= mesh.node_mass[:, None] * mesh.gravity[:2]
         force += mesh.node_damping[:, None] * velocity
         force[:, 1:] += pair
         force[:, :-1] -= pair

@@ -37,7 +37,8 @@ class Arcs(NamedTuple):
     owner: NDArray[np.int64]  # (P,) segment of each particle
     place: Vector  # (P,) fraction of its segment's length
     beyond: Vector  # (P,) distance past the segment's end, on the connector behind it
-    mass: Vector  # (P,)
+    mass: Vector  # (P,) that resists acceleration
+    weight: Vector  # (P,) mass that gravity pulls at
     drag: Vector  # (P,) damping coefficient [kg/s]
     gain: Vector  # (n,) moment per pressure [N·m/Pa]
     stiffness: Vector  # (n,) EI / L
@@ -130,7 +131,8 @@ def inertia(q: Vector, v: Vector, arcs: Arcs) -> tuple[Vector, Vector, Vector, V
                 total += H[i, k] * v[k]
             rate[i] = total
         for i in range(last):
-            torque[i] += mass * (J[i].real * arcs.gravity[0] + J[i].imag * arcs.gravity[1])
+            pulled = J[i].real * arcs.gravity[0] + J[i].imag * arcs.gravity[1]
+            torque[i] += arcs.weight[p] * pulled
             for k in range(last):
                 product = J[i].real * J[k].real + J[i].imag * J[k].imag
                 M[i, k] += mass * product
@@ -166,7 +168,7 @@ def acceleration(q: Vector, v: Vector, torque: Vector, arcs: Arcs) -> Vector:
             turning += H[i, i] * v[i] * v[i]
             for k in range(i):
                 turning += 2.0 * H[i, k] * v[i] * v[k]
-        felt = mass * (pull - turning) - arcs.drag[p] * velocity
+        felt = arcs.weight[p] * pull - mass * turning - arcs.drag[p] * velocity
         for i in range(last):
             force[i] += J[i].real * felt.real + J[i].imag * felt.imag
             for k in range(i + 1):
@@ -262,7 +264,7 @@ def force_slopes(q: Vector, v: Vector, a: Vector, arcs: Arcs) -> tuple[Vector, V
         mass, drag, last = arcs.mass[p], arcs.drag[p], arcs.owner[p] + 1
         point = point_derivatives(q, arcs, frame, p, slopes, J, H)
         _third(q, v, arcs, frame, p, point, slopes[2], H, third)
-        speed, acceleration_ = 0.0 + 0.0j, -pull
+        speed, acceleration_ = 0.0 + 0.0j, 0.0 + 0.0j
         for s in range(last):
             turn, push = 0.0 + 0.0j, 0.0 + 0.0j
             for k in range(last):
@@ -271,7 +273,7 @@ def force_slopes(q: Vector, v: Vector, a: Vector, arcs: Arcs) -> tuple[Vector, V
             turning[s], pushing[s] = turn, push
             speed += J[s] * v[s]
             acceleration_ += J[s] * a[s] + turn * v[s]
-        felt = mass * acceleration_ + drag * speed
+        felt = mass * acceleration_ - arcs.weight[p] * pull + drag * speed
         for i in range(last):
             for s in range(last):
                 moved = mass * (pushing[s] + third[s]) + drag * turning[s]

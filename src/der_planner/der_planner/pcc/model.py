@@ -68,28 +68,31 @@ class Pcc:
 
     def _arcs(self, fractions: Vector, weights: Vector) -> Arcs:
         """Return the numbers of the kernels; a segment's mass sits at fractions of its length."""
-        # owner, place, beyond, mass and drag of every particle
-        particles: list[tuple[int, float, float, float, float]] = []
+        # owner, place, beyond, mass, weight and drag of every particle
+        particles: list[tuple[int, float, float, float, float, float]] = []
         for j, segment in enumerate(self.limb.segments):
             for place, weight in zip(fractions, weights * self.masses[j], strict=True):
-                particles.append((j, place, 0.0, weight, weight * segment.damping))
+                mass = weight * segment.swing_inertia
+                particles.append((j, place, 0.0, mass, weight, weight * segment.damping))
             if j and self.connector:
                 # Two Gauss points carry the moments of a straight piece exactly.
                 before = self.limb.segments[j - 1]
                 half = 0.25 * self.connector * (before.mass_per_length + segment.mass_per_length)
                 drag = 0.5 * half * (before.damping + segment.damping)
+                mass = 0.5 * half * (before.swing_inertia + segment.swing_inertia)
                 for share in (0.5 - np.sqrt(1 / 12), 0.5 + np.sqrt(1 / 12)):
-                    particles.append((j - 1, 1.0, share * self.connector, half, drag))
+                    beyond = share * self.connector
+                    particles.append((j - 1, 1.0, beyond, mass, half, drag))
         particles += [
-            (*self._place(item.arc_length), item.mass, 0.0)
+            (*self._place(item.arc_length), item.mass, item.mass, 0.0)
             for item in self.limb.masses
             if item.arc_length > self.base
         ]
-        owner, place, beyond, mass, drag = np.array(particles, dtype=float).T.copy()
+        owner, place, beyond, masses, pulled, drag = np.array(particles, dtype=float).T.copy()
         return Arcs(
             self.lengths, self.connector, np.array(self.limb.gravity[:2], dtype=float),
-            owner.astype(np.int64), place, beyond, mass, drag, self.gain, self.stiffness,
-            self.cubic, self.rest, self.material_damping,
+            owner.astype(np.int64), place, beyond, masses, pulled, drag, self.gain,
+            self.stiffness, self.cubic, self.rest, self.material_damping,
         )  # fmt: skip
 
     def _place(self, arc_length: float) -> tuple[int, float, float]:
@@ -203,7 +206,7 @@ class Pcc:
         slopes = kernels.arc_slopes(q, arcs, frame, 2)
         J, H = np.zeros(q.size, dtype=complex), np.zeros((q.size, q.size), dtype=complex)
         potential = 0.0
-        for p, mass in enumerate(arcs.mass):
+        for p, mass in enumerate(arcs.weight):
             point = self.base + kernels.point_derivatives(q, arcs, frame, p, slopes, J, H)
             potential -= mass * (point.real * arcs.gravity[0] + point.imag * arcs.gravity[1])
         return float(0.5 * v @ M @ v + elastic + potential)

@@ -20,7 +20,8 @@ class Mesh:
     Attributes:
         rest: (N-1,) edge lengths at rest.
         axial: (N-1,) EA of each edge.
-        edge_mass: (N-1,) mass of each edge.
+        edge_mass: (N-1,) mass of each edge, which weighs and is damped.
+        swung_mass: (N-1,) mass with which each edge resists acceleration.
         edge_inertia: (N-1,) moment of inertia of each edge about its tangent.
         edge_damping: (N-1,) mass-proportional damping rate.
         bend: (N,) EI / l of each node (0 where the rod does not bend, as at a free end).
@@ -41,6 +42,7 @@ class Mesh:
     rest: Array
     axial: Array
     edge_mass: Array
+    swung_mass: Array
     edge_inertia: Array
     edge_damping: Array
     bend: Array
@@ -65,7 +67,7 @@ class Mesh:
     @property
     def mass_diagonal(self) -> Array:
         """(4N-1,) M."""
-        return interleave(self.node_mass, self.edge_inertia)
+        return interleave(self.swung_node_mass, self.edge_inertia)
 
     @property
     def damping_diagonal(self) -> Array:
@@ -82,8 +84,16 @@ class Mesh:
 
     @property
     def node_mass(self) -> Array:
-        """(N,) half the mass of the edges at each node, and what it carries."""
-        half = 0.5 * self.edge_mass
+        """(N,) half the mass of the edges at each node, and what it carries: what weighs."""
+        return self._on_nodes(self.edge_mass)
+
+    @property
+    def swung_node_mass(self) -> Array:
+        """(N,) the same of what resists acceleration."""
+        return self._on_nodes(self.swung_mass)
+
+    def _on_nodes(self, of_edges: Array) -> Array:
+        half = 0.5 * of_edges
         total: Array = np.append(half, 0.0) + np.append(0.0, half) + self.point_mass
         return total
 
@@ -199,6 +209,7 @@ def uniform_mesh(
         rest=np.full(nodes - 1, step),
         axial=np.full(nodes - 1, float(EA)),
         edge_mass=edge_mass,
+        swung_mass=edge_mass,
         edge_inertia=edge_mass * (2.0 * EI / EA),
         edge_damping=np.full(nodes - 1, not_negative(damping, "damping")),
         bend=EI * inverse,
@@ -286,6 +297,7 @@ def limb_mesh(limb: Limb, nodes: int, clamp: str) -> Mesh:
         rest=rest,
         axial=of_edges("axial_stiffness"),
         edge_mass=edge_mass,
+        swung_mass=edge_mass * of_edges("swing_inertia"),
         edge_inertia=edge_mass * polar,
         edge_damping=of_edges("damping"),
         bend=bend,

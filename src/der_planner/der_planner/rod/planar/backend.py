@@ -31,7 +31,7 @@ class PlanarBackend:
         self.fixed = np.array([*range(self.offset), *fixed], dtype=np.int64)
         self.free = np.array([d for d in self.index if d not in held], dtype=np.int64)
         self.free_rows = self.rows(self.free)
-        self.mass = np.concatenate([np.zeros(self.offset), np.repeat(mesh.node_mass, 2)])
+        self.mass = np.concatenate([np.zeros(self.offset), np.repeat(mesh.swung_node_mass, 2)])
         self.damping = np.concatenate([np.zeros(self.offset), np.repeat(mesh.node_damping, 2)])
         first = [first + ghost for first, _ in mesh.segments]
         last = [first + count - 2 + ghost for first, count in mesh.segments]
