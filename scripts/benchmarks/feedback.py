@@ -2,9 +2,10 @@
 
 On the whole graph: what estimate and replan took for each setpoint that was revised, and the time
 from the instant of a picture to the first command at the board that knows of it. Then, in one
-process, twins play with the default limb's file, as if nobody had calibrated them, and with their
-own. The cost is that of `measure` and `command` together, as the planner calls them for one
-setpoint.
+process, calibrated twins play every motion in open loop, with feedback, as learned from two runs,
+and as learned with feedback; and the first motion with the default limb's file, as if nobody had
+calibrated them. The cost is that of `measure` and `command` together, as the planner calls them for
+one setpoint.
 """
 
 from __future__ import annotations
@@ -17,10 +18,11 @@ import time
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from der_planner.control import Learner
 from der_planner.control.feedback import Feedback
-from der_planner.control.lockstep import play
+from der_planner.control.lockstep import Sensors, play
 from der_planner.identification.offline import calibrate_twin
 from der_planner.limb import Limb
 from der_planner.planning import Motion, Plan, plan
@@ -29,8 +31,13 @@ from der_planner.runs.record import ESTIMATE_TYPE
 from der_planner.runs.recording.reader import BagReader
 from der_planner.twin.offline import OfflineTwin
 
+Array = NDArray[np.float64]
+
 SEEDS = (101, 102, 103)
 PERIODS = (20.0, 6.0)
+LEARNED_FROM = 2
+"""Runs in open loop that a plan is learned from."""
+WAYS = ("open_loop", "feedback", "learned", "learned_feedback")
 _REST = 1.0
 """A twin is vented for so long before its plan is played [s]."""
 
@@ -104,33 +111,55 @@ def _solve_times(bag: Path) -> np.ndarray:
         return np.array([message.solve_time for _, _, message in reader.messages(topics)])
 
 
+def _learned(planned: Plan, seed: int) -> Plan:
+    """Return the plan after runs of it, as a camera would have seen them."""
+    learner, noise = Learner(planned), Sensors().tip_noise
+    for run in range(LEARNED_FROM):
+        tip = play(planned, _twin(seed)).tip
+        generator = np.random.default_rng([seed, run])
+        learner.add(planned.time, tip + noise * generator.standard_normal(tip.shape))
+        planned = learner.next()
+        if learner.stopped:
+            break
+    return planned
+
+
+def _errors(seed: int, limb: Limb, case: str, period: float, ways: int) -> tuple[Array, Array]:
+    """Return mean tip errors [m] in the first ``ways`` of `WAYS`, and what commands took [s]."""
+    planned = plan(limb, Motion.named(case, period=period, cycles=1))
+    errors, took = [], []
+    for again in range(ways // 2):
+        each = _learned(planned, seed) if again else planned
+        feedback = _Timed(each)
+        errors.append(play(each, _twin(seed)).error.mean())
+        errors.append(play(each, _twin(seed), feedback).error.mean())
+        took += feedback.took
+    return np.array(errors), np.array(took)
+
+
 def run(quick: bool = False) -> dict[str, float]:
     """Print mean tip errors with and without feedback, and the cost of a command; return all."""
     figures = _on_the_graph()
     for name, value in figures.items():
         unit, scale = ("ms", 1e3) if name.endswith("_s") else ("cm", 1e2)
         print(f"  {name.rpartition('_')[0]:<42} {value * scale:8.3f} {unit}", flush=True)
-    took: list[float] = []
-    seeds = SEEDS[:1] if quick else SEEDS
-    limbs = {"calibrated": {seed: calibrate_twin(seed, Limb.default())[0] for seed in seeds}}
-    limbs["default"] = dict.fromkeys(seeds, Limb.default())
-    print("mean tip error in cm over the twins: open loop, feedback")
-    for name, by_seed in limbs.items():
-        for period in PERIODS[:1] if quick else PERIODS:
-            for case in JOINT_MOTIONS[:1] if quick else JOINT_MOTIONS:
-                errors = []
-                for seed, limb in by_seed.items():
-                    planned = plan(limb, Motion.named(case, period=period, cycles=1))
-                    feedback = _Timed(planned)
-                    alone = play(planned, _twin(seed)).error.mean()
-                    errors.append((alone, play(planned, _twin(seed), feedback).error.mean()))
-                    took += feedback.took
-                alone, corrected = np.mean(errors, axis=0)
-                key = f"{name}_{case}_{period:.0f}s"
-                figures[f"{key}_open_loop_m"] = float(alone)
-                figures[f"{key}_feedback_m"] = float(corrected)
-                print(f"  {key:<42} {alone * 100:8.3f} {corrected * 100:8.3f}", flush=True)
-    median, late = np.quantile(took, [0.5, 0.99])
+    seeds, periods = (SEEDS[:1], PERIODS[:1]) if quick else (SEEDS, PERIODS)
+    cases = JOINT_MOTIONS[:1] if quick else JOINT_MOTIONS
+    limbs = {seed: calibrate_twin(seed, Limb.default())[0] for seed in seeds}
+    table = [("calibrated", limbs, case, period, 4) for period in periods for case in cases]
+    table.append(("default", dict.fromkeys(seeds, Limb.default()), cases[0], periods[0], 2))
+    print(f"mean tip error in cm over the twins: {', '.join(WAYS)}; most of any twin's")
+    took = []
+    for name, by_seed, case, period, ways in table:
+        rows = [_errors(seed, limb, case, period, ways) for seed, limb in by_seed.items()]
+        errors = np.array([row[0] for row in rows])
+        took += [row[1] for row in rows]
+        key = f"{name}_{case}_{period:.0f}s"
+        for way, mean in zip(WAYS, errors.mean(axis=0), strict=False):
+            figures[f"{key}_{way}_m"] = float(mean)
+        told = [" ".join(f"{100 * x:7.3f}" for x in row) for row in (errors.mean(0), errors.max(0))]
+        print(f"  {key:<38} {told[0]}  ; {told[1]}", flush=True)
+    median, late = np.quantile(np.concatenate(took), [0.5, 0.99])
     figures["command_median_s"], figures["command_p99_s"] = float(median), float(late)
     print(f"estimate and replan: median {median * 1e3:.1f} ms, p99 {late * 1e3:.1f} ms")
     return figures

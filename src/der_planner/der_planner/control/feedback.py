@@ -18,7 +18,7 @@ from threadpoolctl import ThreadpoolController
 
 from der_planner.control.chambers import ChamberLog
 from der_planner.control.estimation import Estimator
-from der_planner.control.horizon import Allowed, Horizon
+from der_planner.control.horizon import Allowed, Horizon, settings_of
 from der_planner.control.knowledge import Estimate
 from der_planner.control.nominal import Nominal
 from der_planner.control.supervision import Limits, Supervisor, Warned
@@ -53,7 +53,7 @@ class Feedback:
         self._supervisor = Supervisor(limits, authority)
         self._chambers = ChamberLog(self._nominal)
         self._estimator = Estimator(self._nominal, self._chambers)
-        self._horizon = Horizon(self._nominal, self._chambers)
+        self._horizon = Horizon(self._nominal, self._chambers, settings_of(plan))
         self._horizon.warm_up(self._estimator.beginning(0), self._allowed)
 
     @property

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from der_planner.control.chambers import ChamberLog
 from der_planner.control.estimation import Estimator
+from der_planner.control.knowledge import EstimatorSettings
 from der_planner.control.nominal import STEP, Nominal
 from der_planner.model.drive import STEPS
 from der_planner.model.series import CONTROL_PERIOD
@@ -20,6 +21,9 @@ from der_planner.planning.result import Plan
 
 Array = NDArray[np.float64]
 
+_SLOW = EstimatorSettings(missing_density=100.0)
+"""What the model lacks changes more slowly than feedback reckons with, so that a gain that is lower
+shows as a gain."""
 _WHOLE = 1e6
 """A history that is longer than any run [s]."""
 _BEFORE = 1.0
@@ -101,7 +105,7 @@ def smooth(plan: Plan, filmed: Filmed) -> Smoothed:
     """
     nominal = Nominal(plan)
     chambers = ChamberLog(nominal, kept=_WHOLE)
-    estimator = Estimator(nominal, chambers, history=_WHOLE)
+    estimator = Estimator(nominal, chambers, _SLOW, history=_WHOLE)
     for time, pressures in zip(filmed.pressure_time, filmed.differential_pressure, strict=True):
         chambers.read(float(time), pressures)
     seen = np.isfinite(filmed.tip).all(axis=1) & (filmed.picture_time > -_BEFORE)

@@ -26,7 +26,9 @@ from der_planner.control.nominal import Nominal
 from der_planner.model import air, material
 from der_planner.model.drive import STEPS
 from der_planner.model.series import CONTROL_PERIOD
+from der_planner.planning.plan_file import LEARNED
 from der_planner.planning.quadratic import UnsolvedError, minimise
+from der_planner.planning.result import Plan
 
 Array = NDArray[np.float64]
 
@@ -46,6 +48,17 @@ class HorizonSettings:
     bend: float = 0.004
     change: float = 5e-6
     smoothness: float = 5e-6
+
+
+def settings_of(plan: Plan) -> HorizonSettings:
+    """Return sizes and weights for a plan.
+
+    A learned plan already makes up for what repeats, the chambers' slowness too, which is held to
+    be news here: its corrections are to be slow.
+    """
+    if plan.method.startswith(LEARNED):
+        return HorizonSettings(change=2e-5, smoothness=2e-5)
+    return HorizonSettings()
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ class EstimatorSettings:
     tip_noise: float = 3e-4
     pressure_density: float = 15.0
     missing_first: float = 600.0
-    missing_density: float = 100.0
+    missing_density: float = 250.0
     gain_first: float = 0.15
     gain_density: float = 0.01
     tip_first: float = 3e-3
