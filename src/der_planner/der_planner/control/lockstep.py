@@ -50,8 +50,7 @@ class Plant(Protocol):
 class Sensors:
     """What camera and board show, and when it is known.
 
-    The noise is that of the tracker on rendered pictures (`src/apriltag_tracker/README.md`): no tip
-    is off by more than 0.05 mm there.
+    The noise is twice that of the tracker on rendered pictures (`src/apriltag_tracker/README.md`).
 
     Attributes:
         frame_rate: of the camera [Hz].

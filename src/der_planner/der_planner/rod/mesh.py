@@ -257,15 +257,13 @@ def _cells(rest: Array, ghost: bool) -> Array:
 
 def limb_mesh(limb: Limb, nodes: int, clamp: str) -> Mesh:
     """Return the mesh of `Rod.from_limb`; see there for the arguments."""
-    count = limb.segment_count
-    least = 3 * count
+    least = 3 * limb.segment_count
     require(isinstance(nodes, (int, np.integer)) and nodes >= least, "nodes",
-            f"an int of {least} or more for {count} segments", nodes)  # fmt: skip
+            f"an int of {least} or more for {limb.segment_count} segments", nodes)  # fmt: skip
     owner, rest, pairs = _segment_edges(limb, nodes)
     ghost = clamp == "ghost"
-    rigid = limb.connector_length > 0.0
     # What bends at a node is half of each edge beside it; a rigid connector does not bend.
-    half = np.where((owner < 0) & rigid, 0.0, 0.5 * rest)
+    half = np.where((owner < 0) & (limb.connector_length > 0.0), 0.0, 0.5 * rest)
     before, after = np.append(0.0, half), np.append(half, 0.0)
     before[-1] = after[-1] = 0.0
     if not ghost:

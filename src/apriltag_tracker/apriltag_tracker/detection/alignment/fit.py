@@ -3,7 +3,7 @@
 The model of a pixel is offset + (gain + slopes) × the printed pattern, seen through a homography,
 a Gaussian blur and a linear smear (the mean along the way that the tag goes during the exposure).
 All of it is fitted to the grey levels by Gauss-Newton with analytic derivatives; pixels that do not
-fit, such as those of a thing that covers the tag, lose their weight. The covariance of the corners
+fit, as where something covers the tag, lose their weight. The covariance of the corners
 is that of the fit: noise of the pixels, as the residuals show it, through the same derivatives.
 """
 
