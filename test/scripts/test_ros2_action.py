@@ -68,7 +68,8 @@ def player():
 
 @pytest.mark.graph
 def test_actions_are_listed(player: Player):
-    assert listed(f"/play [{TYPE}]", "action", "list", "-t") == [f"/play [{TYPE}]"]
+    # Others may be there: a planner of another test that was killed a moment ago.
+    assert f"/play [{TYPE}]" in listed(f"/play [{TYPE}]", "action", "list", "-t")
 
 
 @pytest.mark.graph
