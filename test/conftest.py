@@ -82,20 +82,22 @@ class Graph:
 
 
 @pytest.fixture
-def graph(tmp_path: Path) -> Iterator[Graph]:
+def graph(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Graph]:
     """Return a `Graph` whose processes end with the test."""
     from domain import own_domain
 
-    running = Graph(tmp_path, own_domain())
+    running = Graph(tmp_path, own_domain(request.path))
     yield running
     running.close()
 
 
 @pytest.fixture(scope="module")
-def lasting_graph(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Graph]:
+def lasting_graph(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Graph]:
     """Return a `Graph` that all tests of a module share."""
     from domain import own_domain
 
-    running = Graph(tmp_path_factory.mktemp("graph"), own_domain())
+    running = Graph(tmp_path_factory.mktemp("graph"), own_domain(request.path))
     yield running
     running.close()

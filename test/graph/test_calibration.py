@@ -18,7 +18,7 @@ pytestmark = pytest.mark.graph
 
 
 def calibrate(out: Path, excitation: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    domain = str(own_domain())
+    domain = str(own_domain(__file__))
     return subprocess.run(
         [
             sys.executable,

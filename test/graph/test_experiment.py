@@ -38,7 +38,7 @@ class Experiment:
     def __init__(self, folder: Path, *arguments: str) -> None:
         self.out = folder / "out"
         self.marker = f"TEST_EXPERIMENT={folder}"
-        domain = str(own_domain())
+        domain = str(own_domain(__file__))
         name, value = self.marker.split("=", 1)
         self._process = subprocess.Popen(
             [

@@ -19,7 +19,7 @@ from domain import own_domain
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMAND = ROOT / "scripts" / "ros2"
-DOMAIN = own_domain()
+DOMAIN = own_domain(__file__)
 TIMEOUT = 120.0
 # Where the real tool is installed, the stand-in is tested all the same.
 ENVIRONMENT = {**os.environ, "ROS_DOMAIN_ID": str(DOMAIN), "DER_LIMB_ROS2_HANDED_OVER": "1"}

@@ -1,17 +1,24 @@
-"""The ROS domain of this process's tests: tests that run side by side do not hear each other."""
+"""The ROS domain of a test file: tests beside each other or one after the other do not mix."""
 
 from __future__ import annotations
 
 import os
+import zlib
+from pathlib import Path
 
 # 102 to 231 collides with ephemeral ports on Linux; 0 to 20 is where people work.
 FIRST, COUNT = 21, 80
 
 
-def own_domain() -> int:
-    """Return TEST_DOMAIN_ID, or a number by the process; workers side by side get neighbours."""
+def own_domain(file: str | Path) -> int:
+    """Return the domain of a test file in this session and worker.
+
+    Files have domains of their own, so that nothing that a test of another file left behind is
+    heard, and workers side by side have even and odd ones. TEST_DOMAIN_ID fixes the number for all.
+    """
+    if fixed := os.environ.get("TEST_DOMAIN_ID"):
+        return int(fixed)
     worker = os.environ.get("PYTEST_XDIST_WORKER")
     session = os.getpid() if worker is None else os.getppid()
-    first = int(os.environ.get("TEST_DOMAIN_ID", FIRST + session % COUNT))
     place = 0 if worker is None else int(worker.removeprefix("gw"))
-    return FIRST + (first - FIRST + place) % COUNT
+    return FIRST + (session + 2 * zlib.crc32(Path(file).name.encode()) + place) % COUNT
