@@ -51,17 +51,19 @@ def shared_data() -> Path:
 
 
 class Graph:
-    """Starts nodes in a domain of its own and talks to them.
+    """Starts nodes in the domain of a test file and talks to them.
 
     ``client`` is the orchestrator's own `GraphClient`: wait_for, wait_ready, subscribe, call.
     """
 
-    def __init__(self, folder: Path, domain_id: int) -> None:
+    def __init__(self, folder: Path, file: Path) -> None:
+        from domain import own_domain
+
         from der_planner.experiment.client import GraphClient
 
-        self.domain_id = domain_id
+        self.domain_id = own_domain(file)
         self.folder = folder
-        self.client = GraphClient("test", domain_id=domain_id)
+        self.client = GraphClient("test", domain_id=self.domain_id)
         self.processes = []
 
     def start(self, package: str, executable: str, name: str = "", remap=None, **parameters):
@@ -84,9 +86,7 @@ class Graph:
 @pytest.fixture
 def graph(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Graph]:
     """Return a `Graph` whose processes end with the test."""
-    from domain import own_domain
-
-    running = Graph(tmp_path, own_domain(request.path))
+    running = Graph(tmp_path, request.path)
     yield running
     running.close()
 
@@ -96,8 +96,6 @@ def lasting_graph(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Graph]:
     """Return a `Graph` that all tests of a module share."""
-    from domain import own_domain
-
-    running = Graph(tmp_path_factory.mktemp("graph"), own_domain(request.path))
+    running = Graph(tmp_path_factory.mktemp("graph"), request.path)
     yield running
     running.close()

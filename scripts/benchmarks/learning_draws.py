@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from der_planner.control import Learner
 from der_planner.limb import Limb, Segment
+from der_planner.limb_days import on_another_day
 from der_planner.model.response import simulate
 from der_planner.planning import Motion, Plan, plan
 from der_planner.planning.motions import JOINT_MOTIONS
@@ -39,11 +40,10 @@ def _drawn(limb: Limb, generator: np.random.Generator) -> Limb:
 
     def segment(known: Segment) -> Segment:
         stiffness = known.bending_stiffness * draw(0.85, 1.2)
+        day = on_another_day(known, generator.standard_normal(), generator.standard_normal())
         return replace(
-            known,
+            day,
             bending_stiffness=stiffness,
-            moment_gain=known.moment_gain * float(np.exp(0.35 * generator.standard_normal())),
-            rest_curvature=float(np.radians(6.0) * generator.standard_normal()) / known.length,
             gain_asymmetry=draw(-0.08, 0.08),
             friction_moment=draw(0.02, 0.12) * 0.5 * stiffness / known.length,
             friction_curvature=draw(0.05, 0.25) / known.length,

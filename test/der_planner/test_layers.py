@@ -11,6 +11,7 @@ LAYERS = {
     "limb_declaration": 0,
     "limb_loads": 1,
     "limb_parameters": 1,
+    "limb_days": 2,
     "limb": 2,
     "rod": 3,
     "pcc": 3,

@@ -14,7 +14,7 @@ leaves anyhow, over as many setpoints as it stays alike. The limb file itself is
 
 from __future__ import annotations
 
-import math
+import functools
 from dataclasses import replace
 
 import numpy as np
@@ -22,18 +22,12 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from der_planner.limb import Limb, LimbError, Segment
+from der_planner.limb_days import LARGEST_CHANGES, on_another_day
 from der_planner.planning.correction import Correction
 from der_planner.planning.errors import PlanningError
 
 Array = NDArray[np.float64]
 
-GAIN_SPREAD = 0.35
-"""From one day to another, of the logarithm of a gain: a real limb's changed by up to a half."""
-REST_SPREAD = math.radians(6.0)
-"""Of a rest angle: those of a real limb wander by so much [rad]."""
-LARGEST_GAIN_CHANGE = 4.0
-"""Factor beyond which no fit looks."""
-LARGEST_REST_CHANGE = math.radians(35.0)
 FAR = 3e-3
 """Mean distance [m] between measured and expected tip beyond which a model is adapted."""
 _ERROR = 2e-3
@@ -64,12 +58,18 @@ def adapted(correction: Correction, commands: Array, tip: Array) -> Correction |
     limb = correction.limb
     size = 2 * limb.segment_count
 
-    def missed(x: Array) -> Array:
+    # Each simulation is asked for by errors, slopes and comparisons at the same unknowns.
+    @functools.cache
+    def missed_at(key: bytes) -> Array:
         try:
-            gap = correction.of(moved(limb, x)).expected(commands).tip[seen] - tip[seen]
+            model = correction.of(moved(limb, np.frombuffer(key)))
+            gap = model.expected(commands).tip[seen] - tip[seen]
         except (PlanningError, LimbError):
             gap = np.full((int(seen.sum()), 2), np.nan)
         return np.where(np.isfinite(gap), gap, _UNFOLLOWED)
+
+    def missed(x: Array) -> Array:
+        return missed_at(x.tobytes())
 
     def residual(x: Array) -> Array:
         return np.concatenate([missed(x).ravel() / (_ERROR * np.sqrt(_ALIKE)), x])
@@ -84,8 +84,7 @@ def adapted(correction: Correction, commands: Array, tip: Array) -> Correction |
     before = far(np.zeros(size))
     if before < FAR:
         return None
-    largest = (math.log(LARGEST_GAIN_CHANGE) / GAIN_SPREAD, LARGEST_REST_CHANGE / REST_SPREAD)
-    bound = np.tile(largest, limb.segment_count)
+    bound = np.tile(LARGEST_CHANGES, limb.segment_count)
     found = least_squares(
         residual,
         np.zeros(size),
@@ -108,11 +107,7 @@ def moved(limb: Limb, x: Array) -> Limb:
 
     def each(segments: tuple[Segment, ...]) -> tuple[Segment, ...]:
         return tuple(
-            replace(
-                segment,
-                moment_gain=segment.moment_gain * float(np.exp(GAIN_SPREAD * gain)),
-                rest_curvature=segment.rest_curvature + float(REST_SPREAD * rest) / segment.length,
-            )
+            on_another_day(segment, gain, rest)
             for segment, (gain, rest) in zip(segments, x.reshape(-1, 2), strict=True)
         )
 

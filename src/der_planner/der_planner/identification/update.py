@@ -37,24 +37,18 @@ from der_planner.identification.problem import (
 from der_planner.identification.report import CALIBRATE_AGAIN, Change, Update
 from der_planner.identification.rod_angles import NODES
 from der_planner.limb import Limb, Segment
+from der_planner.limb_days import GAIN_SPREAD, LARGEST_CHANGES, REST_SPREAD, on_another_day
 from der_planner.model.response import RodModel, simulate
 from der_planner.rod import ConvergenceError
 
 Array = NDArray[np.float64]
 
-GAIN_SPREAD = 0.35
-"""From one day to another, of the logarithm of a gain: a real limb's changed by up to a half."""
-REST_SPREAD = math.radians(6.0)
-"""Of a rest angle: those of a real limb wander by so much [rad]."""
 FRICTION_SPREAD = 0.5
 """Of friction, as a share of it …"""
 LEAST_FRICTION_SPREAD = 100.0
 """… and at least this, as a pressure [Pa]."""
 FRICTION_ANGLE = 0.1
 """Bend over which friction turns round, for a limb file without friction [rad]."""
-LARGEST_GAIN_CHANGE = 4.0
-"""Factor beyond which no fit looks."""
-LARGEST_REST_CHANGE = math.radians(35.0)
 WRONG_WAY = -0.5
 """Correlation of predicted and measured bend below which pressure and bend have other signs."""
 LEAST_DURATION = 5.0
@@ -129,8 +123,8 @@ class _Days:
         self._size = 3 * limb.segment_count
         self._weight = 1.0 / (ANGLE_ERROR * math.sqrt(CORRELATION))
         self._last: tuple[bytes, list[Array] | None] | None = None
-        gain, rest = math.log(LARGEST_GAIN_CHANGE) / GAIN_SPREAD, LARGEST_REST_CHANGE / REST_SPREAD
-        self._high = np.tile([gain, rest, _LARGEST_FRICTION_CHANGE], limb.segment_count)
+        largest = [*LARGEST_CHANGES, _LARGEST_FRICTION_CHANGE]
+        self._high = np.tile(largest, limb.segment_count)
         self._low = -self._high
         # Friction is never negative.
         for m, segment in enumerate(limb.segments):
@@ -332,17 +326,12 @@ def _friction_spread(segment: Segment) -> float:
 def _moved(segment: Segment, row: Array) -> Segment:
     """Return a segment with its three unknowns put in place; what does not move stays as it is."""
     changed = {}
-    if row[_GAIN]:
-        changed["moment_gain"] = segment.moment_gain * math.exp(GAIN_SPREAD * row[_GAIN])
-    if row[_REST]:
-        moved = segment.rest_curvature + REST_SPREAD * row[_REST] / segment.length
-        changed["rest_curvature"] = float(moved)
     if row[_FRICTION]:
         moment = segment.friction_moment + _friction_spread(segment) * row[_FRICTION]
         changed["friction_moment"] = max(0.0, float(moment))
         if not segment.friction_curvature:
             changed["friction_curvature"] = FRICTION_ANGLE / segment.length
-    return replace(segment, **changed)
+    return replace(on_another_day(segment, row[_GAIN], row[_REST]), **changed)
 
 
 def _with_provenance(

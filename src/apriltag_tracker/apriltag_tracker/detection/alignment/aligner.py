@@ -47,6 +47,7 @@ class Alignment:
         kept: share of the weight that was kept: less than 1 where something covers the tag.
         residual: RMS of the pixels that fit [grey levels].
         contrast: white minus black [grey levels].
+        alike: correlation of neighbouring residuals; a smear that is not fitted makes them alike.
     """
 
     corners: NDArray[np.float64]
@@ -57,6 +58,7 @@ class Alignment:
     kept: float
     residual: float
     contrast: float
+    alike: float
 
 
 class Aligner:
@@ -95,20 +97,20 @@ class Aligner:
         """
         if smear is not None and math.hypot(*smear) >= _SHORTEST:
             known = self._fit(image, tag, corners, blur, smear)
-            if known is not None and known[1] < _SMEARED:
-                return known[0]
+            if known is not None and known.alike < _SMEARED:
+                return known
         plain = self._fit(image, tag, corners, blur, None)
         if plain is None:
             return self._from_all_sides(image, tag, corners)
-        best, alike = plain
-        if alike < _SMEARED:
-            return best
-        smeared = self._smeared(image, tag, best)
+        if plain.alike < _SMEARED:
+            return plain
+        best = plain
+        smeared = self._smeared(image, tag, plain)
         if smeared is None:
-            smeared = self._turned(image, tag, best)
+            smeared = self._turned(image, tag, plain)
         if smeared is not None and smeared.residual < 0.98 * best.residual:
             best = smeared
-        if best.explained < 0.93 and best.kept > 0.97 and alike > 0.5:
+        if best.explained < 0.93 and best.kept > 0.97 and plain.alike > 0.5:
             searched = self._from_all_sides(image, tag, corners)
             if searched is not None and searched.residual < 0.9 * best.residual:
                 best = searched
@@ -124,8 +126,7 @@ class Aligner:
     ) -> Alignment | None:
         """Fit one tag from where it is expected, with its smear; nothing else is tried."""
         known = smear if math.hypot(*smear) >= _SHORTEST else None
-        found = self._fit(image, tag, corners, blur, known)
-        return None if found is None else found[0]
+        return self._fit(image, tag, corners, blur, known)
 
     def _smeared(self, image: NDArray[np.uint8], tag: int, plain: Alignment) -> Alignment | None:
         cell = side_length(plain.corners) / self._border
@@ -134,14 +135,12 @@ class Aligner:
         blur = guess_smear(image, table, table_blur, self._border, plain.corners, plain.blur, guess)
         if math.hypot(*guess) < _SHORTEST:
             return None
-        found = self._fit(image, tag, plain.corners, max(blur, 0.5), guess)
-        return None if found is None else found[0]
+        return self._fit(image, tag, plain.corners, max(blur, 0.5), guess)
 
     def _turned(self, image: NDArray[np.uint8], tag: int, plain: Alignment) -> Alignment | None:
         """Try a turn without a smear, by which the corners went two pixels."""
         turn = 2.0 / (math.sqrt(0.5) * side_length(plain.corners))
-        found = self._fit(image, tag, plain.corners, plain.blur, np.zeros(2), turn)
-        return None if found is None else found[0]
+        return self._fit(image, tag, plain.corners, plain.blur, np.zeros(2), turn)
 
     def _from_all_sides(
         self, image: NDArray[np.uint8], tag: int, corners: NDArray[np.float64]
@@ -153,8 +152,8 @@ class Aligner:
             angle = k * math.pi / 8.0
             smear = length * np.array([math.cos(angle), math.sin(angle)])
             found = self._fit(image, tag, corners, USUAL_BLUR, smear)
-            if found is not None and (best is None or found[0].residual < best.residual):
-                best = found[0]
+            if found is not None and (best is None or found.residual < best.residual):
+                best = found
         return best
 
     def _fit(
@@ -165,8 +164,8 @@ class Aligner:
         blur: float,
         smear: NDArray[np.float64] | None,
         turn: float = 0.0,
-    ) -> tuple[Alignment, float] | None:
-        """Fit with or without smear and turn; also returns how alike its residuals are."""
+    ) -> Alignment | None:
+        """Fit with or without smear and turn."""
         result = np.zeros(fit.RESULT_VALUES)
         placed, covariance = np.empty((4, 2)), np.empty((8, 8))
         start = np.ascontiguousarray(corners)
@@ -202,17 +201,15 @@ class Aligner:
         # through the arc a pixel sees more of the tag's middle, so that the tag looks larger.
         middle = placed.mean(axis=0)
         placed = middle + (placed - middle) * (1.0 - result[8] ** 2 / 24.0)
-        return (
-            Alignment(
-                placed,
-                covariance,
-                float(result[0]),
-                result[1:3].copy(),
-                float(result[3]),
-                float(result[5]),
-                float(result[4]),
-                float(result[6]),
-            ),
+        return Alignment(
+            placed,
+            covariance,
+            float(result[0]),
+            result[1:3].copy(),
+            float(result[3]),
+            float(result[5]),
+            float(result[4]),
+            float(result[6]),
             float(result[7]),
         )
 
