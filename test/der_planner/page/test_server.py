@@ -57,6 +57,9 @@ class Calls:
     def play(self, request: MotionRequest) -> Answer:
         return Answer(True, request.motion)
 
+    def fill(self, segment: int, side: int, pressure: float) -> Answer:
+        raise NotImplementedError
+
     def play_path(self, tip: Any) -> Answer:
         return Answer(True, "path")
 

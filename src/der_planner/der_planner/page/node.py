@@ -29,7 +29,7 @@ from der_msgs.msg import (
     PressureState,
     TagDetectionArray,
 )
-from der_planner.limb import Limb
+from der_planner.limb import Limb, mounting_of
 from der_planner.page.access import Binding, listen, read_password
 from der_planner.page.afterwards.experiments import Experiments
 from der_planner.page.drawing.studio import Studio
@@ -40,7 +40,14 @@ from der_planner.page.operators import POLICIES, Desk
 from der_planner.page.overlay import Overlay
 from der_planner.page.picture import PictureFeed
 from der_planner.page.server import PageServer, Parts
-from der_planner.page.situation import DriverState, LimbView, NodeStatus, Situation
+from der_planner.page.situation import (
+    DriverState,
+    EstimateView,
+    LimbView,
+    NodeStatus,
+    PlanView,
+    Situation,
+)
 from der_planner.page.worker import Worker
 from der_planner.planning import PathLimits
 from limb_interfaces import qos, topics
@@ -64,7 +71,7 @@ class PageNode(Node):
         check_overrides(self, refuse=True)
         binding.check()
         self._situation = Situation()
-        self._commands = GraphCommands(self, self._situation)
+        self._commands = GraphCommands(self, self._situation, self._studio.limb.segment_count)
         self._replayer = Worker()
         self._picture = PictureFeed(self._picture_rate)
         self._overlay = Overlay(self._tag_map)
@@ -189,9 +196,22 @@ class PageNode(Node):
         self._situation.put_reference(stamp, message.point.x, message.point.y)
 
     def _on_plan(self, message: PressurePlan) -> None:
+        self._situation.put_plan(
+            PlanView(
+                message.motion, message.model, message.method, message.limb,
+                mounting_of(message.gravity), message.payload, message.payload_at,
+                message.predicted_error,
+            )
+        )  # fmt: skip
         self._overlay.put_path(np.array(message.tip_reference).reshape(-1, 2))
 
     def _on_estimate(self, message: LimbEstimate) -> None:
+        self._situation.put_estimate(
+            EstimateView(
+                tuple(message.missing_pressure), tuple(message.missing_pressure_sigma),
+                tuple(message.gain_error), tuple(message.correction), message.share, message.reason,
+            )
+        )  # fmt: skip
         self._overlay.put_estimate(np.array([(point.x, point.y) for point in message.curve]))
 
     def _on_markers(self, message: MarkerArray) -> None:

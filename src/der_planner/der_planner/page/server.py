@@ -23,7 +23,7 @@ from fastapi.staticfiles import StaticFiles
 
 from der_planner.page.access import SESSION_LIFE, Binding, Sessions, bracketed
 from der_planner.page.afterwards.experiments import Experiments
-from der_planner.page.commands import Commands, answer_of
+from der_planner.page.commands import Commands, answer_of, in_buttons
 from der_planner.page.drawing.studio import Studio
 from der_planner.page.guard import COOKIE, LOGIN, Guard
 from der_planner.page.operators import Desk
@@ -141,7 +141,8 @@ def create_app(parts: Parts, sessions: Sessions, secure: bool) -> FastAPI:
     async def vent() -> JSONResponse:
         # Whoever sees the page may vent, operator or not.
         answer = await answer_of("vent", parts.commands.call("vent"))
-        return JSONResponse({"success": answer.success, "message": answer.message})
+        message = in_buttons(answer.message)
+        return JSONResponse({"success": answer.success, "message": message})
 
     bell = Bell()
     parts.picture.on_put = bell.ring

@@ -50,7 +50,7 @@ const page = { data: null, at: -Infinity, received: 0, listeners: [] };
     put(find("faults"), driver && age !== null ? (old ? `${age.toFixed(1)} s ago  ` : "") + driver.faults.join("; ") : "");
     find("mode")?.classList.toggle("fault", !!driver && driver.mode === "fault");
     find("summary")?.classList.toggle("old", old);
-    if (page.data) { showNodes(page.data.nodes, seconds() - page.at); showSupply(driver); showLines(page.data.nodes, lost); }
+    if (page.data) { showNodes(page.data.nodes, seconds() - page.at); showSupply(driver); showLines(page.data, lost); showEstimate(page.data.estimate); }
   }
 
   function showAge(panel, lost, silence) {
@@ -92,7 +92,9 @@ const page = { data: null, at: -Infinity, received: 0, listeners: [] };
   const cpuOf = (node) => (node.values.cpu_percent === undefined ? "" : `${node.values.cpu_percent} %`);
 
   // What planner and recorder do now, beside the buttons that command them.
-  function showLines(nodes, lost) {
+  function showLines(data, lost) {
+    const nodes = data.nodes, plan = find("plan-line");
+    if (plan) { plan.hidden = !data.plan; put(plan, `Newest plan: ${data.plan}`); }
     for (const name of ["planner", "recorder"]) {
       const line = find(`${name}-line`), node = nodes.find((one) => one.name === name);
       if (!line) continue;
@@ -107,6 +109,18 @@ const page = { data: null, at: -Infinity, received: 0, listeners: [] };
     if (name === "recorder") return node.message + (values.bytes === undefined ? "" : `, ${megabytes.toFixed(1)} MB, ${values.messages} messages`);
     const done = ["planning", "streaming"].includes(values.state) ? ` ${(100 * Number(values.progress)).toFixed(0)} %` : "";
     return values.state === undefined || node.message.startsWith(values.state) ? node.message + done : `${values.state}${done}, ${node.message}`;
+  }
+
+  // What feedback knows beside the shape: shown only while it speaks.
+  function showEstimate(estimate) {
+    const line = find("estimate-line"), age = ageOf("estimate");
+    if (!line) return;
+    line.hidden = !estimate || age === null || age > page.data.sources.estimate.limit;
+    if (line.hidden) return;
+    const list = (values) => values.map((value) => (value === null ? "?" : value.toFixed(1))).join(" / ");
+    put(line, `Feedback: missing pressure ${list(estimate.missing_kpa)} ± ${list(estimate.missing_sigma_kpa)} kPa, gain error ` +
+      `${list(estimate.gain_error_percent)} %, correction ${list(estimate.correction_kpa)} kPa, ${estimate.share_percent} % of it acts` +
+      (estimate.reason ? `: ${estimate.reason}` : ""));
   }
 
   function showSupply(driver) {
@@ -133,7 +147,7 @@ const page = { data: null, at: -Infinity, received: 0, listeners: [] };
   }
 
   const typing = (element) => element && (element.isContentEditable || element.tagName === "TEXTAREA" ||
-    (element.tagName === "INPUT" && ["text", "search", "password"].includes(element.type) && !element.readOnly));
+    (element.tagName === "INPUT" && ["text", "search", "password"].includes(element.type) && !["decimal", "numeric"].includes(element.inputMode) && !element.readOnly));
   document.addEventListener("pointerdown", (event) => { if (event.target.closest?.("#vent")) { event.preventDefault(); vent(); } }, true);
   // Before any other key handler, so that a space bar vents even where a button has the focus.
   for (const kind of ["keydown", "keyup"]) window.addEventListener(kind, (event) => {
