@@ -10,7 +10,6 @@ from der_planner.limb import Limb
 from der_planner.twin.hardware import draw
 from der_planner.twin.truth import known_values
 
-
 pytestmark = pytest.mark.slow
 
 SEED = 4
