@@ -9,11 +9,11 @@ from dataclasses import replace
 from fastapi import FastAPI
 from nicegui import Client, ui
 
-from der_planner.page import setup_page
 from der_planner.page.afterwards import listing, replay
 from der_planner.page.commands import Answer, MotionRequest, Service, answer_of
 from der_planner.page.drawing.sketch import Sketch
 from der_planner.page.server import STATIC, Parts
+from der_planner.page.setup import page as setup_page
 from der_planner.planning import METHODS
 from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD, NAMES
 from der_planner.planning.plan_file import LEARNED

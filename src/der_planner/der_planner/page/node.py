@@ -34,6 +34,7 @@ from der_planner.page.access import Binding, listen, read_password
 from der_planner.page.afterwards.experiments import Experiments
 from der_planner.page.drawing.studio import Studio
 from der_planner.page.graph_commands import GraphCommands
+from der_planner.page.intake import Intake
 from der_planner.page.layout import lay_out
 from der_planner.page.operators import POLICIES, Desk
 from der_planner.page.overlay import Overlay
@@ -137,7 +138,8 @@ class PageNode(Node):
     # What comes in -------------------------------------------------------------------------
 
     def _subscribe(self) -> None:
-        subscribe = self.create_subscription
+        self._intake = Intake(self)
+        subscribe = self._intake.subscribe
         subscribe(PressureState, topics.PRESSURE_STATE, self._on_driver, qos.STATES)
         subscribe(LimbState, topics.LIMB_STATE, self._on_limb, qos.STATES)
         subscribe(TagDetectionArray, topics.TAGS, self._on_tags, qos.STATES)
@@ -148,6 +150,7 @@ class PageNode(Node):
         subscribe(CameraInfo, topics.CAMERA_INFO, self._on_camera, qos.IMAGES)
         subscribe(LimbEstimate, topics.ESTIMATE, self._on_estimate, qos.STATES)
         subscribe(DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, qos.STATES)
+        self._intake.start()
 
     def _on_driver(self, message: PressureState) -> None:
         self._situation.put_driver(
@@ -232,12 +235,14 @@ class PageNode(Node):
         """Subscribe to images while somebody looks; end with the server."""
         if self._server.error is not None:
             self.fatal_error = f"the page's server ended: {self._server.error}"
+        if self._intake.error is not None:
+            self.fatal_error = f"a message could not be taken: {self._intake.error!r}"
         if self._picture.watched and self._images is None:
-            self._images = self.create_subscription(
+            self._images = self._intake.subscribe(
                 Image, topics.IMAGE, self._on_image, qos.IMAGES, raw=True
             )
         elif not self._picture.watched and self._images is not None:
-            self.destroy_subscription(self._images)
+            self._intake.remove(self._images)
             self._images = None
 
     def _on_lost_operator(self, _window: str) -> None:
@@ -264,6 +269,7 @@ class PageNode(Node):
 
     def close(self) -> None:
         """Stop serving."""
+        self._intake.close()
         self._server.close()
         self._studio.previewer.close()
         self._replayer.close()

@@ -4,6 +4,7 @@
 const page = { data: null, at: -Infinity, received: 0, listeners: [] };
 (() => {
   const LOST = 0.7; // seconds without live data after which the connection counts as lost
+  const RECENT = 1.3; // seconds: nodes speak once a second
   const seconds = () => performance.now() / 1000;
   const find = (id) => document.getElementById(id);
   const put = (element, text) => { if (element && element.textContent !== text) element.textContent = text; };
@@ -65,20 +66,27 @@ const page = { data: null, at: -Infinity, received: 0, listeners: [] };
     put(panel.querySelector(".age"), text);
   }
 
+  // Only what changed is written, since the browser lays out and paints the table anew with it.
   function showNodes(nodes, waited) {
-    const rows = find("node-rows");
-    if (!rows || !nodes.length) return;
-    const table = nodes.map((node) => {
-      const row = document.createElement("tr"), cells = [node.name, node.state, node.message, cpuOf(node), `${(node.age + waited).toFixed(1)} s`];
-      cells.forEach((text, index) => {
-        const cell = row.insertCell();
-        cell.textContent = text; // never as HTML: messages come from anywhere
-        if (index === 1) cell.className = `state ${node.state}`;
-      });
-      row.dataset.node = node.name;
-      return row;
+    const body = find("node-rows");
+    if (!body || !nodes.length) return;
+    const names = nodes.map((node) => node.name).join();
+    if (body.dataset.names !== names) {
+      body.dataset.names = names;
+      body.replaceChildren(...nodes.map((node) => {
+        const row = document.createElement("tr");
+        for (let cell = 0; cell < 5; cell += 1) row.insertCell();
+        row.dataset.node = node.name;
+        return row;
+      }));
+    }
+    nodes.forEach((node, index) => {
+      const cells = body.rows[index].cells, age = node.age + waited;
+      // As text, never as HTML: messages come from anywhere.
+      [node.name, node.state, node.message, cpuOf(node), age < RECENT ? "now" : `${age.toFixed(1)} s ago`]
+        .forEach((text, place) => put(cells[place], text));
+      if (cells[1].className !== `state ${node.state}`) cells[1].className = `state ${node.state}`;
     });
-    rows.replaceChildren(...table);
   }
 
   const cpuOf = (node) => (node.values.cpu_percent === undefined ? "" : `${node.values.cpu_percent} %`);

@@ -6,7 +6,7 @@ from nicegui import ui
 
 from der_planner.limb import Limb
 from der_planner.page.server import STATIC, Parts
-from der_planner.page.setup_steps import SetupGuide
+from der_planner.page.setup.steps import SetupGuide
 
 ADDRESS = "/setup"
 INTERVAL = 0.5
