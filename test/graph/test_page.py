@@ -17,7 +17,7 @@ import pytest
 from filmed import FilmedRun
 from runs import FRAMES, reference
 
-from der_msgs.msg import PressureState
+from der_msgs.msg import PressurePlan, PressureState
 from limb_interfaces import qos, topics
 
 webdriver = pytest.importorskip("selenium.webdriver")
@@ -167,6 +167,10 @@ def test_what_died_is_not_shown_as_live(rig: Rig) -> None:
     old = "document.getElementById('summary').classList.contains('old')"
     lost = "document.body.classList.contains('lost')"
     rig.wait(lambda: not browser.execute_script(f"return {old}"), "the driver's state")
+    plans = rig.client.node.create_publisher(PressurePlan, topics.PLAN, qos.LATCHED)
+    plans.publish(PressurePlan(motion="odd", tip_reference=[0.1, 0.2, 0.3]))
+    said = "return document.querySelector('[data-node=page]').textContent"
+    rig.wait(lambda: "could not be used" in browser.execute_script(said), "the page to say so")
     stopped = silent_after(browser, rig.driver, signal.SIGSTOP, old)
     assert "ago" in browser.find_element("id", "faults").text
     rig.driver.signal(signal.SIGCONT)
