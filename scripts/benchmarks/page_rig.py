@@ -25,7 +25,7 @@ from der_planner.experiment.errors import GraphError
 from der_planner.experiment.processes import NodeProcess
 from limb_interfaces import qos, topics
 
-DOMAIN = 95
+DOMAIN = int(os.environ.get("ROS_DOMAIN_ID") or 95)
 PATIENCE = 120.0
 """[s] for a node or a browser to start on a loaded machine."""
 FLAGS = (

@@ -123,6 +123,8 @@ def test_one_arms_and_everybody_vents(rig: Rig) -> None:
     assert not enabled(first, "arm")
     press(rig, first, "take")
     arm(rig, first)
+    first.refresh()  # it is the same tab of the same browser: on_lost_operator=vent does nothing
+    rig.wait(lambda: first.find_elements("id", "arm") and enabled(first, "arm"), "the operator")
     rig.wait(lambda: not enabled(second, "take"), "the second window to see the first one command")
     assert not enabled(second, "arm")
 
