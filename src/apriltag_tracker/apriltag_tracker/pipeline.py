@@ -119,7 +119,9 @@ class LimbTracker:
                 f"the detector reads {detector.family.name} but the tag map is of "
                 f"{tags.family.name}: make it by Detector(family=tag_map.family)"
             )
-        self.tracker = TagTracker(self._flat, detector, self.options.tracking)
+        detector = detector.through((intrinsics.matrix, intrinsics.distortion))
+        still = [tag.id for tag in tags.world]
+        self.tracker = TagTracker(self._flat, detector, self.options.tracking, still)
         self.world = WorldPose(tags, intrinsics)
         uncertainty = self.options.uncertainty
         self.fitter = ShapeFitter(
