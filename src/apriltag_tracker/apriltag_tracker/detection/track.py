@@ -29,7 +29,8 @@ class Track:
         tag: as seen last.
         stamp: of that picture [s].
         velocity: (4, 2) px/s of the corners, since the picture before.
-        acceleration: (4, 2) px/s², zero where the last picture was foreseen better without it.
+        acceleration: (4, 2) px/s², zero before it is known.
+        curved: whether the acceleration counts; not where the last picture was nearer without it.
         step: s from the picture before to the last one, 0 if there is none.
         surprise: how far the corners were from where they were foreseen [px].
         missed: pictures since then in which the tag was not found.
@@ -40,6 +41,7 @@ class Track:
     stamp: float
     velocity: NDArray[np.float64] = field(default_factory=_nowhere)
     acceleration: NDArray[np.float64] = field(default_factory=_nowhere)
+    curved: bool = True
     step: float = 0.0
     surprise: float = math.inf
     missed: int = 0
@@ -48,8 +50,13 @@ class Track:
     def predict(self, stamp: float) -> NDArray[np.float64]:
         """Return the corners (4, 2) px at a time [s]: the parabola through the last pictures."""
         gap = stamp - self.stamp
+        corners = self.tag.corners + self.velocity * gap
+        return corners + self._bent(gap) if self.curved else corners
+
+    def _bent(self, gap: float) -> NDArray[np.float64]:
+        """Return by how much the parabola leaves the straight line after a time [s], (4, 2) px."""
         bent: NDArray[np.float64] = self.acceleration * (0.5 * gap * (gap + self.step))
-        return self.tag.corners + self.velocity * gap + bent
+        return bent
 
     def foreseen(self, cells: int) -> bool:
         """Tell whether the pattern, of so many cells along the border, can be fitted at once."""
@@ -67,18 +74,19 @@ class Track:
             return Track(tag, stamp)
         moved = tag.corners - self.tag.corners
         velocity = moved / step
-        straight = float(np.abs(moved - self.velocity * step).max())
-        curved, acceleration = math.inf, _nowhere()
+        off = moved - self.velocity * step
+        straight, bent = (float(np.abs(gap).max()) for gap in (off, off - self._bent(step)))
+        acceleration = _nowhere()
         if self.step > 0.0 and self.missed == 0:
             acceleration = (velocity - self.velocity) * (2.0 / (step + self.step))
-            curved = float(np.abs(tag.corners - self.predict(stamp)).max())
         return Track(
             tag,
             stamp,
             velocity,
-            acceleration if curved <= straight else _nowhere(),
+            acceleration,
+            bent <= straight,
             step,
-            min(straight, curved),
+            min(straight, bent),
             lines_first=max(self.lines_first - 1, 0),
         )
 

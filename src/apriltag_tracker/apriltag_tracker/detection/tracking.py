@@ -102,6 +102,8 @@ class TagTracker:
         """Fits in a row in which a fixed tag has not moved."""
         self._looks: dict[int, tuple[int, NDArray[np.float64]]] = {}
         """In which frame a fixed tag was fitted last, and how its border looked, (4, 2)."""
+        self._postponed: dict[int, Tag] | None = None
+        """What was found in the last image, if its full search was left for later."""
         self._last_full = self._last_thorough = -np.inf
 
     def reset(self) -> None:
@@ -111,7 +113,11 @@ class TagTracker:
         self._last_full = self._last_thorough = -np.inf
 
     def track(
-        self, gray: NDArray[np.uint8], stamp: float, expect: Expect | None = None
+        self,
+        gray: NDArray[np.uint8],
+        stamp: float,
+        expect: Expect | None = None,
+        search_later: bool = False,
     ) -> list[Tag]:
         """Find the tags of one frame.
 
@@ -119,12 +125,15 @@ class TagTracker:
             gray: image (rows, columns) of uint8.
             stamp: when it was taken [s]; must grow from call to call, or tracking starts anew.
             expect: says where tags are that were not found, None if nothing is known of that.
+            search_later: leave a search of the whole image that can add nothing to this answer to
+                `search_again`, for those who wait for the answer.
 
         Returns:
             Tags of the map, each id once.
         """
         image = grey(gray)
         self.counts.frames += 1
+        self._postponed = None
         if any(
             track.stamp >= stamp or track.stamp < stamp - 1.0 for track in self._tracks.values()
         ):
@@ -136,7 +145,7 @@ class TagTracker:
         self.counts.tracked += len(found)
         self._by_expectation(image, stamp, found, expect)
         known = len(found)
-        self._search_in_full(image, stamp, found, predicted)
+        self._search_in_full(image, stamp, found, predicted, search_later)
         if lost := [tag for tag in predicted if tag not in found]:
             self._merge(found, self._by_regions(image, lost, predicted), predicted)
         if len(found) > known:
@@ -144,6 +153,13 @@ class TagTracker:
         self._remember_looks(image, found)
         self._remember(found, stamp)
         return [found[tag] for tag in sorted(found)]
+
+    def search_again(self, gray: NDArray[np.uint8]) -> None:
+        """Search the whole of the last image for duplicates and unknown tags, if that was left."""
+        if self._postponed is not None:
+            self.counts.full_searches += 1
+            self._merge(self._postponed, self._detector.detect(gray, enough=()), {})
+            self._postponed = None
 
     def _by_expectation(
         self,
@@ -177,6 +193,7 @@ class TagTracker:
         stamp: float,
         found: dict[int, Tag],
         predicted: dict[int, NDArray[np.float64]],
+        search_later: bool,
     ) -> None:
         """Search the whole image if it is time to."""
         options = self.options
@@ -187,6 +204,9 @@ class TagTracker:
         if not thorough and stamp - self._last_full < period:
             return
         self._last_full = stamp
+        if search_later and not missing and not absent:
+            self._postponed = found
+            return
         if thorough:
             self._last_thorough = stamp
         self.counts.full_searches += 1

@@ -35,8 +35,11 @@ class _Seen:
         self.noise = (1.0 - share) ** 2 * self.noise + share**2 * tag.covariance
 
 
-_LASTING = 0.01
-"""Error of a corner that stays from frame to frame, so that averaging does not remove it [px]."""
+_LASTING = 0.002
+"""Error of a corner that stays from frame to frame, so that averaging does not remove it [px].
+
+Pixels are rounded to whole grey levels, and the fit's model of lens and print is not quite theirs.
+"""
 
 _LEAST_MEMORY = 40
 """Pictures of one tag that are averaged at least."""

@@ -54,7 +54,7 @@ _FEWEST = 60
 _BESIDE = 2
 """What covers a tag is blurred: pixels so near to what does not fit count no more either [px]."""
 
-_MODEL_ERROR = 0.004
+_MODEL_ERROR = 0.003
 """What the model leaves out, whatever the noise, moves a corner by so much [px]."""
 
 _WIDE, _WIDE_ERROR = 0.8, 0.02
@@ -265,11 +265,13 @@ def _finish(
     h: NDArray[np.float64],
     normal: NDArray[np.float64],
     blur: float,
+    count: int,
     result: NDArray[np.float64],
     covariance: NDArray[np.float64],
 ) -> None:
     """Write the covariance of the corners."""
-    residual, alike = result[4], result[7]
+    # Of pixels that have nothing in common the correlation is seldom above this either.
+    residual, alike = result[4], max(result[7] - 1.0 / math.sqrt(count), 0.0)
     slopes = corner_slopes(h)
     spread = np.ascontiguousarray(np.linalg.inv(normal)[:8, :8])
     variance = residual**2 * ((1.0 + alike) / (1.0 - alike)) ** 2
@@ -402,7 +404,7 @@ def align(
             break
     _judge(pixels, count, move, result)
     result[:3], result[8] = state[:3], state[3]
-    _finish(h, normal, state[0], result, covariance)
+    _finish(h, normal, state[0], count, result, covariance)
     bend_back(bend, corners)
     corners += centre
     return moved < 0.1
