@@ -72,8 +72,8 @@ def test_a_payload_that_was_not_on_the_limb_when_it_was_calibrated_is_carried():
 
 
 def test_tips_tell_how_much_of_a_bend_is_the_weights():
-    limb = Limb.default().mounted("sideways")
-    pressure = waves(12_000.0, 2, 15.0)
+    limb = with_geometry(Limb.default().mounted("sideways"), np.array([0.12, 0.12]), 4e-3, 1e-3)
+    pressure = waves(16_800.0, 2, 15.0)
     time = 0.05 * np.arange(len(pressure))
     model, fine = RodModel(limb, NODES), RodModel(limb)
     seen = simulate(fine, time, pressures=pressure)
@@ -84,17 +84,17 @@ def test_tips_tell_how_much_of_a_bend_is_the_weights():
     # Lengths that are wrong by some millimetres are no reason to find another stiffness.
     other = with_geometry(limb, np.array([0.117, 0.125]), 0.004, 0.003)
     tips = UnevenTips(limb, other, log, np.ones(len(time), bool), RodModel(other, NODES), finer)
-    values, term = start_values(limb), column("log_stiffness")
+    values, term = start_values(other), column("log_stiffness")
 
     def residual(change: float) -> np.ndarray:
         moved = values.copy()
         moved[1, term] += change
-        return tips.residual(RodAngles(limb, time, pressure).derivatives(moved, []))
+        return tips.residual(RodAngles(other, time, pressure).derivatives(moved, []))
 
     own = np.linalg.norm(residual(0.0))
-    assert np.linalg.norm(residual(-0.3)) > 3.0 * own
-    assert np.linalg.norm(residual(0.3)) > 3.0 * own
-    slope = tips.jacobian(RodAngles(limb, time, pressure).derivatives(values, [(1, term)]))[:, 0]
+    assert np.linalg.norm(residual(-0.3)) > 2.5 * own
+    assert np.linalg.norm(residual(0.3)) > 2.5 * own
+    slope = tips.jacobian(RodAngles(other, time, pressure).derivatives(values, [(1, term)]))[:, 0]
     difference = (residual(0.02) - residual(-0.02)) / 0.04
     assert np.abs(slope - difference).max() < 0.05 * np.abs(difference).max()
 
