@@ -139,6 +139,12 @@ def test_one_arms_and_everybody_vents(rig: Rig) -> None:
     first.get("about:blank")  # the parameter on_lost_operator asks for a vent
     rig.wait_mode(PressureState.DISARMED)
     rig.wait(lambda: enabled(second, "take"), "the desk to be free again")
+    second.get(f"{rig.url}setup")
+    arm(rig, second)
+    rig.wait(lambda: second.find_element("id", "mode").text == "ARMED", "the page to know")
+    press(rig, second, "fill-1-right")
+    rig.wait(lambda: min(rig.states[-1].measured_differential) < -3000.0, "the chamber to fill")
+    assert abs(rig.states[-1].measured_differential[0]) < 1000.0
     hosts = {urlsplit(url).netloc for url in requested(second)}
     assert hosts == {urlsplit(rig.url).netloc}
 
