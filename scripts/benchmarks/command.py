@@ -28,6 +28,7 @@ PARTS = (
     "learning",
     "learning_draws",
     "feedback",
+    "feedback_draws",
     "page",
     "page_wire",
     "page_memory",

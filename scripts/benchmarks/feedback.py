@@ -115,9 +115,11 @@ def _learned(planned: Plan, seed: int) -> Plan:
     """Return the plan after runs of it, as a camera would have seen them."""
     learner, noise = Learner(planned), Sensors().tip_noise
     for run in range(LEARNED_FROM):
-        tip = play(planned, _twin(seed)).tip
+        played = play(planned, _twin(seed))
         generator = np.random.default_rng([seed, run])
-        learner.add(planned.time, tip + noise * generator.standard_normal(tip.shape))
+        tip = played.tip + noise * generator.standard_normal(played.tip.shape)
+        chambers = played.time, played.differential_pressure
+        learner.add(planned.time, tip, chambers=chambers)
         planned = learner.next()
         if learner.stopped:
             break

@@ -2,8 +2,8 @@
 
 The share goes from 0 to 1 once the limb is seen. It goes back to 0, which is the plan alone, where
 feedback can do harm: the camera sees nothing, or what it sees does not fit the model; corrections
-swing; they stay at what they are allowed; commands are asked for too late. Lost tags may come back;
-after the other reasons the rest of the run is played without feedback.
+swing; they stay at what they are allowed to no avail; commands are asked for too late. Lost tags
+may come back; after the other reasons the rest of the run is played without feedback.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ REASONS = {
     "tags lost": "the limb has not been seen for {:.1f} s",
     "inconsistent": "the limb moves as the model cannot, measurements are {:.0f} times too far off",
     "oscillation": "corrections swing by {:.0f} Pa, and neither they nor the limb come to rest",
-    "saturation": "a correction has been at its limit of {:.0f} Pa for too long",
+    "saturation": "a correction is at its limit of {:.0f} Pa, and the tip far from its path",
     "late": "commands come {:.2f} s after their instant",
 }
 """Every reason and what is said of it."""
@@ -47,7 +47,9 @@ class Limits:
         kept: for so long after that the last disturbances are still counted with [s].
         inconsistent: squared distance of measurements per coordinate, smoothed; 1 is expected.
         patience: for which measurements may be inconsistent [s].
-        saturated: for which a correction may be at its limit [s].
+        saturated: for which a correction may be at its limit [s] …
+        astray: … while the tip is further from r̄ than this share of the limb's length: a limb that
+            needs much and follows is not left.
         swing: from one turn of a swinging correction to the next, as a share of the authority.
         turns: so many of them are an oscillation, unless it dies out …
         window: … if they come within this time [s].
@@ -62,6 +64,7 @@ class Limits:
     inconsistent: float = 20.0
     patience: float = 2.0
     saturated: float = 3.0
+    astray: float = 0.03
     swing: float = 0.1
     turns: int = 6
     window: float = 4.0
@@ -89,6 +92,7 @@ class Supervisor:
     Args:
         limits: when feedback is taken back.
         authority: largest correction [Pa].
+        length: of the limb [m].
 
     Attributes:
         share: 0 … 1.
@@ -96,8 +100,8 @@ class Supervisor:
         warnings: all that were given.
     """
 
-    def __init__(self, limits: Limits, authority: float) -> None:
-        self.limits, self.authority = limits, authority
+    def __init__(self, limits: Limits, authority: float, length: float) -> None:
+        self.limits, self.authority, self.length = limits, authority, length
         self.share = 0.0
         self.reason = ""
         self.warnings: list[Warned] = []
@@ -138,16 +142,19 @@ class Supervisor:
             self.share = min(1.0, self.share + CONTROL_PERIOD / limits.ramp)
         return self.share
 
-    def sent(self, time: float, correction: Array, swing: float) -> None:
+    def sent(self, time: float, correction: Array, swing: float, missed: float) -> None:
         """Look at a correction that is sent.
 
         Args:
             time: instant of the command [s].
             correction: (M,) [Pa].
             swing: rate at which the limb deviates from the model's motion then [rad/s].
+            missed: distance of the tip from r̄ then [m].
         """
         limits = self.limits
-        if self.share > 0.0 and np.abs(correction).max() > 0.98 * self.authority * self.share:
+        astray = missed > limits.astray * self.length
+        limited = np.abs(correction).max() > 0.98 * self.authority * self.share
+        if self.share > 0.0 and limited and astray:
             if self._limited_since is None:
                 self._limited_since = time
             if time - self._limited_since > limits.saturated:
