@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from der_planner.limb import Limb, Segment
 from der_planner.limb_days import on_another_day
-from der_planner.model import air
+from der_planner.model import air, material
 from der_planner.model.response import RodModel, simulate
 
 Array = NDArray[np.float64]
@@ -42,7 +42,10 @@ def drawn(limb: Limb, generator: np.random.Generator) -> Limb:
 
 
 def with_slow_air(limb: Limb, generator: np.random.Generator) -> Limb:
-    """Return a limb whose outlets hold its chambers up, and whose segments creep, as real ones."""
+    """Return a limb whose outlets hold its chambers up, and whose segments creep and damp.
+
+    Its first swing has a damping ratio of about 0.03 to 0.06, as a silicone limb's.
+    """
     draw = generator.uniform
     air_of = replace(
         limb.pneumatics,
@@ -52,7 +55,12 @@ def with_slow_air(limb: Limb, generator: np.random.Generator) -> Limb:
         vent_exponent=draw(0.55, 0.75),
     )
     creeping = [
-        replace(s, creep_stiffness=draw(0.0, 0.03) * s.bending_stiffness, creep_time=3.0)
+        replace(
+            s,
+            creep_stiffness=draw(0.0, 0.03) * s.bending_stiffness,
+            creep_time=3.0,
+            material_damping=draw(0.006, 0.012),
+        )
         for s in limb.segments
     ]
     return replace(limb, segments=tuple(creeping), pneumatics=air_of)
@@ -94,6 +102,8 @@ def nearly(true: Limb, generator: np.random.Generator) -> Limb:
 class DrawnLimb:
     """A limb's rod and air as a plant of the lock-step.
 
+    Friction and creep act along the bend that the limb has, on a straight line from tick to tick.
+
     Args:
         limb: the true one, vented and at rest.
     """
@@ -105,23 +115,33 @@ class DrawnLimb:
         self._held = still[0]
         self._commands = [still[0]]
         self._seen = simulate(self._model, np.array([0.0, _TICK]), pressures=still)
+        rested = self._seen.bend_angles[0]
+        self._memory = material.Memory(rested, np.zeros_like(rested), np.zeros_like(rested))
 
     def advance(self, command: Array, duration: float) -> None:
         """Hold a command (M,) [Pa] for a time [s], a multiple of the tick."""
         for _ in range(round(duration / _TICK)):
             self._commands.append(np.array(command))
             del self._commands[: -self._remembered - 1]
-            known = np.array(self._commands)
-            chambers = air.follow_commands(self._limb.pneumatics, known[1:], _TICK, 1, known[0])
+            commands = np.array(self._commands)
+            chambers = air.follow_commands(
+                self._limb.pneumatics, commands[1:], _TICK, 1, commands[0]
+            )
+            bend = self._seen.bend_angles
+            rate = (bend[-1] - bend[-2]) / _TICK
             before, self._held = self._held, chambers.pair[-1, :, 0] - chambers.pair[-1, :, 1]
             self._seen = simulate(
                 self._model,
                 np.array([0.0, _TICK]),
                 pressures=np.stack([before, self._held]),
+                bend=lambda time, at=bend[-1], rate=rate: at + np.multiply.outer(time, rate),
                 start=self._seen.final,
-                memory=self._seen.memory,
-                steps=2,
+                memory=self._memory,
+                steps=1,
             )
+            turned = np.stack([self._memory.bend, self._seen.bend_angles[-1]])
+            known = material.remember(self._limb, np.array([0.0, _TICK]), turned, self._memory)
+            self._memory = known.at(-1)
 
     @property
     def differential_pressure(self) -> Array:
