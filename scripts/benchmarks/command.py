@@ -25,6 +25,7 @@ PARTS = (
     "identification",
     "studies",
     "loads",
+    "calibration_draws",
     "learning",
     "learning_draws",
     "feedback",

@@ -7,9 +7,7 @@ not played again: a study that was stopped goes on.
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import subprocess
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -22,6 +20,7 @@ from apriltag_tracker.pipeline import LimbTracker
 from apriltag_tracker.synthetic.camera import CameraModel, SyntheticCamera
 from apriltag_tracker.synthetic.shapes import constant_curvature
 from apriltag_tracker.tag_map import TagMap
+from benchmarks import rows as kept
 from benchmarks.identification import FRESH_SEEDS
 from der_planner.identification import LogError, calibrate_twin
 from der_planner.limb import Limb, LimbError
@@ -87,29 +86,7 @@ class Row:
 
 def read_rows(path: Path = ROWS) -> list[Row]:
     """Return the rows that were played."""
-    if not path.exists():
-        return []
-    with path.open(newline="") as file:
-        return [
-            Row(**{
-                field.name: text[field.name] if field.type == "str" else
-                int(text[field.name]) if field.type == "int" else float(text[field.name] or "nan")
-                for field in dataclasses.fields(Row)
-            })
-            for text in csv.DictReader(file)
-        ]  # fmt: skip
-
-
-def _append(row: Row, path: Path = ROWS) -> None:
-    new = not path.exists()
-    with path.open("a", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        if new:
-            writer.writerow([field.name for field in dataclasses.fields(Row)])
-        writer.writerow(
-            [f"{value:.7g}" if isinstance(value, float) else value
-             for value in dataclasses.astuple(row)]
-        )  # fmt: skip
+    return kept.read(Row, path)
 
 
 def _wanted(seeds: tuple[int, ...]) -> Iterator[Row]:
@@ -238,14 +215,11 @@ def run(quick: bool) -> dict[str, float | str]:
     """Play what is missing and print the table; ``quick`` plays the first twin only."""
     seeds = FRESH_SEEDS[:1] if quick else FRESH_SEEDS
     done = {row.key for row in read_rows()}
-    commit = subprocess.run(
-        ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"],
-        capture_output=True, text=True, check=False,
-    ).stdout.strip()  # fmt: skip
+    commit = kept.commit()
     for wanted in _wanted(seeds):
         if wanted.key not in done:
             row = dataclasses.replace(play_row(wanted), commit=commit)
-            _append(row)
+            kept.append(row, ROWS)
             said = row.refused or f"{row.mean_error_m * 100:.3f} cm"
             print(f"  {' '.join(map(str, row.key))}: {said}", flush=True)
     print("\nTip that the tracker measures of a limb that sags out of its plane")

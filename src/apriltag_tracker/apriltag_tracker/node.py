@@ -290,12 +290,13 @@ class TrackerNode(Node):
             self._fail(stamp, self._watch.calibration_problem or NO_CALIBRATION)
             return
         try:
-            observation = self._tracker.observe(gray, stamps.seconds(stamp))
+            observation = self._tracker.observe(gray, stamps.seconds(stamp), search_later=True)
         except (ValueError, ArithmeticError, cv2.error) as error:
             self._fail(stamp, str(error))
             return
         latency = self._publish(observation, gray, stamp)
         self._watch.observed(observation, latency, time.perf_counter() - started)
+        self._tracker.search_again(gray)
 
     def _fail(self, stamp: Time, problem: str) -> None:
         """Say at once that this image gives no state, and why."""

@@ -44,6 +44,7 @@ def run_node(create: Callable[[], Node], arguments: Sequence[str] | None = None)
     """
     stop = threading.Event()
     transport.use_large_messages()
+    transport.keep_buffers()
     for number in END_SIGNALS:
         signal.signal(number, lambda *_: stop.set())
     try:

@@ -9,8 +9,12 @@ from link_chain import LinkChain
 
 from der_planner.identification import CalibrationLog, LogError, fit, predict
 from der_planner.identification.excitation import sweep, waves
+from der_planner.identification.geometry import UnevenTips, with_geometry
 from der_planner.identification.logs.prepare import prepare
+from der_planner.identification.parameters import column, start_values
+from der_planner.identification.rod_angles import NODES, RodAngles
 from der_planner.limb import Limb, gravity_of
+from der_planner.model.response import RodModel, simulate
 from der_planner.planning import Motion, plan
 
 pytestmark = pytest.mark.slow
@@ -65,6 +69,34 @@ def test_a_payload_that_was_not_on_the_limb_when_it_was_calibrated_is_carried():
     played = chain.play(chosen.time, chosen.differential_pressure, 0)
     error = np.linalg.norm(played.tip - chosen.tip_reference, axis=1)
     assert error.mean() < 0.0025
+
+
+def test_tips_tell_how_much_of_a_bend_is_the_weights():
+    limb = with_geometry(Limb.default().mounted("sideways"), np.array([0.12, 0.12]), 4e-3, 1e-3)
+    pressure = waves(16_800.0, 2, 15.0)
+    time = 0.05 * np.arange(len(pressure))
+    model, fine = RodModel(limb, NODES), RodModel(limb)
+    seen = simulate(fine, time, pressures=pressure)
+    log = CalibrationLog(time, pressure, pressure, seen.bend_angles, seen.tip)
+    coarse = simulate(model, time, pressures=pressure)
+    finer = seen.tip - fine.kinematics.tip(seen.bend_angles)
+    finer -= coarse.tip - model.kinematics.tip(coarse.bend_angles)
+    # Lengths that are wrong by some millimetres are no reason to find another stiffness.
+    other = with_geometry(limb, np.array([0.117, 0.125]), 0.004, 0.003)
+    tips = UnevenTips(limb, other, log, np.ones(len(time), bool), RodModel(other, NODES), finer)
+    values, term = start_values(other), column("log_stiffness")
+
+    def residual(change: float) -> np.ndarray:
+        moved = values.copy()
+        moved[1, term] += change
+        return tips.residual(RodAngles(other, time, pressure).derivatives(moved, []))
+
+    own = np.linalg.norm(residual(0.0))
+    assert np.linalg.norm(residual(-0.3)) > 2.5 * own
+    assert np.linalg.norm(residual(0.3)) > 2.5 * own
+    slope = tips.jacobian(RodAngles(other, time, pressure).derivatives(values, [(1, term)]))[:, 0]
+    difference = (residual(0.02) - residual(-0.02)) / 0.04
+    assert np.abs(slope - difference).max() < 0.05 * np.abs(difference).max()
 
 
 def test_mass_is_told_where_stiffness_is_given():

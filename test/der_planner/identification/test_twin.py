@@ -10,14 +10,23 @@ from der_planner.limb import Limb
 from der_planner.twin.hardware import draw
 from der_planner.twin.truth import known_values
 
+pytestmark = pytest.mark.slow
 
-@pytest.mark.slow
-def test_twin_is_predicted_after_one_calibration():
-    limb, report = calibrate_twin(0, Limb.default())
+SEED = 4
+
+
+@pytest.fixture(scope="module")
+def calibrated():
+    """Return the calibrated limb and the fit's report."""
+    return calibrate_twin(SEED, Limb.default(), quick=False)
+
+
+def test_twin_is_predicted_after_one_calibration(calibrated):
+    limb, report = calibrated
     assert np.degrees(report.residual).max() < 1.0
     time = np.arange(0, 30, PERIOD)
     pressure = 9000.0 * np.stack([1 - np.cos(time / 3), np.sin(time / 2)], axis=1)
-    log = record_twin(0, Excitation(time, pressure, ()), run=2)
+    log = record_twin(SEED, Excitation(time, pressure, ()), run=2)
     predicted = predict(limb, log.time, log.measured_differential)
     error = np.linalg.norm(predicted.tip - log.tip, axis=1) / limb.length
     assert error.mean() < 0.03
@@ -26,11 +35,10 @@ def test_twin_is_predicted_after_one_calibration():
     assert error.mean() < 0.5 * np.linalg.norm(default.tip - log.tip, axis=1).mean() / limb.length
 
 
-@pytest.mark.slow
-def test_what_the_twin_knows_is_recovered_within_the_stated_uncertainty():
-    _, report = calibrate_twin(4, Limb.default(), quick=False)
+def test_what_the_twin_knows_is_recovered_within_the_stated_uncertainty(calibrated):
+    _, report = calibrated
     distances = {}
-    for name, known in known_values(draw(4)).items():
+    for name, known in known_values(draw(SEED)).items():
         found = report.value(name)
         deviation = np.hypot(found.deviation, known.spread)
         distances[name] = abs(found.value - known.value) / deviation

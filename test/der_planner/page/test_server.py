@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import struct
+import threading
 import time
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from fastapi import FastAPI
@@ -53,6 +56,9 @@ class Calls:
 
     def play(self, request: MotionRequest) -> Answer:
         return Answer(True, request.motion)
+
+    def fill(self, segment: int, side: int, pressure: float) -> Answer:
+        raise NotImplementedError
 
     def play_path(self, tip: Any) -> Answer:
         return Answer(True, "path")
@@ -187,3 +193,36 @@ def test_a_picture_is_made_only_if_somebody_looks(rig: Rig) -> None:
     size = struct.unpack(">I", body[:4])[0]
     assert body[4 + size : 6 + size] == b"\xff\xd8"
     assert client.get("/picture?after=1").status_code == 204
+
+
+def test_a_request_waits_for_the_next_picture(rig: Rig) -> None:
+    first, second = (np.full((72, 128), shade, dtype=np.uint8) for shade in (90, 200))
+    rig.picture.put(5, first)
+    client = rig.client()
+    with client:
+        assert client.get("/picture?wait=1").status_code == 200
+        coming = threading.Timer(0.2, rig.picture.put, (6, second))
+        coming.start()
+        answer = client.get("/picture?after=1&wait=30")
+        coming.join()
+        begun = time.monotonic()
+        assert client.get("/picture?after=2&wait=30").status_code == 204
+    assert 0.5 < time.monotonic() - begun < 20.0  # nobody holds a request for as long as it likes
+    size = struct.unpack(">I", answer.content[:4])[0]
+    assert json.loads(answer.content[4 : 4 + size])["number"] == 2
+
+
+def test_a_small_window_gets_a_small_file_that_is_made_once(rig: Rig) -> None:
+    random = np.random.default_rng(0)
+    rig.picture.put(5, random.integers(0, 255, (720, 1280), dtype=np.uint8))
+    whole, half = rig.picture.take(0), rig.picture.take(0, shown=700)
+    assert whole is not None
+    assert half is not None
+    assert half.size == whole.size == (1280, 720)  # what is drawn over it is in the camera's pixels
+    shapes = [
+        cv2.imdecode(np.frombuffer(one.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE).shape
+        for one in (whole, half)
+    ]
+    assert shapes == [(720, 1280), (360, 640)]
+    assert rig.picture.take(0, shown=640) is half
+    assert rig.picture.take(0, shown=2000) is whole

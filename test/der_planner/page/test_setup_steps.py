@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from der_planner.page.setup_steps import SetupGuide, Step
+from der_planner.page.setup.steps import SetupGuide, Step
 from der_planner.page.situation import DriverState, LimbView, NodeStatus, Situation
 
 VENTED = DriverState(

@@ -20,6 +20,7 @@ from der_planner.page.situation import (
     DriverState,
     LimbView,
     NodeStatus,
+    PlanView,
     Situation,
 )
 
@@ -160,3 +161,21 @@ def test_no_reference_is_made_up_across_a_pause(situation: Situation) -> None:
     situation.put_reference(1_000_000_000, 0.1, 0.0)  # a newer plan
     assert situation.reference_at(2_000_000_000) is None
     assert situation.reference_at(1_000_000_000) == (0.1, 0.0)
+
+
+def test_a_plan_says_what_it_reckons_with(situation: Situation) -> None:
+    carried = PlanView(
+        "opposite_direction", "der", "optimal", "mine", "hanging", 0.02, 0.12, 0.0031
+    )
+    situation.put_plan(carried)
+    said = situation.snapshot()["plan"]
+    for part in ("opposite", "'mine'", "hanging", "20 g at 12.0 cm", "0.31 cm"):
+        assert part in said
+    assert "carrying" not in str(PlanView("a", "pcc", "paper", "mine", "horizontal", 0.0, 0.0, 0.0))
+
+
+def test_remedies_name_the_buttons_of_the_page(situation: Situation) -> None:
+    status = "refused: the driver is DISARMED: call pressure_driver/arm, then planner/start"
+    situation.put_status(NodeStatus("/limb/planner", 1, status))
+    (node,) = situation.snapshot()["nodes"]
+    assert node["message"].endswith("press Arm, then Play last plan again")

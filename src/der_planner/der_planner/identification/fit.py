@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.identification.air import AirFit, fit_air
-from der_planner.identification.geometry import GeometryFit, fit_geometry, with_geometry
+from der_planner.identification.geometry import GeometryFit, UnevenTips, fit_geometry, with_geometry
 from der_planner.identification.logs.log import CalibrationLog, LogError
 from der_planner.identification.logs.prepare import LONGEST_GAP, Prepared, prepare
 from der_planner.identification.parameters import GROUPS, OPTIONAL, to_limb
@@ -21,6 +21,7 @@ from der_planner.identification.problem import Problem
 from der_planner.identification.report import FitReport, LoadsFit, Unknown, loads_of
 from der_planner.identification.rod_angles import NODES
 from der_planner.limb import CalibratedRange, Limb
+from der_planner.model.response import NODES as PLANNED_NODES
 from der_planner.model.response import RodModel, simulate
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.rod import ConvergenceError
@@ -117,7 +118,7 @@ def _fit_bends_and_lengths(
 
     The lengths follow from tips and bend angles only if it is known how unevenly each segment
     bends; that follows from a fitted limb, whose weight depends on its lengths. So both are fitted
-    in turn until the lengths stay the same.
+    in turn until the lengths stay the same. How unevenly it bends also tells the stiffness.
     """
     loaded = any(limb.gravity[:2])
     prior = limb
@@ -127,12 +128,15 @@ def _fit_bends_and_lengths(
     problem = Problem(limb, prepared, offset, groups, nodes)
     fitted = _Fitted(limb, lengths, problem, *problem.solve())
     for _ in range(MOST_PASSES if geometry and loaded else 0):
-        uneven = _uneven_tip(to_limb(fitted.limb, fitted.values), prepared, offset)
+        found = to_limb(fitted.limb, fitted.values)
+        uneven = _uneven_tip(found, prepared, offset)
         lengths = fit_geometry(prior, prepared.log, uneven=uneven)
         if lengths is None:
             break
         limb = with_geometry(prior, lengths.lengths, lengths.connector, lengths.base)
-        problem = Problem(limb, prepared, offset, groups, nodes, start=fitted.values)
+        finer = uneven - _uneven_tip(found, prepared, offset, nodes)
+        tips = UnevenTips(prior, limb, prepared.log, prepared.usable, RodModel(limb, nodes), finer)
+        problem = Problem(limb, prepared, offset, groups, nodes, fitted.values, tips)
         moved = np.abs(np.subtract(_lengths(limb), _lengths(fitted.limb))).max()
         fitted = _Fitted(limb, lengths, problem, *problem.solve())
         if moved < SAME_LENGTH:
@@ -140,13 +144,13 @@ def _fit_bends_and_lengths(
     return fitted
 
 
-def _uneven_tip(limb: Limb, prepared: Prepared, offset: Array) -> Array:
+def _uneven_tip(limb: Limb, prepared: Prepared, offset: Array, nodes: int = PLANNED_NODES) -> Array:
     """Return the tip (K, 2) of the limb along the log less that of evenly bent segments [m].
 
     Raises:
         LogError: the rod of the planners, which has more nodes than that of the fit, cannot follow.
     """
-    model = RodModel(limb)
+    model = RodModel(limb, nodes)
     try:
         seen = simulate(model, prepared.log.time, pressures=prepared.pressure - offset)
     except ConvergenceError as error:

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from der_planner.identification.logs.log import CalibrationLog
+from der_planner.identification.rod_angles import Predicted
 from der_planner.limb import Limb
 from der_planner.model.bending import PolylineKinematics
+from der_planner.model.response import RodModel
 from der_planner.rod import Rod
 
 Array = NDArray[np.float64]
@@ -31,8 +33,13 @@ UNEVEN_BEND = 1.0
 """… [rad], and the less the straighter it is: the straight limb tells its whole length …"""
 STRAIGHT_ERROR = 1e-4
 """… as well as the tags do [m]."""
+UNEVEN_ERROR = 2e-3
+"""Error of a tip where it tells stiffness [m]: what makes a limb bend unevenly beside its weight,
+fittings and uneven walls, stays the same for the whole log and averages out less."""
 CORRELATION = 20.0
 """Rows over which that error stays the same (1 s)."""
+_NUDGE = 1e-6
+"""Change of a length for the slope of the tip [m]."""
 NODES = 21
 """Of the rod whose chain of edges is fitted, as the planners use it. A polyline bends at its inner
 nodes alone and leaves a straight half edge at both ends of a segment; the fitted stiff pieces make
@@ -80,38 +87,24 @@ def fit_geometry(
     angles, tip = log.bend_angles[rows][::every], log.tip[rows][::every]
     if uneven is not None:
         tip = tip - uneven[rows][::every]
-    prior = np.array([segment.length for segment in limb.segments])
-    known = limb.connector_length or 4e-3
-    connector = min(max(known, 1.1 * CONNECTOR_RANGE[0]), 0.9 * CONNECTOR_RANGE[1])
-    several = limb.segment_count > 1
-    base = min(max(limb.base_length, 1e-3), 0.9 * BASE_RANGE[1])
-    spread = np.concatenate([LENGTH_PRIOR * prior, [STIFF_PRIOR, STIFF_PRIOR]])
-    start = np.concatenate([prior, [base, connector]])
-    low = np.concatenate([0.8 * prior, [BASE_RANGE[0], CONNECTOR_RANGE[0]]])
-    high = np.concatenate([1.2 * prior, [BASE_RANGE[1], CONNECTOR_RANGE[1]]])
+    start, spread, low, high = _known(limb)
     uneven_share = np.minimum(np.linalg.norm(angles, axis=1) / UNEVEN_BEND, 1.0)
     error = np.hypot(STRAIGHT_ERROR, TIP_ERROR * uneven_share)[:, None]
     weight = math.sqrt(every / CORRELATION) / error
-    count = len(prior)
-    free = count + 2 if several else count + 1
 
     def difference(candidate: Limb) -> Array:
-        rod = Rod.from_limb(candidate, nodes)
-        return np.asarray(PolylineKinematics.of_rod(rod).tip(angles) - tip)
-
-    def candidate(x: Array) -> Limb:
-        return with_geometry(limb, x[:count], float(x[-1]) if several else None, float(x[count]))
+        return np.asarray(_even_tip(candidate, angles, nodes) - tip)
 
     def residual(x: Array) -> Array:
-        data = (weight * difference(candidate(x))).ravel()
-        return np.concatenate([data, (x - start[:free]) / spread[:free]])
+        data = (weight * difference(_with(limb, x))).ravel()
+        return np.concatenate([data, (x - start) / spread])
 
     solution = least_squares(
-        residual, start[:free], bounds=(low[:free], high[:free]), x_scale=spread[:free]
+        residual, np.clip(start, 1.1 * low, 0.9 * high), bounds=(low, high), x_scale=spread
     )
     jacobian = np.asarray(solution.jac)
     covariance = np.linalg.inv(jacobian.T @ jacobian)
-    found = candidate(solution.x)
+    found = _with(limb, solution.x)
     return GeometryFit(
         lengths=np.array([segment.length for segment in found.segments]),
         connector=found.connector_length,
@@ -120,6 +113,102 @@ def fit_geometry(
         residual_before=_distance(difference(limb)),
         residual=_distance(difference(found)),
     )
+
+
+class UnevenTips:
+    """What tips tell of the weight's share in the bend, whatever the lengths are.
+
+    A pressure and a rest angle bend a segment evenly, weight bends it most where it begins. So the
+    tip at given bend angles tells how much of them is the weight's, which bend angles alone hardly
+    tell from a rest angle and the neighbour's pressure. Lengths shift the tip as well: the residual
+    is what the best lengths leave, and it changes by an unknown as it does with them.
+
+    Args:
+        prior: with the lengths that are known before.
+        limb: with the lengths that were fitted last.
+        log: with tips and bend angles on the rows of the fit.
+        usable: (K,) rows to fit to.
+        model: of the limb, with the nodes of the fit.
+        finer: (K, 2) tip less that of an evenly bent limb of a rod of many nodes, less the same of
+            the model's [m].
+    """
+
+    def __init__(
+        self,
+        prior: Limb,
+        limb: Limb,
+        log: CalibrationLog,
+        usable: NDArray[np.bool_],
+        model: RodModel,
+        finer: Array,
+    ) -> None:
+        seen = np.all(np.isfinite(log.bend_angles), axis=1) & np.all(np.isfinite(log.tip), axis=1)
+        self._rows, self._even = usable & seen, model.kinematics
+        angles = log.bend_angles[self._rows]
+        tip = _even_tip(limb, angles, NODES)
+        self._uneven = (log.tip - finer)[self._rows] - tip
+        self._weight = 1.0 / (UNEVEN_ERROR * math.sqrt(CORRELATION))
+        start, spread, low, high = _known(prior)
+        now = _lengths_of(limb)
+        # A length at its bound stays there.
+        free = np.flatnonzero((now - low > _NUDGE) & (high - now > _NUDGE))
+        longer = [_with(limb, now + _NUDGE * np.eye(len(now))[place]) for place in free]
+        columns = [(_even_tip(each, angles, NODES) - tip).ravel() / _NUDGE for each in longer]
+        by_lengths = np.concatenate(
+            [self._weight * np.stack(columns, axis=1), np.diag(1.0 / spread[free])]
+        )
+        self._known = ((now - start) / spread)[free]
+        self._spanned = np.linalg.qr(by_lengths)[0]
+
+    def residual(self, found: Predicted | None) -> Array:
+        """Return the weighted residual of a prediction; zeros for None, a trial without one."""
+        if found is None:
+            return np.zeros(len(self._spanned))
+        uneven = (found.tip - self._even.tip(found.angles))[self._rows]
+        data = self._weight * (uneven - self._uneven).ravel()
+        return self._left(np.concatenate([data, self._known]))
+
+    def jacobian(self, found: Predicted) -> Array:
+        """Return the derivative of the residual by the P unknowns."""
+        rows, unknowns = self._rows, found.tip_by.shape[2]
+        evenly = self._even.tip_jacobians(found.angles[rows]) @ found.angles_by[rows]
+        change = self._weight * (found.tip_by[rows] - evenly).reshape(-1, unknowns)
+        return self._left(np.concatenate([change, np.zeros((len(self._known), unknowns))]))
+
+    def _left(self, rows: Array) -> Array:
+        left: Array = rows - self._spanned @ (self._spanned.T @ rows)
+        return left
+
+
+def _known(prior: Limb) -> tuple[Array, Array, Array, Array]:
+    """Return where lengths, base and connector start, their spreads and bounds [m].
+
+    Without the connector for one segment.
+    """
+    lengths = np.array([segment.length for segment in prior.segments])
+    count = len(lengths) + (2 if prior.segment_count > 1 else 1)
+    start = np.concatenate([lengths, [prior.base_length, prior.connector_length or 4e-3]])
+    spread = np.concatenate([LENGTH_PRIOR * lengths, [STIFF_PRIOR, STIFF_PRIOR]])
+    low = np.concatenate([0.8 * lengths, [BASE_RANGE[0], CONNECTOR_RANGE[0]]])
+    high = np.concatenate([1.2 * lengths, [BASE_RANGE[1], CONNECTOR_RANGE[1]]])
+    return start[:count], spread[:count], low[:count], high[:count]
+
+
+def _lengths_of(limb: Limb) -> Array:
+    lengths = [*(s.length for s in limb.segments), limb.base_length]
+    return np.array([*lengths, limb.connector_length] if limb.segment_count > 1 else lengths)
+
+
+def _with(limb: Limb, lengths: Array) -> Limb:
+    """Return the limb with lengths, base and connector as `_known` orders them."""
+    count = limb.segment_count
+    connector = float(lengths[-1]) if count > 1 else None
+    return with_geometry(limb, lengths[:count], connector, float(lengths[count]))
+
+
+def _even_tip(limb: Limb, angles: Array, nodes: int) -> Array:
+    """Return the tips (K, 2) of the limb's polyline, bent evenly by angles (K, M) [m]."""
+    return PolylineKinematics.of_rod(Rod.from_limb(limb, nodes)).tip(angles)
 
 
 def with_geometry(

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from der_planner.identification.geometry import UnevenTips
 from der_planner.identification.logs.log import LogError
 from der_planner.identification.logs.prepare import Prepared
 from der_planner.identification.parameters import (
@@ -17,7 +18,7 @@ from der_planner.identification.parameters import (
     without,
 )
 from der_planner.identification.report import Unknown
-from der_planner.identification.rod_angles import RodAngles
+from der_planner.identification.rod_angles import Predicted, RodAngles
 from der_planner.identification.statics import static_start
 from der_planner.limb import Limb
 from der_planner.rod import ConvergenceError
@@ -51,6 +52,7 @@ class Problem:
         groups: of terms to fit.
         nodes: of the rod.
         start: (M, T) values to start from; None: in closed form from the log's statics.
+        tips: fit to them, too; None: to the bend angles alone.
     """
 
     def __init__(
@@ -61,8 +63,9 @@ class Problem:
         groups: frozenset[str],
         nodes: int,
         start: Array | None = None,
+        tips: UnevenTips | None = None,
     ) -> None:
-        self.groups, self.nodes = groups, nodes
+        self.groups, self.nodes, self._tips = groups, nodes, tips
         self._prepared = prepared
         self._wanted = [
             (segment, index)
@@ -81,7 +84,7 @@ class Problem:
         self._prior = without(start_values(limb), groups)
         self._start = self._static_start(limb, offset) if start is None else start.copy()
         self._weight = 1.0 / (ANGLE_ERROR * np.sqrt(CORRELATION))
-        self._cache: tuple[bytes, Array | None, Array] | None = None
+        self._cache: tuple[bytes, Predicted | None] | None = None
         self.evaluations = 0
 
     def solve(self) -> tuple[Array, Array]:
@@ -171,7 +174,7 @@ class Problem:
         for more in STIFFER_STARTS if fitted else STIFFER_STARTS[:1]:
             self._start = begin.copy()
             self._start[:, column(name)] += sign * more
-            if self._evaluate(np.clip(self._scaled(self._start), low, high))[0] is not None:
+            if self._evaluate(np.clip(self._scaled(self._start), low, high)) is not None:
                 return
         raise LogError(
             "the rod cannot follow this log, neither with the prior's stiffness nor with more: "
@@ -189,37 +192,43 @@ class Problem:
         wanted = np.array([values[place] for place in self._wanted])
         return np.asarray(wanted / self._scale)
 
-    def _evaluate(self, x: Array) -> tuple[Array | None, Array]:
-        """Return the angles (K, M) and their derivatives (K, M, P); None: the rod cannot follow."""
+    def _evaluate(self, x: Array) -> Predicted | None:
+        """Return the prediction with its derivatives; None: the rod cannot follow."""
         key = x.tobytes()
         if self._cache is None or self._cache[0] != key:
             self.evaluations += 1
-            angles: Array | None
+            found: Predicted | None
             try:
-                angles, derivatives = self._prediction.derivatives(self._values(x), self._wanted)
+                found = self._prediction.derivatives(self._values(x), self._wanted)
             except ConvergenceError:
-                angles, derivatives = None, np.zeros(0)
-            if angles is not None and not np.all(np.isfinite(angles)):
-                angles = None
-            self._cache = (key, angles, derivatives)
-        return self._cache[1], self._cache[2]
+                found = None
+            if found is not None and not np.all(np.isfinite(found.angles)):
+                found = None
+            self._cache = (key, found)
+        return self._cache[1]
 
     def _residual(self, x: Array) -> Array:
-        angles, _ = self._evaluate(x)
+        found = self._evaluate(x)
         rows = self._prepared.usable
         measured = self._prepared.log.bend_angles[rows]
         error = np.full(measured.shape, NOT_FOLLOWED)
-        if angles is not None:
-            error = angles[rows] - measured
+        if found is not None:
+            error = found.angles[rows] - measured
+        parts = [self._weight * error.ravel()]
+        if self._tips is not None:
+            parts.append(self._tips.residual(found))
         prior = ((x - self._scaled(self._prior)) * self._scale / self._spread)[self._known]
-        return np.concatenate([self._weight * error.ravel(), prior])
+        return np.concatenate([*parts, prior])
 
     def _jacobian(self, x: Array) -> Array:
-        _, derivatives = self._evaluate(x)
+        found = self._evaluate(x)
+        assert found is not None  # a trial that is not followed is never where the optimiser stays
         rows = self._prepared.usable
-        data: Array = self._weight * derivatives[rows].reshape(-1, len(x)) * self._scale
+        parts = [self._weight * found.angles_by[rows].reshape(-1, len(x)) * self._scale]
+        if self._tips is not None:
+            parts.append(self._tips.jacobian(found) * self._scale)
         prior = np.diag(self._scale / self._spread)[self._known]
-        return np.concatenate([data, prior])
+        return np.concatenate([*parts, prior])
 
 
 def correlation_length(remaining: Array) -> float:

@@ -7,6 +7,8 @@ measured bend inside the model, an error of friction would partly cancel itself 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,6 +30,22 @@ _STEP = 0.1
 """Change of an unknown, in units of its scale, for the difference of two simulations."""
 
 
+class Predicted(NamedTuple):
+    """What a rod does along a log of K rows, and the derivatives by P unknowns.
+
+    Attributes:
+        angles: (K, M) bend angles [rad].
+        tip: (K, 2) [m].
+        angles_by: (K, M, P).
+        tip_by: (K, 2, P).
+    """
+
+    angles: Array
+    tip: Array
+    angles_by: Array
+    tip_by: Array
+
+
 class RodAngles:
     """Predicts bend angles open loop along measured pressures.
 
@@ -46,8 +64,8 @@ class RodAngles:
         """Return predicted bend angles (K, M) [rad] for the unknowns (M, T)."""
         return self._simulate(RodModel(to_limb(self._prior, values), self._nodes)).bend_angles
 
-    def derivatives(self, values: Array, wanted: list[tuple[int, int]]) -> tuple[Array, Array]:
-        """Return angles (K, M) and their derivatives (K, M, P) by P unknowns.
+    def derivatives(self, values: Array, wanted: list[tuple[int, int]]) -> Predicted:
+        """Return bend angles and tips with their derivatives by P unknowns.
 
         Args:
             values: (M, T) unknowns.
@@ -63,17 +81,19 @@ class RodAngles:
         response = self._simulate(model, linearise=True)
         angles, effective = response.bend_angles, self.effective(values)
         assert response.derivative is not None
-        result = np.empty((*angles.shape, len(wanted)))
+        angles_by = np.empty((*angles.shape, len(wanted)))
+        tip_by = np.empty((*response.tip.shape, len(wanted)))
         for place, (segment, term) in enumerate(wanted):
             if TERMS[term].group in ("dynamics", "mass"):
-                result[:, :, place] = self._difference(values, segment, term, angles)
-                continue
-            change = self._pressure_change(values, segment, term, effective)
-            change[:, segment] += self._moment_change(
-                values[segment], term, effective[:, segment], angles[:, segment]
-            )
-            result[:, :, place] = response.derivative.by_effective(change)[1]
-        return angles, result
+                changed = self._difference(values, segment, term, response)
+            else:
+                change = self._pressure_change(values, segment, term, effective)
+                change[:, segment] += self._moment_change(
+                    values[segment], term, effective[:, segment], angles[:, segment]
+                )
+                changed = response.derivative.by_effective(change)
+            tip_by[:, :, place], angles_by[:, :, place] = changed
+        return Predicted(angles, response.tip, angles_by, tip_by)
 
     def effective(self, values: Array) -> Array:
         """Return the effective pressures (K, M) [Pa] of the unknowns (M, T)."""
@@ -85,13 +105,15 @@ class RodAngles:
             model, self._time, pressures=self._pressure, steps=SUBSTEPS, linearise=linearise
         )
 
-    def _difference(self, values: Array, segment: int, term: int, angles: Array) -> Array:
-        """Return the derivative (K, M) by an unknown that changes the rod itself."""
+    def _difference(
+        self, values: Array, segment: int, term: int, now: Response
+    ) -> tuple[Array, Array]:
+        """Return the derivatives of tip and angles by an unknown that changes the rod itself."""
         step = _STEP * TERMS[term].scale
         moved = values.copy()
         put(moved, segment, term, float(values[segment, term]) + step)
-        changed: Array = (self.angles(moved) - angles) / step
-        return changed
+        then = self._simulate(RodModel(to_limb(self._prior, moved), self._nodes))
+        return (then.tip - now.tip) / step, (then.bend_angles - now.bend_angles) / step
 
     def _pressure_change(self, values: Array, segment: int, term: int, effective: Array) -> Array:
         """Return ∂(effective pressures)/∂unknown (K, M), by a difference of the closed form."""

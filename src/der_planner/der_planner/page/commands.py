@@ -15,6 +15,9 @@ Service = Literal["vent", "arm", "start", "stop", "record_start", "record_stop"]
 PATIENCE = 3.0
 """[s] to wait for a service's answer."""
 
+FILLING = 3.0
+"""[s] for which a chamber is filled alone; then the driver holds and lets it down by itself."""
+
 OWNERS: dict[Service, str] = {
     "vent": "pressure_driver",
     "arm": "pressure_driver",
@@ -24,6 +27,22 @@ OWNERS: dict[Service, str] = {
     "record_stop": "recorder",
 }
 """The node that serves each."""
+
+
+IN_BUTTONS = (
+    ("call pressure_driver/arm, then planner/start", "press Arm, then Play last plan again"),
+    ("call pressure_driver/arm", "press Arm"),
+    ("call arm", "press Arm"),
+    ("call planner/start", "press Play last plan again"),
+)
+"""How the nodes name their services, and how the page names its buttons for them."""
+
+
+def in_buttons(text: str) -> str:
+    """Return what a node says with the page's buttons in place of its services."""
+    for service, button in IN_BUTTONS:
+        text = text.replace(service, button)
+    return text
 
 
 @dataclass(frozen=True)
@@ -46,6 +65,9 @@ class MotionRequest:
         period: [s] of one cycle.
         cycles: how many.
         feedback: correct the setpoints while the limb moves.
+        payload: [kg] carried beside the limb's own masses; 0: the planner's parameter.
+        payload_at: [m] where, along the limb from its clamp; 0: the tip.
+        mounting: a name or degrees of tilt; empty: the planner's parameter.
     """
 
     motion: str
@@ -55,6 +77,9 @@ class MotionRequest:
     period: float
     cycles: int
     feedback: bool
+    payload: float = 0.0
+    payload_at: float = 0.0
+    mounting: str = ""
 
 
 class Commands(Protocol):
@@ -66,6 +91,16 @@ class Commands(Protocol):
 
     def play(self, request: MotionRequest) -> Answer:
         """Ask the planner to plan and play a motion."""
+        ...
+
+    def fill(self, segment: int, side: int, pressure: float) -> Answer:
+        """Fill one chamber alone for `FILLING`.
+
+        Args:
+            segment: its number, 0 at the clamp.
+            side: 1 for the left chamber, which bends counter-clockwise, -1 for the right one.
+            pressure: differential pressure [Pa], above zero.
+        """
         ...
 
     def play_path(self, tip: NDArray[np.float64]) -> Answer:

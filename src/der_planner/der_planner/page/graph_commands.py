@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import time
+import uuid
 from concurrent.futures import Future
 from typing import Any
 
@@ -14,11 +16,12 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from der_msgs.msg import MotionCommand
-from der_planner.page.commands import OWNERS, Answer, MotionRequest, Service
-from der_planner.page.situation import Situation
+from der_msgs.msg import MotionCommand, PressureSetpoint
+from der_planner.page.commands import FILLING, OWNERS, Answer, MotionRequest, Service
+from der_planner.page.situation import NANOSECONDS, Situation
 from der_planner.planning.plan_file import learned_names
 from limb_interfaces import qos, topics
+from limb_interfaces.stamps import stamp_from_nanoseconds
 
 PATHS: dict[Service, str] = {
     "vent": "pressure_driver/vent",
@@ -29,6 +32,11 @@ PATHS: dict[Service, str] = {
     "record_stop": "recorder/stop",
 }
 
+TICK = NANOSECONDS // 20
+"""[ns] between two setpoints."""
+FILL_AHEAD = 4
+"""Ticks from now to the first setpoint."""
+
 
 class GraphCommands:
     """`Commands` by ROS; called from the server's thread, answered from the executor's.
@@ -36,15 +44,20 @@ class GraphCommands:
     Args:
         node: of the page.
         situation: what the nodes have said of themselves.
+        segments: of the limb.
     """
 
-    def __init__(self, node: Node, situation: Situation) -> None:
+    def __init__(self, node: Node, situation: Situation, segments: int) -> None:
         self._situation = situation
+        self._segments = segments
         self._service_clients = {
             service: node.create_client(Trigger, path) for service, path in PATHS.items()
         }
         self._recorder_parameters = node.create_client(SetParameters, "recorder/set_parameters")
         self._paths = node.create_publisher(PathMessage, topics.NEAREST_PATH, qos.COMMANDS)
+        self._setpoints = node.create_publisher(
+            PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS
+        )
         self._motions = node.create_publisher(MotionCommand, topics.COMMAND, qos.COMMANDS)
 
     def call(self, service: Service) -> Future[Answer]:
@@ -75,7 +88,8 @@ class GraphCommands:
             MotionCommand(
                 motion=request.motion, model=request.model, method=request.method,
                 amplitude=request.amplitude, period=request.period, cycles=request.cycles,
-                feedback=request.feedback,
+                feedback=request.feedback, payload=request.payload,
+                payload_at=request.payload_at, mounting=request.mounting,
             )
         )  # fmt: skip
         return Answer(True, f"asked the planner for {request.motion} with {request.model}")
@@ -102,6 +116,23 @@ class GraphCommands:
         request = SetParameters.Request(parameters=[Parameter(name="metadata", value=metadata)])
         self._recorder_parameters.call_async(request).add_done_callback(then)
         return answer
+
+    def fill(self, segment: int, side: int, pressure: float) -> Answer:
+        """Send the driver setpoints for one chamber, if it is armed and nothing is played."""
+        mode = self._situation.driver_mode
+        if mode != "armed":
+            return Answer(
+                False, f"the driver is {mode or 'not heard'}: it must be armed and at rest"
+            )
+        first = (time.time_ns() // TICK + FILL_AHEAD) * TICK
+        plan_id, values = f"fill_{uuid.uuid4().hex[:8]}", [0.0] * self._segments
+        values[segment] = side * pressure
+        for index in range(round(FILLING * NANOSECONDS / TICK)):
+            message = PressureSetpoint(plan_id=plan_id, index=index, differential_pressure=values)
+            message.header.stamp = stamp_from_nanoseconds(first + index * TICK)
+            self._setpoints.publish(message)
+        which = f"segment {segment}, {'left' if side > 0 else 'right'}"
+        return Answer(True, f"{which}: {pressure / 1000:.1f} kPa for {FILLING:.0f} s")
 
     def play_path(self, tip: np.ndarray[Any, Any]) -> Answer:
         """Let the planner play the nearest path that it can to points (P, 2) [m]."""

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Awaitable, Callable
-from dataclasses import replace
 
 from fastapi import FastAPI
 from nicegui import Client, ui
 
-from der_planner.page import setup_page
 from der_planner.page.afterwards import listing, replay
-from der_planner.page.commands import Answer, MotionRequest, Service, answer_of
+from der_planner.page.commands import Answer, Service, answer_of, in_buttons
 from der_planner.page.drawing.sketch import Sketch
+from der_planner.page.motion_form import FormError, MotionForm
 from der_planner.page.server import STATIC, Parts
-from der_planner.planning import METHODS
-from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD, NAMES
-from der_planner.planning.plan_file import LEARNED
+from der_planner.page.setup import page as setup_page
 
 RECONNECT = 3.0
 """[s] that a browser's connection may be away before it counts as lost."""
@@ -24,8 +20,6 @@ FAST = 0.3
 """[s] between two looks at who commands."""
 SLOW = 2.0
 """[s] between two looks at which plans have been learned."""
-NO_PLANS = "No learned plans"
-BEST = "the best"
 LINKS = {
     "Experiments": listing.ADDRESS,
     "Replay": replay.ADDRESS,
@@ -63,6 +57,7 @@ class Window:
                 self._controls()
             self._panel("numbers", "Last 30 s", "driver", "plots.html")
             self._panel("nodes", "Nodes", "", "nodes.html")
+        client.on_connect(lambda: parts.desk.connected(self._name, str(client.tab_id)))
         client.on_delete(lambda: parts.desk.disconnected(self._name))
         ui.timer(FAST, self._show_desk)
         ui.timer(SLOW, self._offer_learned)
@@ -83,26 +78,17 @@ class Window:
             self._who = ui.label().props('id="who"')
             for text, address in LINKS.items():
                 ui.link(text, address, new_tab=True)
-        ui.html("<div id='planner-line'></div><div id='recorder-line'></div>", sanitize=False)
+        ui.html(
+            "<div id='planner-line'></div><div id='plan-line'></div><div id='recorder-line'></div>",
+            sanitize=False,
+        )
         with ui.row().classes("line"):
             self._button("Arm", "arm", lambda: self._call("arm"), "positive")
             self._button("Stop motion", "stop", lambda: self._call("stop"), "warning")
             self._button("Play last plan again", "start", lambda: self._call("start"), "primary")
-        with ui.row().classes("line"):
-            self._motion = ui.select(list(NAMES), value=NAMES[0], label="Motion")
-            self._model = ui.select(list(METHODS), value="der", label="Model")
-            self._model.on_value_change(self._offer_methods)
-            self._method = ui.select({"": BEST}, value="", label="Method")
-            self._offer_methods()
-        with ui.row().classes("line"):
-            degrees = round(math.degrees(DEFAULT_AMPLITUDE), 3)
-            self._amplitude = ui.number("Amplitude [°]", value=degrees, min=1, max=90)
-            self._period = ui.number("Period [s]", value=DEFAULT_PERIOD, min=1, max=600)
-            self._cycles = ui.number("Cycles", value=DEFAULT_CYCLES, min=1, max=100, precision=0)
-            self._button("Play motion", "play", self._on_play, "primary")
-        with ui.row().classes("line"):
-            self._learned = ui.select([], label=NO_PLANS, clearable=True).props('id="learned"')
-            self._feedback = ui.switch("Feedback").props('id="feedback"')
+        self._form = MotionForm(
+            lambda: self._button("Play motion", "play", self._on_play, "primary")
+        )
         with ui.row().classes("line"):
             self._note = ui.input("Note for the recording")
             self._button("Record", "record", self._on_record, "primary")
@@ -114,19 +100,8 @@ class Window:
         button = ui.button(text, on_click=action, color=colour).props(f'id="{name}"')
         self._guarded.append(button)
 
-    def _offer_methods(self) -> None:
-        names = METHODS[str(self._model.value)]
-        self._method.set_options({"": BEST, **{name: name for name in names}}, value="")
-
     def _offer_learned(self) -> None:
-        """Offer the plans that are in the planner's folder now; a chosen one that is gone goes."""
-        names = self._parts.commands.learned_plans()
-        if names == self._learned.options:
-            return
-        chosen = self._learned.value if self._learned.value in names else None
-        self._learned.set_options(names, value=chosen)
-        label = "Learned plan instead" if names else NO_PLANS
-        self._learned.props(f'label="{label}"')
+        self._form.offer_learned(self._parts.commands.learned_plans())
 
     def _show_desk(self) -> None:
         desk = self._parts.desk
@@ -170,21 +145,14 @@ class Window:
     async def _on_play(self) -> None:
         if not self._may_command():
             return
-        values = (self._amplitude.value, self._period.value, self._cycles.value)
-        if any(value is None for value in values):
-            ui.notify("amplitude, period and cycles must be numbers", type="negative")
+        try:
+            request = self._form.read()
+        except FormError as error:
+            ui.notify(str(error), type="negative")
             return
-        amplitude, period, cycles = values
-        request = MotionRequest(
-            str(self._motion.value), str(self._model.value), str(self._method.value),
-            math.radians(float(amplitude)), float(period), int(cycles), bool(self._feedback.value),
-        )  # fmt: skip
-        learned = str(self._learned.value or "")
-        if learned:
-            request = replace(request, motion=learned, method=LEARNED)
         self._tell("play", self._parts.commands.play(request))
 
     def _tell(self, what: str, answer: Answer) -> None:
-        text = f"{what.replace('_', ' ')}: {answer.message}"
+        text = f"{what.replace('_', ' ')}: {in_buttons(answer.message)}"
         with self._client:
             ui.notify(text, type="positive" if answer.success else "negative", timeout=6000)

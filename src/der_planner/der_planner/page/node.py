@@ -29,17 +29,25 @@ from der_msgs.msg import (
     PressureState,
     TagDetectionArray,
 )
-from der_planner.limb import Limb
+from der_planner.limb import Limb, mounting_of
 from der_planner.page.access import Binding, listen, read_password
 from der_planner.page.afterwards.experiments import Experiments
 from der_planner.page.drawing.studio import Studio
 from der_planner.page.graph_commands import GraphCommands
+from der_planner.page.intake import Intake
 from der_planner.page.layout import lay_out
 from der_planner.page.operators import POLICIES, Desk
 from der_planner.page.overlay import Overlay
 from der_planner.page.picture import PictureFeed
 from der_planner.page.server import PageServer, Parts
-from der_planner.page.situation import DriverState, LimbView, NodeStatus, Situation
+from der_planner.page.situation import (
+    DriverState,
+    EstimateView,
+    LimbView,
+    NodeStatus,
+    PlanView,
+    Situation,
+)
 from der_planner.page.worker import Worker
 from der_planner.planning import PathLimits
 from limb_interfaces import qos, topics
@@ -63,7 +71,7 @@ class PageNode(Node):
         check_overrides(self, refuse=True)
         binding.check()
         self._situation = Situation()
-        self._commands = GraphCommands(self, self._situation)
+        self._commands = GraphCommands(self, self._situation, self._studio.limb.segment_count)
         self._replayer = Worker()
         self._picture = PictureFeed(self._picture_rate)
         self._overlay = Overlay(self._tag_map)
@@ -137,7 +145,8 @@ class PageNode(Node):
     # What comes in -------------------------------------------------------------------------
 
     def _subscribe(self) -> None:
-        subscribe = self.create_subscription
+        self._intake = Intake(self)
+        subscribe = self._intake.subscribe
         subscribe(PressureState, topics.PRESSURE_STATE, self._on_driver, qos.STATES)
         subscribe(LimbState, topics.LIMB_STATE, self._on_limb, qos.STATES)
         subscribe(TagDetectionArray, topics.TAGS, self._on_tags, qos.STATES)
@@ -148,6 +157,7 @@ class PageNode(Node):
         subscribe(CameraInfo, topics.CAMERA_INFO, self._on_camera, qos.IMAGES)
         subscribe(LimbEstimate, topics.ESTIMATE, self._on_estimate, qos.STATES)
         subscribe(DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, qos.STATES)
+        self._intake.start()
 
     def _on_driver(self, message: PressureState) -> None:
         self._situation.put_driver(
@@ -186,9 +196,22 @@ class PageNode(Node):
         self._situation.put_reference(stamp, message.point.x, message.point.y)
 
     def _on_plan(self, message: PressurePlan) -> None:
+        self._situation.put_plan(
+            PlanView(
+                message.motion, message.model, message.method, message.limb,
+                mounting_of(message.gravity), message.payload, message.payload_at,
+                message.predicted_error,
+            )
+        )  # fmt: skip
         self._overlay.put_path(np.array(message.tip_reference).reshape(-1, 2))
 
     def _on_estimate(self, message: LimbEstimate) -> None:
+        self._situation.put_estimate(
+            EstimateView(
+                tuple(message.missing_pressure), tuple(message.missing_pressure_sigma),
+                tuple(message.gain_error), tuple(message.correction), message.share, message.reason,
+            )
+        )  # fmt: skip
         self._overlay.put_estimate(np.array([(point.x, point.y) for point in message.curve]))
 
     def _on_markers(self, message: MarkerArray) -> None:
@@ -232,12 +255,14 @@ class PageNode(Node):
         """Subscribe to images while somebody looks; end with the server."""
         if self._server.error is not None:
             self.fatal_error = f"the page's server ended: {self._server.error}"
+        if self._intake.error is not None:
+            self.fatal_error = f"no more messages can be taken: {self._intake.error!r}"
         if self._picture.watched and self._images is None:
-            self._images = self.create_subscription(
+            self._images = self._intake.subscribe(
                 Image, topics.IMAGE, self._on_image, qos.IMAGES, raw=True
             )
         elif not self._picture.watched and self._images is not None:
-            self.destroy_subscription(self._images)
+            self._intake.remove(self._images)
             self._images = None
 
     def _on_lost_operator(self, _window: str) -> None:
@@ -255,15 +280,19 @@ class PageNode(Node):
             "operator": "yes" if self._desk.operator else "no",
             "picture": "watched" if self._picture.watched else "nobody looks",
             "refused_requests": self._server.guard.refused,
+            "refused_messages": self._intake.refused,
             "on_lost_operator": self._policy,
             "threads": threading.active_count(),
         }
         if not self._server.ready:
             return Health("stale", "the server is starting", values)
+        if self._intake.refused:
+            return Health("warning", self._intake.last_refused, values)
         return Health("ok", f"serving {self._server.url}", values)
 
     def close(self) -> None:
         """Stop serving."""
+        self._intake.close()
         self._server.close()
         self._studio.previewer.close()
         self._replayer.close()

@@ -1,4 +1,4 @@
-"""The camera's picture for browsers: JPEG, no faster than asked for, and only if somebody looks."""
+"""The camera's picture for browsers: JPEG, as fast and as large as they show it, if they look."""
 
 from __future__ import annotations
 
@@ -13,6 +13,10 @@ from numpy.typing import NDArray
 
 LOOKING = 2.0
 """[s] after the last request during which somebody counts as looking."""
+WIDTHS = (320, 480, 640, 960)
+"""[px] to which a picture is made smaller for a window that shows no more."""
+STRETCH = 0.85
+"""Least width of a picture over that at which it is shown."""
 
 
 class PictureError(RuntimeError):
@@ -26,16 +30,18 @@ class Encoded:
     Attributes:
         number: counts the pictures from 1.
         stamp: of the image [ns].
+        size: width and height of the camera's image [px]; the file may be smaller.
         jpeg: the file.
     """
 
     number: int
     stamp: int
+    size: tuple[int, int]
     jpeg: bytes
 
 
 class PictureFeed:
-    """Keeps the newest picture and encodes it once, when the first browser asks for it.
+    """Keeps the newest picture; encodes it once for all browsers that show it about as large.
 
     Args:
         rate: pictures a second at most.
@@ -54,7 +60,9 @@ class PictureFeed:
         self._due = -np.inf
         self._number = 0
         self._raw: tuple[int, NDArray[np.uint8]] | None = None
-        self._encoded: Encoded | None = None
+        self._encoded: dict[int, Encoded] = {}
+        self.on_put: Callable[[], None] = lambda: None
+        """Called, from the thread that puts it, when a picture has come."""
 
     @property
     def watched(self) -> bool:
@@ -75,22 +83,50 @@ class PictureFeed:
         with self._lock:
             self._number += 1
             self._raw = (stamp, grey)
+            self._encoded.clear()
+        self.on_put()
 
-    def take(self, after: int) -> Encoded | None:
-        """Return the newest picture, None if it is not newer than number ``after``.
+    def look(self, after: int) -> bool:
+        """Tell whether there is a picture other than number ``after``; counts as looking."""
+        self._asked = self._clock()
+        return self._raw is not None and self._number != after
+
+    def take(self, after: int, shown: int = 0) -> Encoded | None:
+        """Return the newest picture, None if it is number ``after``.
+
+        Args:
+            after: number of the one that is known.
+            shown: width at which it is shown [px], which may make it smaller; 0: as it is.
 
         Raises:
             PictureError: OpenCV cannot encode it.
         """
-        self._asked = self._clock()
+        if not self.look(after):
+            return None
         with self._lock:
-            if self._raw is None or self._number == after:
-                return None
-            if self._encoded is None or self._encoded.number != self._number:
-                done, data = cv2.imencode(
-                    ".jpg", self._raw[1], [cv2.IMWRITE_JPEG_QUALITY, self._quality]
-                )
-                if not done:
-                    raise PictureError("OpenCV cannot encode the picture as JPEG")
-                self._encoded = Encoded(self._number, self._raw[0], data.tobytes())
-            return self._encoded
+            assert self._raw is not None
+            stamp, grey = self._raw
+            width = width_for(grey.shape[1], shown)
+            if width not in self._encoded:
+                size = (grey.shape[1], grey.shape[0])
+                jpeg = _encode(grey, width, self._quality)
+                self._encoded[width] = Encoded(self._number, stamp, size, jpeg)
+            return self._encoded[width]
+
+
+def width_for(full: int, shown: int) -> int:
+    """Return the width [px] of the file for a picture of a full width that is shown at another."""
+    if shown <= 0:
+        return full
+    return min((width for width in WIDTHS if STRETCH * shown <= width < full), default=full)
+
+
+def _encode(grey: NDArray[np.uint8], width: int, quality: int) -> bytes:
+    height, full = grey.shape
+    if width < full:
+        size = (width, max(1, round(height * width / full)))
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    done, data = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not done:
+        raise PictureError("OpenCV cannot encode the picture as JPEG")
+    return data.tobytes()

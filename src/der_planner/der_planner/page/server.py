@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import logging
 import socket
@@ -22,7 +23,7 @@ from fastapi.staticfiles import StaticFiles
 
 from der_planner.page.access import SESSION_LIFE, Binding, Sessions, bracketed
 from der_planner.page.afterwards.experiments import Experiments
-from der_planner.page.commands import Commands, answer_of
+from der_planner.page.commands import Commands, answer_of, in_buttons
 from der_planner.page.drawing.studio import Studio
 from der_planner.page.guard import COOKIE, LOGIN, Guard
 from der_planner.page.operators import Desk
@@ -34,6 +35,8 @@ from der_planner.page.worker import Worker
 STATIC = Path(__file__).parent / "static"
 RATE = 10.0
 """Hz of the live data."""
+LONGEST_WAIT = 1.0
+"""[s] that a request for a picture may wait for the next one."""
 WRONG_PASSWORD_DELAY = 1.0
 """[s] during which no other password is tried."""
 
@@ -50,6 +53,37 @@ class Parts:
     studio: Studio
     experiments: Experiments
     replayer: Worker
+
+
+class Bell:
+    """Wakes what waits in the server's loop, from any thread."""
+
+    def __init__(self) -> None:
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._waiting: set[asyncio.Future[None]] = set()
+
+    def ring(self) -> None:
+        """Wake all that wait."""
+        if self._loop is not None:
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                self._loop.call_soon_threadsafe(self._wake)
+
+    async def rung(self, patience: float) -> None:
+        """Wait for the bell, for some seconds at most; not at all if they are not above zero."""
+        if not patience > 0.0:
+            return
+        self._loop = asyncio.get_running_loop()
+        ringing = self._loop.create_future()
+        self._waiting.add(ringing)
+        try:
+            await asyncio.wait([ringing], timeout=patience)
+        finally:
+            self._waiting.discard(ringing)
+
+    def _wake(self) -> None:
+        for ringing in self._waiting:
+            if not ringing.done():
+                ringing.set_result(None)
 
 
 class LiveText:
@@ -107,15 +141,24 @@ def create_app(parts: Parts, sessions: Sessions, secure: bool) -> FastAPI:
     async def vent() -> JSONResponse:
         # Whoever sees the page may vent, operator or not.
         answer = await answer_of("vent", parts.commands.call("vent"))
-        return JSONResponse({"success": answer.success, "message": answer.message})
+        message = in_buttons(answer.message)
+        return JSONResponse({"success": answer.success, "message": message})
+
+    bell = Bell()
+    parts.picture.on_put = bell.ring
 
     @app.get("/picture")
-    async def picture(after: int = 0, region: bool = False) -> Response:
-        encoded = await asyncio.to_thread(parts.picture.take, after)
+    async def picture(
+        after: int = 0, region: bool = False, width: int = 0, wait: float = 0.0
+    ) -> Response:
+        if not parts.picture.look(after):
+            await bell.rung(min(wait, LONGEST_WAIT))
+        encoded = await asyncio.to_thread(parts.picture.take, after, width)
         if encoded is None:
             return Response(status_code=204)
         reference = parts.situation.reference_at(encoded.stamp)
-        drawn = parts.overlay.at(encoded.stamp, reference) | {"number": encoded.number}
+        drawn = parts.overlay.at(encoded.stamp, reference)
+        drawn |= {"number": encoded.number, "size": encoded.size}
         if region:
             outlines = await asyncio.to_thread(lambda: parts.studio.region)
             drawn["region"] = [parts.overlay.pixels_of(outline) for outline in outlines]
@@ -209,6 +252,7 @@ class PageServer:
                 proxy_headers=False,
                 ws_ping_interval=1.0,
                 ws_ping_timeout=2.0,
+                ws_per_message_deflate=False,  # it costs more time than it saves on a local network
                 timeout_graceful_shutdown=1,
                 lifespan="on",
                 **options,

@@ -2,7 +2,7 @@
 "use strict";
 page.sketch = (() => {
   const INSIDE = "#ffffff", OUTSIDE = "#ff4040";
-  let on = false, points = [], preview = null, begun = 0, pointer = null;
+  let on = false, clean = true, points = [], preview = null, begun = 0, pointer = null;
   const canvas = () => document.getElementById("sketch");
 
   function pathOf(outlines) {
@@ -27,11 +27,12 @@ page.sketch = (() => {
   }
 
   function draw() {
-    const target = canvas(), picture = document.getElementById("picture");
-    if (!target || !picture) return;
-    if (target.width !== picture.width || target.height !== picture.height) { target.width = picture.width; target.height = picture.height; }
+    const target = canvas(), [width, height] = page.pictureSize || [1280, 720];
+    if (!target || (!on && clean)) return; // what is drawn anew is composed anew, also where nothing is seen
+    if (target.width !== width || target.height !== height) { target.width = width; target.height = height; }
     const context = target.getContext("2d");
     context.clearRect(0, 0, target.width, target.height);
+    clean = !on;
     if (!on) return;
     const region = page.region ? pathOf(page.region) : null;
     if (region) { context.fillStyle = "rgba(60, 200, 255, .28)"; context.fill(region); }

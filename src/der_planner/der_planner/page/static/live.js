@@ -4,6 +4,7 @@
 const page = { data: null, at: -Infinity, received: 0, listeners: [] };
 (() => {
   const LOST = 0.7; // seconds without live data after which the connection counts as lost
+  const RECENT = 1.3; // seconds: nodes speak once a second
   const seconds = () => performance.now() / 1000;
   const find = (id) => document.getElementById(id);
   const put = (element, text) => { if (element && element.textContent !== text) element.textContent = text; };
@@ -49,7 +50,7 @@ const page = { data: null, at: -Infinity, received: 0, listeners: [] };
     put(find("faults"), driver && age !== null ? (old ? `${age.toFixed(1)} s ago  ` : "") + driver.faults.join("; ") : "");
     find("mode")?.classList.toggle("fault", !!driver && driver.mode === "fault");
     find("summary")?.classList.toggle("old", old);
-    if (page.data) { showNodes(page.data.nodes, seconds() - page.at); showSupply(driver); showLines(page.data.nodes, lost); }
+    if (page.data) { showNodes(page.data.nodes, seconds() - page.at); showSupply(driver); showLines(page.data, lost); showEstimate(page.data.estimate); }
   }
 
   function showAge(panel, lost, silence) {
@@ -65,26 +66,35 @@ const page = { data: null, at: -Infinity, received: 0, listeners: [] };
     put(panel.querySelector(".age"), text);
   }
 
+  // Only what changed is written, since the browser lays out and paints the table anew with it.
   function showNodes(nodes, waited) {
-    const rows = find("node-rows");
-    if (!rows || !nodes.length) return;
-    const table = nodes.map((node) => {
-      const row = document.createElement("tr"), cells = [node.name, node.state, node.message, cpuOf(node), `${(node.age + waited).toFixed(1)} s`];
-      cells.forEach((text, index) => {
-        const cell = row.insertCell();
-        cell.textContent = text; // never as HTML: messages come from anywhere
-        if (index === 1) cell.className = `state ${node.state}`;
-      });
-      row.dataset.node = node.name;
-      return row;
+    const body = find("node-rows");
+    if (!body || !nodes.length) return;
+    const names = nodes.map((node) => node.name).join();
+    if (body.dataset.names !== names) {
+      body.dataset.names = names;
+      body.replaceChildren(...nodes.map((node) => {
+        const row = document.createElement("tr");
+        for (let cell = 0; cell < 5; cell += 1) row.insertCell();
+        row.dataset.node = node.name;
+        return row;
+      }));
+    }
+    nodes.forEach((node, index) => {
+      const cells = body.rows[index].cells, age = node.age + waited;
+      // As text, never as HTML: messages come from anywhere.
+      [node.name, node.state, node.message, cpuOf(node), age < RECENT ? "now" : `${age.toFixed(1)} s ago`]
+        .forEach((text, place) => put(cells[place], text));
+      if (cells[1].className !== `state ${node.state}`) cells[1].className = `state ${node.state}`;
     });
-    rows.replaceChildren(...table);
   }
 
   const cpuOf = (node) => (node.values.cpu_percent === undefined ? "" : `${node.values.cpu_percent} %`);
 
   // What planner and recorder do now, beside the buttons that command them.
-  function showLines(nodes, lost) {
+  function showLines(data, lost) {
+    const nodes = data.nodes, plan = find("plan-line");
+    if (plan) { plan.hidden = !data.plan; put(plan, `Newest plan: ${data.plan}`); }
     for (const name of ["planner", "recorder"]) {
       const line = find(`${name}-line`), node = nodes.find((one) => one.name === name);
       if (!line) continue;
@@ -99,6 +109,18 @@ const page = { data: null, at: -Infinity, received: 0, listeners: [] };
     if (name === "recorder") return node.message + (values.bytes === undefined ? "" : `, ${megabytes.toFixed(1)} MB, ${values.messages} messages`);
     const done = ["planning", "streaming"].includes(values.state) ? ` ${(100 * Number(values.progress)).toFixed(0)} %` : "";
     return values.state === undefined || node.message.startsWith(values.state) ? node.message + done : `${values.state}${done}, ${node.message}`;
+  }
+
+  // What feedback knows beside the shape: shown only while it speaks.
+  function showEstimate(estimate) {
+    const line = find("estimate-line"), age = ageOf("estimate");
+    if (!line) return;
+    line.hidden = !estimate || age === null || age > page.data.sources.estimate.limit;
+    if (line.hidden) return;
+    const list = (values) => values.map((value) => (value === null ? "?" : value.toFixed(1))).join(" / ");
+    put(line, `Feedback: missing pressure ${list(estimate.missing_kpa)} ± ${list(estimate.missing_sigma_kpa)} kPa, gain error ` +
+      `${list(estimate.gain_error_percent)} %, correction ${list(estimate.correction_kpa)} kPa, ${estimate.share_percent} % of it acts` +
+      (estimate.reason ? `: ${estimate.reason}` : ""));
   }
 
   function showSupply(driver) {
@@ -125,7 +147,7 @@ const page = { data: null, at: -Infinity, received: 0, listeners: [] };
   }
 
   const typing = (element) => element && (element.isContentEditable || element.tagName === "TEXTAREA" ||
-    (element.tagName === "INPUT" && ["text", "search", "password"].includes(element.type) && !element.readOnly));
+    (element.tagName === "INPUT" && ["text", "search", "password"].includes(element.type) && !["decimal", "numeric"].includes(element.inputMode) && !element.readOnly));
   document.addEventListener("pointerdown", (event) => { if (event.target.closest?.("#vent")) { event.preventDefault(); vent(); } }, true);
   // Before any other key handler, so that a space bar vents even where a button has the focus.
   for (const kind of ["keydown", "keyup"]) window.addEventListener(kind, (event) => {

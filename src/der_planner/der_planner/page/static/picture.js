@@ -1,7 +1,8 @@
 // Fetches the camera's picture while somebody looks, and draws over it what belongs to it.
 "use strict";
 (() => {
-  const INTERVAL = 66, PATIENCE = 100, TRAIL = 10000; // ms
+  const LEAST = 30, TRAIL = 10000; // ms
+  const REGION_EVERY = 15; // pictures: the reachable region moves in the picture only with the camera
   const wait = (time) => new Promise((done) => setTimeout(done, time));
   let number = 0, trail = [];
   page.pictures = 0;
@@ -19,10 +20,13 @@
 
   // Draws a picture, or a plain background where there is none, and what belongs over it.
   function draw(canvas, image, over, tips) {
-    const [width, height] = image ? [image.width, image.height] : over.size;
-    if (canvas.width !== width || canvas.height !== height) { canvas.width = width; canvas.height = height; }
+    // Everything is given in pixels of the camera, and drawn no finer than the window shows it.
+    const [width, height] = over.size, scale = Math.min(1, shownWidth(canvas) / width);
+    const across = Math.round(width * scale), down = Math.round(height * scale);
+    if (canvas.width !== across || canvas.height !== down) { canvas.width = across; canvas.height = down; }
     const context = canvas.getContext("2d");
-    if (image) context.drawImage(image, 0, 0);
+    context.setTransform(across / width, 0, 0, down / height, 0, 0);
+    if (image) context.drawImage(image, 0, 0, width, height);
     else { context.fillStyle = "#3a424b"; context.fillRect(0, 0, width, height); }
     line(context, over.path, "#30c060", 2.5);
     line(context, over.planned, "#9be8b4", 5);
@@ -38,8 +42,11 @@
       context.lineWidth = 3;
       context.stroke();
     }
+    context.setTransform(1, 0, 0, 1, 0, 0);
   }
   page.drawOver = draw;
+
+  const shownWidth = (canvas) => Math.round(canvas.clientWidth * (window.devicePixelRatio || 1)) || 1280;
 
   function trailWith(tip) {
     const now = performance.now();
@@ -52,19 +59,23 @@
     const canvas = document.getElementById("picture");
     if (!canvas || document.hidden) return 300;
     const begin = performance.now();
-    const answer = await fetch(`/picture?after=${number}${page.sketch.on ? "&region=1" : ""}`, { signal: AbortSignal.timeout(3000) });
-    if (answer.status !== 200) return answer.status === 204 ? PATIENCE : 1000;
+    const region = page.sketch.on && (!page.region || page.pictures % REGION_EVERY === 0);
+    // The server answers when there is a newer picture, so that none waits to be asked for.
+    const address = `/picture?after=${number}&wait=1&width=${shownWidth(canvas)}${region ? "&region=1" : ""}`;
+    const answer = await fetch(address, { signal: AbortSignal.timeout(3000) });
+    if (answer.status !== 200) return answer.status === 204 ? 0 : 1000;
     const body = await answer.arrayBuffer(), size = new DataView(body).getUint32(0);
     const over = JSON.parse(new TextDecoder().decode(new Uint8Array(body, 4, size)));
     const image = await createImageBitmap(new Blob([new Uint8Array(body, 4 + size)], { type: "image/jpeg" }));
     number = over.number;
+    page.pictureSize = over.size;
     if (over.region) page.region = over.region;
     draw(canvas, image, over, trailWith(over.tip));
     const note = document.getElementById("view-note");
-    if (note) note.textContent = over.problem;
+    if (note && note.textContent !== over.problem) note.textContent = over.problem;
     image.close();
     page.pictures += 1;
-    return Math.max(0, INTERVAL - (performance.now() - begin));
+    return Math.max(0, LEAST - (performance.now() - begin));
   }
 
   (async () => {

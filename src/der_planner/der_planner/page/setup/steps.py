@@ -8,6 +8,8 @@ from typing import Any
 
 PRESSED = 3.0
 """[kPa] Differential pressure at which a segment counts as driven to one side."""
+FILLED = 5.0
+"""[kPa] to which the page's buttons fill a chamber, or less where the limb bears less."""
 QUIET = 1.0
 """[kPa] Below it a segment counts as vented."""
 
@@ -86,17 +88,18 @@ class SetupGuide:
 
     def _chambers(self) -> Step:
         wanted = [(segment, side) for segment in range(self._segments) for side in (1, -1)]
-        left = [_chamber(*place) for place in wanted if place not in self._driven]
+        left = [chamber(*place) for place in wanted if place not in self._driven]
         return Step(
             "Each chamber has been filled alone",
             not left,
             f"not yet: {', '.join(left)}" if left else "all of them, since this page was opened",
-            f"Arm, and publish {PRESSED + 2:.0f} kPa on one segment at a time (pressure_driver's "
-            "page says how); look whether the limb bends to the side that is said.",
+            "Arm and fill each with the buttons below; look whether the limb bends to the side "
+            "that is said.",
         )
 
 
-def _chamber(segment: int, side: int) -> str:
+def chamber(segment: int, side: int) -> str:
+    """Return the name of a chamber: side 1 is the left one."""
     return f"segment {segment} {'left (bends counter-clockwise)' if side > 0 else 'right'}"
 
 
