@@ -24,6 +24,8 @@ PERIOD = 20.0
 CASE = "asynchronous"
 INSTANT = 8.0
 """Of payload and push [s]."""
+TIP = 0.244
+"""Arc length of the twin's tip [m]."""
 _PUSHED = 0.2
 _NEAR = 0.01
 _DIED = 0.2
@@ -35,11 +37,11 @@ def _gain(twin: OfflineTwin) -> None:
 
 
 def _payload(twin: OfflineTwin) -> None:
-    twin.twin.push(Push(twin.twin.time, twin.twin.length, (0.0, 0.0, 0.0), mass=0.02))
+    twin.twin.push(Push(twin.twin.time, TIP, mass=0.02))
 
 
 def _push(twin: OfflineTwin) -> None:
-    push = Push(twin.twin.time, twin.twin.length, (0.0, 0.3, 0.0), duration=_PUSHED)
+    push = Push(twin.twin.time, TIP, (0.0, 0.3, 0.0), duration=_PUSHED)
     twin.twin.push(push)
 
 

@@ -253,7 +253,11 @@ def test_a_limb_that_needs_much_and_follows_is_not_left(planned):
 
 
 def swinging(
-    amplitude: float, frequency: float, decay: float, limb_decay: float | None = None
+    amplitude: float,
+    frequency: float,
+    decay: float,
+    limb_decay: float | None = None,
+    missed: float = 0.05 * LENGTH,
 ) -> Supervisor:
     """Return what watched a correction that swings for ten seconds, as the limb does.
 
@@ -262,6 +266,7 @@ def swinging(
         frequency: of both [Hz].
         decay: of the correction [1/s].
         limb_decay: of the limb's swing [1/s]; that of the correction if None.
+        missed: largest distance of the tip from r̄ [m].
     """
     watch = Supervisor(Limits(), authority=9600.0, length=LENGTH)
     for k in range(200):
@@ -270,7 +275,7 @@ def swinging(
         value = amplitude * np.exp(-decay * time) * np.sin(2 * np.pi * frequency * time)
         swing = np.exp(-(decay if limb_decay is None else limb_decay) * time)
         rate = swing * abs(np.cos(2 * np.pi * frequency * time))
-        watch.sent(time, np.array([np.clip(value, -9600.0, 9600.0), 0.0]), rate, 0.0)
+        watch.sent(time, np.array([np.clip(value, -9600.0, 9600.0), 0.0]), rate, missed * rate)
     return watch
 
 
@@ -278,6 +283,7 @@ def test_a_correction_that_swings_on_ends_feedback():
     assert swinging(1500.0, 1.2, 0.0).reason == "oscillation"
     assert swinging(1500.0, 1.2, 0.0).share == 0.0
     assert not swinging(300.0, 1.2, 0.0).reason
+    assert not swinging(1500.0, 1.2, 0.0, missed=0.02 * LENGTH).reason
     assert not swinging(4000.0, 1.2, 1.0).reason
     assert not swinging(4000.0, 1.0 / 3.0, 0.0).reason
 

@@ -194,7 +194,9 @@ class Learner:
         """
         if self._best is None:
             return self._plan
-        self._plan = dataclasses.replace(self._next(self._best), chambers_beyond=self._beyond)
+        self._plan = self._next(self._best)
+        if self._beyond is not None:
+            self._plan = dataclasses.replace(self._plan, chambers_beyond=self._beyond)
         return self._plan
 
     def _next(self, best: Played) -> Plan:

@@ -2,12 +2,14 @@
 
 The share goes from 0 to 1 once the limb is seen. It goes back to 0, which is the plan alone, where
 feedback can do harm: the camera sees nothing, or what it sees does not fit the model; corrections
-swing; they stay at what they are allowed to no avail; commands are asked for too late. Lost tags
-may come back; after the other reasons the rest of the run is played without feedback.
+swing, or stay at what they are allowed, and the tip is far from its path; commands are asked for
+too late. Lost tags may come back; after the other reasons the rest of the run is played without
+feedback.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 
@@ -47,9 +49,10 @@ class Limits:
         kept: for so long after that the last disturbances are still counted with [s].
         inconsistent: squared distance of measurements per coordinate, smoothed; 1 is expected.
         patience: for which measurements may be inconsistent [s].
-        saturated: for which a correction may be at its limit [s] …
-        astray: … while the tip is further from r̄ than this share of the limb's length: a limb that
-            needs much and follows is not left.
+        saturated: for which a correction may be at its limit [s].
+        astray: neither a correction at its limit nor an oscillation ends feedback while the tip
+            stays within this share of the limb's length from r̄: a limb that needs much, and
+            follows, is not left to a plan that may be further off.
         swing: from one turn of a swinging correction to the next, as a share of the authority.
         turns: so many of them are an oscillation, unless it dies out …
         window: … if they come within this time [s].
@@ -100,7 +103,7 @@ class Supervisor:
         warnings: all that were given.
     """
 
-    def __init__(self, limits: Limits, authority: float, length: float) -> None:
+    def __init__(self, limits: Limits, authority: float, length: float = 1.0) -> None:
         self.limits, self.authority, self.length = limits, authority, length
         self.share = 0.0
         self.reason = ""
@@ -109,6 +112,7 @@ class Supervisor:
         self._strange_since: float | None = None
         self._limited_since: float | None = None
         self._late = 0.0
+        self._astray_at = -math.inf
         self._turns: list[_Turns] = []
 
     def take_over(self, other: Supervisor) -> None:
@@ -142,17 +146,19 @@ class Supervisor:
             self.share = min(1.0, self.share + CONTROL_PERIOD / limits.ramp)
         return self.share
 
-    def sent(self, time: float, correction: Array, swing: float, missed: float) -> None:
+    def sent(self, time: float, correction: Array, swing: float, missed: float = math.inf) -> None:
         """Look at a correction that is sent.
 
         Args:
             time: instant of the command [s].
             correction: (M,) [Pa].
             swing: rate at which the limb deviates from the model's motion then [rad/s].
-            missed: distance of the tip from r̄ then [m].
+            missed: distance of the tip from r̄ then [m]; if nobody tells, it is far.
         """
         limits = self.limits
         astray = missed > limits.astray * self.length
+        if astray:
+            self._astray_at = time
         limited = np.abs(correction).max() > 0.98 * self.authority * self.share
         if self.share > 0.0 and limited and astray:
             if self._limited_since is None:
@@ -166,7 +172,7 @@ class Supervisor:
         for turns, value in zip(self._turns, correction, strict=True):
             turns.add(time, float(value), swing)
             way = turns.oscillation(time, limits.turns, limits.window)
-            if way > 0.0:
+            if way > 0.0 and time - self._astray_at <= limits.window:
                 self.stop(time, "oscillation", way)
 
     def late(self, time: float, by: float) -> None:
