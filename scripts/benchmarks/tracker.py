@@ -32,7 +32,6 @@ from benchmarks.tracker_pictures import (
 )
 from benchmarks.tracker_quality import measure_fast_limb, measure_fixed_tags, measure_quality
 
-
 _SETTLED = 36
 """Pictures after which fixed tags are fitted in turn."""
 
