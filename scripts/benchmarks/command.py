@@ -29,6 +29,7 @@ PARTS = (
     "learning",
     "learning_draws",
     "feedback",
+    "feedback_draws",
     "page",
     "page_wire",
     "page_memory",

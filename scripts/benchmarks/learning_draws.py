@@ -10,14 +10,13 @@ own wander.
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.drawn_limb import drawn
 from der_planner.control import Learner
-from der_planner.limb import Limb, Segment
-from der_planner.limb_days import on_another_day
+from der_planner.limb import Limb
 from der_planner.model.response import simulate
 from der_planner.planning import Motion, Plan, plan
 from der_planner.planning.motions import JOINT_MOTIONS
@@ -33,28 +32,6 @@ LARGEST_WANDER = 1e-3
 CAMERA_NOISE = 1e-4
 """Standard deviation of the tip [m]."""
 _WORSE = 1.1
-
-
-def _drawn(limb: Limb, generator: np.random.Generator) -> Limb:
-    draw = generator.uniform
-
-    def segment(known: Segment) -> Segment:
-        stiffness = known.bending_stiffness * draw(0.85, 1.2)
-        day = on_another_day(known, generator.standard_normal(), generator.standard_normal())
-        return replace(
-            day,
-            bending_stiffness=stiffness,
-            gain_asymmetry=draw(-0.08, 0.08),
-            friction_moment=draw(0.02, 0.12) * 0.5 * stiffness / known.length,
-            friction_curvature=draw(0.05, 0.25) / known.length,
-        )
-
-    air = replace(
-        limb.pneumatics,
-        time_constant=limb.pneumatics.time_constant * draw(0.6, 1.6),
-        delay=draw(0.0, 0.05),
-    )
-    return replace(limb, segments=tuple(segment(s) for s in limb.segments), pneumatics=air)
 
 
 def _curve(first: Plan, true: Limb, generator: np.random.Generator) -> tuple[Array, float, Learner]:
@@ -87,7 +64,7 @@ def run(quick: bool = False) -> Figures:
             motion = Motion.named(case, period=period, cycles=1)
             plans[case, period] = plan(Limb.default(), motion, method="optimal")
         begin = time.process_time()
-        true = _drawn(Limb.default(), generator)
+        true = drawn(Limb.default(), generator)
         errors, wander, learner = _curve(plans[case, period], true, generator)
         worse = bool(np.any(errors[1:] > _WORSE * errors[0] + wander))
         diverged += worse

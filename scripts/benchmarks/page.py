@@ -89,7 +89,7 @@ def measure_vent(rig: Rig, window: Any, count: int) -> dict[str, float]:
     taken = []
     for number in range(count):
         rig.wait_mode(PressureState.DISARMED)
-        rig.client.call("pressure_driver/arm", 20.0)
+        rig.arm()
         rig.wait_mode(PressureState.ARMED)
         _hold(rig, publisher, f"vent{number}")
         rig.client.spin(float(random.uniform(0.0, 0.1)))  # any place between two ticks
@@ -104,7 +104,7 @@ def measure_vent(rig: Rig, window: Any, count: int) -> dict[str, float]:
 
 
 def measure_rates(rig: Rig, windows: list[Any], seconds: float) -> dict[str, float]:
-    """Count pictures drawn and live data received while a motion is played, and the CPU time."""
+    """Count pictures drawn and live data received by browsers, and the page's CPU time."""
     before = [window.execute_script(COUNTS) for window in windows]
     cpu = rig.cpu(seconds)
     after = [window.execute_script(COUNTS) for window in windows]
@@ -112,7 +112,27 @@ def measure_rates(rig: Rig, windows: list[Any], seconds: float) -> dict[str, flo
         [(b - a) / (last[2] - first[2]) * 1000.0 for a, b in zip(first[:2], last[:2], strict=True)]
         for first, last in zip(before, after, strict=True)
     ]
-    name = f"windows_{len(windows)}"
+    return _figures(f"windows_{len(windows)}", rates, cpu)
+
+
+def measure_served(rig: Rig, count: int, seconds: float) -> dict[str, float]:
+    """Count what the page sends to viewers that draw nothing, and its CPU time."""
+    viewers = [rig.view() for _ in range(count)]
+    rig.wait(lambda: all(v.pictures and v.received for v in viewers), "the first pictures")
+    before = [(viewer.pictures, viewer.received) for viewer in viewers]
+    begin = time.monotonic()
+    cpu = rig.cpu(seconds)
+    took = time.monotonic() - begin
+    rates = [
+        [(viewer.pictures - pictures) / took, (viewer.received - received) / took]
+        for viewer, (pictures, received) in zip(viewers, before, strict=True)
+    ]
+    for viewer in viewers:
+        viewer.close()
+    return _figures(f"served_{count}", rates, cpu)
+
+
+def _figures(name: str, rates: list[list[float]], cpu: float) -> dict[str, float]:
     return {
         f"{name}_pictures_per_s_least": min(rate[0] for rate in rates),
         f"{name}_live_data_per_s_least": min(rate[1] for rate in rates),
@@ -123,7 +143,7 @@ def measure_rates(rig: Rig, windows: list[Any], seconds: float) -> dict[str, flo
 def _move(rig: Rig, cycles: int) -> None:
     """Arm, and have the planner play a motion."""
     rig.wait_mode(PressureState.DISARMED)
-    rig.client.call("pressure_driver/arm", 20.0)
+    rig.arm()
     publisher = rig.client.node.create_publisher(MotionCommand, topics.COMMAND, qos.COMMANDS)
     rig.wait(publisher.get_subscription_count, "the planner to listen")
     publisher.publish(MotionCommand(motion="same_direction", model="der", cycles=cycles))
@@ -138,11 +158,15 @@ def run(quick: bool) -> dict[str, float]:
             first = rig.browse()
             print(f"page: vent, load {os.getloadavg()[0]:.1f} …", file=sys.stderr, flush=True)
             figures = measure_vent(rig, first, 10 if quick else 100)
-            _move(rig, 3)
+            first.get("about:blank")
+            _move(rig, 5)
+            for count in (1, 2):
+                figures |= measure_served(rig, count, seconds)
+            first = rig.browse()
             figures |= measure_rates(rig, [first], seconds)
             figures |= measure_rates(rig, [first, rig.browse()], seconds)
     except BrowserError as error:
         print(f"page: not measured: {error}")
         return {}
-    report("the page with one and two windows", figures)
+    report("the page with one and two windows, served and shown", figures)
     return figures

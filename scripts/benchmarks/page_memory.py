@@ -21,7 +21,7 @@ def _keep_moving(rig: Rig, publisher: object) -> None:
     if not rig.states or rig.states[-1].mode == PressureState.TRACKING:
         return
     if rig.states[-1].mode == PressureState.DISARMED:
-        rig.client.call("pressure_driver/arm", 20.0)
+        rig.arm()
     publisher.publish(MotionCommand(motion="asynchronous", model="pcc", period=10.0, cycles=1))  # type: ignore[attr-defined]
 
 

@@ -3,27 +3,39 @@
 from __future__ import annotations
 
 import contextlib
+import http.client
+import json
 import os
 import shutil
 import socket
+import struct
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from websockets.sync.client import connect
+from websockets.typing import Origin
+
 from der_msgs.msg import ChamberPressures, PressureState
 from der_planner.experiment.client import GraphClient
+from der_planner.experiment.errors import GraphError
 from der_planner.experiment.processes import NodeProcess
 from limb_interfaces import qos, topics
 
-DOMAIN = 95
+DOMAIN = int(os.environ.get("ROS_DOMAIN_ID") or 95)
 PATIENCE = 120.0
 """[s] for a node or a browser to start on a loaded machine."""
 FLAGS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
 )  # fmt: skip
+
+
+SHOWN = 740
+"""[px] Width at which a window of 1280 x 800 shows the picture."""
 
 
 class BrowserError(RuntimeError):
@@ -123,6 +135,25 @@ class Rig:
         del self.states[:]
         self.wait(lambda: self.states and self.states[-1].mode in modes, f"a mode of {modes}")
 
+    def arm(self) -> None:
+        """Arm the driver as soon as it lets itself be armed: chambers take a while to vent."""
+
+        def armed() -> bool:
+            try:
+                self.client.call("pressure_driver/arm", 20.0)
+            except GraphError:
+                self.client.spin(0.2)
+                return False
+            return True
+
+        self.wait(armed, "the driver to be armed")
+
+    def view(self) -> Viewer:
+        """Begin to take what a window would take, without a browser that draws it."""
+        viewer = Viewer(self.url)
+        self._stack.callback(viewer.close)
+        return viewer
+
     def cpu(self, seconds: float, name: str = "page") -> float:
         """Return the share of a core [%] that a node's process uses during some seconds."""
         before, begin = self.processes[name].measure_cpu(), time.monotonic()
@@ -149,6 +180,50 @@ class Rig:
     def close(self) -> None:
         """End the browsers and the nodes."""
         self._stack.close()
+
+
+class Viewer:
+    """Takes pictures and live data as a window does, and counts them; it draws nothing.
+
+    Args:
+        url: of the page.
+    """
+
+    def __init__(self, url: str) -> None:
+        self.pictures = 0
+        self.received = 0
+        self._host = url.split("//")[1].strip("/")
+        self._stop = threading.Event()
+        self._threads = [
+            threading.Thread(target=run, daemon=True) for run in (self._look, self._listen)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def _look(self) -> None:
+        connection, number = http.client.HTTPConnection(self._host, timeout=PATIENCE), 0
+        while not self._stop.is_set():
+            connection.request("GET", f"/picture?after={number}&wait=1&width={SHOWN}")
+            answer = connection.getresponse()
+            body = answer.read()
+            if answer.status == http.HTTPStatus.OK:
+                size = struct.unpack(">I", body[:4])[0]
+                number = json.loads(body[4 : 4 + size])["number"]
+                self.pictures += 1
+        connection.close()
+
+    def _listen(self) -> None:
+        origin = Origin(f"http://{self._host}")
+        with connect(f"ws://{self._host}/live", origin=origin) as socket:
+            while not self._stop.is_set():
+                socket.recv(timeout=PATIENCE)
+                self.received += 1
+
+    def close(self) -> None:
+        """Take no more."""
+        self._stop.set()
+        for thread in self._threads:
+            thread.join(timeout=5.0)
 
 
 @contextlib.contextmanager

@@ -8,6 +8,7 @@ import pytest
 from apriltag_tracker.detection.alignment.aligner import Aligner
 from apriltag_tracker.detection.alignment.pattern import tabulate
 from apriltag_tracker.family import TAG36H11
+from apriltag_tracker.synthetic.camera import Optics, SyntheticCamera
 from benchmarks.tracker_renderer import Scene, render
 
 
@@ -69,3 +70,20 @@ def test_a_pattern_of_another_tag_explains_little():
     for tag, corners in truth.items():
         other = aligner.align(image, (tag + 1) % TAG36H11.tag_count, corners)
         assert other is None or other.explained < 0.9
+
+
+def test_sides_that_the_lens_bends_do_not_shift_the_corners(tags, model):
+    """Where a lens bends a side by 0.07 px, a homography alone is wrong by more than the noise."""
+    lens = (model.intrinsics.matrix, model.intrinsics.distortion)
+    camera = SyntheticCamera(model, tags, Optics(), seed=11)
+    nees = {False: [], True: []}
+    for _ in range(6):
+        frame = camera.frame(None)
+        for through, values in nees.items():
+            aligner = Aligner(lens=lens if through else None)
+            for tag, corners in frame.corners.items():
+                fitted = aligner.align(frame.image, tag, corners + 0.1)
+                gap = (fitted.corners - corners).ravel()
+                values.append(gap @ np.linalg.solve(fitted.covariance, gap) / 8.0)
+    assert np.mean(nees[False]) > 2.0
+    assert 0.5 < np.mean(nees[True]) < 1.5

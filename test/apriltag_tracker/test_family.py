@@ -143,3 +143,38 @@ def test_sheets_of_another_family_are_printed(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert "tag36h10 0" in next(iter(sorted(tmp_path.glob("*.svg")))).read_text()
+
+
+def spiral(cells):
+    """Return a code as the AprilTag 3 library writes it: quadrants from outside in, as they turn.
+
+    Its `bit_x` and `bit_y` of square codes begin with the upper row less its last cell, go on with
+    the row below less a cell at each end, and repeat that for the other sides, clockwise.
+    """
+    edge = cells.shape[0]
+    quadrant = [(x, y) for y in range(edge // 2) for x in range(y, edge - 1 - y)]
+    bits = []
+    for _ in range(4):
+        bits += [int(cells[y, x]) for x, y in quadrant]
+        quadrant = [(edge - 1 - y, x) for x, y in quadrant]
+    return int("".join(map(str, bits)), 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "first"),
+    [
+        ("tag36h11", 0xD7E00984B),
+        ("tag36h10", 0x1A42F9469),
+        ("tag16h5", 0x27C8),
+    ],
+)
+def test_tags_are_those_of_the_c_library_the_same_way_round(name, first):
+    """Tag 0 of the tables in tag36h11.c, tag36h10.c and tag16h5.c of AprilTag 3."""
+    assert spiral(FAMILIES[name].codes()[0]) == first
+
+
+def test_more_tags_of_a_family_that_the_c_library_does_not_read():
+    """`pyapriltags` is built without tag36h10; these are the next codes of its C table."""
+    codes = FAMILIES["tag36h10"].codes()
+    known = (0x21A48C08D, 0x26DFDBC5D, 0x2D19B78FB, 0x31C5557DF, 0x3F2B3D349)
+    assert tuple(spiral(codes[tag]) for tag in range(1, 6)) == known

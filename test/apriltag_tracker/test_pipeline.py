@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from apriltag_tracker.camera import Intrinsics, lens
-from apriltag_tracker.detection import decoding, edges
+from apriltag_tracker.detection import Detector, decoding, edges
 from apriltag_tracker.pipeline import LimbTracker, TrackerOptions, Uncertainty, warm_up
 from apriltag_tracker.pose import plane
 from apriltag_tracker.synthetic.camera import Errors, Optics, SyntheticCamera
@@ -44,6 +44,22 @@ def test_the_tip_is_within_a_tenth_of_a_millimetre(straight_tags, model, camera,
     ]
     # Two degrees of freedom: the mean is 2 where the covariance is honest.
     assert 0.3 < np.mean(normalised) < 8.0
+
+
+@pytest.mark.parametrize("count", [1, 2, 6])
+def test_the_tip_is_as_sure_as_it_says_with_few_fixed_tags(straight_tags, model, swing, count):
+    """Squared error a number, in units of the covariance, in the first pictures of many starts."""
+    order = (1, 4, 0, 3, 2, 5)
+    world = tuple(straight_tags.world[k] for k in order[:count])
+    tags, detector = dataclasses.replace(straight_tags, world=world), Detector()
+    nees = []
+    for seed in range(40, 52):
+        camera = SyntheticCamera(model, tags, Optics(), seed=seed)
+        tracker = LimbTracker(tags, model.intrinsics, detector=detector)
+        error, observations = run(tracker, camera, swing, 1, start=seed)
+        spread = observations[-1].estimate.tip_covariance
+        nees.append(error[-1] @ np.linalg.solve(spread, error[-1]) / 2.0)
+    assert 0.4 < np.mean(nees) < 2.0
 
 
 def test_set_up_errors_stay_within_the_systematic_part(straight_tags, model, swing):

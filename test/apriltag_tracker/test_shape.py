@@ -167,5 +167,6 @@ def test_tags_that_contradict_each_other_give_nothing(tags):
     assert ShapeFitter(tags).fit([]) is None
 
 
-def test_angles_are_wrapped():
-    assert np.allclose(wrap(np.array([0.1, 2 * np.pi + 0.1, -2 * np.pi + 0.1])), 0.1)
+@pytest.mark.parametrize("turns", [-2, -1, 0, 1])
+def test_angles_are_wrapped(turns):
+    assert wrap(2.0 * np.pi * turns + 0.1) == pytest.approx(0.1)

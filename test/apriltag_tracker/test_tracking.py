@@ -3,8 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from apriltag_tracker.camera import CameraPose
 from apriltag_tracker.detection.tracking import TagTracker, TrackingOptions
-from apriltag_tracker.synthetic.camera import Optics, SyntheticCamera
+from apriltag_tracker.synthetic.camera import CameraModel, Optics, SyntheticCamera
 
 PERIOD = 1.0 / 30.0
 
@@ -78,6 +79,70 @@ def test_a_jump_is_followed(tags, camera, detector, swing):
     assert found.keys() == frame.corners.keys()
     for tag_id, tag in found.items():
         assert np.abs(tag.corners - frame.corners[tag_id]).max() < 0.2
+
+
+def still_tracker(tags, detector, after=4, **more):
+    options = TrackingOptions(still_after=after, **more)
+    return TagTracker(tags.ids, detector, options, [tag.id for tag in tags.world])
+
+
+def test_fixed_tags_are_fitted_in_turn_once_they_are_known(tags, camera, detector, swing):
+    tracker = still_tracker(tags, detector)
+    fixed = {tag.id for tag in tags.world}
+    turns = []
+    for k in range(20):
+        frame = camera.frame(swing.shape(k * PERIOD), swing.velocity(k * PERIOD))
+        found = {tag.id: tag for tag in tracker.track(frame.image, k * PERIOD)}
+        assert found.keys() == frame.corners.keys()
+        assert all(found[tag.id].measured for tag in tags.limb)
+        turns.append({tag for tag in fixed if found[tag].measured})
+        assert all(np.abs(found[tag].corners - frame.corners[tag]).max() < 0.1 for tag in fixed)
+    assert all(turn == fixed for turn in turns[:4])
+    assert all(len(turn) == 1 for turn in turns[8:])
+    assert set.union(*turns[-len(fixed) :]) == fixed
+
+
+def test_a_camera_that_is_pushed_has_all_tags_fitted_at_once(tags, model, detector, swing):
+    pushed = CameraModel(
+        model.intrinsics,
+        CameraPose.looking_down((0.1284, 0.004, 0.600), -1.5650, (0.030, -0.020)),
+    )
+    cameras = [SyntheticCamera(each, tags, Optics(), seed=3) for each in (model, pushed)]
+    tracker = still_tracker(tags, detector)
+    for k in range(14):
+        frame = cameras[k >= 10].frame(swing.shape(0.3))
+        found = {tag.id: tag for tag in tracker.track(frame.image, k * PERIOD)}
+        assert found.keys() == frame.corners.keys()
+        for tag in found.values():
+            assert np.abs(tag.corners - frame.corners[tag.id]).max() < 0.1
+        if k >= 10:
+            assert all(tag.measured for tag in found.values())
+
+
+def test_a_fixed_tag_that_is_covered_is_not_taken_for_still(tags, camera, detector, swing):
+    tracker = still_tracker(tags, detector)
+    for k in range(14):
+        corners = camera.frame(None).corners[102]
+        covers = [cover(corners)] if k >= 10 else []
+        frame = camera.frame(swing.shape(0.3), covers=covers)
+        found = {tag.id for tag in tracker.track(frame.image, k * PERIOD)}
+        assert (102 in found) == (k < 10)
+
+
+def test_a_search_that_can_wait_is_left_for_later(tags, camera, detector, swing):
+    tracker = still_tracker(tags, detector, full_search_period=0.0)
+    frame = camera.frame(swing.shape(0.1))
+    copied = paste(frame.image.copy(), frame.corners[1], (900, 500))
+    for k, image in enumerate((frame.image, frame.image, copied)):
+        searches = tracker.counts.full_searches
+        assert len(tracker.track(image, k * PERIOD, search_later=True)) == len(tags.ids)
+        # Nothing is known before the first picture: that search cannot wait.
+        assert tracker.counts.full_searches - searches == (k == 0)
+        tracker.search_again(image)
+        assert tracker.counts.full_searches - searches == 1
+        tracker.search_again(image)
+        assert tracker.counts.full_searches - searches == 1
+    assert tracker.counts.duplicates == 1
 
 
 def paste(image, corners, place):

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 
@@ -84,6 +85,35 @@ def test_the_pose_stays_while_fixed_tags_are_covered(tags, model):
     for _ in range(50):
         pose = world.update([])
     assert pose is not None
+
+
+def test_the_pose_is_as_sure_as_the_pictures_that_were_fitted(tags, model):
+    seen = tags_seen(tags, model, model.pose)
+    looked_at = [dataclasses.replace(tag, found_by="still") for tag in seen]
+    world = WorldPose(tags, model.intrinsics)
+    world.update(seen)
+    once = world.covariance.copy()
+    for _ in range(90):
+        world.update(looked_at)
+    assert np.allclose(world.covariance, once)
+    for _ in range(30):
+        world.update(seen)
+    assert 10.0 < np.trace(once) / np.trace(world.covariance) < 31.0
+
+
+def test_the_pose_covariance_is_that_of_many_pictures(tags, model):
+    """Squared errors of many solutions in units of the covariance: 1 a number."""
+    random = np.random.default_rng(2)
+    nees = []
+    for _ in range(60):
+        world = WorldPose(dataclasses.replace(tags, world=tags.world[:2]), model.intrinsics)
+        for _ in range(4):
+            pose = world.update(tags_seen(tags, model, model.pose, 0.01, random)[:2])
+        turn = cv2.Rodrigues(pose.rotation @ model.pose.rotation.T)[0].ravel()
+        shift = pose.translation - (pose.rotation @ model.pose.rotation.T) @ model.pose.translation
+        error = np.concatenate([turn, shift])
+        nees.append(error @ np.linalg.solve(world.covariance, error) / 6.0)
+    assert 0.6 < np.mean(nees) < 1.3
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])

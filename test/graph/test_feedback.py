@@ -131,7 +131,7 @@ def test_a_motion_gives_way_to_another_without_a_jump(rig):
     assert np.abs(np.diff(sent, axis=0)).max() < 3000.0
     # The turn itself is fast, and this limb file is not calibrated: up to 2 cm on the way.
     assert series.error(0.0, 2.5).max() < 0.12 * LENGTH
-    assert series.error(2.3, 2.5).mean() < 0.07 * LENGTH
+    assert series.error(2.3, 2.5).mean() < 0.06 * LENGTH
     assert not phase.warnings()
 
 
@@ -217,7 +217,7 @@ def test_a_hose_that_leaks_is_made_up_for_and_one_that_bursts_vents_the_limb(rig
     phase.until(5.0)
     series = phase.judged(0.5, 5.0)
     # This limb file is not calibrated, and beside other programs pictures come late.
-    assert series.error(2.5, 5.0).mean() < 0.06 * LENGTH
+    assert series.error(2.5, 5.0).mean() < 0.045 * LENGTH
     assert rig.states_are_tracking()
     rig.set_parameter("board_emulator", "faults", "leak:0:50")
     said = rig.client.diagnostic_values

@@ -17,7 +17,7 @@ import pytest
 from filmed import FilmedRun
 from runs import FRAMES, reference
 
-from der_msgs.msg import PressureState
+from der_msgs.msg import PressurePlan, PressureState
 from limb_interfaces import qos, topics
 
 webdriver = pytest.importorskip("selenium.webdriver")
@@ -123,6 +123,8 @@ def test_one_arms_and_everybody_vents(rig: Rig) -> None:
     assert not enabled(first, "arm")
     press(rig, first, "take")
     arm(rig, first)
+    first.refresh()  # it is the same tab of the same browser: on_lost_operator=vent does nothing
+    rig.wait(lambda: first.find_elements("id", "arm") and enabled(first, "arm"), "the operator")
     rig.wait(lambda: not enabled(second, "take"), "the second window to see the first one command")
     assert not enabled(second, "arm")
 
@@ -167,6 +169,10 @@ def test_what_died_is_not_shown_as_live(rig: Rig) -> None:
     old = "document.getElementById('summary').classList.contains('old')"
     lost = "document.body.classList.contains('lost')"
     rig.wait(lambda: not browser.execute_script(f"return {old}"), "the driver's state")
+    plans = rig.client.node.create_publisher(PressurePlan, topics.PLAN, qos.LATCHED)
+    plans.publish(PressurePlan(motion="odd", tip_reference=[0.1, 0.2, 0.3]))
+    said = "return document.querySelector('[data-node=page]').textContent"
+    rig.wait(lambda: "could not be used" in browser.execute_script(said), "the page to say so")
     stopped = silent_after(browser, rig.driver, signal.SIGSTOP, old)
     assert "ago" in browser.find_element("id", "faults").text
     rig.driver.signal(signal.SIGCONT)

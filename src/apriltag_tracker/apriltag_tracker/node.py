@@ -40,7 +40,7 @@ from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.gaps import StampGaps
 from limb_interfaces.overrides import check_overrides
 from limb_interfaces.parameters import declare
-from limb_interfaces.runner import run_node
+from limb_interfaces.runner import event_executor, run_node
 from limb_interfaces.transforms import TransformPublisher, camera_transform, limb_transforms
 
 ANNOTATED_IMAGE = "camera/image_annotated"
@@ -290,12 +290,13 @@ class TrackerNode(Node):
             self._fail(stamp, self._watch.calibration_problem or NO_CALIBRATION)
             return
         try:
-            observation = self._tracker.observe(gray, stamps.seconds(stamp))
+            observation = self._tracker.observe(gray, stamps.seconds(stamp), search_later=True)
         except (ValueError, ArithmeticError, cv2.error) as error:
             self._fail(stamp, str(error))
             return
         latency = self._publish(observation, gray, stamp)
         self._watch.observed(observation, latency, time.perf_counter() - started)
+        self._tracker.search_again(gray)
 
     def _fail(self, stamp: Time, problem: str) -> None:
         """Say at once that this image gives no state, and why."""
@@ -392,7 +393,7 @@ class TrackerNode(Node):
 
 def main() -> int:
     """Run the node."""
-    return run_node(TrackerNode)
+    return run_node(TrackerNode, make_executor=event_executor)
 
 
 if __name__ == "__main__":

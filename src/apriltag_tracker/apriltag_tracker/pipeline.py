@@ -119,7 +119,9 @@ class LimbTracker:
                 f"the detector reads {detector.family.name} but the tag map is of "
                 f"{tags.family.name}: make it by Detector(family=tag_map.family)"
             )
-        self.tracker = TagTracker(self._flat, detector, self.options.tracking)
+        detector = detector.through((intrinsics.matrix, intrinsics.distortion))
+        still = [tag.id for tag in tags.world]
+        self.tracker = TagTracker(self._flat, detector, self.options.tracking, still)
         self.world = WorldPose(tags, intrinsics)
         uncertainty = self.options.uncertainty
         self.fitter = ShapeFitter(
@@ -135,12 +137,15 @@ class LimbTracker:
         self.misplaced = 0
         """Tags left out so far because they were on the wrong place."""
 
-    def observe(self, gray: NDArray[np.uint8], stamp: float) -> LimbObservation:
+    def observe(
+        self, gray: NDArray[np.uint8], stamp: float, search_later: bool = False
+    ) -> LimbObservation:
         """Find the limb in one image.
 
         Args:
             gray: image (rows, columns) of uint8.
             stamp: when it was taken [s].
+            search_later: leave what cannot change the answer to `search_again`.
 
         Raises:
             ValueError: the image is none, or has another size than the calibration.
@@ -151,7 +156,9 @@ class LimbTracker:
                 f"the image has {gray.shape[1]} x {gray.shape[0]} px but the calibration is for "
                 f"{size.width} x {size.height}: calibrate at the resolution that is used"
             )
-        found = self.tracker.track(gray, stamp, lambda tags: self._expect(tags, stamp))
+        found = self.tracker.track(
+            gray, stamp, lambda tags: self._expect(tags, stamp), search_later
+        )
         pose = self.world.update(found)
         placed, planar, common, shared_noise = self._place(found, pose)
         if pose is None:
@@ -171,6 +178,10 @@ class LimbTracker:
             self._history.clear()
         self._history = [*self._history[-1:], (stamp, estimate)]
         return LimbObservation(placed, estimate, self._remark(estimate))
+
+    def search_again(self, gray: NDArray[np.uint8]) -> None:
+        """Look for duplicates and unknown tags in the last image, if that was left for later."""
+        self.tracker.search_again(gray)
 
     def _expect(self, found: Sequence[Tag], stamp: float) -> list[ExpectedTag]:
         """Return where the limb's other tags are, if the camera's pose is known."""

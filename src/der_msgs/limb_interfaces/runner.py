@@ -10,9 +10,14 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+
+try:
+    from rclpy.experimental import EventsExecutor
+except ImportError:
+    EventsExecutor = None
 
 from limb_interfaces import transport
 from limb_interfaces.entry import END_SIGNALS
@@ -25,7 +30,21 @@ class ClosableNode(Protocol):
         """Vent, flush, release: called exactly once, before the node is destroyed."""
 
 
-def run_node(create: Callable[[], Node], arguments: Sequence[str] | None = None) -> int:
+def event_executor() -> Executor:
+    """Return rclpy's executor that is told of each message, where it has one (7.1.4 and later).
+
+    The usual one asks all topics and services anew for every message: of receiving an image this
+    takes half the CPU time.
+    """
+    executor: Executor = SingleThreadedExecutor() if EventsExecutor is None else EventsExecutor()
+    return executor
+
+
+def run_node(
+    create: Callable[[], Node],
+    arguments: Sequence[str] | None = None,
+    make_executor: Callable[[], Executor] = SingleThreadedExecutor,
+) -> int:
     r"""Create a node, spin it until a signal ends it, close it, and return the exit code.
 
     The signals are those of `limb_interfaces.entry.END_SIGNALS`: Ctrl-C, SIGTERM, a terminal that
@@ -38,12 +57,14 @@ def run_node(create: Callable[[], Node], arguments: Sequence[str] | None = None)
     Args:
         create: makes the node; an exception ends the process with exit code 1 and its message.
         arguments: command line, `sys.argv` if None.
+        make_executor: of what spins the node.
 
     Returns:
         0 after one of these signals, 1 after an error.
     """
     stop = threading.Event()
     transport.use_large_messages()
+    transport.keep_buffers()
     for number in END_SIGNALS:
         signal.signal(number, lambda *_: stop.set())
     try:
@@ -58,7 +79,7 @@ def run_node(create: Callable[[], Node], arguments: Sequence[str] | None = None)
     exit_code = 0
     try:
         node = create()
-        executor = SingleThreadedExecutor()
+        executor = make_executor()
         executor.add_node(node)
         while rclpy.ok() and not stop.is_set():
             executor.spin_once(timeout_sec=0.1)

@@ -1,5 +1,7 @@
 """What feedback takes the chambers to hold next."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -51,3 +53,23 @@ def test_after_a_long_time_the_model_counts_again(nominal):
     assert np.all(surprise[1] > surprise[0])
     assert np.abs(surprise[2]).max() < 200.0
     assert np.isfinite(log.during(steps)).all()
+
+
+def test_what_a_learned_plan_knows_of_its_chambers_is_no_news():
+    motion = Motion.named("same_direction", amplitude=0.5, period=8.0, cycles=1)
+    planned = replace(plan(Limb.default(), motion, method="projected"), method="learned")
+    beyond = 200.0 + 5.0 * np.arange(len(planned.time))[:, None] * np.array([1.0, -1.0])
+    told = Nominal(replace(planned, chambers_beyond=beyond))
+    steps = np.arange(60)
+    news = {}
+    for name, nominal in (("told", told), ("not told", Nominal(planned))):
+        log = ChamberLog(nominal)
+        for k in range(8):
+            # Amid the first step of period k the chambers are a tenth of a period into it.
+            share = beyond[k] - 0.4 * (beyond[k + 1] - beyond[k])
+            log.read(STEP * (5 * k + 0.5), log.model(np.array([5 * k]))[0] + share + 30.0)
+        news[name] = log.during(steps) - log.model(steps)
+    # Only what is more than expected counts; nothing does where nobody told what to expect.
+    np.testing.assert_allclose(news["told"][:36], 30.0, atol=10.0)
+    assert np.abs(news["told"][40:] - 30.0).max() < 25.0
+    assert not news["not told"].any()

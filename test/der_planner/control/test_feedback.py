@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from link_chain import LinkChain
 
-from der_planner.control import Feedback
+from der_planner.control import Feedback, Learner
 from der_planner.control.lockstep import Played, Sensors, play
 from der_planner.control.supervision import Limits, Supervisor
 from der_planner.limb import Limb
@@ -83,6 +83,40 @@ def test_commands_keep_all_limits(planned, corrected):
     assert np.abs(steps).max() <= air.slew_limit * 0.05 + 1e-6
     ramp = np.minimum(1.0, (played.time + 0.05) / 1.0)
     assert np.all(np.abs(played.correction).max(axis=1) <= 0.4 * air.pressure_limit * ramp + 1.0)
+
+
+def test_what_the_horizon_reckons_with_can_be_sent():
+    fast = plan(Limb.default(), Motion.named("same_direction", period=6.0, cycles=1))
+    air, beyond = fast.limb.pneumatics, []
+
+    class Watched(Feedback):
+        def command(self, time: float) -> np.ndarray:
+            command = super().command(time)
+            first, coming = self.coming()
+            place = np.minimum(first + np.arange(len(coming)), len(fast.time) - 1)
+            wanted = fast.differential_pressure[place] + coming
+            if self.share == 1.0:
+                beyond.append(np.abs(np.diff(wanted, axis=0)).max() - air.slew_limit * 0.05)
+            return command
+
+    play(fast, Chain(), Watched(fast))
+    assert len(beyond) > 100
+    assert max(beyond) < 1e-6
+
+
+def test_feedback_and_learning_do_not_fight(planned):
+    learner, following = Learner(planned), planned
+    draw = np.random.default_rng(4)
+    for _ in range(2):
+        run = play(following, Chain())
+        tip = run.tip + 5e-5 * draw.standard_normal(run.tip.shape)
+        learner.add(run.time, tip, chambers=(run.time, run.differential_pressure))
+        following = learner.next()
+    alone = play(following, Chain()).error.mean()
+    assert alone < 0.005 * LENGTH
+    feedback = Feedback(following)
+    assert play(following, Chain(), feedback).error.mean() < 1.6 * alone
+    assert not feedback.warnings
 
 
 def test_the_same_run_twice_is_the_same(planned, corrected):
@@ -204,8 +238,26 @@ def test_a_limb_that_does_not_follow_is_left_to_the_plan(planned):
     assert np.abs(played.correction[-1]).max() < 1.0
 
 
+def test_a_limb_that_needs_much_and_follows_is_not_left(planned):
+    plant = Chain()
+    plant.chain.change_gain(0.5)
+    feedback = Feedback(planned)
+    played = play(planned, plant, feedback)
+    alone = Chain()
+    alone.chain.change_gain(0.5)
+    authority = 0.4 * planned.limb.pneumatics.pressure_limit
+    at_limit = np.abs(played.correction).max(axis=1) > 0.98 * authority
+    assert at_limit.sum() > 60
+    assert not feedback.warnings
+    assert played.error.mean() < 0.4 * play(planned, alone).error.mean()
+
+
 def swinging(
-    amplitude: float, frequency: float, decay: float, limb_decay: float | None = None
+    amplitude: float,
+    frequency: float,
+    decay: float,
+    limb_decay: float | None = None,
+    missed: float = 0.05 * LENGTH,
 ) -> Supervisor:
     """Return what watched a correction that swings for ten seconds, as the limb does.
 
@@ -214,15 +266,16 @@ def swinging(
         frequency: of both [Hz].
         decay: of the correction [1/s].
         limb_decay: of the limb's swing [1/s]; that of the correction if None.
+        missed: largest distance of the tip from r̄ [m].
     """
-    watch = Supervisor(Limits(), authority=9600.0)
+    watch = Supervisor(Limits(), authority=9600.0, length=LENGTH)
     for k in range(200):
         time = 0.05 * k
         watch.advance(time, age=0.05, strange=1.0)
         value = amplitude * np.exp(-decay * time) * np.sin(2 * np.pi * frequency * time)
         swing = np.exp(-(decay if limb_decay is None else limb_decay) * time)
         rate = swing * abs(np.cos(2 * np.pi * frequency * time))
-        watch.sent(time, np.array([np.clip(value, -9600.0, 9600.0), 0.0]), rate)
+        watch.sent(time, np.array([np.clip(value, -9600.0, 9600.0), 0.0]), rate, missed * rate)
     return watch
 
 
@@ -230,6 +283,7 @@ def test_a_correction_that_swings_on_ends_feedback():
     assert swinging(1500.0, 1.2, 0.0).reason == "oscillation"
     assert swinging(1500.0, 1.2, 0.0).share == 0.0
     assert not swinging(300.0, 1.2, 0.0).reason
+    assert not swinging(1500.0, 1.2, 0.0, missed=0.02 * LENGTH).reason
     assert not swinging(4000.0, 1.2, 1.0).reason
     assert not swinging(4000.0, 1.0 / 3.0, 0.0).reason
 

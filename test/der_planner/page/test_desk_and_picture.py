@@ -27,6 +27,23 @@ def test_one_commands_and_others_watch() -> None:
     assert desk.operator is None
 
 
+def test_a_window_that_is_loaded_anew_still_commands() -> None:
+    lost: list[str] = []
+    desk = Desk(lost.append)
+    desk.connected("a", "tab 1")
+    desk.connected("b", "tab 2")
+    assert desk.take("a")
+    desk.connected("c", "tab 2")
+    assert desk.may_command("a")
+    desk.connected("d", "tab 1")
+    assert desk.may_command("d")
+    assert not desk.may_command("a")
+    desk.disconnected("a")
+    assert not lost
+    desk.disconnected("d")
+    assert lost == ["d"]
+
+
 @pytest.mark.parametrize("camera_rate", [30.0, 25.0, 10.0])
 def test_pictures_keep_their_rate(camera_rate: float) -> None:
     now = 0.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import cv2
@@ -73,6 +74,11 @@ def test_pixels_become_metres_where_they_are_drawn() -> None:
     overlay.put_estimate(on_plane)
     overlay.put_planned(on_plane)
     np.testing.assert_allclose(overlay.at(1, None)["estimate"], pixels, atol=0.2)
+    broken = np.vstack([on_plane, [[math.nan, 0.1], [0.1, math.inf]]])
+    overlay.put_estimate(broken)
+    shown = overlay.at(1, (math.nan, 0.0))  # what is nowhere is left out: it is no JSON either
+    assert len(shown["estimate"]) == len(pixels)
+    assert shown["reference"] is None
     now = 1.0
     shown = overlay.at(1, None)
     assert (shown["estimate"], shown["planned"]) == ([], [])  # nobody plans or corrects any more

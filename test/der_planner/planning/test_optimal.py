@@ -128,3 +128,22 @@ def test_smoothness_makes_commands_smoother():
         return np.linalg.norm(np.diff(commands - warm, 2, axis=0))
 
     assert bends(smooth.commands) < 0.7 * bends(rough.commands)
+
+
+def test_each_window_begins_within_the_limits(monkeypatch):
+    """Where a window has moved away from the guess of the next one, there is no jump between."""
+    motion = Motion.named("asynchronous", amplitude=0.2, period=4.0, cycles=1)
+    solver = solver_for(LIMB, motion, window=30, settled=20)
+    guess = np.zeros_like(solver.warm)
+
+    def moved(command, state, first, last):
+        if first == 0:
+            command[:last] += np.linspace(0.0, 4000.0, last)[:, None]
+        return 1, False
+
+    monkeypatch.setattr(solver, "improve", moved)
+    found = solver.run(begin=guess).commands
+    assert found[19].min() > 2000.0
+    assert found[-1].max() < 1.0
+    steps = np.diff(found, axis=0, prepend=0.0)
+    assert np.abs(steps).max() <= LIMB.pneumatics.slew_limit * CONTROL_PERIOD + 1e-6

@@ -22,9 +22,12 @@ def bent():
 
 
 def test_a_plan_is_read_back_whole(bent, tmp_path):
+    beyond = np.arange(2.0 * len(bent.time)).reshape(-1, 2)
+    bent = replace(bent, chambers_beyond=beyond)
     write_plan(bent, tmp_path / "kept" / "a.yaml", about={"runs": 3})
     again = read_plan(tmp_path / "kept" / "a.yaml")
-    for name in ("time", "differential_pressure", "tip_reference", "tip_predicted"):
+    arrays = ("time", "differential_pressure", "tip_reference", "tip_predicted", "chambers_beyond")
+    for name in arrays:
         assert np.array_equal(getattr(again, name), getattr(bent, name))
     assert again.limb.to_mapping() == bent.limb.to_mapping()
     assert np.allclose(again.bend_angles, bent.bend_angles, atol=1e-9)

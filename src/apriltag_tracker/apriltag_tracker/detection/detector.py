@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apriltag_tracker.detection import decoding, edges
-from apriltag_tracker.detection.alignment.aligner import USUAL_BLUR, Aligner, Alignment
+from apriltag_tracker.detection.alignment.aligner import USUAL_BLUR, Aligner, Alignment, Lens
 from apriltag_tracker.detection.covered import covered_quads
 from apriltag_tracker.detection.quads import check_orientation, find_quads, refine
 from apriltag_tracker.detection.smeared import read_smeared
@@ -88,6 +89,12 @@ class Detector:
         self.largest_residual = largest_residual
         self._aligner = Aligner(self.family)
         check_orientation(self.family)
+
+    def through(self, lens: Lens) -> Detector:
+        """Return a detector like this for pictures of a lens, whose bend of the sides it knows."""
+        other = copy(self)
+        other._aligner = Aligner(self.family, lens)
+        return other
 
     def warm_up(self) -> None:
         """Load or compile everything a first image would wait for."""
@@ -182,6 +189,22 @@ class Detector:
         tags = self._collect(ids, corners, stats, found & (distance <= forgiven), found_by)
         aligned = (self._aligned(image, tag, *known.get(tag.id, _USUAL)) for tag in tags)
         return [tag for tag in aligned if tag is not None]
+
+    def confirm_at_once(
+        self, image: NDArray[np.uint8], corners: NDArray[np.float64], before: Tag
+    ) -> Tag | None:
+        """Return a tag whose whole pattern fits where it is predicted, None if it does not.
+
+        Args:
+            image: grey image.
+            corners: (4, 2) px, predicted to a third of a cell.
+            before: the tag as it was seen last; blur and smear start from that.
+        """
+        smear = np.array(before.smear)
+        fitted = self._aligner.align_near(image, before.id, corners, before.blur, smear)
+        if fitted is None or not self._is_the_tag(fitted, corners):
+            return None
+        return _tag_of(before.id, fitted, "tracked")
 
     def confirm_expected(
         self, image: NDArray[np.uint8], expected: ExpectedTag, blur: float

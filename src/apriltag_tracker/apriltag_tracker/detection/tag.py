@@ -20,11 +20,11 @@ class Tag:
         id: within the family.
         corners: (4, 2) px, counter-clockwise from the printed lower left.
         covariance: (8, 8) px² of the corners x0 y0 x1 …, of the fit of the whole pattern.
-        line_residual: RMS distance of the edge points from the four lines [px]; NaN of a tag whose
-            border was too smeared for lines.
-        edge_share: share of the border's profiles that took part, of the worst side.
+        line_residual: RMS distance of the edge points from the four lines [px]; NaN of a tag that
+            was found by its pattern alone.
+        edge_share: share of the border's profiles that took part, of the worst side; 0 without.
         contrast: white minus black [grey levels].
-        found_by: `full`, `tracked`, `expected` or `region`.
+        found_by: `full`, `tracked`, `expected`, `region` or `still`.
         blur: standard deviation of lens and pixel together [px].
         smear: way during the exposure, x and y [px]; its sign is not known.
     """
@@ -38,6 +38,11 @@ class Tag:
     found_by: str = "full"
     blur: float = USUAL_BLUR
     smear: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def measured(self) -> bool:
+        """Whether the corners are from this picture; else it only shows that nothing has moved."""
+        return self.found_by != "still"
 
     @property
     def centre(self) -> NDArray[np.float64]:

@@ -1,41 +1,34 @@
 """Tags from frame to frame: short searches where tags are expected, full searches now and then.
 
-A tag that was seen is looked for at its predicted corners by the line fit itself, and its code is
-read there. A tag too smeared for lines is confirmed by its whole pattern, from the blur and smear
-it had. A tag of the limb that is missing is looked for where the limb's other tags say that it is.
-When one is still missing, the whole image is searched at once, which costs less than a search
-around several predictions. What is still missing is looked for in regions around the predictions,
-put together into one mosaic, as it is and then sharpened and enlarged. While all tags are tracked,
-a full search runs once a second.
+A tag that was seen is fitted at once by its whole pattern, where its last pictures foresee it, with
+the blur and smear that it had. Where that does not fit, lines are fitted to its border and its code
+is read there. Tags that do not move are fitted in turn, and only looked at in between; one that
+looks different is fitted in the same picture. A tag of the limb that is missing is looked for where
+the limb's other tags say that it is. When one is still missing, the whole image is searched at
+once, which costs less than a search around several predictions. What is still missing is looked for
+in regions around the predictions, put together into one mosaic, as it is and then sharpened and
+enlarged. While all tags are tracked, a full search runs once a second.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from apriltag_tracker.detection.detector import Detector, grey
+from apriltag_tracker.detection.regions import from_mosaic, mosaic_of, sharpened
+from apriltag_tracker.detection.still import look_at_borders, unmoved
 from apriltag_tracker.detection.tag import ExpectedTag, Tag
+from apriltag_tracker.detection.track import Track
 
 Expect = Callable[[Sequence[Tag]], Sequence[ExpectedTag]]
 """Says from the tags that were found in an image where others are, the surest first."""
 
-_TILE = 16
-"""Tiles of the mosaic are padded to a multiple of this [px]."""
-
-
-@dataclass
-class _Track:
-    """What is known of one tag: as it was seen last, and the velocity of its corners."""
-
-    tag: Tag
-    velocity: NDArray[np.float64]
-    stamp: float
-    missed: int = 0
+_MOVED = 0.3
+"""A fixed tag whose corners differ by more from one fit to the next has moved [px]."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +47,8 @@ class TrackingOptions:
             by a fifth with every frame in which the tag was not found.
         largest_jump: distance from the prediction beyond which a duplicate is not the tag [tag
             sizes].
+        still_after: pictures in which a tag that does not move is fitted; after these, one such tag
+            is fitted in every picture, in turn, and the others are only looked at.
     """
 
     full_search_period: float = 1.0
@@ -63,6 +58,7 @@ class TrackingOptions:
     keep_frames: int = 8
     region_growth: float = 1.6
     largest_jump: float = 1.5
+    still_after: int = 30
 
 
 @dataclass
@@ -86,6 +82,7 @@ class TagTracker:
         wanted: ids of the tags in the map; others are counted and left out.
         detector: finds and confirms tags.
         options: when to search how.
+        still: ids of tags that do not move as long as nobody moves the camera.
     """
 
     def __init__(
@@ -93,21 +90,34 @@ class TagTracker:
         wanted: Collection[int],
         detector: Detector | None = None,
         options: TrackingOptions | None = None,
+        still: Collection[int] = (),
     ) -> None:
         self._wanted = frozenset(wanted)
+        self._still = frozenset(still)
         self._detector = detector or Detector()
         self.options = options or TrackingOptions()
         self.counts = TrackingCounts()
-        self._tracks: dict[int, _Track] = {}
+        self._tracks: dict[int, Track] = {}
+        self._fits: dict[int, int] = {}
+        """Fits in a row in which a fixed tag has not moved."""
+        self._looks: dict[int, tuple[int, NDArray[np.float64]]] = {}
+        """In which frame a fixed tag was fitted last, and how its border looked, (4, 2)."""
+        self._postponed: dict[int, Tag] | None = None
+        """What was found in the last image, if its full search was left for later."""
         self._last_full = self._last_thorough = -np.inf
 
     def reset(self) -> None:
         """Forget all tracks: the next frame is searched in full."""
         self._tracks.clear()
+        self._fits.clear()
         self._last_full = self._last_thorough = -np.inf
 
     def track(
-        self, gray: NDArray[np.uint8], stamp: float, expect: Expect | None = None
+        self,
+        gray: NDArray[np.uint8],
+        stamp: float,
+        expect: Expect | None = None,
+        search_later: bool = False,
     ) -> list[Tag]:
         """Find the tags of one frame.
 
@@ -115,30 +125,41 @@ class TagTracker:
             gray: image (rows, columns) of uint8.
             stamp: when it was taken [s]; must grow from call to call, or tracking starts anew.
             expect: says where tags are that were not found, None if nothing is known of that.
+            search_later: leave a search of the whole image that can add nothing to this answer to
+                `search_again`, for those who wait for the answer.
 
         Returns:
             Tags of the map, each id once.
         """
         image = grey(gray)
         self.counts.frames += 1
+        self._postponed = None
         if any(
             track.stamp >= stamp or track.stamp < stamp - 1.0 for track in self._tracks.values()
         ):
             self.reset()
-        predicted = {tag: self._predict(track, stamp) for tag, track in self._tracks.items()}
+        predicted = {tag: track.predict(stamp) for tag, track in self._tracks.items()}
         found = self._by_prediction(image, predicted)
         if expect is None:
             self._by_pattern(image, predicted, found)
         self.counts.tracked += len(found)
         self._by_expectation(image, stamp, found, expect)
         known = len(found)
-        self._search_in_full(image, stamp, found, predicted)
+        self._search_in_full(image, stamp, found, predicted, search_later)
         if lost := [tag for tag in predicted if tag not in found]:
             self._merge(found, self._by_regions(image, lost, predicted), predicted)
         if len(found) > known:
             self._by_expectation(image, stamp, found, expect)
+        self._remember_looks(image, found)
         self._remember(found, stamp)
         return [found[tag] for tag in sorted(found)]
+
+    def search_again(self, gray: NDArray[np.uint8]) -> None:
+        """Search the whole of the last image for duplicates and unknown tags, if that was left."""
+        if self._postponed is not None:
+            self.counts.full_searches += 1
+            self._merge(self._postponed, self._detector.detect(gray, enough=()), {})
+            self._postponed = None
 
     def _by_expectation(
         self,
@@ -155,6 +176,8 @@ class TagTracker:
             return
         every = stamp - self._last_thorough >= self.options.absent_search_period
         looked_for = self._wanted if every else self._wanted & self._tracks.keys()
+        if not looked_for - found.keys():
+            return
         blur = float(np.median([tag.blur for tag in found.values()]))
         more = True
         while more and looked_for - found.keys():
@@ -170,6 +193,7 @@ class TagTracker:
         stamp: float,
         found: dict[int, Tag],
         predicted: dict[int, NDArray[np.float64]],
+        search_later: bool,
     ) -> None:
         """Search the whole image if it is time to."""
         options = self.options
@@ -180,28 +204,76 @@ class TagTracker:
         if not thorough and stamp - self._last_full < period:
             return
         self._last_full = stamp
+        if search_later and not missing and not absent:
+            self._postponed = found
+            return
         if thorough:
             self._last_thorough = stamp
         self.counts.full_searches += 1
         enough = self._wanted - found.keys()
         self._merge(found, self._detector.detect(image, thorough, enough), predicted)
 
-    @staticmethod
-    def _predict(track: _Track, stamp: float) -> NDArray[np.float64]:
-        return track.tag.corners + track.velocity * (stamp - track.stamp)
-
     def _by_prediction(
         self, image: NDArray[np.uint8], predicted: dict[int, NDArray[np.float64]]
     ) -> dict[int, Tag]:
-        fresh = [tag for tag in predicted if self._tracks[tag].missed == 0]
-        if not fresh:
+        """Find tags where they were seen last or where they go from there."""
+        fresh = [tag for tag, track in self._tracks.items() if track.missed == 0]
+        found = self._unmoved(image, fresh)
+        cells = self._detector.family.border_cells
+        for tag in fresh:
+            track = self._tracks[tag]
+            if tag in found or not track.foreseen(cells):
+                continue
+            seen = self._detector.confirm_at_once(image, predicted[tag], track.tag)
+            if seen is None:
+                track.avoid_pattern()
+            else:
+                found[tag] = seen
+        if rest := [tag for tag in fresh if tag not in found]:
+            quads = np.ascontiguousarray([predicted[tag] for tag in rest])
+            last = {tag: self._tracks[tag].tag for tag in rest}
+            before = {tag: (seen.blur, np.array(seen.smear)) for tag, seen in last.items()}
+            ids = np.array(rest, dtype=np.int64)
+            search = self.options.search
+            tags = self._detector.confirm(image, ids, quads, search, "tracked", before)
+            found.update({tag.id: tag for tag in tags})
+        return found
+
+    def _unmoved(self, image: NDArray[np.uint8], fresh: Sequence[int]) -> dict[int, Tag]:
+        """Return the tags that do not move and look as they did; the one longest not fitted is not.
+
+        Their corners are those of the picture in which they were fitted last.
+        """
+        settled = [tag for tag in fresh if self._fits.get(tag, 0) >= self.options.still_after]
+        if settled:
+            settled.remove(min(settled, key=lambda tag: self._looks[tag][0]))
+        if not settled:
             return {}
-        quads = np.ascontiguousarray([predicted[tag] for tag in fresh])
-        ids = np.array(fresh, dtype=np.int64)
-        last = {tag: self._tracks[tag].tag for tag in fresh}
-        before = {tag: (seen.blur, np.array(seen.smear)) for tag, seen in last.items()}
-        tags = self._detector.confirm(image, ids, quads, self.options.search, "tracked", before)
-        return {tag.id: tag for tag in tags}
+        tags = [self._tracks[tag].tag for tag in settled]
+        looks = self._look(image, tags)
+        before = np.array([self._looks[tag][1] for tag in settled])
+        return {
+            tag.id: tag if tag.found_by == "still" else replace(tag, found_by="still")
+            for tag, same in zip(tags, unmoved(looks, before), strict=True)
+            if same
+        }
+
+    def _look(self, image: NDArray[np.uint8], tags: Sequence[Tag]) -> NDArray[np.float64]:
+        looks = np.empty((len(tags), 4, 2))
+        corners = np.array([tag.corners for tag in tags])
+        look_at_borders(image, corners, self._detector.family.border_cells, looks)
+        return looks
+
+    def _remember_looks(self, image: NDArray[np.uint8], found: dict[int, Tag]) -> None:
+        """Note how tags look that do not move and were fitted in this picture."""
+        fitted = [tag for tag in found.values() if tag.id in self._still and tag.measured]
+        if not fitted:
+            return
+        for tag, look in zip(fitted, self._look(image, fitted), strict=True):
+            track = self._tracks.get(tag.id)
+            rests = track is not None and np.abs(tag.corners - track.tag.corners).max() < _MOVED
+            self._fits[tag.id] = self._fits.get(tag.id, 0) + 1 if rests else 0
+            self._looks[tag.id] = (self.counts.frames, look)
 
     def _by_pattern(
         self,
@@ -228,16 +300,16 @@ class TagTracker:
         ]
         if not boxes:
             return []
-        mosaic, corners = _mosaic(image, boxes)
+        mosaic, corners = mosaic_of(image, boxes)
         found: list[Tag] = []
         for scale in (1, 2):
-            searched = mosaic if scale == 1 else _sharpened(mosaic, scale)
+            searched = mosaic if scale == 1 else sharpened(mosaic, scale)
             seen = self._detector.search(searched, "region", scale)
             if not seen:
                 continue
             # Back to the whole image, where the corners are refined in pixels as they came.
             quads = (np.array([tag.corners for tag in seen]) + 0.5) / scale - 0.5
-            quads = _from_mosaic(quads, boxes, corners)
+            quads = from_mosaic(quads, boxes, corners)
             ids = np.array([tag.id for tag in seen], dtype=np.int64)
             found = self._detector.confirm(image, ids, quads, 2.5, "region")
             if {tag.id for tag in found} >= set(lost):
@@ -300,15 +372,18 @@ class TagTracker:
     def _remember(self, found: dict[int, Tag], stamp: float) -> None:
         for tag_id, tag in found.items():
             track = self._tracks.get(tag_id)
-            velocity = np.zeros((4, 2))
-            if track is not None and stamp > track.stamp:
-                velocity = (tag.corners - track.tag.corners) / (stamp - track.stamp)
-            self._tracks[tag_id] = _Track(tag, velocity, stamp)
+            if track is None:
+                self._tracks[tag_id] = Track(tag, stamp)
+            elif self._fits.get(tag_id, 0) > 0:
+                self._tracks[tag_id] = track.rest(tag, stamp)
+            else:
+                self._tracks[tag_id] = track.follow(tag, stamp)
         for tag_id in [tag for tag in self._tracks if tag not in found]:
             track = self._tracks[tag_id]
             track.missed += 1
             if track.missed > self.options.keep_frames:
                 del self._tracks[tag_id]
+                self._fits.pop(tag_id, None)
 
 
 def _distinct(tags: Sequence[Tag]) -> list[Tag]:
@@ -318,48 +393,3 @@ def _distinct(tags: Sequence[Tag]) -> list[Tag]:
         if all(np.hypot(*(tag.centre - other.centre)) > 0.5 * tag.pixel_size for other in kept):
             kept.append(tag)
     return kept
-
-
-def _mosaic(
-    image: NDArray[np.uint8], boxes: Sequence[tuple[int, int, int, int]]
-) -> tuple[NDArray[np.uint8], list[tuple[int, int]]]:
-    """Put regions of an image side by side; returns the mosaic and each tile's row and column."""
-    side = max(max(bottom - top, right - left) for top, bottom, left, right in boxes)
-    tile = -(-(side + 4) // _TILE) * _TILE
-    across = int(np.ceil(np.sqrt(len(boxes))))
-    down = -(-len(boxes) // across)
-    mosaic = np.full((down * tile, across * tile), 128, dtype=np.uint8)
-    corners = []
-    for k, (top, bottom, left, right) in enumerate(boxes):
-        row, column = (k // across) * tile, (k % across) * tile
-        mosaic[row : row + bottom - top, column : column + right - left] = image[
-            top:bottom, left:right
-        ]
-        corners.append((row, column))
-    return mosaic, corners
-
-
-def _from_mosaic(
-    quads: NDArray[np.float64],
-    boxes: Sequence[tuple[int, int, int, int]],
-    corners: Sequence[tuple[int, int]],
-) -> NDArray[np.float64]:
-    """Return corners (n, 4, 2) of the mosaic as corners in the image."""
-    result = quads.copy()
-    starts = np.array(corners, dtype=float)
-    for i, quad in enumerate(quads):
-        middle = quad.mean(axis=0)
-        gaps = middle[::-1] - starts
-        inside = np.where((gaps >= 0).all(axis=1), gaps.sum(axis=1), np.inf)
-        k = int(np.argmin(inside))
-        top, _, left, _ = boxes[k]
-        result[i] += (left - corners[k][1], top - corners[k][0])
-    return result
-
-
-def _sharpened(image: NDArray[np.uint8], scale: int) -> NDArray[np.uint8]:
-    """Enlarge an image and sharpen it, which brings back tags that motion has smeared."""
-    large = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-    soft = cv2.GaussianBlur(large, (0, 0), 1.5 * scale)
-    result: NDArray[np.uint8] = cv2.addWeighted(large, 2.2, soft, -1.2, 0.0)
-    return result

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 PLACE = 3
@@ -79,40 +81,79 @@ class Curve:
         return points, table
 
 
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def wrap(angle: float) -> float:
+    """Return an angle between −π and π."""
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def write_places(
+    parameters: NDArray[np.float64],
+    integral: NDArray[np.float64],
+    inner: NDArray[np.float64],
+    outer: NDArray[np.float64],
+    places: NDArray[np.float64],
+    slopes: NDArray[np.float64],
+) -> None:
+    """Write places x, y, heading (n, 3) of a curve and their derivatives (n, 3, size).
+
+    Args:
+        parameters: (size,) of the curve.
+        integral: (n, points) weights that integrate from the base up to each place.
+        inner: (points, size) derivatives of the heading at the points of the integral.
+        outer: (n, size) the same at the places.
+        places: output.
+        slopes: output.
+    """
+    count, size = outer.shape
+    heading = inner @ parameters
+    cosine, sine = np.cos(heading), np.sin(heading)
+    stretch = 1.0 + parameters[3]
+    slopes[:] = 0.0
+    for i in range(count):
+        x, y = 0.0, 0.0
+        for p in range(inner.shape[0]):
+            weight = integral[i, p]
+            if weight == 0.0:
+                continue
+            along, across = weight * cosine[p], weight * sine[p]
+            x += along
+            y += across
+            for q in range(2, size):
+                slopes[i, 0, q] -= across * inner[p, q]
+                slopes[i, 1, q] += along * inner[p, q]
+        places[i, 0] = parameters[0] + stretch * x
+        places[i, 1] = parameters[1] + stretch * y
+        places[i, 2] = 0.0
+        for q in range(size):
+            slopes[i, 0, q] *= stretch
+            slopes[i, 1, q] *= stretch
+            slopes[i, 2, q] = outer[i, q]
+            places[i, 2] += outer[i, q] * parameters[q]
+        slopes[i, 0, 0] = slopes[i, 1, 1] = 1.0
+        slopes[i, 0, 3], slopes[i, 1, 3] = x, y
+
+
 class Evaluation:
-    """A curve at a fixed set of arc lengths: places and their derivatives."""
+    """A curve at a fixed set of arc lengths: places and their derivatives.
+
+    Attributes:
+        s: (n,) m, arc lengths.
+        integral, inner, outer: tables of `write_places`.
+    """
 
     def __init__(self, curve: Curve, s: Sequence[float]) -> None:
         self.s = np.asarray(s, dtype=np.float64)
-        points, self._integral = curve.quadrature(s)
+        points, self.integral = curve.quadrature(s)
         self.inner = curve.heading_basis(points)
-        self._outer = curve.heading_basis(self.s)
-        self._size = curve.size
+        self.outer = curve.heading_basis(self.s)
 
     def places(
         self, parameters: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return x, y, heading (n, 3) and their derivatives (n, 3, size)."""
-        heading = self.inner @ parameters
-        stretch = 1.0 + parameters[3]
-        cosine, sine = np.cos(heading), np.sin(heading)
-        x, y = self._integral @ cosine, self._integral @ sine
         places = np.empty((len(self.s), PLACE))
-        places[:, 0] = parameters[0] + stretch * x
-        places[:, 1] = parameters[1] + stretch * y
-        places[:, 2] = self._outer @ parameters
-        jacobian = np.empty((len(self.s), PLACE, self._size))
-        jacobian[:, 0] = -stretch * (self._integral @ (sine[:, None] * self.inner))
-        jacobian[:, 1] = stretch * (self._integral @ (cosine[:, None] * self.inner))
-        jacobian[:, 2] = self._outer
-        jacobian[:, 0, 0] = 1.0
-        jacobian[:, 1, 1] = 1.0
-        jacobian[:, 0, 3] = x
-        jacobian[:, 1, 3] = y
-        return places, jacobian
-
-
-def wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return angles between −π and π."""
-    result: NDArray[np.float64] = (angle + np.pi) % (2.0 * np.pi) - np.pi
-    return result
+        slopes = np.empty((len(self.s), PLACE, self.outer.shape[1]))
+        write_places(parameters, self.integral, self.inner, self.outer, places, slopes)
+        return places, slopes

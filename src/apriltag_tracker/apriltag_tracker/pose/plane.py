@@ -132,6 +132,56 @@ def locate(
     return places, spreads, misfits
 
 
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _moves_of_a_point(
+    point: NDArray[np.float64],
+    rotation: NDArray[np.float64],
+    translation: NDArray[np.float64],
+    moves: NDArray[np.float64],
+) -> None:
+    """Write how x and y of a point on its plane move with the camera's pose, (2, 6)."""
+    seen = rotation @ point + translation
+    down = np.ascontiguousarray(rotation.T)
+    ray = down @ seen
+    shift = np.zeros(3)
+    for k in range(6):
+        shift[:] = 0.0
+        if k < 3:
+            # e × X of the axis k.
+            after, last = (k + 1) % 3, (k + 2) % 3
+            shift[after], shift[last] = -seen[last], seen[after]
+        else:
+            shift[k - 3] = 1.0
+        turned = down @ shift
+        for row in range(2):
+            moves[row, k] = ray[row] * turned[2] / ray[2] - turned[row]
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _pose_moves(
+    places: NDArray[np.float64],
+    heights: NDArray[np.float64],
+    sizes: NDArray[np.float64],
+    rotation: NDArray[np.float64],
+    translation: NDArray[np.float64],
+    result: NDArray[np.float64],
+) -> None:
+    right, up = np.empty((2, 6)), np.empty((2, 6))
+    for i in range(places.shape[0]):
+        centre = np.array([places[i, 0], places[i, 1], heights[i]])
+        half = 0.5 * sizes[i]
+        cosine, sine = half * math.cos(places[i, 2]), half * math.sin(places[i, 2])
+        middle = result[i, :2]
+        along, across = np.array([cosine, sine, 0.0]), np.array([-sine, cosine, 0.0])
+        _moves_of_a_point(centre, rotation, translation, middle)
+        _moves_of_a_point(centre + along, rotation, translation, right)
+        _moves_of_a_point(centre + across, rotation, translation, up)
+        for k in range(6):
+            turn = -sine * (right[0, k] - middle[0, k]) + cosine * (right[1, k] - middle[1, k])
+            turn -= cosine * (up[0, k] - middle[0, k]) + sine * (up[1, k] - middle[1, k])
+            result[i, 2, k] = 0.5 * turn / half**2
+
+
 def pose_moves(
     places: NDArray[np.float64],
     heights: NDArray[np.float64],
@@ -152,29 +202,15 @@ def pose_moves(
     Returns:
         (n, 3, 6) derivatives of x, y, yaw by ω [rad] and τ [m].
     """
-    count = len(places)
-    cosine, sine = np.cos(places[:, 2]), np.sin(places[:, 2])
-    along = 0.5 * sizes[:, None] * np.stack([cosine, sine, np.zeros(count)], axis=1)
-    across = 0.5 * sizes[:, None] * np.stack([-sine, cosine, np.zeros(count)], axis=1)
-    centre = np.column_stack([places[:, :2], heights])
-    points = np.concatenate([centre, centre + along, centre + across])
-    seen = points @ pose.rotation.T + pose.translation
-    # Columns of ω × X are e × X; turned into limb_base.
-    shifts = np.empty((len(points), 3, 6))
-    for axis in range(3):
-        unit = np.zeros(3)
-        unit[axis] = 1.0
-        shifts[:, :, axis] = np.cross(unit, seen)
-        shifts[:, :, 3 + axis] = unit
-    shifts = np.einsum("ji,njk->nik", pose.rotation, shifts)
-    ray = seen @ pose.rotation
-    moved = ray[:, :2, None] * (shifts[:, 2:] / ray[:, 2, None, None]) - shifts[:, :2]
-    middle, right, up = moved[:count], moved[count : 2 * count], moved[2 * count :]
-    result = np.empty((count, 3, 6))
-    result[:, :2] = middle
-    turn_right = np.einsum("ni,nik->nk", across[:, :2], right - middle)
-    turn_up = np.einsum("ni,nik->nk", along[:, :2], up - middle)
-    result[:, 2] = 0.5 * (turn_right - turn_up) / (0.25 * sizes**2)[:, None]
+    result = np.empty((len(places), 3, 6))
+    _pose_moves(
+        np.ascontiguousarray(places),
+        np.ascontiguousarray(heights),
+        np.ascontiguousarray(sizes),
+        np.ascontiguousarray(pose.rotation),
+        np.ascontiguousarray(pose.translation),
+        result,
+    )
     return result
 
 

@@ -14,7 +14,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from apriltag_tracker.pose.curve import PLACE, Curve, Evaluation, wrap
+from apriltag_tracker.pose.curve import PLACE, Curve, Evaluation
+from apriltag_tracker.pose.solution import solve_shape
 from apriltag_tracker.tag_map import TagMap
 
 
@@ -285,40 +286,30 @@ class ShapeFitter:
     ) -> _Fit:
         """Find the most probable parameters and the gain (size, n, 3) from measurements to them."""
         evaluation = self._evaluation(curve, tuple(tag.arc_length for tag in tags))
-        measured = np.array([tag.pose for tag in tags])
         prior = self.prior
         slack = (
             (prior.tag_position, prior.tag_heading)
             if curve.degrees
             else (prior.arc_position, prior.arc_heading)
         )
-        extra = np.array([slack[0], slack[0], slack[1]]) ** 2
-        whiten = np.array(
-            [np.linalg.inv(np.linalg.cholesky(tag.covariance + np.diag(extra))) for tag in tags]
-        )
-        weak = 1.0 / self._prior_sigma(curve)
-        expected = np.zeros(curve.size) if usual is None else usual[: curve.size]
         parameters = start[: curve.size].copy()
-        count = PLACE * len(tags)
-        for _ in range(12):
-            places, jacobian = evaluation.places(parameters)
-            gap = measured - places
-            gap[:, 2] = wrap(gap[:, 2])
-            rows = np.vstack([(whiten @ jacobian).reshape(count, -1), np.diag(weak)])
-            right = np.concatenate(
-                [np.einsum("nij,nj->ni", whiten, gap).ravel(), weak * (expected - parameters)]
-            )
-            normal = rows.T @ rows
-            move = np.linalg.solve(normal, rows.T @ right)
-            # A step of more than a radian of heading is damped: the fit may start far away.
-            reach = float(np.abs(evaluation.inner @ move).max())
-            parameters = parameters + move * min(1.0, 1.0 / max(reach, 1e-9))
-            if reach < 1e-9 and float(np.abs(move[:2]).max()) < 1e-9:
-                break
-        gain = np.linalg.solve(normal, rows[:count].T).reshape(-1, len(tags), PLACE)
-        gain = np.einsum("pni,nij->pnj", gain, whiten)
-        # I - G J, times the prior: how much of each parameter the measurements leave open.
-        left_open = (np.eye(curve.size) - np.einsum("pnj,njq->pq", gain, jacobian)) / weak
+        count, size = len(tags), curve.size
+        gain, gap = np.empty((size, count, PLACE)), np.empty((count, PLACE))
+        left_open = np.empty((size, size))
+        solve_shape(
+            np.array([tag.pose for tag in tags]),
+            np.array([tag.covariance for tag in tags]),
+            np.array([slack[0], slack[0], slack[1]]) ** 2,
+            1.0 / self._prior_sigma(curve),
+            np.zeros(size) if usual is None else usual[:size],
+            evaluation.integral,
+            evaluation.inner,
+            evaluation.outer,
+            parameters,
+            gain,
+            gap,
+            left_open,
+        )
         return _Fit(parameters, gain, gap, left_open)
 
     def _estimate(

@@ -15,21 +15,34 @@ from apriltag_tracker.tag_map import TagMap, WorldTag
 
 @dataclass
 class _Seen:
-    """Running mean of one fixed tag's corners and of their covariance in one frame."""
+    """Mean of one fixed tag's corners over the pictures in which it was fitted.
+
+    Attributes:
+        corners: (4, 2) px.
+        noise: (8, 8) px², covariance of the mean that the pictures' noise leaves.
+        count: of pictures; older ones fade once it stays.
+    """
 
     corners: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    noise: NDArray[np.float64]
     count: int = 1
 
     def add(self, tag: Tag, memory: int) -> None:
-        """Take one more frame."""
+        """Take one more picture."""
         self.count = min(self.count + 1, memory)
-        self.corners += (tag.corners - self.corners) / self.count
-        self.covariance += (tag.covariance - self.covariance) / self.count
+        share = 1.0 / self.count
+        self.corners += share * (tag.corners - self.corners)
+        self.noise = (1.0 - share) ** 2 * self.noise + share**2 * tag.covariance
 
 
-_LASTING = 0.01
-"""Error of a corner that stays from frame to frame, so that averaging does not remove it [px]."""
+_LASTING = 0.002
+"""Error of a corner that stays from frame to frame, so that averaging does not remove it [px].
+
+Pixels are rounded to whole grey levels, and the fit's model of lens and print is not quite theirs.
+"""
+
+_LEAST_MEMORY = 40
+"""Pictures of one tag that are averaged at least."""
 
 
 class WorldPose:
@@ -38,7 +51,8 @@ class WorldPose:
     Args:
         tags: the tag map.
         intrinsics: of the camera.
-        memory: frames over which corners are averaged.
+        memory: pictures over which corners are averaged; at least `_LEAST_MEMORY` of each tag where
+            not all are fitted in every picture.
         solve_every: frames between two solutions once the pose has settled.
         bump: shift of the fixed tags, all together, that means that the camera was moved [px].
         bump_frames: frames in a row that must show it.
@@ -82,12 +96,14 @@ class WorldPose:
             self.bumps += 1
             self._seen.clear()
             self._frames = 0
-        for tag, _ in known:
+        fitted = [tag for tag, _ in known if tag.measured]
+        memory = max(self._memory * len(fitted) // max(len(known), 1), _LEAST_MEMORY)
+        for tag in fitted:
             seen = self._seen.get(tag.id)
             if seen is None:
                 self._seen[tag.id] = _Seen(tag.corners.copy(), tag.covariance.copy())
             else:
-                seen.add(tag, self._memory)
+                seen.add(tag, memory)
         if known and (self._frames < 10 or self._frames % self._solve_every == 0):
             self._solve()
         if known:
@@ -96,14 +112,12 @@ class WorldPose:
 
     def _moved(self, known: Sequence[tuple[Tag, WorldTag]]) -> bool:
         """Tell whether most fixed tags have been elsewhere than their mean for a few frames."""
-        shifts = [
-            float(np.hypot(*(tag.corners - self._seen[tag.id].corners).mean(axis=0)))
-            for tag, _ in known
-            if tag.id in self._seen
-        ]
-        if not shifts:
+        averaged = [tag for tag, _ in known if tag.id in self._seen]
+        if not averaged:
             return False
-        if float(np.median(shifts)) > self._bump:
+        gaps = np.array([tag.corners - self._seen[tag.id].corners for tag in averaged])
+        shifts = sorted(np.hypot(*gaps.mean(axis=1).T).tolist())
+        if shifts[(len(shifts) - 1) // 2] > self._bump:
             self._shifted += 1
         else:
             self._shifted = 0
@@ -167,7 +181,7 @@ class WorldPose:
         result = np.zeros((6, 6))
         for k, tag in enumerate(ids):
             known = self._seen[tag]
-            spread = known.covariance / known.count + _LASTING**2 * np.eye(8)
+            spread = known.noise + _LASTING**2 * np.eye(8)
             part = gain[:, 8 * k : 8 * k + 8]
             result += part @ spread @ part.T
         return result

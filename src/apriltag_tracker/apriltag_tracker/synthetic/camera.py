@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +22,12 @@ from apriltag_tracker.tag_map import UNIT_CORNERS, TagMap
 SCHEMA_VERSION = 1
 MARGIN_CELLS = 1
 _NOISE_LENGTH = 1 << 21
-_LARGEST_INSTANTS = 9
+_STILL, _INSTANTS_APART, _MOST_INSTANTS = 0.2, 1.1, 16
+"""Ways during an exposure that are shorter than the first [px] are one instant; longer ones take
+Gauss's instants, about so far apart [px]: of a blurred picture their mean is that of all."""
+
+
+_gauss = lru_cache(np.polynomial.legendre.leggauss)
 
 
 @dataclass(frozen=True)
@@ -206,10 +213,8 @@ class SyntheticCamera:
         if shape is not None:
             self._draw_body(image, shape)
             for tag in self.tags.limb:
-                placements = self._placements(tag.id, shape, velocity)
-                middle = placements[len(placements) // 2]
-                corners = self._draw_tag(image, tag.id, placements)
-                if corners is not None:
+                middle, placements, shares = self._placements(tag.id, shape, velocity)
+                if self._draw_tag(image, tag.id, placements, shares):
                     result.corners[tag.id] = self._corners(middle)
         for polygon in covers:
             points = np.round(np.array(polygon) * 16).astype(np.int32)
@@ -220,8 +225,13 @@ class SyntheticCamera:
         """Return what does not move, without noise."""
         return self._background.copy()
 
-    def _placements(self, tag_id: int, shape: Shape, velocity: Shape | None) -> NDArray[np.float64]:
-        """Return x, y, z, yaw, size of a limb tag over the exposure, (k, 5)."""
+    def _placements(
+        self, tag_id: int, shape: Shape, velocity: Shape | None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return x, y, z, yaw, size of a limb tag in the middle, (5,), and over the exposure.
+
+        The latter are (k, 5), each with the share (k,) of the exposure that it stands for.
+        """
         tag = self.tags.limb_tag(tag_id)
         assert tag is not None
         offset = self._mounting[tag_id]
@@ -241,16 +251,19 @@ class SyntheticCamera:
 
         now = shape.at(tag.arc_length)
         if velocity is None or self.optics.exposure <= 0.0:
-            return place(now)[None]
+            return place(now), place(now)[None], np.ones(1)
         later = Shape(
             shape.arc_length, shape.points + velocity.points, shape.heading + velocity.heading
         )
         rate = later.at(tag.arc_length) - now
         half = 0.5 * self.optics.exposure
         travelled = 2.0 * half * scale * (np.hypot(rate[0], rate[1]) + abs(rate[2]) * tag.size)
-        instants = int(min(2 * (travelled // 0.7) + 1, _LARGEST_INSTANTS))
-        shares = (np.arange(instants) + 0.5) / instants * 2.0 - 1.0
-        return np.array([place(now + rate * half * share) for share in shares])
+        if travelled < _STILL:
+            return place(now), place(now)[None], np.ones(1)
+        instants = min(1 + math.ceil(travelled / _INSTANTS_APART), _MOST_INSTANTS)
+        nodes, weights = _gauss(instants)
+        placements = np.array([place(now + rate * half * node) for node in nodes])
+        return place(now), placements, 0.5 * weights
 
     def _corners(self, placement: NDArray[np.float64]) -> NDArray[np.float64]:
         x, y, z, yaw, size = placement
@@ -261,9 +274,13 @@ class SyntheticCamera:
         return project(self.model.intrinsics, self.model.pose, points)
 
     def _draw_tag(
-        self, image: NDArray[np.uint8], tag_id: int, placements: NDArray[np.float64]
-    ) -> NDArray[np.float64] | None:
-        """Draw a tag; returns its corners at the last instant, None if it is out of sight."""
+        self,
+        image: NDArray[np.uint8],
+        tag_id: int,
+        placements: NDArray[np.float64],
+        shares: NDArray[np.float64],
+    ) -> bool:
+        """Draw a tag over an exposure; returns whether any of it is in the picture."""
         first, last = self._corners(placements[0]), self._corners(placements[-1])
         both = np.concatenate([first, last])
         middle = both.mean(axis=0)
@@ -276,7 +293,7 @@ class SyntheticCamera:
         rows, columns = image.shape
         box = np.array([max(low[1], 0), min(high[1], rows), max(low[0], 0), min(high[0], columns)])
         if box[0] >= box[1] or box[2] >= box[3]:
-            return None
+            return False
         maps = np.array([self._to_cells(placement) for placement in placements])
         cell = 1.0 / self.tags.family.border_cells
         side = 0.5 * (np.hypot(*(last[1] - last[0])) + np.hypot(*(last[2] - last[3]))) * cell
@@ -289,13 +306,14 @@ class SyntheticCamera:
             int(self._random.integers(0, _NOISE_LENGTH)),
             box,
             maps,
+            shares,
             np.array([blur / side, blur / other]),
             self._cells[tag_id],
             self.optics.black,
             self.optics.white,
             self._table,
         )
-        return last
+        return True
 
     def _to_cells(self, placement: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the map from rays to cells (columns, rows downward) of one placed tag."""
@@ -372,6 +390,6 @@ class SyntheticCamera:
         image: NDArray[Any] = np.clip(np.round(floor), 0, 255).astype(np.uint8)
         noise, self._noise = self._noise, np.zeros_like(self._noise)
         for tag_id, (_, placement) in self._world.items():
-            self._draw_tag(image, tag_id, placement[None])
+            self._draw_tag(image, tag_id, placement[None], np.ones(1))
         self._noise = noise
         return image

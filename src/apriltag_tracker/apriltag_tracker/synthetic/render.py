@@ -26,7 +26,7 @@ def cumulative_table() -> NDArray[np.float32]:
     return np.array([0.5 * (1.0 + math.erf(x / math.sqrt(2.0))) for x in grid], dtype=np.float32)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
 def _cumulative(x: float, table: NDArray[np.float32]) -> float:
     if x <= -_TABLE_REACH:
         return 0.0
@@ -38,7 +38,7 @@ def _cumulative(x: float, table: NDArray[np.float32]) -> float:
     return float(table[k] * (1.0 - part) + table[min(k + 1, _TABLE_STEPS)] * part)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _seen(
     m: NDArray[np.float64],
     x: float,
@@ -53,24 +53,25 @@ def _seen(
     `weights` (n,) is room to work in; the rest is as in `draw_tag`.
     """
     count = cells.shape[0]
-    w = m[2, 0] * x + m[2, 1] * y + m[2, 2]
-    u = (m[0, 0] * x + m[0, 1] * y + m[0, 2]) / w
-    v = (m[1, 0] * x + m[1, 1] * y + m[1, 2]) / w
+    scale = 1.0 / (m[2, 0] * x + m[2, 1] * y + m[2, 2])
+    u = (m[0, 0] * x + m[0, 1] * y + m[0, 2]) * scale
+    v = (m[1, 0] * x + m[1, 1] * y + m[1, 2]) * scale
     u0 = max(math.floor(u - 3.0 * spread[0]), 0)
     u1 = min(math.floor(u + 3.0 * spread[0]), count - 1)
     v0 = max(math.floor(v - 3.0 * spread[1]), 0)
     v1 = min(math.floor(v + 3.0 * spread[1]), count - 1)
     if u0 > u1 or v0 > v1:
         return 0.0, 0.0
-    last = _cumulative((u0 - u) / spread[0], table)
+    across, down = 1.0 / spread[0], 1.0 / spread[1]
+    last = _cumulative((u0 - u) * across, table)
     for i in range(u0, u1 + 1):
-        following = _cumulative((i + 1 - u) / spread[0], table)
+        following = _cumulative((i + 1 - u) * across, table)
         weights[i] = following - last
         last = following
     cover, bright = 0.0, 0.0
-    last = _cumulative((v0 - v) / spread[1], table)
+    last = _cumulative((v0 - v) * down, table)
     for j in range(v0, v1 + 1):
-        following = _cumulative((j + 1 - v) / spread[1], table)
+        following = _cumulative((j + 1 - v) * down, table)
         share = following - last
         last = following
         for i in range(u0, u1 + 1):
@@ -79,7 +80,7 @@ def _seen(
     return cover, bright
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def draw_tag(
     canvas: NDArray[np.uint8],
     rays: NDArray[np.float32],
@@ -88,6 +89,7 @@ def draw_tag(
     noise_start: int,
     box: NDArray[np.int64],
     maps: NDArray[np.float64],
+    shares: NDArray[np.float64],
     spread: NDArray[np.float64],
     cells: NDArray[np.uint8],
     black: float,
@@ -104,7 +106,8 @@ def draw_tag(
         noise_start: place in the noise.
         box: first row, end row, first column, end column.
         maps: (k, 3, 3) from rays to cells (column to the right, row downward), one for each instant
-            of the exposure, averaged.
+            of the exposure.
+        shares: (k,) of the exposure that each instant stands for; they sum to 1.
         spread: (2,) standard deviation of blur and pixel in cells, along columns and rows.
         cells: (n, n) printed cells with their margin, 1 is white.
         black: grey level of black cells in nominal light.
@@ -120,12 +123,10 @@ def draw_tag(
             cover, bright = 0.0, 0.0
             for k in range(instants):
                 more, whiter = _seen(maps[k], x, y, spread, cells, weights, table)
-                cover += more
-                bright += whiter
+                cover += shares[k] * more
+                bright += shares[k] * whiter
             if cover <= 0.0:
                 continue
-            cover /= instants
-            bright /= instants
             value = (black * (cover - bright) + white * bright) * light[row, column]
             value += noise[position % noise.shape[0]] * cover
             position += 1

@@ -34,7 +34,9 @@ class ChamberLog:
     """Chamber pressures of the past as measured, of the future by the law of the air.
 
     Between two readings the pressures are on a straight line. After the last one the model's
-    pressures under the commands hold, with the difference that the last readings showed.
+    pressures under the commands hold, with the difference that the last readings showed. What a
+    learned plan knows its chambers to hold beyond their model is left out of all of them: the tip
+    that the plan expects has it already.
 
     Args:
         nominal: of the plan.
@@ -139,12 +141,11 @@ class ChamberLog:
     def during(self, steps: Whole) -> Array:
         """Return the differential pressures (n, M) [Pa] amid consecutive fine steps (n,)."""
         middle = STEP * (steps.astype(np.float64) + 0.5)
-        known = middle <= self.newest
+        known = (middle <= self.newest) & self._nominal.watched
         result = np.empty((len(steps), self._inputs))
         if known.any():
-            result[known] = interpolate(
-                middle[known], np.array(self._times), np.array(self._readings)
-            )
+            readings = interpolate(middle[known], np.array(self._times), np.array(self._readings))
+            result[known] = readings - self._nominal.chambers_beyond(middle[known])
         if not known.all():
             coming = self.model(steps[~known])
             coming += self.surprise(middle[~known])
@@ -166,7 +167,7 @@ class ChamberLog:
         readings, which fades within `_GROWTH_TIME`: a chamber that vents more slowly than its model
         is left behind further and further.
         """
-        if not self._times:
+        if not self._times or not self._nominal.watched:
             return np.zeros((len(time), self._inputs))
         if self._gap is None:
             self._gap = self._beyond_model()
@@ -186,6 +187,7 @@ class ChamberLog:
         )
         middles = STEP * (steps.astype(np.float64) + 0.5)
         gaps = np.array(self._readings[begin:]) - interpolate(instants, middles, self.model(steps))
+        gaps -= self._nominal.chambers_beyond(instants)
         away = instants - last
         if len(away) < 3 or np.ptp(away) < _GROWTH_SEEN / 2:
             return gaps[-1], np.zeros(self._inputs)

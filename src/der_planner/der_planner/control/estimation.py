@@ -193,6 +193,14 @@ class Estimator:
             age=time - self.newest,
         )
 
+    def missed(self, known: Knowledge, k: int) -> float:
+        """Return the distance of the tip from r̄ [m] at control period ``k``."""
+        nominal = self.nominal
+        row = nominal.periods(k)
+        moved = nominal.moved_tip(nominal.bend[row], known.mean[: self.inputs])
+        gap = nominal.tip[row] + moved + known.mean[-2:] - nominal.reference[row]
+        return float(np.linalg.norm(gap))
+
     def between(self, first: int, last: int) -> tuple[list[Knowledge], list[Knowledge]]:
         """Return what was expected and what is known at fine steps ``first`` … ``last``.
 

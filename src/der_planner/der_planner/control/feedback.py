@@ -50,7 +50,8 @@ class Feedback:
         limits = limits or Limits()
         authority = limits.authority * air.pressure_limit
         self._allowed = Allowed(authority, air.pressure_limit, air.slew_limit * CONTROL_PERIOD)
-        self._supervisor = Supervisor(limits, authority)
+        length = sum(segment.length for segment in plan.limb.segments)
+        self._supervisor = Supervisor(limits, authority, length)
         self._chambers = ChamberLog(self._nominal)
         self._estimator = Estimator(self._nominal, self._chambers)
         self._horizon = Horizon(self._nominal, self._chambers, settings_of(plan))
@@ -135,13 +136,14 @@ class Feedback:
         else:
             supervisor.in_time()
         planned, before = self._nominal.command(k), self._chambers.sent(k - 1)
-        correction, swing = np.zeros_like(planned), 0.0
+        correction, swing, missed = np.zeros_like(planned), 0.0, 0.0
         try:
             # Matrices of some ten rows: more threads only get into other processes' way.
             with _THREADS.limit(limits=1, user_api="blas"):
                 known = self._estimator.at(instant)
                 age = instant - self._estimator.newest
                 swing = float(np.linalg.norm(known.rate))
+                missed = self._estimator.missed(known, k)
                 share = supervisor.advance(instant, age, known.strange)
                 if share > 0.0:
                     correction = share * self._horizon.solve(k, known, self._allowed)
@@ -153,7 +155,7 @@ class Feedback:
         limit, step = self._allowed.limit, self._allowed.step
         command: Array = np.clip(planned + correction, before - step, before + step)
         command = np.clip(command, -limit, limit)
-        supervisor.sent(instant, command - planned, swing)
+        supervisor.sent(instant, command - planned, swing, missed)
         self._chambers.send(k, command)
         self._estimator.changed(instant)
         return command

@@ -9,13 +9,17 @@ correction. The corrections c (W, M), added to the plan's commands, then minimis
 where r is c less what makes up for the disturbances d and g, which are known ahead, with |command|
 within the pressure limit, its change within the slew limit and |c| within the authority. ν keeps
 the segments near the model's bend where the tip hardly tells them apart. The chambers' law, with
-its slow venting, is linearised about the commands rolled forward. Corrections are straight lines
-between a few knots, close together at first, so that the programme has some twenty unknowns.
+its slow venting, is linearised about the commands rolled forward, and of the change that the
+programme finds so much is taken as makes the sum less when it is rolled forward itself. Only
+commands that can be sent are rolled forward. Corrections are straight lines between a few knots,
+close together at first, so that the programme has some thirty unknowns. The horizon is longer than
+a chamber takes to vent: what a shorter one gains now it pays for after its end.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +28,7 @@ from der_planner.control.chambers import ChamberLog
 from der_planner.control.knowledge import Knowledge
 from der_planner.control.nominal import Nominal
 from der_planner.model import air, material
+from der_planner.model.commands import within_limits
 from der_planner.model.drive import STEPS
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning.plan_file import LEARNED
@@ -44,7 +49,7 @@ class HorizonSettings:
         smoothness: λ' [m/Pa].
     """
 
-    knots: tuple[int, ...] = (0, 1, 2, 3, 5, 7, 10, 14, 19, 25, 32, 39)
+    knots: tuple[int, ...] = (0, 1, 2, 3, 5, 7, 10, 14, 19, 25, 32, 40, 50, 69)
     bend: float = 0.004
     change: float = 5e-6
     smoothness: float = 5e-6
@@ -53,8 +58,7 @@ class HorizonSettings:
 def settings_of(plan: Plan) -> HorizonSettings:
     """Return sizes and weights for a plan.
 
-    A learned plan already makes up for what repeats, the chambers' slowness too, which is held to
-    be news here: its corrections are to be slow.
+    A learned plan already makes up for what repeats: its corrections are to be slow.
     """
     if plan.method.startswith(LEARNED):
         return HorizonSettings(change=2e-5, smoothness=2e-5)
@@ -74,6 +78,47 @@ class Allowed:
     authority: float
     limit: float
     step: float
+
+
+_SHARES = (1.0, 0.5, 0.2)
+"""Of a change that are tried."""
+
+
+class _Rolled(NamedTuple):
+    """What corrections from control period ``first`` on lead to.
+
+    Attributes:
+        correction: (W, M) [Pa].
+        chambers, before: what the chambers do, and the commands in it before ``first``.
+        held, effective: (W, S, M) in the chambers, and felt [Pa].
+        misses: (W, 2) tip − r̄ at the ends of the periods [m].
+        bends: (W, M) δθ there [rad].
+    """
+
+    first: int
+    correction: Array
+    chambers: air.Chambers
+    before: int
+    held: Array
+    effective: Array
+    misses: Array
+    bends: Array
+
+
+class _Free(NamedTuple):
+    """What corrections cost nothing: that of the two periods before, and from now on.
+
+    Attributes:
+        before: r (2, M) that was sent [Pa].
+        ahead: (W, M) what makes up for d and g [Pa].
+    """
+
+    before: Array
+    ahead: Array
+
+    def beyond(self, correction: Array) -> Array:
+        """Return r (W + 2, M) [Pa] of corrections (W, M)."""
+        return np.concatenate([self.before, correction - self.ahead])
 
 
 class Horizon:
@@ -97,6 +142,14 @@ class Horizon:
         self._hats = _hats(self.settings.knots)
         self._guess: tuple[int, Array] | None = None
         inputs = nominal.limb.segment_count
+        weights = (1, self.settings.change), (2, self.settings.smoothness)
+        self._differences = [
+            weight * np.diff(np.eye(self.window + 2), order, axis=0)[2 - order :]
+            for order, weight in weights
+        ]
+        self._difference_rows = [
+            np.kron(each[:, 2:] @ self._hats, np.eye(inputs)) for each in self._differences
+        ]
         self.solution = 0, np.zeros((self.window, inputs))
 
     def solve(self, first: int, known: Knowledge, allowed: Allowed) -> Array:
@@ -107,29 +160,66 @@ class Horizon:
             known: of the limb at its beginning.
             allowed: what corrections and commands must keep.
         """
-        inputs = self._nominal.limb.segment_count
         last = np.array([self._corrected(first - back) for back in (2, 1)])
         ahead = self._ahead(first, known)
         guess = self._begin(first, last[-1] - ahead[1]) + ahead[2:]
-        misses, bends, jacobian, turned = self._roll(first, guess, known)
+        guess = self._kept(first, guess, allowed)
+        free = _Free(last - ahead[:2], ahead[2:])
+        here = self._roll(first, guess, known)
+        change = self._programme(here, known, allowed, free)
+        best = self._searched(here, change, known, allowed, free)
+        self._guess = first, best.correction - free.ahead
+        self.solution = first, best.correction
+        correction_now: Array = self.solution[1][0]
+        return correction_now
+
+    def _programme(self, here: _Rolled, known: Knowledge, allowed: Allowed, free: _Free) -> Array:
+        """Return the change (W, M) [Pa] of corrections that is best to first order.
+
+        Args:
+            here: rolled forward without the change.
+            known: of the limb.
+            allowed: what corrections and commands must keep.
+            free: what costs nothing.
+        """
+        inputs = here.correction.shape[1]
+        jacobian, turned = self._derivatives(here, known)
         # Unknown is the change of the knots.
         knots = self._hats.shape[1] * inputs
         tip = jacobian.reshape(-1, knots)
         bend = self.settings.bend * turned.reshape(-1, knots)
         hessian = tip.T @ tip + bend.T @ bend
-        gradient = tip.T @ misses.ravel() + self.settings.bend * (bend.T @ bends.ravel())
-        run = np.concatenate([last, guess]) - ahead
-        for order, weight in ((1, self.settings.change), (2, self.settings.smoothness)):
-            each = np.diff(np.eye(len(run)), order, axis=0)[2 - order :]
-            rows = np.kron(each[:, 2:] @ self._hats, np.eye(inputs))
-            hessian += weight**2 * rows.T @ rows
-            gradient += weight**2 * rows.T @ (each @ run).ravel()
-        change = self._within(hessian, gradient, first, guess, allowed).reshape(-1, inputs)
-        correction = guess + self._hats @ change
-        self._guess = first, correction - ahead[2:]
-        self.solution = first, np.clip(correction, -allowed.authority, allowed.authority)
-        correction_now: Array = self.solution[1][0]
-        return correction_now
+        gradient = tip.T @ here.misses.ravel() + self.settings.bend * (bend.T @ here.bends.ravel())
+        run = free.beyond(here.correction)
+        for each, rows in zip(self._differences, self._difference_rows, strict=True):
+            hessian += rows.T @ rows
+            gradient += rows.T @ (each @ run).ravel()
+        change = self._within(hessian, gradient, here.first, here.correction, allowed)
+        moved: Array = self._hats @ change.reshape(-1, inputs)
+        return moved
+
+    def _searched(
+        self, here: _Rolled, change: Array, known: Knowledge, allowed: Allowed, free: _Free
+    ) -> _Rolled:
+        """Return what is reached on the way of a change (W, M) [Pa] that minimises more.
+
+        The programme knows the chambers to first order. Where they vent as fast as they can, a
+        small command changes nothing and a larger one fills the other chamber of the pair: the
+        whole change may do harm that a part of it does not.
+        """
+        least = self._minimised(here, free)
+        for share in _SHARES:
+            tried = self._kept(here.first, here.correction + share * change, allowed)
+            there = self._roll(here.first, tried, known)
+            if self._minimised(there, free) < least:
+                return there
+        return here
+
+    def _minimised(self, rolled: _Rolled, free: _Free) -> float:
+        """Return what is minimised (see the module) [m²]."""
+        run = free.beyond(rolled.correction)
+        squares = (rolled.misses**2).sum() + self.settings.bend**2 * (rolled.bends**2).sum()
+        return float(squares + sum(((each @ run) ** 2).sum() for each in self._differences))
 
     def warm_up(self, known: Knowledge, allowed: Allowed) -> None:
         """Compile, or load from the cache, what `solve` calls."""
@@ -160,6 +250,19 @@ class Horizon:
         """Return the correction (M,) that was sent for a period [Pa]."""
         return self._chambers.sent(k) - self._nominal.command(k)
 
+    def _kept(self, first: int, correction: Array, allowed: Allowed) -> Array:
+        """Return corrections (W, M) [Pa] cut to what they and the commands under them must keep.
+
+        What is rolled forward must be what can be sent.
+        """
+        planned = self._nominal.commands[self._nominal.periods(first + np.arange(self.window))]
+        wanted = planned + np.clip(correction, -allowed.authority, allowed.authority)
+        commands, _ = within_limits(
+            wanted, self._nominal.limb.pneumatics, CONTROL_PERIOD, self._chambers.sent(first - 1)
+        )
+        kept: Array = commands - planned
+        return kept
+
     def _begin(self, first: int, last: Array) -> Array:
         """Return the last solution, moved to begin now, (W, M) [Pa]."""
         if self._guess is None or not 0 <= first - self._guess[0] < self.window:
@@ -168,16 +271,11 @@ class Horizon:
         before = self._guess[1]
         return before[np.minimum(np.arange(self.window) + gone, self.window - 1)]
 
-    def _roll(
-        self, first: int, guess: Array, known: Knowledge
-    ) -> tuple[Array, Array, Array, Array]:
-        """Return misses (W, 2) [m] and bends (W, M) [rad] at the ends of the periods.
-
-        And their derivatives by the corrections at the knots (W, 2, knots·M), (W, M, knots·M).
-        """
+    def _roll(self, first: int, correction: Array, known: Knowledge) -> _Rolled:
+        """Return what corrections (W, M) [Pa] from a control period on lead to."""
         nominal, inputs = self._nominal, self._nominal.limb.segment_count
         periods = nominal.periods(first + np.arange(self.window))
-        commands = nominal.commands[periods] + guess
+        commands = nominal.commands[periods] + correction
         chambers, before = self._chambers.follow(first, commands)
         middle = (first * STEPS + np.arange(self.window * STEPS) + 0.5) * CONTROL_PERIOD / STEPS
         held = chambers.differential[before:] + self._chambers.surprise(middle).reshape(
@@ -189,32 +287,40 @@ class Horizon:
         effective = material.without_memory(
             nominal.limb, held, taken.reshape(self.window, STEPS, inputs)
         )
-        slopes = material.slopes(nominal.limb, held, effective).matrix.mean(axis=1)
-        reached = air.derivative(chambers, before).mean(axis=1)
         missing, gain = self._disturbance(known)
-        slopes = slopes * (1.0 + gain)[None, :, None]
-        felt = effective.mean(axis=1)
         planned = nominal.effective[fine].reshape(self.window, STEPS, inputs).mean(axis=1)
-        push = felt * (1.0 + gain) + missing - planned
-        # Pressures by the knots' corrections, then swing by these, period after period.
-        reached = np.einsum("wvb,vn->wnb", reached, self._hats)
-        into = nominal.input[periods]
-        driven = np.einsum("wsb,wnb->wsnb", into @ slopes, reached)
-        driven = driven.reshape(self.window, 2 * inputs, -1)
-        pushed = np.einsum("wsb,wb->ws", into, push)
-        swing, moved = known.mean[: 2 * inputs], np.zeros(driven.shape[1:])
+        push = effective.mean(axis=1) * (1.0 + gain) + missing - planned
+        pushed = np.einsum("wsb,wb->ws", nominal.input[periods], push)
+        swing = known.mean[: 2 * inputs]
         bends = np.empty((self.window, inputs))
-        turned = np.empty((self.window, inputs, driven.shape[2]))
         for i, transition in enumerate(nominal.transition[periods]):
             swing = transition @ swing + pushed[i]
-            moved = transition @ moved + driven[i]
-            bends[i], turned[i] = swing[:inputs], moved[:inputs]
+            bends[i] = swing[:inputs]
         ends = nominal.periods(first + 1 + np.arange(self.window))
         bend = nominal.bend[ends]
         misses = nominal.tip[ends] + nominal.moved_tip(bend, bends) - nominal.reference[ends]
         misses = misses + known.mean[-2:]
-        jacobian = nominal.kinematics.tip_jacobians(bend + bends) @ turned
-        return misses, bends, jacobian, turned
+        return _Rolled(first, correction, chambers, before, held, effective, misses, bends)
+
+    def _derivatives(self, rolled: _Rolled, known: Knowledge) -> tuple[Array, Array]:
+        """Return ∂misses (W, 2, knots·M) and ∂bends (W, M, knots·M) by the knots' corrections."""
+        nominal, inputs = self._nominal, self._nominal.limb.segment_count
+        slopes = material.slopes(nominal.limb, rolled.held, rolled.effective).matrix.mean(axis=1)
+        slopes = slopes * (1.0 + self._disturbance(known)[1])[None, :, None]
+        # Pressures by the knots' corrections, then swing by these, period after period.
+        reached = air.derivative(rolled.chambers, rolled.before).mean(axis=1)
+        reached = np.einsum("wvb,vn->wnb", reached, self._hats)
+        periods = nominal.periods(rolled.first + np.arange(self.window))
+        driven = np.einsum("wsb,wnb->wsnb", nominal.input[periods] @ slopes, reached)
+        driven = driven.reshape(self.window, 2 * inputs, -1)
+        moved = np.zeros(driven.shape[1:])
+        turned = np.empty((self.window, inputs, driven.shape[2]))
+        for i, transition in enumerate(nominal.transition[periods]):
+            moved = transition @ moved + driven[i]
+            turned[i] = moved[:inputs]
+        bend = nominal.bend[nominal.periods(rolled.first + 1 + np.arange(self.window))]
+        jacobian = nominal.kinematics.tip_jacobians(bend + rolled.bends) @ turned
+        return jacobian, turned
 
     def _within(
         self, hessian: Array, gradient: Array, first: int, guess: Array, allowed: Allowed

@@ -116,6 +116,7 @@ class Learner:
         self._of_file = self._correction
         self._plan = plan
         self._pending: Played | None = None
+        self._beyond: Array | None = None
         self._begin()
 
     def _begin(self) -> None:
@@ -144,6 +145,7 @@ class Learner:
         covariance: ArrayLike | None = None,
         *,
         commands: ArrayLike | None = None,
+        chambers: tuple[ArrayLike, ArrayLike] | None = None,
     ) -> None:
         """Take in a run of the plan that `next` gave last, or of the first plan.
 
@@ -155,6 +157,8 @@ class Learner:
             covariance: (K, 2, 2) of the tip [m²]; None: estimated from the scatter of the tips.
             commands: (setpoints, M) that were in force in this run, if not those of the plan, for
                 instance with what feedback added [Pa].
+            chambers: rising instants (n,) [s] and what the chambers held then (n, M) [Pa]: what
+                feedback on a learned plan takes for granted, not for news.
 
         Raises:
             LearningError: the arrays do not fit together or to the plan.
@@ -167,6 +171,8 @@ class Learner:
             said = f"refused: {said}"
         else:
             accepted, said = self._take(played)
+        if accepted and chambers is not None:
+            self._beyond = _beyond(played, self._plan.time, *chambers)
         self.history.append(
             LearningRun(
                 len(self.history) + 1,
@@ -188,18 +194,21 @@ class Learner:
         """
         if self._best is None:
             return self._plan
-        best = self._best
+        self._plan = self._next(self._best)
+        if self._beyond is not None:
+            self._plan = dataclasses.replace(self._plan, chambers_beyond=self._beyond)
+        return self._plan
+
+    def _next(self, best: Played) -> Plan:
         if self.stopped or not self._fresh:
-            self._plan = self._as_plan(best)
-            return self._plan
+            return self._as_plan(best)
         self._fresh = False
         known, error = self._runs.known(best), self._runs.error(best)
         target = known.value - (1.0 - self._step) * error
         following = self._correction.plan(best.commands, target, self._pull)
         # What is expected is the disturbance itself, whatever share of the error was asked to go.
         tip = following.tip_predicted - target + known.value
-        self._plan = dataclasses.replace(following, tip_predicted=tip)
-        return self._plan
+        return dataclasses.replace(following, tip_predicted=tip)
 
     # One run ---------------------------------------------------------------------------------
 
@@ -338,6 +347,31 @@ class Learner:
             tip_predicted=run.expected.tip + self._runs.known(run).value,
             method="learned",
         )
+
+
+def _beyond(run: Played, setpoints: Array, time: ArrayLike, held: ArrayLike) -> Array:
+    """Return by how much the chambers held more than their model in each period (K, M) [Pa].
+
+    Args:
+        run: as it was played.
+        setpoints: (K,) [s].
+        time: (n,) rising instants [s].
+        held: (n, M) differential pressures in the chambers then [Pa].
+
+    Raises:
+        LearningError: shapes that do not fit, or instants that do not rise.
+    """
+    instants, values = np.asarray(time, dtype=float), np.asarray(held, dtype=float)
+    wanted = (len(instants), run.commands.shape[1])
+    if instants.ndim != 1 or not len(instants) or values.shape != wanted:
+        raise LearningError(
+            f"chambers need instants (n,) and pressures {wanted}, got shapes {instants.shape} and "
+            f"{values.shape}: take both from the same recording"
+        )
+    middle = setpoints + 0.5 * (setpoints[1] - setpoints[0])
+    known = np.column_stack([np.interp(middle, instants, column) for column in values.T])
+    beyond: Array = known - run.expected.pressure
+    return beyond
 
 
 def _refusal(seen: float, astray: str) -> str:

@@ -23,7 +23,8 @@ from der_planner.model import material
 from der_planner.model.balance import Balance
 from der_planner.model.drive import STEPS
 from der_planner.model.response import RodModel, simulate
-from der_planner.model.series import CONTROL_PERIOD, step_middles
+from der_planner.model.series import CONTROL_PERIOD, interpolate, step_middles
+from der_planner.planning.plan_file import LEARNED
 from der_planner.planning.result import Plan
 from der_planner.planning.ways import resting_spline, sample_spline
 
@@ -61,6 +62,8 @@ class Nominal:
         before: (M,) command before the first one [Pa].
         effective: (K'·STEPS, M) effective pressures of the fine steps [Pa].
         taken: (K'·STEPS, M) pressures that friction and creep take of them [Pa].
+        watched: the chambers' readings are news: not so on a learned plan of which nobody told what
+            its chambers hold beyond their model.
         fine_transition, fine_input: (K', 2M, 2M) and (K', 2M, M) of (δθ, δθ̇) in one fine step.
         transition, input: the same of a control period.
     """
@@ -99,6 +102,9 @@ class Nominal:
         middle = step_middles(count, STEPS)
         self.fine_bend = sample_spline(spline, middle)[0]
         self.taken = material.memory_pressures(plan.limb, middle, self.fine_bend)
+        beyond = plan.chambers_beyond
+        self.watched = beyond is not None or not plan.method.startswith(LEARNED)
+        self._beyond = np.zeros((1, inputs)) if beyond is None else beyond
         self._linearise(Balance(model.rod, model.kinematics), time)
 
     @property
@@ -127,6 +133,12 @@ class Nominal:
     def command(self, k: int) -> Array:
         """Return the plan's command (M,) of a control period [Pa]."""
         return self.before if k < 0 else self.commands[min(k, self.count - 1)]
+
+    def chambers_beyond(self, time: Array) -> Array:
+        """Return what the chambers are known to hold beyond their model (n, M) at instants [s]."""
+        middle = (np.arange(len(self._beyond)) + 0.5) * CONTROL_PERIOD
+        beyond: Array = interpolate(time, middle, self._beyond)
+        return beyond
 
     def moved_tip(self, bend: Array, change: Array) -> Array:
         """Return by how much the tip moves (…, 2) [m] if bend angles (…, M) change [rad]."""

@@ -30,8 +30,16 @@ def add_run(learner: Learner, run: RunSeries) -> None:
     given = run.tip_covariance.value
     whole = len(given) == len(run.tip) and bool(np.isfinite(given).any())
     covariance = given.reshape(-1, 2, 2) if whole else None
+    held = run.measured
+    told = (held.time, held.value) if len(held) else None
     try:
-        learner.add(run.tip.time, run.tip.value, covariance, commands=run.setpoints.value)
+        learner.add(
+            run.tip.time,
+            run.tip.value,
+            covariance,
+            commands=run.setpoints.value,
+            chambers=told,
+        )
     except LearningError as error:
         raise GraphError(f"cannot learn from {run.description.title}: {error}") from error
 

@@ -42,19 +42,26 @@ _NO_EVENTS = SubscriptionEventCallbacks(use_default_callbacks=False)
 class Intake:
     """Takes all messages of several topics that have come, every `PERIOD`, in a thread of its own.
 
+    A message that a callback cannot take, as one of another program may be, is reported and left
+    out: it must not end the page and its vent.
+
     Args:
         node: that subscribes.
     """
 
     def __init__(self, node: Node) -> None:
         self._node = node
+        self.refused = 0
+        """Messages left out."""
+        self.last_refused = ""
+        """Topic and reason of the newest of them."""
         self._group = _Unwoken()
         self._lock = threading.Lock()
         self._subscriptions: list[Subscription] = []
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="intake", daemon=True)
         self.error: Exception | None = None
-        """What a callback raised, which ends the looking."""
+        """What ended the looking."""
 
     def subscribe(
         self,
@@ -108,4 +115,12 @@ class Intake:
                 taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
                 if taken is None:
                     break
-                subscription.callback(taken[0])
+                try:
+                    subscription.callback(taken[0])
+                except Exception as error:  # whatever is wrong with the message
+                    self._refuse(subscription.topic_name, error)
+
+    def _refuse(self, topic: str, error: Exception) -> None:
+        self.refused += 1
+        self.last_refused = f"a message of {topic} could not be used: {error}"
+        self._node.get_logger().error(self.last_refused, throttle_duration_sec=10.0)

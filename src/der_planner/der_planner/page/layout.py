@@ -57,6 +57,7 @@ class Window:
                 self._controls()
             self._panel("numbers", "Last 30 s", "driver", "plots.html")
             self._panel("nodes", "Nodes", "", "nodes.html")
+        client.on_connect(lambda: parts.desk.connected(self._name, str(client.tab_id)))
         client.on_delete(lambda: parts.desk.disconnected(self._name))
         ui.timer(FAST, self._show_desk)
         ui.timer(SLOW, self._offer_learned)

@@ -101,7 +101,7 @@ class MotionForm:
         with ui.row().classes("line"):
             self._payload = Quantity("Payload [g]", 0, 0, 10_000)
             self._place = Quantity("at [cm], 0: tip", 0, 0, 1000)
-            mountings = {"": "as the planner's", **{name: name for name in MOUNTINGS}}
+            mountings = {"": "planner's", **{name: name for name in MOUNTINGS}}
             self._mounting = ui.select(
                 mountings, value="", label="Mounting or tilt [°]", new_value_mode="add-unique"
             ).props('id="mounting"')

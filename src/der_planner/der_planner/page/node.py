@@ -256,7 +256,7 @@ class PageNode(Node):
         if self._server.error is not None:
             self.fatal_error = f"the page's server ended: {self._server.error}"
         if self._intake.error is not None:
-            self.fatal_error = f"a message could not be taken: {self._intake.error!r}"
+            self.fatal_error = f"no more messages can be taken: {self._intake.error!r}"
         if self._picture.watched and self._images is None:
             self._images = self._intake.subscribe(
                 Image, topics.IMAGE, self._on_image, qos.IMAGES, raw=True
@@ -280,11 +280,14 @@ class PageNode(Node):
             "operator": "yes" if self._desk.operator else "no",
             "picture": "watched" if self._picture.watched else "nobody looks",
             "refused_requests": self._server.guard.refused,
+            "refused_messages": self._intake.refused,
             "on_lost_operator": self._policy,
             "threads": threading.active_count(),
         }
         if not self._server.ready:
             return Health("stale", "the server is starting", values)
+        if self._intake.refused:
+            return Health("warning", self._intake.last_refused, values)
         return Health("ok", f"serving {self._server.url}", values)
 
     def close(self) -> None:

@@ -151,14 +151,14 @@ class Overlay:
         if view is not None and view.valid:
             curve = np.array(view.curve).reshape(-1, 2)
             answer["curve"] = place(curve[:: max(1, len(curve) // CURVE_POINTS)])
-            answer["tip"] = place(np.array([view.tip]))[0]
+            answer["tip"] = place.point(view.tip)
         answer["path"], now = place(path), self._clock()
         if now - shown <= LASTING:
             answer["planned"] = place(planned)
         if now - heard <= LASTING:
             answer["estimate"] = place(estimate)
         if reference is not None:
-            answer["reference"] = place(np.array([reference]))[0]
+            answer["reference"] = place.point(reference)
         return answer
 
 
@@ -167,6 +167,8 @@ class _Placer:
         self._intrinsics, self._pose, self._height = intrinsics, pose, height
 
     def __call__(self, points: NDArray[np.float64]) -> list[list[float]]:
+        # Another program may say that something is nowhere; a picture cannot show it there.
+        points = points[np.isfinite(points).all(axis=1)]
         if not len(points):
             return []
         raised = np.column_stack([points, np.full(len(points), self._height)])
@@ -174,6 +176,9 @@ class _Placer:
             project(self._intrinsics, self._pose, raised), 1
         ).tolist()
         return pixels
+
+    def point(self, point: tuple[float, float]) -> list[float] | None:
+        return next(iter(self(np.array([point]))), None)
 
     def back(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         return self._pose.onto_plane(self._intrinsics.rays(pixels), self._height)

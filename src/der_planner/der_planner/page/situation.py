@@ -31,6 +31,12 @@ GAP = NANOSECONDS // 5
 """[ns] between two references across which none is interpolated: four setpoints of 20 Hz."""
 
 
+def centimetres(metres: float) -> str:
+    """Return a small length [m] for people."""
+    length = metres * CENTIMETRES
+    return "below 0.01 cm" if length < 0.01 else f"{length:.2f} cm"
+
+
 @dataclass(frozen=True)
 class DriverState:
     """What the driver says at a tick; pressures in Pa, NaN where unknown.
@@ -103,11 +109,9 @@ class PlanView:
             place = f"{self.payload_at * CENTIMETRES:.1f} cm from the clamp"
             carried = f", carrying {self.payload * GRAMS:.3g} g at "
             carried += place if self.payload_at else "the tip"
-        error = self.predicted_error * CENTIMETRES
-        expected = f"{error:.2f} cm" if error >= 0.01 else "below 0.01 cm"
         return (
             f"{self.motion}, {self.model} {self.method}, for the limb '{self.limb}', "
-            f"{self.mounting}{carried}; predicted error {expected}"
+            f"{self.mounting}{carried}; predicted error {centimetres(self.predicted_error)}"
         )
 
 

@@ -164,10 +164,8 @@ class Optimiser:
         """
         count = len(self.warm)
         first_guess = self.warm if begin is None else begin
-        command, _ = within_limits(
-            first_guess, self.model.limb.pneumatics, CONTROL_PERIOD, self.before
-        )
-        state = self.start
+        command = np.array(first_guess, dtype=float)
+        state, before = self.start, self.before
         tip = np.empty((count, 2))
         first, steps, limited = 0, 0, 0
         while first < count:
@@ -175,12 +173,17 @@ class Optimiser:
             if count - last < self.settings.window - self.settings.settled:
                 last = count
             keep = last if last == count else first + self.settings.settled
+            # The window before may have moved away from what was guessed of this one: a search that
+            # begins beyond a limit may find nothing better within it.
+            command[first:], _ = within_limits(
+                command[first:], self.model.limb.pneumatics, CONTROL_PERIOD, before
+            )
             used, met = self.improve(command, state, first, last)
             steps, limited = steps + used, limited + met
             window = self.drive.window(command[:keep], first)
             motion = self.model.shoot(state, window.effective, CONTROL_PERIOD)
             tip[first:keep] = motion.tip[:-1]
-            state, first = motion.final, keep
+            state, first, before = motion.final, keep, command[keep - 1]
             progress(first / count)
         return Outcome(command, tip, steps, limited)
 

@@ -62,6 +62,8 @@ def write_plan(plan: Plan, path: str | Path, about: Mapping[str, Any] | None = N
         "tip_predicted_m": plan.tip_predicted.tolist(),
         "reference_bend_angles_rad": plan.reference.bend_angles.tolist(),
     }
+    if plan.chambers_beyond is not None:
+        content["chambers_beyond_pa"] = plan.chambers_beyond.tolist()
     unfinished = file.with_name(f".{file.name}.part")
     text = "# A plan, in SI units; row by row the setpoints, 50 ms apart.\n"
     unfinished.write_text(text + yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
@@ -100,6 +102,9 @@ def _plan_of(content: Any) -> Plan:
         _rows(content, key, 2, count) for key in ("tip_reference_m", "tip_predicted_m")
     )
     angles = _rows(content, "reference_bend_angles_rad", limb.segment_count, count)
+    beyond = None
+    if "chambers_beyond_pa" in content:
+        beyond = _rows(content, "chambers_beyond_pa", limb.segment_count, count)
     start = None
     if content["start"] is not None:
         start = Start(**{key: np.array(value, float) for key, value in content["start"].items()})
@@ -130,6 +135,7 @@ def _plan_of(content: Any) -> Plan:
         limb=physics.limb,
         kinematics=physics.kinematics,
         solve_time=float(content["solve_time"]),
+        chambers_beyond=beyond,
     )
 
 

@@ -31,6 +31,8 @@ class Plan:
         solve_time: wall time of the planning [s].
         warnings: sentences: limits that cut the wanted pressures, ranges that were left.
         details: numbers of the method: iterations, cost, Newton steps.
+        chambers_beyond: (K, M) by how much the chambers held more than their model in the last run
+            that a learned plan is from, mean of each period [Pa]; None: nobody told.
     """
 
     time: Array
@@ -49,6 +51,7 @@ class Plan:
     solve_time: float
     warnings: tuple[str, ...] = ()
     details: dict[str, float] = field(default_factory=dict)
+    chambers_beyond: Array | None = None
 
     @property
     def tip_reference(self) -> Array:

@@ -140,9 +140,10 @@ def _learned(planned: Plan, loads: Limb, row: Mapping[str, Any]) -> Plan:
 
     learner = Learner(planned)
     for run in range(_FIRST_LEARNING_RUN, _FIRST_LEARNING_RUN + row["learning_runs"]):
-        tip, _ = _blind(planned, loads, row, run)
+        tip, beyond = _blind(planned, loads, row, run)
+        held = planned.time, planned.differential_pressure + beyond
         noise = np.random.default_rng([row["seed"], run]).standard_normal(tip.shape)
-        learner.add(planned.time, tip + row["tag_noise"] * TIP_NOISE * noise)
+        learner.add(planned.time, tip + row["tag_noise"] * TIP_NOISE * noise, chambers=held)
         planned = learner.next()
         if learner.stopped:
             break

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from apriltag_tracker.camera.lens import local_bend
 from apriltag_tracker.detection.alignment import fit
 from apriltag_tracker.detection.alignment.pattern import tabulate
 from apriltag_tracker.detection.alignment.sampling import side_length
@@ -32,6 +33,10 @@ _SHORTEST = 0.9
 """A shorter smear cannot be told from blur, and is counted as such [px]."""
 
 _PASSES = 9
+
+
+Lens = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Camera matrix (3, 3) [px] and distortion (8,)."""
 
 
 @dataclass(frozen=True)
@@ -60,16 +65,24 @@ class Alignment:
     contrast: float
     alike: float
 
+    @property
+    def complete(self) -> bool:
+        """Whether no smear, and no other one, is missing in the fit, as its residuals show."""
+        return self.alike < _SMEARED
+
 
 class Aligner:
     """Fits patterns of tags to pictures; remembers the tables that this takes.
 
     Args:
         family: of the tags.
+        lens: camera matrix (3, 3) [px] and distortion (8,) of the pictures, whose bend of a tag's
+            sides is taken into account; None for pictures without distortion.
     """
 
-    def __init__(self, family: Family = TAG36H11) -> None:
+    def __init__(self, family: Family = TAG36H11, lens: Lens | None = None) -> None:
         self._family = family
+        self._lens = lens
         self._border = float(family.border_cells)
         self._tables: OrderedDict[tuple[int, int], tuple[NDArray[np.float32], float]] = (
             OrderedDict()
@@ -97,13 +110,15 @@ class Aligner:
         """
         if smear is not None and math.hypot(*smear) >= _SHORTEST:
             known = self._fit(image, tag, corners, blur, smear)
-            if known is not None and known.alike < _SMEARED:
+            if known is not None and known.complete:
                 return known
         plain = self._fit(image, tag, corners, blur, None)
         if plain is None:
             return self._from_all_sides(image, tag, corners)
-        if plain.alike < _SMEARED:
-            return plain
+        return plain if plain.complete else self._completed(image, tag, plain)
+
+    def _completed(self, image: NDArray[np.uint8], tag: int, plain: Alignment) -> Alignment:
+        """Return the best of a fit without a smear and fits with what may be missing in it."""
         best = plain
         smeared = self._smeared(image, tag, plain)
         if smeared is None:
@@ -111,10 +126,25 @@ class Aligner:
         if smeared is not None and smeared.residual < 0.98 * best.residual:
             best = smeared
         if best.explained < 0.93 and best.kept > 0.97 and plain.alike > 0.5:
-            searched = self._from_all_sides(image, tag, corners)
+            searched = self._from_all_sides(image, tag, plain.corners)
             if searched is not None and searched.residual < 0.9 * best.residual:
                 best = searched
         return best
+
+    def align_near(
+        self,
+        image: NDArray[np.uint8],
+        tag: int,
+        corners: NDArray[np.float64],
+        blur: float,
+        smear: NDArray[np.float64],
+    ) -> Alignment | None:
+        """Fit one tag whose place is known to a third of a cell, with about the smear it had."""
+        fitted = self.align_once(image, tag, corners, blur, smear)
+        if fitted is None or fitted.complete:
+            return fitted
+        plain = self._fit(image, tag, fitted.corners, blur, None)
+        return None if plain is None else self._completed(image, tag, plain)
 
     def align_once(
         self,
@@ -132,7 +162,16 @@ class Aligner:
         cell = side_length(plain.corners) / self._border
         table, table_blur = self._table(tag, plain.blur / cell)
         guess = np.zeros(2)
-        blur = guess_smear(image, table, table_blur, self._border, plain.corners, plain.blur, guess)
+        blur = guess_smear(
+            image,
+            table,
+            table_blur,
+            self._border,
+            plain.corners,
+            self._bend(plain.corners),
+            plain.blur,
+            guess,
+        )
         if math.hypot(*guess) < _SHORTEST:
             return None
         return self._fit(image, tag, plain.corners, max(blur, 0.5), guess)
@@ -169,7 +208,7 @@ class Aligner:
         result = np.zeros(fit.RESULT_VALUES)
         placed, covariance = np.empty((4, 2)), np.empty((8, 8))
         start = np.ascontiguousarray(corners)
-        cell = side_length(corners) / self._border
+        cell, bend = side_length(corners) / self._border, self._bend(start)
         result[0] = blur
         if smear is not None:
             result[1:3], result[8] = smear, turn
@@ -182,6 +221,7 @@ class Aligner:
                 table_blur,
                 self._border,
                 start,
+                bend,
                 free,
                 _PASSES,
                 placed,
@@ -212,6 +252,13 @@ class Aligner:
             float(result[6]),
             float(result[7]),
         )
+
+    def _bend(self, corners: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how the lens bends lines at a tag, (6,) 1/px."""
+        if self._lens is None:
+            return np.zeros(6)
+        bend: NDArray[np.float64] = local_bend(corners, *self._lens)
+        return bend
 
     def _table(self, tag: int, blur: float) -> tuple[NDArray[np.float32], float]:
         """Return the table of a tag's pattern nearest to a blur [cells], and its blur."""

@@ -20,10 +20,12 @@ from apriltag_tracker.detection.alignment.sampling import (
     UNKNOWNS,
     Pixels,
     View,
+    bend_back,
     corner_slopes,
     new_pixels,
     sample_model,
     side_length,
+    straighten,
     write_corners,
 )
 from apriltag_tracker.detection.decoding import square_to_quad
@@ -52,7 +54,7 @@ _FEWEST = 60
 _BESIDE = 2
 """What covers a tag is blurred: pixels so near to what does not fit count no more either [px]."""
 
-_MODEL_ERROR = 0.004
+_MODEL_ERROR = 0.003
 """What the model leaves out, whatever the noise, moves a corner by so much [px]."""
 
 _WIDE, _WIDE_ERROR = 0.8, 0.02
@@ -263,11 +265,13 @@ def _finish(
     h: NDArray[np.float64],
     normal: NDArray[np.float64],
     blur: float,
+    count: int,
     result: NDArray[np.float64],
     covariance: NDArray[np.float64],
 ) -> None:
     """Write the covariance of the corners."""
-    residual, alike = result[4], result[7]
+    # Of pixels that have nothing in common the correlation is seldom above this either.
+    residual, alike = result[4], max(result[7] - 1.0 / math.sqrt(count), 0.0)
     slopes = corner_slopes(h)
     spread = np.ascontiguousarray(np.linalg.inv(normal)[:8, :8])
     variance = residual**2 * ((1.0 + alike) / (1.0 - alike)) ** 2
@@ -346,6 +350,7 @@ def align(
     table_blur: float,
     border: float,
     start: NDArray[np.float64],
+    bend: NDArray[np.float64],
     free_smear: bool,
     passes: int,
     corners: NDArray[np.float64],
@@ -360,6 +365,7 @@ def align(
         table_blur: blur of the table [cells]; the fit's may differ by a few percent.
         border: cells along the black border.
         start: (4, 2) px, corners to start from, from the printed lower left counter-clockwise.
+        bend: (6,) of `lens.local_bend` at the tag.
         free_smear: whether smear and turn are fitted; they cannot both start from zero, where the
             directions of a smear are alike.
         passes: at most so many steps of Gauss-Newton.
@@ -372,12 +378,13 @@ def align(
     """
     centre = np.array([start[:, 0].mean(), start[:, 1].mean()])
     corners[:] = start - centre
+    straighten(bend, corners)
     h, state = _begin(corners, result, free_smear)
     side = side_length(start)
     stride, room = _stride_and_room(start, free_smear)
     cell = side / border
     # The pixels that count stay the same while the blur changes: it is the start's.
-    view = View(image, table, table_blur, border, cell, 2.0 * state[0] / cell, stride, centre)
+    view = View(image, table, table_blur, border, cell, 2.0 * state[0] / cell, stride, centre, bend)
     pixels = new_pixels(room)
     normal, right = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS)
     moved, count = 0.0, 0
@@ -397,6 +404,7 @@ def align(
             break
     _judge(pixels, count, move, result)
     result[:3], result[8] = state[:3], state[3]
-    _finish(h, normal, state[0], result, covariance)
+    _finish(h, normal, state[0], count, result, covariance)
+    bend_back(bend, corners)
     corners += centre
     return moved < 0.1

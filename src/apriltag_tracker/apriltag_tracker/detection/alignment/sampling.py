@@ -35,6 +35,7 @@ class View(NamedTuple):
         stride: of so many runs of pixels one is used, another one in every row, so that edges of
             all directions are seen.
         centre: (2,) px, the origin of the homography's coordinates.
+        bend: (6,) of `lens.local_bend`: the homography is that of the straightened pixels.
     """
 
     image: NDArray[np.uint8]
@@ -45,6 +46,7 @@ class View(NamedTuple):
     reach: float
     stride: int
     centre: NDArray[np.float64]
+    bend: NDArray[np.float64]
 
 
 class Pixels(NamedTuple):
@@ -103,6 +105,33 @@ def write_corners(h: NDArray[np.float64], corners: NDArray[np.float64]) -> None:
         w = h[6] * u + h[7] * v + 1.0
         corners[k, 0] = (h[0] * u + h[1] * v + h[2]) / w
         corners[k, 1] = (h[3] * u + h[4] * v + h[5]) / w
+
+
+@njit(cache=True, inline="always")  # type: ignore[untyped-decorator]
+def straightened(bend: NDArray[np.float64], x: float, y: float) -> tuple[float, float]:
+    """Return where a point about the centre would be without the lens's bend."""
+    return (
+        x + (bend[0] * x + bend[1] * y) * x + bend[2] * y * y,
+        y + (bend[3] * x + bend[4] * y) * x + bend[5] * y * y,
+    )
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def straighten(bend: NDArray[np.float64], points: NDArray[np.float64]) -> None:
+    """Take the lens's bend out of points (n, 2) about the centre."""
+    for k in range(points.shape[0]):
+        points[k, 0], points[k, 1] = straightened(bend, points[k, 0], points[k, 1])
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def bend_back(bend: NDArray[np.float64], points: NDArray[np.float64]) -> None:
+    """Put the lens's bend into points (n, 2): the inverse of `straighten`, by iteration."""
+    for k in range(points.shape[0]):
+        x, y = points[k, 0], points[k, 1]
+        for _ in range(4):
+            u, v = straightened(bend, points[k, 0], points[k, 1])
+            points[k, 0] += x - u
+            points[k, 1] += y - v
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -269,13 +298,13 @@ def sample_model(
     first_row, last_row, first, last = _pixels_of(view, h)
     count = 0
     for row in range(first_row, last_row + 1):
-        y = row - centre[1]
+        down = row - centre[1]
         start = first // RUN
         for block in range(start + (-start - row) % view.stride, last // RUN + 1, view.stride):
             for column in range(max(block * RUN, first), min(block * RUN + RUN - 1, last) + 1):
                 if count >= pixels.values.shape[0]:
                     return count
-                x = column - centre[0]
+                x, y = straightened(view.bend, column - centre[0], down)
                 u, v, ux, uy, vx, vy = _square_at(back, x, y, border)
                 # In the table columns run to the right and rows down, from the margin's corner.
                 c, r = u * border + MARGIN, (1.0 - v) * border + MARGIN

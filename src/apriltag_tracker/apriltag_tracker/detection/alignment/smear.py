@@ -14,6 +14,7 @@ from apriltag_tracker.detection.alignment.sampling import (
     new_pixels,
     sample_model,
     side_length,
+    straighten,
 )
 from apriltag_tracker.detection.decoding import square_to_quad
 
@@ -66,6 +67,7 @@ def guess_smear(
     table_blur: float,
     border: float,
     corners: NDArray[np.float64],
+    bend: NDArray[np.float64],
     blur: float,
     smear: NDArray[np.float64],
 ) -> float:
@@ -81,6 +83,7 @@ def guess_smear(
         table_blur: its blur [cells].
         border: cells along the black border.
         corners: (4, 2) px of the fit.
+        bend: (6,) of `lens.local_bend` there.
         blur: of the fit [px].
         smear: (2,) px, output.
 
@@ -89,7 +92,9 @@ def guess_smear(
     """
     centre = np.array([corners[:, 0].mean(), corners[:, 1].mean()])
     h = np.empty(9)
-    h[:8] = square_to_quad(corners - centre)
+    straight = corners - centre
+    straighten(bend, straight)
+    h[:8] = square_to_quad(straight)
     h[8] = 1.0
     cell = side_length(corners) / border
     low_x, low_y = int(corners[:, 0].min() - cell - 2), int(corners[:, 1].min() - cell - 2)
@@ -98,7 +103,7 @@ def guess_smear(
     smear[:] = 0.0
     pixels = new_pixels(room)
     rows, where = pixels.rows, pixels.where
-    view = View(image, table, table_blur, border, cell, 2.0 * blur / cell, 1, centre)
+    view = View(image, table, table_blur, border, cell, 2.0 * blur / cell, 1, centre, bend)
     count = sample_model(view, h, np.array([blur, 0.0, 0.0, 0.0]), pixels)
     if count < 60:
         return blur

@@ -18,6 +18,7 @@ from der_planner.page.drawing.kept import DrawingError
 from der_planner.page.drawing.preview import Preview
 from der_planner.page.drawing.studio import drawn_pixels
 from der_planner.page.server import Parts
+from der_planner.page.situation import centimetres
 
 PIECES = 30
 """Points of a predicted limb's line."""
@@ -170,6 +171,6 @@ def summary(found: Preview) -> str:
         )
     text = (
         f"{followed} in {found.duration:.1f} s, with {found.largest_pressure / 1000:.1f} kPa at "
-        f"most; predicted error {found.predicted_error * 100:.2f} cm."
+        f"most; predicted error {centimetres(found.predicted_error)}."
     )
     return " ".join([text, *(f"Warning: {warning}." for warning in found.warnings)])
