@@ -40,7 +40,7 @@ from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.gaps import StampGaps
 from limb_interfaces.overrides import check_overrides
 from limb_interfaces.parameters import declare
-from limb_interfaces.runner import event_executor, run_node
+from limb_interfaces.runner import run_node
 from limb_interfaces.transforms import TransformPublisher, camera_transform, limb_transforms
 
 ANNOTATED_IMAGE = "camera/image_annotated"
@@ -393,7 +393,7 @@ class TrackerNode(Node):
 
 def main() -> int:
     """Run the node."""
-    return run_node(TrackerNode, make_executor=event_executor)
+    return run_node(TrackerNode)
 
 
 if __name__ == "__main__":

@@ -10,14 +10,9 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import rclpy
-from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
-
-try:
-    from rclpy.experimental import EventsExecutor
-except ImportError:
-    EventsExecutor = None
 
 from limb_interfaces import transport
 from limb_interfaces.entry import END_SIGNALS
@@ -30,21 +25,7 @@ class ClosableNode(Protocol):
         """Vent, flush, release: called exactly once, before the node is destroyed."""
 
 
-def event_executor() -> Executor:
-    """Return rclpy's executor that is told of each message, where it has one (7.1.4 and later).
-
-    The usual one asks all topics and services anew for every message: of receiving an image this
-    takes half the CPU time.
-    """
-    executor: Executor = SingleThreadedExecutor() if EventsExecutor is None else EventsExecutor()
-    return executor
-
-
-def run_node(
-    create: Callable[[], Node],
-    arguments: Sequence[str] | None = None,
-    make_executor: Callable[[], Executor] = SingleThreadedExecutor,
-) -> int:
+def run_node(create: Callable[[], Node], arguments: Sequence[str] | None = None) -> int:
     r"""Create a node, spin it until a signal ends it, close it, and return the exit code.
 
     The signals are those of `limb_interfaces.entry.END_SIGNALS`: Ctrl-C, SIGTERM, a terminal that
@@ -57,7 +38,6 @@ def run_node(
     Args:
         create: makes the node; an exception ends the process with exit code 1 and its message.
         arguments: command line, `sys.argv` if None.
-        make_executor: of what spins the node.
 
     Returns:
         0 after one of these signals, 1 after an error.
@@ -79,7 +59,7 @@ def run_node(
     exit_code = 0
     try:
         node = create()
-        executor = make_executor()
+        executor = SingleThreadedExecutor()
         executor.add_node(node)
         while rclpy.ok() and not stop.is_set():
             executor.spin_once(timeout_sec=0.1)

@@ -27,7 +27,7 @@ from limb_interfaces import qos, stamps, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.overrides import check_overrides
 from limb_interfaces.parameters import declare
-from limb_interfaces.runner import event_executor, run_node
+from limb_interfaces.runner import run_node
 
 FRAME = "camera_optical_frame"
 _INFO_PERIOD = 0.5
@@ -186,7 +186,7 @@ class SyntheticCameraNode(Node):
 
 def main() -> int:
     """Run the node."""
-    return run_node(SyntheticCameraNode, make_executor=event_executor)
+    return run_node(SyntheticCameraNode)
 
 
 if __name__ == "__main__":
