@@ -270,3 +270,24 @@ def test_a_run_that_does_not_move_with_its_commands_is_refused(first):
     learner.add(first.time, simulate(other_limb(), first.time, commands=crossed).tip[:-1])
     assert "does not move with the commands" in learner.history[1].reason
     assert learner.next() is first
+
+
+def test_chambers_are_told_in_any_order_with_gaps_and_refused_where_they_do_not_fit(first):
+    """What a learned plan knows of its chambers is their reading less the model's pressure."""
+    tip = play(first, other_limb())
+    time = np.concatenate([first.time, first.time + 0.02])
+    held = np.full((len(time), LIMB.segment_count), 1500.0)
+    held[7:40] = np.nan
+    mixed = np.random.default_rng(3).permutation(len(time))
+    learner = Learner(first)
+    with pytest.raises(LearningError, match=r"chambers need instants \(n,\) and pressures"):
+        learner.add(first.time, tip, chambers=(time, held[:, :1]))
+    assert not learner.history
+    learner.add(first.time, tip, chambers=(time[mixed], held[mixed]))
+    model = simulate(LIMB, first.time, commands=first.differential_pressure)
+    np.testing.assert_allclose(
+        learner.next().chambers_beyond, 1500.0 - model.differential_pressure.mean(axis=1), atol=1e-6
+    )
+    nothing = Learner(first)
+    nothing.add(first.time, tip, chambers=(time, np.full_like(held, np.nan)))
+    assert nothing.next().chambers_beyond is None

@@ -157,8 +157,8 @@ class Learner:
             covariance: (K, 2, 2) of the tip [m²]; None: estimated from the scatter of the tips.
             commands: (setpoints, M) that were in force in this run, if not those of the plan, for
                 instance with what feedback added [Pa].
-            chambers: rising instants (n,) [s] and what the chambers held then (n, M) [Pa]: what
-                feedback on a learned plan takes for granted, not for news.
+            chambers: instants (n,) [s] and what the chambers held then (n, M) [Pa], NaN where it is
+                not known: what feedback on a learned plan takes for granted, not for news.
 
         Raises:
             LearningError: the arrays do not fit together or to the plan.
@@ -166,13 +166,14 @@ class Learner:
         measured = Measured.build(time, tip, covariance)
         played, mean, largest, astray = self._played(measured, commands)
         seen = float(played.shown.seen.mean())
+        beyond = None if chambers is None else _beyond(played, self._plan.time, *chambers)
         accepted, said = False, _refusal(seen, astray)
         if said:
             said = f"refused: {said}"
         else:
             accepted, said = self._take(played)
-        if accepted and chambers is not None:
-            self._beyond = _beyond(played, self._plan.time, *chambers)
+        if accepted and beyond is not None:
+            self._beyond = beyond
         self.history.append(
             LearningRun(
                 len(self.history) + 1,
@@ -349,25 +350,33 @@ class Learner:
         )
 
 
-def _beyond(run: Played, setpoints: Array, time: ArrayLike, held: ArrayLike) -> Array:
+def _beyond(run: Played, setpoints: Array, time: ArrayLike, held: ArrayLike) -> Array | None:
     """Return by how much the chambers held more than their model in each period (K, M) [Pa].
 
     Args:
         run: as it was played.
         setpoints: (K,) [s].
-        time: (n,) rising instants [s].
+        time: (n,) instants, in any order [s].
         held: (n, M) differential pressures in the chambers then [Pa].
 
+    Returns:
+        None where no reading was whole.
+
     Raises:
-        LearningError: shapes that do not fit, or instants that do not rise.
+        LearningError: shapes that do not fit.
     """
     instants, values = np.asarray(time, dtype=float), np.asarray(held, dtype=float)
     wanted = (len(instants), run.commands.shape[1])
-    if instants.ndim != 1 or not len(instants) or values.shape != wanted:
+    if instants.ndim != 1 or values.shape != wanted:
         raise LearningError(
             f"chambers need instants (n,) and pressures {wanted}, got shapes {instants.shape} and "
             f"{values.shape}: take both from the same recording"
         )
+    whole = np.isfinite(instants) & np.isfinite(values).all(axis=1)
+    if not whole.any():
+        return None
+    order = np.argsort(instants[whole], kind="stable")
+    instants, values = instants[whole][order], values[whole][order]
     middle = setpoints + 0.5 * (setpoints[1] - setpoints[0])
     known = np.column_stack([np.interp(middle, instants, column) for column in values.T])
     beyond: Array = known - run.expected.pressure
