@@ -56,24 +56,26 @@ def _send_goal(options: argparse.Namespace) -> int:
         client = ActionClient(session.node, kind, options.action_name)
         print("Waiting for an action server to become available...")
         client.wait_for_server()
+        # A flag instead of an exception, which would tear rclpy's waiting apart. From before the
+        # goal is sent on: the server may move the limb before its answer is here.
+        asked: list[int] = []
+        signal.signal(signal.SIGINT, lambda number, _: asked.append(number))
         print(f"Sending goal:\n     {to_yaml(goal)}")
-        handle = _result(session, client.send_goal_async(goal, _show if options.feedback else None))
+        sent = client.send_goal_async(goal, _show if options.feedback else None)
+        handle = _result(session, sent, asked)
         if not handle.accepted:
             print("Goal was rejected.")
             return 1
         print(f"Goal accepted with ID: {bytes(handle.goal_id.uuid).hex()}\n")
-        # A flag instead of an exception, which would tear rclpy's waiting apart.
-        asked: list[int] = []
-        signal.signal(signal.SIGINT, lambda number, _: asked.append(number))
         awaited = handle.get_result_async()
         cancelling = None
         while not awaited.done():
-            rclpy.spin_once(session.node, timeout_sec=0.1)
+            _spin(session, asked)
             if asked and cancelling is None:
                 # As the real tool: what was asked for is not left to run on alone.
                 print("Canceling goal...", file=sys.stderr)
                 cancelling = handle.cancel_goal_async()
-        answer = _result(session, awaited)
+        answer = _result(session, awaited, asked)
         print(f"Result:\n    {to_yaml(answer.result)}")
         status = _ENDS.get(answer.status, "UNKNOWN")
         print(f"Goal finished with status: {status}")
@@ -85,14 +87,25 @@ def _show(message: Any) -> None:
     print(f"Feedback:\n    {to_yaml(message.feedback)}")
 
 
-def _result(session: Session, future: Any) -> Any:
+def _spin(session: Session, asked: list[int]) -> None:
+    """Take what the server says; at the second Ctrl-C, wait for it no longer.
+
+    Raises:
+        CommandError: that was asked for.
+    """
+    rclpy.spin_once(session.node, timeout_sec=0.1)
+    if len(asked) > 1:
+        raise CommandError("the action server does not answer: the goal may still be carried out")
+
+
+def _result(session: Session, future: Any, asked: list[int]) -> Any:
     """Wait for an answer of the server.
 
     Raises:
-        CommandError: it is an error.
+        CommandError: it is an error, or is waited for no longer.
     """
     while not future.done():
-        rclpy.spin_once(session.node, timeout_sec=0.1)
+        _spin(session, asked)
     if future.result() is None:
         raise CommandError(f"Exception while calling the action: {future.exception()!r}")
     return future.result()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import subprocess
 import threading
 import time
 
@@ -25,6 +26,7 @@ class Player:
 
         self.kind = PlayMotion
         self.cancelled = False
+        self.released = threading.Event()
         self._context = Context()
         rclpy.init(context=self._context, domain_id=DOMAIN)
         self._node = rclpy.create_node("player", context=self._context)
@@ -49,6 +51,8 @@ class Player:
             self.cancelled = True
             goal.canceled()
             return result
+        if goal.request.command.motion == "deaf":
+            self.released.wait(60.0)
         goal.succeed()
         return result
 
@@ -83,17 +87,37 @@ def test_a_goal_is_sent_and_its_feedback_and_result_shown(player: Player):
     assert "motions" in answer.stderr
 
 
-@pytest.mark.graph
-def test_ctrl_c_cancels_the_goal(player: Player):
-    process = start("action", "send_goal", "-f", "/play", TYPE, "{command: {motion: endless}}")
+def streaming(motion: str) -> subprocess.Popen[str]:
+    """Start a goal and wait for its feedback."""
+    goal = f"{{command: {{motion: {motion}}}}}"
+    process = start("action", "send_goal", "-f", "/play", TYPE, goal)
     assert process.stdout is not None
     heard = ""
     while "streaming" not in heard:
         line = process.stdout.readline()
         assert line, process.communicate()
         heard += line
+    return process
+
+
+@pytest.mark.graph
+def test_ctrl_c_cancels_the_goal(player: Player):
+    process = streaming("endless")
     process.send_signal(signal.SIGINT)
     said, complaint = process.communicate(timeout=60)
     assert player.cancelled, complaint
     assert "status: CANCELED" in said
     assert process.returncode == 1
+
+
+@pytest.mark.graph
+def test_a_second_ctrl_c_ends_the_waiting_for_a_server_that_does_not_answer(player: Player):
+    process = streaming("deaf")
+    assert process.stderr is not None
+    process.send_signal(signal.SIGINT)
+    assert "Canceling goal" in process.stderr.readline()
+    process.send_signal(signal.SIGINT)
+    _, complaint = process.communicate(timeout=60)
+    player.released.set()
+    assert process.returncode == 1
+    assert "the goal may still be carried out" in complaint
