@@ -30,6 +30,7 @@ from der_planner.identification.offline import (
 from der_planner.limb import Limb, PointMass, Segment
 from der_planner.limb_loads import gravity_of
 from der_planner.model.response import simulate
+from der_planner.model.series import interpolate, step_middles
 from der_planner.planning import BucklingError
 from der_planner.planning.loads.rest import rest_of
 from der_planner.rod import ConvergenceError
@@ -184,10 +185,8 @@ def _rod_log(row: Row, _: Limb) -> tuple[CalibrationLog, Truth]:
     run = calibration_run(AMPLITUDE * limb.pneumatics.pressure_limit, quick=True)
     seen = simulate(limb, run.time, commands=run.differential_pressure, nodes=RECORD_NODES)
     inside = seen.differential_pressure
-    step = (seen.time[1] - seen.time[0]) / inside.shape[1]
-    amid = seen.time[0] + step * (np.arange(inside.shape[0] * inside.shape[1]) + 0.5)
-    held = inside.reshape(len(amid), -1)
-    pressure = np.stack([np.interp(run.time, amid, column) for column in held.T], axis=1)
+    amid = seen.time[0] + step_middles(*inside.shape[:2], seen.time[1] - seen.time[0])
+    pressure = interpolate(run.time, amid, inside.reshape(len(amid), -1))
 
     def noisy(values: Array, deviation: float) -> Array:
         return values + deviation * generator.standard_normal(values.shape)

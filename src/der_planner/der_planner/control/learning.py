@@ -33,6 +33,7 @@ from der_planner.control.disturbance import (
     stays_behind,
 )
 from der_planner.control.repeatability import Played, Runs
+from der_planner.model.series import interpolate
 from der_planner.planning.correction import Correction
 from der_planner.planning.errors import PlanningError
 from der_planner.planning.result import Plan
@@ -378,8 +379,7 @@ def _beyond(run: Played, setpoints: Array, time: ArrayLike, held: ArrayLike) -> 
     order = np.argsort(instants[whole], kind="stable")
     instants, values = instants[whole][order], values[whole][order]
     middle = setpoints + 0.5 * (setpoints[1] - setpoints[0])
-    known = np.column_stack([np.interp(middle, instants, column) for column in values.T])
-    beyond: Array = known - run.expected.pressure
+    beyond: Array = interpolate(middle, instants, values) - run.expected.pressure
     return beyond
 
 
