@@ -15,8 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from benchmarks.identification import FRESH_SEEDS
-from benchmarks.loads import MODELS, calibrated, comparisons, read_rows
+from benchmarks.loads import MODELS, STUDY_SEEDS, calibrated, comparisons, read_rows
 from der_planner.limb import Limb
 from der_planner.model.air import pair_of
 from der_planner.model.bending import ArcKinematics
@@ -126,7 +125,7 @@ def _draw_line(axis: Axes, of_panel: list, model: str, style: str, label: str) -
 def main() -> int:
     """Draw both."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--seed", type=int, default=FRESH_SEEDS[0], help="twin of the shapes")
+    parser.add_argument("--seed", type=int, default=STUDY_SEEDS[0], help="twin of the shapes")
     given = parser.parse_args()
     draw_shapes(FOLDER / "loads_shapes.png", given.seed)
     draw_errors(FOLDER / "loads_errors.png")
