@@ -21,7 +21,7 @@ from apriltag_tracker.tag_map import LimbTag, TagMap
 from der_planner.limb import Limb
 from der_planner.page.access import Binding, Sessions
 from der_planner.page.afterwards.experiments import Experiments
-from der_planner.page.commands import Answer, MotionRequest, Service
+from der_planner.page.commands import Answer, Conditions, MotionRequest, Service
 from der_planner.page.drawing.studio import Studio
 from der_planner.page.guard import Guard
 from der_planner.page.operators import Desk
@@ -60,7 +60,7 @@ class Calls:
     def fill(self, segment: int, side: int, pressure: float) -> Answer:
         raise NotImplementedError
 
-    def play_path(self, tip: Any) -> Answer:
+    def play_path(self, tip: Any, conditions: Conditions) -> Answer:
         return Answer(True, "path")
 
     def learned_plans(self) -> list[str]:

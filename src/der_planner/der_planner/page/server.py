@@ -13,17 +13,18 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 from urllib.parse import parse_qs
 
 import uvicorn
-from fastapi import FastAPI, Request, Response, WebSocket, WebSocketDisconnect
+from fastapi import Depends, FastAPI, Request, Response, WebSocket, WebSocketDisconnect
 from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, RedirectResponse
 from fastapi.staticfiles import StaticFiles
 
+from der_planner.limb import LimbError
 from der_planner.page.access import SESSION_LIFE, Binding, Sessions, bracketed
 from der_planner.page.afterwards.experiments import Experiments
-from der_planner.page.commands import Commands, answer_of, in_buttons
+from der_planner.page.commands import Commands, Load, answer_of
 from der_planner.page.drawing.studio import Studio
 from der_planner.page.guard import COOKIE, LOGIN, Guard
 from der_planner.page.operators import Desk
@@ -119,6 +120,30 @@ def create_app(parts: Parts, sessions: Sessions, secure: bool) -> FastAPI:
     """
     app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
     app.mount("/static", StaticFiles(directory=STATIC))
+    _add_live(app, parts)
+    _add_picture(app, parts)
+
+    @app.post("/vent")
+    async def vent() -> JSONResponse:
+        # Whoever sees the page may vent, operator or not.
+        answer = await answer_of("vent", parts.commands.call("vent"))
+        return JSONResponse({"success": answer.success, "message": answer.message})
+
+    @app.get("/experiments/{name}/{inside:path}")
+    async def experiment_file(name: str, inside: str) -> Response:
+        found = await asyncio.to_thread(parts.experiments.file, name, inside)
+        if found is None:
+            return Response("no such file of an experiment", status_code=404)
+        return FileResponse(found, headers=_UNCACHED)
+
+    _add_login(app, sessions, secure)
+    return app
+
+
+_UNCACHED = {"Cache-Control": "no-store"}
+
+
+def _add_live(app: FastAPI, parts: Parts) -> None:
     live = LiveText(parts)
 
     @app.websocket("/live")
@@ -137,19 +162,18 @@ def create_app(parts: Parts, sessions: Sessions, secure: bool) -> FastAPI:
         finally:
             listening.cancel()
 
-    @app.post("/vent")
-    async def vent() -> JSONResponse:
-        # Whoever sees the page may vent, operator or not.
-        answer = await answer_of("vent", parts.commands.call("vent"))
-        message = in_buttons(answer.message)
-        return JSONResponse({"success": answer.success, "message": message})
 
+def _add_picture(app: FastAPI, parts: Parts) -> None:
     bell = Bell()
     parts.picture.on_put = bell.ring
 
     @app.get("/picture")
     async def picture(
-        after: int = 0, region: bool = False, width: int = 0, wait: float = 0.0
+        load: Annotated[Load, Depends(_load)],
+        after: int = 0,
+        region: bool = False,
+        width: int = 0,
+        wait: float = 0.0,
     ) -> Response:
         if not parts.picture.look(after):
             await bell.rung(min(wait, LONGEST_WAIT))
@@ -160,24 +184,23 @@ def create_app(parts: Parts, sessions: Sessions, secure: bool) -> FastAPI:
         drawn = parts.overlay.at(encoded.stamp, reference)
         drawn |= {"number": encoded.number, "size": encoded.size}
         if region:
-            outlines = await asyncio.to_thread(lambda: parts.studio.region)
-            drawn["region"] = [parts.overlay.pixels_of(outline) for outline in outlines]
+            drawn["region"] = await asyncio.to_thread(_region, parts, load)
         head = json.dumps(drawn, separators=(",", ":")).encode()
         body = struct.pack(">I", len(head)) + head + encoded.jpeg
         return Response(body, media_type="application/octet-stream", headers=_UNCACHED)
 
-    @app.get("/experiments/{name}/{inside:path}")
-    async def experiment_file(name: str, inside: str) -> Response:
-        found = await asyncio.to_thread(parts.experiments.file, name, inside)
-        if found is None:
-            return Response("no such file of an experiment", status_code=404)
-        return FileResponse(found, headers=_UNCACHED)
 
-    _add_login(app, sessions, secure)
-    return app
+def _load(payload: float = 0.0, payload_at: float = 0.0, mounting: str = "") -> Load:
+    return Load(payload, payload_at, mounting)
 
 
-_UNCACHED = {"Cache-Control": "no-store"}
+def _region(parts: Parts, load: Load) -> list[list[list[float]]]:
+    """Return the outlines of what the tip reaches under a load [px]; none if there is no such."""
+    try:
+        outlines = parts.studio.region(load)
+    except LimbError:
+        return []  # the form says what is wrong with it
+    return [parts.overlay.pixels_of(outline) for outline in outlines]
 
 
 async def _until_closed(websocket: WebSocket) -> None:

@@ -59,9 +59,9 @@
     const canvas = document.getElementById("picture");
     if (!canvas || document.hidden) return 300;
     const begin = performance.now();
-    const region = page.sketch.on && (!page.region || page.pictures % REGION_EVERY === 0);
+    const load = page.sketch.load, region = page.sketch.on && (!page.region || page.pictures % REGION_EVERY === 0);
     // The server answers when there is a newer picture, so that none waits to be asked for.
-    const address = `/picture?after=${number}&wait=1&width=${shownWidth(canvas)}${region ? "&region=1" : ""}`;
+    const address = `/picture?after=${number}&wait=1&width=${shownWidth(canvas)}${region ? `&region=1&${load}` : ""}`;
     const answer = await fetch(address, { signal: AbortSignal.timeout(3000) });
     if (answer.status !== 200) return answer.status === 204 ? 0 : 1000;
     const body = await answer.arrayBuffer(), size = new DataView(body).getUint32(0);
@@ -69,7 +69,7 @@
     const image = await createImageBitmap(new Blob([new Uint8Array(body, 4 + size)], { type: "image/jpeg" }));
     number = over.number;
     page.pictureSize = over.size;
-    if (over.region) page.region = over.region;
+    if (over.region && load === page.sketch.load) page.region = over.region;
     draw(canvas, image, over, trailWith(over.tip));
     const note = document.getElementById("view-note");
     if (note && note.textContent !== over.problem) note.textContent = over.problem;
