@@ -223,6 +223,7 @@ class Viewer:
         origin = Origin(f"http://{self._host}")
         with connect(f"ws://{self._host}/live", origin=origin) as socket:
             while not self._stop.is_set():
+                socket.send(str(time.monotonic()))
                 socket.recv(timeout=PATIENCE)
                 self.received += 1
 

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import json
 import logging
+import math
 import socket
 import struct
 import threading
@@ -36,6 +37,8 @@ from der_planner.page.worker import Worker
 STATIC = Path(__file__).parent / "static"
 RATE = 10.0
 """Hz of the live data."""
+LONGEST_TIME = 30
+"""Characters of the time that a window says."""
 LONGEST_WAIT = 1.0
 """[s] that a request for a picture may wait for the next one."""
 WRONG_PASSWORD_DELAY = 1.0
@@ -110,6 +113,47 @@ class LiveText:
         return self._text
 
 
+class Asking:
+    """A window's requests for live data, each with the time of its own clock.
+
+    A window asks again when it has the answer, so that no more than one is under way: a slow
+    connection delays data, but does not pile them up. The time and how long the request waited here
+    go back with the answer: what else has passed on the window's clock is how old the data can be.
+    """
+
+    def __init__(self) -> None:
+        self._asked = asyncio.Event()
+        self._closed = False
+        self._time, self._at = 0.0, 0.0
+
+    async def listen(self, websocket: WebSocket) -> None:
+        """Take requests until the window is gone."""
+        try:
+            while (message := await websocket.receive())["type"] != "websocket.disconnect":
+                with contextlib.suppress(ValueError):  # no clock shows that
+                    self._take(float((message.get("text") or "")[:LONGEST_TIME]))
+        except (WebSocketDisconnect, RuntimeError):
+            pass
+        finally:
+            self._closed = True
+            self._asked.set()
+
+    def _take(self, sent: float) -> None:
+        if math.isfinite(sent):
+            self._time, self._at = sent, time.monotonic()
+            self._asked.set()
+
+    async def asks(self) -> bool:
+        """Wait for the next request; return False instead when the window is gone."""
+        await self._asked.wait()
+        self._asked.clear()
+        return not self._closed
+
+    def answer(self, data: str) -> str:
+        """Return a JSON object with the request's time, and how long it waited [s]."""
+        return f'{{"asked":{self._time!r},"waited":{time.monotonic() - self._at:.4f},{data[1:]}'
+
+
 def create_app(parts: Parts, sessions: Sessions, secure: bool) -> FastAPI:
     """Return the application without its layout.
 
@@ -149,14 +193,15 @@ def _add_live(app: FastAPI, parts: Parts) -> None:
     @app.websocket("/live")
     async def send_live(websocket: WebSocket) -> None:
         await websocket.accept()
-        listening = asyncio.create_task(_until_closed(websocket))
+        window = Asking()
+        listening = asyncio.create_task(window.listen(websocket))
         due = time.monotonic()
         try:
-            while not listening.done():
-                await websocket.send_text(live())
+            while await window.asks():
+                await asyncio.sleep(due - time.monotonic())
+                await websocket.send_text(window.answer(live()))
                 # On a grid, so that what sending takes does not add up; nothing is made up for.
                 due = max(due + 1.0 / RATE, time.monotonic())
-                await asyncio.sleep(due - time.monotonic())
         except (WebSocketDisconnect, RuntimeError):
             pass  # the browser has gone
         finally:
@@ -175,6 +220,7 @@ def _add_picture(app: FastAPI, parts: Parts) -> None:
         width: int = 0,
         wait: float = 0.0,
     ) -> Response:
+        begun = time.monotonic()
         if not parts.picture.look(after):
             await bell.rung(min(wait, LONGEST_WAIT))
         encoded = await asyncio.to_thread(parts.picture.take, after, width)
@@ -185,6 +231,7 @@ def _add_picture(app: FastAPI, parts: Parts) -> None:
         drawn |= {"number": encoded.number, "size": encoded.size}
         if region:
             drawn["region"] = await asyncio.to_thread(_region, parts, load)
+        drawn["waited"] = round(time.monotonic() - begun, 4)
         head = json.dumps(drawn, separators=(",", ":")).encode()
         body = struct.pack(">I", len(head)) + head + encoded.jpeg
         return Response(body, media_type="application/octet-stream", headers=_UNCACHED)
@@ -201,14 +248,6 @@ def _region(parts: Parts, load: Load) -> list[list[list[float]]]:
     except LimbError:
         return []  # the form says what is wrong with it
     return [parts.overlay.pixels_of(outline) for outline in outlines]
-
-
-async def _until_closed(websocket: WebSocket) -> None:
-    try:
-        while True:
-            await websocket.receive()
-    except (WebSocketDisconnect, RuntimeError):
-        return
 
 
 def _add_login(app: FastAPI, sessions: Sessions, secure: bool) -> None:

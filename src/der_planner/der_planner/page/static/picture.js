@@ -69,6 +69,7 @@
     const image = await createImageBitmap(new Blob([new Uint8Array(body, 4 + size)], { type: "image/jpeg" }));
     number = over.number;
     page.pictureSize = over.size;
+    page.pictureAt = begin / 1000 + over.waited;
     if (over.region && load === page.sketch.load) page.region = over.region;
     draw(canvas, image, over, trailWith(over.tip));
     const note = document.getElementById("view-note");
