@@ -33,6 +33,8 @@ PATHS: dict[Service, str] = {
 
 TICK = NANOSECONDS // 20
 """[ns] between two setpoints."""
+RECORDER = "recorder"
+"""The node that listens to commands without following them."""
 FILL_AHEAD = 4
 """Ticks from now to the first setpoint."""
 
@@ -47,6 +49,7 @@ class GraphCommands:
     """
 
     def __init__(self, node: Node, situation: Situation, segments: int) -> None:
+        self._node = node
         self._situation = situation
         self._segments = segments
         self._service_clients = {
@@ -133,7 +136,8 @@ class GraphCommands:
         return self._command(message, conditions, f"a path of {len(tip)} points")
 
     def _command(self, message: MotionCommand, conditions: Conditions, what: str) -> Answer:
-        if not self._motions.get_subscription_count():
+        listeners = self._node.get_subscriptions_info_by_topic(self._motions.topic_name)
+        if all(listener.node_name == RECORDER for listener in listeners):
             return Answer(False, "no planner listens: start it")
         load = conditions.load
         message.model, message.method = conditions.model, conditions.method
