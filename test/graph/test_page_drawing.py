@@ -136,6 +136,13 @@ def test_a_drawing_is_previewed_played_and_kept(
     hosts = {urlsplit(address).netloc for address in asked if address.startswith("http")}
     assert hosts == {urlsplit(url).netloc}
 
+    slow = {"offline": False, "latency": 600, "downloadThroughput": 5000, "uploadThroughput": 5000}
+    browser.execute_cdp_cmd("Network.emulateNetworkConditions", slow)
+    wait("return document.querySelector('#view .age').textContent.endsWith('s old')", "the age")
+    assert browser.execute_script(
+        "return page.data.sources.camera.fresh"
+    )  # the way is slow, not it
+
     signal_browser(browser, signal.SIGKILL)
     client.wait_for(
         lambda: client.diagnostic_values("planner").get("reason") == "stopped as asked",
