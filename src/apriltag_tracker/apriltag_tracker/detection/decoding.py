@@ -160,7 +160,7 @@ def read_code(
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def count_bits(value: np.uint64) -> int:
+def count_bits(value: np.uint64) -> np.int64:
     """Count the ones of an integer: in pairs of bits, in fours, in bytes, and these added up."""
     value -= (value >> np.uint64(1)) & np.uint64(0x5555555555555555)
     fours = np.uint64(0x3333333333333333)

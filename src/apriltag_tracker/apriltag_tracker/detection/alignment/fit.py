@@ -141,7 +141,9 @@ def _judge(
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def _prepare(pixels: Pixels, count: int, share: float, result: NDArray[np.float64]) -> bool:
+def _prepare(
+    pixels: Pixels, count: int, share: float, stride: int, result: NDArray[np.float64]
+) -> bool:
     """Fit the light, write residuals and weights; derivatives become those of the grey level."""
     rows, residual = pixels.rows, pixels.residual
     linear = np.zeros(4)
@@ -153,7 +155,7 @@ def _prepare(pixels: Pixels, count: int, share: float, result: NDArray[np.float6
     for i in range(count):
         seen = linear[0] + gain * rows[13, i] + linear[2] * rows[14, i] + linear[3] * rows[15, i]
         residual[i] = pixels.values[i] - seen
-    weigh(residual, pixels.weights, pixels.where, count, share)
+    weigh(residual, pixels.weights, pixels.where, count, share, stride)
     # The slopes of the light are small: derivatives take the gain of the tag's middle.
     for a in range(_LINEAR):
         for i in range(count):
@@ -270,7 +272,8 @@ def _take(
         return 0
     if count != before:
         pixels.weights[:count] = 1.0
-    return count if _prepare(pixels, count, 1.0 if step < _CAREFUL else 0.5, result) else 0
+    share = 1.0 if step < _CAREFUL else 0.5
+    return count if _prepare(pixels, count, share, view.stride, result) else 0
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]

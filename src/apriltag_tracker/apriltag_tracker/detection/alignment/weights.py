@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 QUANTISATION = 0.3
 """Standard deviation of the rounding to whole grey levels."""
 
-_BESIDE = 2
-"""What covers a tag is blurred: pixels so near to what does not fit count no more either [px]."""
+_BESIDE, _MOST_BESIDE = 2, 5
+"""What covers a tag is blurred: pixels so near to what does not fit count no more either [px].
+Where runs of pixels are left out, the nearest one that shows what does not fit is further away."""
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -47,9 +48,10 @@ def _weigh_beside(
     limit: float,
     where: NDArray[np.int64],
     count: int,
+    beside: int,
     weights: NDArray[np.float64],
 ) -> None:
-    """Take the weight from the pixels around those whose residual is above a limit."""
+    """Take the weight from the pixels `beside` those whose residual is above a limit."""
     top, left = where[0, 0], where[1, :count].min()
     marked = np.zeros(
         (where[0, count - 1] - top + 1, where[1, :count].max() - left + 1), dtype=np.bool_
@@ -58,8 +60,8 @@ def _weigh_beside(
         if abs(residual[i]) > limit:
             row, column = where[0, i] - top, where[1, i] - left
             marked[
-                max(row - _BESIDE, 0) : row + _BESIDE + 1,
-                max(column - _BESIDE, 0) : column + _BESIDE + 1,
+                max(row - beside, 0) : row + beside + 1,
+                max(column - beside, 0) : column + beside + 1,
             ] = True
     for i in range(count):
         if marked[where[0, i] - top, where[1, i] - left]:
@@ -73,6 +75,7 @@ def weigh(
     where: NDArray[np.int64],
     count: int,
     share: float,
+    stride: int,
 ) -> None:
     """Take weight from what is far off; the new weights count by a share.
 
@@ -86,4 +89,5 @@ def weigh(
         weights[i] += share * (fresh - weights[i])
         largest = max(largest, off)
     if largest > 2.0 * limit:
-        _weigh_beside(residual, 2.0 * limit, where, count, weights)
+        beside = min(_BESIDE + stride - 1, _MOST_BESIDE)
+        _weigh_beside(residual, 2.0 * limit, where, count, beside, weights)
