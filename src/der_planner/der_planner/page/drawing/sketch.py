@@ -76,10 +76,10 @@ class Sketch:
         self._client.run_javascript(script)
 
     def _on_switch(self) -> None:
-        self._run(f"page.sketch.turn({json.dumps(bool(self._switch.value))})")
         if self._switch.value:
-            self._shade()
-        else:
+            self._shade()  # before the window asks for what is reachable
+        self._run(f"page.sketch.turn({json.dumps(bool(self._switch.value))})")
+        if not self._switch.value:
             self._clear()
 
     def _clear(self) -> None:
