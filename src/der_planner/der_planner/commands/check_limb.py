@@ -20,7 +20,8 @@ import dataclasses
 import sys
 from pathlib import Path
 
-from der_planner.experiment.load_options import add_load_options, as_loaded
+from der_planner.experiment.errors import OptionError
+from der_planner.experiment.load_options import add_load_options, as_loaded, check_loads
 from der_planner.identification import (
     CalibrationLog,
     ColumnMap,
@@ -43,6 +44,7 @@ def main() -> int:
     if given.columns is None and any(path.suffix == ".csv" for path in given.runs):
         parser.error("a table needs --columns FILE")
     try:
+        check_loads(given)
         limb = Limb.from_yaml(given.limb)
         if given.out is not None:
             _check_new(given.out)
@@ -51,7 +53,7 @@ def main() -> int:
         if given.update:
             return _update(limb, loaded, logs, given.out)
         return max([_check(loaded, log, len(logs) > 1) for log in logs])
-    except (LogError, LimbError, OutputError, OSError) as error:
+    except (LogError, LimbError, OptionError, OutputError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
 
