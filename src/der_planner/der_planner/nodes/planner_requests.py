@@ -89,19 +89,34 @@ def from_command(message: MotionCommand, options: PlannerOptions, now: int) -> R
     """
     start = start_of(nanoseconds(message.header.stamp), now)
     limb = _asked_for(message, options)
+    if message.path and (message.motion or message.method == LEARNED):
+        raise ValueError(
+            "the command has a path, and a motion or a learned plan beside it: give one of them"
+        )
     if message.method == LEARNED:
         return _from_learned(message, limb, options, start)
     model = message.model or options.model
-    motion = Motion.named(
+    motion = _along_path(message, options) if message.path else _named(message, options)
+    method = choose_method(model, message.method or options.method)
+    feedback = _corrected(message, model, options)
+    return Request(message.plan_id, limb, motion, model, method, start, feedback=feedback)
+
+
+def _named(message: MotionCommand, options: PlannerOptions) -> Motion:
+    return Motion.named(
         message.motion,
         amplitude=message.amplitude or DEFAULT_AMPLITUDE,
         period=message.period or DEFAULT_PERIOD,
         cycles=message.cycles or DEFAULT_CYCLES,
         branch=options.branch,
     )
-    method = choose_method(model, message.method or options.method)
-    feedback = _corrected(message, model, options)
-    return Request(message.plan_id, limb, motion, model, method, start, feedback=feedback)
+
+
+def _along_path(message: MotionCommand, options: PlannerOptions) -> Motion:
+    return Motion.from_tip_path(
+        None, np.array([(point.x, point.y) for point in message.path]), branch=options.branch,
+        limits=options.limits, nearest=message.nearest_path or options.nearest_path,
+    )  # fmt: skip
 
 
 def _from_learned(
