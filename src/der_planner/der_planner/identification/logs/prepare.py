@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import savgol_filter
 
 from der_planner.identification.logs.log import CalibrationLog, LogError
 from der_planner.limb import Limb
@@ -110,6 +109,9 @@ def prepare(
             f"{period * waited.sum():.1f} s are not used, since no pressure tells that motion"
         )
     count = min(SMOOTHING, len(bend) - (len(bend) + 1) % 2)
+    # It takes half a second to import: only who has a log pays for it.
+    from scipy.signal import savgol_filter  # noqa: PLC0415
+
     bend = np.asarray(savgol_filter(bend, count, 2, axis=0))
     return Prepared(grid, pressure, bend, valid & ~waited, tuple(warnings))
 
