@@ -96,6 +96,7 @@ def prepare(
     bend = np.stack([bridge(column) for column in grid.bend_angles.T], axis=1)
     if to_fit:
         _check_units(pressure, limb)
+        _check_tips(grid, limb)
         _check_commands(grid, warnings)
         _check_excitation(pressure, warnings)
         _check_saturation(pressure, limb, warnings)
@@ -160,6 +161,20 @@ def _check_units(pressure: Array, limb: Limb) -> None:
         )
 
 
+def _check_tips(log: CalibrationLog, limb: Limb) -> None:
+    """Refuse tips that are nowhere near the limb: another unit, or another origin."""
+    away = np.linalg.norm(log.tip, axis=1)
+    if not np.isfinite(away).any():
+        return
+    far = float(np.nanpercentile(away, 90))
+    if not 0.5 * limb.length < far < 1.5 * limb.length:
+        raise LogError(
+            f"the tips are {far:.3g} m from the clamp, the limb '{limb.name}' is "
+            f"{limb.length:.3g} m long: check the tips' unit (length_unit) and origin, which is "
+            "the clamp, or give the limb's lengths in the limb file of --prior"
+        )
+
+
 def _check_commands(log: CalibrationLog, warnings: list[str]) -> None:
     measured = log.measured_differential
     for index, (command, column) in enumerate(
@@ -187,7 +202,7 @@ def _check_excitation(pressure: Array, warnings: list[str]) -> None:
             raise LogError(
                 f"input {index} was not excited (standard deviation {value:.0f} Pa, "
                 f"{LEAST_EXCITATION:.0f} Pa needed): nothing can be told of segment {index}; "
-                "run the calibration motion"
+                "run the calibration motion, or check the unit of the pressures"
             )
     if pressure.shape[1] > 1:
         together = np.asarray(np.corrcoef(pressure.T))
