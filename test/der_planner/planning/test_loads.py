@@ -144,10 +144,21 @@ def test_arcs_that_rest_elsewhere_or_know_nothing_of_a_sag_say_so():
 
 
 def test_a_weight_of_its_own_that_is_too_much_is_named_so():
-    with pytest.raises(OverloadError, match=r"Without the 50\.0 g that it carries it is too much"):
+    with pytest.raises(OverloadError, match=r"Even without the 50\.0 g that it carries"):
         plan(LIMB.mounted("hanging").carrying(0.05), Motion.named("same_direction", 0.79, 8.0, 1))
     with pytest.raises(PlanningError, match="out of reach"):
         plan(LIMB.mounted("hanging"), Motion.from_tip_path(None, [[0.3, 0.0], [0.3, 0.1]]))
+
+
+def test_a_limb_that_hardly_stands_says_so():
+    motion = Motion.named("same_direction", 0.1, 6.0, 1)
+    for factor, share in ((1.16, "96 %"), (1.3, "")):
+        limb = stiffer(LIMB, factor).mounted("standing")
+        said = [
+            text for text in plan(limb, motion, "der", "projected").warnings if "buckle" in text
+        ]
+        assert len(said) == (1 if share else 0)
+        assert all(f"stands under {share} of the load" in text for text in said)
 
 
 def test_a_standing_limb_beyond_its_critical_load_is_refused_by_name():

@@ -74,7 +74,8 @@ class OverloadError(PlanningError):
     ) -> None:
         remedy = "Shrink or move the motion, or mount the limb otherwise"
         if carried and possible_mass is None:
-            remedy = f"Without the {carried * 1000:.1f} g that it carries it is too much. {remedy}"
+            weight = f"{carried * 1000:.1f} g"
+            remedy = f"Even without the {weight} that it carries it is too much. {remedy}"
         elif carried and possible_mass is not None:
             remedy = (
                 f"It carries {carried * 1000:.1f} g: {possible_mass * 1000:.1f} g are possible "
