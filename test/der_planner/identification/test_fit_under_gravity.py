@@ -80,6 +80,9 @@ def test_lengths_that_are_far_off_are_named_in_place_of_a_traceback():
     _, report = fit(replace(limb, segments=long), log, terms=())
     assert "segment 1 is given as 165 mm and was found to be 132 mm or less" in report.text()
     assert "limb file of --prior" in report.text()
+    for factor, shift in ((1000.0, 0.0), (0.01, 0.0), (1.0, 0.4)):
+        with pytest.raises(LogError, match=r"check the tips' unit .* and origin"):
+            fit(limb, replace(log, tip=factor * log.tip + shift), terms=())
 
 
 def test_tips_tell_how_much_of_a_bend_is_the_weights():

@@ -150,6 +150,17 @@ def test_a_weight_of_its_own_that_is_too_much_is_named_so():
         plan(LIMB.mounted("hanging"), Motion.from_tip_path(None, [[0.3, 0.0], [0.3, 0.1]]))
 
 
+def test_a_limb_that_hardly_stands_says_so():
+    motion = Motion.named("same_direction", 0.1, 6.0, 1)
+    for factor, share in ((1.16, "96 %"), (1.3, "")):
+        limb = stiffer(LIMB, factor).mounted("standing")
+        said = [
+            text for text in plan(limb, motion, "der", "projected").warnings if "buckle" in text
+        ]
+        assert len(said) == (1 if share else 0)
+        assert all(f"stands under {share} of the load" in text for text in said)
+
+
 def test_a_standing_limb_beyond_its_critical_load_is_refused_by_name():
     """Greenhill: a column under its own weight buckles at q L³ / EI = 7.837."""
     standing = LIMB.mounted("standing")

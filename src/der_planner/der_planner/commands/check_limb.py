@@ -6,7 +6,7 @@
 
 Predicts each run open loop from its measured pressures, for a limb that is mounted as --mounting
 says (without it: as its file says) and carries a --payload in the runs. Exit code 0: it fits; 3:
-calibrate again; 1: a run or the file cannot be used.
+calibrate again; 1: a run or the file cannot be used; 2: bad options.
 
 With --update: gain, rest angle and friction are brought up to date from all runs together, ordinary
 ones, as far as they tell them; the rest stays. Half a minute in which both segments move tells
@@ -53,7 +53,10 @@ def main() -> int:
         if given.update:
             return _update(limb, loaded, logs, given.out)
         return max([_check(loaded, log, len(logs) > 1) for log in logs])
-    except (LogError, LimbError, OptionError, OutputError, OSError) as error:
+    except OptionError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except (LogError, LimbError, OutputError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
 

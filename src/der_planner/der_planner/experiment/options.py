@@ -14,6 +14,7 @@ from der_planner.experiment.errors import OptionError
 from der_planner.experiment.load_options import add_load_options, check_loads
 from der_planner.experiment.node_specs import Hardware
 from der_planner.limb import Limb
+from der_planner.methods import LEARNED
 from der_planner.planning import METHODS as METHODS_BY_MODEL
 from der_planner.planning import Motion, PlanningError
 from der_planner.planning.motions import (
@@ -23,7 +24,6 @@ from der_planner.planning.motions import (
     JOINT_MOTIONS,
 )
 from der_planner.planning.motions import NAMES as MOTIONS
-from der_planner.runs.run import LEARNED
 
 MODELS = tuple(METHODS_BY_MODEL)
 METHODS = METHODS_BY_MODEL["der"]

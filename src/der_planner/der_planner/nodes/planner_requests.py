@@ -11,10 +11,11 @@ from nav_msgs.msg import Path as PathMessage
 
 from der_msgs.msg import MotionCommand
 from der_planner.limb import Limb
+from der_planner.methods import LEARNED
 from der_planner.nodes.planner_parameters import LARGEST_PAYLOAD, PlannerOptions
 from der_planner.planning import Motion, choose_method
 from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD
-from der_planner.planning.plan_file import LEARNED, learned_plan
+from der_planner.planning.plan_file import learned_plan
 from der_planner.planning.result import Plan
 from limb_interfaces import topics
 from limb_interfaces.stamps import NANOSECONDS, nanoseconds

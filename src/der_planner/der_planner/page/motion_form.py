@@ -9,10 +9,10 @@ from dataclasses import replace
 from nicegui import ui
 
 from der_planner.limb import MOUNTINGS, LimbError, gravity_of
+from der_planner.methods import LEARNED
 from der_planner.page.commands import Conditions, Load, MotionRequest
 from der_planner.planning import METHODS
 from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD, NAMES
-from der_planner.planning.plan_file import LEARNED
 
 NO_PLANS = "No learned plans"
 BEST = "the best"

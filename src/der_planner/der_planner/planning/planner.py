@@ -20,6 +20,7 @@ from der_planner.model.response import NODES, simulate
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import models
 from der_planner.planning.errors import PlanningError
+from der_planner.planning.loads.rest import nearly_buckling
 from der_planner.planning.models import METHODS, PlanningModel
 from der_planner.planning.motions import Motion, Reference
 from der_planner.planning.optimal import Optimiser
@@ -83,7 +84,7 @@ def plan(
         report(0.3)
         solved = _followed(physics, spline, reference, method, report)
     bend = sample_spline(spline, reference.time)[0]
-    left = [str(reference.deviation or "")]
+    left = [str(reference.deviation or ""), nearly_buckling(physics.limb)]
     warnings = filter(None, left + solved.warnings + _calibration_warnings(physics.limb, bend))
     return Plan(
         time=reference.time,
