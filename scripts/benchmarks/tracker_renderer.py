@@ -29,7 +29,7 @@ class Scene:
 
     Attributes:
         name: of the row.
-        pixels: side of the tags' black border [px].
+        pixels: side of the tags' border [px].
         blur: standard deviation of the lens [px].
         defocus: radius of the disc that a point becomes [px].
         noise: standard deviation of reading [grey levels]; photons add the root of 2 % of a level.
@@ -73,7 +73,8 @@ def render(
     truth = {}
     room = 1.3 * scene.pixels + 0.5 * (scene.smear + scene.rolling) + 3.0 * scene.blur
     # The sheet of a family of few cells is wider against its border.
-    sheet = max(1.0, (scene.family.border_cells + 2) / scene.family.border_cells / 1.25)
+    border, rim = scene.family.border_cells, scene.family.rim
+    sheet = max(1.0, (border + 2 * rim) / border / 1.25)
     half = int(np.ceil(0.5 * 1.45 * sheet * scene.pixels + scene.smear + scene.rolling + 4.0))
     pitch = max(2 * half + 2, int(room))
     for top in range(0, height - pitch + 1, pitch):
@@ -117,12 +118,13 @@ def _patch(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the picture (pitch, pitch) of one tag, 1 is white, and the direction it goes."""
     left, top, pitch = box
-    across = scene.family.border_cells + 4
+    rim = scene.family.rim
+    across = scene.family.border_cells + 2 * rim + 2
     cells = np.full((across, across), _FLOOR)
-    cells[1:-1, 1:-1] = np.where(scene.family.printed_cells(tag, 1) > 0, _WHITE, _BLACK)
+    cells[1:-1, 1:-1] = np.where(scene.family.printed_cells(tag) > 0, _WHITE, _BLACK)
     # Corners of the border in cells, columns to the right and rows down.
-    end = across - 2.0
-    target = np.array([[2.0, end], [end, end], [end, 2.0], [2.0, 2.0]], dtype=np.float32)
+    start, end = rim + 1.0, across - rim - 1.0
+    target = np.array([[start, end], [end, end], [end, start], [start, start]], dtype=np.float32)
     to_cells = cv2.getPerspectiveTransform(corners.astype(np.float32), target).astype(np.float64)
     # float32 corners lose some 1e-5 px; what is rendered is what the truth says to 1e-3 px.
     fine = (np.arange(pitch * FINE) + 0.5) / FINE - 0.5

@@ -11,12 +11,16 @@ from dataclasses import replace
 
 import numpy as np
 
+from apriltag_tracker.detection import Detector
 from apriltag_tracker.pipeline import LimbTracker
 from apriltag_tracker.synthetic.camera import CameraModel, SyntheticCamera
 from apriltag_tracker.synthetic.shapes import constant_curvature
 from apriltag_tracker.tag_map import TagMap
+from benchmarks.tracker_renderer import Scene, render
+from der_planner.identification.parameters import start_values
+from der_planner.identification.rod_angles import RodAngles
 from der_planner.limb import Limb
-from der_planner.model.response import simulate_many
+from der_planner.model.response import simulate, simulate_many
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import METHODS, Motion, plan
 from der_planner.rod import Rod
@@ -35,10 +39,40 @@ def _track() -> None:
     # The first image is searched in full, the next by regions.
     for stamp in (0.0, 0.03):
         tracker.observe(picture, stamp)
+    # Tags that something covers, or that motion smears, are looked for in ways of their own.
+    for scene in (Scene("covered", corner=0.25), Scene("smeared", smear=6.0)):
+        Detector().detect(render(scene, seed=40, size=(320, 240))[0])
+
+
+def _fitted(limb: Limb) -> Limb:
+    """Return a limb with all that a calibration finds: each takes kernels of its own."""
+    segments = tuple(
+        replace(
+            segment,
+            friction_moment=300.0 * segment.moment_gain,
+            friction_curvature=0.12 / segment.length,
+            creep_stiffness=400.0 * segment.moment_gain * segment.length,
+            creep_time=8.0,
+        )
+        for segment in limb.segments
+    )
+    air = replace(limb.pneumatics, vent_rate=5000.0)
+    return replace(limb, segments=segments, pneumatics=air)
+
+
+def _fit() -> None:
+    """Ask for what a fit asks for: angles of a limb with memory by its parameters and inputs."""
+    limb = _fitted(Limb.default().mounted("hanging"))
+    time, pressure = CONTROL_PERIOD * np.arange(4.0), np.full((4, 2), 500.0)
+    found = simulate(limb, time, commands=pressure, linearise=True)
+    assert found.derivative is not None
+    found.derivative.tangent(pressure)
+    RodAngles(limb, time, pressure).derivatives(start_values(limb), [(0, 0), (1, 0)])
 
 
 def _in_space() -> None:
     rod = Rod.from_limb(replace(Limb.default(), gravity=(0.0, 0.0, -9.81)))
+    rod.warm_up()
     state, pressures = rod.straight_state(), np.zeros((2, 2))
     for method in ("backward_euler", "sdirk2"):
         rod.simulate(state, pressures, CONTROL_PERIOD, method=method, linearise=True)
@@ -47,9 +81,7 @@ def _in_space() -> None:
 
 def main() -> int:
     """Use every kernel once and say how long each part took."""
-    limb = Limb.default()
-    # A calibrated limb's chambers are vented slowly: that takes kernels of its own.
-    limb = replace(limb, pneumatics=replace(limb.pneumatics, vent_rate=5000.0))
+    limb = _fitted(Limb.default())
     quick = Motion.named("asynchronous", amplitude=0.1, period=2.0, cycles=1)
     parts = {
         f"planner {model} {method}": lambda model=model, method=method: plan(
@@ -58,6 +90,8 @@ def main() -> int:
         for model, methods in METHODS.items()
         for method in methods
     }
+    parts["fit"] = _fit
+    parts["rod"] = Rod.from_limb(limb).warm_up
     parts["rod in space"] = _in_space
     parts["twin"] = lambda: play(np.array([0.0, 0.05]), np.zeros((2, 2)))
     parts["many rods"] = lambda: simulate_many(

@@ -1,22 +1,29 @@
 from __future__ import annotations
 
+import ctypes
 import dataclasses
 import subprocess
 import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pyapriltags
+import pyapriltags.apriltags as c_library
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from apriltag_tracker import family
 from apriltag_tracker.detection import Detector
 from apriltag_tracker.family import FAMILIES, TAG36H11
 from apriltag_tracker.pipeline import LimbTracker
+from apriltag_tracker.sheets import drawing, tag_pages
 from apriltag_tracker.synthetic.camera import Optics, SyntheticCamera
+from apriltag_tracker.tag_map import LimbTag, TagMap
 from benchmarks.tracker_renderer import Scene, render
 
 EACH = pytest.mark.parametrize("each", FAMILIES.values(), ids=FAMILIES)
+STANDARD = ("tagStandard41h12", "tagStandard52h13")
 
 
 @EACH
@@ -25,7 +32,7 @@ def test_tag_0_reads_the_published_code(each):
 
 
 def test_a_turned_dictionary_is_noticed(monkeypatch):
-    turned = np.rot90(TAG36H11.codes(), 1, axes=(1, 2))
+    turned = np.rot90(TAG36H11.codes().reshape(-1, 6, 6), 1, axes=(1, 2)).reshape(-1, 36)
     monkeypatch.setattr(family, "_codes", lambda _: turned)
     with pytest.raises(family.FamilyError, match="turned in another way"):
         TAG36H11.check_code_of_tag_0()
@@ -33,12 +40,14 @@ def test_a_turned_dictionary_is_noticed(monkeypatch):
 
 @EACH
 def test_codes_differ_in_as_many_cells_as_stated_however_they_are_turned(each):
-    codes = each.codes().reshape(each.tag_count, -1)
+    mask, codes = each.code_mask(), each.codes()
+    cells = np.zeros((each.tag_count, *mask.shape), dtype=np.uint8)
+    cells[:, mask] = codes
     some = np.arange(0, each.tag_count, max(each.tag_count // 16, 1))
     nearest = []
     for turn in range(4):
-        turned = np.rot90(each.codes(), turn, axes=(1, 2)).reshape(each.tag_count, -1)
-        distance = (codes[some][:, None, :] != turned[None, :, :]).sum(axis=2)
+        turned = np.rot90(cells, turn, axes=(1, 2))[:, mask]
+        distance = np.array([(code != turned).sum(axis=1) for code in codes[some]])
         if turn == 0:
             distance[np.arange(len(some)), some] = 99
         nearest.append(distance.min())
@@ -47,13 +56,51 @@ def test_codes_differ_in_as_many_cells_as_stated_however_they_are_turned(each):
 
 @EACH
 def test_printed_cells_have_border_and_margin(each):
-    cells = each.printed_cells(7, margin=2)
-    assert cells.shape == (each.border_cells + 4,) * 2
-    assert cells[:2].min() == 1
-    assert cells[:, -2:].min() == 1
-    assert cells[2, 2:-2].max() == 0
-    assert cells[2:-2, 2].max() == 0
-    assert np.array_equal(cells[3:-3, 3:-3], each.codes()[7])
+    cells = each.printed_cells(7, margin=each.rim + 1)
+    assert cells.shape == (each.border_cells + 2 * each.rim + 2,) * 2
+    assert cells[0].min() == cells[:, -1].min() == 1
+    seen = each.seen_cells(7)
+    border = seen[each.rim : -each.rim, each.rim : -each.rim]
+    assert border[0].max() == border[:, -1].max() == 0
+    margin = seen[each.rim - 1 : seen.shape[0] - each.rim + 1, each.rim - 1]
+    assert margin.min() == 1
+    assert np.array_equal(each.printed_cells(7)[each.code_mask()], each.codes()[7])
+    with pytest.raises(ValueError, match="has a rim of"):
+        each.printed_cells(7, margin=each.rim - 1)
+
+
+@pytest.mark.parametrize("name", STANDARD)
+def test_standard_tags_are_printed_as_the_c_library_draws_them(name):
+    """Every cell of `apriltag_to_image`, which also makes the published pictures of the tags."""
+    library = ctypes.CDLL(str(Path(c_library.__file__).parent / "libapriltag.so"))
+    create = getattr(library, f"{name}_create")
+    create.restype = ctypes.POINTER(c_library._ApriltagFamily)
+    library.apriltag_to_image.restype = ctypes.POINTER(c_library._ImageU8)
+    theirs, ours = create(), FAMILIES[name]
+    assert theirs.contents.ncodes == ours.tag_count
+    assert theirs.contents.width_at_border == ours.border_cells
+    assert theirs.contents.h == ours.hamming
+    for tag in range(0, ours.tag_count, max(ours.tag_count // 700, 1)):
+        drawn = library.apriltag_to_image(theirs, tag).contents
+        cells = np.ctypeslib.as_array(drawn.buf, (drawn.height, drawn.stride))[:, : drawn.width]
+        assert np.array_equal(cells > 0, ours.printed_cells(tag) > 0)
+
+
+def test_a_standard_tag_is_the_published_one():
+    """`tag41_12_00000` of the AprilTag project's collection of pictures, row by row."""
+    published = (
+        "110111100 000000000 101111100 001111101 001001100 001010101 101111100 000000000 110100100"
+    )
+    cells = FAMILIES["tagStandard41h12"].printed_cells(0)
+    assert " ".join("".join(map(str, row)) for row in cells) == published
+
+
+def test_a_damaged_table_of_standard_codes_is_noticed(monkeypatch):
+    each = FAMILIES["tagStandard41h12"]
+    damaged = np.roll(each.codes(), 1, axis=1)
+    monkeypatch.setattr(family, "_codes", lambda _: damaged)
+    with pytest.raises(family.FamilyError, match=r"standard_families\.npz is damaged"):
+        Detector(family=each)
 
 
 @pytest.mark.parametrize("tag", [-1, 587])
@@ -62,9 +109,9 @@ def test_unknown_tags_are_refused(tag):
         TAG36H11.printed_cells(tag)
 
 
-@pytest.mark.parametrize("name", ["tagStandard52h13", "tag49h1", 36, None])
+@pytest.mark.parametrize("name", ["tagCircle49h12", "tagCustom48h12", "tag49h1", 36, None])
 def test_other_families_are_refused_with_those_that_there_are(name):
-    with pytest.raises(ValueError, match="there are tag36h11, tag36h10, tag25h9, tag16h5"):
+    with pytest.raises(ValueError, match=r"there are tag36h11, .* tag16h5, tagStandard41h12"):
         family.named(name)
 
 
@@ -77,7 +124,10 @@ def test_other_families_are_refused_with_those_that_there_are(name):
 def test_every_family_is_placed_by_its_own_pattern(each, scene):
     if each.needs_pattern and scene.corner > 0.0:
         pytest.skip("covered tags of a family with so short codes are not told from others")
-    image, truth = render(dataclasses.replace(scene, family=each), 70, (320, 240))
+    # Of the same paper the outer ring takes a part.
+    pixels = scene.pixels * (0.7 if each.outer_ring else 1.0)
+    scene = dataclasses.replace(scene, family=each, pixels=pixels)
+    image, truth = render(scene, 70, (320, 240))
     found = {tag.id: tag for tag in Detector(family=each).detect(image)}
     assert found.keys() <= truth.keys()
     assert len(found) >= 0.9 * len(truth)
@@ -90,17 +140,18 @@ def test_every_family_is_placed_by_its_own_pattern(each, scene):
     assert 0.3 < np.mean(nees) < 3.0
 
 
-@pytest.mark.parametrize("name", ["tag16h5", "tag25h9"])
+@pytest.mark.parametrize("name", ["tag16h5", "tag25h9", "tagStandard41h12"])
 def test_the_c_library_reads_the_same_tags_the_same_way_round(name):
-    image, truth = render(Scene("large", pixels=48.0, family=FAMILIES[name]), 71, (320, 240))
+    pixels = 48.0 if name not in STANDARD else 34.0
+    image, truth = render(Scene("large", pixels=pixels, family=FAMILIES[name]), 71, (320, 240))
     theirs = pyapriltags.Detector(families=name).detect(image)
     seen = {tag.tag_id: np.asarray(tag.corners) - 0.5 for tag in theirs if tag.decision_margin > 50}
     assert seen.keys() >= truth.keys()
     assert all(np.abs(seen[tag] - corners).max() < 0.5 for tag, corners in truth.items())
 
 
-@pytest.mark.parametrize("name", ["tag16h5", "tag25h9"])
-def test_pictures_without_tags_show_none_of_the_weak_families(name):
+@pytest.mark.parametrize("name", ["tag16h5", "tag25h9", *STANDARD])
+def test_pictures_without_tags_show_none_of_other_families(name):
     detector, random = Detector(family=name), np.random.default_rng(17)
     for _ in range(25):
         picture = random.integers(0, 256, random.integers(8, 200, 2), dtype=np.uint8)
@@ -114,7 +165,7 @@ def test_more_forgiven_cells_than_a_weak_family_bears_are_refused():
         Detector(correct_bits=1, family="tag16h5")
 
 
-@pytest.mark.parametrize("name", ["tag16h5", "tag25h9"])
+@pytest.mark.parametrize("name", ["tag16h5", "tag25h9", "tagStandard41h12"])
 def test_a_limb_with_another_family_is_tracked(tags, model, swing, name):
     limb = tuple(dataclasses.replace(tag, id=k) for k, tag in enumerate(tags.limb))
     world = tuple(dataclasses.replace(tag, id=20 + k) for k, tag in enumerate(tags.world))
@@ -127,6 +178,11 @@ def test_a_limb_with_another_family_is_tracked(tags, model, swing, name):
         observation = tracker.observe(frame.image, k / 30.0)
     gap = observation.estimate.tip - swing.shape(moment).points[-1]
     assert np.hypot(*gap) < 1e-4
+    # The size of a standard tag is the edge of its white border: places would not fit otherwise.
+    fixed = {tag.id: tag for tag in other.world}
+    for placed in observation.tags:
+        if placed.tag.id in fixed:
+            assert np.hypot(*(placed.pose[:2] - fixed[placed.tag.id].position[:2])) < 1e-4
     assert len(observation.tags) == len(other.ids)
 
 
@@ -143,6 +199,29 @@ def test_sheets_of_another_family_are_printed(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert "tag36h10 0" in next(iter(sorted(tmp_path.glob("*.svg")))).read_text()
+
+
+@pytest.mark.parametrize("name", ["tag36h11", *STANDARD])
+def test_a_printed_sheet_is_read_back_in_its_size(name):
+    """The page drawn at 8 px/mm: the first tag is read, and its border has the size asked for."""
+    each = FAMILIES[name]
+    tags = TagMap((0.1,), (LimbTag(4, 0.05, 0.0, 0.02),), (), family=each)
+    figure = drawing(tag_pages(tags)[0])
+    figure.set_dpi(25.4 * 8)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    picture = cv2.cvtColor(np.asarray(canvas.buffer_rgba()), cv2.COLOR_RGBA2BGR)
+    (found,) = Detector(family=each).detect(picture)
+    assert found.id == 4
+    assert found.pixel_size == pytest.approx(8 * 20.0, abs=0.3)
+    lower_left, lower_right, upper_right, _ = found.corners
+    assert lower_right[0] > lower_left[0] + 100.0
+    assert upper_right[1] < lower_right[1] - 100.0
+
+
+def square_code(each, tag):
+    """Return the cells of a code, (n, n)."""
+    return each.codes()[tag].reshape(each.code_cells, each.code_cells)
 
 
 def spiral(cells):
@@ -170,11 +249,11 @@ def spiral(cells):
 )
 def test_tags_are_those_of_the_c_library_the_same_way_round(name, first):
     """Tag 0 of the tables in tag36h11.c, tag36h10.c and tag16h5.c of AprilTag 3."""
-    assert spiral(FAMILIES[name].codes()[0]) == first
+    assert spiral(square_code(FAMILIES[name], 0)) == first
 
 
 def test_more_tags_of_a_family_that_the_c_library_does_not_read():
     """`pyapriltags` is built without tag36h10; these are the next codes of its C table."""
-    codes = FAMILIES["tag36h10"].codes()
     known = (0x21A48C08D, 0x26DFDBC5D, 0x2D19B78FB, 0x31C5557DF, 0x3F2B3D349)
-    assert tuple(spiral(codes[tag]) for tag in range(1, 6)) == known
+    ours = [square_code(FAMILIES["tag36h10"], tag) for tag in range(1, 6)]
+    assert tuple(spiral(code) for code in ours) == known

@@ -44,7 +44,7 @@ def _set(*path, value):
     ("change", "message"),
     [
         (_set("schema", value=9), "schema"),
-        (_set("family", value="tagStandard41h12"), "outside of their border.*tag36h11, tag36h10"),
+        (_set("family", value="tagCustom48h12"), "a hole in the middle.*tag36h11, tag36h10"),
         (_set("family", value="tag16h5"), "one of 0 to 29, which tag16h5 has"),
         (_set("limb", value=None), "'limb'"),
         (_set("limb", "segment_lengths", value=[]), "segment_lengths"),

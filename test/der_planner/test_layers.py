@@ -9,6 +9,7 @@ import der_planner
 ROOT = Path(der_planner.__file__).parent
 LAYERS = {
     "limb_declaration": 0,
+    "methods": 0,
     "limb_loads": 1,
     "limb_parameters": 1,
     "limb_days": 2,

@@ -14,6 +14,7 @@ from typing import Any
 from urllib.parse import quote, urlsplit
 
 import pytest
+from browsers import signal_browser
 from filmed import FilmedRun
 from runs import FRAMES, reference
 
@@ -51,7 +52,7 @@ return true;
 class Rig:
     """A board, a driver and the page; browsers that look at it."""
 
-    def __init__(self, graph: Any, folder: Path) -> None:
+    def __init__(self, graph: Any, folder: Path, on_lost_operator: str) -> None:
         self.client = graph.client
         self.folder = folder
         self.browsers: list[Any] = []
@@ -65,7 +66,7 @@ class Rig:
         graph.start("pressure_driver", "board_emulator", port_link=link)
         self.client.wait_ready(["board_emulator"])
         self.driver = graph.start("pressure_driver", "pressure_driver", port=link)
-        self.page = graph.start("der_planner", "page", port=port, on_lost_operator="vent")
+        self.page = graph.start("der_planner", "page", port=port, on_lost_operator=on_lost_operator)
         self.client.wait_ready(["pressure_driver", "page"])
 
     def open(self) -> Any:
@@ -91,14 +92,23 @@ class Rig:
         del self.states[:]
         self.wait(lambda: self.states and self.states[-1].mode in modes, f"a mode of {modes}")
 
+    def lose(self, browser: Any, number: int = signal.SIGKILL) -> None:
+        """Send a signal to all processes of a browser, and wait until the page misses it."""
+        self.browsers.remove(browser)
+        signal_browser(browser, number)
+        self.wait(
+            lambda: self.client.diagnostic_values("page").get("operator") == "no",
+            "the page to miss its operator",
+        )
+
     def close(self) -> None:
         for browser in self.browsers:
             browser.quit()
 
 
 @pytest.fixture
-def rig(graph: Any, tmp_path: Path) -> Iterator[Rig]:
-    running = Rig(graph, tmp_path)
+def rig(graph: Any, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Rig]:
+    running = Rig(graph, tmp_path, getattr(request, "param", "vent"))
     yield running
     running.close()
 
@@ -138,8 +148,9 @@ def test_one_arms_and_everybody_vents(rig: Rig) -> None:
 
     rig.wait_mode(PressureState.DISARMED)
     arm(rig, first)
-    first.get("about:blank")  # the parameter on_lost_operator asks for a vent
+    rig.lose(first, signal.SIGSTOP)  # as a computer that falls asleep: its connection stays open
     rig.wait_mode(PressureState.DISARMED)
+    signal_browser(first, signal.SIGKILL)
     rig.wait(lambda: enabled(second, "take"), "the desk to be free again")
     second.get(f"{rig.url}setup")
     arm(rig, second)
@@ -164,8 +175,15 @@ def requested(browser: Any) -> list[str]:
     return [url for url in found if urlsplit(url).scheme in ("http", "https", "ws", "wss")]
 
 
+@pytest.mark.parametrize("rig", ["continue"], indirect=True)
 def test_what_died_is_not_shown_as_live(rig: Rig) -> None:
-    browser = rig.open()
+    operator, browser = rig.open(), rig.open()
+    press(rig, operator, "take")
+    arm(rig, operator)
+    rig.wait(lambda: rig.client.diagnostic_values("page")["operator"] == "yes", "the operator")
+    rig.lose(operator)
+    rig.wait(lambda: enabled(browser, "take"), "the desk to be free again")
+    rig.wait_mode(PressureState.ARMED)  # nothing but the browser ends with it
     old = "document.getElementById('summary').classList.contains('old')"
     lost = "document.body.classList.contains('lost')"
     rig.wait(lambda: not browser.execute_script(f"return {old}"), "the driver's state")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
+import signal
 import socket
 import uuid
 from pathlib import Path
@@ -11,6 +13,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
+from browsers import signal_browser
 
 from der_msgs.msg import PressurePlan, PressureState
 from limb_interfaces import qos, topics
@@ -33,6 +36,11 @@ const across = box.width / canvas.width, down = box.height / canvas.height;
 return [box.left + right[0] * across, box.top + right[1] * down];
 """
 """Where the region is farthest to the right, in the window."""
+SELECT = """
+const field = [...document.querySelectorAll('input')].find((one) => one.ariaLabel === arguments[0]);
+field.focus();
+field.select();
+"""
 
 
 @pytest.fixture
@@ -50,7 +58,8 @@ def url(graph: Any, tmp_path: Path) -> str:
     for package, executable in nodes:
         graph.start(package, executable)
     graph.start("der_planner", "planner", default_method="projected")
-    graph.start("der_planner", "page", port=port, drawings=str(tmp_path / "drawings"))
+    graph.start("der_planner", "page", port=port, drawings=str(tmp_path / "drawings"),
+                on_lost_operator="stop")  # fmt: skip
     names = [executable for _, executable in nodes]
     graph.client.wait_ready(["pressure_driver", "planner", "page", *names])
     return f"http://127.0.0.1:{port}/"
@@ -66,7 +75,8 @@ def browser(tmp_path: Path) -> Any:
     options.set_capability("goog:loggingPrefs", {"performance": "ALL"})
     window = webdriver.Chrome(options=options, service=webdriver.ChromeService(CHROMEDRIVER))
     yield window
-    window.quit()
+    with contextlib.suppress(Exception):  # it may have been killed
+        window.quit()
 
 
 def test_a_drawing_is_previewed_played_and_kept(
@@ -106,8 +116,12 @@ def test_a_drawing_is_previewed_played_and_kept(
     browser.find_element("css selector", ".drawing-name input").send_keys("../hand")
     press("save-drawing")
     client.wait_for((tmp_path / "drawings" / "hand.csv").exists, 20.0, "the kept drawing")
-    press("play-drawing")
+    browser.execute_script(SELECT, "Payload [g]")
+    browser.switch_to.active_element.send_keys("20")
+    wait("return page.sketch.load.startsWith('payload=0.02&')", "the load to be reckoned with")
+    press("play-drawing")  # once it is planned anew
     client.wait_for(lambda: topics.PLAN in client.newest, 60.0, "the plan")
+    assert client.newest[topics.PLAN].payload == pytest.approx(0.02)
     client.wait_for(
         lambda: client.newest[topics.PRESSURE_STATE].mode == PressureState.TRACKING,
         20.0,
@@ -121,3 +135,17 @@ def test_a_drawing_is_previewed_played_and_kept(
     ]
     hosts = {urlsplit(address).netloc for address in asked if address.startswith("http")}
     assert hosts == {urlsplit(url).netloc}
+
+    slow = {"offline": False, "latency": 600, "downloadThroughput": 5000, "uploadThroughput": 5000}
+    browser.execute_cdp_cmd("Network.emulateNetworkConditions", slow)
+    wait("return document.querySelector('#view .age').textContent.endsWith('s old')", "the age")
+    assert browser.execute_script(
+        "return page.data.sources.camera.fresh"
+    )  # the way is slow, not it
+
+    signal_browser(browser, signal.SIGKILL)
+    client.wait_for(
+        lambda: client.diagnostic_values("planner").get("reason") == "stopped as asked",
+        30.0,
+        "the planner to stop when the operator's browser is gone",
+    )

@@ -85,7 +85,7 @@ def test_a_disarmed_driver_is_sent_nothing_and_start_plays_once_it_is_armed(rig)
 
     rig.command("early")
     rig.wait(lambda: rig.said("state") == "refused", "the refusal")
-    assert "the driver is DISARMED: call pressure_driver/arm" in rig.said("reason")
+    assert "the driver is DISARMED: arm the driver" in rig.said("reason")
     with pytest.raises(GraphError, match="DISARMED"):
         rig.client.call("planner/start")
     assert not rig.setpoints

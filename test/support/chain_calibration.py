@@ -1,47 +1,18 @@
-"""Limb files and tables of a `LinkChain`, found from its own log as those of any limb are."""
+"""What is known of a `LinkChain` before it is calibrated, and its log as a table."""
 
 from __future__ import annotations
 
-import functools
-import hashlib
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import yaml
-from link_chain import LinkChain, Mass
+from link_chain import Mass
 
-import der_planner
-from der_planner.identification import CalibrationLog, fit
+from der_planner.identification import CalibrationLog
 from der_planner.limb import Limb
 
-CACHE = Path(tempfile.gettempdir()) / "der_limb_link_chains"
 Gravity = tuple[float, float, float]
-
-
-@functools.cache
-def calibrated(
-    seed: int, gravity: Gravity = (0.0, 0.0, 0.0), masses: tuple[Mass, ...] = (), quick: bool = True
-) -> Limb:
-    """Return the limb that `fit` finds from the log of a chain.
-
-    It takes ten seconds; the result is kept on disk for as long as no source of the package and
-    of the chain changes.
-    """
-    digest = hashlib.sha256(repr((seed, gravity, masses, quick)).encode())
-    sources = [*Path(der_planner.__file__).parent.rglob("*.py"), *Path(__file__).parent.glob("*")]
-    for path in sorted(path for path in sources if path.suffix == ".py"):
-        digest.update(path.read_bytes())
-    file = CACHE / f"{digest.hexdigest()[:24]}.yaml"
-    if not file.exists():
-        chain = LinkChain(seed, gravity, masses)
-        limb, _ = fit(prior(gravity, masses), chain.log(quick=quick))
-        CACHE.mkdir(exist_ok=True)
-        partial = file.with_suffix(f".{id(limb)}")
-        limb.to_yaml(partial)
-        partial.replace(file)
-    return Limb.from_yaml(file)
 
 
 def prior(gravity: Gravity = (0.0, 0.0, 0.0), masses: tuple[Mass, ...] = ()) -> Limb:

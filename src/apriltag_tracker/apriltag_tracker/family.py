@@ -1,14 +1,25 @@
-"""Tag families: what a printed tag looks like, and how OpenCV's copy of the family is turned."""
+"""Tag families: what a printed tag looks like, and how OpenCV's copy of the family is turned.
+
+OpenCV knows the codes of the square families. Those of the standard families, whose cells lie on
+both sides of a white border, are in `data/standard_families.npz`: the codes of the AprilTag 3
+library (BSD licence beside it), cell by cell in rows.
+"""
 
 from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+Layout = tuple[int, int]
+"""Cells along the edge of the inner code, and rings of code cells beyond the border's margin."""
+
+_STANDARD_CODES = Path(__file__).parent / "data" / "standard_families.npz"
 
 
 class FamilyError(RuntimeError):
@@ -17,11 +28,15 @@ class FamilyError(RuntimeError):
 
 @dataclass(frozen=True)
 class Family:
-    """A family of tags with a black border one cell wide around a square code.
+    """A family of tags with a border one cell wide around a square code.
+
+    The border is black on white. With an outer ring it is white on black, and beyond the black
+    cells around it lies one more ring of cells that belong to the code. Such tags are read in the
+    negative of a picture, where they have a black border like the others.
 
     Attributes:
         name: as the AprilTag library calls it.
-        code_cells: cells along the edge of the code.
+        code_cells: cells along the edge of the code inside of the border.
         tag_count: how many tags there are.
         hamming: cells in which any two codes differ at least, however they are turned.
         first_code: bits of the printed tag 0, row by row from its upper left, as published.
@@ -30,7 +45,7 @@ class Family:
         explained: share of the pixels' variance above which a pattern is a tag's. A pattern with so
             many other cells that it is not forgiven explains less, however sharp the picture is.
         needs_pattern: the code alone is too weak: the whole pattern must explain the picture, too.
-        dictionary_id: OpenCV's number of the family.
+        dictionary_id: OpenCV's number of the family, None if it has none.
     """
 
     name: str
@@ -42,12 +57,32 @@ class Family:
     most_corrected: int
     explained: float
     needs_pattern: bool
-    dictionary_id: int
+    dictionary_id: int | None
+
+    @property
+    def outer_ring(self) -> bool:
+        """Whether cells around the border belong to the code, and the border is white."""
+        return self.dictionary_id is None
+
+    @property
+    def layout(self) -> Layout:
+        """Where the cells of the code are."""
+        return self.code_cells, int(self.outer_ring)
 
     @property
     def border_cells(self) -> int:
-        """Cells along the edge of the black border; `size` of a tag means these."""
+        """Cells along the edge of the border, which `size` of a tag means."""
         return self.code_cells + 2
+
+    @property
+    def rim(self) -> int:
+        """Cells around the border that belong to the tag: its margin, and an outer ring."""
+        return 1 + int(self.outer_ring)
+
+    @property
+    def sheet_cells(self) -> float:
+        """Cells along the edge of the sheet: half a one more on each side of an outer ring."""
+        return self.border_cells + 2.0 * self.rim + float(self.outer_ring)
 
     @property
     def most_wrong(self) -> int:
@@ -55,66 +90,99 @@ class Family:
         return (self.hamming - 1) // 2
 
     def dictionary(self) -> Any:
-        """Return OpenCV's dictionary of the family."""
-        return cv2.aruco.getPredefinedDictionary(self.dictionary_id)
+        """Return OpenCV's dictionary of the family, or one of a single tag that nobody prints."""
+        if self.dictionary_id is not None:
+            return cv2.aruco.getPredefinedDictionary(self.dictionary_id)
+        cells = np.zeros((self.code_cells,) * 2, dtype=np.uint8)
+        return cv2.aruco.Dictionary(
+            cv2.aruco.Dictionary.getByteListFromBits(cells), self.code_cells, 0
+        )
+
+    def code_mask(self) -> NDArray[np.bool_]:
+        """Tell which cells of a tag with its rim belong to the code, (n, n)."""
+        across = np.arange(self.border_cells + 2 * self.rim)
+        inward = np.minimum(across, across[::-1]) - self.rim
+        ring = np.minimum(inward[:, None], inward[None, :])
+        mask: NDArray[np.bool_] = (ring >= 1) | (ring <= -2)
+        return mask
 
     def codes(self) -> NDArray[np.uint8]:
-        """Return the white (1) and black (0) inner cells of all printed tags, (tags, n, n).
+        """Return the white (1) and black (0) code cells of all printed tags, (tags, cells).
 
-        Row 0 is the upper row of the printed tag. OpenCV stores the codes turned by half a turn.
+        The cells are those of `code_mask`, row by row from the upper left of the printed tag.
         """
         return _codes(self)
 
-    def printed_cells(self, tag: int, margin: int = 1) -> NDArray[np.uint8]:
-        """Return the cells of one printed tag with its black border and white margin.
+    def printed_cells(self, tag: int, margin: int | None = None) -> NDArray[np.uint8]:
+        """Return the cells of one printed tag with its border and what is around it.
 
         Args:
             tag: id within the family.
-            margin: width of the white margin in cells.
+            margin: cells around the border, white beyond the tag's rim; None for the rim alone.
 
         Returns:
             (border_cells + 2 margin,) * 2 array of 0 (black) and 1 (white), upper row first.
 
         Raises:
-            ValueError: no such tag in the family.
+            ValueError: no such tag in the family, or a margin that cuts the rim.
         """
         if not 0 <= tag < self.tag_count:
             raise ValueError(f"tag id {tag}: {self.name} has 0 to {self.tag_count - 1}")
-        cells = np.ones((self.border_cells + 2 * margin,) * 2, dtype=np.uint8)
-        cells[margin : margin + self.border_cells, margin : margin + self.border_cells] = 0
-        inner = slice(margin + 1, margin + 1 + self.code_cells)
-        cells[inner, inner] = self.codes()[tag]
-        return cells
+        beyond = 0 if margin is None else margin - self.rim
+        if beyond < 0:
+            raise ValueError(f"margin of {margin} cells: {self.name} has a rim of {self.rim}")
+        mask = self.code_mask()
+        inside = np.s_[self.rim : -self.rim, self.rim : -self.rim]
+        cells = np.full(mask.shape, 0 if self.outer_ring else 1, dtype=np.uint8)
+        cells[inside] = 1 if self.outer_ring else 0
+        cells[mask] = self.codes()[tag]
+        return np.pad(cells, beyond, constant_values=1)
+
+    def seen_cells(self, tag: int) -> NDArray[np.uint8]:
+        """Return one tag with its rim as it is read: with a black border, in the negative or not.
+
+        Raises:
+            ValueError: no such tag in the family.
+        """
+        cells = self.printed_cells(tag)
+        return 1 - cells if self.outer_ring else cells
 
     def enlarged_tag(self, tag: int, scale: int) -> NDArray[np.uint8]:
-        """Return a perfect picture of a tag without its margin, `scale` px a cell, of 0 and 255."""
-        cells = self.printed_cells(tag, margin=0) * np.uint8(255)
+        """Return a perfect picture of a tag with its rim, `scale` px a cell, of 0 and 255."""
+        cells = self.printed_cells(tag) * np.uint8(255)
         return np.repeat(np.repeat(cells, scale, axis=0), scale, axis=1)
 
     def check_code_of_tag_0(self) -> None:
-        """Compare tag 0 of OpenCV's dictionary with the family's published code.
+        """Compare tag 0 with the family's published code.
 
         Raises:
             FamilyError: they differ, so every yaw would be wrong.
         """
-        bits = self.codes()[0].ravel()
-        value = int("".join(str(bit) for bit in bits), 2)
-        if value != self.first_code:
-            raise FamilyError(
-                f"tag 0 of {self.name} in OpenCV {cv2.__version__} reads {value:#x} and not "
-                f"{self.first_code:#x}: its dictionary is turned in another way than this package "
-                "knows; install opencv-python-headless 4.14 or 5.0"
-            )
+        value = int("".join(str(bit) for bit in self.codes()[0]), 2)
+        if value == self.first_code:
+            return
+        wrong = f"tag 0 of {self.name} reads {value:#x} and not {self.first_code:#x}"
+        if self.dictionary_id is None:
+            raise FamilyError(f"{wrong}: {_STANDARD_CODES} is damaged; install the package again")
+        raise FamilyError(
+            f"{wrong} in OpenCV {cv2.__version__}: its dictionary is turned in another way than "
+            "this package knows; install opencv-python-headless 4.14 or 5.0"
+        )
 
 
 @functools.cache
 def _codes(family: Family) -> NDArray[np.uint8]:
-    size = family.code_cells
-    table = np.empty((family.tag_count, size, size), dtype=np.uint8)
+    if family.dictionary_id is None:
+        count = int(family.code_mask().sum())
+        with np.load(_STANDARD_CODES) as tables:
+            packed = tables[family.name]
+        return np.unpackbits(packed, axis=1, count=count)
+    table = np.empty((family.tag_count, family.code_cells**2), dtype=np.uint8)
     known = family.dictionary()
     for tag in range(family.tag_count):
         stored = cv2.aruco.generateImageMarker(known, tag, family.border_cells)
-        table[tag] = np.rot90(stored[1:-1, 1:-1] > 0, 2)
+        # OpenCV stores the codes turned by half a turn.
+        table[tag] = np.rot90(stored[1:-1, 1:-1] > 0, 2).ravel()
     return table
 
 
@@ -123,6 +191,8 @@ _ALL = (
     Family("tag36h10", 6, 2320, 10, 0x1CA92A687, 1, 1, 0.93, False, cv2.aruco.DICT_APRILTAG_36h10),
     Family("tag25h9", 5, 35, 9, 0x155CBF1, 0, 1, 0.955, True, cv2.aruco.DICT_APRILTAG_25h9),
     Family("tag16h5", 4, 30, 5, 0x231B, 0, 0, 0.95, True, cv2.aruco.DICT_APRILTAG_16h5),
+    Family("tagStandard41h12", 3, 2115, 12, 0x1BC2788B1A4, 2, 2, 0.93, False, None),
+    Family("tagStandard52h13", 4, 48714, 13, 0x406B98AB8AA9A, 3, 4, 0.93, False, None),
 )
 
 FAMILIES = {family.name: family for family in _ALL}
@@ -139,6 +209,6 @@ def named(name: object) -> Family:
         return FAMILIES[name]
     there = ", ".join(FAMILIES)
     why = ""
-    if isinstance(name, str) and name.lower().startswith(("tagstandard", "tagcircle", "tagcustom")):
-        why = "its tags have cells outside of their border, which nothing here reads; "
+    if isinstance(name, str) and name.lower().startswith(("tagcircle", "tagcustom")):
+        why = "its tags are round or have a hole in the middle, which nothing here reads; "
     raise ValueError(f"family '{name}': {why}there are {there}")

@@ -108,7 +108,7 @@ def tag_pages(tags: TagMap, paper: str = "a4") -> list[Page]:
     ]
     entries += [(tag.id, tag.size, "fixed") for tag in tags.world]
     for tag, size, note in entries:
-        sheet = 1e3 * size * (tags.family.border_cells + 2) / tags.family.border_cells
+        sheet = 1e3 * size * tags.family.sheet_cells / tags.family.border_cells
         step = max(sheet, 46.0) + 8.0
         if sheet > width - 2.0 * _MARGIN or sheet > height - 60.0:
             raise SheetError(f"tag {tag} of {1e3 * size:.0f} mm does not fit on {paper} paper")
@@ -164,11 +164,12 @@ def _add_tag(
 ) -> None:
     """Add a tag, `place` being its size and its sheet's left and upper edges [mm]."""
     size, x, y = place
-    cells = family.printed_cells(tag, 1)
+    cells = family.printed_cells(tag)
     cell = size / family.border_cells
+    sheet = cell * family.sheet_cells
+    left, top = (edge + 0.5 * (sheet - cell * len(cells)) for edge in (x, y))
     for column, row, w, h in _black_rectangles(cells == 0):
-        page.rectangles.append((x + column * cell, y + row * cell, w * cell, h * cell))
-    sheet = cell * len(cells)
+        page.rectangles.append((left + column * cell, top + row * cell, w * cell, h * cell))
     page.cuts.append((x, y, sheet, sheet))
     page.labels.append((x, y + sheet + 4.0, 3.2, f"{family.name} {tag}: {size:.1f} mm, {note}"))
     page.labels.append((x, y + sheet + 8.0, 2.6, "right-hand side: along the limb, or along x"))

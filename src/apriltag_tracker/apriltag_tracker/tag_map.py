@@ -32,7 +32,7 @@ class LimbTag:
         id: within the family.
         arc_length: of its centre from the clamp along the centreline [m].
         height: above the base plane [m].
-        size: edge of the black border [m].
+        size: edge of the border, black or white, that the family has [m].
         offset: mounting offset of the centre along and across the limb [m, m] and of its direction
             [rad], against where `arc_length` says it is.
     """

@@ -4,7 +4,6 @@ NAMESPACE = "limb"
 
 COMMAND = "command"
 PATH = "path"
-NEAREST_PATH = "nearest_path"
 PLAN = "plan"
 PRESSURE_SETPOINT = "pressure_setpoint"
 TIP_REFERENCE = "tip_reference"

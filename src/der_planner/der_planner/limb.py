@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -142,6 +144,19 @@ class Limb:
         return self.base_length + sum(segment.length for segment in self.segments) + connectors
 
     @property
+    def mass(self) -> float:
+        """What a scale shows from the clamp on, everything that the limb carries included [kg]."""
+        return self._own_mass + sum(item.mass for item in self.masses)
+
+    @property
+    def _own_mass(self) -> float:
+        """The distributed mass: base, segments and connectors [kg]."""
+        densities = [segment.mass_per_length for segment in self.segments]
+        own = densities[0] * self.base_length
+        own += sum(s.mass_per_length * s.length for s in self.segments)
+        return own + self.connector_length * sum(0.5 * (a + b) for a, b in pairwise(densities))
+
+    @property
     def static_gain(self) -> NDArray[np.float64]:
         """(M,) `Segment.static_gain` [rad/Pa]."""
         return np.array([segment.static_gain for segment in self.segments])
@@ -153,6 +168,34 @@ class Limb:
         if model == "der" or not self.pcc_segments:
             return self
         return dataclasses.replace(self, segments=self.pcc_segments, pcc_segments=())
+
+    def weighing(self, mass: float) -> Limb:
+        """Return the limb with as much mass per length as makes it weigh this much.
+
+        Its `masses` are part of what was weighed and stay; the rest is spread as it was.
+
+        Args:
+            mass: from the clamp on, fittings, tubes and tags included, without a payload [kg].
+
+        Raises:
+            LimbError: it is not a number, or the limb's `masses` alone are as heavy.
+        """
+        fittings = sum(item.mass for item in self.masses)
+        if not math.isfinite(mass) or mass <= fittings:
+            raise LimbError(
+                f"the limb is said to weigh {mass:g} kg: it must be more than the {fittings:g} kg "
+                "of its masses, which are part of it"
+            )
+        factor = (mass - fittings) / self._own_mass
+
+        def scaled(segments: tuple[Segment, ...]) -> tuple[Segment, ...]:
+            return tuple(
+                dataclasses.replace(s, mass_per_length=factor * s.mass_per_length) for s in segments
+            )
+
+        return dataclasses.replace(
+            self, segments=scaled(self.segments), pcc_segments=scaled(self.pcc_segments)
+        )
 
     def carrying(self, payload: float, at: float | None = None, name: str = PAYLOAD) -> Limb:
         """Return the limb with one more mass.
@@ -171,13 +214,20 @@ class Limb:
         place = self.length if at is None else float(at)
         if 0 < place - self.length <= BEYOND_THE_TIP:
             place = self.length
+        if not place >= 0:
+            raise LimbError(f"the {name}'s arc_length must be at least 0 m, got {place}")
+        if place > self.length * (1 + 1e-9):
+            raise LimbError(
+                f"the {name}'s arc_length must be at most the limb's length of "
+                f"{self.length:.6g} m, got {place}"
+            )
         mass = PointMass(place, float(payload), name)
         return dataclasses.replace(self, masses=(*self.masses, mass))
 
     @property
     def payload(self) -> tuple[float, float]:
         """What only this run carries: its mass [kg], and where along the limb [m]; 0 is the tip."""
-        for item in self.masses:
+        for item in reversed(self.masses):  # `carrying` puts it last
             if item.name == PAYLOAD:
                 at_tip = item.arc_length >= self.length * (1 - 1e-9)
                 return item.mass, 0.0 if at_tip else item.arc_length

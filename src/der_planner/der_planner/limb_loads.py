@@ -24,6 +24,9 @@ from der_planner.limb_declaration import LimbError, parameter
 GRAVITY = 9.81
 """Of the earth [m/s²]."""
 _SAME_GRAVITY = 1e-6
+_ROUNDING = 1e-12
+MOST_TILT = 180.0
+"""Of a plate about the straight limb, either way [degrees]."""
 MOUNTINGS = {
     "horizontal": (0.0, 0.0, 0.0),
     "hanging": (GRAVITY, 0.0, 0.0),
@@ -75,7 +78,7 @@ def gravity_of(mounting: str) -> tuple[float, float, float]:
     """Return gravity in `limb_base` [m/s²] of a mounting, see the module.
 
     Raises:
-        LimbError: neither a name in `MOUNTINGS` nor a finite number of degrees.
+        LimbError: neither a name in `MOUNTINGS` nor degrees of −180 to 180.
     """
     text = str(mounting).strip()
     if text in MOUNTINGS:
@@ -84,9 +87,12 @@ def gravity_of(mounting: str) -> tuple[float, float, float]:
         degrees = float(text)
     except ValueError:
         degrees = math.nan
-    if not math.isfinite(degrees):
+    if not -MOST_TILT <= degrees <= MOST_TILT:
         raise LimbError(
-            f"mounting '{mounting}' is unknown: choose {', '.join(MOUNTINGS)}, or degrees by which "
-            "the plane of motion is tilted about the straight limb"
+            f"mounting '{mounting}' is unknown: choose {', '.join(MOUNTINGS)}, or degrees of "
+            f"{-MOST_TILT:g} to {MOST_TILT:g} by which the plane of motion is tilted about the "
+            "straight limb"
         )
-    return (0.0, -GRAVITY * math.sin(math.radians(degrees)), 0.0)
+    pull = GRAVITY * math.sin(math.radians(degrees))
+    # 180 degrees are level, whatever the sine of a rounded π is.
+    return (0.0, -pull if abs(pull) > _ROUNDING else 0.0, 0.0)

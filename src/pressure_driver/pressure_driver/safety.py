@@ -160,7 +160,7 @@ class SafetyMachine:
         self._latched = True
         self._vent_since = now
         self._enter(Mode.VENTING)
-        return True, "venting; call arm to go on"
+        return True, "venting; arm to go on"
 
     def offer(
         self, setpoint: Setpoint, wall: int, now: float, origin: Origin | None = None

@@ -49,11 +49,44 @@ def test_mounting_stays_in_the_limb_file_and_payload_does_not(table, monkeypatch
     assert run(check_limb, *later, "--mounting", "0", monkeypatch=monkeypatch) == 3
 
 
+def test_what_a_scale_shows_sets_the_scale_of_the_limb_file(table, monkeypatch, capsys):
+    """Stiffness and gain follow the mass; a log of shapes and pressures shows their ratios only."""
+    rows = (table / "log.csv").read_text().splitlines()
+    (table / "short.csv").write_text("\n".join(rows[: 20 * 14]))
+    given = ("--csv", table / "short.csv", "--columns", table / "columns.yaml")
+    given += ("--terms", "dynamics")
+    given += ("--mounting", "hanging", "--payload", 0.05, "--payload-at", 0.2)
+    heavier = 1.15 * Limb.default().mass
+    found = {}
+    for name, more in (("prior", ()), ("weighed", ("--mass", heavier))):
+        out = table / f"{name}.yaml"
+        assert run(calibrate_limb, *given, *more, "--out", out, monkeypatch=monkeypatch) == 0
+        found[name] = Limb.from_yaml(out), capsys.readouterr().out
+    (prior, unweighed), (limb, said) = found.values()
+    assert "as in the prior: it was not weighed (--mass KG)" in unweighed
+    assert f"the limb weighs {1000 * limb.mass:.0f} g in its file, by --mass" in said
+    assert limb.mass == pytest.approx(heavier, rel=0.011)
+    assert limb.provenance["weighed_kg"] == pytest.approx(heavier)
+    # The payload on both is the same 50 g: what the scale changes is a little less than 15 %.
+    for before, after in zip(prior.segments, limb.segments, strict=True):
+        assert 1.06 < after.bending_stiffness / before.bending_stiffness < 1.16
+        assert 1.06 < after.moment_gain / before.moment_gain < 1.16
+
+
 def test_loads_that_cannot_be_are_refused(table, monkeypatch, capsys):
     given = ("--csv", table / "log.csv", "--columns", table / "columns.yaml")
     for wrong, reason in (
         (("--mounting", "upside"), "mounting 'upside' is unknown"),
         (("--payload", 0.05, "--payload-at", 0.7), "at most the limb's length"),
+        (("--payload", 20), "--payload is 20.0 kg: choose 0 to 10; 20 g are 0.02"),
+        (("--payload", "nan"), "--payload is nan kg"),
+        (("--payload-at", 0.1), "give --payload, too"),
+        (("--payload", 0.05, "--payload-at", -0.1), "--payload-at is -0.1 m"),
+        (("--mass", 310), "--mass is 310.0 kg: choose 0.001 to 10; 310 g are 0.31"),
+        (("--mass", 0.3, "--fit-mass"), "choose one of the two"),
     ):
         assert run(calibrate_limb, *given, *wrong, monkeypatch=monkeypatch) != 0
         assert reason in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        run(calibrate_limb, *given, "--payload", 0.05, "--payload", 0.02, monkeypatch=monkeypatch)
+    assert "--payload: given twice" in capsys.readouterr().err

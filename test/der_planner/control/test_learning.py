@@ -1,5 +1,6 @@
 """Learning from run to run, on limbs that are not the one of the plan."""
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -36,8 +37,9 @@ def first():
     return plan(LIMB, Motion.named("same_direction", period=12.0, cycles=1), method="optimal")
 
 
-def learn(first, limb, runs):
-    learner, planned, errors = Learner(first), first, []
+def learn(first, limb, runs, before=None):
+    """Learn from runs on a limb, after those that ``before`` has learned from."""
+    learner, planned, errors = copy.deepcopy(before) or (Learner(first), first, [])
     for _ in range(runs):
         tip = play(planned, limb)
         errors.append(mean_error(planned, tip))
@@ -55,8 +57,19 @@ def check_limits(planned):
 
 
 @pytest.fixture(scope="module")
-def learned(first):
-    return learn(first, other_limb(), 3)
+def two_runs(first):
+    return learn(first, other_limb(), 2)
+
+
+@pytest.fixture
+def learned_twice(two_runs):
+    """Return learner, next plan and errors after two runs, to go on with."""
+    return copy.deepcopy(two_runs)
+
+
+@pytest.fixture(scope="module")
+def learned(first, two_runs):
+    return learn(first, other_limb(), 1, two_runs)
 
 
 def test_the_error_of_a_rod_with_less_gain_falls_by_more_than_five(learned):
@@ -73,9 +86,9 @@ def test_what_is_expected_of_the_next_plan_comes_true(learned):
     assert gap < 5e-4
 
 
-def test_the_same_runs_give_the_same_plan(first):
-    one, two = (learn(first, other_limb(), 1)[1] for _ in range(2))
-    assert np.array_equal(one.differential_pressure, two.differential_pressure)
+def test_the_same_runs_give_the_same_plan(first, two_runs):
+    again = learn(first, other_limb(), 2)[1]
+    assert np.array_equal(again.differential_pressure, two_runs[1].differential_pressure)
 
 
 def test_a_chain_of_links_that_was_never_calibrated_is_learned_in_two_runs():
@@ -159,8 +172,8 @@ def test_a_run_that_saw_hardly_anything_is_refused(first, learned):
         assert learner.next() is first
 
 
-def test_another_limb_is_set_aside_once_and_then_learned_from_the_start(first):
-    learner, planned, errors = learn(first, other_limb(), 2)
+def test_another_limb_is_set_aside_once_and_then_learned_from_the_start(learned_twice):
+    learner, planned, errors = learned_twice
     swapped = other_limb(gain=0.65, rest=-0.05)
     learner.add(planned.time, play(planned, swapped))
     assert not learner.history[-1].accepted
@@ -175,16 +188,16 @@ def test_another_limb_is_set_aside_once_and_then_learned_from_the_start(first):
     assert mean_error(after, play(after, swapped)) < mean_error(again, tip) / 2
 
 
-def test_one_strange_run_is_forgotten(first):
-    learner, planned, _ = learn(first, other_limb(), 2)
+def test_one_strange_run_is_forgotten(learned_twice):
+    learner, planned, _ = learned_twice
     learner.add(planned.time, play(planned, other_limb(rest=-0.1)))
     again = learner.next()
     learner.add(again.time, play(again, other_limb()))
     assert [run.accepted for run in learner.history] == [True, True, False, True]
 
 
-def test_a_worse_plan_is_left_for_the_best_with_a_smaller_step(first):
-    learner, planned, errors = learn(first, other_limb(), 2)
+def test_a_worse_plan_is_left_for_the_best_with_a_smaller_step(first, learned_twice):
+    learner, planned, errors = learned_twice
     best = planned.differential_pressure
     learner.add(planned.time, play(planned, other_limb()))
     worse = 0.97 * best
@@ -244,8 +257,8 @@ def test_a_limb_far_from_its_file_is_used_since_it_moves_with_its_commands(first
     assert errors[1] < errors[0] / 20
 
 
-def test_a_strange_limb_swapped_in_between_is_learned_from_the_start(first):
-    learner, planned, _ = learn(first, other_limb(), 2)
+def test_a_strange_limb_swapped_in_between_is_learned_from_the_start(learned_twice):
+    learner, planned, _ = learned_twice
     strange, errors = other_limb(gain=1.7, rest=0.2), []
     for _ in range(3):
         tip = play(planned, strange)

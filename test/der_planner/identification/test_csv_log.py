@@ -57,7 +57,8 @@ def test_gaps_are_bridged_up_to_a_length(table):
     [
         ({"angles": ("phi",)}, "no column 'phi'"),
         ({"chambers": ("a",)}, "needs 1 commands and 2 chambers"),
-        ({"pressure_unit": "bar"}, "pressure_unit is 'bar'"),
+        ({"pressure_unit": "atm"}, "pressure_unit is 'atm'"),
+        ({"time_unit": "h"}, "time_unit is 'h'"),
         ({"rest_until": 0.3, "commanded": ("t",), "ignore": ()}, None),
     ],
 )
@@ -80,10 +81,72 @@ def test_map_files(tmp_path):
         ColumnMap.from_yaml(tmp_path / "nothing.yaml")
 
 
+@pytest.mark.parametrize(
+    ("line", "named"),
+    [
+        ("time: [t]", "time is"),
+        ("chambers: a", "chambers is 'a', give a list"),
+        ("angle_factor: '2'", "angle_factor is '2', give a number"),
+        ("ignore: [1, 2]", "ignore is .* pairs of times"),
+        ("tip: [x]", "tip is .* x and y"),
+    ],
+)
+def test_values_of_another_kind_in_a_map_are_named(tmp_path, line, named):
+    path = tmp_path / "columns.yaml"
+    keys = {"time": "t", "commanded": "[u]", "chambers": "[a, b]", "angles": "[theta]"}
+    key, value = line.split(": ", 1)
+    path.write_text("".join(f"{k}: {v}\n" for k, v in {**keys, key: value}.items()))
+    with pytest.raises(LogError, match=named):
+        ColumnMap.from_yaml(path)
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        ROWS.replace("\n", "\r\n").encode(),
+        b"\xef\xbb\xbf" + ROWS.encode(),
+        ROWS.encode("utf-16"),
+        ("# rig 3, Tuesday\n" + ROWS + "\n\n").encode(),
+        ROWS.replace(",", ";").replace(".", ",").encode(),
+        ROWS.replace(",", "\t").encode(),
+        "\n".join(",".join(f'"{v}"' for v in row.split(",")) for row in ROWS.split()).encode(),
+        "".join(f"{row},{'20' if n else 'T [°C]'}\n" for n, row in enumerate(ROWS.split())).encode(
+            "cp1252"
+        ),
+        (ROWS + "0.5,40,10").encode(),
+    ],
+    ids=["crlf", "bom", "utf16", "comment", "semicolon", "tabs", "quotes", "cp1252", "cut-short"],
+)  # fmt: skip
+def test_tables_of_other_programs_are_read_alike(tmp_path, table, written):
+    expected = read_csv(table, ColumnMap(**COLUMNS))
+    (tmp_path / "other.csv").write_bytes(written)
+    found = read_csv(tmp_path / "other.csv", ColumnMap(**COLUMNS))
+    np.testing.assert_allclose(found.time, expected.time)
+    np.testing.assert_allclose(found.measured_differential, expected.measured_differential)
+    np.testing.assert_allclose(found.bend_angles, expected.bend_angles)
+
+
+def test_rows_need_a_time_of_their_own(tmp_path, table):
+    (tmp_path / "ms.csv").write_text(
+        ROWS.replace("0.1,0,", ",0,").replace("0.3,40", "0.2,40").replace("0.4,40", "400,40")
+    )
+    log = read_csv(tmp_path / "ms.csv", ColumnMap(**{**COLUMNS, "time_unit": "ms"}))
+    np.testing.assert_allclose(log.time, [0.0, 0.2e-3, 0.4])
+    (tmp_path / "two.csv").write_text(ROWS + ROWS.split("\n", 1)[1])
+    with pytest.raises(LogError, match=r"falls from 0\.4 s to 0 s: is it more than one run"):
+        read_csv(tmp_path / "two.csv", ColumnMap(**COLUMNS))
+
+
 def test_damaged_tables_are_refused(tmp_path):
     path = tmp_path / "bad.csv"
     path.write_text("t,u\n0,x\n1,2\n")
-    with pytest.raises(LogError, match="no number"):
+    with pytest.raises(LogError, match=r"line 2, column 'u' of .* is 'x', which is no number"):
+        read_csv(path, ColumnMap(**COLUMNS))
+    path.write_text("t,u\n0,1,2\n1,2\n")
+    with pytest.raises(LogError, match=r"line 2 of .* has 3 columns, its header has 2"):
+        read_csv(path, ColumnMap(**COLUMNS))
+    path.write_text("t,u,u\n0,1,2\n1,2,3\n")
+    with pytest.raises(LogError, match="two columns 'u'"):
         read_csv(path, ColumnMap(**COLUMNS))
     path.write_text("t,u\n")
     with pytest.raises(LogError, match="fewer than two rows"):

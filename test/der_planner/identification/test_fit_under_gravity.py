@@ -71,6 +71,20 @@ def test_a_payload_that_was_not_on_the_limb_when_it_was_calibrated_is_carried():
     assert error.mean() < 0.0025
 
 
+def test_lengths_that_are_far_off_are_named_in_place_of_a_traceback():
+    limb = Limb.default().mounted("hanging")
+    long = tuple(replace(segment, length=1.35 * segment.length) for segment in limb.segments)
+    pressure = waves(12_000.0, 2, 12.0)
+    time = 0.05 * np.arange(len(pressure))
+    log = LinkChain(3, gravity_of("hanging")).play(time, pressure, 20.0).log()
+    _, report = fit(replace(limb, segments=long), log, terms=())
+    assert "segment 1 is given as 165 mm and was found to be 132 mm or less" in report.text()
+    assert "limb file of --prior" in report.text()
+    for factor, shift in ((1000.0, 0.0), (0.01, 0.0), (1.0, 0.4)):
+        with pytest.raises(LogError, match=r"check the tips' unit .* and origin"):
+            fit(limb, replace(log, tip=factor * log.tip + shift), terms=())
+
+
 def test_tips_tell_how_much_of_a_bend_is_the_weights():
     limb = with_geometry(Limb.default().mounted("sideways"), np.array([0.12, 0.12]), 4e-3, 1e-3)
     pressure = waves(16_800.0, 2, 15.0)

@@ -49,6 +49,26 @@ def test_a_payload_of_nothing_changes_nothing_and_one_off_the_limb_is_refused():
     assert base.carrying(0.01).for_model("pcc").masses == base.carrying(0.01).masses
 
 
+def test_a_limb_weighs_what_the_scale_says_with_its_fittings():
+    limb = dataclasses.replace(LIMB, base_length=0.01, connector_length=0.004)
+    limb = limb.carrying(0.045, 0.13, name="valve")
+    heavier = limb.weighing(0.36)
+    assert heavier.mass == pytest.approx(0.36)
+    assert heavier.masses == limb.masses
+    factors = [
+        new.mass_per_length / old.mass_per_length
+        for new, old in zip(heavier.segments, limb.segments, strict=True)
+    ]
+    assert factors == pytest.approx([(0.36 - 0.045) / (limb.mass - 0.045)] * 2)
+    for wrong in (0.045, 0.0, -0.3, float("nan"), float("inf")):
+        with pytest.raises(LimbError, match=r"more than the 0\.045 kg of its masses"):
+            limb.weighing(wrong)
+
+
+def test_the_payload_is_the_run_s_even_where_a_file_has_a_mass_of_that_name():
+    assert LIMB.carrying(0.01, 0.1).carrying(0.02).payload == (0.02, 0.0)
+
+
 def test_mountings_say_where_gravity_points():
     assert gravity_of("hanging") == (GRAVITY, 0.0, 0.0)
     assert gravity_of("standing") == (-GRAVITY, 0.0, 0.0)
@@ -57,6 +77,7 @@ def test_mountings_say_where_gravity_points():
     np.testing.assert_allclose(gravity_of("10"), (0.0, -1.7035, 0.0), atol=1e-4)
     np.testing.assert_allclose(gravity_of("-10.0"), (0.0, 1.7035, 0.0), atol=1e-4)
     assert LIMB.mounted("0").gravity == pytest.approx((0.0, 0.0, 0.0))
-    for wrong in ("upside down", "nan", "inf", ""):
+    assert not any(gravity_of("180.0"))
+    for wrong in ("upside down", "nan", "inf", "", "370", "-181"):
         with pytest.raises(LimbError, match="choose horizontal, hanging, standing, sideways"):
             gravity_of(wrong)

@@ -14,13 +14,14 @@ from apriltag_tracker.camera import CameraPose, Intrinsics
 from apriltag_tracker.camera.pinhole import project
 from apriltag_tracker.detection.tag import Tag
 from apriltag_tracker.tag_map import TagMap
-from der_planner.limb import Limb
+from der_planner.limb import Limb, LimbError
 from der_planner.model.bending import ArcKinematics
+from der_planner.page.commands import Load
 from der_planner.page.drawing.kept import DrawingError, Drawings
 from der_planner.page.drawing.preview import Previewer, preview
 from der_planner.page.drawing.region import reachable_region
 from der_planner.page.drawing.sketch import summary
-from der_planner.page.drawing.studio import drawn_pixels
+from der_planner.page.drawing.studio import Studio, drawn_pixels
 from der_planner.page.overlay import Overlay
 from der_planner.page.situation import LimbView
 from der_planner.planning import PathLimits
@@ -93,6 +94,21 @@ def test_pixels_become_metres_where_they_are_drawn() -> None:
     assert "tracker" in far["problem"]
 
 
+def test_a_load_decides_what_is_reached_and_what_draws(tmp_path: Path) -> None:
+    studio = Studio(LIMB, PathLimits(), tmp_path, carried=Load(0.01))
+    assert studio.limb_under(Load()) == LIMB.carrying(0.01)
+    assert studio.limb_under(Load(0.02, 0.1, "hanging")) == LIMB.mounted("hanging").carrying(
+        0.02, 0.1
+    )
+    assert studio.limb_under(Load(0.0, 0.1, "90")).payload == (0.01, 0.0)  # as the planner has it
+    lying, sideways = (studio.region(Load(0.03, 0.0, name)) for name in ("", "sideways"))
+    height = [np.ptp(np.vstack(outlines)[:, 1]) for outlines in (lying, sideways)]
+    assert height[1] < 0.9 * height[0]  # the weight is lifted on one side
+    assert studio.region(Load(0.03)) is studio.region(Load(0.03))
+    with pytest.raises(LimbError, match="mass"):
+        studio.limb_under(Load(0.02, 9.0))
+
+
 @pytest.mark.parametrize(
     "sent",
     [None, [], "line", [[1, 2]], [[1, 2], [3]], [[1, 2], [3, None]], [[1, 2], [3, 1e400]],
@@ -104,11 +120,11 @@ def test_what_is_no_drawing_is_refused(sent: object) -> None:
 
 
 def test_a_preview_is_planned_in_another_process() -> None:
-    previewer = Previewer(LIMB, PathLimits())
+    previewer = Previewer(PathLimits())
     turn = np.linspace(0, 2 * np.pi, 40)
     ring = ARCS.tip([0.9, 0.9]) + 0.03 * np.column_stack([np.cos(turn), np.sin(turn)])
     try:
-        found = previewer.ask(ring, "pcc", "paper").result(timeout=120)
+        found = previewer.ask(LIMB, ring, "pcc", "paper").result(timeout=120)
     finally:
         previewer.close()
     assert not found.problem

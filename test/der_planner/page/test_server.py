@@ -21,7 +21,7 @@ from apriltag_tracker.tag_map import LimbTag, TagMap
 from der_planner.limb import Limb
 from der_planner.page.access import Binding, Sessions
 from der_planner.page.afterwards.experiments import Experiments
-from der_planner.page.commands import Answer, MotionRequest, Service
+from der_planner.page.commands import Answer, Conditions, MotionRequest, Service
 from der_planner.page.drawing.studio import Studio
 from der_planner.page.guard import Guard
 from der_planner.page.operators import Desk
@@ -60,7 +60,7 @@ class Calls:
     def fill(self, segment: int, side: int, pressure: float) -> Answer:
         raise NotImplementedError
 
-    def play_path(self, tip: Any) -> Answer:
+    def play_path(self, tip: Any, conditions: Conditions) -> Answer:
         return Answer(True, "path")
 
     def learned_plans(self) -> list[str]:
@@ -152,9 +152,29 @@ def test_answers_forbid_frames_and_other_machines(rig: Rig) -> None:
 
 
 def test_live_data_come_ten_times_a_second(rig: Rig) -> None:
+    counts = []
     with rig.client(origin=ORIGIN).websocket_connect(SOCKET + "/live") as live:
-        counts = [live.receive_json()["count"] for _ in range(5)]
+        begun = time.monotonic()
+        for _ in range(5):
+            live.send_text("7.5")
+            counts.append(live.receive_json()["count"])
+        assert time.monotonic() - begun >= 0.39
     assert counts == sorted(set(counts))
+
+
+def test_data_do_not_pile_up_on_a_slow_way_and_tell_their_age(rig: Rig) -> None:
+    with rig.client(origin=ORIGIN).websocket_connect(SOCKET + "/live") as live:
+        for odd in ("", "now", "nan", "1e999"):
+            live.send_text(odd)  # no time, no answer
+        live.send_text("12.5")
+        first = live.receive_json()
+        time.sleep(0.35)  # three intervals during which the window does not ask
+        live.send_text("100.25")
+        begun = time.monotonic()
+        second = live.receive_json()
+    assert (first["asked"], second["asked"]) == (12.5, 100.25)
+    assert second["count"] == first["count"] + 1
+    assert 0.0 <= second["waited"] <= time.monotonic() - begun
 
 
 def test_a_driver_that_does_not_answer_is_no_vent(

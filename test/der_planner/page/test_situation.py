@@ -172,10 +172,3 @@ def test_a_plan_says_what_it_reckons_with(situation: Situation) -> None:
     for part in ("opposite", "'mine'", "hanging", "20 g at 12.0 cm", "0.31 cm"):
         assert part in said
     assert "carrying" not in str(PlanView("a", "pcc", "paper", "mine", "horizontal", 0.0, 0.0, 0.0))
-
-
-def test_remedies_name_the_buttons_of_the_page(situation: Situation) -> None:
-    status = "refused: the driver is DISARMED: call pressure_driver/arm, then planner/start"
-    situation.put_status(NodeStatus("/limb/planner", 1, status))
-    (node,) = situation.snapshot()["nodes"]
-    assert node["message"].endswith("press Arm, then Play last plan again")

@@ -123,11 +123,42 @@ def test_a_payload_that_cannot_be_lifted_is_refused_with_what_could_be(model):
         plan(limb.carrying(1.1 * error.possible_mass), motion, model, "projected")
 
 
+def test_a_payload_far_too_heavy_is_named_where_the_limb_cannot_even_take_the_shape():
+    motion = Motion.named("asynchronous", 0.35, 8.0, 1)
+    with pytest.raises(OverloadError, match=r"It carries 500\.0 g: 1\d\d\.\d g are possible"):
+        plan(LIMB.mounted("hanging").carrying(0.5), motion, "der", "projected")
+    with pytest.raises(PlanningError, match=r"out of reach.*It carries 2000\.0 g: carry less"):
+        plan(LIMB.mounted("sideways").carrying(2.0), motion, "der", "projected")
+
+
+def test_arcs_that_rest_elsewhere_or_know_nothing_of_a_sag_say_so():
+    motion = Motion.named("asynchronous", 0.2, 20.0, 1)
+    for method in METHODS["pcc"]:
+        said = plan(LIMB.mounted("sideways").carrying(0.05), motion, "pcc", method).warnings
+        assert any("mm off, since it rests elsewhere than the limb" in text for text in said)
+        assert not any("a longer period" in text for text in said if "misses the" in text)
+        assert not any("the limits leave" in text for text in said)
+    level = dataclasses.replace(LIMB, gravity=(0.0, 0.0, -GRAVITY))
+    with pytest.raises(PlanningError, match=r"plan with the rod \(der\)"):
+        plan(level, motion, "pcc", "projected")
+
+
 def test_a_weight_of_its_own_that_is_too_much_is_named_so():
-    with pytest.raises(OverloadError, match=r"Without the 50\.0 g that it carries it is too much"):
+    with pytest.raises(OverloadError, match=r"Even without the 50\.0 g that it carries"):
         plan(LIMB.mounted("hanging").carrying(0.05), Motion.named("same_direction", 0.79, 8.0, 1))
     with pytest.raises(PlanningError, match="out of reach"):
         plan(LIMB.mounted("hanging"), Motion.from_tip_path(None, [[0.3, 0.0], [0.3, 0.1]]))
+
+
+def test_a_limb_that_hardly_stands_says_so():
+    motion = Motion.named("same_direction", 0.1, 6.0, 1)
+    for factor, share in ((1.16, "96 %"), (1.3, "")):
+        limb = stiffer(LIMB, factor).mounted("standing")
+        said = [
+            text for text in plan(limb, motion, "der", "projected").warnings if "buckle" in text
+        ]
+        assert len(said) == (1 if share else 0)
+        assert all(f"stands under {share} of the load" in text for text in said)
 
 
 def test_a_standing_limb_beyond_its_critical_load_is_refused_by_name():

@@ -35,7 +35,7 @@ def beam_tip(hardware, gravity, payload: float = 0.0, at: float = 0.244):
         [hardware.base_fitting, first.flexible_length, hardware.connector,
          second.flexible_length, hardware.tip_fitting]
     )  # fmt: skip
-    count = 4000
+    count = 1000
     step = ends[-1] / count
     middle = (np.arange(count) + 0.5) * step
 

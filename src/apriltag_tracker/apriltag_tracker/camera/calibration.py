@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apriltag_tracker.camera.pinhole import Intrinsics
-from apriltag_tracker.detection.detector import Detector, grey
+from apriltag_tracker.detection.detector import Detector
+from apriltag_tracker.detection.picture import grey
 from apriltag_tracker.pipeline import LimbTracker
 from apriltag_tracker.sheets import BoardLayout
 from apriltag_tracker.tag_map import LimbTag, TagMap

@@ -2,7 +2,7 @@
 
 Cells are sampled at their centres, sharpened against their neighbours, and compared with a
 threshold half-way between two planes: one through the white margin, one through the black border,
-so that uneven light does not matter.
+so that uneven light does not matter. A family with a white border is read in the negative.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from apriltag_tracker.detection.edges import inside, sample
-from apriltag_tracker.family import Family
+from apriltag_tracker.family import Family, Layout
 
 SHARPENING = 0.25
 """Share of the difference between a cell and its neighbours that is added to it."""
@@ -31,12 +31,13 @@ def code_table(family: Family) -> NDArray[np.uint64]:
     Row r holds what is read when the corners start r corners late: at the printed lower right for
     r = 1, and so on counter-clockwise.
     """
-    bits = family.code_cells**2
+    mask, codes = family.code_mask(), family.codes()
+    bits = codes.shape[1]
     weights = np.uint64(1) << np.arange(bits - 1, -1, -1, dtype=np.uint64)
+    cells = np.zeros((len(codes), *mask.shape), dtype=np.uint8)
+    cells[:, mask] = 1 - codes if family.outer_ring else codes
     rows = [
-        (np.rot90(family.codes(), -turn, axes=(1, 2)).reshape(-1, bits) * weights).sum(
-            axis=1, dtype=np.uint64
-        )
+        (np.rot90(cells, -turn, axes=(1, 2))[:, mask] * weights).sum(axis=1, dtype=np.uint64)
         for turn in range(4)
     ]
     return np.ascontiguousarray(rows)
@@ -66,16 +67,19 @@ def square_to_quad(c: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def _sample_cells(
-    image: NDArray[np.uint8], corners: NDArray[np.float64], values: NDArray[np.float64]
+    image: NDArray[np.uint8],
+    corners: NDArray[np.float64],
+    rim: int,
+    values: NDArray[np.float64],
 ) -> bool:
-    """Sample the n x n cells of a tag with its margin; row 0 is the upper one."""
+    """Sample the n x n cells of a tag, `rim` of them outside of its border; row 0 is the upper."""
     h = square_to_quad(corners)
     grid = len(values)
-    border = grid - 2.0
+    border = grid - 2.0 * rim
     for row in range(grid):
-        v = 1.0 - (row - 0.5) / border
+        v = 1.0 - (row + 0.5 - rim) / border
         for column in range(grid):
-            u = (column - 0.5) / border
+            u = (column + 0.5 - rim) / border
             w = h[6] * u + h[7] * v + 1.0
             x = (h[0] * u + h[1] * v + h[2]) / w
             y = (h[3] * u + h[4] * v + h[5]) / w
@@ -105,62 +109,71 @@ def _ring_plane(values: NDArray[np.float64], ring: int) -> tuple[float, float, f
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
+def _sharpened(values: NDArray[np.float64], row: int, column: int) -> float:
+    """Return a cell with more of its difference from its four neighbours; the last have fewer."""
+    last = len(values) - 1
+    value = values[row, column]
+    neighbours = values[max(row - 1, 0), column] + values[min(row + 1, last), column]
+    neighbours += values[row, max(column - 1, 0)] + values[row, min(column + 1, last)]
+    return float(value + SHARPENING * (4.0 * value - neighbours))
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
 def read_code(
-    image: NDArray[np.uint8], corners: NDArray[np.float64], code_cells: int
+    image: NDArray[np.uint8], corners: NDArray[np.float64], layout: Layout
 ) -> tuple[bool, np.uint64]:
     """Read the cells of one tag's code as an integer, upper left cell first.
 
     Args:
         image: grey image.
         corners: (4, 2) px, counter-clockwise as printed; the first is taken for the lower left.
-        code_cells: along the edge of the code.
+        layout: of the family.
 
     Returns:
         Whether there is a tag (white margin, black border, contrast), and the code.
     """
-    grid = code_cells + 4
+    code_cells, outer = layout
+    grid = code_cells + 4 + 2 * outer
     middle = 0.5 * (grid - 1)
     values = np.empty((grid, grid))
     code = np.uint64(0)
-    if not _sample_cells(image, corners, values):
+    if not _sample_cells(image, corners, 1 + outer, values):
         return False, code
-    white, white_row, white_column = _ring_plane(values, 0)
-    black, black_row, black_column = _ring_plane(values, 1)
+    white, white_row, white_column = _ring_plane(values, outer)
+    black, black_row, black_column = _ring_plane(values, outer + 1)
     if white - black < _LEAST_CONTRAST:
         return False, code
     mean = 0.5 * (white + black)
     slope_row, slope_column = 0.5 * (white_row + black_row), 0.5 * (white_column + black_column)
     wrong = 0
-    for row in range(1, grid - 1):
-        for column in range(1, grid - 1):
+    for row in range(grid):
+        for column in range(grid):
+            ring = min(row, column, grid - 1 - row, grid - 1 - column)
             threshold = mean + slope_row * (row - middle) + slope_column * (column - middle)
-            value = values[row, column]
-            if row in {1, grid - 2} or column in {1, grid - 2}:
-                wrong += value > threshold
-                continue
-            neighbours = values[row - 1, column] + values[row + 1, column]
-            neighbours += values[row, column - 1] + values[row, column + 1]
-            value += SHARPENING * (4.0 * value - neighbours)
-            code = (code << np.uint64(1)) | np.uint64(value > threshold)
+            if ring == outer + 1:
+                wrong += values[row, column] > threshold
+            elif ring != outer:
+                bright = _sharpened(values, row, column) > threshold
+                code = (code << np.uint64(1)) | np.uint64(bright)
     # One cell of 14 of the border may be wrong.
     return wrong <= 4 * (code_cells + 1) // 14, code
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def count_bits(value: np.uint64) -> int:
-    """Count the ones of an integer."""
-    count = 0
-    while value:
-        value &= value - np.uint64(1)
-        count += 1
-    return count
+def count_bits(value: np.uint64) -> np.int64:
+    """Count the ones of an integer: in pairs of bits, in fours, in bytes, and these added up."""
+    value -= (value >> np.uint64(1)) & np.uint64(0x5555555555555555)
+    fours = np.uint64(0x3333333333333333)
+    value = (value & fours) + ((value >> np.uint64(2)) & fours)
+    value = (value + (value >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return np.int64((value * np.uint64(0x0101010101010101)) >> np.uint64(56))
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def distances(
     image: NDArray[np.uint8],
     corners: NDArray[np.float64],
-    code_cells: int,
+    layout: Layout,
     expected: NDArray[np.uint64],
     found: NDArray[np.bool_],
     distance: NDArray[np.int64],
@@ -173,7 +186,7 @@ def distances(
         distance[i] = UNREADABLE
         if not found[i]:
             continue
-        readable, code = read_code(image, corners[i], code_cells)
+        readable, code = read_code(image, corners[i], layout)
         if readable:
             distance[i] = count_bits(code ^ expected[i])
 
@@ -182,7 +195,7 @@ def distances(
 def identify(
     image: NDArray[np.uint8],
     corners: NDArray[np.float64],
-    code_cells: int,
+    layout: Layout,
     table: NDArray[np.uint64],
     found: NDArray[np.bool_],
     ids: NDArray[np.int64],
@@ -194,7 +207,7 @@ def identify(
     Args:
         image: grey image.
         corners: (n, 4, 2) px, counter-clockwise as printed, starting anywhere.
-        code_cells: along the edge of a code.
+        layout: of the family.
         table: of `code_table`.
         found: (n,) which to read.
         ids: (n,) output.
@@ -205,7 +218,7 @@ def identify(
         distance[i] = UNREADABLE
         if not found[i]:
             continue
-        readable, code = read_code(image, corners[i], code_cells)
+        readable, code = read_code(image, corners[i], layout)
         if readable:
             ids[i], turns[i], distance[i] = _nearest(code, table)
 

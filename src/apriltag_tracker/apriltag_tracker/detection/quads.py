@@ -50,6 +50,9 @@ def find_quads(
     if faint:
         image = cv2.GaussianBlur(image, (3, 3), 0.0)
     found, ids, others = detector.detectMarkers(image)
+    if family.dictionary_id is None:
+        # OpenCV finds the borders, but cannot read a code of which it sees the inner part only.
+        return np.empty(0, dtype=np.int64), np.empty((0, 4, 2)), _quads([*found, *others])
     rest = _quads(others)
     if ids is None or len(ids) == 0:
         return np.empty(0, dtype=np.int64), np.empty((0, 4, 2)), rest
@@ -89,14 +92,19 @@ def _opencv_detector(family: Family, extent: int, smallest: float, faint: bool) 
 def check_orientation(family: Family) -> None:
     """Detect one known tag and check id, corner order, rotation and pixel convention.
 
+    Of a family that OpenCV cannot read, only tag 0 is compared: `Detector.warm_up` detects one.
+
     Raises:
         family.FamilyError: this OpenCV answers otherwise than this package expects.
     """
     family.check_code_of_tag_0()
+    if family.dictionary_id is None:
+        return
     scale, left, top = 5, 30, 20
-    side = family.border_cells * scale
+    side, rim = family.border_cells * scale, family.rim * scale
     canvas = np.full((100, 110), 255, dtype=np.uint8)
-    canvas[top : top + side, left : left + side] = family.enlarged_tag(0, scale)
+    sheet = np.s_[top - rim : top + side + rim, left - rim : left + side + rim]
+    canvas[sheet] = family.enlarged_tag(0, scale)
     ids, quads, _ = find_quads(canvas, family, 20.0)
     right, bottom = left + side, top + side
     expected = np.array([[left, bottom], [right, bottom], [right, top], [left, top]]) - 0.5

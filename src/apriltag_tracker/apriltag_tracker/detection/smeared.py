@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from apriltag_tracker.detection import decoding
 from apriltag_tracker.detection.edges import inside, sample
-from apriltag_tracker.family import Family
+from apriltag_tracker.family import Family, Layout
 
 _DIRECTIONS = 10
 _LENGTHS = (1.0, 1.5, 2.0, 2.5)
@@ -28,6 +28,9 @@ _LENGTHS = (1.0, 1.5, 2.0, 2.5)
 _SPACING = 0.5
 _FIRST = -0.75
 """Samples lie in this raster [cells], from so far outside of the border."""
+
+_FAR = 2
+"""No sample is so far outside of a tag, nor was during the smear [cells]."""
 
 _RIDGE = 0.02
 _TRIED = 8
@@ -61,21 +64,35 @@ class _Table:
     normals: NDArray[np.float32]
 
 
-def _raster(border: int) -> NDArray[np.float64]:
-    """Return where samples lie along one side [cells]."""
-    return np.arange(_FIRST, border - _FIRST + 1e-9, _SPACING)
+def _raster(layout: Layout) -> NDArray[np.float64]:
+    """Return where samples lie along one side [cells]; an outer ring is sampled, too."""
+    code_cells, outer = layout
+    first = _FIRST - outer
+    return np.arange(first, code_cells + 2 - first + 1e-9, _SPACING)
+
+
+def _unknowns(family: Family) -> NDArray[np.int64]:
+    """Return which unknown each cell is, upper row first, of a tag and `_FAR` cells around it.
+
+    The grey levels of the cells of the code come first, then those of the border and the margin,
+    and of what is beyond an outer ring.
+    """
+    mask = family.code_mask()
+    bits = int(mask.sum())
+    number = np.full(mask.shape, bits + 1)
+    border = np.s_[family.rim : -family.rim]
+    number[border, border] = bits
+    number[mask] = np.arange(bits)
+    return np.pad(number, _FAR, constant_values=bits + 1 + int(family.outer_ring))
 
 
 @functools.cache
-def _table(code_cells: int) -> _Table:
-    """Return the solutions for all smears.
-
-    Unknown are the grey levels of the inner cells row by row from the upper left, of the border
-    and of the margin.
-    """
-    inner = code_cells**2
-    last = code_cells + 1
-    places = _raster(code_cells + 2)
+def _table(family: Family) -> _Table:
+    """Return the solutions for all smears."""
+    cells = _unknowns(family)
+    count = int(cells.max()) + 1
+    left, bottom = family.rim + _FAR, family.rim + _FAR + family.border_cells - 1
+    places = _raster(family.layout)
     across, up = np.meshgrid(places, places)
     smears, shown = [], []
     instants = (np.arange(15) + 0.5) / 15 - 0.5
@@ -83,18 +100,15 @@ def _table(code_cells: int) -> _Table:
         for k in range(_DIRECTIONS):
             angle = math.pi * k / _DIRECTIONS
             smear = length * np.array([math.cos(angle), math.sin(angle)])
-            design = np.zeros((across.size, inner + 2))
+            design = np.zeros((across.size, count))
             for t in instants:
-                column = np.floor(across + t * smear[0]).astype(np.int64).ravel()
-                row = last - np.floor(up + t * smear[1]).astype(np.int64).ravel()
-                ring = np.minimum(np.minimum(column, last - column), np.minimum(row, last - row))
-                code = (row - 1) * code_cells + column - 1
-                cell = np.where(ring >= 1, code, np.where(ring < 0, inner + 1, inner))
-                design[np.arange(across.size), cell] += 1.0 / len(instants)
+                column = left + np.floor(across + t * smear[0]).astype(np.int64).ravel()
+                row = bottom - np.floor(up + t * smear[1]).astype(np.int64).ravel()
+                design[np.arange(across.size), cells[row, column]] += 1.0 / len(instants)
             smears.append(smear)
             shown.append(design)
     stacked = np.array(shown)
-    normal = np.swapaxes(stacked, 1, 2) @ stacked + _RIDGE * np.eye(inner + 2)
+    normal = np.swapaxes(stacked, 1, 2) @ stacked + _RIDGE * np.eye(count)
     solutions = np.linalg.solve(normal, np.swapaxes(stacked, 1, 2))
     return _Table(np.array(smears), solutions.astype(np.float32), normal.astype(np.float32))
 
@@ -126,8 +140,8 @@ def read_smeared(
     image: NDArray[np.uint8], quad: NDArray[np.float64], family: Family
 ) -> SmearedCode | None:
     """Read a quadrilateral (4, 2) px that runs as printed; None if it is no smeared tag."""
-    inner = family.code_cells**2
-    table, places = _table(family.code_cells), _raster(family.border_cells)
+    bits = family.codes().shape[1]
+    table, places = _table(family), _raster(family.layout)
     values = np.empty(len(places) ** 2)
     if not _sample_quad(image, quad, places, values):
         return None
@@ -141,10 +155,10 @@ def read_smeared(
     best: SmearedCode | None = None
     fewest = family.most_wrong + 1
     for k in np.argsort(-explained)[:_TRIED]:
-        black, white = levels[k, inner:]
+        black, white = levels[k, bits : bits + 2]
         if white - black < _LEAST_CONTRAST:
             continue
-        tag, turn, wrong = decoding.nearest_code(levels[k, :inner] > 0.5 * (black + white), family)
+        tag, turn, wrong = decoding.nearest_code(levels[k, :bits] > 0.5 * (black + white), family)
         if wrong < fewest:
             side = 0.5 * (quad[1] - quad[0] + quad[2] - quad[3]) / family.border_cells
             rise = 0.5 * (quad[3] - quad[0] + quad[2] - quad[1]) / family.border_cells

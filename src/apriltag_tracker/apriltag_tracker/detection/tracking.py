@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apriltag_tracker.detection.detector import Detector, grey
+from apriltag_tracker.detection.detector import Detector
 from apriltag_tracker.detection.regions import from_mosaic, mosaic_of, sharpened
 from apriltag_tracker.detection.still import look_at_borders, unmoved
 from apriltag_tracker.detection.tag import ExpectedTag, Tag
@@ -131,7 +131,7 @@ class TagTracker:
         Returns:
             Tags of the map, each id once.
         """
-        image = grey(gray)
+        image = self._detector.seen(gray)
         self.counts.frames += 1
         self._postponed = None
         if any(
@@ -211,7 +211,8 @@ class TagTracker:
             self._last_thorough = stamp
         self.counts.full_searches += 1
         enough = self._wanted - found.keys()
-        self._merge(found, self._detector.detect(image, thorough, enough), predicted)
+        tags = self._detector.search(image, "full", 1, thorough, enough)
+        self._merge(found, tags, predicted)
 
     def _by_prediction(
         self, image: NDArray[np.uint8], predicted: dict[int, NDArray[np.float64]]

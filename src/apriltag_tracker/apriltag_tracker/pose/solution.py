@@ -23,6 +23,23 @@ def _whitening(covariances: NDArray[np.float64], slack: NDArray[np.float64]) -> 
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
+def _write_gains(
+    inverse: NDArray[np.float64],
+    by: NDArray[np.float64],
+    whiten: NDArray[np.float64],
+    slopes: NDArray[np.float64],
+    gain: NDArray[np.float64],
+    left_open: NDArray[np.float64],
+) -> None:
+    """Write the derivative G of the parameters by the measurements, and I - G J."""
+    left_open[:] = np.eye(len(inverse))
+    for i in range(len(by)):
+        share = inverse @ np.ascontiguousarray(by[i].T) @ whiten[i]
+        gain[:, i] = share
+        left_open -= share @ slopes[i]
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
 def solve_shape(
     measured: NDArray[np.float64],
     covariances: NDArray[np.float64],
@@ -77,12 +94,6 @@ def solve_shape(
         parameters += move * min(1.0, 1.0 / max(reach, 1e-9))
         if reach < _SETTLED and max(abs(move[0]), abs(move[1])) < _SETTLED:
             break
-    inverse = np.linalg.inv(normal)
-    # I - G J, times the prior: how much of each parameter the measurements leave open.
-    left_open[:] = np.eye(size)
-    for i in range(count):
-        share = inverse @ np.ascontiguousarray(by[i].T) @ whiten[i]
-        gain[:, i] = share
-        left_open -= share @ slopes[i]
+    _write_gains(np.linalg.inv(normal), by, whiten, slopes, gain, left_open)
     for q in range(size):
         left_open[:, q] /= weak[q]

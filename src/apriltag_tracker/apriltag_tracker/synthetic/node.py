@@ -83,6 +83,9 @@ class SyntheticCameraNode(Node):
         self._last_shape = time.monotonic()
         self._busy = 0.0
         self._image = self._image_message()
+        size = self._camera.model.intrinsics
+        self._pixels = np.frombuffer(self._image.data, np.uint8).reshape(size.height, size.width)
+        """The picture in the message, which is filled anew for every shape."""
         self._info = self._info_message()
         self._images = self.create_publisher(Image, topics.IMAGE, qos.SENSOR_DATA)
         self._infos = self.create_publisher(CameraInfo, topics.CAMERA_INFO, qos.LATCHED)
@@ -105,6 +108,8 @@ class SyntheticCameraNode(Node):
         size = self._camera.model.intrinsics
         message = Image(height=size.height, width=size.width, encoding="mono8", step=size.width)
         message.header.frame_id = FRAME
+        # rclpy copies an array.array in one piece; other sequences go through element by element.
+        message.data = array.array("B", bytes(size.width * size.height))
         return message
 
     def _info_message(self) -> CameraInfo:
@@ -141,8 +146,7 @@ class SyntheticCameraNode(Node):
         frame = self._camera.frame(shape, self._velocity(stamp, shape))
         self._before = (stamp, shape)
         self._image.header.stamp = message.header.stamp
-        # rclpy copies an array.array in one piece; other sequences go through element by element.
-        self._image.data = array.array("B", frame.image.tobytes())
+        self._pixels[:] = frame.image
         self._images.publish(self._image)
         if time.monotonic() - self._last_info > _INFO_PERIOD:
             self._info.header.stamp = message.header.stamp

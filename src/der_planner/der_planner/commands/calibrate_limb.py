@@ -4,7 +4,7 @@
     python3 scripts/calibrate_limb.py --graph --seed 3 --out my_twin.yaml
     python3 scripts/calibrate_limb.py --graph --hardware my_rig.yaml --out my_limb.yaml
     python3 scripts/calibrate_limb.py --bag calibrations/DATE/bag --out my_limb.yaml
-    python3 scripts/calibrate_limb.py --csv log.csv --columns columns.yaml --out my_limb.yaml
+    python3 scripts/calibrate_limb.py --csv log.csv --columns map.yaml --mass 0.31 --out limb.yaml
 
 --offline plays the calibration on the twin in one process, in seconds. --graph plays it in real
 time on the running graph, on the twin or the hardware, records a bag, vents, and fits to the bag:
@@ -12,12 +12,14 @@ about three minutes. A bag is any recorded run that excites every input; `--exci
 writes the pressures of the calibration run, and `--play FILE.csv` plays such a file instead.
 
 --mounting says how the limb was mounted in the log, --payload what it carried beside its own
-masses: the payload belongs to the log and does not enter the limb file.
+masses: the payload belongs to the log and does not enter the limb file. --mass is what a scale
+shows of the limb: the limb file weighs as much, and its stiffness and gains follow from that.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import math
 import sys
 import time
@@ -27,7 +29,13 @@ import numpy as np
 
 from der_planner.experiment.errors import GraphError, NodeError, OptionError
 from der_planner.experiment.interrupts import interrupt_once
-from der_planner.experiment.load_options import add_load_options, as_loaded, without_payload
+from der_planner.experiment.load_options import (
+    add_load_options,
+    as_loaded,
+    check_kilograms,
+    check_loads,
+    without_payload,
+)
 from der_planner.experiment.node_specs import Hardware
 from der_planner.experiment.progress import Progress
 from der_planner.identification import (
@@ -53,6 +61,11 @@ from der_planner.identification.plots import plot_prediction
 from der_planner.limb import Limb, LimbError
 from der_planner.runs.outputs import OutputError, check_file, check_folder
 from pressure_driver.schedule import ScheduleLimits
+
+LIGHTEST = 1e-3
+"""A limb of less [kg] is a mistake in the unit."""
+SAME_MASS = 0.01
+"""Share by which the fitted lengths may change the mass of a limb that was weighed."""
 
 
 def _arguments() -> argparse.Namespace:
@@ -97,6 +110,13 @@ def _arguments() -> argparse.Namespace:
     )
     add_load_options(parser)
     parser.add_argument(
+        "--mass",
+        type=float,
+        metavar="KG",
+        help="what the limb weighs from its clamp on, with fittings, tubes and tags and without "
+        "the payload (without it: as the prior)",
+    )
+    parser.add_argument(
         "--fit-mass",
         action="store_true",
         help="fit the mass of each segment and keep the prior's stiffness, not the other way round",
@@ -137,8 +157,10 @@ def main() -> int:
     """Run the command line: 0 when a limb file was written, 1 after an error, 2 for bad options."""
     given = _arguments()
     try:
+        _check_loads(given)
         _check_outputs(given)
-        prior = as_loaded(Limb.from_yaml(given.prior) if given.prior else Limb.default(), given)
+        bare = Limb.from_yaml(given.prior) if given.prior else Limb.default()
+        prior = as_loaded(bare if given.mass is None else bare.weighing(given.mass), given)
         if given.excitation:
             run = _excitation(prior, prior.pneumatics.pressure_limit, given)
             write_excitation(run, given.excitation)
@@ -147,7 +169,7 @@ def main() -> int:
         log = _obtain(prior, given)
         terms = [] if given.terms == "none" else given.terms.split(",")
         terms += ["mass"] if given.fit_mass else []
-        limb, report = fit(prior, log, terms=terms, longest_gap=given.longest_gap)
+        limb, report = _fit(prior, log, terms, given)
         held_out = [_read(path, given) for path in given.held_out]
         _conclude(limb, report, log, held_out, given)
     except (OptionError, OutputError) as error:
@@ -160,6 +182,56 @@ def main() -> int:
         print(f"stopped by {error or 'SIGINT'}; no limb file was written", file=sys.stderr)
         return 130
     return 0
+
+
+def _check_loads(given: argparse.Namespace) -> None:
+    """Refuse loads that no limb has.
+
+    Raises:
+        OptionError: names the option and what it may be.
+    """
+    check_loads(given)
+    if given.mass is None:
+        return
+    check_kilograms("--mass", given.mass, LIGHTEST)
+    if given.fit_mass:
+        raise OptionError("--fit-mass looks for the mass that --mass gives: choose one of the two")
+
+
+def _fit(
+    prior: Limb, log: CalibrationLog, terms: list[str], given: argparse.Namespace
+) -> tuple[Limb, FitReport]:
+    """Fit; a limb that was weighed weighs the same with the lengths that were found."""
+    limb, report = fit(prior, log, terms=terms, longest_gap=given.longest_gap)
+    if given.mass is None:
+        return limb, report
+    found = without_payload(limb, given)
+    off = found.mass / given.mass - 1.0
+    if abs(off) > SAME_MASS:
+        print(
+            f"the lengths that were found make the limb {100 * off:+.1f} % of what it weighs: "
+            "fitting once more …",
+            file=sys.stderr,
+        )
+        weighed = found.weighing(given.mass).segments
+        segments = tuple(
+            dataclasses.replace(old, mass_per_length=new.mass_per_length)
+            for old, new in zip(prior.segments, weighed, strict=True)
+        )
+        again = dataclasses.replace(prior, segments=segments, pcc_segments=())
+        limb, report = fit(again, log, terms=terms, longest_gap=given.longest_gap)
+    provenance = {**limb.provenance, "weighed_kg": given.mass}
+    return dataclasses.replace(limb, provenance=provenance), report
+
+
+def _weight(limb: Limb, given: argparse.Namespace) -> str:
+    """Say what the limb of the file weighs, and where that comes from."""
+    weighs = f"mass: the limb weighs {1000 * limb.mass:.0f} g in its file"
+    if given.mass is not None:
+        return f"{weighs}, by --mass"
+    if given.fit_mass:
+        return f"{weighs}, as fitted"
+    return f"{weighs}, as in the prior: it was not weighed (--mass KG)"
 
 
 def _check_outputs(given: argparse.Namespace) -> None:
@@ -251,9 +323,11 @@ def _conclude(
     text = report.text()
     for unseen in held_out:
         text += "\n" + _held_out_text(limb, unseen, given.longest_gap)
+    kept = without_payload(limb, given)
+    text += "\n" + _weight(kept, given)
     print(text)
     given.out.parent.mkdir(parents=True, exist_ok=True)
-    without_payload(limb, given).to_yaml(given.out)
+    kept.to_yaml(given.out)
     print(f"limb file: {given.out}")
     if given.report:
         given.report.mkdir(parents=True, exist_ok=True)

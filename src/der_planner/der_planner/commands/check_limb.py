@@ -6,7 +6,7 @@
 
 Predicts each run open loop from its measured pressures, for a limb that is mounted as --mounting
 says (without it: as its file says) and carries a --payload in the runs. Exit code 0: it fits; 3:
-calibrate again; 1: a run or the file cannot be used.
+calibrate again; 1: a run or the file cannot be used; 2: bad options.
 
 With --update: gain, rest angle and friction are brought up to date from all runs together, ordinary
 ones, as far as they tell them; the rest stays. Half a minute in which both segments move tells
@@ -20,7 +20,8 @@ import dataclasses
 import sys
 from pathlib import Path
 
-from der_planner.experiment.load_options import add_load_options, as_loaded
+from der_planner.experiment.errors import OptionError
+from der_planner.experiment.load_options import add_load_options, as_loaded, check_loads
 from der_planner.identification import (
     CalibrationLog,
     ColumnMap,
@@ -43,6 +44,7 @@ def main() -> int:
     if given.columns is None and any(path.suffix == ".csv" for path in given.runs):
         parser.error("a table needs --columns FILE")
     try:
+        check_loads(given)
         limb = Limb.from_yaml(given.limb)
         if given.out is not None:
             _check_new(given.out)
@@ -51,6 +53,9 @@ def main() -> int:
         if given.update:
             return _update(limb, loaded, logs, given.out)
         return max([_check(loaded, log, len(logs) > 1) for log in logs])
+    except OptionError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     except (LogError, LimbError, OutputError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

@@ -27,11 +27,11 @@ from numpy.typing import NDArray
 from der_planner.control.chambers import ChamberLog
 from der_planner.control.knowledge import Knowledge
 from der_planner.control.nominal import Nominal
+from der_planner.methods import LEARNED
 from der_planner.model import air, material
 from der_planner.model.commands import within_limits
 from der_planner.model.drive import STEPS
 from der_planner.model.series import CONTROL_PERIOD
-from der_planner.planning.plan_file import LEARNED
 from der_planner.planning.quadratic import UnsolvedError, minimise
 from der_planner.planning.result import Plan
 

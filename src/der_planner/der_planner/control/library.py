@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from der_planner.control.learning import PULL
+from der_planner.methods import LEARNED
 from der_planner.planning.correction import Correction
 from der_planner.planning.errors import PlanningError
-from der_planner.planning.plan_file import LEARNED, SUFFIX, difference, read_plan
+from der_planner.planning.plan_file import SUFFIX, difference, read_plan
 from der_planner.planning.result import Plan
 
 NEAR = math.log(1.35)

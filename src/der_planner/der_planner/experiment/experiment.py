@@ -15,8 +15,8 @@ from der_planner.experiment.ledger import Ledger
 from der_planner.experiment.options import Options, Trial
 from der_planner.experiment.progress import Progress
 from der_planner.limb import Limb, LimbError, mounting_of
+from der_planner.methods import LEARNED
 from der_planner.runs.outputs import check_folder
-from der_planner.runs.run import LEARNED
 
 
 def run(options: Options) -> None:

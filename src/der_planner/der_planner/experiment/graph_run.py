@@ -23,8 +23,8 @@ from der_planner.experiment.options import Options, Trial
 from der_planner.experiment.processes import NodeProcess
 from der_planner.experiment.progress import Progress
 from der_planner.limb import Limb
+from der_planner.methods import LEARNED
 from der_planner.planning import paths
-from der_planner.runs.run import LEARNED
 from limb_interfaces import qos, stamps, topics
 
 PLAN_TIMEOUT = 120.0

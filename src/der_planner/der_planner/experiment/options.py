@@ -11,9 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from der_planner.experiment.errors import OptionError
-from der_planner.experiment.load_options import add_load_options
+from der_planner.experiment.load_options import add_load_options, check_loads
 from der_planner.experiment.node_specs import Hardware
-from der_planner.limb import Limb, LimbError, gravity_of
+from der_planner.limb import Limb
+from der_planner.methods import LEARNED
 from der_planner.planning import METHODS as METHODS_BY_MODEL
 from der_planner.planning import Motion, PlanningError
 from der_planner.planning.motions import (
@@ -23,7 +24,6 @@ from der_planner.planning.motions import (
     JOINT_MOTIONS,
 )
 from der_planner.planning.motions import NAMES as MOTIONS
-from der_planner.runs.run import LEARNED
 
 MODELS = tuple(METHODS_BY_MODEL)
 METHODS = METHODS_BY_MODEL["der"]
@@ -270,7 +270,7 @@ def parse(arguments: Sequence[str]) -> Options:
     _check_names("model", models, MODELS)
     _check_names("method", (given.method,), METHODS)
     _check_ranges(given)
-    _check_loads(given)
+    check_loads(given)
     _check_path_and_page(given)
     hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
     if hardware is not None and given.offline:
@@ -341,26 +341,10 @@ def _check_ranges(given: argparse.Namespace) -> None:
         ("seed", 0, 2**31 - 1000),
         ("period", 0.5, 600.0),
         ("amplitude", 0.01, 2.0),
-        ("payload", 0.0, 10.0),
     ):
         value = getattr(given, name)
         if not least <= value <= most:
             raise OptionError(f"--{name} is {value}: choose {least} to {most}")
-
-
-def _check_loads(given: argparse.Namespace) -> None:
-    """Refuse an unknown mounting, or the place of a payload that is not there.
-
-    Raises:
-        OptionError: names the option.
-    """
-    try:
-        if given.mounting:
-            gravity_of(given.mounting)
-    except LimbError as error:
-        raise OptionError(f"--mounting: {error}") from error
-    if given.payload_at is not None and not given.payload:
-        raise OptionError("--payload-at is the place of a payload: give --payload, too")
 
 
 def _check_path_and_page(given: argparse.Namespace) -> None:

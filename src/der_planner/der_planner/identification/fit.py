@@ -12,7 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.identification.air import AirFit, fit_air
-from der_planner.identification.geometry import GeometryFit, UnevenTips, fit_geometry, with_geometry
+from der_planner.identification.geometry import (
+    GeometryFit,
+    UnevenTips,
+    fit_geometry,
+    lengths_at_their_end,
+    with_geometry,
+)
 from der_planner.identification.logs.log import CalibrationLog, LogError
 from der_planner.identification.logs.prepare import LONGEST_GAP, Prepared, prepare
 from der_planner.identification.parameters import GROUPS, OPTIONAL, to_limb
@@ -74,6 +80,8 @@ def fit(
     air = _try_air(prepared, warnings)
     offset = np.zeros(limb.segment_count) if air is None else air.offset
     fitted = _fit_bends_and_lengths(limb, prepared, offset, groups, nodes, geometry)
+    if fitted.lengths is not None:
+        warnings += filter(None, [lengths_at_their_end(limb, fitted.lengths.lengths)])
     unknowns, correlation = fitted.problem.uncertainties(fitted.values, fitted.jacobian)
     if "dynamics" in groups and _all_untold(unknowns):
         warnings.append(

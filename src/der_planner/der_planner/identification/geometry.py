@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 
 LENGTH_PRIOR = 0.05
 """Relative standard deviation of how much of a segment bends: its fittings do not."""
+LENGTH_RANGE = (0.8, 1.2)
+"""Of a segment over the prior's."""
 CONNECTOR_RANGE = (1e-3, 3e-2)
 """Of the connector [m]: the rod needs an edge there."""
 BASE_RANGE = (0.0, 3e-2)
@@ -38,6 +40,7 @@ UNEVEN_ERROR = 2e-3
 fittings and uneven walls, stays the same for the whole log and averages out less."""
 CORRELATION = 20.0
 """Rows over which that error stays the same (1 s)."""
+_AT_END = 1e-3
 _NUDGE = 1e-6
 """Change of a length for the slope of the tip [m]."""
 NODES = 21
@@ -154,9 +157,8 @@ class UnevenTips:
         free = np.flatnonzero((now - low > _NUDGE) & (high - now > _NUDGE))
         longer = [_with(limb, now + _NUDGE * np.eye(len(now))[place]) for place in free]
         columns = [(_even_tip(each, angles, NODES) - tip).ravel() / _NUDGE for each in longer]
-        by_lengths = np.concatenate(
-            [self._weight * np.stack(columns, axis=1), np.diag(1.0 / spread[free])]
-        )
+        slopes = np.reshape(columns, (len(free), tip.size)).T
+        by_lengths = np.concatenate([self._weight * slopes, np.diag(1.0 / spread[free])])
         self._known = ((now - start) / spread)[free]
         self._spanned = np.linalg.qr(by_lengths)[0]
 
@@ -189,9 +191,27 @@ def _known(prior: Limb) -> tuple[Array, Array, Array, Array]:
     count = len(lengths) + (2 if prior.segment_count > 1 else 1)
     start = np.concatenate([lengths, [prior.base_length, prior.connector_length or 4e-3]])
     spread = np.concatenate([LENGTH_PRIOR * lengths, [STIFF_PRIOR, STIFF_PRIOR]])
-    low = np.concatenate([0.8 * lengths, [BASE_RANGE[0], CONNECTOR_RANGE[0]]])
-    high = np.concatenate([1.2 * lengths, [BASE_RANGE[1], CONNECTOR_RANGE[1]]])
+    low = np.concatenate([LENGTH_RANGE[0] * lengths, [BASE_RANGE[0], CONNECTOR_RANGE[0]]])
+    high = np.concatenate([LENGTH_RANGE[1] * lengths, [BASE_RANGE[1], CONNECTOR_RANGE[1]]])
     return start[:count], spread[:count], low[:count], high[:count]
+
+
+def lengths_at_their_end(prior: Limb, lengths: Array) -> str:
+    """Return a sentence where the lengths (M,) of segments went as far as they may; else empty."""
+    measured = np.array([segment.length for segment in prior.segments])
+    share = lengths / measured
+    ends = (share < LENGTH_RANGE[0] + _AT_END) | (share > LENGTH_RANGE[1] - _AT_END)
+    if not ends.any():
+        return ""
+    named = ", ".join(
+        f"segment {index} is given as {1e3 * measured[index]:.0f} mm and was found to be "
+        f"{1e3 * lengths[index]:.0f} mm" + (" or less" if share[index] < 1 else " or more")
+        for index in np.flatnonzero(ends)
+    )
+    return (
+        f"lengths as far from the prior's as they may be: {named}. Measure the segments and give "
+        "their lengths in the limb file of --prior; check the unit and the origin of the tips"
+    )
 
 
 def _lengths_of(limb: Limb) -> Array:

@@ -16,7 +16,7 @@ _NAMES = {
     PressureState.VENTING: "VENTING",
     PressureState.FAULT: "FAULT",
 }
-_REMEDY = "call pressure_driver/arm, then planner/start"
+_REMEDY = "arm the driver, then play the plan again"
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from der_planner.nodes.driver_watch import DriverWatch, Ending
 from der_planner.nodes.planner_action import MotionAction
 from der_planner.nodes.planner_feedback import Corrector, Done
 from der_planner.nodes.planner_making import PlanMaker
-from der_planner.nodes.planner_parameters import read_parameters
+from der_planner.nodes.planner_parameters import PlannerOptions, read_parameters
 from der_planner.nodes.planner_publishers import PlannerPublishers
 from der_planner.nodes.planner_requests import Request, from_command, from_path, new_plan_id
 from der_planner.nodes.planner_stage import Stage
@@ -78,9 +78,6 @@ class PlannerNode(Node):
         )
         self.create_subscription(MotionCommand, topics.COMMAND, self._on_command, qos.COMMANDS)
         self.create_subscription(PathMessage, topics.PATH, self._on_path, qos.COMMANDS)
-        self.create_subscription(
-            PathMessage, topics.NEAREST_PATH, self._on_nearest_path, qos.COMMANDS
-        )
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
         self.create_timer(0.1, self._show)
@@ -110,11 +107,16 @@ class PlannerNode(Node):
                     f"plan '{wanted}' was ended by the driver, which takes no more of it: give the "
                     "command another plan_id, or none"
                 )
-            request = from_command(message, self._options, self._now())
+            request = from_command(message, self._current_options(), self._now())
         except ValueError as error:
             self._refuse(message.plan_id, str(error))
             return
         self._accept(request)
+
+    def _current_options(self) -> PlannerOptions:
+        """Return the parameters with what may be changed while the node runs as it is now."""
+        nearest = bool(self.get_parameter("nearest_path").value)
+        return replace(self._options, nearest_path=nearest)
 
     def _is_busy(self, plan_id: str) -> bool:
         """Tell whether a plan of this id is being planned or played."""
@@ -124,16 +126,9 @@ class PlannerNode(Node):
             return planned or self._stage.find(plan_id) is not None
 
     def _on_path(self, message: PathMessage) -> None:
-        self._take_path(message, bool(self.get_parameter("nearest_path").value))
-
-    def _on_nearest_path(self, message: PathMessage) -> None:
-        self._take_path(message, nearest=True)
-
-    def _take_path(self, message: PathMessage, nearest: bool) -> None:
         plan_id = new_plan_id()
         try:
-            options = replace(self._options, nearest_path=nearest)
-            request = from_path(message, plan_id, options, self._now())
+            request = from_path(message, plan_id, self._current_options(), self._now())
         except (ValueError, IndexError) as error:
             self._refuse(plan_id, str(error))
             return
@@ -146,13 +141,11 @@ class PlannerNode(Node):
         position = self._stage.position
         obstacle = self._driver.obstacle()
         if newest is None:
-            response.message = "no plan yet: publish a command first"
+            response.message = "no plan yet: ask for a motion first"
         elif position is not None:
-            response.message = f"plan {position[0].plan_id} is being played: call stop first"
+            response.message = f"plan {position[0].plan_id} is being played: stop it first"
         elif newest[1].reference.start is not None:
-            response.message = (
-                f"plan {newest[0]} began in another motion: publish its command again"
-            )
+            response.message = f"plan {newest[0]} began in another motion: ask for its own again"
         elif obstacle is not None:
             response.message = obstacle.reason
         else:
@@ -160,13 +153,17 @@ class PlannerNode(Node):
             feedback = Feedback(result) if corrected else None
             schedule = self._play(self._stage.unspent(plan_id), result, 0, feedback)
             response.success = True
-            response.message = f"plan {schedule.plan_id} starts at {schedule.start * 1e-9:.2f} s"
+            ahead = (schedule.start - self._now()) / NANOSECONDS
+            response.message = (
+                f"plays plan {schedule.plan_id} ({result.motion}) for {result.duration:.0f} s, "
+                f"beginning in {max(ahead, 0.0):.1f} s"
+            )
         return response
 
     def _on_stop(self, _: Any, response: Any) -> Any:
         """Cancel planning and streaming; the driver holds, then vents."""
-        planning, playing = self._end_all("stopped", "the service stop was called")
-        self._status.set("idle", reason="stopped by the service stop")
+        planning, playing = self._end_all("stopped", "it was asked to stop")
+        self._status.set("idle", reason="stopped as asked")
         response.success = True
         response.message = {
             (True, True): "cancelled the plan in the making and stopped streaming",
@@ -296,9 +293,7 @@ class PlannerNode(Node):
             self._play(request.plan_id, result, begin, feedback, request.cancelled)
         else:
             self._output.plan(Schedule(request.plan_id, result, 0))
-            self._status.set(
-                "done", request.plan_id, reason="waits for the service start", progress=1.0
-            )
+            self._status.set("done", request.plan_id, reason="waits to be started", progress=1.0)
 
     # Streaming -----------------------------------------------------------------------------
 

@@ -85,7 +85,7 @@ def read_parameters(node: Node) -> PlannerOptions:
         ),
         nearest_path=bool(
             read("nearest_path", False, "follow the nearest path that the limb can follow where a "
-                 "path on the topic leaves its reach, instead of refusing it", read_only=False)
+                 "path leaves its reach, instead of refusing it", read_only=False)
         ),
         driver_timeout=float(
             read("driver_timeout", 1.0, "silence of the driver [s] after which it counts as dead",

@@ -11,10 +11,11 @@ from nav_msgs.msg import Path as PathMessage
 
 from der_msgs.msg import MotionCommand
 from der_planner.limb import Limb
+from der_planner.methods import LEARNED
 from der_planner.nodes.planner_parameters import LARGEST_PAYLOAD, PlannerOptions
 from der_planner.planning import Motion, choose_method
 from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD
-from der_planner.planning.plan_file import LEARNED, learned_plan
+from der_planner.planning.plan_file import learned_plan
 from der_planner.planning.result import Plan
 from limb_interfaces import topics
 from limb_interfaces.stamps import NANOSECONDS, nanoseconds
@@ -88,19 +89,34 @@ def from_command(message: MotionCommand, options: PlannerOptions, now: int) -> R
     """
     start = start_of(nanoseconds(message.header.stamp), now)
     limb = _asked_for(message, options)
+    if message.path and (message.motion or message.method == LEARNED):
+        raise ValueError(
+            "the command has a path, and a motion or a learned plan beside it: give one of them"
+        )
     if message.method == LEARNED:
         return _from_learned(message, limb, options, start)
     model = message.model or options.model
-    motion = Motion.named(
+    motion = _along_path(message, options) if message.path else _named(message, options)
+    method = choose_method(model, message.method or options.method)
+    feedback = _corrected(message, model, options)
+    return Request(message.plan_id, limb, motion, model, method, start, feedback=feedback)
+
+
+def _named(message: MotionCommand, options: PlannerOptions) -> Motion:
+    return Motion.named(
         message.motion,
         amplitude=message.amplitude or DEFAULT_AMPLITUDE,
         period=message.period or DEFAULT_PERIOD,
         cycles=message.cycles or DEFAULT_CYCLES,
         branch=options.branch,
     )
-    method = choose_method(model, message.method or options.method)
-    feedback = _corrected(message, model, options)
-    return Request(message.plan_id, limb, motion, model, method, start, feedback=feedback)
+
+
+def _along_path(message: MotionCommand, options: PlannerOptions) -> Motion:
+    return Motion.from_tip_path(
+        None, np.array([(point.x, point.y) for point in message.path]), branch=options.branch,
+        limits=options.limits, nearest=message.nearest_path or options.nearest_path,
+    )  # fmt: skip
 
 
 def _from_learned(

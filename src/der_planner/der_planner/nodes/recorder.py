@@ -272,7 +272,7 @@ class Recorder(Node):
 
     def _on_start(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._session is not None and not self._session.status().failure:
-            response.message = f"already recording into {self._session.folder}: call stop first"
+            response.message = f"already recording into {self._session.folder}: stop that first"
             return response
         if self._session is not None:
             self._stop()
@@ -286,14 +286,14 @@ class Recorder(Node):
 
     def _on_stop(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._session is None:
-            response.message = self._last_failure or "not recording: call start first"
+            response.message = self._last_failure or "not recording: start a recording first"
             return response
         response.success, response.message = self._stop()
         return response
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         if self._session is None:
-            response.message = "not recording: call start first"
+            response.message = "not recording: start a recording first"
             return response
         self._session.paused = request.data
         response.success = True
@@ -302,7 +302,7 @@ class Recorder(Node):
 
     def _on_mark(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._session is None:
-            response.message = "not recording: call start first"
+            response.message = "not recording: start a recording first"
             return response
         self._marks += 1
         label = self._parameter("mark_label") or f"mark {self._marks}"

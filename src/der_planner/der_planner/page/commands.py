@@ -29,22 +29,6 @@ OWNERS: dict[Service, str] = {
 """The node that serves each."""
 
 
-IN_BUTTONS = (
-    ("call pressure_driver/arm, then planner/start", "press Arm, then Play last plan again"),
-    ("call pressure_driver/arm", "press Arm"),
-    ("call arm", "press Arm"),
-    ("call planner/start", "press Play last plan again"),
-)
-"""How the nodes name their services, and how the page names its buttons for them."""
-
-
-def in_buttons(text: str) -> str:
-    """Return what a node says with the page's buttons in place of its services."""
-    for service, button in IN_BUTTONS:
-        text = text.replace(service, button)
-    return text
-
-
 @dataclass(frozen=True)
 class Answer:
     """What came of a request, in the words of the node that was asked."""
@@ -54,32 +38,54 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class MotionRequest:
-    """A named motion to play, or a learned plan, whose name is the motion's and method `learned`.
+class Load:
+    """How the limb is mounted and what it carries, as a motion command says it.
 
     Attributes:
-        motion: its name.
-        model: `der` or `pcc`.
-        method: of the planner; empty: the best for the model.
-        amplitude: [rad].
-        period: [s] of one cycle.
-        cycles: how many.
-        feedback: correct the setpoints while the limb moves.
         payload: [kg] carried beside the limb's own masses; 0: the planner's parameter.
         payload_at: [m] where, along the limb from its clamp; 0: the tip.
         mounting: a name or degrees of tilt; empty: the planner's parameter.
     """
 
-    motion: str
-    model: str
-    method: str
-    amplitude: float
-    period: float
-    cycles: int
-    feedback: bool
     payload: float = 0.0
     payload_at: float = 0.0
     mounting: str = ""
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What a motion or a drawing is planned with.
+
+    Attributes:
+        model: `der` or `pcc`.
+        method: of the planner; empty: the best for the model.
+        load: mounting and payload.
+        feedback: correct the setpoints while the limb moves.
+    """
+
+    model: str = "der"
+    method: str = ""
+    load: Load = Load()
+    feedback: bool = False
+
+
+@dataclass(frozen=True)
+class MotionRequest:
+    """A named motion to play, or a learned plan, whose name is the motion's and method `learned`.
+
+    Attributes:
+        motion: its name.
+        amplitude: [rad].
+        period: [s] of one cycle.
+        cycles: how many.
+        conditions: what it is planned with.
+    """
+
+    motion: str
+    amplitude: float
+    period: float
+    cycles: int
+    conditions: Conditions
 
 
 class Commands(Protocol):
@@ -103,7 +109,7 @@ class Commands(Protocol):
         """
         ...
 
-    def play_path(self, tip: NDArray[np.float64]) -> Answer:
+    def play_path(self, tip: NDArray[np.float64], conditions: Conditions) -> Answer:
         """Ask the planner to play the nearest path to points (P, 2) [m] that it can."""
         ...
 

@@ -9,15 +9,14 @@ from concurrent.futures import Future
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Path as PathMessage
+from geometry_msgs.msg import Point
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from der_msgs.msg import MotionCommand, PressureSetpoint
-from der_planner.page.commands import FILLING, OWNERS, Answer, MotionRequest, Service
+from der_planner.page.commands import FILLING, OWNERS, Answer, Conditions, MotionRequest, Service
 from der_planner.page.situation import NANOSECONDS, Situation
 from der_planner.planning.plan_file import learned_names
 from limb_interfaces import qos, topics
@@ -34,6 +33,8 @@ PATHS: dict[Service, str] = {
 
 TICK = NANOSECONDS // 20
 """[ns] between two setpoints."""
+RECORDER = "recorder"
+"""The node that listens to commands without following them."""
 FILL_AHEAD = 4
 """Ticks from now to the first setpoint."""
 
@@ -48,13 +49,13 @@ class GraphCommands:
     """
 
     def __init__(self, node: Node, situation: Situation, segments: int) -> None:
+        self._node = node
         self._situation = situation
         self._segments = segments
         self._service_clients = {
             service: node.create_client(Trigger, path) for service, path in PATHS.items()
         }
         self._recorder_parameters = node.create_client(SetParameters, "recorder/set_parameters")
-        self._paths = node.create_publisher(PathMessage, topics.NEAREST_PATH, qos.COMMANDS)
         self._setpoints = node.create_publisher(
             PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS
         )
@@ -82,17 +83,11 @@ class GraphCommands:
 
     def play(self, request: MotionRequest) -> Answer:
         """Publish a motion command; the planner's answer is seen in its diagnostics."""
-        if not self._motions.get_subscription_count():
-            return Answer(False, "no planner listens: start it")
-        self._motions.publish(
-            MotionCommand(
-                motion=request.motion, model=request.model, method=request.method,
-                amplitude=request.amplitude, period=request.period, cycles=request.cycles,
-                feedback=request.feedback, payload=request.payload,
-                payload_at=request.payload_at, mounting=request.mounting,
-            )
+        message = MotionCommand(
+            motion=request.motion, amplitude=request.amplitude, period=request.period,
+            cycles=request.cycles,
         )  # fmt: skip
-        return Answer(True, f"asked the planner for {request.motion} with {request.model}")
+        return self._command(message, request.conditions, request.motion)
 
     def record(self, note: str) -> Future[Answer]:
         """Start the recorder with the note in the bag's metadata."""
@@ -134,18 +129,22 @@ class GraphCommands:
         which = f"segment {segment}, {'left' if side > 0 else 'right'}"
         return Answer(True, f"{which}: {pressure / 1000:.1f} kPa for {FILLING:.0f} s")
 
-    def play_path(self, tip: np.ndarray[Any, Any]) -> Answer:
+    def play_path(self, tip: np.ndarray[Any, Any], conditions: Conditions) -> Answer:
         """Let the planner play the nearest path that it can to points (P, 2) [m]."""
-        if not self._paths.get_subscription_count():
+        points = [Point(x=float(x), y=float(y)) for x, y in tip]
+        message = MotionCommand(path=points, nearest_path=True)
+        return self._command(message, conditions, f"a path of {len(tip)} points")
+
+    def _command(self, message: MotionCommand, conditions: Conditions, what: str) -> Answer:
+        listeners = self._node.get_subscriptions_info_by_topic(self._motions.topic_name)
+        if all(listener.node_name == RECORDER for listener in listeners):
             return Answer(False, "no planner listens: start it")
-        message = PathMessage()
-        message.header.frame_id = topics.BASE_FRAME
-        for x, y in tip:
-            pose = PoseStamped()
-            pose.pose.position.x, pose.pose.position.y = float(x), float(y)
-            message.poses.append(pose)
-        self._paths.publish(message)
-        return Answer(True, f"asked the planner for a path of {len(tip)} points")
+        load = conditions.load
+        message.model, message.method = conditions.model, conditions.method
+        message.feedback, message.mounting = conditions.feedback, load.mounting
+        message.payload, message.payload_at = load.payload, load.payload_at
+        self._motions.publish(message)
+        return Answer(True, f"asked the planner for {what} with {conditions.model}")
 
     def learned_plans(self) -> list[str]:
         """Return the names of the learned plans in the folder that the planner says it has."""

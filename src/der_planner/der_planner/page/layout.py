@@ -8,7 +8,7 @@ from fastapi import FastAPI
 from nicegui import Client, ui
 
 from der_planner.page.afterwards import listing, replay
-from der_planner.page.commands import Answer, Service, answer_of, in_buttons
+from der_planner.page.commands import Answer, Conditions, Service, answer_of
 from der_planner.page.drawing.sketch import Sketch
 from der_planner.page.motion_form import FormError, MotionForm
 from der_planner.page.server import STATIC, Parts
@@ -52,7 +52,9 @@ class Window:
         ui.add_body_html((STATIC / "frame.html").read_text())
         with ui.element("main").props('id="panels"'):
             with self._panel("view", "Camera", "camera", "view.html"):
-                self._sketch = Sketch(client, parts, self._may_command, self._tell)
+                self._sketch = Sketch(
+                    client, parts, self._conditions, self._may_command, self._tell
+                )
             with self._panel("do", "Command", "", ""):
                 self._controls()
             self._panel("numbers", "Last 30 s", "driver", "plots.html")
@@ -87,7 +89,8 @@ class Window:
             self._button("Stop motion", "stop", lambda: self._call("stop"), "warning")
             self._button("Play last plan again", "start", lambda: self._call("start"), "primary")
         self._form = MotionForm(
-            lambda: self._button("Play motion", "play", self._on_play, "primary")
+            lambda: self._button("Play motion", "play", self._on_play, "primary"),
+            self._sketch.look_again,
         )
         with ui.row().classes("line"):
             self._note = ui.input("Note for the recording")
@@ -133,6 +136,9 @@ class Window:
         ui.notify("take control first", type="warning")
         return False
 
+    def _conditions(self) -> Conditions:
+        return self._form.conditions()
+
     async def _call(self, service: Service) -> None:
         if self._may_command():
             self._tell(service, await answer_of(service, self._parts.commands.call(service)))
@@ -153,6 +159,6 @@ class Window:
         self._tell("play", self._parts.commands.play(request))
 
     def _tell(self, what: str, answer: Answer) -> None:
-        text = f"{what.replace('_', ' ')}: {in_buttons(answer.message)}"
+        text = f"{what.replace('_', ' ')}: {answer.message}"
         with self._client:
             ui.notify(text, type="positive" if answer.success else "negative", timeout=6000)

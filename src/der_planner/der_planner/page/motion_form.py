@@ -9,10 +9,10 @@ from dataclasses import replace
 from nicegui import ui
 
 from der_planner.limb import MOUNTINGS, LimbError, gravity_of
-from der_planner.page.commands import MotionRequest
+from der_planner.methods import LEARNED
+from der_planner.page.commands import Conditions, Load, MotionRequest
 from der_planner.planning import METHODS
 from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD, NAMES
-from der_planner.planning.plan_file import LEARNED
 
 NO_PLANS = "No learned plans"
 BEST = "the best"
@@ -57,6 +57,10 @@ class Quantity:
         # Telephones show digits, and the space bar vents here, too: no number has a space.
         self._field.props(f"inputmode={'numeric' if whole else 'decimal'} hide-bottom-space")
 
+    def on_change(self, action: Callable[[], object]) -> None:
+        """Call something whenever the text changes."""
+        self._field.on_value_change(action)
+
     def read(self) -> float:
         """Return the number.
 
@@ -83,9 +87,12 @@ class MotionForm:
 
     Args:
         add_play: adds the button that plays the motion, in its place among the fields.
+        conditions_changed: is called when `conditions` may return something else.
     """
 
-    def __init__(self, add_play: Callable[[], None]) -> None:
+    def __init__(
+        self, add_play: Callable[[], None], conditions_changed: Callable[[], object]
+    ) -> None:
         with ui.row().classes("line"):
             self._motion = ui.select(list(NAMES), value=NAMES[0], label="Motion")
             self._model = ui.select(list(METHODS), value="der", label="Model")
@@ -108,6 +115,10 @@ class MotionForm:
         with ui.row().classes("line"):
             self._learned = ui.select([], label=NO_PLANS, clearable=True).props('id="learned"')
             self._feedback = ui.switch("Feedback").props('id="feedback"')
+        for quantity in (self._payload, self._place):
+            quantity.on_change(conditions_changed)
+        for choice in (self._model, self._method, self._mounting, self._feedback):
+            choice.on_value_change(conditions_changed)
 
     def read(self) -> MotionRequest:
         """Return what is asked for.
@@ -117,18 +128,31 @@ class MotionForm:
         """
         request = MotionRequest(
             motion=str(self._motion.value),
-            model=str(self._model.value),
-            method=str(self._method.value),
             amplitude=math.radians(self._amplitude.read()),
             period=self._period.read(),
             cycles=int(self._cycles.read()),
-            feedback=bool(self._feedback.value),
-            payload=self._payload.read() / GRAMS,
-            payload_at=self._place.read() / CENTIMETRES,
-            mounting=read_mounting(self._mounting.value),
+            conditions=self.conditions(),
         )
         learned = str(self._learned.value or "")
-        return replace(request, motion=learned, method=LEARNED) if learned else request
+        if not learned:
+            return request
+        conditions = replace(request.conditions, method=LEARNED)
+        return replace(request, motion=learned, conditions=conditions)
+
+    def conditions(self) -> Conditions:
+        """Return what motions and drawings are to be planned with.
+
+        Raises:
+            FormError: a field holds what it cannot.
+        """
+        load = Load(
+            self._payload.read() / GRAMS,
+            self._place.read() / CENTIMETRES,
+            read_mounting(self._mounting.value),
+        )
+        return Conditions(
+            str(self._model.value), str(self._method.value), load, bool(self._feedback.value)
+        )
 
     def offer_learned(self, names: list[str]) -> None:
         """Offer the plans that are in the planner's folder now; a chosen one that is gone goes."""

@@ -32,6 +32,7 @@ from der_msgs.msg import (
 from der_planner.limb import Limb, mounting_of
 from der_planner.page.access import Binding, listen, read_password
 from der_planner.page.afterwards.experiments import Experiments
+from der_planner.page.commands import Load
 from der_planner.page.drawing.studio import Studio
 from der_planner.page.graph_commands import GraphCommands
 from der_planner.page.intake import Intake
@@ -138,9 +139,8 @@ class PageNode(Node):
         folder = Path(str(read("drawings", "~/limb_drawings", "folder of kept drawings")))
         if mounting:
             limb = limb.mounted(mounting)
-        return Studio(
-            limb.carrying(payload, place or None), PathLimits(speed, most), folder.expanduser()
-        )
+        carried = Load(payload, place)
+        return Studio(limb, PathLimits(speed, most), folder.expanduser(), carried)
 
     # What comes in -------------------------------------------------------------------------
 

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import json
 import logging
+import math
 import socket
 import struct
 import threading
@@ -13,17 +14,18 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 from urllib.parse import parse_qs
 
 import uvicorn
-from fastapi import FastAPI, Request, Response, WebSocket, WebSocketDisconnect
+from fastapi import Depends, FastAPI, Request, Response, WebSocket, WebSocketDisconnect
 from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, RedirectResponse
 from fastapi.staticfiles import StaticFiles
 
+from der_planner.limb import LimbError
 from der_planner.page.access import SESSION_LIFE, Binding, Sessions, bracketed
 from der_planner.page.afterwards.experiments import Experiments
-from der_planner.page.commands import Commands, answer_of, in_buttons
+from der_planner.page.commands import Commands, Load, answer_of
 from der_planner.page.drawing.studio import Studio
 from der_planner.page.guard import COOKIE, LOGIN, Guard
 from der_planner.page.operators import Desk
@@ -35,6 +37,8 @@ from der_planner.page.worker import Worker
 STATIC = Path(__file__).parent / "static"
 RATE = 10.0
 """Hz of the live data."""
+LONGEST_TIME = 30
+"""Characters of the time that a window says."""
 LONGEST_WAIT = 1.0
 """[s] that a request for a picture may wait for the next one."""
 WRONG_PASSWORD_DELAY = 1.0
@@ -109,6 +113,47 @@ class LiveText:
         return self._text
 
 
+class Asking:
+    """A window's requests for live data, each with the time of its own clock.
+
+    A window asks again when it has the answer, so that no more than one is under way: a slow
+    connection delays data, but does not pile them up. The time and how long the request waited here
+    go back with the answer: what else has passed on the window's clock is how old the data can be.
+    """
+
+    def __init__(self) -> None:
+        self._asked = asyncio.Event()
+        self._closed = False
+        self._time, self._at = 0.0, 0.0
+
+    async def listen(self, websocket: WebSocket) -> None:
+        """Take requests until the window is gone."""
+        try:
+            while (message := await websocket.receive())["type"] != "websocket.disconnect":
+                with contextlib.suppress(ValueError):  # no clock shows that
+                    self._take(float((message.get("text") or "")[:LONGEST_TIME]))
+        except (WebSocketDisconnect, RuntimeError):
+            pass
+        finally:
+            self._closed = True
+            self._asked.set()
+
+    def _take(self, sent: float) -> None:
+        if math.isfinite(sent):
+            self._time, self._at = sent, time.monotonic()
+            self._asked.set()
+
+    async def asks(self) -> bool:
+        """Wait for the next request; return False instead when the window is gone."""
+        await self._asked.wait()
+        self._asked.clear()
+        return not self._closed
+
+    def answer(self, data: str) -> str:
+        """Return a JSON object with the request's time, and how long it waited [s]."""
+        return f'{{"asked":{self._time!r},"waited":{time.monotonic() - self._at:.4f},{data[1:]}'
+
+
 def create_app(parts: Parts, sessions: Sessions, secure: bool) -> FastAPI:
     """Return the application without its layout.
 
@@ -119,52 +164,14 @@ def create_app(parts: Parts, sessions: Sessions, secure: bool) -> FastAPI:
     """
     app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
     app.mount("/static", StaticFiles(directory=STATIC))
-    live = LiveText(parts)
-
-    @app.websocket("/live")
-    async def send_live(websocket: WebSocket) -> None:
-        await websocket.accept()
-        listening = asyncio.create_task(_until_closed(websocket))
-        due = time.monotonic()
-        try:
-            while not listening.done():
-                await websocket.send_text(live())
-                # On a grid, so that what sending takes does not add up; nothing is made up for.
-                due = max(due + 1.0 / RATE, time.monotonic())
-                await asyncio.sleep(due - time.monotonic())
-        except (WebSocketDisconnect, RuntimeError):
-            pass  # the browser has gone
-        finally:
-            listening.cancel()
+    _add_live(app, parts)
+    _add_picture(app, parts)
 
     @app.post("/vent")
     async def vent() -> JSONResponse:
         # Whoever sees the page may vent, operator or not.
         answer = await answer_of("vent", parts.commands.call("vent"))
-        message = in_buttons(answer.message)
-        return JSONResponse({"success": answer.success, "message": message})
-
-    bell = Bell()
-    parts.picture.on_put = bell.ring
-
-    @app.get("/picture")
-    async def picture(
-        after: int = 0, region: bool = False, width: int = 0, wait: float = 0.0
-    ) -> Response:
-        if not parts.picture.look(after):
-            await bell.rung(min(wait, LONGEST_WAIT))
-        encoded = await asyncio.to_thread(parts.picture.take, after, width)
-        if encoded is None:
-            return Response(status_code=204)
-        reference = parts.situation.reference_at(encoded.stamp)
-        drawn = parts.overlay.at(encoded.stamp, reference)
-        drawn |= {"number": encoded.number, "size": encoded.size}
-        if region:
-            outlines = await asyncio.to_thread(lambda: parts.studio.region)
-            drawn["region"] = [parts.overlay.pixels_of(outline) for outline in outlines]
-        head = json.dumps(drawn, separators=(",", ":")).encode()
-        body = struct.pack(">I", len(head)) + head + encoded.jpeg
-        return Response(body, media_type="application/octet-stream", headers=_UNCACHED)
+        return JSONResponse({"success": answer.success, "message": answer.message})
 
     @app.get("/experiments/{name}/{inside:path}")
     async def experiment_file(name: str, inside: str) -> Response:
@@ -180,12 +187,67 @@ def create_app(parts: Parts, sessions: Sessions, secure: bool) -> FastAPI:
 _UNCACHED = {"Cache-Control": "no-store"}
 
 
-async def _until_closed(websocket: WebSocket) -> None:
+def _add_live(app: FastAPI, parts: Parts) -> None:
+    live = LiveText(parts)
+
+    @app.websocket("/live")
+    async def send_live(websocket: WebSocket) -> None:
+        await websocket.accept()
+        window = Asking()
+        listening = asyncio.create_task(window.listen(websocket))
+        due = time.monotonic()
+        try:
+            while await window.asks():
+                await asyncio.sleep(due - time.monotonic())
+                await websocket.send_text(window.answer(live()))
+                # On a grid, so that what sending takes does not add up; nothing is made up for.
+                due = max(due + 1.0 / RATE, time.monotonic())
+        except (WebSocketDisconnect, RuntimeError):
+            pass  # the browser has gone
+        finally:
+            listening.cancel()
+
+
+def _add_picture(app: FastAPI, parts: Parts) -> None:
+    bell = Bell()
+    parts.picture.on_put = bell.ring
+
+    @app.get("/picture")
+    async def picture(
+        load: Annotated[Load, Depends(_load)],
+        after: int = 0,
+        region: bool = False,
+        width: int = 0,
+        wait: float = 0.0,
+    ) -> Response:
+        begun = time.monotonic()
+        if not parts.picture.look(after):
+            await bell.rung(min(wait, LONGEST_WAIT))
+        encoded = await asyncio.to_thread(parts.picture.take, after, width)
+        if encoded is None:
+            return Response(status_code=204)
+        reference = parts.situation.reference_at(encoded.stamp)
+        drawn = parts.overlay.at(encoded.stamp, reference)
+        drawn |= {"number": encoded.number, "size": encoded.size}
+        if region:
+            drawn["region"] = await asyncio.to_thread(_region, parts, load)
+        drawn["waited"] = round(time.monotonic() - begun, 4)
+        head = json.dumps(drawn, separators=(",", ":")).encode()
+        body = struct.pack(">I", len(head)) + head + encoded.jpeg
+        return Response(body, media_type="application/octet-stream", headers=_UNCACHED)
+
+
+def _load(payload: float = 0.0, payload_at: float = 0.0, mounting: str = "") -> Load:
+    return Load(payload, payload_at, mounting)
+
+
+def _region(parts: Parts, load: Load) -> list[list[list[float]]]:
+    """Return the outlines of what the tip reaches under a load [px]; none if there is no such."""
     try:
-        while True:
-            await websocket.receive()
-    except (WebSocketDisconnect, RuntimeError):
-        return
+        outlines = parts.studio.region(load)
+    except LimbError:
+        return []  # the form says what is wrong with it
+    return [parts.overlay.pixels_of(outline) for outline in outlines]
 
 
 def _add_login(app: FastAPI, sessions: Sessions, secure: bool) -> None:

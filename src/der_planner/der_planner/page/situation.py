@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from der_planner.page.commands import in_buttons
 from der_planner.page.processes import Processes
 
 PASCAL_PER_KILOPASCAL = 1000.0
@@ -305,7 +304,7 @@ def _mode(driver: DriverState) -> str:
 def _driver_values(driver: DriverState) -> dict[str, Any]:
     return {
         "mode": _mode(driver),
-        "faults": [in_buttons(fault) for fault in driver.faults],
+        "faults": list(driver.faults),
         "plan_id": driver.plan_id,
         "commanded_kpa": _kilopascal(driver.commanded),
         "measured_kpa": _kilopascal(driver.measured),
@@ -332,7 +331,7 @@ def _node_values(status: NodeStatus, age: float, trouble: str) -> dict[str, Any]
     return {
         "name": _short(status.name),
         "state": level,
-        "message": trouble or in_buttons(status.message),
+        "message": trouble or status.message,
         "age": round(age, 1),
         "values": dict(status.values),
     }

@@ -56,6 +56,16 @@ def arc_point(z: float) -> Any:
 
 
 @njit(cache=True, nogil=True)
+def arcs_and_slopes(z: Vector) -> Any:
+    """Return g and its first derivative, each (n,), at every z (n,)."""
+    arcs, slopes = np.empty(z.size, dtype=np.complex128), np.empty(z.size, dtype=np.complex128)
+    for k in range(z.size):
+        zeroth, first, _, _ = arc_moments(z[k])
+        arcs[k], slopes[k] = zeroth, 1j * first
+    return arcs, slopes
+
+
+@njit(cache=True, nogil=True)
 def solve_symmetric(A: Vector, b: Vector) -> None:
     """Solve A x = b for a positive definite A (n, n), of which the lower half is given.
 

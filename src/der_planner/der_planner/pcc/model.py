@@ -124,14 +124,14 @@ class Pcc:
         """Return ∂tip/∂bend angles (..., 2, n) [m/rad] for bend angles (..., n) [rad]."""
         angles = np.asarray(bend_angles, dtype=float)
         tip, ends, headings = self._joints(angles)
-        columns = headings * self.lengths * _arc_slope(angles) + 1j * (tip[..., None] - ends)
+        columns = headings * self.lengths * _arc_ends(angles)[1] + 1j * (tip[..., None] - ends)
         return np.stack([columns.real, columns.imag], axis=-2)
 
     def _joints(self, angles: Vector) -> tuple[Complex, Complex, Complex]:
         """Return the tip (...), the ends of the segments and their first headings (..., n)."""
         turned = np.cumsum(angles, axis=-1)
         headings = np.exp(1j * (turned - angles))
-        steps = headings * self.lengths * _arc(angles)
+        steps = headings * self.lengths * _arc_ends(angles)[0]
         between = np.exp(1j * turned) * self.connector
         between[..., -1] = 0.0
         ends = self.base + np.cumsum(steps, axis=-1) + np.cumsum(between, axis=-1) - between
@@ -146,9 +146,9 @@ class Pcc:
             if j:
                 position += heading * self.connector
                 points.append(position)
-            for fraction in np.arange(1, points_per_segment + 1) / points_per_segment:
-                arc = fraction * _arc(np.array(fraction * angle))
-                points.append(complex(position + heading * self.lengths[j] * arc))
+            fractions = np.arange(1, points_per_segment + 1) / points_per_segment
+            arcs = fractions * _arc_ends(fractions * angle)[0]
+            points += list(position + heading * self.lengths[j] * arcs)
             position = points[-1]
             heading *= np.exp(1j * angle)
         line = np.array(points)
@@ -300,22 +300,7 @@ class Pcc:
         return max(1, int(np.ceil(fastest * step / LARGEST_PHASE)))
 
 
-def _arc(angle: Vector) -> Complex:
-    """Return g(angle) = ∫₀¹ exp(i angle η) dη, by half angles: exact and smooth through zero."""
-    half = np.asarray(angle) / 2
-    result: Complex = np.sinc(half / np.pi) * np.exp(1j * half)
-    return result
-
-
-def _arc_slope(angle: Vector) -> Complex:
-    """Return g′(angle) = i ∫₀¹ η exp(i angle η) dη; by its series where the quotient cancels."""
-    small = np.abs(angle) < arc_kernel.SERIES_BELOW
-    safe = np.where(small, 1.0, angle)
-    quotient = (np.exp(1j * safe) - _arc(safe)) / safe
-    series = np.zeros(np.shape(angle), dtype=complex)
-    term = np.full(np.shape(angle), 1j)
-    for m in range(14):
-        series += term / (m + 2)
-        term = term * 1j * np.where(small, angle, 0.0) / (m + 1)
-    result: Complex = np.where(small, series, quotient)
-    return result
+def _arc_ends(angles: Vector) -> tuple[Complex, Complex]:
+    """Return g = ∫₀¹ exp(i angle η) dη and its derivative at angles [rad] of any shape."""
+    arcs, slopes = arc_kernel.arcs_and_slopes(np.ravel(angles))
+    return arcs.reshape(angles.shape), slopes.reshape(angles.shape)

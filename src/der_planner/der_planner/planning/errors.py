@@ -21,17 +21,23 @@ class UnreachableError(PlanningError):
     """
 
     def __init__(
-        self, time: float, point: tuple[float, float], distance: float, required_pressure: float
+        self,
+        time: float,
+        point: tuple[float, float],
+        distance: float,
+        required_pressure: float,
+        carried: float = 0.0,
     ) -> None:
         needed = (
             "no pressure reaches it"
             if math.isnan(required_pressure)
             else f"it would need {required_pressure / 1000:.1f} kPa"
         )
+        lighter = f"It carries {carried * 1000:.1f} g: carry less, move" if carried else "Move"
         super().__init__(
             f"the point ({point[0]:.4f}, {point[1]:.4f}) m at t = {time:.2f} s is out of reach: "
             f"{distance * 1000:.1f} mm from what the limb reaches within its pressure limit; "
-            f"{needed}. Move or shrink the path, or lower the amplitude"
+            f"{needed}. {lighter} or shrink the path, or lower the amplitude"
         )
         self.time = time
         self.point = point
@@ -68,7 +74,8 @@ class OverloadError(PlanningError):
     ) -> None:
         remedy = "Shrink or move the motion, or mount the limb otherwise"
         if carried and possible_mass is None:
-            remedy = f"Without the {carried * 1000:.1f} g that it carries it is too much. {remedy}"
+            weight = f"{carried * 1000:.1f} g"
+            remedy = f"Even without the {weight} that it carries it is too much. {remedy}"
         elif carried and possible_mass is not None:
             remedy = (
                 f"It carries {carried * 1000:.1f} g: {possible_mass * 1000:.1f} g are possible "

@@ -26,8 +26,6 @@ from der_planner.planning.ways import Start, resting_spline, sample_spline
 
 Array = NDArray[np.float64]
 
-LEARNED = "learned"
-"""The method of plans that were learned."""
 SCHEMA_VERSION = 1
 SUFFIX = ".yaml"
 _SAME = 1e-9

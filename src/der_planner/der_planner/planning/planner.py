@@ -20,6 +20,7 @@ from der_planner.model.response import NODES, simulate
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import models
 from der_planner.planning.errors import PlanningError
+from der_planner.planning.loads.rest import nearly_buckling
 from der_planner.planning.models import METHODS, PlanningModel
 from der_planner.planning.motions import Motion, Reference
 from der_planner.planning.optimal import Optimiser
@@ -79,11 +80,11 @@ def plan(
     with _THREADS.limit(limits=1, user_api="blas"):
         physics = models.build(limb, model, nodes)
         reference = motion.reference(limb, start)
-        spline = physics.configuration(reference)
+        spline = _configuration(physics, reference, model)
         report(0.3)
         solved = _followed(physics, spline, reference, method, report)
     bend = sample_spline(spline, reference.time)[0]
-    left = [str(reference.deviation or "")]
+    left = [str(reference.deviation or ""), nearly_buckling(physics.limb)]
     warnings = filter(None, left + solved.warnings + _calibration_warnings(physics.limb, bend))
     return Plan(
         time=reference.time,
@@ -103,6 +104,19 @@ def plan(
         warnings=tuple(warnings),
         details=solved.details,
     )
+
+
+def _configuration(physics: PlanningModel, reference: Reference, model: str) -> BSpline:
+    """Return q̄(t) of a model; a refusal says where arcs are refused for what they do not know."""
+    try:
+        return physics.configuration(reference)
+    except PlanningError as error:
+        if model == "pcc" and physics.limb.gravity[2]:
+            error.args = (
+                f"{error}. Arcs know nothing of the sag out of their plane that this gravity "
+                "brings: plan with the rod (der)",
+            )
+        raise
 
 
 @dataclass(frozen=True)
@@ -152,7 +166,8 @@ def _solve(
         outcome = solver.run(lambda share: report(0.4 + 0.6 * share))
         commands, tip, said = outcome.commands, outcome.tip, ""
         missed = _mean_distance(tip, reference)
-        if outcome.limited and missed > _NOTABLE_ERROR:
+        elsewhere = _begins_elsewhere(tip, reference) and not _excessive(physics.limb, wanted)
+        if outcome.limited and missed > _NOTABLE_ERROR and not elsewhere:
             said = f"the limits leave a mean error of {missed * 1000:.1f} mm on the model itself"
         details: dict[str, float] = {"steps": outcome.steps, "limited_windows": outcome.limited}
     else:
@@ -239,11 +254,22 @@ def _error_warnings(tip: Array, reference: Reference, method: str) -> list[str]:
     if missed.max() <= _LARGE_ERROR:
         return []
     remedy = "" if method == "optimal" else ", or the method optimal,"
+    advice = f"a longer period{remedy} or a smaller amplitude misses less"
+    if _begins_elsewhere(tip, reference):
+        advice = (
+            f"it begins {missed[0] * 1000:.1f} mm off, since it rests elsewhere than the limb "
+            "under its load, which no period changes: the rod (der) rests where the limb does"
+        )
     return [
         f"the model itself misses the reference by {missed.mean() * 1000:.1f} mm on average and by "
-        f"{missed.max() * 1000:.1f} mm at {reference.time[missed.argmax()]:.1f} s: a longer "
-        f"period{remedy} or a smaller amplitude misses less"
+        f"{missed.max() * 1000:.1f} mm at {reference.time[missed.argmax()]:.1f} s: {advice}"
     ]
+
+
+def _begins_elsewhere(tip: Array, reference: Reference) -> bool:
+    """Tell whether most of what tips (K, 2) miss is there when the motion begins at rest."""
+    missed = np.linalg.norm(tip - reference.tip, axis=1)
+    return reference.start is None and bool(missed[0] > 0.5 * missed.max())
 
 
 def _mean_distance(tip: Array, reference: Reference) -> float:
@@ -262,10 +288,20 @@ def _vent_warnings(slow: SlowVenting | None, missed: float) -> list[str]:
     ]
 
 
+def _wants(wanted: Array) -> tuple[float, float]:
+    """Return the largest pressure [Pa] and the largest change [Pa/s] of wanted commands (K, M)."""
+    fastest = np.abs(np.diff(wanted, axis=0)).max(initial=0.0) / CONTROL_PERIOD
+    return float(np.abs(wanted).max()), float(fastest)
+
+
+def _excessive(limb: Limb, wanted: Array) -> bool:
+    largest, fastest = _wants(wanted)
+    return largest > limb.pneumatics.pressure_limit or fastest > limb.pneumatics.slew_limit
+
+
 def _excess(limb: Limb, wanted: Array) -> str:
     air = limb.pneumatics
-    largest = float(np.abs(wanted).max())
-    fastest = float(np.abs(np.diff(wanted, axis=0)).max(initial=0.0)) / CONTROL_PERIOD
+    largest, fastest = _wants(wanted)
     return (
         f"the motion wants {largest:.0f} Pa and {fastest:.0f} Pa/s, allowed are "
         f"{air.pressure_limit:.0f} Pa and {air.slew_limit:.0f} Pa/s; a longer period or a smaller "

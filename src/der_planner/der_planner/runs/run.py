@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from der_planner.methods import LEARNED
+
 Array = NDArray[np.float64]
-LEARNED = "learned"
-"""The method of a plan that was learned; runs of an experiment add from how many runs it was."""
 
 
 def method_name(method: str, learned_from: object = None) -> str:

@@ -1,4 +1,7 @@
-"""The rows of a study: a grid of values, times draws of the factors that are given as ranges."""
+"""The rows of a study: a grid of values, times draws of the factors that are given as ranges.
+
+scipy.stats takes most of a second to import: only who draws with it pays for it.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm, qmc
 
 from der_planner.studies.errors import StudyError
 from der_planner.studies.factors import Value
@@ -38,6 +40,8 @@ class Spread:
     def value(self, share: float) -> Value:
         """Return the value below which ``share`` (0 … 1) of the draws lie."""
         if self.scale == "normal":
+            from scipy.stats import norm  # noqa: PLC0415
+
             return float(norm.ppf(share, self.low, self.high))
         if self.scale == "log":
             return float(self.low * math.exp(share * math.log(self.high / self.low)))
@@ -67,6 +71,8 @@ class Draw:
 
 
 def _sobol(dimensions: int, count: int, seed: int) -> Array:
+    from scipy.stats import qmc  # noqa: PLC0415
+
     sequence = qmc.Sobol(dimensions, rng=np.random.default_rng(seed))
     points: Array = sequence.random_base2(int(math.log2(count)))
     return points

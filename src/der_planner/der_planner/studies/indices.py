@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.stats
 
 from der_planner.studies.store import Kept
 from der_planner.studies.study import Study
@@ -46,6 +45,9 @@ def sobol_indices(study: Study, kept: Mapping[str, Kept], of: str) -> tuple[Inde
     values = np.array(good)
     if np.ptp(values) == 0.0:
         return ()
+    # It takes most of a second to import: only studies with Sobol indices pay for it.
+    import scipy.stats  # noqa: PLC0415
+
     found = scipy.stats.sobol_indices(
         func={
             "f_A": values[None, :count],

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from apriltag_tracker.camera.lens import local_bend
 from apriltag_tracker.detection.alignment import fit
-from apriltag_tracker.detection.alignment.pattern import tabulate
+from apriltag_tracker.detection.alignment.pattern import Pattern, tabulate
 from apriltag_tracker.detection.alignment.sampling import side_length
 from apriltag_tracker.detection.alignment.smear import guess_smear
 from apriltag_tracker.family import TAG36H11, Family
@@ -84,9 +84,7 @@ class Aligner:
         self._family = family
         self._lens = lens
         self._border = float(family.border_cells)
-        self._tables: OrderedDict[tuple[int, int], tuple[NDArray[np.float32], float]] = (
-            OrderedDict()
-        )
+        self._tables: OrderedDict[tuple[int, int], Pattern] = OrderedDict()
 
     def align(
         self,
@@ -160,18 +158,9 @@ class Aligner:
 
     def _smeared(self, image: NDArray[np.uint8], tag: int, plain: Alignment) -> Alignment | None:
         cell = side_length(plain.corners) / self._border
-        table, table_blur = self._table(tag, plain.blur / cell)
+        pattern, bend = self._table(tag, plain.blur / cell), self._bend(plain.corners)
         guess = np.zeros(2)
-        blur = guess_smear(
-            image,
-            table,
-            table_blur,
-            self._border,
-            plain.corners,
-            self._bend(plain.corners),
-            plain.blur,
-            guess,
-        )
+        blur = guess_smear(image, pattern, plain.corners, bend, plain.blur, guess)
         if math.hypot(*guess) < _SHORTEST:
             return None
         return self._fit(image, tag, plain.corners, max(blur, 0.5), guess)
@@ -213,26 +202,15 @@ class Aligner:
         if smear is not None:
             result[1:3], result[8] = smear, turn
         for attempt in range(3):
-            table, table_blur = self._table(tag, result[0] / cell)
-            free = smear is not None
+            pattern, free = self._table(tag, result[0] / cell), smear is not None
             settled = fit.align(
-                image,
-                table,
-                table_blur,
-                self._border,
-                start,
-                bend,
-                free,
-                _PASSES,
-                placed,
-                covariance,
-                result,
+                image, pattern, start, bend, free, _PASSES, placed, covariance, result
             )
             if not settled and attempt > 0:
                 return None
             if not np.all(np.isfinite(placed)):
                 return None
-            if settled and abs(math.log(result[0] / (cell * table_blur))) < math.log(_STEP):
+            if settled and abs(math.log(result[0] / (cell * pattern.blur))) < math.log(_STEP):
                 break
             start = placed.copy() if settled else start
         if not settled or not np.all(np.isfinite(covariance)):
@@ -260,8 +238,8 @@ class Aligner:
         bend: NDArray[np.float64] = local_bend(corners, *self._lens)
         return bend
 
-    def _table(self, tag: int, blur: float) -> tuple[NDArray[np.float32], float]:
-        """Return the table of a tag's pattern nearest to a blur [cells], and its blur."""
+    def _table(self, tag: int, blur: float) -> Pattern:
+        """Return the table of a tag's pattern nearest to a blur [cells]."""
         level = round(math.log(min(max(blur, 0.04), 2.0)) / math.log(_STEP))
         key = (tag, level)
         if key in self._tables:
@@ -269,7 +247,10 @@ class Aligner:
             return self._tables[key]
         near = _STEP**level
         resolution = min(max(round(_POINTS / near), 5), 16)
-        entry = tabulate(self._family.printed_cells(tag, 1), resolution, near), near
+        cells = self._family.seen_cells(tag)
+        entry = Pattern(
+            tabulate(cells, resolution, near), near, self._border, float(self._family.rim)
+        )
         self._tables[key] = entry
         if len(self._tables) > _TABLES:
             self._tables.popitem(last=False)

@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from apriltag_tracker.detection.alignment.pattern import Pattern
 from apriltag_tracker.detection.alignment.sampling import (
     RUN,
     UNKNOWNS,
@@ -27,6 +28,11 @@ from apriltag_tracker.detection.alignment.sampling import (
     side_length,
     straighten,
     write_corners,
+)
+from apriltag_tracker.detection.alignment.weights import (
+    QUANTISATION,
+    neighbours_alike,
+    weigh,
 )
 from apriltag_tracker.detection.decoding import square_to_quad
 
@@ -42,17 +48,14 @@ _MOST_PIXELS, _MOST_SMEARED = 1700.0, 2600.0
 """Of the rectangle around a tag; a smear takes more of them to be told."""
 
 _LEAST_BLUR, _MOST_BLUR = 0.32, 4.0
-_QUANTISATION = 0.3
-"""Standard deviation of the rounding to whole grey levels."""
+_PERSPECTIVE = 1.04
+"""By so much the near part of a tag is larger than the mean."""
 
 _SETTLED = 0.03
 """Steps end when no corner moves further [px]; what is left after such a step is a tenth of it."""
 
 _FEWEST = 60
 """Pixels that a fit needs."""
-
-_BESIDE = 2
-"""What covers a tag is blurred: pixels so near to what does not fit count no more either [px]."""
 
 _MODEL_ERROR = 0.003
 """What the model leaves out, whatever the noise, moves a corner by so much [px]."""
@@ -114,82 +117,6 @@ def _linear_terms(
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def _typical(residual: NDArray[np.float64], count: int) -> float:
-    """Return the residuals' standard deviation from the median of about 200 of them."""
-    step = max(count // 200, 1)
-    return max(1.4826 * float(np.median(np.abs(residual[:count:step]))), _QUANTISATION)
-
-
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _neighbours_alike(
-    residual: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    where: NDArray[np.int64],
-    count: int,
-) -> float:
-    """Return the correlation of the residuals of neighbouring pixels, 0 to 0.9.
-
-    What the model lacks leaves residuals that are alike in neighbours. Of a sequence with this
-    correlation ρ, n values are worth n (1 − ρ) / (1 + ρ); the same holds across the rows.
-    """
-    product, square = 0.0, 1e-12
-    for i in range(count - 1):
-        if where[0, i] == where[0, i + 1] and where[1, i] + 1 == where[1, i + 1]:
-            both = weights[i] * weights[i + 1]
-            product += both * residual[i] * residual[i + 1]
-            square += 0.5 * both * (residual[i] ** 2 + residual[i + 1] ** 2)
-    return min(max(product / square, 0.0), 0.9)
-
-
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _weigh_beside(
-    residual: NDArray[np.float64],
-    limit: float,
-    where: NDArray[np.int64],
-    count: int,
-    weights: NDArray[np.float64],
-) -> None:
-    """Take the weight from the pixels around those whose residual is above a limit."""
-    top, left = where[0, 0], where[1, :count].min()
-    marked = np.zeros(
-        (where[0, count - 1] - top + 1, where[1, :count].max() - left + 1), dtype=np.bool_
-    )
-    for i in range(count):
-        if abs(residual[i]) > limit:
-            row, column = where[0, i] - top, where[1, i] - left
-            marked[
-                max(row - _BESIDE, 0) : row + _BESIDE + 1,
-                max(column - _BESIDE, 0) : column + _BESIDE + 1,
-            ] = True
-    for i in range(count):
-        if marked[where[0, i] - top, where[1, i] - left]:
-            weights[i] = min(weights[i], 0.01)
-
-
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _weigh(
-    residual: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    where: NDArray[np.int64],
-    count: int,
-    share: float,
-) -> None:
-    """Take weight from what is far off; the new weights count by a share.
-
-    Something that covers a part of the tag is blurred, too: what is beside it counts less as well.
-    """
-    limit = 3.5 * _typical(residual, count)
-    largest = 0.0
-    for i in range(count):
-        off = abs(residual[i])
-        fresh = 1.0 if off <= limit else (limit / off) ** 4
-        weights[i] += share * (fresh - weights[i])
-        largest = max(largest, off)
-    if largest > 2.0 * limit:
-        _weigh_beside(residual, 2.0 * limit, where, count, weights)
-
-
-@njit(cache=True)  # type: ignore[untyped-decorator]
 def _judge(
     pixels: Pixels, count: int, move: NDArray[np.float64], result: NDArray[np.float64]
 ) -> None:
@@ -208,13 +135,15 @@ def _judge(
         all_square += off
         whole += (values[i] - mean) ** 2
     result[3] = 1.0 - all_square / whole
-    result[4] = max(math.sqrt(square / max(kept - UNKNOWNS, 10.0)), _QUANTISATION)
+    result[4] = max(math.sqrt(square / max(kept - UNKNOWNS, 10.0)), QUANTISATION)
     result[5] = kept / count
-    result[7] = _neighbours_alike(residual, weights, pixels.where, count)
+    result[7] = neighbours_alike(residual, weights, pixels.where, count)
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def _prepare(pixels: Pixels, count: int, share: float, result: NDArray[np.float64]) -> bool:
+def _prepare(
+    pixels: Pixels, count: int, share: float, stride: int, result: NDArray[np.float64]
+) -> bool:
     """Fit the light, write residuals and weights; derivatives become those of the grey level."""
     rows, residual = pixels.rows, pixels.residual
     linear = np.zeros(4)
@@ -226,7 +155,7 @@ def _prepare(pixels: Pixels, count: int, share: float, result: NDArray[np.float6
     for i in range(count):
         seen = linear[0] + gain * rows[13, i] + linear[2] * rows[14, i] + linear[3] * rows[15, i]
         residual[i] = pixels.values[i] - seen
-    _weigh(residual, pixels.weights, pixels.where, count, share)
+    weigh(residual, pixels.weights, pixels.where, count, share, stride)
     # The slopes of the light are small: derivatives take the gain of the tag's middle.
     for a in range(_LINEAR):
         for i in range(count):
@@ -301,10 +230,13 @@ def _write_normal(
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def _stride_and_room(start: NDArray[np.float64], free_smear: bool) -> tuple[int, int]:
+def _stride_and_room(
+    start: NDArray[np.float64], pattern: Pattern, free_smear: bool
+) -> tuple[int, int]:
     """Return of how many runs of pixels one is used, and for how many there must be room."""
-    wide = (start[:, 0].max() - start[:, 0].min()) * 1.3 + 4.0
-    high = (start[:, 1].max() - start[:, 1].min()) * 1.3 + 4.0
+    whole = _PERSPECTIVE * (1.0 + 2.0 * pattern.rim / pattern.border)
+    wide = (start[:, 0].max() - start[:, 0].min()) * whole + 4.0
+    high = (start[:, 1].max() - start[:, 1].min()) * whole + 4.0
     stride = 1 + int(wide * high / (_MOST_SMEARED if free_smear else _MOST_PIXELS))
     return stride, int(high + 4.0) * int(wide / stride + 2.0 * RUN)
 
@@ -340,15 +272,14 @@ def _take(
         return 0
     if count != before:
         pixels.weights[:count] = 1.0
-    return count if _prepare(pixels, count, 1.0 if step < _CAREFUL else 0.5, result) else 0
+    share = 1.0 if step < _CAREFUL else 0.5
+    return count if _prepare(pixels, count, share, view.stride, result) else 0
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def align(
     image: NDArray[np.uint8],
-    table: NDArray[np.float32],
-    table_blur: float,
-    border: float,
+    pattern: Pattern,
     start: NDArray[np.float64],
     bend: NDArray[np.float64],
     free_smear: bool,
@@ -361,9 +292,7 @@ def align(
 
     Args:
         image: grey image.
-        table: of `pattern.tabulate`.
-        table_blur: blur of the table [cells]; the fit's may differ by a few percent.
-        border: cells along the black border.
+        pattern: of the tag; the blur of the fit may differ by a few percent from that of its table.
         start: (4, 2) px, corners to start from, from the printed lower left counter-clockwise.
         bend: (6,) of `lens.local_bend` at the tag.
         free_smear: whether smear and turn are fitted; they cannot both start from zero, where the
@@ -381,10 +310,10 @@ def align(
     straighten(bend, corners)
     h, state = _begin(corners, result, free_smear)
     side = side_length(start)
-    stride, room = _stride_and_room(start, free_smear)
-    cell = side / border
+    stride, room = _stride_and_room(start, pattern, free_smear)
+    cell = side / pattern.border
     # The pixels that count stay the same while the blur changes: it is the start's.
-    view = View(image, table, table_blur, border, cell, 2.0 * state[0] / cell, stride, centre, bend)
+    view = View(image, pattern, cell, 2.0 * state[0] / cell, stride, centre, bend)
     pixels = new_pixels(room)
     normal, right = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS)
     moved, count = 0.0, 0

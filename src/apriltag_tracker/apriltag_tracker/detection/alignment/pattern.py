@@ -8,6 +8,7 @@ the share of cell c in grid point i. Derivatives by place and by blur are produc
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -16,8 +17,22 @@ from numpy.typing import NDArray
 LAYERS = 4
 """Value, derivatives by column and by row (a cell), derivative by the blur (a cell)."""
 
-MARGIN = 1
-"""Width of the white margin that belongs to the pattern, in cells."""
+
+class Pattern(NamedTuple):
+    """The pattern of a tag under one blur.
+
+    Attributes:
+        table: of `tabulate`.
+        blur: of the table [cells].
+        border: cells along the border.
+        rim: cells around the border that belong to the pattern.
+    """
+
+    table: NDArray[np.float32]
+    blur: float
+    border: float
+    rim: float
+
 
 _REACH = 4.0
 _ROOT = math.sqrt(0.5)
@@ -54,7 +69,7 @@ def tabulate(cells: NDArray[np.uint8], resolution: int, blur: float) -> NDArray[
     """Tabulate a blurred pattern.
 
     Args:
-        cells: (n, n) printed cells with their margin, 1 is white, upper row first.
+        cells: (n, n) cells of the tag with its rim, 1 is white, upper row first.
         resolution: grid points a cell.
         blur: standard deviation of the Gaussian [cells].
 

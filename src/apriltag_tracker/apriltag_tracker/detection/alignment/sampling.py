@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from apriltag_tracker.detection.alignment.pattern import MARGIN
+from apriltag_tracker.detection.alignment.pattern import Pattern
 
 UNKNOWNS = 16
 """Homography (8), blur [px], smear x, y [px], turn during the exposure [rad], and what is linear:
@@ -27,11 +27,9 @@ class View(NamedTuple):
 
     Attributes:
         image: grey image.
-        table: of `pattern.tabulate`.
-        table_blur: blur of the table [cells].
-        border: cells along the black border.
+        pattern: of the tag.
         cell: edge of a cell [px].
-        reach: so far from the edge of its margin a tag is looked at [cells].
+        reach: so far from the edge of its rim a tag is looked at [cells].
         stride: of so many runs of pixels one is used, another one in every row, so that edges of
             all directions are seen.
         centre: (2,) px, the origin of the homography's coordinates.
@@ -39,9 +37,7 @@ class View(NamedTuple):
     """
 
     image: NDArray[np.uint8]
-    table: NDArray[np.float32]
-    table_blur: float
-    border: float
+    pattern: Pattern
     cell: float
     reach: float
     stride: int
@@ -165,13 +161,13 @@ def side_length(corners: NDArray[np.float64]) -> float:
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def _bounds(h: NDArray[np.float64], margin: float) -> tuple[float, float, float, float]:
-    """Return the range of x and of y that a tag with its margin covers."""
+def _bounds(h: NDArray[np.float64], rim: float) -> tuple[float, float, float, float]:
+    """Return the range of x and of y that a tag with its rim, in sides of the border, covers."""
     low_x = low_y = 1e9
     high_x = high_y = -1e9
     for k in range(4):
-        u = 1.0 + margin if k in {1, 2} else -margin
-        v = 1.0 + margin if k in {2, 3} else -margin
+        u = 1.0 + rim if k in {1, 2} else -rim
+        v = 1.0 + rim if k in {2, 3} else -rim
         w = h[6] * u + h[7] * v + 1.0
         x, y = (h[0] * u + h[1] * v + h[2]) / w, (h[3] * u + h[4] * v + h[5]) / w
         low_x, high_x = min(low_x, x), max(high_x, x)
@@ -228,9 +224,9 @@ def _look_up(
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def _pixels_of(view: View, h: NDArray[np.float64]) -> tuple[int, int, int, int]:
-    """Return the first and last row and column of the image that a tag with its margin covers."""
+    """Return the first and last row and column of the image that a tag with its rim covers."""
     image, centre = view.image, view.centre
-    low_x, high_x, low_y, high_y = _bounds(h, MARGIN / view.border)
+    low_x, high_x, low_y, high_y = _bounds(h, view.pattern.rim / view.pattern.border)
     return (
         max(int(low_y + centre[1]), 0),
         min(int(high_y + centre[1]) + 1, image.shape[0] - 1),
@@ -290,11 +286,12 @@ def sample_model(
     Returns:
         How many pixels there are.
     """
-    table, centre, cell, rows = view.table, view.centre, view.cell, pixels.rows
-    border, whole = view.border, view.border + 2.0 * MARGIN
+    table, centre, cell, rows = view.pattern.table, view.centre, view.cell, pixels.rows
+    border, rim = view.pattern.border, view.pattern.rim
+    whole = border + 2.0 * rim
     resolution = (table.shape[0] - 1) // int(whole)
     back = inverse(h)
-    change = state[0] / cell - view.table_blur
+    change = state[0] / cell - view.pattern.blur
     first_row, last_row, first, last = _pixels_of(view, h)
     count = 0
     for row in range(first_row, last_row + 1):
@@ -306,8 +303,8 @@ def sample_model(
                     return count
                 x, y = straightened(view.bend, column - centre[0], down)
                 u, v, ux, uy, vx, vy = _square_at(back, x, y, border)
-                # In the table columns run to the right and rows down, from the margin's corner.
-                c, r = u * border + MARGIN, (1.0 - v) * border + MARGIN
+                # In the table columns run to the right and rows down, from the rim's corner.
+                c, r = u * border + rim, (1.0 - v) * border + rim
                 smear_x, smear_y = state[1] - state[3] * y, state[2] + state[3] * x
                 dc, dr = ux * smear_x + uy * smear_y, -(vx * smear_x + vy * smear_y)
                 edge_c, edge_r = 0.5 * abs(dc) + view.reach, 0.5 * abs(dr) + view.reach

@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from apriltag_tracker.detection.alignment.pattern import Pattern
 from apriltag_tracker.detection.alignment.sampling import (
     Pixels,
     View,
@@ -63,9 +64,7 @@ def _best_change(
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def guess_smear(
     image: NDArray[np.uint8],
-    table: NDArray[np.float32],
-    table_blur: float,
-    border: float,
+    pattern: Pattern,
     corners: NDArray[np.float64],
     bend: NDArray[np.float64],
     blur: float,
@@ -79,9 +78,7 @@ def guess_smear(
 
     Args:
         image: grey image.
-        table: of `pattern.tabulate`.
-        table_blur: its blur [cells].
-        border: cells along the black border.
+        pattern: of the tag.
         corners: (4, 2) px of the fit.
         bend: (6,) of `lens.local_bend` there.
         blur: of the fit [px].
@@ -96,14 +93,15 @@ def guess_smear(
     straighten(bend, straight)
     h[:8] = square_to_quad(straight)
     h[8] = 1.0
-    cell = side_length(corners) / border
-    low_x, low_y = int(corners[:, 0].min() - cell - 2), int(corners[:, 1].min() - cell - 2)
-    high_x, high_y = int(corners[:, 0].max() + cell + 3), int(corners[:, 1].max() + cell + 3)
+    cell = side_length(corners) / pattern.border
+    around = int(1.2 * pattern.rim * cell) + 2
+    low_x, low_y = int(corners[:, 0].min()) - around, int(corners[:, 1].min()) - around
+    high_x, high_y = int(corners[:, 0].max()) + around + 2, int(corners[:, 1].max()) + around + 2
     room = (high_x - low_x + 1) * (high_y - low_y + 1)
     smear[:] = 0.0
     pixels = new_pixels(room)
     rows, where = pixels.rows, pixels.where
-    view = View(image, table, table_blur, border, cell, 2.0 * blur / cell, 1, centre, bend)
+    view = View(image, pattern, cell, 2.0 * blur / cell, 1, centre, bend)
     count = sample_model(view, h, np.array([blur, 0.0, 0.0, 0.0]), pixels)
     if count < 60:
         return blur

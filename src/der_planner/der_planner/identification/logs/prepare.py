@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import savgol_filter
 
 from der_planner.identification.logs.log import CalibrationLog, LogError
 from der_planner.limb import Limb
@@ -97,6 +96,7 @@ def prepare(
     bend = np.stack([bridge(column) for column in grid.bend_angles.T], axis=1)
     if to_fit:
         _check_units(pressure, limb)
+        _check_tips(grid, limb)
         _check_commands(grid, warnings)
         _check_excitation(pressure, warnings)
         _check_saturation(pressure, limb, warnings)
@@ -110,6 +110,9 @@ def prepare(
             f"{period * waited.sum():.1f} s are not used, since no pressure tells that motion"
         )
     count = min(SMOOTHING, len(bend) - (len(bend) + 1) % 2)
+    # It takes half a second to import: only who has a log pays for it.
+    from scipy.signal import savgol_filter  # noqa: PLC0415
+
     bend = np.asarray(savgol_filter(bend, count, 2, axis=0))
     return Prepared(grid, pressure, bend, valid & ~waited, tuple(warnings))
 
@@ -158,6 +161,20 @@ def _check_units(pressure: Array, limb: Limb) -> None:
         )
 
 
+def _check_tips(log: CalibrationLog, limb: Limb) -> None:
+    """Refuse tips that are nowhere near the limb: another unit, or another origin."""
+    away = np.linalg.norm(log.tip, axis=1)
+    if not np.isfinite(away).any():
+        return
+    far = float(np.nanpercentile(away, 90))
+    if not 0.5 * limb.length < far < 1.5 * limb.length:
+        raise LogError(
+            f"the tips are {far:.3g} m from the clamp, the limb '{limb.name}' is "
+            f"{limb.length:.3g} m long: check the tips' unit (length_unit) and origin, which is "
+            "the clamp, or give the limb's lengths in the limb file of --prior"
+        )
+
+
 def _check_commands(log: CalibrationLog, warnings: list[str]) -> None:
     measured = log.measured_differential
     for index, (command, column) in enumerate(
@@ -185,7 +202,7 @@ def _check_excitation(pressure: Array, warnings: list[str]) -> None:
             raise LogError(
                 f"input {index} was not excited (standard deviation {value:.0f} Pa, "
                 f"{LEAST_EXCITATION:.0f} Pa needed): nothing can be told of segment {index}; "
-                "run the calibration motion"
+                "run the calibration motion, or check the unit of the pressures"
             )
     if pressure.shape[1] > 1:
         together = np.asarray(np.corrcoef(pressure.T))

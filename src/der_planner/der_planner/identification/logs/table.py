@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -13,10 +13,19 @@ import yaml
 from numpy.typing import NDArray
 
 from der_planner.identification.logs.log import CalibrationLog, LogError
+from der_planner.identification.logs.text import read_table
 
 Array = NDArray[np.float64]
 
-PRESSURE_UNITS = {"Pa": 1.0, "hPa": 100.0, "kPa": 1000.0, "psi": 6894.757}
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
+PRESSURE_UNITS = {
+    "Pa": 1.0,
+    "hPa": 100.0,
+    "mbar": 100.0,
+    "kPa": 1000.0,
+    "bar": 1e5,
+    "psi": 6894.757,
+}
 ANGLE_UNITS = {"rad": 1.0, "deg": np.pi / 180.0}
 LENGTH_UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
 REST_SHARE = 0.02
@@ -30,13 +39,14 @@ class ColumnMap:
     """Which column is what, and in which unit.
 
     Attributes:
-        time: column of the time [s].
+        time: column of the time.
         commanded: (M,) columns of commanded differential pressures.
         chambers: (2M,) columns of measured chamber pressures: 0, 1 of segment 0, then of segment 1.
         angles: (M,) columns of the segments' angles.
         tip: (2,) columns of x, y in `limb_base`; empty if there are none.
         tags: columns that repeat their last value, all of them, when a tag is lost; empty: never.
-        pressure_unit, angle_unit, length_unit: see `PRESSURE_UNITS`, `ANGLE_UNITS`, `LENGTH_UNITS`.
+        time_unit, pressure_unit, angle_unit, length_unit: see `TIME_UNITS`, `PRESSURE_UNITS`,
+            `ANGLE_UNITS`, `LENGTH_UNITS`.
         angle_factor: bend angle per listed angle: 2 for chord angles, −1 for the other sign.
         rest_until: rows at rest before this time [s] give the sensors' offsets and are the zero of
             the pressures; a log that does not rest then, and every log with the word ``auto``, has
@@ -50,6 +60,7 @@ class ColumnMap:
     angles: tuple[str, ...]
     tip: tuple[str, ...] = ()
     tags: tuple[str, ...] = ()
+    time_unit: str = "s"
     pressure_unit: str = "Pa"
     angle_unit: str = "rad"
     length_unit: str = "m"
@@ -62,7 +73,7 @@ class ColumnMap:
         """Read a map.
 
         Raises:
-            LogError: the file cannot be read, or a key is unknown or missing.
+            LogError: the file cannot be read, or a key is unknown, missing or of another kind.
         """
         try:
             content = yaml.safe_load(Path(path).read_text())
@@ -80,22 +91,54 @@ class ColumnMap:
                 + (f"{missing[0]} is missing; " if missing else "")
                 + f"the keys are {', '.join(sorted(known))}"
             )
-        values: dict[str, Any] = {
-            key: tuple(tuple(v) if isinstance(v, list) else v for v in value)
-            if isinstance(value, list)
-            else value
-            for key, value in content.items()
-        }
+        values: dict[str, Any] = {}
+        for key, value in content.items():
+            fits, expected = _KINDS.get(key, _TEXT)
+            if not fits(value):
+                raise LogError(f"column map {path}: {key} is {value!r}, give {expected}")
+            values[key] = value
+            if isinstance(value, list):
+                values[key] = tuple(tuple(v) if isinstance(v, list) else v for v in value)
         return cls(**values)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_names(value: object) -> bool:
+    return isinstance(value, list) and all(isinstance(name, str) for name in value)
+
+
+def _is_stretches(value: object) -> bool:
+    return isinstance(value, list) and all(
+        isinstance(pair, list) and len(pair) == 2 and all(map(_is_number, pair)) for pair in value
+    )
+
+
+_NAMES = (_is_names, "a list of columns' names, as [name, name]")
+_TEXT = (lambda value: isinstance(value, str), "one word or name")
+_KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
+    **dict.fromkeys(("commanded", "chambers", "angles", "tags"), _NAMES),
+    "tip": (
+        lambda value: _is_names(value) and len(value) in (0, 2),
+        "the two columns of x and y, as [name, name]",
+    ),
+    "angle_factor": (lambda value: _is_number(value) and value != 0, "a number, not 0"),
+    "rest_until": (lambda value: value == "auto" or _is_number(value), "a time in s, or auto"),
+    "ignore": (_is_stretches, "a list of pairs of times in s, as [[1.5, 3.0]]"),
+}
+"""What the value of a key must be, and how that is said; a key that is not here is `_TEXT`."""
 
 
 def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
     """Read a log.
 
     Raises:
-        LogError: a column is missing or no number, or a unit is unknown; the message names it.
+        LogError: a column is missing or no number, a unit is unknown, or time falls; the message
+            names it.
     """
-    table = _table(Path(path))
+    table = read_table(Path(path))
     pressure = _unit(columns.pressure_unit, PRESSURE_UNITS, "pressure_unit")
     angle = _unit(columns.angle_unit, ANGLE_UNITS, "angle_unit") * columns.angle_factor
     length = _unit(columns.length_unit, LENGTH_UNITS, "length_unit")
@@ -115,7 +158,8 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
             )
         return np.stack([table[name] for name in names], axis=1)
 
-    time = pick((columns.time,))[:, 0]
+    seconds = _unit(columns.time_unit, TIME_UNITS, "time_unit")
+    time = seconds * pick((columns.time,))[:, 0]
     command, chambers = pick(columns.commanded), pick(columns.chambers)
     angles = pick(columns.angles)
     tip = pick(columns.tip) if columns.tip else np.full((len(time), 2), np.nan)
@@ -133,7 +177,7 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
         tags = pick(columns.tags)
         lost = np.all(np.diff(tags, axis=0, prepend=np.nan) == 0, axis=1)
         angles[lost], tip[lost] = np.nan, np.nan
-    keep = np.ones(len(time), dtype=bool)
+    keep = _timed(time, path)
     for first, last in columns.ignore:
         keep &= (time < first) | (time > last)
     return CalibrationLog(
@@ -144,6 +188,26 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
         tip=length * tip[keep],
         source=Path(path).name,
     )
+
+
+def _timed(time: Array, path: str | Path) -> NDArray[np.bool_]:
+    """Return which rows have a time of their own (K,); of rows at one time the first.
+
+    Raises:
+        LogError: the time falls from one row to the next.
+    """
+    known = np.flatnonzero(np.isfinite(time))
+    step = np.diff(time[known])
+    if (step < 0).any():
+        row = int(np.argmax(step < 0))
+        raise LogError(
+            f"the time of {path} falls from {time[known[row]]:.6g} s to "
+            f"{time[known[row + 1]]:.6g} s: is it more than one run, or has a clock been set? Keep "
+            "one run a table"
+        )
+    keep = np.zeros(len(time), dtype=bool)
+    keep[known[np.append(True, step > 0)[: len(known)]]] = True
+    return keep
 
 
 def _rest(time: Array, command: Array, rest_until: float | str) -> NDArray[np.bool_]:
@@ -186,21 +250,3 @@ def _unit(name: str, known: Mapping[str, float], key: str) -> float:
     if name not in known:
         raise LogError(f"{key} is '{name}': choose {', '.join(known)}")
     return known[name]
-
-
-def _table(path: Path) -> dict[str, Array]:
-    try:
-        with path.open(newline="") as stream:
-            rows = list(csv.reader(stream))
-    except OSError as error:
-        raise LogError(f"cannot read the log {path}: {error.strerror}") from error
-    if len(rows) < 3:
-        raise LogError(f"the log {path} has fewer than two rows below its header")
-    header = [name.strip() for name in rows[0]]
-    try:
-        values = np.array([[float(v) if v.strip() else np.nan for v in row] for row in rows[1:]])
-    except ValueError as error:
-        raise LogError(f"the log {path} holds something that is no number: {error}") from error
-    if values.ndim != 2 or values.shape[1] != len(header):
-        raise LogError(f"the rows of {path} do not have {len(header)} columns each")
-    return {name: values[:, index] for index, name in enumerate(header)}

@@ -76,17 +76,16 @@ class Previewer:
     """Plans drawings beside the page, so that the page stays alive.
 
     Args:
-        limb: that draws.
         limits: of the tip, as the planner has them.
     """
 
-    def __init__(self, limb: Limb, limits: PathLimits) -> None:
-        self._limb, self._limits = limb, limits
+    def __init__(self, limits: PathLimits) -> None:
+        self._limits = limits
         self._worker = Worker()
 
-    def ask(self, tip: Array, model: str = "der", method: str = "") -> Future[Preview]:
-        """Plan a drawing (P, 2) [m]; the first one starts the process and takes longer."""
-        return self._worker.ask(preview, self._limb, tip, self._limits, model, method)
+    def ask(self, limb: Limb, tip: Array, model: str = "der", method: str = "") -> Future[Preview]:
+        """Plan a drawing (P, 2) [m] for a limb; the first starts the process and takes longer."""
+        return self._worker.ask(preview, limb, tip, self._limits, model, method)
 
     def close(self) -> None:
         """End the process, also in the middle of a plan."""

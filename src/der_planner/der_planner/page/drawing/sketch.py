@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import dataclasses
 import json
 from collections.abc import Callable
 from concurrent.futures import CancelledError, Future
@@ -13,7 +15,7 @@ from nicegui import Client, ui
 from nicegui.events import GenericEventArguments
 from numpy.typing import NDArray
 
-from der_planner.page.commands import Answer
+from der_planner.page.commands import Answer, Conditions
 from der_planner.page.drawing.kept import DrawingError
 from der_planner.page.drawing.preview import Preview
 from der_planner.page.drawing.studio import drawn_pixels
@@ -32,6 +34,7 @@ class Sketch:
     Args:
         client: the window.
         parts: what the page shows and commands.
+        conditions: returns what to plan with; raises `ValueError` where it makes no sense.
         may_command: tells whether this window commands, and says so if not.
         tell: shows an answer.
     """
@@ -40,12 +43,16 @@ class Sketch:
         self,
         client: Client,
         parts: Parts,
+        conditions: Callable[[], Conditions],
         may_command: Callable[[], bool],
         tell: Callable[[str, Answer], None],
     ) -> None:
         self._client, self._parts = client, parts
-        self._may_command, self._tell = may_command, tell
-        self._tip: NDArray[np.float64] | None = None
+        self._conditions, self._may_command, self._tell = conditions, may_command, tell
+        self._drawn: NDArray[np.float64] | None = None
+        """What was drawn last, whether it can be played or not."""
+        self._planned: tuple[NDArray[np.float64], Conditions] | None = None
+        """What can be played, and what it was planned with."""
         self._pending: Future[Preview] | None = None
         with ui.row().classes("line"):
             self._switch = ui.switch("Draw on the picture", on_change=self._on_switch)
@@ -63,18 +70,20 @@ class Sketch:
     @property
     def ready(self) -> bool:
         """Whether there is a drawing that can be played."""
-        return self._tip is not None and self._pending is None and bool(self._switch.value)
+        return self._planned is not None and self._pending is None and bool(self._switch.value)
 
     def _run(self, script: str) -> None:
         self._client.run_javascript(script)
 
     def _on_switch(self) -> None:
+        if self._switch.value:
+            self._shade()  # before the window asks for what is reachable
         self._run(f"page.sketch.turn({json.dumps(bool(self._switch.value))})")
         if not self._switch.value:
             self._clear()
 
     def _clear(self) -> None:
-        self._tip = None
+        self._drawn = self._planned = None
         if self._pending is not None:
             self._pending.cancel()
             self._pending = None
@@ -93,13 +102,36 @@ class Sketch:
             return
         await self._look_at(tip)
 
+    async def look_again(self) -> None:
+        """Shade and plan anew: what they reckon with may have changed."""
+        if self._switch.value:
+            self._shade()
+            if self._drawn is not None:
+                await self._look_at(self._drawn)
+
+    def _shade(self) -> None:
+        """Let the window ask for what is reachable under the load of the form."""
+        with contextlib.suppress(ValueError):  # the form says it, and a drawing's preview does
+            load = json.dumps(dataclasses.asdict(self._conditions().load))
+            self._run(f"page.sketch.carry({load})")
+
     async def _look_at(self, tip: NDArray[np.float64]) -> None:
         """Plan a drawing beside the page and show what comes of it."""
         if self._pending is not None:
             self._pending.cancel()
-        self._tip = None
+            self._pending = None
+        self._drawn, self._planned = tip, None
+        self.play.set_enabled(False)
+        try:
+            conditions = self._conditions()
+            limb = self._parts.studio.limb_under(conditions.load)
+        except ValueError as error:
+            self._result.set_text(f"This cannot be planned: {error}")
+            return
         self._result.set_text("Planning what the limb can follow …")
-        pending = self._pending = self._parts.studio.previewer.ask(tip)
+        pending = self._pending = self._parts.studio.previewer.ask(
+            limb, tip, conditions.model, conditions.method
+        )
         try:
             found = await asyncio.wrap_future(pending)
         except (CancelledError, asyncio.CancelledError):
@@ -112,7 +144,7 @@ class Sketch:
             return
         self._pending = None
         if not found.problem:
-            self._tip = tip
+            self._planned = tip, conditions
         self._result.set_text(summary(found))
         place = self._parts.overlay.pixels_of
         thinned = [pose[:: max(1, len(pose) // PIECES)] for pose in found.poses]
@@ -127,10 +159,10 @@ class Sketch:
     def _on_play(self) -> None:
         if not self._may_command():
             return
-        if self._tip is None:
+        if self._planned is None:
             ui.notify("draw a line first, and wait for its preview", type="warning")
             return
-        self._tell("play drawing", self._parts.commands.play_path(self._tip))
+        self._tell("play drawing", self._parts.commands.play_path(*self._planned))
 
     async def _on_load(self) -> None:
         if not self._kept.value:
@@ -145,12 +177,12 @@ class Sketch:
         await self._look_at(tip)
 
     def _on_save(self) -> None:
-        if self._tip is None:
+        if self._drawn is None:
             ui.notify("there is no drawing to keep", type="warning")
             return
         drawings = self._parts.studio.drawings
         try:
-            name = drawings.save(str(self._title.value or ""), self._tip)
+            name = drawings.save(str(self._title.value or ""), self._drawn)
         except DrawingError as error:
             ui.notify(str(error), type="negative")
             return

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.limb import Limb
+from der_planner.page.commands import Load
 from der_planner.page.drawing.kept import MOST_POINTS, DrawingError, Drawings
 from der_planner.page.drawing.preview import Previewer
 from der_planner.page.drawing.region import reachable_region
@@ -17,25 +18,47 @@ from der_planner.planning import PathLimits
 
 Array = NDArray[np.float64]
 
+REGIONS_KEPT = 8
+"""Loads whose reachable regions are remembered."""
+
 
 class Studio:
     """Everything of drawing that all windows share.
 
     Args:
-        limb: that draws, under its loads.
+        limb: that draws, mounted as the planner's.
         limits: of the tip, as the planner has them.
         folder: of kept drawings.
+        carried: the planner's payload, and where.
     """
 
-    def __init__(self, limb: Limb, limits: PathLimits, folder: Path) -> None:
+    def __init__(
+        self, limb: Limb, limits: PathLimits, folder: Path, carried: Load | None = None
+    ) -> None:
         self.limb = limb
-        self.previewer = Previewer(limb, limits)
+        self.previewer = Previewer(limits)
         self.drawings = Drawings(folder)
+        self._carried = carried or Load()
+        self.region = lru_cache(REGIONS_KEPT)(self._region)
+        self.limb_under(self._carried)  # what it cannot carry is refused at once
 
-    @cached_property
-    def region(self) -> list[Array]:
-        """Outlines (P, 2) [m] of what the tip reaches; takes about a second at first."""
-        return reachable_region(self.limb)
+    def limb_under(self, load: Load) -> Limb:
+        """Return the limb as the planner would have it for a command of this load.
+
+        Raises:
+            LimbError: no such mounting, or no such place on the limb.
+        """
+        limb = self.limb.mounted(load.mounting) if load.mounting else self.limb
+        carried = load if load.payload else self._carried
+        return limb.carrying(carried.payload, carried.payload_at or None)
+
+    def _region(self, load: Load) -> list[Array]:
+        """Return outlines (P, 2) [m] of what the tip reaches; takes about a second at first.
+
+        Raises:
+            LimbError: as `limb_under`.
+        """
+        return reachable_region(self.limb_under(load))
 
 
 def drawn_pixels(sent: Any) -> Array:

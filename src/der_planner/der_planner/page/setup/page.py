@@ -8,7 +8,7 @@ import functools
 from nicegui import Client, ui
 
 from der_planner.limb import Limb
-from der_planner.page.commands import FILLING, Answer, answer_of, in_buttons
+from der_planner.page.commands import FILLING, Answer, answer_of
 from der_planner.page.server import STATIC, Parts
 from der_planner.page.setup.steps import FILLED, SetupGuide, chamber
 from der_planner.page.situation import PASCAL_PER_KILOPASCAL
@@ -55,7 +55,7 @@ def _add_buttons(client: Client, parts: Parts) -> None:
     def tell(answer: Answer) -> None:
         with client:
             ui.notify(
-                in_buttons(answer.message),
+                answer.message,
                 type="positive" if answer.success else "negative",
                 timeout=6000,
             )

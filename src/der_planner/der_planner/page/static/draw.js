@@ -2,7 +2,7 @@
 "use strict";
 page.sketch = (() => {
   const INSIDE = "#ffffff", OUTSIDE = "#ff4040";
-  let on = false, clean = true, points = [], preview = null, begun = 0, pointer = null;
+  let load = "", on = false, clean = true, points = [], preview = null, begun = 0, pointer = null;
   const canvas = () => document.getElementById("sketch");
 
   function pathOf(outlines) {
@@ -84,6 +84,9 @@ page.sketch = (() => {
 
   return {
     get on() { return on; },
+    get load() { return load; },
+    // What is reachable depends on the load: it is asked for anew, and not shown as if it held meanwhile.
+    carry(wanted) { const next = new URLSearchParams(wanted).toString(); if (next !== load) { load = next; page.region = null; } },
     get points() { return points; },
     get preview() { return preview; },
     turn(wanted) { on = wanted; canvas()?.classList.toggle("on", on); document.getElementById("draw-legend")?.toggleAttribute("hidden", !on); if (!on) { points = []; preview = null; } },

@@ -1,23 +1,29 @@
 // Keeps the page honest: shows what the server sends ten times a second, greys what is old, also when
 // nothing comes any more, and sends the vent. It needs nothing of the page's framework.
 "use strict";
-const page = { data: null, at: -Infinity, received: 0, listeners: [] };
+// at: when the newest data were true at the latest; pictureAt: the same of the picture that is shown.
+const page = { data: null, at: -Infinity, pictureAt: -Infinity, received: 0, listeners: [] };
 (() => {
   const LOST = 0.7; // seconds without live data after which the connection counts as lost
   const RECENT = 1.3; // seconds: nodes speak once a second
   const seconds = () => performance.now() / 1000;
   const find = (id) => document.getElementById(id);
   const put = (element, text) => { if (element && element.textContent !== text) element.textContent = text; };
-  let socket = null, lastOpened = -Infinity, ventText = null, ventUntil = 0, ventGood = false;
+  let socket = null, lastOpened = -Infinity, ventText = null, ventUntil = 0, ventGood = false, heard = -Infinity;
 
   function connect() {
     lastOpened = seconds();
     const mine = new WebSocket(location.origin.replace(/^http/, "ws") + "/live");
     socket = mine;
+    // The server answers each request once: a slow connection delays data and does not pile them up.
+    const ask = () => mine.send(String(seconds()));
+    mine.onopen = ask;
     mine.onmessage = (event) => {
       if (socket !== mine) return;
       page.data = JSON.parse(event.data);
-      page.at = seconds();
+      heard = seconds();
+      page.at = page.data.asked + page.data.waited; // what has passed since may have been the way here
+      ask();
       page.received += 1;
       show();
       page.listeners.forEach((listener) => listener(page.data));
@@ -31,6 +37,12 @@ const page = { data: null, at: -Infinity, received: 0, listeners: [] };
     return entry && entry.age !== null ? entry.age + seconds() - page.at : null;
   }
 
+  // The picture has a way of its own: it may be older than what the camera last sent.
+  function pictureAge() {
+    const age = ageOf("camera");
+    return age === null ? null : Math.max(age, seconds() - page.pictureAt);
+  }
+
   function show() {
     const silence = seconds() - page.at, lost = silence > LOST;
     document.body.classList.toggle("lost", lost);
@@ -39,7 +51,8 @@ const page = { data: null, at: -Infinity, received: 0, listeners: [] };
       const venting = seconds() < ventUntil;
       notice.classList.toggle("shown", lost || venting);
       notice.classList.toggle("good", venting && ventGood && !lost);
-      const away = Number.isFinite(silence) ? `No connection to the page's server for ${silence.toFixed(1)} s: nothing below is live.`
+      const slow = seconds() - heard <= LOST;
+      const away = slow ? `The connection is slow: what is shown below was so ${silence.toFixed(1)} s ago.` : Number.isFinite(silence) ? `No connection to the page's server for ${silence.toFixed(1)} s: nothing below is live.`
         : "Waiting for the page's server…";
       put(notice, [venting ? ventText : "", lost ? away : ""].filter(Boolean).join("  "));
     }
@@ -57,9 +70,9 @@ const page = { data: null, at: -Infinity, received: 0, listeners: [] };
     const source = panel.dataset.source, entry = source && page.data && page.data.sources[source];
     let old = lost, text = lost && Number.isFinite(silence) ? `${silence.toFixed(1)} s old` : "";
     if (source) {
-      const age = ageOf(source);
+      const age = panel.id === "view" ? pictureAge() : ageOf(source);
       old = old || age === null || age > entry.limit;
-      text = age === null ? "nothing received" : old ? `${age.toFixed(1)} s old` : "live";
+      text = age === null ? "nothing received" : age === Infinity ? "no picture yet" : old ? `${age.toFixed(1)} s old` : "live";
     }
     panel.classList.toggle("old-title", old);
     for (const child of panel.children) if (child.querySelector && !child.querySelector("h2")) child.classList.toggle("old", old && panel.id !== "do");
@@ -159,7 +172,7 @@ const page = { data: null, at: -Infinity, received: 0, listeners: [] };
 
   setInterval(() => {
     // A connection that says nothing is given up, since a dead server's may stay open for minutes.
-    if (socket && seconds() - page.at > 3 && seconds() - lastOpened > 3) { socket.close(); socket = null; }
+    if (socket && seconds() - heard > 3 && seconds() - lastOpened > 3) { socket.close(); socket = null; }
     if (!socket && seconds() - lastOpened > 1) connect();
     show();
   }, 200);

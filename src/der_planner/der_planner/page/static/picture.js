@@ -4,11 +4,13 @@
   const LEAST = 30, TRAIL = 10000; // ms
   const REGION_EVERY = 15; // pictures: the reachable region moves in the picture only with the camera
   const wait = (time) => new Promise((done) => setTimeout(done, time));
-  let number = 0, trail = [];
+  const SLOW = 0.4, QUICK = 0.1, COARSE = 320; // s on the way: pictures are asked for small where it takes long; px
+  let number = 0, trail = [], coarse = false;
   page.pictures = 0;
 
-  function line(context, points, colour, width, closed = false) {
+  function line(context, points, colour, width, closed = false, dash = []) {
     if (points.length < 2) return;
+    context.setLineDash(dash);
     context.beginPath();
     points.forEach(([x, y], index) => (index ? context.lineTo(x, y) : context.moveTo(x, y)));
     if (closed) context.closePath();
@@ -16,6 +18,7 @@
     context.strokeStyle = colour;
     context.lineWidth = width;
     context.stroke();
+    context.setLineDash([]);
   }
 
   // Draws a picture, or a plain background where there is none, and what belongs over it.
@@ -31,8 +34,8 @@
     line(context, over.path, "#30c060", 2.5);
     line(context, over.planned, "#9be8b4", 5);
     for (const tag of over.tags) line(context, [0, 2, 4, 6].map((i) => [tag[i], tag[i + 1]]), "#2e9bff", 2, true);
-    line(context, over.estimate || [], "#ff5fd0", 2);
     line(context, over.curve, "#ff7828", 3);
+    line(context, over.estimate || [], "#ff5fd0", 4, false, [10, 12]); // the measured limb shows in its gaps
     line(context, tips, "#ffd84a", 2);
     for (const [point, colour] of [[over.tip, "#ff7828"], [over.reference, "#30c060"]]) {
       if (!point) continue;
@@ -59,17 +62,20 @@
     const canvas = document.getElementById("picture");
     if (!canvas || document.hidden) return 300;
     const begin = performance.now();
-    const region = page.sketch.on && (!page.region || page.pictures % REGION_EVERY === 0);
+    const load = page.sketch.load, region = page.sketch.on && (!page.region || page.pictures % REGION_EVERY === 0);
     // The server answers when there is a newer picture, so that none waits to be asked for.
-    const address = `/picture?after=${number}&wait=1&width=${shownWidth(canvas)}${region ? "&region=1" : ""}`;
-    const answer = await fetch(address, { signal: AbortSignal.timeout(3000) });
+    const address = `/picture?after=${number}&wait=1&width=${coarse ? COARSE : shownWidth(canvas)}${region ? `&region=1&${load}` : ""}`;
+    const answer = await fetch(address, { signal: AbortSignal.timeout(10000) });
     if (answer.status !== 200) return answer.status === 204 ? 0 : 1000;
     const body = await answer.arrayBuffer(), size = new DataView(body).getUint32(0);
     const over = JSON.parse(new TextDecoder().decode(new Uint8Array(body, 4, size)));
     const image = await createImageBitmap(new Blob([new Uint8Array(body, 4 + size)], { type: "image/jpeg" }));
     number = over.number;
     page.pictureSize = over.size;
-    if (over.region) page.region = over.region;
+    page.pictureAt = begin / 1000 + over.waited;
+    const way = performance.now() / 1000 - page.pictureAt;
+    coarse = way > SLOW || (coarse && way > QUICK);
+    if (over.region && load === page.sketch.load) page.region = over.region;
     draw(canvas, image, over, trailWith(over.tip));
     const note = document.getElementById("view-note");
     if (note && note.textContent !== over.problem) note.textContent = over.problem;

@@ -25,7 +25,12 @@ from der_planner.model.bending import bend_angles
 from der_planner.model.held import Holder, Poses
 from der_planner.model.material import differential_pressure
 from der_planner.model.response import RodModel
-from der_planner.planning.errors import BucklingError, PlanningError, UnreachableError
+from der_planner.planning.errors import (
+    BucklingError,
+    OverloadError,
+    PlanningError,
+    UnreachableError,
+)
 from der_planner.planning.loads.overload import check_load
 from der_planner.planning.loads.rest import stable_rest
 from der_planner.planning.motions import Reference
@@ -156,24 +161,41 @@ def posed_motion(model: RodModel, reference: Reference, nodes: int) -> PosedMoti
     home = bend_angles(model.rod, stable_rest(model).q[None])[0]
     guess = reference.sample(time)[0] + (home - reference.rest)
     poses = _poses(model, time, tip, guess)
-    missed = poses.misses > _TOLERANCE * limb.length
-    if missed.any() and limb.segment_count > 1:
-        k = int(np.argmax(missed))
-        point = float(tip[k, 0]), float(tip[k, 1])
-        raise UnreachableError(float(time[k]), point, float(poses.misses[k]), float("nan"))
-
     pressure = _needed(limb, time, poses)
     worst = int(np.abs(pressure).max(axis=1).argmax())
     some = np.unique(np.append(np.arange(0, count, _SPARSE), [0, worst, count - 1]))
 
     def needed(lighter: Limb) -> Array:
         fewer = _poses(RodModel(lighter, nodes), time[some], tip[some], guess[some])
+        left = _unreached(lighter, time[some], tip[some], fewer)
+        if left is not None:
+            raise left
         return _needed(lighter, time[some], fewer)
 
-    check_load(limb, time, tip, pressure, needed)
+    unreached = _unreached(limb, time, tip, poses)
+    try:
+        if unreached is None or limb.masses:
+            check_load(limb, time, tip, pressure, needed)
+    except OverloadError as error:
+        # What keeps the limb from a point is its load only if it would be there with less of it.
+        if unreached is None or error.possible_mass is not None:
+            raise
+    if unreached is not None:
+        raise unreached
     q = np.array([state.q for state in poses.states])[:, model.rod.free]
     bend, shape = (_through(time, values, reference.start) for values in (poses.bend_angles, q))
     return PosedMotion(model.rod, time, poses, bend, shape)
+
+
+def _unreached(limb: Limb, time: Array, tip: Array, poses: Poses) -> UnreachableError | None:
+    """Return what says that poses miss their points (K, 2) [m]; None: they are there."""
+    missed = poses.misses > _TOLERANCE * limb.length
+    if not missed.any() or limb.segment_count == 1:
+        return None
+    k = int(np.argmax(missed))
+    point = float(tip[k, 0]), float(tip[k, 1])
+    carried = sum(item.mass for item in limb.masses)
+    return UnreachableError(float(time[k]), point, float(poses.misses[k]), float("nan"), carried)
 
 
 def _through(time: Array, values: Array, start: Start | None) -> BSpline:

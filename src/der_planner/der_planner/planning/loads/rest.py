@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 
 _STRAIGHT = 1e-3
 """A limb that rests within this bend [rad] of straight starts there."""
+NEAR = 1.1
+"""A standing limb that would buckle under so many times its load is near that [-]."""
 _APART = 1e-3
 """Two resting shapes that are this far apart are two [m]."""
 
@@ -101,6 +103,21 @@ def _said(limb: Limb, what: str) -> str:
         f"the limb '{limb.name}' {what}: straight it buckles under {share * mass:.3f} kg spread as "
         f"its {mass:.3f} kg are ({share:.2f} of them). A bending stiffness {1 / share:.2f} times "
         "as large, less mass, a shorter limb or another mounting keeps it upright"
+    )
+
+
+def nearly_buckling(limb: Limb) -> str:
+    """Return a sentence where a standing limb is near the load at which it buckles; else empty."""
+    x, y, z = limb.gravity
+    if x >= 0:
+        return ""
+    share = critical_share(dataclasses.replace(limb, gravity=(NEAR * x, y, z)))
+    if share >= 1:
+        return ""
+    return (
+        f"the limb stands under {100 / (NEAR * share):.0f} % of the load under which it would "
+        "buckle if it were straight: a few per cent less stiffness or more mass move its tip by "
+        "centimetres. Make it stiffer or lighter, or mount it otherwise"
     )
 
 

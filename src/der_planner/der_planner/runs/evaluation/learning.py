@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from der_planner.methods import LEARNED
 from der_planner.runs.evaluation import style
 from der_planner.runs.evaluation.figures import new_figure
 from der_planner.runs.evaluation.metrics import RunResult
-from der_planner.runs.run import LEARNED
 
 CM = 100.0
 

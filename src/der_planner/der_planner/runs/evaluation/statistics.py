@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import bootstrap
 
 from der_planner.runs.evaluation.metrics import RunResult, json_value
 from der_planner.runs.run import Array
@@ -259,6 +258,9 @@ def _bootstrap(samples: Sequence[Array], statistic: Callable[..., Any]) -> tuple
     """
     if min(len(sample) for sample in samples) < 2:
         return float("nan"), float("nan")
+    # It takes most of a second to import: only who compares trials pays for it.
+    from scipy.stats import bootstrap  # noqa: PLC0415
+
     found = bootstrap(
         samples,
         statistic,

@@ -1,0 +1,56 @@
+"""Commands of the method learned and along paths: what is planned, and what is refused."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import Point
+
+from der_msgs.msg import MotionCommand
+from der_planner.limb import Limb
+from der_planner.nodes.planner_requests import from_command
+from der_planner.planning import Motion, PathLimits, plan
+from der_planner.planning.plan_file import write_plan
+
+
+def test_a_learned_plan_is_named_in_place_of_the_motion(tmp_path):
+    limb = Limb.default()
+    motion = Motion.named("asynchronous", amplitude=0.3, period=3.0, cycles=1)
+    kept = plan(limb, motion, method="projected")
+    write_plan(kept, tmp_path / "mine.yaml")
+    options = SimpleNamespace(
+        limb=limb, payload=0.0, payload_at=0.0, learned_plans=str(tmp_path),
+        model="der", method="", branch="", feedback=False,
+    )  # fmt: skip
+    request = from_command(MotionCommand(motion="mine", method="learned"), options, 0)
+    assert (request.method, request.motion.name) == ("learned", "asynchronous")
+    assert np.array_equal(request.learned.differential_pressure, kept.differential_pressure)
+    for fields, said in (
+        ({"motion": "none"}, "no learned plan 'none'"),
+        ({"motion": "mine", "payload": 0.02}, "another masses"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            from_command(MotionCommand(method="learned", **fields), options, 0)
+
+
+def test_a_command_may_carry_a_path_with_a_load_of_its_own():
+    options = SimpleNamespace(
+        limb=Limb.default(), payload=0.0, payload_at=0.0, model="der", method="", branch="",
+        feedback=False, limits=PathLimits(), nearest_path=False,
+    )  # fmt: skip
+    path = [Point(x=0.2, y=0.08), Point(x=0.22, y=0.05)]
+    command = MotionCommand(path=path, model="pcc", payload=0.02, mounting="hanging")
+    request = from_command(command, options, 0)
+    assert request.limb == options.limb.mounted("hanging").carrying(0.02)
+    assert (request.motion.name, request.model, request.motion.nearest) == ("path", "pcc", False)
+    command.nearest_path = True
+    assert from_command(command, options, 0).motion.nearest
+    for fields, said in (
+        ({"motion": "asynchronous"}, "give one of them"),
+        ({"method": "learned"}, "give one of them"),
+        ({"path": path[:1]}, "two or more points"),
+        ({"path": [Point(x=math.nan), path[0]]}, "not finite"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            from_command(MotionCommand(**{"path": path, **fields}), options, 0)
