@@ -9,7 +9,12 @@ from link_chain import LinkChain
 
 from der_planner.identification import CalibrationLog, LogError, fit, predict
 from der_planner.identification.excitation import sweep, waves
-from der_planner.identification.geometry import UnevenTips, with_geometry
+from der_planner.identification.geometry import (
+    UnevenTips,
+    check_that_it_holds,
+    unevenness,
+    with_geometry,
+)
 from der_planner.identification.logs.prepare import prepare
 from der_planner.identification.parameters import column, start_values
 from der_planner.identification.rod_angles import NODES, RodAngles
@@ -111,6 +116,27 @@ def test_tips_tell_how_much_of_a_bend_is_the_weights():
     slope = tips.jacobian(RodAngles(other, time, pressure).derivatives(values, [(1, term)]))[:, 0]
     difference = (residual(0.02) - residual(-0.02)) / 0.04
     assert np.abs(slope - difference).max() < 0.05 * np.abs(difference).max()
+
+
+def test_a_limb_that_gives_way_in_the_rod_of_more_nodes_is_told_by_the_other_one_or_refused():
+    known = Limb.default().mounted("sideways")
+    time = 0.05 * np.arange(120)
+    pressure = np.minimum(time / 3.0, 1.0)[:, None] * np.array([-20e3, -20e3])
+
+    def softening(growth: float) -> Limb:
+        changes = {"bending_stiffness": 0.0183, "cubic_stiffness": growth, "damping": 0.7}
+        return replace(known, segments=tuple(replace(s, **changes) for s in known.segments))
+
+    whole, lacking = unevenness(softening(-1.0e-5), time, pressure, NODES)
+    assert 0.0 < np.abs(lacking).max() < 0.2 * np.abs(whole).max()
+    check_that_it_holds(softening(-1.0e-5), time, pressure)
+    whole, lacking = unevenness(softening(-1.6e-5), time, pressure, NODES)
+    assert np.isfinite(whole).all()
+    assert not lacking.any()
+    with pytest.raises(LogError, match=r"gives way .* \(--terms without 'cubic'\)"):
+        check_that_it_holds(softening(-1.6e-5), time, pressure)
+    with pytest.raises(LogError, match="gives way"):
+        unevenness(softening(-1.6e-5), time, 1.6 * pressure, NODES)
 
 
 def test_mass_is_told_where_stiffness_is_given():

@@ -15,8 +15,10 @@ from der_planner.identification.air import AirFit, fit_air
 from der_planner.identification.geometry import (
     GeometryFit,
     UnevenTips,
+    check_that_it_holds,
     fit_geometry,
     lengths_at_their_end,
+    unevenness,
     with_geometry,
 )
 from der_planner.identification.logs.log import CalibrationLog, LogError
@@ -27,10 +29,8 @@ from der_planner.identification.problem import Problem
 from der_planner.identification.report import FitReport, LoadsFit, Unknown, loads_of
 from der_planner.identification.rod_angles import NODES
 from der_planner.limb import CalibratedRange, Limb
-from der_planner.model.response import NODES as PLANNED_NODES
-from der_planner.model.response import RodModel, simulate
+from der_planner.model.response import RodModel
 from der_planner.model.series import CONTROL_PERIOD
-from der_planner.rod import ConvergenceError
 
 Array = NDArray[np.float64]
 
@@ -135,36 +135,24 @@ def _fit_bends_and_lengths(
         limb = with_geometry(prior, lengths.lengths, lengths.connector, lengths.base)
     problem = Problem(limb, prepared, offset, groups, nodes)
     fitted = _Fitted(limb, lengths, problem, *problem.solve())
+    finer = np.zeros(0)
     for _ in range(MOST_PASSES if geometry and loaded else 0):
         found = to_limb(fitted.limb, fitted.values)
-        uneven = _uneven_tip(found, prepared, offset)
+        uneven, finer = unevenness(found, prepared.log.time, prepared.pressure - offset, nodes)
         lengths = fit_geometry(prior, prepared.log, uneven=uneven)
         if lengths is None:
             break
         limb = with_geometry(prior, lengths.lengths, lengths.connector, lengths.base)
-        finer = uneven - _uneven_tip(found, prepared, offset, nodes)
         tips = UnevenTips(prior, limb, prepared.log, prepared.usable, RodModel(limb, nodes), finer)
         problem = Problem(limb, prepared, offset, groups, nodes, fitted.values, tips)
         moved = np.abs(np.subtract(_lengths(limb), _lengths(fitted.limb))).max()
         fitted = _Fitted(limb, lengths, problem, *problem.solve())
         if moved < SAME_LENGTH:
             break
+    if finer.size and not finer.any():
+        found = to_limb(fitted.limb, fitted.values)
+        check_that_it_holds(found, prepared.log.time, prepared.pressure - offset)
     return fitted
-
-
-def _uneven_tip(limb: Limb, prepared: Prepared, offset: Array, nodes: int = PLANNED_NODES) -> Array:
-    """Return the tip (K, 2) of the limb along the log less that of evenly bent segments [m].
-
-    Raises:
-        LogError: the rod of the planners, which has more nodes than that of the fit, cannot follow.
-    """
-    model = RodModel(limb, nodes)
-    try:
-        seen = simulate(model, prepared.log.time, pressures=prepared.pressure - offset)
-    except ConvergenceError as error:
-        raise LogError(f"the fitted rod cannot follow the log with all nodes: {error}") from error
-    uneven: Array = seen.tip - model.kinematics.tip(seen.bend_angles)
-    return uneven
 
 
 def _lengths(limb: Limb) -> list[float]:

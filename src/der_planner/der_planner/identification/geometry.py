@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from der_planner.identification.logs.log import CalibrationLog
+from der_planner.identification.logs.log import CalibrationLog, LogError
 from der_planner.identification.rod_angles import Predicted
 from der_planner.limb import Limb
 from der_planner.model.bending import PolylineKinematics
-from der_planner.model.response import RodModel
-from der_planner.rod import Rod
+from der_planner.model.response import NODES, RodModel, simulate
+from der_planner.rod import ConvergenceError, Rod
 
 Array = NDArray[np.float64]
 
@@ -43,10 +43,11 @@ CORRELATION = 20.0
 _AT_END = 1e-3
 _NUDGE = 1e-6
 """Change of a length for the slope of the tip [m]."""
-NODES = 21
-"""Of the rod whose chain of edges is fitted, as the planners use it. A polyline bends at its inner
-nodes alone and leaves a straight half edge at both ends of a segment; the fitted stiff pieces make
-up for that."""
+GIVES_WAY = (
+    "the limb that fits the log best gives way under the pressures of the log: its stiffness falls "
+    "too far as it bends. Fit it without that term (--terms without 'cubic'), or record a log with "
+    "smaller pressures"
+)
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,9 @@ def fit_geometry(
     Args:
         limb: the prior.
         log: with tips and bend angles.
-        nodes: of the rod.
+        nodes: of the rod whose chain of edges is fitted, by default those of the planners' rod. A
+            polyline bends at its inner nodes alone and leaves a straight half edge at both ends of
+            a segment; the fitted stiff pieces make up for that.
         uneven: (K, 2) tip of the limb less that of an evenly bent one at the same bend angles, as
             its weight bends it [m]; None: it bends evenly.
     """
@@ -116,6 +119,53 @@ def fit_geometry(
         residual_before=_distance(difference(limb)),
         residual=_distance(difference(found)),
     )
+
+
+def unevenness(limb: Limb, time: Array, pressure: Array, nodes: int) -> tuple[Array, Array]:
+    """Return the tip less that of evenly bent segments, and what the fit's rod lacks of it [m].
+
+    Both are (K, 2). A limb whose stiffness falls as it bends may give way in the rod of the
+    planners, whose many nodes see a sharper bend at the clamp, although the rod of the fit follows
+    the log. Then the rod of the fit tells it alone and lacks nothing: the next fit has better
+    lengths, and by them a better stiffness.
+
+    Args:
+        limb: that was fitted.
+        time: (K,) of the log [s].
+        pressure: (K, M) differential pressures inside the chambers [Pa].
+        nodes: of the rod in the fit.
+
+    Raises:
+        LogError: not even the rod of the fit follows the log.
+    """
+    try:
+        coarse = _uneven_tip(limb, time, pressure, nodes)
+    except ConvergenceError as error:
+        raise LogError(GIVES_WAY) from error
+    try:
+        whole = _uneven_tip(limb, time, pressure, NODES)
+    except ConvergenceError:
+        return coarse, np.zeros_like(coarse)
+    return whole, whole - coarse
+
+
+def check_that_it_holds(limb: Limb, time: Array, pressure: Array) -> None:
+    """Refuse a limb that the rod of the planners cannot follow along a log; as in `unevenness`.
+
+    Raises:
+        LogError: it gives way under the pressures of the log.
+    """
+    try:
+        _uneven_tip(limb, time, pressure, NODES)
+    except ConvergenceError as error:
+        raise LogError(GIVES_WAY) from error
+
+
+def _uneven_tip(limb: Limb, time: Array, pressure: Array, nodes: int) -> Array:
+    model = RodModel(limb, nodes)
+    seen = simulate(model, time, pressures=pressure)
+    uneven: Array = seen.tip - model.kinematics.tip(seen.bend_angles)
+    return uneven
 
 
 class UnevenTips:
