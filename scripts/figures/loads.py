@@ -94,7 +94,7 @@ def draw_errors(path: Path) -> None:
     mountings = list(dict.fromkeys(row.mounting for row, *_ in found))
     figure, axes = plt.subplots(
         1, len(mountings), figsize=(3.2 * len(mountings), 3), layout="constrained", squeeze=False,
-        sharey=True,
+        sharex=True, sharey=True,
     )  # fmt: skip
     for axis, mounting in zip(axes[0], mountings, strict=True):
         for period, style in ((20.0, "-o"), (6.0, "--s")):
@@ -104,7 +104,8 @@ def draw_errors(path: Path) -> None:
             )  # fmt: skip
             for model in MODELS:
                 _draw_line(axis, of_panel, model, style, f"{model.upper()}, {period:.0f} s")
-        axis.set(title=mounting, xlabel="payload [g]", yscale="log")
+        title = f"tilted by {mounting}°" if mounting.isdigit() else mounting
+        axis.set(title=title, xlabel="payload [g]", yscale="log")
     axes[0, 0].set_ylabel("mean tip error [cm]")
     axes[0, 0].legend(fontsize=7)
     figure.savefig(path, dpi=DPI)
