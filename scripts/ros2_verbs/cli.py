@@ -32,8 +32,33 @@ class Terminated(BaseException):
     """The process was sent SIGTERM."""
 
 
-def _terminate(*_: object) -> None:
-    raise Terminated
+class Interruption:
+    """Ends a command by an exception where SIGINT or SIGTERM finds it.
+
+    Python drops an exception that is raised inside a destructor or a callback of the garbage
+    collector. So it is raised again, every `AGAIN` seconds, until the command has ended.
+    """
+
+    AGAIN = 0.5
+
+    def __init__(self) -> None:
+        self._error: type[BaseException] = KeyboardInterrupt
+        signal.signal(signal.SIGALRM, self._raise)
+        signal.signal(signal.SIGINT, self._end)
+        signal.signal(signal.SIGTERM, self._end)
+
+    def _end(self, number: int, _: object) -> None:
+        self._error = Terminated if number == signal.SIGTERM else KeyboardInterrupt
+        signal.setitimer(signal.ITIMER_REAL, self.AGAIN, self.AGAIN)
+        raise self._error
+
+    def _raise(self, *_: object) -> None:
+        raise self._error
+
+    @staticmethod
+    def noticed() -> None:
+        """Raise no more: the command is ending."""
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
 def add_verbs(parser: argparse.ArgumentParser, command: str) -> argparse._SubParsersAction:
@@ -91,7 +116,7 @@ def main(arguments: Sequence[str]) -> str | int | None:
     if isinstance(sys.stdout, io.TextIOWrapper):
         # A reader at the other end of a pipe sees each message when it comes.
         sys.stdout.reconfigure(line_buffering=True)
-    signal.signal(signal.SIGTERM, _terminate)
+    interruption = Interruption()
     try:
         result: str | int | None = options.main(options)
     except KeyboardInterrupt:
@@ -104,4 +129,5 @@ def main(arguments: Sequence[str]) -> str | int | None:
         result = int(signal.SIGTERM)
     except RuntimeError as error:
         result = str(error)
+    interruption.noticed()
     return result

@@ -16,7 +16,7 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
-from ros2_verbs.cli import CommandError
+from ros2_verbs.cli import CommandError, Interruption
 
 HIDDEN_PREFIX = "_"
 _AT_LEAST, _AT_MOST = 1.5, 6.0
@@ -83,6 +83,7 @@ class Session:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        Interruption.noticed()
         with contextlib.suppress(Exception):
             self.node.destroy_node()
         with contextlib.suppress(Exception):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import signal
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,7 +12,8 @@ from types import SimpleNamespace
 import pytest
 import yaml
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
+SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
+sys.path.insert(0, str(SCRIPTS))
 
 
 def fill(kind, text: str):
@@ -228,3 +231,35 @@ def test_interfaces_are_shown_as_their_authors_wrote_them():
         definition("der_msgs/msg/Nothing")
     with pytest.raises(CommandError, match="is no interface"):
         definition("MotionCommand")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_that_python_drops_inside_a_destructor_ends_the_command(number: signal.Signals):
+    program = f"""
+import os, sys, time
+sys.path.insert(0, {str(SCRIPTS)!r})
+from ros2_verbs import cli
+
+class Finished:
+    def __del__(self):
+        os.kill(os.getpid(), {int(number)})
+        time.sleep(0)
+
+def work(_):
+    Finished()
+    while True:
+        time.sleep(0.05)
+
+def parser(_):
+    options = cli.argparse.ArgumentParser()
+    options.set_defaults(main=work, help_of=options)
+    return options
+
+cli._parser = parser
+sys.exit(cli.main([]))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert "Exception ignored in" in done.stderr  # Python has dropped the first one
+    assert done.returncode == number, done.stderr
