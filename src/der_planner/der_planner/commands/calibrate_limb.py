@@ -72,16 +72,7 @@ def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    source = parser.add_mutually_exclusive_group(required=True)
-    source.add_argument("--offline", action="store_true", help="calibrate the twin of --seed")
-    source.add_argument(
-        "--graph", action="store_true", help="play on the running graph, record a bag and fit to it"
-    )
-    source.add_argument("--bag", type=Path, help="fit to a recorded run")
-    source.add_argument("--csv", type=Path, help="fit to a table; needs --columns")
-    source.add_argument(
-        "--excitation", type=Path, metavar="FILE", help="write the run's pressures as CSV and stop"
-    )
+    _add_sources(parser)
     parser.add_argument(
         "--hardware", type=Path, metavar="FILE", help="with --graph: in place of the twin"
     )
@@ -133,6 +124,20 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--out", type=Path, default=Path("limb.yaml"), help="limb file to write")
     parser.add_argument("--report", type=Path, help="folder for report.txt and prediction.png")
     return _checked(parser, parser.parse_args())
+
+
+def _add_sources(parser: argparse.ArgumentParser) -> None:
+    """Declare where the run comes from, one of which must be given."""
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument("--offline", action="store_true", help="calibrate the twin of --seed")
+    source.add_argument(
+        "--graph", action="store_true", help="play on the running graph, record a bag and fit to it"
+    )
+    source.add_argument("--bag", type=Path, help="fit to a recorded run")
+    source.add_argument("--csv", type=Path, help="fit to a table; needs --columns")
+    source.add_argument(
+        "--excitation", type=Path, metavar="FILE", help="write the run's pressures as CSV and stop"
+    )
 
 
 def _checked(parser: argparse.ArgumentParser, given: argparse.Namespace) -> argparse.Namespace:

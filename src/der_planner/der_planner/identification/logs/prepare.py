@@ -109,12 +109,16 @@ def prepare(
             "the log begins while the limb swings: its first "
             f"{period * waited.sum():.1f} s are not used, since no pressure tells that motion"
         )
-    count = min(SMOOTHING, len(bend) - (len(bend) + 1) % 2)
+    return Prepared(grid, pressure, _smoothed(bend), valid & ~waited, tuple(warnings))
+
+
+def _smoothed(bend: Array) -> Array:
+    """Return bend angles (K, M) without the tags' noise."""
     # It takes half a second to import: only who has a log pays for it.
     from scipy.signal import savgol_filter  # noqa: PLC0415
 
-    bend = np.asarray(savgol_filter(bend, count, 2, axis=0))
-    return Prepared(grid, pressure, bend, valid & ~waited, tuple(warnings))
+    count = min(SMOOTHING, len(bend) - (len(bend) + 1) % 2)
+    return np.asarray(savgol_filter(bend, count, 2, axis=0))
 
 
 def _still_swinging(
