@@ -73,8 +73,7 @@ def render(
     truth = {}
     room = 1.3 * scene.pixels + 0.5 * (scene.smear + scene.rolling) + 3.0 * scene.blur
     # The sheet of a family of few cells is wider against its border.
-    border, rim = scene.family.border_cells, scene.family.rim
-    sheet = max(1.0, (border + 2 * rim) / border / 1.25)
+    sheet = max(1.0, scene.family.tag_cells / scene.family.border_cells / 1.25)
     half = int(np.ceil(0.5 * 1.45 * sheet * scene.pixels + scene.smear + scene.rolling + 4.0))
     pitch = max(2 * half + 2, int(room))
     for top in range(0, height - pitch + 1, pitch):
@@ -119,7 +118,7 @@ def _patch(
     """Return the picture (pitch, pitch) of one tag, 1 is white, and the direction it goes."""
     left, top, pitch = box
     rim = scene.family.rim
-    across = scene.family.border_cells + 2 * rim + 2
+    across = scene.family.tag_cells + 2
     cells = np.full((across, across), _FLOOR)
     cells[1:-1, 1:-1] = np.where(scene.family.printed_cells(tag) > 0, _WHITE, _BLACK)
     # Corners of the border in cells, columns to the right and rows down.

@@ -80,9 +80,14 @@ class Family:
         return 1 + int(self.outer_ring)
 
     @property
+    def tag_cells(self) -> int:
+        """Cells along the edge of the tag with its rim."""
+        return self.border_cells + 2 * self.rim
+
+    @property
     def sheet_cells(self) -> float:
         """Cells along the edge of the sheet: half a one more on each side of an outer ring."""
-        return self.border_cells + 2.0 * self.rim + float(self.outer_ring)
+        return self.tag_cells + float(self.outer_ring)
 
     @property
     def most_wrong(self) -> int:
@@ -100,7 +105,7 @@ class Family:
 
     def code_mask(self) -> NDArray[np.bool_]:
         """Tell which cells of a tag with its rim belong to the code, (n, n)."""
-        across = np.arange(self.border_cells + 2 * self.rim)
+        across = np.arange(self.tag_cells)
         inward = np.minimum(across, across[::-1]) - self.rim
         ring = np.minimum(inward[:, None], inward[None, :])
         mask: NDArray[np.bool_] = (ring >= 1) | (ring <= -2)
@@ -147,10 +152,14 @@ class Family:
         cells = self.printed_cells(tag)
         return 1 - cells if self.outer_ring else cells
 
-    def enlarged_tag(self, tag: int, scale: int) -> NDArray[np.uint8]:
-        """Return a perfect picture of a tag with its rim, `scale` px a cell, of 0 and 255."""
-        cells = self.printed_cells(tag) * np.uint8(255)
-        return np.repeat(np.repeat(cells, scale, axis=0), scale, axis=1)
+    def draw_tag(
+        self, canvas: NDArray[np.uint8], tag: int, scale: int, left: int, top: int
+    ) -> None:
+        """Draw a perfect picture of a tag, its border's upper left corner at `left`, `top` [px]."""
+        cells, rim = self.printed_cells(tag) * np.uint8(255), self.rim * scale
+        end = len(cells) * scale - rim
+        sheet = np.s_[top - rim : top + end, left - rim : left + end]
+        canvas[sheet] = np.repeat(np.repeat(cells, scale, axis=0), scale, axis=1)
 
     def check_code_of_tag_0(self) -> None:
         """Compare tag 0 with the family's published code.

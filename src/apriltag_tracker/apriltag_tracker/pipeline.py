@@ -309,10 +309,9 @@ def warm_up(detector: Detector) -> None:
     size = 0.00025 * side
     limb, world = (LimbTag(0, 0.01, 0.0, size),), (WorldTag(1, (0.03, 0.0, 0.0), 0.0, size),)
     tags = TagMap((0.02,), limb, world, family=family)
-    image, rim = np.full((120, 240), 255, dtype=np.uint8), 5 * family.rim
+    image = np.full((120, 240), 255, dtype=np.uint8)
     for tag, left in ((0, 40), (1, 120)):
-        sheet = np.s_[40 - rim : 40 + side + rim, left - rim : left + side + rim]
-        image[sheet] = family.enlarged_tag(tag, 5)
+        family.draw_tag(image, tag, 5, left, 40)
     matrix = [f, 0.0, 59.5, 0.0, f, 59.5, 0.0, 0.0, 1.0]
     tracker = LimbTracker(tags, Intrinsics.create(240, 120, matrix, []), detector=detector)
     for stamp in (0.0, 0.03):

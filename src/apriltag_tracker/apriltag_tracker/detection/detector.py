@@ -80,8 +80,8 @@ class Detector:
     def warm_up(self) -> None:
         """Load or compile everything a first image would wait for."""
         canvas = np.full((96, 96), 255, dtype=np.uint8)
-        end, rim = 28 + 5 * self.family.border_cells, 5 * self.family.rim
-        canvas[28 - rim : end + rim, 28 - rim : end + rim] = self.family.enlarged_tag(0, 5)
+        end = 28 + 5 * self.family.border_cells
+        self.family.draw_tag(canvas, 0, 5, 28, 28)
         if [tag.id for tag in self.detect(canvas)] != [0]:
             raise FamilyError(f"a perfect picture of {self.family.name} 0 is not detected")
         low, high = 27.5, end - 0.5

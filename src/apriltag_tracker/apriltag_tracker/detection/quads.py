@@ -101,10 +101,9 @@ def check_orientation(family: Family) -> None:
     if family.dictionary_id is None:
         return
     scale, left, top = 5, 30, 20
-    side, rim = family.border_cells * scale, family.rim * scale
+    side = family.border_cells * scale
     canvas = np.full((100, 110), 255, dtype=np.uint8)
-    sheet = np.s_[top - rim : top + side + rim, left - rim : left + side + rim]
-    canvas[sheet] = family.enlarged_tag(0, scale)
+    family.draw_tag(canvas, 0, scale, left, top)
     ids, quads, _ = find_quads(canvas, family, 20.0)
     right, bottom = left + side, top + side
     expected = np.array([[left, bottom], [right, bottom], [right, top], [left, top]]) - 0.5

@@ -287,9 +287,8 @@ class SyntheticCamera:
         first, last = self._corners(placements[0]), self._corners(placements[-1])
         both = np.concatenate([first, last])
         middle = both.mean(axis=0)
-        grown = middle + (both - middle) * (
-            1.0 + 2.0 * self.tags.family.rim / self.tags.family.border_cells
-        )
+        family = self.tags.family
+        grown = middle + (both - middle) * (family.tag_cells / family.border_cells)
         blur = np.sqrt(self.optics.blur**2 + render.PIXEL_VARIANCE)
         low = np.floor(grown.min(axis=0) - 3.0 * blur - 1.0).astype(np.int64)
         high = np.ceil(grown.max(axis=0) + 3.0 * blur + 2.0).astype(np.int64)
@@ -323,7 +322,7 @@ class SyntheticCamera:
         x, y, z, yaw, size = placement
         cosine, sine = np.cos(yaw), np.sin(yaw)
         cell = size / self.tags.family.border_cells
-        half = 0.5 * self._cells_across()
+        half = 0.5 * self.tags.family.tag_cells
         # Homogeneous (column, row, 1) -> point on the tag's plane in limb_base.
         plane = np.array(
             [
@@ -336,9 +335,6 @@ class SyntheticCamera:
         pose = np.hstack([self.model.pose.rotation, self.model.pose.translation[:, None]])
         result: NDArray[np.float64] = np.linalg.inv(pose @ plane)
         return result
-
-    def _cells_across(self) -> int:
-        return self.tags.family.border_cells + 2 * self.tags.family.rim
 
     def _draw_body(self, image: NDArray[np.uint8], shape: Shape) -> None:
         """Draw the limb's silhouette: dark silicone at half the height of its tags."""
