@@ -126,11 +126,14 @@ class Limb:
         check(self)
         for index, item in enumerate(self.masses):
             check(item, f"masses[{index}].")
-            if item.arc_length > self.length * (1 + 1e-9):
-                raise LimbError(
-                    f"masses[{index}].arc_length must be at most the limb's length of "
-                    f"{self.length:.6g} m, got {item.arc_length}"
-                )
+            self._check_place(f"masses[{index}].arc_length", item.arc_length)
+
+    def _check_place(self, what: str, arc_length: float) -> None:
+        """Refuse a mass beyond the limb."""
+        if arc_length > self.length * (1 + 1e-9):
+            raise LimbError(
+                f"{what} must be at most the limb's length of {self.length:.6g} m, got {arc_length}"
+            )
 
     @property
     def segment_count(self) -> int:
@@ -216,11 +219,7 @@ class Limb:
             place = self.length
         if not place >= 0:
             raise LimbError(f"the {name}'s arc_length must be at least 0 m, got {place}")
-        if place > self.length * (1 + 1e-9):
-            raise LimbError(
-                f"the {name}'s arc_length must be at most the limb's length of "
-                f"{self.length:.6g} m, got {place}"
-            )
+        self._check_place(f"the {name}'s arc_length", place)
         mass = PointMass(place, float(payload), name)
         return dataclasses.replace(self, masses=(*self.masses, mass))
 

@@ -10,9 +10,7 @@ from typing import Any
 
 from der_planner.experiment.errors import OptionError
 from der_planner.limb import Limb, LimbError, gravity_of
-
-HEAVIEST = 10.0
-"""[kg] More is a mistake in the unit."""
+from der_planner.limb_loads import HEAVIEST
 
 
 class _Once(argparse.Action):

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from der_planner.identification.air import AirFit, fit_air
 from der_planner.identification.geometry import (
     GeometryFit,
+    Unevenness,
     UnevenTips,
     check_that_it_holds,
     fit_geometry,
@@ -135,21 +136,23 @@ def _fit_bends_and_lengths(
         limb = with_geometry(prior, lengths.lengths, lengths.connector, lengths.base)
     problem = Problem(limb, prepared, offset, groups, nodes)
     fitted = _Fitted(limb, lengths, problem, *problem.solve())
-    finer = np.zeros(0)
+    bent: Unevenness | None = None
     for _ in range(MOST_PASSES if geometry and loaded else 0):
         found = to_limb(fitted.limb, fitted.values)
-        uneven, finer = unevenness(found, prepared.log.time, prepared.pressure - offset, nodes)
-        lengths = fit_geometry(prior, prepared.log, uneven=uneven)
+        bent = unevenness(found, prepared.log.time, prepared.pressure - offset, nodes)
+        lengths = fit_geometry(prior, prepared.log, uneven=bent.tip)
         if lengths is None:
             break
         limb = with_geometry(prior, lengths.lengths, lengths.connector, lengths.base)
-        tips = UnevenTips(prior, limb, prepared.log, prepared.usable, RodModel(limb, nodes), finer)
+        tips = UnevenTips(
+            prior, limb, prepared.log, prepared.usable, RodModel(limb, nodes), bent.lacking
+        )
         problem = Problem(limb, prepared, offset, groups, nodes, fitted.values, tips)
         moved = np.abs(np.subtract(_lengths(limb), _lengths(fitted.limb))).max()
         fitted = _Fitted(limb, lengths, problem, *problem.solve())
         if moved < SAME_LENGTH:
             break
-    if finer.size and not finer.any():
+    if bent is not None and not bent.holds:
         found = to_limb(fitted.limb, fitted.values)
         check_that_it_holds(found, prepared.log.time, prepared.pressure - offset)
     return fitted

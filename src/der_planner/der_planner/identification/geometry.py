@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,10 +122,24 @@ def fit_geometry(
     )
 
 
-def unevenness(limb: Limb, time: Array, pressure: Array, nodes: int) -> tuple[Array, Array]:
-    """Return the tip less that of evenly bent segments, and what the fit's rod lacks of it [m].
+class Unevenness(NamedTuple):
+    """How unevenly its weight bends a limb along a log, as its tip shows it.
 
-    Both are (K, 2). A limb whose stiffness falls as it bends may give way in the rod of the
+    Attributes:
+        tip: (K, 2) less that of evenly bent segments [m].
+        lacking: (K, 2) what the rod of the fit lacks of it [m].
+        holds: whether the rod of the planners follows the log.
+    """
+
+    tip: Array
+    lacking: Array
+    holds: bool
+
+
+def unevenness(limb: Limb, time: Array, pressure: Array, nodes: int) -> Unevenness:
+    """Return how unevenly a fitted limb bends.
+
+    A limb whose stiffness falls as it bends may give way in the rod of the
     planners, whose many nodes see a sharper bend at the clamp, although the rod of the fit follows
     the log. Then the rod of the fit tells it alone and lacks nothing: the next fit has better
     lengths, and by them a better stiffness.
@@ -138,15 +153,12 @@ def unevenness(limb: Limb, time: Array, pressure: Array, nodes: int) -> tuple[Ar
     Raises:
         LogError: not even the rod of the fit follows the log.
     """
-    try:
-        coarse = _uneven_tip(limb, time, pressure, nodes)
-    except ConvergenceError as error:
-        raise LogError(GIVES_WAY) from error
+    coarse = _uneven_tip(limb, time, pressure, nodes)
     try:
         whole = _uneven_tip(limb, time, pressure, NODES)
-    except ConvergenceError:
-        return coarse, np.zeros_like(coarse)
-    return whole, whole - coarse
+    except LogError:
+        return Unevenness(coarse, np.zeros_like(coarse), holds=False)
+    return Unevenness(whole, whole - coarse, holds=True)
 
 
 def check_that_it_holds(limb: Limb, time: Array, pressure: Array) -> None:
@@ -155,15 +167,15 @@ def check_that_it_holds(limb: Limb, time: Array, pressure: Array) -> None:
     Raises:
         LogError: it gives way under the pressures of the log.
     """
-    try:
-        _uneven_tip(limb, time, pressure, NODES)
-    except ConvergenceError as error:
-        raise LogError(GIVES_WAY) from error
+    _uneven_tip(limb, time, pressure, NODES)
 
 
 def _uneven_tip(limb: Limb, time: Array, pressure: Array, nodes: int) -> Array:
     model = RodModel(limb, nodes)
-    seen = simulate(model, time, pressures=pressure)
+    try:
+        seen = simulate(model, time, pressures=pressure)
+    except ConvergenceError as error:
+        raise LogError(GIVES_WAY) from error
     uneven: Array = seen.tip - model.kinematics.tip(seen.bend_angles)
     return uneven
 

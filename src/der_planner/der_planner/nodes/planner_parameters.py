@@ -10,12 +10,10 @@ from typing import Any
 from rclpy.node import Node
 
 from der_planner.limb import Limb
+from der_planner.limb_loads import HEAVIEST
 from der_planner.planning import METHODS, PathLimits
 from der_planner.planning.inverse import BRANCHES
 from limb_interfaces.parameters import declare
-
-LARGEST_PAYLOAD = 10.0
-"""[kg] More is a mistake in the unit."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,7 @@ def read_parameters(node: Node) -> PlannerOptions:
         limb=_read_limb(read),
         payload=float(
             read("payload", 0.0, "mass [kg] carried beside the limb's own masses, where a command "
-                 "names none", at_least=0.0, at_most=LARGEST_PAYLOAD)
+                 "names none", at_least=0.0, at_most=HEAVIEST)
         ),
         payload_at=float(
             read("payload_at", 0.0, "where, along the limb from its clamp [m]; 0: the tip",

@@ -8,17 +8,21 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from nav_msgs.msg import Path as PathMessage
+from numpy.typing import NDArray
 
 from der_msgs.msg import MotionCommand
 from der_planner.limb import Limb
+from der_planner.limb_loads import HEAVIEST
 from der_planner.methods import LEARNED
-from der_planner.nodes.planner_parameters import LARGEST_PAYLOAD, PlannerOptions
+from der_planner.nodes.planner_parameters import PlannerOptions
 from der_planner.planning import Motion, choose_method
 from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD
 from der_planner.planning.plan_file import learned_plan
 from der_planner.planning.result import Plan
 from limb_interfaces import topics
 from limb_interfaces.stamps import NANOSECONDS, nanoseconds
+
+Array = NDArray[np.float64]
 
 OLDEST_STAMP = 10
 """A start further back than this [s] is a mistake; a shorter delay is travel and typing."""
@@ -96,7 +100,7 @@ def from_command(message: MotionCommand, options: PlannerOptions, now: int) -> R
     if message.method == LEARNED:
         return _from_learned(message, limb, options, start)
     model = message.model or options.model
-    motion = _along_path(message, options) if message.path else _named(message, options)
+    motion = _drawn(message, options) if message.path else _named(message, options)
     method = choose_method(model, message.method or options.method)
     feedback = _corrected(message, model, options)
     return Request(message.plan_id, limb, motion, model, method, start, feedback=feedback)
@@ -112,11 +116,15 @@ def _named(message: MotionCommand, options: PlannerOptions) -> Motion:
     )
 
 
-def _along_path(message: MotionCommand, options: PlannerOptions) -> Motion:
+def _drawn(message: MotionCommand, options: PlannerOptions) -> Motion:
+    tip = np.array([(point.x, point.y) for point in message.path])
+    return _along_path(None, tip, options, message.nearest_path or options.nearest_path)
+
+
+def _along_path(time: Array | None, tip: Array, options: PlannerOptions, nearest: bool) -> Motion:
     return Motion.from_tip_path(
-        None, np.array([(point.x, point.y) for point in message.path]), branch=options.branch,
-        limits=options.limits, nearest=message.nearest_path or options.nearest_path,
-    )  # fmt: skip
+        time, tip, branch=options.branch, limits=options.limits, nearest=nearest
+    )
 
 
 def _from_learned(
@@ -132,8 +140,8 @@ def _from_learned(
 def _asked_for(message: MotionCommand, options: PlannerOptions) -> Limb:
     """Return the limb mounted and loaded as a command says."""
     limb = options.limb.mounted(message.mounting) if message.mounting else options.limb
-    if message.payload < 0 or message.payload > LARGEST_PAYLOAD:
-        raise ValueError(f"the payload is {message.payload} kg: give 0 to {LARGEST_PAYLOAD:g} kg")
+    if message.payload < 0 or message.payload > HEAVIEST:
+        raise ValueError(f"the payload is {message.payload} kg: give 0 to {HEAVIEST:g} kg")
     carried = message.payload, message.payload_at
     if message.payload == 0:
         carried = options.payload, options.payload_at
@@ -161,10 +169,7 @@ def from_path(message: PathMessage, plan_id: str, options: PlannerOptions, now: 
     tip = np.array([(p.pose.position.x, p.pose.position.y) for p in message.poses])
     stamps = [nanoseconds(pose.header.stamp) for pose in message.poses]
     time = (np.array(stamps) - stamps[0]) * 1e-9 if any(stamps) else None
-    motion = Motion.from_tip_path(
-        time, tip.reshape(-1, 2), branch=options.branch, limits=options.limits,
-        nearest=options.nearest_path,
-    )  # fmt: skip
+    motion = _along_path(time, tip.reshape(-1, 2), options, options.nearest_path)
     start = start_of(nanoseconds(message.header.stamp), now)
     limb = loaded(options.limb, options.payload, options.payload_at)
     method = choose_method(options.model, options.method)
