@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from domain import own_domain
 
+from der_planner.experiment.client import GraphClient
 from der_planner.limb import gravity_of
 from der_planner.planning.plan_file import read_plan
 from der_planner.runs.evaluation import load_run
@@ -249,6 +250,17 @@ def test_two_graphs_do_not_mix(experiment, graph):
     run = experiment("--models", "der")
     assert run.finish() == 1
     assert "another graph is running in this ROS domain (node 'board_emulator')" in run.errors
+
+
+def test_a_graph_that_begins_meanwhile_is_found_before_the_driver_is_armed(experiment, graph):
+    run = experiment("--models", "der")
+    run.wait_for_line("starting board_emulator")
+    with GraphClient("board_emulator", domain_id=graph.domain_id):
+        assert run.finish() == 1
+    assert "another graph is running in this ROS domain (node 'board_emulator')" in run.errors
+    assert "ready after" in run.errors
+    assert not (run.out / "bags").exists() or not list((run.out / "bags").iterdir())
+    assert run.processes() == {}
 
 
 def test_a_rig_file_takes_the_place_of_the_twin(experiment, graph, rig: Path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from types import TracebackType
@@ -204,11 +205,11 @@ class GraphClient:
             raise GraphError(f"{service} was refused: {answer.message}")
         return str(answer.message)
 
-    def other_nodes(self, seconds: float = 1.0) -> list[str]:
-        """Return the other nodes of the graph's namespace, after listening for a while."""
-        self.spin(seconds)
+    def count_nodes(self) -> Counter[str]:
+        """Return how many nodes of each name the graph's namespace has, as far as is known by now.
+
+        A node that has just started learns of the others within tenths of a second; on a busy
+        machine, or over a network that loses messages, it can take seconds.
+        """
         found = self.node.get_node_names_and_namespaces()
-        own = self.node.get_name()
-        return sorted(
-            name for name, space in found if space == f"/{topics.NAMESPACE}" and name != own
-        )
+        return Counter(name for name, space in found if space == f"/{topics.NAMESPACE}")

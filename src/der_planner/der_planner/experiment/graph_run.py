@@ -28,6 +28,8 @@ from der_planner.planning import paths
 from limb_interfaces import qos, stamps, topics
 
 PLAN_TIMEOUT = 120.0
+DISCOVERY = 1.0
+"""How long the orchestrator listens for another graph before it starts nodes [s]."""
 VENTED_PRESSURE = 1000.0
 """Differential pressure below which a limb counts as vented [Pa]."""
 
@@ -104,18 +106,25 @@ class GraphPlayer(ABC):
         with tempfile.TemporaryDirectory(prefix="der_limb_") as folder, GraphClient() as client:
             port = str(Path(folder) / "board")
             specs = self._specs(port)
+            client.spin(DISCOVERY)
             self._refuse_second_graph(client, specs)
             self._join(client)
             with self._everything_stops(client):
                 self._start(client, specs, port)
+                # A graph that was not seen at once, or that began meanwhile, is known by now.
+                self._refuse_second_graph(client, specs, own=1)
                 return self._record(client)
 
     def _join(self, client: GraphClient) -> None:
         """Subscribe and advertise, before the nodes start."""
         client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES)
 
-    def _refuse_second_graph(self, client: GraphClient, specs: list[NodeSpec]) -> None:
-        others = set(client.other_nodes()) & {spec.executable for spec in specs}
+    def _refuse_second_graph(
+        self, client: GraphClient, specs: list[NodeSpec], own: int = 0
+    ) -> None:
+        """Raise `GraphError` if nodes of another graph are seen beside ``own`` of each name."""
+        count = client.count_nodes()
+        others = [spec.executable for spec in specs if count[spec.executable] > own]
         if others:
             raise GraphError(
                 f"another graph is running in this ROS domain (node '{min(others)}'): stop it, or "
