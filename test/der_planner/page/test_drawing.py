@@ -162,6 +162,16 @@ def test_a_name_stays_in_its_folder(tmp_path: Path, name: str) -> None:
         drawings.save(name, points)
 
 
+def test_names_of_any_language_and_files_put_there_by_hand_are_found(tmp_path: Path) -> None:
+    drawings = Drawings(tmp_path)
+    points = np.array([[0.1, 0.2], [0.12, 0.21]])
+    assert drawings.save("Über 円", points) == "Über_円"
+    (tmp_path / "by hand.csv").write_text("x [cm], y [cm]\n10, 20\n12, 21\n")
+    assert drawings.names() == ["by hand", "Über_円"]
+    for name in drawings.names():
+        np.testing.assert_allclose(drawings.load(name), points, atol=1e-6)
+
+
 def test_a_missing_drawing_is_named(tmp_path: Path) -> None:
-    with pytest.raises(DrawingError, match=r"none\.csv"):
+    with pytest.raises(DrawingError, match="no drawing 'none'"):
         Drawings(tmp_path).load("none")

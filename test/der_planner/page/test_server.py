@@ -202,6 +202,19 @@ def test_a_password_is_asked_for_everywhere() -> None:
     assert rig.calls.services == ["vent"]
 
 
+def test_a_window_that_only_listens_stays_logged_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("der_planner.page.access.SESSION_LIFE", 0.5)
+    client = Rig(PASSWORD).client(origin=ORIGIN)
+    client.post("/login", data={"password": PASSWORD})
+    with client.websocket_connect(SOCKET + "/live") as live:
+        for _ in range(10):
+            live.send_text("1.0")
+            live.receive_json()
+        assert client.post("/vent").json()["success"]
+    time.sleep(0.6)
+    assert client.post("/vent").status_code == 401
+
+
 def test_a_picture_is_made_only_if_somebody_looks(rig: Rig) -> None:
     grey: Any = np.full((72, 128), 90, dtype=np.uint8)
     assert not rig.picture.due()

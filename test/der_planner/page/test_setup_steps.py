@@ -37,9 +37,9 @@ def test_a_running_rig_passes_until_it_falls_silent() -> None:
     rig.situation.put_driver(VENTED)
     rig.situation.put_limb(LimbView(1, True, "", (0.2, 0.0), (0.0, 0.0), ((0.0, 0.0),)))
     rig.situation.put_status(NodeStatus("/limb/planner", 0, "idle", {"limb": "ours"}))
-    assert rig.done() == [True, True, False, True, True, True, True]
+    assert rig.done() == [True, True, False, True, True, True, True, True]
     rig.now = 6.0
-    assert rig.done() == [False, False, False, True, True, False, False]
+    assert rig.done() == [False, False, False, True, True, False, False, False]
 
 
 def test_each_chamber_counts_only_if_it_is_driven_alone() -> None:
@@ -63,7 +63,16 @@ def test_pressure_that_stays_and_the_shipped_limb_are_no_success() -> None:
     assert not steps[1].done
     assert "1.50 kPa" in steps[1].seen
     assert not steps[6].done
+    assert not steps[7].done
     rig.situation.put_driver(replace(VENTED, mode=1))
     assert not rig.steps()[1].done
     rig.situation.put_driver(replace(VENTED, telemetry_age=float("nan")))
     assert "never been heard" in rig.steps()[0].seen
+
+
+def test_a_calibration_run_is_seen_while_and_after_it_is_played() -> None:
+    rig = Rig()
+    rig.situation.put_driver(replace(VENTED, mode=2, plan_id="calibration-12ab34cd"))
+    assert (rig.steps()[6].done, rig.steps()[6].seen) == (False, "one is being played")
+    rig.situation.put_driver(VENTED)
+    assert rig.steps()[6].done

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import hmac
 import ipaddress
+import math
 import secrets
 import socket
 import time
@@ -16,7 +17,8 @@ from urllib.parse import urlsplit
 SHORTEST_PASSWORD = 12
 """Characters: a limb is not defended by a word from a dictionary."""
 SESSION_LIFE = 12 * 3600.0
-"""[s] after which the password is asked for again."""
+"""[s] without a sign of a browser after which the password is asked for again. A window that is
+open says something all the time: its vent must not be refused because a shift was long."""
 LOOPBACK_NAMES = ("127.0.0.1", "localhost", "[::1]")
 
 
@@ -195,8 +197,14 @@ class Sessions:
         return token
 
     def holds(self, token: str) -> bool:
-        """Tell whether a token belongs to a session that is still open."""
-        return not self.needed or self._until.get(_digest(token), 0.0) > self._clock()
+        """Tell whether a token belongs to a session that is still open; use keeps it open."""
+        if not self.needed:
+            return True
+        key, now = _digest(token), self._clock()
+        if self._until.get(key, -math.inf) <= now:
+            return False
+        self._until[key] = now + SESSION_LIFE
+        return True
 
 
 def _digest(text: str) -> bytes:

@@ -60,15 +60,21 @@ class Guard:
             if scope["type"] == "http" and scope["method"] in SAFE_METHODS:
                 await _refuse(scope, receive, send, 303, "log in first", LOGIN)
             else:
-                await _refuse(scope, receive, send, 401, "log in first")
+                await _refuse(scope, receive, send, 401, "load this page anew and log in")
             return
+
+        async def noted() -> Message:
+            message = await receive()
+            self._logged_in(scope)  # a window that only listens is in use, too
+            return message
 
         async def with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 message = {**message, "headers": [*message["headers"], *HEADERS]}
             await send(message)
 
-        await self.app(scope, receive, with_headers)
+        kept = scope["type"] == "websocket" and self._sessions.needed
+        await self.app(scope, noted if kept else receive, with_headers)
 
     def _objection(self, scope: Scope) -> str:
         """Return why a request is refused; empty if it is not."""

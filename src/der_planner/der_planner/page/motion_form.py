@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -17,6 +18,8 @@ from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFA
 NO_PLANS = "No learned plans"
 BEST = "the best"
 GRAMS, CENTIMETRES = 1000.0, 100.0
+_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
+"""What is a thousand in one country and one in another."""
 
 
 class FormError(ValueError):
@@ -29,9 +32,11 @@ def read_number(text: object, least: float, most: float) -> float:
     Raises:
         FormError: it is none, or not from ``least`` to ``most``.
     """
-    given = str(text or "").strip().replace(",", ".")
+    given = str(text or "").strip()
+    if _THOUSANDS.fullmatch(given):
+        raise FormError("a point before decimals, and no mark of thousands")
     try:
-        value = float(given)
+        value = float(given.replace(",", ".").replace("_", "?"))
     except ValueError:
         value = math.nan
     if not least <= value <= most:

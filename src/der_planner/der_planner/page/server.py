@@ -23,7 +23,7 @@ from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, Redirect
 from fastapi.staticfiles import StaticFiles
 
 from der_planner.limb import LimbError
-from der_planner.page.access import SESSION_LIFE, Binding, Sessions, bracketed
+from der_planner.page.access import Binding, Sessions, bracketed
 from der_planner.page.afterwards.experiments import Experiments
 from der_planner.page.commands import Commands, Load, answer_of
 from der_planner.page.drawing.studio import Studio
@@ -270,10 +270,8 @@ def _add_login(app: FastAPI, sessions: Sessions, secure: bool) -> None:
             text = form.replace("{reason}", "Wrong password.")
             return HTMLResponse(text, status_code=403, headers=_UNCACHED)
         answer = RedirectResponse("/", status_code=303)
-        answer.set_cookie(
-            COOKIE, token, max_age=int(SESSION_LIFE), httponly=True, secure=secure,
-            samesite="strict",
-        )  # fmt: skip
+        # It ends with the browser, and here when it is not used: see `SESSION_LIFE`.
+        answer.set_cookie(COOKIE, token, httponly=True, secure=secure, samesite="strict")
         return answer
 
 

@@ -15,7 +15,8 @@ Array = NDArray[np.float64]
 
 LONGEST_NAME = 60
 MOST_POINTS = 20_000
-_WRONG = re.compile(r"[^A-Za-z0-9_-]+")
+_WRONG = re.compile(r"[^\w-]+")
+"""Letters and digits of any language are a name's own; a folder's marks and dots are not."""
 
 
 class DrawingError(ValueError):
@@ -74,7 +75,9 @@ class Drawings:
         Raises:
             DrawingError: there is none of that name, or its file is no path.
         """
-        path = self.folder / f"{file_name(name)}.csv"
+        if name not in self.names():  # so that no name leads out of the folder
+            raise DrawingError(f"there is no drawing '{name}' in {self.folder}")
+        path = self.folder / f"{name}.csv"
         try:
             _, tip = read_csv(path)
         except PlanningError as error:

@@ -12,6 +12,8 @@ FILLED = 5.0
 """[kPa] to which the page's buttons fill a chamber, or less where the limb bears less."""
 QUIET = 1.0
 """[kPa] Below it a segment counts as vented."""
+CALIBRATION = "calibration-"
+"""With what the plans of `calibrate_limb.py` begin."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,7 @@ class SetupGuide:
         self._default = default
         self._segments = segments
         self._driven: set[tuple[int, int]] = set()
+        self._calibrating = self._calibrated = False
 
     def steps(self, data: dict[str, Any], camera_problem: str, calibrated: bool) -> list[Step]:
         """Return all steps.
@@ -74,10 +77,29 @@ class SetupGuide:
                 else limb["reason"] or "tip at ({:.1f}, {:.1f}) cm".format(*limb["tip_cm"]),
                 "Light it evenly; tags should be 25 px wide or more.",
             ),
+            self._calibration(data["nodes"]),
             _limb_file(data["nodes"], self._default),
         ]
 
+    def _calibration(self, nodes: Sequence[dict[str, Any]]) -> Step:
+        own = _planned_limb(nodes) not in ("", self._default)
+        seen = "none has been played since this page was opened"
+        if self._calibrated:
+            seen = "one is being played" if self._calibrating else "one has been played"
+        elif own:
+            seen = "there is a limb file"
+        return Step(
+            "A calibration run has been played",
+            own or (self._calibrated and not self._calibrating),
+            seen,
+            "`python3 scripts/calibrate_limb.py --graph --hardware RIG.yaml --out LIMB.yaml` plays "
+            "and records one with nodes of its own: end all nodes but this page first.",
+        )
+
     def _watch(self, driver: dict[str, Any] | None) -> None:
+        plan = "" if driver is None else driver["plan_id"]
+        self._calibrating = plan.startswith(CALIBRATION)
+        self._calibrated = self._calibrated or self._calibrating
         if driver is None:
             return
         pressures = [0.0 if value is None else value for value in driver["measured_kpa"]]
@@ -143,13 +165,19 @@ def _camera(data: dict[str, Any], calibrated: bool) -> Step:
     )
 
 
-def _limb_file(nodes: Sequence[dict[str, Any]], default: str) -> Step:
+def _planned_limb(nodes: Sequence[dict[str, Any]]) -> str:
+    """Return the name of the limb that the planner plans for; empty if it is not heard."""
     planner = next((node for node in nodes if node["name"] == "planner"), None)
-    alive = planner is not None and planner["state"] not in ("late", "dead")
-    name = planner["values"].get("limb", "") if planner is not None and alive else ""
+    if planner is None or planner["state"] in ("late", "dead"):
+        return ""
+    return str(planner["values"].get("limb", ""))
+
+
+def _limb_file(nodes: Sequence[dict[str, Any]], default: str) -> Step:
+    name = _planned_limb(nodes)
     return Step(
         "The planner has this limb's own file",
-        bool(name) and name != default,
+        name not in ("", default),
         f"it plans for '{name}'" if name else "no planner is heard",
         "scripts/calibrate_limb.py makes it from a calibration run; start the planner with "
         "limb_file:=FILE.",

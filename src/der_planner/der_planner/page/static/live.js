@@ -9,7 +9,10 @@ const page = { data: null, at: -Infinity, pictureAt: -Infinity, received: 0, lis
   const seconds = () => performance.now() / 1000;
   const find = (id) => document.getElementById(id);
   const put = (element, text) => { if (element && element.textContent !== text) element.textContent = text; };
-  let socket = null, lastOpened = -Infinity, ventText = null, ventUntil = 0, ventGood = false, heard = -Infinity;
+  const PRESS = 1; // seconds after a press on vent during which the click that ends it is no second one
+  let socket = null, lastOpened = -Infinity, ventText = null, ventUntil = 0, ventGood = false, heard = -Infinity, pressed = -Infinity;
+  let lag = Date.now() / 1000 - seconds();
+  document.documentElement.lang = "en"; // for screen readers
 
   function connect() {
     lastOpened = seconds();
@@ -142,6 +145,16 @@ const page = { data: null, at: -Infinity, pictureAt: -Infinity, received: 0, lis
     put(find("supply"), `Supply ${supply} absolute · board heard ${driver.telemetry_age === null ? "never" : driver.telemetry_age.toFixed(2) + " s ago"}`);
   }
 
+  // While a computer sleeps, the steady clock may stand still: what the calendar is ahead by counts as age, too.
+  function watchSleep() {
+    const now = Date.now() / 1000 - seconds(), slept = now - lag;
+    lag = now;
+    if (slept < LOST) return;
+    page.at -= slept;
+    page.pictureAt -= slept;
+    heard -= slept;
+  }
+
   async function vent() {
     const button = find("vent");
     button?.classList.add("sent");
@@ -161,7 +174,12 @@ const page = { data: null, at: -Infinity, pictureAt: -Infinity, received: 0, lis
 
   const typing = (element) => element && (element.isContentEditable || element.tagName === "TEXTAREA" ||
     (element.tagName === "INPUT" && ["text", "search", "password"].includes(element.type) && !["decimal", "numeric"].includes(element.inputMode) && !element.readOnly));
-  document.addEventListener("pointerdown", (event) => { if (event.target.closest?.("#vent")) { event.preventDefault(); vent(); } }, true);
+  const onVent = (event) => event.target.closest?.("#vent");
+  document.addEventListener("pointerdown", (event) => { if (onVent(event)) { event.preventDefault(); pressed = seconds(); vent(); } }, true);
+  // The Enter key, screen readers and switches click without a pointer.
+  document.addEventListener("click", (event) => { if (onVent(event) && (event.detail === 0 || seconds() - pressed > PRESS)) vent(); }, true);
+  const sayKey = () => put(document.querySelector("#vent small"), typing(document.activeElement) ? "press here: typing" : "space bar");
+  for (const kind of ["focusin", "focusout"]) document.addEventListener(kind, () => setTimeout(sayKey));
   // Before any other key handler, so that a space bar vents even where a button has the focus.
   for (const kind of ["keydown", "keyup"]) window.addEventListener(kind, (event) => {
     if (event.code !== "Space" || typing(event.target)) return;
@@ -174,7 +192,9 @@ const page = { data: null, at: -Infinity, pictureAt: -Infinity, received: 0, lis
     // A connection that says nothing is given up, since a dead server's may stay open for minutes.
     if (socket && seconds() - heard > 3 && seconds() - lastOpened > 3) { socket.close(); socket = null; }
     if (!socket && seconds() - lastOpened > 1) connect();
+    watchSleep();
     show();
   }, 200);
+  document.addEventListener("visibilitychange", show);
   connect();
 })();
