@@ -16,7 +16,6 @@ from urllib.parse import quote, urlsplit
 import pytest
 from browsers import signal_browser
 from filmed import FilmedRun
-from firefox import FIREFOX, Firefox
 from runs import FRAMES, reference
 
 from der_msgs.msg import PressurePlan, PressureState
@@ -233,39 +232,6 @@ def assert_soon(*seconds: float) -> None:
     """A second is the promise; a browser that other programs keep waiting may break it once."""
     assert min(seconds) < 1.0
     assert max(seconds) < 5.0
-
-
-@pytest.mark.skipif(not FIREFOX, reason="no Firefox: sudo apt-get install firefox-esr")
-@pytest.mark.parametrize("rig", ["continue"], indirect=True)
-def test_firefox_arms_and_vents_and_knows_what_died(rig: Rig, tmp_path: Path) -> None:
-    browser = Firefox(tmp_path)
-    rig.browsers.append(browser)
-    browser.get(rig.url)
-    rig.wait(lambda: browser.value("!!page.data && !!document.getElementById('take')"), "the page")
-    for way in (
-        lambda: browser.press(" "),
-        lambda: browser.click("document.getElementById('vent')"),
-    ):
-        rig.wait(
-            lambda: browser.value("document.getElementById('take').disabled === false"), "desk"
-        )
-        if browser.value("document.getElementById('arm').disabled"):
-            browser.click("document.getElementById('take')")
-        rig.wait(lambda: browser.value("!document.getElementById('arm').disabled"), "the desk")
-        browser.click("document.getElementById('arm')")
-        rig.wait_mode(PressureState.ARMED)
-        way()
-        rig.wait_mode(PressureState.DISARMED, PressureState.VENTING)
-        rig.wait_mode(PressureState.DISARMED)
-    note = "document.querySelector('[aria-label^=Note]')"
-    browser.click(note)
-    for key in "a b":
-        browser.press(key)
-    assert browser.value(f"{note}.value") == "a b"
-    rig.page.signal(signal.SIGSTOP)
-    rig.wait(lambda: browser.value("document.body.classList.contains('lost')"), "the silence")
-    rig.page.signal(signal.SIGCONT)
-    rig.wait(lambda: not browser.value("document.body.classList.contains('lost')"), "the server")
 
 
 def test_a_replayed_bag_is_never_taken_for_live(rig: Rig, tmp_path: Path) -> None:
