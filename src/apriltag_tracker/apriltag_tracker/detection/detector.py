@@ -257,7 +257,7 @@ class Detector:
             covariance=fitted.covariance,
             contrast=fitted.contrast,
             blur=fitted.blur,
-            smear=(float(fitted.smear[0]), float(fitted.smear[1])),
+            smear=fitted.smear,
         )
 
     def _by_pattern(
@@ -379,7 +379,7 @@ def _tag_of(tag: int, fitted: Alignment, found_by: str) -> Tag:
         contrast=fitted.contrast,
         found_by=found_by,
         blur=fitted.blur,
-        smear=(float(fitted.smear[0]), float(fitted.smear[1])),
+        smear=fitted.smear,
     )
 
 
