@@ -329,7 +329,7 @@ class Detector:
             fitted.explained > self.family.explained
             and fitted.contrast > 12.0
             and counter_clockwise(fitted.corners)
-            and bool(np.abs(fitted.corners - quad).max() < 1.5 * cell)
+            and float(np.abs(fitted.corners - quad).max()) < 1.5 * cell
         )
 
     def _collect(

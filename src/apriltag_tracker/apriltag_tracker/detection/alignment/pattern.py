@@ -17,10 +17,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-_REACH, _PER_SIGMA = 3.3, 40
+_REACH, _PER_SIGMA = 3.6, 40
 """Edges further away than so many standard deviations are not seen; points of the table in one."""
 
-_HALF = int(_REACH * _PER_SIGMA) + 1
+_HALF = round(_REACH * _PER_SIGMA)
 _NEAR = 1.0 / _REACH
 """With a smaller blur [cells] only the edges of a place's own cell are within reach."""
 
@@ -52,6 +52,8 @@ def _tabulate() -> NDArray[np.float64]:
     grid = np.arange(-_HALF, _HALF + 2) / _PER_SIGMA
     distribution = np.array([0.5 * (1.0 + math.erf(x * math.sqrt(0.5))) for x in grid.tolist()])
     density = np.exp(-0.5 * grid**2) / math.sqrt(2.0 * math.pi)
+    # What is further away is not seen at all.
+    distribution[0], distribution[-2:], density[0], density[-2:] = 0.0, 1.0, 0.0, 0.0
     steps = np.diff(distribution), np.diff(density)
     return np.column_stack([distribution[:-1], steps[0], density[:-1], steps[1]])
 
