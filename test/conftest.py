@@ -82,7 +82,7 @@ class Graph:
 
     def close(self) -> None:
         for process in self.processes:
-            process.stop(timeout=5.0)
+            process.stop()
         self.client.close()
 
 

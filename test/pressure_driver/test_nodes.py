@@ -27,7 +27,7 @@ def test_a_run_from_arming_to_the_end_of_the_process(bench, protocol):
     run.wait_mode(PressureState.VENTING)
     run.wait_mode(PressureState.ARMED)
     run.wait(run.vented, "vented chambers")
-    assert nanoseconds(run.air[-1].header.stamp) - max(wanted) < 8_000_000_000
+    assert nanoseconds(run.air[-1].header.stamp) - max(wanted) < 20_000_000_000
     state = run.states[-1]
     counters = (
         state.setpoints_accepted,
