@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -85,7 +86,12 @@ class Graph:
         return process
 
     def close(self) -> None:
-        for process in self.processes:
+        """End all nodes at once, but boards after their drivers, which vent them."""
+        boards = [each for each in self.processes if each.executable == "board_emulator"]
+        others = [each for each in self.processes if each not in boards]
+        for process in others:
+            process.signal(signal.SIGTERM)
+        for process in others + boards:
             process.stop()
         self.client.close()
 
