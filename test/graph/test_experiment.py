@@ -152,7 +152,7 @@ def test_a_run_of_both_models_ends_in_a_table_and_leaves_nothing_behind(experime
 
 def test_a_tilted_limb_carries_a_payload_in_every_part_of_the_graph(experiment):
     loads = ("--mounting", "20", "--payload", "0.02", "--amplitude", "0.3")
-    run = experiment("--models", "der", *loads)
+    run = experiment("--models", "der", "--no-report", *loads)
     assert run.finish() == 0, run.errors
     (entry,) = json.loads((run.out / "results.json").read_text())["runs"]
     assert entry["mounting"] == "20°"
@@ -170,7 +170,7 @@ def test_a_tilted_limb_carries_a_payload_in_every_part_of_the_graph(experiment):
 
 
 def test_a_run_on_the_graph_is_learned_from_and_what_was_learned_is_played(experiment):
-    run = experiment("--models", "der", "--learn", "1", "--amplitude", "0.4")
+    run = experiment("--models", "der", "--learn", "1", "--amplitude", "0.4", "--no-report")
     assert run.finish() == 0, run.errors
     first, second = json.loads((run.out / "results.json").read_text())["runs"]
     assert (first["method"], second["method"]) == ("paper", "learned 1")
@@ -192,7 +192,7 @@ def test_a_path_is_drawn_on_the_graph_as_it_is_in_the_file(experiment, tmp_path:
     )
     rows = [f"{1000 * i}, {100 * x:.2f}, {100 * y:.2f}" for i, (x, y) in enumerate(points)]
     file.write_text("\n".join(["time [ms], x [cm], y [cm]", *rows]))
-    run = experiment("--path", str(file), "--models", "der")
+    run = experiment("--path", str(file), "--models", "der", "--no-report")
     assert run.finish() == 0, run.errors
     (result,) = json.loads((run.out / "results.json").read_text())["runs"]
     assert (result["motion"], result["model"], result["method"]) == ("arc", "der", "paper")
@@ -261,7 +261,7 @@ def test_a_graph_that_begins_meanwhile_is_found_before_the_driver_is_armed(exper
 
 
 def test_a_rig_file_takes_the_place_of_the_twin(experiment, graph, rig: Path):
-    run = experiment("--hardware", str(rig), "--models", "der")
+    run = experiment("--hardware", str(rig), "--models", "der", "--no-report")
     assert run.finish() == 0, run.errors
     document = json.loads((run.out / "results.json").read_text())
     assert document["runs"][0]["valid_fraction"] > 0.9
