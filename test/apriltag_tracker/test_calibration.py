@@ -19,7 +19,7 @@ from apriltag_tracker.camera.calibration import (
     calibrate_mounting,
     with_offsets,
 )
-from apriltag_tracker.commands import calibrate_camera
+from apriltag_tracker.commands.calibrate_camera import main as run_command
 from apriltag_tracker.sheets import BoardLayout
 from apriltag_tracker.synthetic.camera import SyntheticCamera
 from apriltag_tracker.synthetic.shapes import constant_curvature
@@ -197,7 +197,7 @@ def test_the_script_calibrates_a_folder_of_pictures(tmp_path):
 def test_the_script_names_what_is_missing(tmp_path, monkeypatch, capsys, arguments, named):
     out = ["--out", str(tmp_path / "x.yaml")]
     monkeypatch.setattr(sys, "argv", ["calibrate_camera.py", *arguments, *out])
-    assert calibrate_camera.main() == 1
+    assert run_command() == 1
     assert named in capsys.readouterr().err
 
 
