@@ -28,12 +28,12 @@ from der_planner.control.disturbance import (
     LearningError,
     Measured,
     Shown,
+    chambers_beyond,
     disturbance,
     moves_with,
     stays_behind,
 )
 from der_planner.control.repeatability import Played, Runs
-from der_planner.model.series import interpolate
 from der_planner.planning.correction import Correction
 from der_planner.planning.errors import PlanningError
 from der_planner.planning.result import Plan
@@ -167,7 +167,9 @@ class Learner:
         measured = Measured.build(time, tip, covariance)
         played, mean, largest, astray = self._played(measured, commands)
         seen = float(played.shown.seen.mean())
-        beyond = None if chambers is None else _beyond(played, self._plan.time, *chambers)
+        beyond = None
+        if chambers is not None:
+            beyond = chambers_beyond(played.expected.pressure, self._plan.time, *chambers)
         accepted, said = False, _refusal(seen, astray)
         if said:
             said = f"refused: {said}"
@@ -349,38 +351,6 @@ class Learner:
             tip_predicted=run.expected.tip + self._runs.known(run).value,
             method="learned",
         )
-
-
-def _beyond(run: Played, setpoints: Array, time: ArrayLike, held: ArrayLike) -> Array | None:
-    """Return by how much the chambers held more than their model in each period (K, M) [Pa].
-
-    Args:
-        run: as it was played.
-        setpoints: (K,) [s].
-        time: (n,) instants, in any order [s].
-        held: (n, M) differential pressures in the chambers then [Pa].
-
-    Returns:
-        None where no reading was whole.
-
-    Raises:
-        LearningError: shapes that do not fit.
-    """
-    instants, values = np.asarray(time, dtype=float), np.asarray(held, dtype=float)
-    wanted = (len(instants), run.commands.shape[1])
-    if instants.ndim != 1 or values.shape != wanted:
-        raise LearningError(
-            f"chambers need instants (n,) and pressures {wanted}, got shapes {instants.shape} and "
-            f"{values.shape}: take both from the same recording"
-        )
-    whole = np.isfinite(instants) & np.isfinite(values).all(axis=1)
-    if not whole.any():
-        return None
-    order = np.argsort(instants[whole], kind="stable")
-    instants, values = instants[whole][order], values[whole][order]
-    middle = setpoints + 0.5 * (setpoints[1] - setpoints[0])
-    beyond: Array = interpolate(middle, instants, values) - run.expected.pressure
-    return beyond
 
 
 def _refusal(seen: float, astray: str) -> str:
