@@ -48,10 +48,10 @@ def test_after_a_long_time_the_model_counts_again(nominal):
     steps = np.arange(60)
     for k in range(8):
         log.read(0.05 * k, log.model(np.array([5 * k]))[0] + 200.0 + 300.0 * 0.05 * k)
-    surprise = log.surprise(log.newest + np.array([0.0, 0.5, 20.0]))
-    assert surprise[0] == pytest.approx(305.0, abs=2.0)
-    assert np.all(surprise[1] > surprise[0])
-    assert np.abs(surprise[2]).max() < 200.0
+    gap = log.expected_gap(log.newest + np.array([0.0, 0.5, 20.0]))
+    assert gap[0] == pytest.approx(305.0, abs=2.0)
+    assert np.all(gap[1] > gap[0])
+    assert np.abs(gap[2]).max() < 200.0
     assert np.isfinite(log.during(steps)).all()
 
 

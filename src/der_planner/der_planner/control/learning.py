@@ -70,7 +70,7 @@ _ADAPTED = (
 
 @dataclass(frozen=True)
 class LearningRun:
-    """What one run was worth.
+    """What one run has shown, and what was done with it.
 
     Attributes:
         number: of the run, from 1.
@@ -159,7 +159,7 @@ class Learner:
             commands: (setpoints, M) that were in force in this run, if not those of the plan, for
                 instance with what feedback added [Pa].
             chambers: instants (n,) [s] and what the chambers held then (n, M) [Pa], NaN where it is
-                not known: what feedback on a learned plan takes for granted, not for news.
+                not known. Feedback on the learned plan then does not correct the same again.
 
         Raises:
             LearningError: the arrays do not fit together or to the plan.
@@ -354,7 +354,7 @@ class Learner:
 
 
 def _refusal(seen: float, astray: str) -> str:
-    """Return why a run must not be used of which this share was seen; empty if it may.
+    """Return why a run must not be used; empty if it may.
 
     Args:
         seen: share of the setpoints at which the tip was seen following.

@@ -46,7 +46,7 @@ class Limits:
         ramp: time in which feedback comes in [s].
         fade: time in which it is taken back [s].
         blind: without a measurement for longer, the tags are lost [s].
-        kept: for so long after that the last disturbances are still counted with [s].
+        kept: time after that in which the last disturbances are still made up for [s].
         inconsistent: squared distance of measurements per coordinate, smoothed; 1 is expected.
         patience: for which measurements may be inconsistent [s].
         saturated: for which a correction may be at its limit [s].

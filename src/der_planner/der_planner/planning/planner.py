@@ -134,7 +134,7 @@ def _followed(
     method: str,
     report: Callable[[float], None],
 ) -> _Solved:
-    """Return what `_solve` does.
+    """Call `_solve`; a rod that does not converge becomes a refusal with the remedy.
 
     Raises:
         PlanningError: the rod cannot be simulated along the motion.
