@@ -1,4 +1,4 @@
-"""What was commanded and measured of the chambers, and what they will hold next."""
+"""The chambers' commands and readings so far, and their expected pressures."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class ChamberLog:
         return self._commands
 
     def follow(self, first: int, coming: Array) -> tuple[air.Chambers, int]:
-        """Return the chambers under what was sent before period ``first`` and what is coming.
+        """Return the chambers under the commands sent before period ``first`` and the coming ones.
 
         Args:
             first: period of the first coming command.

@@ -127,7 +127,7 @@ class Horizon:
 
     Args:
         nominal: the model's motion under the plan.
-        chambers: what was commanded and measured of the chambers.
+        chambers: their commands and readings.
         settings: sizes and weights.
 
     Attributes:
@@ -202,7 +202,7 @@ class Horizon:
     def _searched(
         self, here: _Rolled, change: Array, known: Knowledge, allowed: Allowed, free: _Free
     ) -> _Rolled:
-        """Return what is reached on the way of a change (W, M) [Pa] that minimises more.
+        """Return the motion with the first of `_SHARES` of a change (W, M) [Pa] that makes it better.
 
         The programme knows the chambers to first order. Where they vent as fast as they can, a
         small command changes nothing and a larger one fills the other chamber of the pair: the
@@ -217,7 +217,7 @@ class Horizon:
         return here
 
     def _minimised(self, rolled: _Rolled, free: _Free) -> float:
-        """Return what is minimised (see the module) [m²]."""
+        """Return the sum that is minimised, see the module [m²]."""
         run = free.beyond(rolled.correction)
         squares = (rolled.misses**2).sum() + self.settings.bend**2 * (rolled.bends**2).sum()
         return float(squares + sum(((each @ run) ** 2).sum() for each in self._differences))

@@ -56,7 +56,7 @@ _WORSE = 1.02
 _SMALLEST_STEP = 0.1
 """α below which learning stops."""
 _ENOUGH_RUNS = 4.0
-"""So many runs must tell what is left from noise before noise can stop learning."""
+"""Learning stops at the noise only when D is worth this many runs."""
 _PATIENCE = 3
 """Runs that bring nothing before learning stops."""
 _NOTHING = 0.05
@@ -289,7 +289,7 @@ class Learner:
         return self._seen_by_model(first), _ADAPTED
 
     def _seen_by_model(self, run: Played) -> Played:
-        """Return a run with what it shows beyond the model of now."""
+        """Return a run with its disturbance against the present model."""
         expected = self._correction.expected(run.commands)
         value = run.shown.value + run.expected.tip - expected.tip
         return Played(run.commands, expected, Shown(value, run.shown.variance, run.shown.seen))
@@ -342,7 +342,7 @@ class Learner:
         return ""
 
     def _as_plan(self, run: Played) -> Plan:
-        """Return the plan of a run's commands; what is expected of it is what all runs say."""
+        """Return the plan of a run's commands, with the tip that all runs let expect."""
         if np.array_equal(run.commands, self._plan.differential_pressure):
             return self._plan
         return dataclasses.replace(

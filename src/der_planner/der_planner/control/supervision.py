@@ -27,7 +27,7 @@ REASONS = {
     "saturation": "a correction is at its limit of {:.0f} Pa, and the tip far from its path",
     "late": "commands come {:.2f} s after their instant",
 }
-"""Every reason and what is said of it."""
+"""Every reason with the sentence of its warning."""
 
 
 _SHRINKS = 0.7

@@ -60,7 +60,7 @@ class Trial:
         return name if self.run == 1 else f"{name}_run{self.run}"
 
     def following(self) -> Trial:
-        """Return the next run, which plays what was learned."""
+        """Return the next run, which plays the plan that was learned."""
         return dataclasses.replace(self, method=LEARNED, run=self.run + 1)
 
     @property
