@@ -202,7 +202,7 @@ class Horizon:
     def _searched(
         self, here: _Rolled, change: Array, known: Knowledge, allowed: Allowed, free: _Free
     ) -> _Rolled:
-        """Return the motion with the first of `_SHARES` of a change (W, M) [Pa] that makes it better.
+        """Return the motion with the first of `_SHARES` of a change (W, M) [Pa] that is better.
 
         The programme knows the chambers to first order. Where they vent as fast as they can, a
         small command changes nothing and a larger one fills the other chamber of the pair: the

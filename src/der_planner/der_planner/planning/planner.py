@@ -107,7 +107,7 @@ def plan(
 
 
 def _configuration(physics: PlanningModel, reference: Reference, model: str) -> BSpline:
-    """Return q̄(t) of a model; where the limb sags out of its plane, a refusal of arcs advises the rod."""
+    """Return q̄(t) of a model; a refusal of arcs that sag out of their plane advises the rod."""
     try:
         return physics.configuration(reference)
     except PlanningError as error:
