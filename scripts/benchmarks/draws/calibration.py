@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks import rows as kept
-from benchmarks.drawn_limb import drawn_friction
+from benchmarks.draws.limb import drawn_friction
 from der_planner.identification import CalibrationLog, LogError, calibration_run, fit, record_twin
 from der_planner.identification.offline import (
     AMPLITUDE,
