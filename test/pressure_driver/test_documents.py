@@ -13,6 +13,7 @@ from pressure_driver.protocols.native import NativeBoard, NativeHost
 
 PACKAGE = Path(__file__).resolve().parents[2] / "src" / "pressure_driver"
 README = (PACKAGE / "README.md").read_text(encoding="utf-8")
+PROTOCOL = (PACKAGE / "doc" / "native_protocol.md").read_text(encoding="utf-8")
 VECTOR = re.compile(r"^\| (\w+) \|.*\| `([0-9a-f ]+)` \|$", re.MULTILINE)
 
 
@@ -42,7 +43,7 @@ def test_the_parameter_file_names_every_parameter_of_the_node(name):
 
 
 def vectors():
-    found = dict(VECTOR.findall(README))
+    found = dict(VECTOR.findall(PROTOCOL))
     assert len(found) >= 7
     return {name: bytes.fromhex(text) for name, text in found.items()}
 
