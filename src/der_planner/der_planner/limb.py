@@ -155,6 +155,12 @@ class Limb:
         return self._own_mass + sum(item.mass for item in self.masses)
 
     @property
+    def moving_mass(self) -> float:
+        """The part of `mass` beyond the stiff base: what bends the limb by its weight [kg]."""
+        carried = sum(item.mass for item in self.masses if item.arc_length > self.base_length)
+        return self._own_mass - self.segments[0].mass_per_length * self.base_length + carried
+
+    @property
     def _own_mass(self) -> float:
         """The distributed mass: base, segments and connectors [kg]."""
         densities = [segment.mass_per_length for segment in self.segments]

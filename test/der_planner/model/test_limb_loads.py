@@ -65,6 +65,14 @@ def test_a_limb_weighs_what_the_scale_says_with_its_fittings():
             limb.weighing(wrong)
 
 
+def test_what_sits_on_the_stiff_base_weighs_and_moves_nothing():
+    limb = dataclasses.replace(LIMB, base_length=0.01, connector_length=0.005)
+    limb = limb.carrying(0.03, at=0.008, name="valve").carrying(0.02)
+    density = LIMB.segments[0].mass_per_length
+    assert limb.mass == pytest.approx(density * (0.244 + 0.01 + 0.005) + 0.05)
+    assert limb.moving_mass == pytest.approx(density * (0.244 + 0.005) + 0.02)
+
+
 def test_the_payload_is_the_run_s_even_where_a_file_has_a_mass_of_that_name():
     assert LIMB.carrying(0.01, 0.1).carrying(0.02).payload == (0.02, 0.0)
 

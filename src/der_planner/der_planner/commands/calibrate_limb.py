@@ -8,7 +8,7 @@
 
 --offline plays the calibration on the twin in one process, in seconds. --graph plays it in real
 time on the running graph, on the twin or the hardware, records a bag, vents, and fits to the bag:
-about three minutes. A bag is any recorded run that excites every input; `--excitation FILE.csv`
+about four minutes. A bag is any recorded run that excites every input; `--excitation FILE.csv`
 writes the pressures of the calibration run, and `--play FILE.csv` plays such a file instead.
 
 --mounting says how the limb was mounted in the log, --payload what it carried beside its own

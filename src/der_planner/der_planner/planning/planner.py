@@ -110,7 +110,7 @@ def plan(
 
 
 def _configuration(physics: PlanningModel, reference: Reference, model: str) -> BSpline:
-    """Return q̄(t) of a model; a refusal says where arcs are refused for what they do not know."""
+    """Return q̄(t) of a model; a refusal of arcs that sag out of their plane advises the rod."""
     try:
         return physics.configuration(reference)
     except PlanningError as error:
@@ -137,7 +137,7 @@ def _followed(
     method: str,
     report: Callable[[float], None],
 ) -> _Solved:
-    """Return what `_solve` does.
+    """Call `_solve`; a rod that does not converge becomes a refusal with the remedy.
 
     Raises:
         PlanningError: the rod cannot be simulated along the motion.

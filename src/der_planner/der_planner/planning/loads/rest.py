@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 _STRAIGHT = 1e-3
 """A limb that rests within this bend [rad] of straight starts there."""
 NEAR = 1.1
-"""A standing limb that would buckle under so many times its load is near that [-]."""
+"""A standing limb that would buckle under less than this multiple of its load is near that [-]."""
 _APART = 1e-3
 """Two resting shapes that are this far apart are two [m]."""
 
