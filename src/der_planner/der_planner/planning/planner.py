@@ -65,7 +65,8 @@ def plan(
         start: where another motion is left; None: where the vented limb rests.
         progress: called with the share that is done, 0 … 1.
 
-    The plan's `warnings` say where limits cut the wanted pressures.
+    The plan's `warnings` say where limits cut the wanted pressures, and where the limb's numbers
+    are those of another mounting.
 
     Raises:
         PlanningError: unknown model or method.
@@ -84,7 +85,9 @@ def plan(
         report(0.3)
         solved = _followed(physics, spline, reference, method, report)
     bend = sample_spline(spline, reference.time)[0]
-    left = [str(reference.deviation or ""), nearly_buckling(physics.limb)]
+    left = [
+        str(reference.deviation or ""), limb.other_mounting, nearly_buckling(physics.limb)
+    ]  # fmt: skip
     warnings = filter(None, left + solved.warnings + _calibration_warnings(physics.limb, bend))
     return Plan(
         time=reference.time,

@@ -116,8 +116,9 @@ def nearly_buckling(limb: Limb) -> str:
         return ""
     return (
         f"the limb stands under {100 / (NEAR * share):.0f} % of the load under which it would "
-        "buckle if it were straight: a few per cent less stiffness or more mass move its tip by "
-        "centimetres. Make it stiffer or lighter, or mount it otherwise"
+        "buckle if it were straight: there a few per cent of stiffness or mass, and friction, move "
+        "its tip by centimetres, which neither rod nor arcs predict. Hang it, or make it stiffer "
+        "or lighter"
     )
 
 
