@@ -165,6 +165,43 @@ def test_a_path_is_planned_and_a_new_command_takes_over_without_a_jump(planner):
     assert np.abs(np.diff(pressures, axis=0)).max() <= 9000 * 0.05 + 1e-6
 
 
+def test_each_motion_has_the_loads_of_its_time(planner):
+    """By parameter, by command, from out of another motion, and by a parameter that was set."""
+    from rcl_interfaces.msg import Parameter, ParameterValue
+    from rcl_interfaces.srv import SetParameters
+
+    node = planner(payload=0.02, mounting="hanging")
+    node.command(plan_id="parameters", model="pcc")
+    node.client.wait_for(lambda: len(node.received("parameters")) > 10, 60.0, "setpoints")
+    node.command(plan_id="heavier", payload=0.05, payload_at=0.2)
+    node.wait_state("done")
+    node.command(plan_id="tilted", payload=0.03, mounting="10", model="pcc")
+    node.wait_plan("tilted")
+    node.wait_state("done")
+    client = node.client.node.create_client(SetParameters, "planner/set_parameters")
+    node.client.wait_for(client.service_is_ready, 30.0, "the parameters")
+    nothing = Parameter(name="payload", value=ParameterValue(type=3, double_value=0.0))
+    answer = client.call_async(SetParameters.Request(parameters=[nothing]))
+    node.client.wait_for(answer.done, 30.0, "the answer")
+    assert answer.result().results[0].successful
+    node.command(plan_id="bare", model="pcc")
+    node.wait_plan("bare")
+    loads = [(p.plan_id, p.payload, p.payload_at, *p.gravity[:2]) for p in node.plans]
+    assert loads == [
+        ("parameters", 0.02, 0.0, 9.81, 0.0),
+        ("heavier", 0.05, 0.2, 9.81, 0.0),
+        ("tilted", 0.03, 0.0, 0.0, pytest.approx(-1.7035, abs=1e-4)),
+        ("bare", 0.0, 0.0, 9.81, 0.0),
+    ]
+    # The heavier motion took over where the first one was: neither setpoints nor reference jump.
+    first, second = node.received("parameters"), node.received("heavier")
+    assert 10 < len(first) < len(node.plans[0].time)
+    both = np.array([m.differential_pressure for m in (*first, *second)])
+    assert np.abs(np.diff(both, axis=0)).max() <= 9000 * 0.05 + 1e-6
+    left = np.array(node.plans[0].tip_predicted).reshape(-1, 2)[len(first)]
+    assert np.linalg.norm(np.array(node.plans[1].tip_reference[:2]) - left) < 0.015
+
+
 def test_start_and_stop(planner):
     from der_planner.experiment.errors import GraphError
 

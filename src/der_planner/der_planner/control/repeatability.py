@@ -32,7 +32,7 @@ _PRIOR_SHARE = 0.1
 _PRIOR_FACTOR = 3.0
 """One standard deviation of ln ε is the logarithm of this."""
 _FADE = 2.0
-"""Time in which what was learned fades beyond the first and last picture [s]."""
+"""Time in which the disturbance fades beyond the first and last picture [s]."""
 _UNLIKE = 4.0
 """A run that differs from the others by so many standard deviations is not one of them …"""
 _NOTABLE = 1.5e-3
@@ -134,7 +134,7 @@ class Known:
 
 
 class Runs:
-    """All runs of one motion of one limb, and what they say together.
+    """All runs of one motion of one limb, and the disturbance that they show together.
 
     Args:
         reference: r̄ (K, 2) at the setpoints [m].

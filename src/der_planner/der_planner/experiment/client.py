@@ -27,7 +27,7 @@ READY = (DiagnosticStatus.OK, DiagnosticStatus.WARN)
 
 @dataclass(frozen=True)
 class Patience:
-    """How long a node may take to get ready [s], by what it says of itself.
+    """How long a node may take to get ready [s], by the level of its diagnostics.
 
     Attributes:
         silent: while it says nothing.

@@ -44,7 +44,7 @@ class Playing:
         begin: ROS time at which the first setpoint takes effect [s].
         length: from the first setpoint to the last [s].
         feed: called at least every 50 ms until the end; publishes what is due, if the orchestrator
-            is the one who publishes.
+            is the one who publishes, or shows what is told of the plan meanwhile.
         plan_id: of the plan, if there is one.
     """
 
@@ -347,8 +347,25 @@ class GraphTrial(GraphPlayer):
             f"predicted error {plan.predicted_error * 100:.2f} cm"
         )
         return Playing(
-            stamps.seconds(plan.header.stamp), float(plan.time[-1]), plan_id=plan.plan_id
+            stamps.seconds(plan.header.stamp),
+            float(plan.time[-1]),
+            feed=self._warnings_of(client, plan.plan_id),
+            plan_id=plan.plan_id,
         )
+
+    def _warnings_of(self, client: GraphClient, plan_id: str) -> Callable[[], None]:
+        """Return what shows the warnings of a plan once the planner's diagnostics have them."""
+        shown: list[str] = []
+
+        def show() -> None:
+            said = client.diagnostic_values("planner")
+            played = said.get("plan_id") == plan_id and said.get("state") == "streaming"
+            if played and not shown:
+                shown.append(said.get("reason", ""))
+                if shown[0]:
+                    self._progress.say(f"  warning: {shown[0]}")
+
+        return show
 
     def _planner_listens(self, client: GraphClient, topic: str) -> bool:
         found = client.node.get_subscriptions_info_by_topic(client.node.resolve_topic_name(topic))

@@ -7,8 +7,8 @@ squares on
     a² |tip(q(w)) − r|² + p² |θ(q(w)) − θ̄|²
 
 with θ the bend angles and θ̄ a guess that decides what the tip leaves open, or with a = 0 the wanted
-bend. Along a path each pose
-starts from the one before it, so that the branch is kept by continuity.
+bend. Along a path each pose starts from the one before it, so that the branch is kept by
+continuity.
 """
 
 from __future__ import annotations

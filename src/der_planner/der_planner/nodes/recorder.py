@@ -131,7 +131,7 @@ class Recorder(Node):
     # Topics
 
     def _discover(self) -> None:
-        """Subscribe to what has appeared, and again where publishers changed their QoS."""
+        """Subscribe to new topics, and again to those whose publishers changed their QoS."""
         for name, types in self.get_topic_names_and_types():
             if not self._is_wanted(name, types[0]):
                 self._unsubscribe(name)

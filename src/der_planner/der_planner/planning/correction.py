@@ -69,7 +69,7 @@ class Correction:
         self._limb = plan.limb
 
     def of(self, limb: Limb) -> Correction:
-        """Return the same with another limb's model; what it plans names the plan's own limb.
+        """Return the same with another limb's model; its plans still name the plan's own limb.
 
         Args:
             limb: with as many segments.
@@ -169,7 +169,7 @@ class Correction:
     def _solve(
         self, commands: Array, wanted: Array, pull: float, begin: Outcome | None
     ) -> tuple[Outcome, int]:
-        """Return what is best for wanted tips (K, 2) [m], and the steps of all windows.
+        """Return the best commands for wanted tips (K, 2) [m], and the steps of all windows.
 
         Args:
             commands: (K, M) toward which the plan is pulled [Pa].

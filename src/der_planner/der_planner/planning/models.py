@@ -50,7 +50,7 @@ class PlanningArcs(ArcModel):
                 "or stiffer, or mount it otherwise"
             )
         near = angles + (home - reference.rest)
-        # What arcs miss of the rod's reach is theirs: the plan says it.
+        # Points that the rod reaches and the arcs miss are no refusal: the plan's error shows them.
         own = solve(self.kinematics, tip, near, REFERENCE_PRIOR)[0]
 
         def needed(limb: Limb) -> Array:

@@ -50,7 +50,7 @@ def check_load(
 
 
 def _possible_share(limb: Limb, needed: Callable[[Limb], Array]) -> float | None:
-    """Return the share of what it carries that the limb can hold; None: it cannot hold itself."""
+    """Return the share of its masses that the limb can hold; None: not even its own weight."""
 
     def holds(share: float) -> bool:
         try:

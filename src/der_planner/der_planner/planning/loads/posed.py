@@ -188,7 +188,7 @@ def posed_motion(model: RodModel, reference: Reference, nodes: int) -> PosedMoti
 
 
 def _unreached(limb: Limb, time: Array, tip: Array, poses: Poses) -> UnreachableError | None:
-    """Return what says that poses miss their points (K, 2) [m]; None: they are there."""
+    """Return the error of poses that miss their points (K, 2) [m]; None where none does."""
     missed = poses.misses > _TOLERANCE * limb.length
     if not missed.any() or limb.segment_count == 1:
         return None

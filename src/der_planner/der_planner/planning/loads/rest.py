@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 _STRAIGHT = 1e-3
 """A limb that rests within this bend [rad] of straight starts there."""
 NEAR = 1.1
-"""A standing limb that would buckle under so many times its load is near that [-]."""
+"""A standing limb that would buckle under less than this multiple of its load is near that [-]."""
 _APART = 1e-3
 """Two resting shapes that are this far apart are two [m]."""
 
@@ -116,8 +116,9 @@ def nearly_buckling(limb: Limb) -> str:
         return ""
     return (
         f"the limb stands under {100 / (NEAR * share):.0f} % of the load under which it would "
-        "buckle if it were straight: a few per cent less stiffness or more mass move its tip by "
-        "centimetres. Make it stiffer or lighter, or mount it otherwise"
+        "buckle if it were straight: there a few per cent of stiffness or mass, and friction, move "
+        "its tip by centimetres, which neither rod nor arcs predict. Hang it, or make it stiffer "
+        "or lighter"
     )
 
 
