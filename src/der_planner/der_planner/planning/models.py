@@ -56,7 +56,7 @@ class PlanningArcs(ArcModel):
         def needed(limb: Limb) -> Array:
             return differential_pressure(limb, time, static_pressure(limb, own), own)
 
-        falls = np.array([self.pcc.firmness(pose) <= 0 for pose in own])
+        falls = np.array([self.pcc.smallest_stiffness(pose) <= 0 for pose in own])
         if falls.any():
             k = int(np.argmax(falls))
             raise BucklingError(

@@ -217,7 +217,7 @@ def _poses(model: RodModel, time: Array, tip: Array, guess: Array) -> Poses:
             f"{tip[error.step, 1]:.4f}) m at t = {time[error.step]:.2f} s: it would buckle or snap "
             "through under its load. Shrink or move the motion, or mount the limb otherwise"
         ) from error
-    falls = poses.firmness <= 0
+    falls = poses.smallest_stiffness <= 0
     if falls.any():
         k = int(np.argmax(falls))
         raise BucklingError(
