@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import signal
@@ -15,7 +16,7 @@ import pytest
 from domain import own_domain
 
 from der_planner.experiment.client import GraphClient
-from der_planner.limb import gravity_of
+from der_planner.limb import CalibratedRange, Limb, gravity_of
 from der_planner.planning.plan_file import read_plan
 from der_planner.runs.evaluation import load_run
 
@@ -150,10 +151,15 @@ def test_a_run_of_both_models_ends_in_a_table_and_leaves_nothing_behind(experime
     assert "0 of 2 trials to play" in again.errors
 
 
-def test_a_tilted_limb_carries_a_payload_in_every_part_of_the_graph(experiment):
+def test_a_tilted_limb_carries_a_payload_in_every_part_of_the_graph(experiment, tmp_path):
+    known = CalibratedRange((2e4, 2e4), (1.5, 1.5))
+    level = dataclasses.replace(Limb.default(), calibrated=known)
+    level.to_yaml(tmp_path / "level.yaml")
     loads = ("--mounting", "20", "--payload", "0.02", "--amplitude", "0.3")
-    run = experiment("--models", "der", "--no-report", *loads)
+    limb = ("--limb", tmp_path / "level.yaml")
+    run = experiment("--models", "der", "--no-report", *limb, *loads)
     assert run.finish() == 0, run.errors
+    assert "warning: the mounting is 20°, the limb was calibrated as horizontal" in run.errors
     (entry,) = json.loads((run.out / "results.json").read_text())["runs"]
     assert entry["mounting"] == "20°"
     np.testing.assert_allclose(entry["gravity_m_s2"], gravity_of("20"))

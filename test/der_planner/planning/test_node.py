@@ -186,20 +186,21 @@ def test_each_motion_has_the_loads_of_its_time(planner):
     assert answer.result().results[0].successful
     node.command(plan_id="bare", model="pcc")
     node.wait_plan("bare")
-    loads = [(p.plan_id, p.payload, p.payload_at, *p.gravity[:2]) for p in node.plans]
-    assert loads == [
-        ("parameters", 0.02, 0.0, 9.81, 0.0),
-        ("heavier", 0.05, 0.2, 9.81, 0.0),
-        ("tilted", 0.03, 0.0, 0.0, pytest.approx(-1.7035, abs=1e-4)),
-        ("bare", 0.0, 0.0, 9.81, 0.0),
-    ]
+    plans = {plan.plan_id: plan for plan in node.plans}
+    loads = {name: (p.payload, p.payload_at, *p.gravity[:2]) for name, p in plans.items()}
+    assert loads == {
+        "parameters": (0.02, 0.0, 9.81, 0.0),
+        "heavier": (0.05, 0.2, 9.81, 0.0),
+        "tilted": (0.03, 0.0, 0.0, pytest.approx(-1.7035, abs=1e-4)),
+        "bare": (0.0, 0.0, 9.81, 0.0),
+    }
     # The heavier motion took over where the first one was: neither setpoints nor reference jump.
     first, second = node.received("parameters"), node.received("heavier")
-    assert 10 < len(first) < len(node.plans[0].time)
+    assert 10 < len(first) < len(plans["parameters"].time)
     both = np.array([m.differential_pressure for m in (*first, *second)])
     assert np.abs(np.diff(both, axis=0)).max() <= 9000 * 0.05 + 1e-6
-    left = np.array(node.plans[0].tip_predicted).reshape(-1, 2)[len(first)]
-    assert np.linalg.norm(np.array(node.plans[1].tip_reference[:2]) - left) < 0.015
+    left = np.array(plans["parameters"].tip_predicted).reshape(-1, 2)[len(first)]
+    assert np.linalg.norm(np.array(plans["heavier"].tip_reference[:2]) - left) < 0.015
 
 
 def test_start_and_stop(planner):

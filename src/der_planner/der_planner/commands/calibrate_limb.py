@@ -262,7 +262,11 @@ def _say_if_it_hardly_stands(prior: Limb) -> None:
     """Say before anything is played or fitted what cannot be fitted well."""
     said = nearly_buckling(prior)
     if said:
-        print(f"warning: by the prior's stiffness and mass {said}", file=sys.stderr)
+        print(
+            f"warning: with the stiffness and mass of the prior {said}. The fit says whether it "
+            "is so with the stiffness that it finds",
+            file=sys.stderr,
+        )
 
 
 def _obtain(prior: Limb, given: argparse.Namespace) -> CalibrationLog:

@@ -125,8 +125,8 @@ class Learner:
         self.stopped = ""
         self._correction = self._of_file
         period = float(self._plan.time[1] - self._plan.time[0])
-        self._runs = Runs(self._plan.tip_reference, period, self._correction.lever)
-        self._step, self._pull = 1.0, PULL * self._correction.lever
+        self._runs = Runs(self._plan.tip_reference, period, self._correction.tip_per_pressure)
+        self._step, self._pull = 1.0, PULL * self._correction.tip_per_pressure
         self._best: Played | None = None
         self._levels: list[float] = []
         self._fresh = False
@@ -312,7 +312,7 @@ class Learner:
             said += ", the same plan again"
         elif new > _WORSE * old + min(margin, old):
             self._step /= 2
-            self._pull = min(self._pull * _HARDER, _HARDEST * self._correction.lever)
+            self._pull = min(self._pull * _HARDER, _HARDEST * self._correction.tip_per_pressure)
             said += f": worse than the best plan, back to it with a step of {self._step:.2f}"
         else:
             self._step = min(1.0, 2 * self._step)

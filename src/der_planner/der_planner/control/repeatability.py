@@ -139,11 +139,11 @@ class Runs:
     Args:
         reference: r̄ (K, 2) at the setpoints [m].
         period: of the setpoints [s].
-        lever: way of the tip per pressure [m/Pa].
+        tip_per_pressure: way of the tip per pressure [m/Pa].
     """
 
-    def __init__(self, reference: Array, period: float, lever: float) -> None:
-        self._reference, self._period, self._lever = reference, period, lever
+    def __init__(self, reference: Array, period: float, tip_per_pressure: float) -> None:
+        self._reference, self._period, self._tip_per_pressure = reference, period, tip_per_pressure
         self._all: list[Played] = []
         self.repeats = Repeatability()
 
@@ -211,7 +211,7 @@ class Runs:
     def _movement(self, one: Played, other: Played) -> float:
         """Return how far a change of commands moves the tip, segment by segment, squared [m²]."""
         change = one.expected.pressure - other.expected.pressure
-        return float((change**2).sum(axis=1).mean()) / 2 * self._lever**2
+        return float((change**2).sum(axis=1).mean()) / 2 * self._tip_per_pressure**2
 
     def _pairs(self) -> list[Pair]:
         result = []

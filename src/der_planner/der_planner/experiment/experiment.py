@@ -185,7 +185,7 @@ def _limb_file(trial: Trial, options: Options, progress: Progress) -> Path | Non
 
     prior = options.mounted(Limb.default())
     if said := nearly_buckling(prior):
-        progress.say(f"  warning: by the default limb's stiffness and mass {said}")
+        progress.say(f"  warning: with the stiffness and mass of the default limb {said}")
     progress.say(f"  calibrating on the twin of seed {trial.seed}")
     begin = time.monotonic()
     limb, _ = calibrate_twin(trial.seed, prior)

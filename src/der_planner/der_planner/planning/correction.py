@@ -84,7 +84,7 @@ class Correction:
         return self._limb
 
     @property
-    def lever(self) -> float:
+    def tip_per_pressure(self) -> float:
         """Largest movement of the tip per differential pressure of a segment at rest [m/Pa]."""
         limb = self._limb
         ahead = np.cumsum([s.length for s in limb.segments][::-1])[::-1]
