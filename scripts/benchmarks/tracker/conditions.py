@@ -20,8 +20,8 @@ from apriltag_tracker.detection.tracking import TagTracker
 from apriltag_tracker.pipeline import LimbTracker
 from apriltag_tracker.synthetic.camera import CameraModel, Frame, SyntheticCamera
 from apriltag_tracker.tag_map import TagMap
-from benchmarks.tracker_graph import measure_graph, measure_ready_pictures
-from benchmarks.tracker_pictures import (
+from benchmarks.tracker.graph import measure_graph, measure_ready_pictures
+from benchmarks.tracker.pictures import (
     CONDITIONS,
     CONFIG,
     PERIOD,
@@ -30,7 +30,7 @@ from benchmarks.tracker_pictures import (
     swinging_limb,
     tag_field,
 )
-from benchmarks.tracker_quality import measure_fast_limb, measure_fixed_tags, measure_quality
+from benchmarks.tracker.quality import measure_fast_limb, measure_fixed_tags, measure_quality
 
 _SETTLED = 36
 """Pictures after which fixed tags are fitted in turn."""

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from sensor_msgs.msg import CameraInfo, Image
 
-from benchmarks.tracker_pictures import PERIOD, swinging_limb
+from benchmarks.tracker.pictures import PERIOD, swinging_limb
 from der_msgs.msg import ChamberPressures, LimbState
 from der_planner.experiment.client import GraphClient
 from der_planner.experiment.processes import NodeProcess

@@ -9,7 +9,7 @@ from apriltag_tracker.detection.alignment.aligner import Aligner
 from apriltag_tracker.detection.alignment.pattern import EDGE_VALUES, framed, look_at
 from apriltag_tracker.family import TAG36H11
 from apriltag_tracker.synthetic.camera import Optics, SyntheticCamera
-from benchmarks.tracker_renderer import Scene, render
+from benchmarks.tracker.renderer import Scene, render
 
 
 def errors_and_nees(scene, seeds=(0, 1)):
