@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,17 +17,21 @@ sys.path.insert(0, str(ROOT / "scripts"))
 sys.path.insert(0, str(ROOT / "test" / "support"))
 
 
-WHOLE_GRAPH = "test/graph/"
-"""Tests that run the whole graph, where each node is timed by the others."""
+WHOLE_GRAPH = ("test_calibration", "test_experiment", "test_feedback", "test_page_drawing")
+"""Files of test/graph that run the whole graph, where each node is timed by the others."""
+
+
+def _is_whole_graph(nodeid: str) -> bool:
+    return nodeid.startswith(tuple(f"test/graph/{name}.py" for name in WHOLE_GRAPH))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run the longest first: in parallel, none of them is then waited for at the end.
 
-    The whole graph, which one worker runs alone, takes longer than all other tests of nodes.
+    The whole graph, which one worker runs alone, takes longer than any other file.
     """
     slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: (WHOLE_GRAPH not in item.nodeid, item.path not in slow))
+    items.sort(key=lambda item: (not _is_whole_graph(item.nodeid), item.path not in slow))
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -39,7 +44,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
     class OneGraphAtATime(LoadFileScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            return WHOLE_GRAPH if nodeid.startswith(WHOLE_GRAPH) else super()._split_scope(nodeid)
+            return "graph" if _is_whole_graph(nodeid) else super()._split_scope(nodeid)
 
     return OneGraphAtATime(config, log) if config.getvalue("dist") == "loadfile" else None
 
@@ -81,8 +86,13 @@ class Graph:
         return process
 
     def close(self) -> None:
-        for process in self.processes:
-            process.stop(timeout=5.0)
+        """End all nodes at once, but boards after their drivers, which vent them."""
+        boards = [each for each in self.processes if each.executable == "board_emulator"]
+        others = [each for each in self.processes if each not in boards]
+        for process in others:
+            process.signal(signal.SIGTERM)
+        for process in others + boards:
+            process.stop()
         self.client.close()
 
 

@@ -1,1 +1,1 @@
-"""One module for each part that `benchmark.py` measures."""
+"""One module for each part that `benchmark.py` measures; `command` names them."""

@@ -16,24 +16,25 @@ from pathlib import Path
 
 from der_planner.runs.outputs import OutputError, check_file
 
-PARTS = (
-    "rod",
-    "planning",
-    "driver",
-    "tracker",
-    "recorder",
-    "identification",
-    "studies",
-    "loads",
-    "calibration_draws",
-    "learning",
-    "learning_draws",
-    "feedback",
-    "feedback_draws",
-    "page",
-    "page_wire",
-    "page_memory",
-)
+PARTS = {
+    "rod": "rod",
+    "planning": "planning",
+    "driver": "driver",
+    "tracker": "tracker.conditions",
+    "recorder": "recorder",
+    "identification": "identification",
+    "studies": "studies",
+    "loads": "loads",
+    "calibration_draws": "draws.calibration",
+    "learning": "learning",
+    "learning_draws": "draws.learning",
+    "feedback": "feedback",
+    "feedback_draws": "draws.feedback",
+    "page": "page.browser",
+    "page_wire": "page.wire",
+    "page_memory": "page.memory",
+}
+"""Module of each part, below `benchmarks`; its ``run(quick)`` prints and returns the figures."""
 
 
 def machine() -> dict[str, str | int]:
@@ -72,13 +73,13 @@ def main() -> int:
         except OutputError as error:
             parser.error(str(error))
         options.json.parent.mkdir(parents=True, exist_ok=True)
-    parts = PARTS if "all" in options.parts else options.parts
+    parts = list(PARTS) if "all" in options.parts else options.parts
     where = machine()
     print(", ".join(f"{key} {value}" for key, value in where.items()))
     figures: dict[str, object] = {"machine": where}
     for part in parts:
         print(f"\n== {part}", flush=True)
-        figures[part] = importlib.import_module(f"benchmarks.{part}").run(options.quick)
+        figures[part] = importlib.import_module(f"benchmarks.{PARTS[part]}").run(options.quick)
         if options.json is not None:
             options.json.write_text(json.dumps(figures, indent=1))
     return 0

@@ -1,4 +1,4 @@
-"""How long a fit takes, what it recovers, what each of its terms buys, and how well it predicts."""
+"""Time of a fit, what it recovers, what each of its terms is worth, and how well it predicts."""
 
 from __future__ import annotations
 

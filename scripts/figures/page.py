@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from benchmarks.page_rig import Rig, running
+from benchmarks.page.rig import Rig, running
 from der_msgs.msg import PressureState
 from der_planner.runs.outputs import folder_argument
 from workspace_setup.basics import ROOT

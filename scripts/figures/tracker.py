@@ -24,7 +24,7 @@ from apriltag_tracker.synthetic.camera import (
     SyntheticCamera,
 )
 from apriltag_tracker.tag_map import TagMap
-from benchmarks.tracker_pictures import CONDITIONS
+from benchmarks.tracker.pictures import CONDITIONS
 from der_planner.runs.outputs import folder_argument
 from der_planner.twin import LimbTwin
 from workspace_setup.basics import ROOT

@@ -14,7 +14,7 @@ from rclpy.action import ActionClient, get_action_names_and_types
 from ros2_verbs.cli import CommandError, add_verb, add_verbs
 from ros2_verbs.filling import Filler, values_of
 from ros2_verbs.messages import interface, to_yaml
-from ros2_verbs.session import Session, add_session_arguments
+from ros2_verbs.session import Session, add_session_arguments, print_names
 
 _ENDS = {
     GoalStatus.STATUS_SUCCEEDED: "SUCCEEDED",
@@ -44,8 +44,7 @@ def _list(options: argparse.Namespace) -> None:
     with Session(options) as session:
         session.discover()
         found = dict(sorted(get_action_names_and_types(session.node)))
-    for name, types in found.items():
-        print(f"{name} [{', '.join(types)}]" if options.show_types else name)
+    print_names(found, options.show_types)
 
 
 def _send_goal(options: argparse.Namespace) -> int:

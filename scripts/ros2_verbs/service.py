@@ -8,7 +8,7 @@ import time
 from ros2_verbs.cli import CommandError, add_verb, add_verbs
 from ros2_verbs.filling import Filler, values_of
 from ros2_verbs.messages import interface
-from ros2_verbs.session import Session, add_session_arguments, is_hidden, print_types
+from ros2_verbs.session import Session, add_session_arguments, is_hidden, print_names, print_types
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,8 +53,7 @@ def _list(options: argparse.Namespace) -> None:
     if options.count_services:
         print(len(found))
         return
-    for name, types in found.items():
-        print(f"{name} [{', '.join(types)}]" if options.show_types else name)
+    print_names(found, options.show_types)
 
 
 def _type(options: argparse.Namespace) -> int:

@@ -176,6 +176,12 @@ class Session:
         return future.result()
 
 
+def print_names(found: dict[str, list[str]], show_types: bool) -> None:
+    """Print the names of topics, services or actions a line, with their types if asked for."""
+    for name, types in found.items():
+        print(f"{name} [{', '.join(types)}]" if show_types else name)
+
+
 def print_types(
     options: argparse.Namespace, name: str, known: Callable[[Session], dict[str, list[str]]]
 ) -> int:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from ros2_verbs import topic_echo, topic_hz, topic_pub
 from ros2_verbs.cli import add_verb, add_verbs
-from ros2_verbs.session import Session, add_session_arguments, is_hidden, print_types
+from ros2_verbs.session import Session, add_session_arguments, is_hidden, print_names, print_types
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,8 +55,7 @@ def _list(options: argparse.Namespace) -> None:
             _print_ends("Published", "publisher", found, session.node.count_publishers)
             _print_ends("Subscribed", "subscriber", found, session.node.count_subscribers)
         else:
-            for name, types in found.items():
-                print(f"{name} [{', '.join(types)}]" if options.show_types else name)
+            print_names(found, options.show_types)
 
 
 def _print_ends(

@@ -16,7 +16,7 @@ from apriltag_tracker.pipeline import LimbTracker
 from apriltag_tracker.synthetic.camera import CameraModel, SyntheticCamera
 from apriltag_tracker.synthetic.shapes import constant_curvature
 from apriltag_tracker.tag_map import TagMap
-from benchmarks.tracker_renderer import Scene, render
+from benchmarks.tracker.renderer import Scene, render
 from der_planner.identification.parameters import start_values
 from der_planner.identification.rod_angles import RodAngles
 from der_planner.limb import Limb

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from apriltag_tracker.camera import Intrinsics
+from apriltag_tracker.commands import calibrate_camera
 
 sys.path.insert(0, str(Path(__file__).parent))
 from test_calibration import TRUE, board_pictures
@@ -63,11 +65,12 @@ def test_a_bag_of_pictures(tmp_path: Path):
     ],
 )
 def test_a_place_that_cannot_be_written_is_refused_before_pictures_are_taken(
-    tmp_path: Path, out: str, reason: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any, out: str, reason: str
 ):
-    process = calibrate(tmp_path / out, "no_pictures_here")
-    said, complaint = process.communicate(timeout=120)
-    assert process.returncode == 1
+    given = ["intrinsics", "no_pictures_here", "--out", str(tmp_path / out)]
+    monkeypatch.setattr(sys, "argv", ["calibrate_camera.py", *given])
+    assert calibrate_camera.main() == 1
+    said, complaint = capsys.readouterr()
     assert reason in complaint
     assert len(complaint.splitlines()) == 1
     assert said == ""

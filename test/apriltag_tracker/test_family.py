@@ -20,7 +20,7 @@ from apriltag_tracker.pipeline import LimbTracker
 from apriltag_tracker.sheets import drawing, tag_pages
 from apriltag_tracker.synthetic.camera import Optics, SyntheticCamera
 from apriltag_tracker.tag_map import LimbTag, TagMap
-from benchmarks.tracker_renderer import Scene, render
+from benchmarks.tracker.renderer import Scene, render
 
 EACH = pytest.mark.parametrize("each", FAMILIES.values(), ids=FAMILIES)
 STANDARD = ("tagStandard41h12", "tagStandard52h13")

@@ -181,7 +181,7 @@ class FakeCamera:
         pass
 
 
-def wait_until(condition, timeout=10.0):
+def wait_until(condition, timeout=60.0):
     end = time.monotonic() + timeout
     while time.monotonic() < end:
         if condition():

@@ -6,12 +6,50 @@ import sys
 
 import numpy as np
 import pytest
+from domain import own_domain
 
 from limb_interfaces import transport
 from limb_interfaces.gaps import StampGaps
 from limb_interfaces.overrides import key_matches, node_keys, parameter_files
 
 PERIOD = 33_333_333
+
+
+def declared(given, default, **options):
+    """Declare a parameter of a node whose command line gives it; return its value."""
+    import rclpy
+    from rclpy.node import Node
+
+    from limb_interfaces.parameters import declare
+
+    context = rclpy.Context()
+    rclpy.init(args=[], context=context, domain_id=own_domain(__file__))
+    line = ["--ros-args", "-p", f"wanted:={given}"]
+    node = Node("declaring", context=context, cli_args=line, start_parameter_services=False)
+    try:
+        value = declare(node, "wanted", default, "of a test", **options)
+        assert node.get_parameter("wanted").value == value
+        return value
+    finally:
+        node.destroy_node()
+        rclpy.shutdown(context=context)
+
+
+def test_a_number_is_taken_where_a_text_or_a_float_is_wanted():
+    from limb_interfaces.parameters import ParameterError
+
+    assert declared("10", "") == "10"
+    assert declared("7.5", "") == "7.5"
+    mass = declared("0", 0.5, at_least=0.0, at_most=10.0)
+    assert (mass, type(mass)) == (0.0, float)
+    for given, default, options in (
+        ("20", 0.5, {"at_most": 10.0}),
+        ("yes", 0.5, {}),
+        ("true", "", {}),
+        ("1.5", 3, {}),
+    ):
+        with pytest.raises(ParameterError, match="parameter 'wanted'"):
+            declared(given, default, **options)
 
 
 def missed(stamps, **options):

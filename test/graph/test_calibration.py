@@ -29,7 +29,7 @@ def calibrate(out: Path, excitation: Path, *arguments: str) -> subprocess.Comple
         env={**os.environ, "ROS_DOMAIN_ID": domain},
         capture_output=True,
         text=True,
-        timeout=200,
+        timeout=400,
         check=False,
     )
 

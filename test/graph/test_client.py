@@ -38,7 +38,7 @@ def test_a_waiting_client_notices_a_death_at_once(graph):
     graph.client.wait_ready(["board_emulator"])
     board.signal(signal.SIGKILL)
     with pytest.raises(NodeError, match="killed by SIGKILL"):
-        graph.client.wait_for(lambda: False, 30.0, "what never comes")
+        graph.client.wait_for(lambda: False, 60.0, "what never comes")
 
 
 def test_nodes_end_with_zero_on_both_signals(graph):
@@ -48,5 +48,5 @@ def test_nodes_end_with_zero_on_both_signals(graph):
         graph.client.diagnostics.clear()
         graph.client.wait_ready(["board_emulator"])
         board.signal(number)
-        graph.client.wait_for(lambda board=board: not board.alive, 20.0, "the end of the node")
+        graph.client.wait_for(lambda board=board: not board.alive, 60.0, "the end of the node")
         assert board.exit_code == 0

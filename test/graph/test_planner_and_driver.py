@@ -69,7 +69,7 @@ class Rig:
 
     def nothing_more_comes(self):
         """What was on its way has arrived; from now on nothing is sent."""
-        self.client.spin(0.3)
+        self.client.spin(0.5)
         count = len(self.setpoints)
         self.client.spin(1.0)
         return len(self.setpoints) == count

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.graph
 
 BYTES_A_SECOND = 9_700
 """Of text: a full line of 115200 baud, with the reports in between."""
-PROMPT = 2.0
+PROMPT = 15.0
 """[s] for an answer or an end on a loaded machine; the flood used to hold them up for ever."""
 
 
@@ -120,27 +120,32 @@ class Driver:
         return [caller.call_async(Trigger.Request()) for _ in range(count)]
 
     def pressurise(self):
-        (answer,) = self.call(1, "arm")
-        self.client.wait_for(answer.done, 10.0, "an answer of arm")
-        assert answer.result().success, answer.result().message
+        def armed():
+            (answer,) = self.call(1, "arm")
+            self.client.wait_for(answer.done, 30.0, "an answer of arm")
+            return answer.result().success
+
+        self.client.wait_for(armed, 30.0, "the driver to be armed")
 
         def commanded():
             self.publisher.publish(PressureSetpoint(differential_pressure=[3000.0, 0.0]))
             self.client.spin(0.04)
             return self.board.asked(time.monotonic() - 0.3)[-1:] == [30.0]
 
-        self.client.wait_for(commanded, 20.0, "pressure on the wire")
+        self.client.wait_for(commanded, 60.0, "pressure on the wire")
 
 
 def test_text_from_the_board_holds_up_neither_vent_nor_the_end(graph, board):
     driver = Driver(graph, board)
     driver.pressurise()
     board.flooding = True
-    until = time.monotonic() + 3.0
-    while time.monotonic() < until:
+
+    def read():
         driver.publisher.publish(PressureSetpoint(differential_pressure=[3000.0, 0.0]))
         driver.client.spin(0.04)
-    assert board.flood_bytes > 2.0 * BYTES_A_SECOND, "the flood must have been read"
+        return board.flood_bytes > 2.5 * BYTES_A_SECOND
+
+    driver.client.wait_for(read, 30.0, "the flood to be read")
     asked_at = time.monotonic()
     (answer,) = driver.call(1, "vent")
     driver.client.wait_for(answer.done, PROMPT, "an answer of vent")
@@ -155,9 +160,11 @@ def test_text_from_the_board_holds_up_neither_vent_nor_the_end(graph, board):
     )
     driver.client.watch([])
     driver.process.signal(signal.SIGINT)
-    driver.client.wait_for(lambda: not driver.process.alive, 3.0 * PROMPT, "the end on SIGINT")
+    driver.client.wait_for(lambda: not driver.process.alive, PROMPT, "the end on SIGINT")
     assert driver.process.exit_code == 0
-    assert board.asked(asked_at)[-3:] == [0.0] * 3
+    driver.client.wait_for(
+        lambda: board.asked(asked_at)[-3:] == [0.0] * 3, PROMPT, "the last commands"
+    )
     log = driver.process.log.read_text()
     assert log.count("board: a") < 200
     assert "faster than it is logged" in log
@@ -188,7 +195,7 @@ def test_simulated_time_is_refused_while_it_runs(graph, board):
     future = service.call_async(
         SetParameters.Request(parameters=[Parameter(name="use_sim_time", value=value)])
     )
-    driver.client.wait_for(future.done, 10.0, "an answer")
+    driver.client.wait_for(future.done, 30.0, "an answer")
     assert not future.result().results[0].successful
     assert "real time" in future.result().results[0].reason
     driver.pressurise()
@@ -216,7 +223,7 @@ def test_two_publishers_of_a_running_graph_are_not_mixed(graph, board):
             )
             > 20
         ),
-        10.0,
+        30.0,
         "the count of refused setpoints",
     )
     assert "another publisher" in driver.process.log.read_text()
@@ -248,15 +255,17 @@ def test_a_log_that_cannot_be_written_stops_nothing(logging_to):
     with open("/dev/full", "w") as disk:
         driver = logging_to(disk)
     driver.pressurise()
-    until = time.monotonic() + 1.5
-    while time.monotonic() < until:
+
+    def tracked():
         for value in (float("nan"), 3000.0):  # the first is refused, which is logged
             driver.publisher.publish(PressureSetpoint(differential_pressure=[value, 0.0]))
         driver.client.spin(0.04)
-    assert driver.states[-1].setpoints_refused > 0
-    assert driver.states[-1].mode == PressureState.TRACKING
+        newest = driver.states[-1]
+        return newest.setpoints_refused > 20 and newest.mode == PressureState.TRACKING
+
+    driver.client.wait_for(tracked, 30.0, "the driver to go on after refusals")
     driver.process.send_signal(signal.SIGINT)
-    assert driver.process.wait(10.0) == 0
+    assert driver.process.wait(30.0) == 0
     driver.client.wait_for(lambda: driver.board.asked(0.0)[-3:] == [0.0] * 3, PROMPT, "the vents")
 
 
@@ -269,7 +278,7 @@ def test_a_log_that_nobody_reads_counts_as_a_blocked_executor(logging_to):
         while True:
             os.write(writer, b"x")
     os.set_blocking(writer, True)
-    end = time.monotonic() + 10.0
+    end = time.monotonic() + 30.0
     while driver.process.poll() is None and time.monotonic() < end:
         driver.publisher.publish(PressureSetpoint(differential_pressure=[float("nan"), 0.0]))
         driver.client.spin(0.04)

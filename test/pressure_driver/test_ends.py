@@ -26,7 +26,7 @@ def test_every_exit_vents(bench):
         run.driver.signal(number)
         run.wait(lambda: not run.driver.alive, "the end of the driver")
         assert run.driver.exit_code == 0
-        run.wait(run.vented, "vented chambers", 15.0)
+        run.wait(run.vented, "vented chambers")
         assert np.ptp(difference(run.commands[-1])) == 0.0
         run.start_driver()
 
@@ -35,7 +35,8 @@ def test_every_exit_vents(bench):
 def test_a_killed_driver_leaves_boards_without_a_watchdog_vented_if_it_has_a_guardian(
     bench, guardian
 ):
-    run = bench(guardian=guardian)
+    # A busy machine may take seconds from the last setpoint to the kill: until then it holds.
+    run = bench(guardian=guardian, hold_time=20.0)
     run.pressurise()
     run.client.watch([run.board])
     run.driver.signal(signal.SIGKILL)
@@ -44,7 +45,7 @@ def test_a_killed_driver_leaves_boards_without_a_watchdog_vented_if_it_has_a_gua
         run.client.spin(1.0)
         assert not run.vented()
         run.start_driver(ready=False)
-    run.wait(run.vented, "vented chambers", 30.0)
+    run.wait(run.vented, "vented chambers")
 
 
 def test_a_stopped_driver_is_ended_and_the_board_vented(bench):
@@ -54,7 +55,7 @@ def test_a_stopped_driver_is_ended_and_the_board_vented(bench):
     run.driver.signal(signal.SIGSTOP)
     run.wait(lambda: not run.driver.alive, "the end of the driver")
     assert run.driver.exit_code == -signal.SIGKILL
-    run.wait(run.vented, "vented chambers", 15.0)
+    run.wait(run.vented, "vented chambers")
 
 
 def test_an_end_without_the_board_says_so(bench):
@@ -75,7 +76,7 @@ def test_a_killed_driver_leaves_native_boards_vented(bench):
     run.client.watch([run.board])
     run.driver.signal(signal.SIGKILL)
     run.wait(lambda: not run.driver.alive, "the end of the driver")
-    run.wait(run.vented, "vented chambers", 15.0)
+    run.wait(run.vented, "vented chambers")
 
 
 CRASHING = """
@@ -111,7 +112,7 @@ def test_an_exception_vents(bench, tmp_path):
         run.wait(lambda: process.poll() is not None, "the end of the driver")
         assert process.returncode == 1
         assert b"a callback failed" in process.stderr.read()
-        run.wait(run.vented, "vented chambers", 15.0)
+        run.wait(run.vented, "vented chambers")
     finally:
         process.kill()
         process.wait()
@@ -148,7 +149,7 @@ def test_a_closed_terminal_vents(bench):
         with contextlib.suppress(OSError):
             os.kill(process, signal.SIGKILL)
             os.waitpid(process, 0)
-    run.wait(run.vented, "vented chambers", 15.0)
+    run.wait(run.vented, "vented chambers")
     assert np.ptp(difference(run.commands[-1])) == 0.0
 
 
@@ -173,7 +174,7 @@ def test_a_signal_while_a_node_is_being_loaded_ends_it_without_a_word(graph, pac
                 return int(masks["SigCgt"], 16) & bit
 
         # Python itself catches SIGINT from the start; the others only once the node's entry runs.
-        deadline = time.monotonic() + 30.0
+        deadline = time.monotonic() + 90.0
         while not (caught(1 << signal.SIGHUP - 1) and caught()):
             assert time.monotonic() < deadline
             time.sleep(0.001)

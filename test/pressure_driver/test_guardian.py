@@ -21,7 +21,7 @@ pytestmark = pytest.mark.slow
 
 PROMISED = 0.3
 """[s] from the last sign of life to the vent command on the wire."""
-ATTEMPTS = 4
+ATTEMPTS = 10
 """A busy machine may keep the test's own board waiting: the promise is checked on the best run."""
 
 DRIVER = """
@@ -77,7 +77,7 @@ sys.exit(0 if link.vented_at_end else 1)
 """
 
 
-def wait_for(condition, what, limit=20.0):
+def wait_for(condition, what, limit=60.0):
     deadline = time.monotonic() + limit
     while not condition():
         assert time.monotonic() < deadline, f"waited too long for {what}"
@@ -106,8 +106,8 @@ class Run:
                 stdout=output,
                 stderr=subprocess.STDOUT,
             )
-        wait_for(self.guardians, "the guardian", 40.0)
-        wait_for(self.pressurised, "pressure in a chamber", 40.0)
+        wait_for(self.guardians, "the guardian")
+        wait_for(self.pressurised, "pressure in a chamber")
 
     def pressurised(self):
         assert self.driver.poll() is None, self.log.read_text()
@@ -173,7 +173,7 @@ def test_a_driver_that_dies_stops_or_blocks_is_ended_and_the_board_vented(run, p
         begin = time.time_ns()
         case.driver.send_signal(number)
         took.append(case.time_to_vent(begin))
-        assert case.driver.wait(5.0) == -signal.SIGKILL
+        assert case.driver.wait(60.0) == -signal.SIGKILL
         wait_for(case.vented, "vented chambers")
         last = len(case.commands)
         wait_for(lambda: not alive(case.guardians()[0]), "the end of the guardian")
@@ -188,7 +188,7 @@ def test_a_blocked_executor_counts_as_dead(run):
     case = run()
     case.start()
     case.driver.send_signal(signal.SIGUSR2)
-    assert case.driver.wait(10.0) == -signal.SIGKILL
+    assert case.driver.wait(60.0) == -signal.SIGKILL
     wait_for(case.vented, "vented chambers")
     assert "no sign of life" in case.say()
 
@@ -200,7 +200,7 @@ def test_after_a_kill_the_next_driver_gets_the_port(run):
     case.driver.wait()
     case.start()
     case.driver.terminate()
-    assert case.driver.wait(10.0) == 0
+    assert case.driver.wait(60.0) == 0
     wait_for(case.vented, "vented chambers")
 
 
@@ -210,7 +210,7 @@ def test_a_normal_end_leaves_no_guardian(run):
     (guardian,) = case.guardians()
     assert alive(guardian)
     case.driver.terminate()
-    assert case.driver.wait(10.0) == 0
+    assert case.driver.wait(60.0) == 0
     assert not alive(guardian)
     assert "driver was ended" not in case.say()
     wait_for(lambda: not case.port.host_present, "a port that nobody holds")
@@ -257,7 +257,6 @@ def test_the_guardian_gets_the_port_that_comes_back(run):
     wait_for(
         lambda: any(not case.is_vent(command) for command in case.commands[count:]),
         "the driver to be armed again",
-        40.0,
     )
     wait_for(case.pressurised, "pressure again")
     begin = time.time_ns()

@@ -118,8 +118,7 @@ def test_boards_that_echo_are_not_probed(simulate, protocol):
 
 
 @pytest.mark.parametrize("protocol", ["ezloop", "ctrlp", "native"])
-@pytest.mark.parametrize("seed", [5, 6])
-@pytest.mark.parametrize("period", [3.0, 20.0])
+@pytest.mark.parametrize(("seed", "period"), [(5, 3.0), (6, 20.0)])
 def test_no_motion_of_a_sound_limb_is_taken_for_a_leak(
     simulate, protocol, seed, period, monkeypatch
 ):

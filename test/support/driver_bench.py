@@ -61,14 +61,14 @@ class Bench:
             self.wait(self.publisher.get_subscription_count, "the driver's subscription")
             self.wait(lambda: self.air, "the air")
 
-    def wait(self, condition, what, limit=30.0):
+    def wait(self, condition, what, limit=60.0):
         return self.client.wait_for(condition, limit, what)
 
     @property
     def mode(self):
         return self.states[-1].mode if self.states else -1
 
-    def wait_mode(self, mode, limit=30.0):
+    def wait_mode(self, mode, limit=60.0):
         """Wait for a mode, even if it has been left again before anybody looked."""
 
         def seen():
@@ -93,7 +93,7 @@ class Bench:
                 return self.client.call("pressure_driver/arm", 20.0)
 
         self.rest = np.array(self.air[-1].pressure)
-        self.wait(try_to_arm, "the driver to arm", 40.0)
+        self.wait(try_to_arm, "the driver to arm")
 
     def play(self, count, shape):
         """Publish setpoints 0.2 s ahead in real time; return stamp -> differential pressures."""
@@ -115,7 +115,7 @@ class Bench:
     def pressurise(self):
         """Arm and play until a chamber is full; a machine that stalls may need several turns."""
         self.arm()
-        deadline = time.monotonic() + 40.0
+        deadline = time.monotonic() + 90.0
         while self.gauge().max() < 2000.0:
             assert time.monotonic() < deadline, "no pressure in any chamber"
             self.play(8, lambda k: (min(900.0 * (k + 1), 3500.0), -min(500.0 * (k + 1), 2000.0)))

@@ -86,6 +86,8 @@ class TrackerNode(Node):
         self._warm_up()
         self._gaps = StampGaps()
         self._tracker: LimbTracker | None = None
+        self._curve: list[Point] = []
+        """Points of the message, which are written anew for every state."""
         self._reader = ImageReader()
         self._last_stamp = -1
         self._frame = ""
@@ -248,6 +250,7 @@ class TrackerNode(Node):
         ):
             return
         self._tracker = LimbTracker(self._map, intrinsics, self._options, self._detector)
+        self._curve = [Point() for _ in range(self._tracker.fitter.curve_points)]
 
     def _on_image(self, message: Image) -> None:
         self._frame = message.header.frame_id
@@ -371,7 +374,9 @@ class TrackerNode(Node):
             message.curvature = estimate.curvature.tolist()
             message.elongation = estimate.elongation
             message.residual = estimate.residual
-            message.curve = [Point(x=x, y=y) for x, y in estimate.curve.tolist()]
+            for point, (x, y) in zip(self._curve, estimate.curve.tolist(), strict=True):
+                point.x, point.y = x, y
+            message.curve = self._curve
             message.tags_used = len(estimate.tags_used)
         now = self.get_clock().now().nanoseconds
         message.latency = (now - stamps.nanoseconds(stamp)) / stamps.NANOSECONDS

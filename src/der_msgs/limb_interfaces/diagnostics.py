@@ -1,4 +1,4 @@
-"""One diagnostics publisher for every node: `/diagnostics`, once a second."""
+"""One diagnostics publisher for every node: `/diagnostics`, once a second, more often at first."""
 
 from __future__ import annotations
 
@@ -29,12 +29,19 @@ _LEVELS = {
     "error": DiagnosticStatus.ERROR,
     "stale": DiagnosticStatus.STALE,
 }
+_INTERVAL, _FIRST_INTERVAL = 1.0, 0.2
+"""[s] between two messages: in general, and at first."""
+_FIRST_READY, _FIRST_TIME = 2.0, 20.0
+"""[s] for how long a node speaks more often: once it is ready, and at most."""
 _CPU_INTERVAL = 0.5
 """[s] over which the CPU time is taken at least: over less, its own ticks show."""
 
 
 class DiagnosticsPublisher:
     """Calls ``report`` once a second and publishes what it returns, the CPU time and the process.
+
+    A node that starts speaks more often until it is ready and others had the time to find it, so
+    that nobody who waits for it waits for its next second.
 
     Args:
         node: the node that the status is about.
@@ -49,10 +56,19 @@ class DiagnosticsPublisher:
         self._publisher = node.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, qos.STATES)
         self._used, self._looked = time.process_time(), time.monotonic()
         self._cpu = 0.0
-        self._timer = node.create_timer(1.0, self.publish)
+        self._slow_from = time.monotonic() + _FIRST_TIME
+        self._timer = node.create_timer(_FIRST_INTERVAL, self._publish_first)
 
-    def publish(self) -> None:
-        """Publish now, without waiting for the next second."""
+    def _publish_first(self) -> None:
+        now = time.monotonic()
+        if self.publish() in ("ok", "warning"):
+            self._slow_from = min(self._slow_from, now + _FIRST_READY)
+        if now >= self._slow_from:
+            self._node.destroy_timer(self._timer)
+            self._timer = self._node.create_timer(_INTERVAL, self.publish)
+
+    def publish(self) -> str:
+        """Publish now, without waiting for the next second; return the level."""
         health = self._report()
         values = {
             **health.values,
@@ -69,6 +85,7 @@ class DiagnosticsPublisher:
         message = DiagnosticArray(status=[status])
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)
+        return health.level
 
     def _measure_cpu(self) -> float:
         """Return this process's share of one core [%] since it was last measured."""

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.node import Node
 
 Value = bool | int | float | str | list[float] | list[int] | list[str]
@@ -58,9 +61,30 @@ def declare(
             )
         ]
     try:
-        value = node.declare_parameter(name, default, descriptor).value
+        value = _declared(node, name, default, descriptor)
     except Exception as error:
         raise ParameterError(f"parameter '{name}' ({description}): {error}") from error
     if choices and value not in choices:
         raise ParameterError(f"parameter '{name}' is '{value}': choose {', '.join(choices)}")
     return value  # type: ignore[no-any-return]
+
+
+def _declared(node: Node, name: str, default: Value, descriptor: ParameterDescriptor) -> Any:
+    """Declare a parameter; a number is taken where a text or a float is wanted, as ``a:=10``.
+
+    The command line makes a whole number of ``10`` whatever is wanted.
+    """
+    try:
+        return node.declare_parameter(name, default, descriptor).value
+    except InvalidParameterTypeException:
+        if not isinstance(default, (str, float)):
+            raise
+        given = node.declare_parameter(
+            name, default, ParameterDescriptor(dynamic_typing=True)
+        ).value
+        node.undeclare_parameter(name)
+        whole = isinstance(given, int) and not isinstance(given, bool)
+        if not (whole or (isinstance(given, float) and isinstance(default, str))):
+            raise
+        meant = type(default)(given)
+        return node.declare_parameter(name, meant, descriptor, ignore_override=True).value

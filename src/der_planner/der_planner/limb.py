@@ -123,6 +123,9 @@ class Limb:
         if len(self.gravity) != 3:
             raise LimbError(f"gravity must be three numbers in m/s², got {self.gravity}")
         check(self.calibrated, "calibrated.")
+        if len(self.calibrated.gravity) not in (0, 3):
+            given = self.calibrated.gravity
+            raise LimbError(f"calibrated.gravity must be three numbers in m/s² or [], got {given}")
         check(self)
         for index, item in enumerate(self.masses):
             check(item, f"masses[{index}].")
@@ -150,6 +153,12 @@ class Limb:
     def mass(self) -> float:
         """What a scale shows from the clamp on, everything that the limb carries included [kg]."""
         return self._own_mass + sum(item.mass for item in self.masses)
+
+    @property
+    def moving_mass(self) -> float:
+        """The part of `mass` beyond the stiff base: what bends the limb by its weight [kg]."""
+        carried = sum(item.mass for item in self.masses if item.arc_length > self.base_length)
+        return self._own_mass - self.segments[0].mass_per_length * self.base_length + carried
 
     @property
     def _own_mass(self) -> float:
@@ -233,8 +242,30 @@ class Limb:
         return 0.0, 0.0
 
     def mounted(self, mounting: str) -> Limb:
-        """Return the limb with the gravity of a mounting, see `gravity_of`."""
-        return dataclasses.replace(self, gravity=gravity_of(mounting))
+        """Return the limb with the gravity of a mounting, see `gravity_of`.
+
+        A limb that was calibrated or declared under another gravity remembers it, see
+        `other_mounting`.
+        """
+        gravity, known = gravity_of(mounting), self.calibrated
+        declared = bool(known.differential_pressure) or any(self.gravity)
+        if declared and not known.gravity and mounting_of(gravity) != mounting_of(self.gravity):
+            known = dataclasses.replace(known, gravity=self.gravity)
+        return dataclasses.replace(self, gravity=gravity, calibrated=known)
+
+    @property
+    def other_mounting(self) -> str:
+        """A sentence where the limb's numbers are those of another mounting; else empty."""
+        before = self.calibrated.gravity
+        if not before or mounting_of(before) == mounting_of(self.gravity):
+            return ""
+        was, now = mounting_of(before), mounting_of(self.gravity)
+        if not self.calibrated.differential_pressure:
+            return f"the mounting is {now}, the limb was declared as {was}: {now} is taken"
+        return (
+            f"the mounting is {now}, the limb was calibrated as {was}: the stiffness, gains and "
+            f"rest angles that were found as {was} are kept. Calibrate it as {now} if it misses"
+        )
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> Limb:

@@ -12,14 +12,14 @@ GAIN_SPREAD = 0.35
 REST_SPREAD = math.radians(6.0)
 """Of a rest angle: those of a real limb wander by so much [rad]."""
 LARGEST_GAIN_CHANGE = 4.0
-"""Factor beyond which no fit looks."""
+"""Largest factor by which a fit may change a gain."""
 LARGEST_REST_CHANGE = math.radians(35.0)
-"""Beyond which no fit looks [rad]."""
+"""Largest change of a rest angle in a fit [rad]."""
 LARGEST_CHANGES = (
     math.log(LARGEST_GAIN_CHANGE) / GAIN_SPREAD,
     LARGEST_REST_CHANGE / REST_SPREAD,
 )
-"""Of gain and rest angle, in their spreads."""
+"""Both limits as multiples of the spreads."""
 
 
 def on_another_day(segment: Segment, gain: float, rest: float) -> Segment:

@@ -29,7 +29,7 @@ class Term:
         unit: of its value.
         scale: a typical value; the solver works in multiples of it.
         low, high: bounds.
-        spread: standard deviation of what is known before any data; infinite for nothing.
+        spread: standard deviation before any data; infinite where nothing is known.
         group: the model term that it belongs to; `linear` is always fitted.
         shared: one value for all segments.
         per: powers of other parameters: unknown = parameter · Π other^power. They are declared

@@ -26,7 +26,7 @@ GRAVITY = 9.81
 _SAME_GRAVITY = 1e-6
 _ROUNDING = 1e-12
 HEAVIEST = 10.0
-"""Of a limb or of what it carries [kg]: more is a mistake in the unit."""
+"""Largest mass of a limb, or of its payload [kg]: more is a mistake in the unit."""
 MOST_TILT = 180.0
 """Of a plate about the straight limb, either way [degrees]."""
 MOUNTINGS = {

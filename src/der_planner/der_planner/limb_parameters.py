@@ -330,7 +330,7 @@ class Pneumatics:
 
 @dataclass(frozen=True)
 class CalibratedRange:
-    """What a calibration run covered, (M,) each, so that a plan beyond it can be recognised."""
+    """What a calibration run covered, so that a plan beyond it can be recognised."""
 
     differential_pressure: tuple[float, ...] = field(
         default=(),
@@ -342,5 +342,13 @@ class CalibratedRange:
         default=(),
         metadata=parameter(
             "rad", "largest |bend angle| seen", "the calibration writes it", least=0.0
+        ),
+    )
+    gravity: tuple[float, ...] = field(
+        default=(),
+        metadata=parameter(
+            "m/s²",
+            "gravity for which the limb's numbers were found; empty: the limb's gravity",
+            "leave it empty: it is noted where a run is mounted otherwise than the limb file",
         ),
     )

@@ -352,7 +352,7 @@ class SerialLink:
         if self._device is not None:
             with contextlib.suppress(Exception):
                 self.vented_at_end = self._send_last_words(self._device)
-            release_port(self._device)
+            release_port(self._device, drop=not self.vented_at_end)
         if self._bytes_waiting is not None:
             self._bytes_waiting.close()
         self._device = self._bytes_waiting = None

@@ -103,13 +103,19 @@ def open_port_when_free(port: str, baud_rate: int, patience: float = RELEASE_TIM
         time.sleep(0.1)
 
 
-def release_port(device: serial.Serial) -> None:
-    """Close a port and drop what waits in its output queue, without waiting for the board.
+def release_port(device: serial.Serial, drop: bool = True) -> None:
+    """Close a port without waiting for the board.
 
     The lock is taken off by name: another descriptor of the same port may live a little longer.
+
+    Args:
+        device: the port.
+        drop: throw away what waits in its output queue, for which the kernel would wait. Not after
+            the last words: a board on a pseudo-terminal may not have read them yet.
     """
-    with contextlib.suppress(Exception):
-        device.reset_output_buffer()
+    if drop:
+        with contextlib.suppress(Exception):
+            device.reset_output_buffer()
     with contextlib.suppress(Exception):
         fcntl.ioctl(device.fileno(), termios.TIOCNXCL)
     with contextlib.suppress(Exception):

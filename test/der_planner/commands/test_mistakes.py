@@ -15,6 +15,7 @@ SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"
 
 
 LENS = ["intrinsics", "--out", "/tmp/never_written.yaml"]
+STANDING = ["--mounting", "standing", "--out", "/tmp/never_written.yaml"]
 
 
 @pytest.fixture
@@ -44,6 +45,12 @@ def call(monkeypatch, capsys, tmp_path):
         ("der_planner.commands.calibrate_limb", ["--offline", "--out", "BUSY"], 2, "no folder"),
         ("der_planner.commands.calibrate_limb", ["--offline", "--out", "."], 2, "is a folder"),
         ("der_planner.commands.calibrate_limb", ["--excitation", "BUSY"], 2, "no folder"),
+        (
+            "der_planner.commands.calibrate_limb",
+            [*STANDING, "--csv", "/none.csv", "--columns", "/none.yaml"],
+            1,
+            "which neither rod nor arcs predict. Hang it",
+        ),
         ("apriltag_tracker.commands.make_tags", ["board", "--out", "BUSY"], 1, "out"),
         ("apriltag_tracker.commands.make_tags", ["board", "--columns", "1"], 1, "2 or more"),
         ("apriltag_tracker.commands.make_tags", ["board", "--marker", "0.03"], 1, "do not fit"),
@@ -85,6 +92,6 @@ def test_a_missing_parameter_file_is_named_by_the_node():
 
 def test_help_of_the_kernels_compiles_nothing():
     line = [sys.executable, str(SCRIPTS / "compile_kernels.py"), "--help"]
-    ended = subprocess.run(line, capture_output=True, text=True, check=False, timeout=60)
+    ended = subprocess.run(line, capture_output=True, text=True, check=False, timeout=200)
     assert ended.returncode == 0
     assert "usage: compile_kernels.py" in ended.stdout

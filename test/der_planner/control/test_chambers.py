@@ -48,14 +48,14 @@ def test_after_a_long_time_the_model_counts_again(nominal):
     steps = np.arange(60)
     for k in range(8):
         log.read(0.05 * k, log.model(np.array([5 * k]))[0] + 200.0 + 300.0 * 0.05 * k)
-    surprise = log.surprise(log.newest + np.array([0.0, 0.5, 20.0]))
-    assert surprise[0] == pytest.approx(305.0, abs=2.0)
-    assert np.all(surprise[1] > surprise[0])
-    assert np.abs(surprise[2]).max() < 200.0
+    gap = log.expected_gap(log.newest + np.array([0.0, 0.5, 20.0]))
+    assert gap[0] == pytest.approx(305.0, abs=2.0)
+    assert np.all(gap[1] > gap[0])
+    assert np.abs(gap[2]).max() < 200.0
     assert np.isfinite(log.during(steps)).all()
 
 
-def test_what_a_learned_plan_knows_of_its_chambers_is_no_news():
+def test_what_a_learned_plan_knows_of_its_chambers_is_not_corrected_again():
     motion = Motion.named("same_direction", amplitude=0.5, period=8.0, cycles=1)
     planned = replace(plan(Limb.default(), motion, method="projected"), method="learned")
     beyond = 200.0 + 5.0 * np.arange(len(planned.time))[:, None] * np.array([1.0, -1.0])

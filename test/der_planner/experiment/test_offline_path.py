@@ -1,5 +1,6 @@
 """A path is drawn offline: from the file to the report."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 from der_planner.experiment.errors import GraphError
 from der_planner.experiment.experiment import run
 from der_planner.experiment.options import parse
-from der_planner.limb import Limb
+from der_planner.limb import CalibratedRange, Limb
 
 
 def write_arc(file: Path, scale: float = 1.0) -> None:
@@ -49,6 +50,20 @@ def test_an_unreachable_path_says_where(tmp_path: Path):
     assert nearest.motion("far").reference(Limb.default()).deviation.mean > 0.1
     with pytest.raises(GraphError, match=r"point \(0\.40\d+, 0\.19\d+\) m at t = 0\.00 s"):
         run(options)
+
+
+def test_another_mounting_than_the_calibrations_is_said(tmp_path: Path, capfd):
+    known = CalibratedRange((2e4, 2e4), (1.5, 1.5))
+    dataclasses.replace(Limb.default(), calibrated=known).to_yaml(tmp_path / "limb.yaml")
+    out = tmp_path / "out"
+    arguments = ["--offline", "--limb", str(tmp_path / "limb.yaml"), "--mounting", "hanging"]
+    arguments += ["--models", "pcc", "--period", "3", "--cycles", "1", "--amplitude", "0.2"]
+    arguments += ["--motions", "asynchronous", "--no-report", "--out", str(out)]
+    said = "warning: the mounting is hanging, the limb was calibrated as horizontal"
+    run(parse([*arguments, "--dry-run"]))
+    assert said in capfd.readouterr().err
+    run(parse(arguments))
+    assert said in capfd.readouterr().err
 
 
 @pytest.mark.slow

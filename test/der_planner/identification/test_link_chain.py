@@ -14,9 +14,9 @@ COMMANDS = 12_000.0 * np.stack([np.sin(TIME), np.sin(1.3 * TIME)], axis=1)
 def test_a_run_repeats_but_for_noise_and_what_it_is_asked_to_vary():
     chain = LinkChain(3, (9.81, 0.0, 0.0))
     first = chain.play(TIME, COMMANDS, noise=0.0)
-    begin = clock.perf_counter()
+    begin = clock.process_time()
     again = LinkChain(3, (9.81, 0.0, 0.0)).play(TIME, COMMANDS, noise=0.0, run=4)
-    assert clock.perf_counter() - begin < 5.0
+    assert clock.process_time() - begin < 5.0  # its kernels are compiled once
     for one, other in zip(first, again, strict=True):
         np.testing.assert_array_equal(one, other)
     seen = chain.play(TIME, COMMANDS, run=1)

@@ -12,13 +12,13 @@ from der_planner.twin.truth import known_values
 
 pytestmark = pytest.mark.slow
 
-SEED = 4
+SEED = 1
 
 
 @pytest.fixture(scope="module")
 def calibrated():
     """Return the calibrated limb and the fit's report."""
-    return calibrate_twin(SEED, Limb.default(), quick=False)
+    return calibrate_twin(SEED, Limb.default())
 
 
 def test_twin_is_predicted_after_one_calibration(calibrated):

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from der_planner.limb import GRAVITY, Limb, LimbError, PointMass, gravity_of
+from der_planner.limb import GRAVITY, CalibratedRange, Limb, LimbError, PointMass, gravity_of
 
 LIMB = Limb.default()
 
@@ -65,8 +65,31 @@ def test_a_limb_weighs_what_the_scale_says_with_its_fittings():
             limb.weighing(wrong)
 
 
+def test_what_sits_on_the_stiff_base_weighs_and_moves_nothing():
+    limb = dataclasses.replace(LIMB, base_length=0.01, connector_length=0.005)
+    limb = limb.carrying(0.03, at=0.008, name="valve").carrying(0.02)
+    density = LIMB.segments[0].mass_per_length
+    assert limb.mass == pytest.approx(density * (0.244 + 0.01 + 0.005) + 0.05)
+    assert limb.moving_mass == pytest.approx(density * (0.244 + 0.005) + 0.02)
+
+
 def test_the_payload_is_the_run_s_even_where_a_file_has_a_mass_of_that_name():
     assert LIMB.carrying(0.01, 0.1).carrying(0.02).payload == (0.02, 0.0)
+
+
+def test_a_limb_remembers_the_mounting_that_its_numbers_were_found_in(tmp_path):
+    assert LIMB.mounted("hanging").other_mounting == ""  # nothing was found or declared before
+    found = dataclasses.replace(LIMB, calibrated=CalibratedRange((1e4, 1e4), (0.5, 0.5)))
+    tilted = found.mounted("10")
+    assert "the mounting is 10°, the limb was calibrated as horizontal" in tilted.other_mounting
+    assert "as horizontal" in tilted.mounted("hanging").other_mounting
+    assert tilted.mounted("180").other_mounting == found.mounted("0").other_mounting == ""
+    tilted.to_yaml(tmp_path / "limb.yaml")
+    assert Limb.from_yaml(tmp_path / "limb.yaml") == tilted
+    declared = LIMB.mounted("hanging").mounted("sideways")
+    assert "the limb was declared as hanging: sideways is taken" in declared.other_mounting
+    with pytest.raises(LimbError, match=r"calibrated\.gravity must be three numbers"):
+        dataclasses.replace(LIMB, calibrated=CalibratedRange(gravity=(1.0, 2.0)))
 
 
 def test_mountings_say_where_gravity_points():

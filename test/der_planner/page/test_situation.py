@@ -103,7 +103,7 @@ def test_a_process_that_ends_or_stops_is_dead_at_once(situation: Situation) -> N
         return node["state"], node["message"]
 
     def becomes(wanted: tuple[str, str]) -> None:
-        deadline = time.monotonic() + 20.0
+        deadline = time.monotonic() + 60.0
         while state() != wanted:
             assert time.monotonic() < deadline, state()
             time.sleep(0.01)

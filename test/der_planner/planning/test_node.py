@@ -146,7 +146,7 @@ def test_a_path_is_planned_and_a_new_command_takes_over_without_a_jump(planner):
     from geometry_msgs.msg import Point, Pose, PoseStamped
     from nav_msgs.msg import Path
 
-    node = planner(path_speed=0.01)
+    node = planner(path_speed=0.004)  # it must last longer than the next takes to plan
     path = Path()
     for y in np.linspace(0.10, 0.13, 7):
         path.poses.append(PoseStamped(pose=Pose(position=Point(x=0.19, y=float(y)))))
@@ -165,13 +165,51 @@ def test_a_path_is_planned_and_a_new_command_takes_over_without_a_jump(planner):
     assert np.abs(np.diff(pressures, axis=0)).max() <= 9000 * 0.05 + 1e-6
 
 
+def test_each_motion_has_the_loads_of_its_time(planner):
+    """By parameter, by command, from out of another motion, and by a parameter that was set."""
+    from rcl_interfaces.msg import Parameter, ParameterValue
+    from rcl_interfaces.srv import SetParameters
+
+    node = planner(payload=0.02, mounting="hanging")
+    node.command(plan_id="parameters", model="pcc")
+    node.client.wait_for(lambda: len(node.received("parameters")) > 10, 60.0, "setpoints")
+    node.command(plan_id="heavier", payload=0.05, payload_at=0.2)
+    node.wait_state("done")
+    node.command(plan_id="tilted", payload=0.03, mounting="10", model="pcc")
+    node.wait_plan("tilted")
+    node.wait_state("done")
+    client = node.client.node.create_client(SetParameters, "planner/set_parameters")
+    node.client.wait_for(client.service_is_ready, 30.0, "the parameters")
+    nothing = Parameter(name="payload", value=ParameterValue(type=3, double_value=0.0))
+    answer = client.call_async(SetParameters.Request(parameters=[nothing]))
+    node.client.wait_for(answer.done, 30.0, "the answer")
+    assert answer.result().results[0].successful
+    node.command(plan_id="bare", model="pcc")
+    node.wait_plan("bare")
+    plans = {plan.plan_id: plan for plan in node.plans}
+    loads = {name: (p.payload, p.payload_at, *p.gravity[:2]) for name, p in plans.items()}
+    assert loads == {
+        "parameters": (0.02, 0.0, 9.81, 0.0),
+        "heavier": (0.05, 0.2, 9.81, 0.0),
+        "tilted": (0.03, 0.0, 0.0, pytest.approx(-1.7035, abs=1e-4)),
+        "bare": (0.0, 0.0, 9.81, 0.0),
+    }
+    # The heavier motion took over where the first one was: neither setpoints nor reference jump.
+    first, second = node.received("parameters"), node.received("heavier")
+    assert 10 < len(first) < len(plans["parameters"].time)
+    both = np.array([m.differential_pressure for m in (*first, *second)])
+    assert np.abs(np.diff(both, axis=0)).max() <= 9000 * 0.05 + 1e-6
+    left = np.array(plans["parameters"].tip_predicted).reshape(-1, 2)[len(first)]
+    assert np.linalg.norm(np.array(plans["heavier"].tip_reference[:2]) - left) < 0.015
+
+
 def test_start_and_stop(planner):
     from der_planner.experiment.errors import GraphError
 
     node = planner(auto_start=False)
     with pytest.raises(GraphError, match="no plan yet"):
         node.client.call("planner/start")
-    node.command(plan_id="waits")
+    node.command(plan_id="waits", period=30.0)
     plan = node.wait_plan("waits")
     node.wait_state("done")
     assert not node.setpoints
@@ -181,6 +219,7 @@ def test_start_and_stop(planner):
         node.client.call("planner/start")
     assert "stopped streaming" in node.client.call("planner/stop")
     node.wait_state("idle")
+    node.client.spin(0.3)  # what was on its way
     seen = len(node.setpoints)
     node.client.spin(0.5)
     assert len(node.setpoints) == seen < len(plan.time)
@@ -212,16 +251,20 @@ def test_a_start_in_another_epoch_is_refused(planner, offset, reason):
 
 def test_a_bad_command_leaves_the_plan_that_plays_alone(planner):
     node = planner()
-    node.command(plan_id="good")
+    node.command(plan_id="good", period=30.0)  # longer than a refusal takes anywhere
     node.client.wait_for(lambda: node.received("good"), 60.0, "setpoints")
     node.command("jump", plan_id="bad")
     node.client.wait_for(lambda: node.state()["last_refusal"], 60.0, "the refusal")
     assert (node.state()["state"], node.state()["plan_id"]) == ("streaming", "good")
     assert "'jump' is unknown" in node.client.diagnostics["planner"].message
-    assert node.wait_state("done")["plan_id"] == "good"
+    heard = len(node.received("good"))
+    node.client.wait_for(lambda: len(node.received("good")) > heard + 5, 60.0, "it to go on")
+    node.command(plan_id="whole", period=1.0)
+    node.wait_plan("whole")
+    assert node.wait_state("done")["plan_id"] == "whole"
     node.process.stop()
     log = node.process.log.read_text()
-    for words in ("plan good accepted", "plan good started", "plan good finished after"):
+    for words in ("plan good accepted", "plan good started", "plan whole finished after"):
         assert words in log
 
 
@@ -271,8 +314,10 @@ def test_the_action_tells_how_it_goes_and_how_it_ended(planner):
     node.client.wait_for(action.server_is_ready, 30.0, "the action")
     heard = []
 
-    def play(motion="asynchronous", plan_id=""):
-        command = MotionCommand(motion=motion, amplitude=0.3, period=3.0, cycles=1, plan_id=plan_id)
+    def play(motion="asynchronous", plan_id="", period=2.0):
+        command = MotionCommand(
+            motion=motion, amplitude=0.3, period=period, cycles=1, plan_id=plan_id
+        )
         sent = action.send_goal_async(
             PlayMotion.Goal(command=command), lambda message: heard.append(message.feedback)
         )
@@ -296,13 +341,13 @@ def test_the_action_tells_how_it_goes_and_how_it_ended(planner):
     assert told == sorted(told)
     assert told[-1] > 0.9
 
-    handle, cut = play(plan_id="cut")
+    handle, cut = play(plan_id="cut", period=30.0)
     node.client.wait_for(lambda: node.received("cut"), 60.0, "setpoints")
     handle.cancel_goal_async()
     assert result_of(cut).result.outcome == "stopped"
     assert len(node.received("cut")) < len(node.wait_plan("cut").time)
 
-    _, old = play(plan_id="old")
+    _, old = play(plan_id="old", period=30.0)
     node.client.wait_for(lambda: node.received("old"), 60.0, "setpoints")
     _, new = play("same_direction", plan_id="new")
     assert result_of(old).result.outcome == "replaced"

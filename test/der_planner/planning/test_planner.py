@@ -281,6 +281,15 @@ def test_warnings_name_what_the_calibration_did_not_cover():
     assert any("segment 0 bends by 4" in w and "covered 23" in w for w in result.warnings)
 
 
+@pytest.mark.parametrize("model", ["der", "pcc"])
+def test_warnings_name_another_mounting_than_the_calibrations(model):
+    limb = dataclasses.replace(LIMB, calibrated=CalibratedRange((2e4, 2e4), (1.5, 1.5)))
+    motion = Motion.named("asynchronous", 0.2, 8.0, 1)
+    assert plan(limb, motion, model, "projected").warnings == ()
+    (said,) = plan(limb.mounted("hanging"), motion, model, "projected").warnings
+    assert said.startswith("the mounting is hanging, the limb was calibrated as horizontal: the")
+
+
 def test_pcc_uses_its_own_identified_segments():
     softer = tuple(dataclasses.replace(s, moment_gain=2 * s.moment_gain) for s in LIMB.segments)
     limb = dataclasses.replace(LIMB, pcc_segments=softer)

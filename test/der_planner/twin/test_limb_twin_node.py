@@ -66,7 +66,7 @@ def test_hangs_carries_and_is_pushed(graph):
     sag = truths[-1].tip.y
     assert sag < -0.06
     # Half a newton upward lifts the tip; it begins at its instant and ends by itself.
-    begin = node.get_clock().now().nanoseconds + stamps.NANOSECONDS
+    begin = node.get_clock().now().nanoseconds + 2 * stamps.NANOSECONDS
     push = LimbPush(arc_length=0.244, duration=1.0)
     push.force.y = 0.5
     push.header.stamp = stamps.stamp_from_nanoseconds(begin)

@@ -257,7 +257,7 @@ class Detector:
             covariance=fitted.covariance,
             contrast=fitted.contrast,
             blur=fitted.blur,
-            smear=(float(fitted.smear[0]), float(fitted.smear[1])),
+            smear=fitted.smear,
         )
 
     def _by_pattern(
@@ -329,7 +329,7 @@ class Detector:
             fitted.explained > self.family.explained
             and fitted.contrast > 12.0
             and counter_clockwise(fitted.corners)
-            and bool(np.abs(fitted.corners - quad).max() < 1.5 * cell)
+            and float(np.abs(fitted.corners - quad).max()) < 1.5 * cell
         )
 
     def _collect(
@@ -379,7 +379,7 @@ def _tag_of(tag: int, fitted: Alignment, found_by: str) -> Tag:
         contrast=fitted.contrast,
         found_by=found_by,
         blur=fitted.blur,
-        smear=(float(fitted.smear[0]), float(fitted.smear[1])),
+        smear=fitted.smear,
     )
 
 

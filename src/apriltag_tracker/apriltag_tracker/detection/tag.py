@@ -91,6 +91,5 @@ def once(tags: Sequence[Tag]) -> list[Tag]:
 
 def counter_clockwise(corners: NDArray[np.float64]) -> bool:
     """Tell whether corners run as printed; y points down in the image. A mirror image does not."""
-    a, b, c, d = corners
-    diagonal, other = c - a, d - b
-    return bool(diagonal[0] * other[1] - diagonal[1] * other[0] < 0.0)
+    (a, e), (b, f), (c, g), (d, h) = corners.tolist()
+    return bool((c - a) * (h - f) - (g - e) * (d - b) < 0.0)

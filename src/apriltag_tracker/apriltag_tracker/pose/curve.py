@@ -26,7 +26,7 @@ class Curve:
         lengths: Sequence[float],
         degrees: int,
         stiff: Sequence[tuple[float, float]] = (),
-        grid: int = 20,
+        grid: int = 6,
     ) -> None:
         ends = np.concatenate([[0.0], np.cumsum(lengths)])
         self.ends = ends

@@ -112,6 +112,13 @@ class _Fit:
     left_open: NDArray[np.float64]
 
 
+def _carried(gain: NDArray[np.float64], spreads: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Carry independent covariances (n, 3, 3), or one for all (3, 3), through a gain (m, n, 3)."""
+    by_tag = gain.transpose(1, 0, 2)
+    result: NDArray[np.float64] = (by_tag @ spreads @ by_tag.transpose(0, 2, 1)).sum(axis=0)
+    return result
+
+
 def _furthest(fit: _Fit) -> float:
     """Return the largest distance of a tag from the fit [m]."""
     return float(np.hypot(fit.residuals[:, 0], fit.residuals[:, 1]).max())
@@ -144,6 +151,7 @@ class ShapeFitter:
     ) -> None:
         self.prior = prior or ShapePrior()
         self.reject_beyond = reject_beyond
+        self.curve_points = curve_points
         self._mounting = np.array([mounting, mounting, mounting_angle])
         self._smooth = Curve(tags.segment_lengths, len(self.prior.corrections), tags.stiff)
         self._constant = Curve(tags.segment_lengths, 0, tags.stiff)
@@ -322,15 +330,14 @@ class ShapeFitter:
         shared_noise: NDArray[np.float64],
     ) -> LimbEstimate:
         curve, slopes = self._outline.places(fit.parameters)
-        noise = np.zeros((2, 2))
-        systematic = np.zeros((2, 2))
-        tip_gain = np.einsum("ip,pnj->inj", slopes[-1, :2], fit.gain)
-        for i, tag in enumerate(tags):
-            noise += tip_gain[:, i] @ tag.covariance @ tip_gain[:, i].T
-            systematic += (tip_gain[:, i] * self._mounting**2) @ tip_gain[:, i].T
-        shared = np.einsum("inj,njk->ik", tip_gain, common)
+        spreads = np.array([tag.covariance for tag in tags])
+        mounted = np.diag(self._mounting**2)
+        tip_gain = np.tensordot(slopes[-1, :2], fit.gain, 1)
+        noise = _carried(tip_gain, spreads)
+        systematic = _carried(tip_gain, mounted)
+        shared = np.tensordot(tip_gain, common, 2)
         systematic += shared @ shared.T
-        shared = np.einsum("inj,njk->ik", tip_gain, shared_noise)
+        shared = np.tensordot(tip_gain, shared_noise, 2)
         noise += shared @ shared.T
         # What the tags do not determine, the prior leaves open.
         undetermined = slopes[-1, :2] @ fit.left_open
@@ -341,11 +348,8 @@ class ShapeFitter:
         means = slice(4, 4 + self._smooth.segments)
         bending = self._smooth.active
         bend_gain = fit.gain[means]
-        variance = np.zeros(self._smooth.segments)
-        for i, tag in enumerate(tags):
-            spread = tag.covariance + np.diag(self._mounting**2)
-            variance += np.einsum("pj,jk,pk->p", bend_gain[:, i], spread, bend_gain[:, i])
-        variance += np.sum(fit.left_open[means] ** 2, axis=1)
+        variance = np.diag(_carried(bend_gain, spreads + mounted))
+        variance = variance + np.sum(fit.left_open[means] ** 2, axis=1)
         return LimbEstimate(
             tip=curve[-1, :2],
             tip_covariance=noise,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +16,18 @@ from numpy.typing import NDArray
 from apriltag_tracker.camera import CameraError, CameraPose, Intrinsics, project
 from apriltag_tracker.camera.lens import ray_map
 from apriltag_tracker.synthetic import render
-from apriltag_tracker.tag_map import UNIT_CORNERS, TagMap
+from apriltag_tracker.synthetic.placing import (
+    MOST_INSTANTS,
+    PLACEMENT,
+    Exposure,
+    Mounts,
+    place_at,
+    place_tags,
+)
+from apriltag_tracker.tag_map import LimbTag, TagMap, WorldTag
 
 SCHEMA_VERSION = 1
 _NOISE_LENGTH = 1 << 21
-_STILL, _INSTANTS_APART, _MOST_INSTANTS = 0.2, 1.1, 16
-"""Ways during an exposure that are shorter than the first [px] are one instant; longer ones take
-Gauss's instants, about so far apart [px]: of a blurred picture their mean is that of all."""
-
-
-_gauss = lru_cache(np.polynomial.legendre.leggauss)
 
 
 @dataclass(frozen=True)
@@ -77,31 +78,7 @@ class Shape:
 
     def at(self, arc_length: float) -> NDArray[np.float64]:
         """Return x, y, heading at an arc length (cubic), continued as a line beyond."""
-        s = self.arc_length
-        k = int(np.clip(np.searchsorted(s, arc_length) - 1, 0, len(s) - 2))
-        step = s[k + 1] - s[k]
-        share = (arc_length - s[k]) / step
-        chord = self.points[k + 1] - self.points[k]
-        turned = self.heading[k + 1] - self.heading[k]
-        heading = self.heading[k] + share * turned
-        if share < 0.0 or share > 1.0:
-            end, angle = (0, self.heading[0]) if share < 0.0 else (-1, self.heading[-1])
-            reach = arc_length - s[end]
-            place = self.points[end] + reach * np.array([np.cos(angle), np.sin(angle)])
-            return np.array([place[0], place[1], angle])
-        # Hermite: the tangents are known, their length is that of the chord's arc.
-        half = 0.5 * turned
-        arc = float(np.hypot(*chord)) * (1.0 + half * half / 6.0)
-        first = arc * np.array([np.cos(self.heading[k]), np.sin(self.heading[k])])
-        second = arc * np.array([np.cos(self.heading[k + 1]), np.sin(self.heading[k + 1])])
-        t = share
-        place = (
-            self.points[k]
-            + chord * (3 * t**2 - 2 * t**3)
-            + first * (t - 2 * t**2 + t**3)
-            + second * (t**3 - t**2)
-        )
-        return np.array([place[0], place[1], heading])
+        return np.array(place_at(self.arc_length, self.points, self.heading, arc_length))
 
 
 @dataclass
@@ -180,18 +157,39 @@ class SyntheticCamera:
         self.errors = errors or Errors()
         self.body_radius = body_radius
         self._random = np.random.default_rng(seed)
-        size = model.intrinsics
-        self._rays = ray_map(size.width, size.height, size.matrix, size.distortion)
-        self._table = render.cumulative_table()
-        self._cells = {tag: tags.family.printed_cells(tag) for tag in tags.ids}
-        self._light = self._make_light()
+        self._eye = self._make_eye()
+        scale = model.intrinsics.matrix[0, 0] / model.pose.position[2]
+        self._exposure = Exposure.create(max(self.optics.exposure, 0.0), scale)
+        self._prints = self._print(tags.limb)
         self._noise = self._make_noise()
         # Saturated sums of bytes take a quarter of the time of a sum of bytes and signed noise.
         self._brighter = np.maximum(self._noise, 0).astype(np.uint8)
         self._darker = np.maximum(-self._noise, 0).astype(np.uint8)
-        self._mounting = self._draw_mounting()
-        self._world = self._draw_world()
-        self._background = self._make_background()
+        self._mounts = self._draw_mounts()
+        self._background, self._world = self._make_background(self._draw_world())
+        self._prepared: NDArray[np.uint8] | None = None
+        self._noise_starts = np.zeros(len(tags.limb), dtype=np.int64)
+
+    def prepare(self, into: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
+        """Draw what the next picture shows whatever the limb does, with that picture's noise.
+
+        A camera that is waiting for the limb does this ahead; `frame` does it otherwise.
+
+        Args:
+            into: (rows, columns) to draw into; new memory if it is None.
+
+        Returns:
+            What the next picture will be drawn into.
+        """
+        rows, columns = self._background.shape
+        start = int(self._random.integers(0, _NOISE_LENGTH - rows * columns))
+        self._noise_starts = self._random.integers(0, _NOISE_LENGTH, len(self._noise_starts))
+        noise = np.s_[start : start + rows * columns]
+        image = np.empty((rows, columns), dtype=np.uint8) if into is None else into
+        cv2.add(self._background, self._brighter[noise].reshape(rows, columns), image)
+        cv2.subtract(image, self._darker[noise].reshape(rows, columns), image)
+        self._prepared = image
+        return image
 
     def frame(
         self,
@@ -199,7 +197,7 @@ class SyntheticCamera:
         velocity: Shape | None = None,
         covers: Sequence[Sequence[tuple[float, float]]] = (),
     ) -> Frame:
-        """Render one picture.
+        """Render one picture, into what was prepared for it.
 
         Args:
             shape: the limb at mid-exposure; None leaves it out.
@@ -207,18 +205,12 @@ class SyntheticCamera:
                 the same arrays; blurs what moves.
             covers: polygons (px) that hide what is below them, drawn last.
         """
-        shape_of, count = self._background.shape, self._background.size
-        start = int(self._random.integers(0, _NOISE_LENGTH - count))
-        brighter = self._brighter[start : start + count].reshape(shape_of)
-        darker = self._darker[start : start + count].reshape(shape_of)
-        image = cv2.subtract(cv2.add(self._background, brighter), darker)
-        result = Frame(image, {tag: corners for tag, (corners, _) in self._world.items()})
+        image = self.prepare() if self._prepared is None else self._prepared
+        self._prepared = None
+        result = Frame(image, dict(self._world))
         if shape is not None:
             self._draw_body(image, shape)
-            for tag in self.tags.limb:
-                middle, placements, shares = self._placements(tag.id, shape, velocity)
-                if self._draw_tag(image, tag.id, placements, shares):
-                    result.corners[tag.id] = self._corners(middle)
+            result.corners.update(self._draw_limb_tags(image, shape, velocity))
         for polygon in covers:
             points = np.round(np.array(polygon) * 16).astype(np.int32)
             cv2.fillPoly(image, [points], 70, cv2.LINE_AA, 4)
@@ -228,113 +220,61 @@ class SyntheticCamera:
         """Return what does not move, without noise."""
         return self._background.copy()
 
-    def _placements(
-        self, tag_id: int, shape: Shape, velocity: Shape | None
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return x, y, z, yaw, size of a limb tag in the middle, (5,), and over the exposure.
-
-        The latter are (k, 5), each with the share (k,) of the exposure that it stands for.
-        """
-        tag = self.tags.limb_tag(tag_id)
-        assert tag is not None
-        offset = self._mounting[tag_id]
-        scale = self.model.intrinsics.matrix[0, 0] / self.model.pose.position[2]
-
-        def place(at: NDArray[np.float64]) -> NDArray[np.float64]:
-            cosine, sine = np.cos(at[2]), np.sin(at[2])
-            return np.array(
-                [
-                    at[0] + cosine * offset[0] - sine * offset[1],
-                    at[1] + sine * offset[0] + cosine * offset[1],
-                    tag.height,
-                    at[2] + offset[2],
-                    tag.size,
-                ]
+    def _draw_limb_tags(
+        self, image: NDArray[np.uint8], shape: Shape, velocity: Shape | None
+    ) -> dict[int, NDArray[np.float64]]:
+        """Draw the limb's tags; returns the corners of those that are in the picture, by id."""
+        later = shape
+        if velocity is not None:
+            later = Shape(
+                shape.arc_length, shape.points + velocity.points, shape.heading + velocity.heading
             )
-
-        now = shape.at(tag.arc_length)
-        if velocity is None or self.optics.exposure <= 0.0:
-            return place(now), place(now)[None], np.ones(1)
-        later = Shape(
-            shape.arc_length, shape.points + velocity.points, shape.heading + velocity.heading
+        count = len(self.tags.limb)
+        middle, counts = np.empty((count, PLACEMENT)), np.empty(count, dtype=np.int64)
+        placements = np.empty((count, MOST_INSTANTS, PLACEMENT))
+        place_tags(
+            self._mounts,
+            self._exposure,
+            shape.arc_length,
+            shape.points,
+            shape.heading,
+            later.points,
+            later.heading,
+            middle,
+            placements,
+            counts,
         )
-        rate = later.at(tag.arc_length) - now
-        half = 0.5 * self.optics.exposure
-        travelled = 2.0 * half * scale * (np.hypot(rate[0], rate[1]) + abs(rate[2]) * tag.size)
-        if travelled < _STILL:
-            return place(now), place(now)[None], np.ones(1)
-        instants = min(1 + math.ceil(travelled / _INSTANTS_APART), _MOST_INSTANTS)
-        nodes, weights = _gauss(instants)
-        placements = np.array([place(now + rate * half * node) for node in nodes])
-        return place(now), placements, 0.5 * weights
+        return self._draw_tags(
+            image, self.tags.limb, self._prints, self._noise, middle, placements, counts
+        )
 
-    def _corners(self, placement: NDArray[np.float64]) -> NDArray[np.float64]:
-        x, y, z, yaw, size = placement
-        turn = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
-        points = np.empty((4, 3))
-        points[:, :2] = UNIT_CORNERS @ turn * size + (x, y)
-        points[:, 2] = z
-        return project(self.model.intrinsics, self.model.pose, points)
-
-    def _draw_tag(
+    def _draw_tags(
         self,
         image: NDArray[np.uint8],
-        tag_id: int,
+        tags: Sequence[LimbTag | WorldTag],
+        prints: render.Prints,
+        noise: NDArray[np.int8],
+        middle: NDArray[np.float64],
         placements: NDArray[np.float64],
-        shares: NDArray[np.float64],
-    ) -> bool:
-        """Draw a tag over an exposure; returns whether any of it is in the picture."""
-        first, last = self._corners(placements[0]), self._corners(placements[-1])
-        both = np.concatenate([first, last])
-        middle = both.mean(axis=0)
-        family = self.tags.family
-        grown = middle + (both - middle) * (family.tag_cells / family.border_cells)
-        blur = np.sqrt(self.optics.blur**2 + render.PIXEL_VARIANCE)
-        low = np.floor(grown.min(axis=0) - 3.0 * blur - 1.0).astype(np.int64)
-        high = np.ceil(grown.max(axis=0) + 3.0 * blur + 2.0).astype(np.int64)
-        rows, columns = image.shape
-        box = np.array([max(low[1], 0), min(high[1], rows), max(low[0], 0), min(high[0], columns)])
-        if box[0] >= box[1] or box[2] >= box[3]:
-            return False
-        maps = np.array([self._to_cells(placement) for placement in placements])
-        cell = 1.0 / self.tags.family.border_cells
-        side = 0.5 * (np.hypot(*(last[1] - last[0])) + np.hypot(*(last[2] - last[3]))) * cell
-        other = 0.5 * (np.hypot(*(last[3] - last[0])) + np.hypot(*(last[2] - last[1]))) * cell
-        render.draw_tag(
+        counts: NDArray[np.int64],
+    ) -> dict[int, NDArray[np.float64]]:
+        """Draw placed tags; returns the corners of those that are in the picture, by id."""
+        corners, drawn = np.empty((len(tags), 4, 2)), np.empty(len(tags), dtype=np.bool_)
+        starts = self._noise_starts if len(noise) > 1 else np.zeros(len(tags), dtype=np.int64)
+        render.draw_tags(
             image,
-            self._rays,
-            self._light,
-            self._noise,
-            int(self._random.integers(0, _NOISE_LENGTH)),
-            box,
-            maps,
-            shares,
-            np.array([blur / side, blur / other]),
-            self._cells[tag_id],
-            self.optics.black,
-            self.optics.white,
-            self._table,
+            self._eye,
+            prints,
+            noise,
+            starts,
+            middle,
+            placements,
+            counts,
+            self._exposure.shares,
+            corners,
+            drawn,
         )
-        return True
-
-    def _to_cells(self, placement: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the map from rays to cells (columns, rows downward) of one placed tag."""
-        x, y, z, yaw, size = placement
-        cosine, sine = np.cos(yaw), np.sin(yaw)
-        cell = size / self.tags.family.border_cells
-        half = 0.5 * self.tags.family.tag_cells
-        # Homogeneous (column, row, 1) -> point on the tag's plane in limb_base.
-        plane = np.array(
-            [
-                [cosine * cell, sine * cell, x - half * cell * (cosine + sine)],
-                [sine * cell, -cosine * cell, y - half * cell * (sine - cosine)],
-                [0.0, 0.0, z],
-                [0.0, 0.0, 1.0],
-            ]
-        )
-        pose = np.hstack([self.model.pose.rotation, self.model.pose.translation[:, None]])
-        result: NDArray[np.float64] = np.linalg.inv(pose @ plane)
-        return result
+        return {tag.id: corners[k] for k, tag in enumerate(tags) if drawn[k]}
 
     def _draw_body(self, image: NDArray[np.uint8], shape: Shape) -> None:
         """Draw the limb's silhouette: dark silicone at half the height of its tags."""
@@ -347,6 +287,27 @@ class SyntheticCamera:
         pixels = project(self.model.intrinsics, self.model.pose, points)
         fixed = np.round(pixels * 16).astype(np.int32)
         cv2.fillPoly(image, [fixed], 52, cv2.LINE_AA, 4)
+
+    def _make_eye(self) -> render.Eye:
+        """Return lens, place and light as the drawing takes them."""
+        size, pose = self.model.intrinsics, self.model.pose
+        return render.Eye(
+            np.ascontiguousarray(pose.rotation),
+            np.ascontiguousarray(pose.translation),
+            size.matrix,
+            size.distortion,
+            ray_map(size.width, size.height, size.matrix, size.distortion),
+            self._make_light(),
+            math.sqrt(self.optics.blur**2 + render.PIXEL_VARIANCE),
+            self.optics.black,
+            self.optics.white,
+            render.cumulative_table(),
+        )
+
+    def _print(self, tags: Sequence[LimbTag | WorldTag]) -> render.Prints:
+        family = self.tags.family
+        cells = np.array([family.printed_cells(tag.id) for tag in tags], dtype=np.float64)
+        return render.Prints(cells, float(family.border_cells))
 
     def _make_light(self) -> NDArray[np.float32]:
         size = self.model.intrinsics
@@ -361,34 +322,48 @@ class SyntheticCamera:
         drawn = self._random.standard_normal(_NOISE_LENGTH, dtype=np.float32) * self.optics.noise
         return np.clip(np.round(drawn), -127, 127).astype(np.int8)
 
-    def _draw_mounting(self) -> dict[int, NDArray[np.float64]]:
-        result = {}
-        for tag in self.tags.limb:
-            drawn = self._random.standard_normal(3)
-            scale = (self.errors.mounting, self.errors.mounting, self.errors.mounting_angle)
-            result[tag.id] = np.array(tag.offset) + drawn * np.array(scale)
-        return result
+    def _draw_mounts(self) -> Mounts:
+        """Draw where the limb's tags really sit."""
+        scale = (self.errors.mounting, self.errors.mounting, self.errors.mounting_angle)
+        drawn = [self._random.standard_normal(3) * scale for _ in self.tags.limb]
+        return Mounts(
+            np.array([tag.arc_length for tag in self.tags.limb]),
+            np.array([tag.height for tag in self.tags.limb]),
+            np.array([tag.size for tag in self.tags.limb]),
+            np.array([tag.offset for tag in self.tags.limb]) + drawn,
+        )
 
-    def _draw_world(self) -> dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-        result = {}
-        for tag in self.tags.world:
+    def _draw_world(self) -> NDArray[np.float64]:
+        """Draw where the fixed tags really are, (n, 5) placements."""
+        result = np.empty((len(self.tags.world), PLACEMENT))
+        for placement, tag in zip(result, self.tags.world, strict=True):
             shift = self._random.standard_normal(2) * self.errors.survey
             x, y, z = tag.position
-            placement = np.array([x + shift[0], y + shift[1], z, tag.yaw, tag.size])
-            result[tag.id] = (self._corners(placement), placement)
+            placement[:] = x + shift[0], y + shift[1], z, tag.yaw, tag.size
         return result
 
-    def _make_background(self) -> NDArray[np.uint8]:
-        """Draw what does not move: a cloudy floor and the fixed tags, without noise."""
+    def _make_background(
+        self, world: NDArray[np.float64]
+    ) -> tuple[NDArray[np.uint8], dict[int, NDArray[np.float64]]]:
+        """Draw what does not move, without noise: a cloudy floor and the fixed tags.
+
+        Args:
+            world: (n, 5) placements of the fixed tags.
+
+        Returns:
+            The picture, and the corners of the fixed tags in it by id.
+        """
         size = self.model.intrinsics
         coarse = self._random.standard_normal((size.height // 40 + 2, size.width // 40 + 2))
         clouds = cv2.resize(
             coarse.astype(np.float32), (size.width, size.height), interpolation=cv2.INTER_CUBIC
         )
-        floor = (self.optics.floor + 6.0 * clouds) * self._light
+        floor = (self.optics.floor + 6.0 * clouds) * self._eye.light
         image: NDArray[Any] = np.clip(np.round(floor), 0, 255).astype(np.uint8)
-        noise, self._noise = self._noise, np.zeros_like(self._noise)
-        for tag_id, (_, placement) in self._world.items():
-            self._draw_tag(image, tag_id, placement[None], np.ones(1))
-        self._noise = noise
-        return image
+        if not len(world):
+            return image, {}
+        instants = np.repeat(world[:, None], MOST_INSTANTS, axis=1)
+        once, silent = np.ones(len(world), dtype=np.int64), np.zeros(1, dtype=np.int8)
+        tags = self.tags.world
+        corners = self._draw_tags(image, tags, self._print(tags), silent, world, instants, once)
+        return image, corners

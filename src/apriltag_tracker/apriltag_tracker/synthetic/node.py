@@ -76,7 +76,7 @@ class SyntheticCameraNode(Node):
         self._camera = SyntheticCamera(
             CameraModel.from_yaml(str(camera)), tags, optics, errors, int(seed)
         )
-        self._compile(tags)
+        self._warm_up(tags)
         self._before: tuple[int, Shape] | None = None
         self._frames = 0
         self._refused = 0
@@ -85,7 +85,8 @@ class SyntheticCameraNode(Node):
         self._image = self._image_message()
         size = self._camera.model.intrinsics
         self._pixels = np.frombuffer(self._image.data, np.uint8).reshape(size.height, size.width)
-        """The picture in the message, which is filled anew for every shape."""
+        """The picture in the message, which is drawn anew for every shape."""
+        self._camera.prepare(self._pixels)
         self._info = self._info_message()
         self._images = self.create_publisher(Image, topics.IMAGE, qos.SENSOR_DATA)
         self._infos = self.create_publisher(CameraInfo, topics.CAMERA_INFO, qos.LATCHED)
@@ -99,10 +100,10 @@ class SyntheticCameraNode(Node):
             declare(self, name, float(default), description, at_least=0.0, at_most=at_most)
         )
 
-    def _compile(self, tags: TagMap) -> None:
+    def _warm_up(self, tags: TagMap) -> None:
         """Draw once, so that no frame of a run waits for a compiler."""
         straight = constant_curvature(tags.segment_lengths, [0.0] * len(tags.segment_lengths))
-        self._camera.frame(straight)
+        self._camera.frame(straight, straight)
 
     def _image_message(self) -> Image:
         size = self._camera.model.intrinsics
@@ -143,16 +144,17 @@ class SyntheticCameraNode(Node):
             self._refused += 1
             return
         stamp = stamps.nanoseconds(message.header.stamp)
-        frame = self._camera.frame(shape, self._velocity(stamp, shape))
-        self._before = (stamp, shape)
+        # Into the message itself, where everything but the limb has been drawn meanwhile.
+        self._camera.frame(shape, self._velocity(stamp, shape))
         self._image.header.stamp = message.header.stamp
-        self._pixels[:] = frame.image
         self._images.publish(self._image)
+        self._before = (stamp, shape)
         if time.monotonic() - self._last_info > _INFO_PERIOD:
             self._info.header.stamp = message.header.stamp
             self._publish_info()
         self._frames += 1
         self._busy += time.perf_counter() - started
+        self._camera.prepare(self._pixels)
 
     def _velocity(self, stamp: int, shape: Shape) -> Shape | None:
         """Return how fast the limb moves, from this shape and the one before."""

@@ -8,7 +8,7 @@
 
 --offline plays the calibration on the twin in one process, in seconds. --graph plays it in real
 time on the running graph, on the twin or the hardware, records a bag, vents, and fits to the bag:
-about three minutes. A bag is any recorded run that excites every input; `--excitation FILE.csv`
+about four minutes. A bag is any recorded run that excites every input; `--excitation FILE.csv`
 writes the pressures of the calibration run, and `--play FILE.csv` plays such a file instead.
 
 --mounting says how the limb was mounted in the log, --payload what it carried beside its own
@@ -59,6 +59,7 @@ from der_planner.identification.offline import AMPLITUDE
 from der_planner.identification.parameters import GROUPS
 from der_planner.identification.plots import plot_prediction
 from der_planner.limb import Limb, LimbError
+from der_planner.planning.loads.rest import nearly_buckling
 from der_planner.runs.outputs import OutputError, check_file, check_folder
 from pressure_driver.schedule import ScheduleLimits
 
@@ -171,6 +172,7 @@ def main() -> int:
             write_excitation(run, given.excitation)
             print(f"{run.duration:.0f} s of excitation in {given.excitation}")
             return 0
+        _say_if_it_hardly_stands(prior)
         log = _obtain(prior, given)
         terms = [] if given.terms == "none" else given.terms.split(",")
         terms += ["mass"] if given.fit_mass else []
@@ -254,6 +256,17 @@ def _excitation(prior: Limb, pressure_limit: float, given: argparse.Namespace) -
     if given.play:
         return read_excitation(given.play, prior.segment_count)
     return calibration_run(AMPLITUDE * pressure_limit, prior.segment_count, given.quick)
+
+
+def _say_if_it_hardly_stands(prior: Limb) -> None:
+    """Say before anything is played or fitted what cannot be fitted well."""
+    said = nearly_buckling(prior)
+    if said:
+        print(
+            f"warning: with the stiffness and mass of the prior {said}. The fit says whether it "
+            "is so with the stiffness that it finds",
+            file=sys.stderr,
+        )
 
 
 def _obtain(prior: Limb, given: argparse.Namespace) -> CalibrationLog:

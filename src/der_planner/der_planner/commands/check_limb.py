@@ -49,6 +49,8 @@ def main() -> int:
         if given.out is not None:
             _check_new(given.out)
         loaded = as_loaded(limb, given)
+        if loaded.other_mounting:
+            print(f"warning: {loaded.other_mounting}", file=sys.stderr)
         logs = [_read(path, given) for path in given.runs]
         if given.update:
             return _update(limb, loaded, logs, given.out)

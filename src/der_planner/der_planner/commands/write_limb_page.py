@@ -34,7 +34,7 @@ _SECTIONS: tuple[tuple[str, Any], ...] = (
     ("`pneumatics`", Pneumatics),
     ("The limb itself", Limb),
     ("`masses`: one entry, which may have a `name`, per mass that the limb carries", PointMass),
-    ("`calibrated`: one value per segment", CalibratedRange),
+    ("`calibrated`: one value per segment, and a gravity", CalibratedRange),
 )
 
 

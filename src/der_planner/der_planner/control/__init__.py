@@ -1,4 +1,4 @@
-"""What is done about the error that a plan leaves: learning between runs, feedback within one."""
+"""Corrections of the error that a plan leaves: learning between runs, feedback within a run."""
 
 from der_planner.control.disturbance import LearningError
 from der_planner.control.feedback import Feedback

@@ -1,4 +1,4 @@
-"""What was commanded and measured of the chambers, and what they will hold next."""
+"""The chambers' commands and readings so far, and their expected pressures."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from der_planner.model.series import CONTROL_PERIOD, interpolate
 
 Array = NDArray[np.float64]
 
-_SURPRISE_TIME = 10.0
-"""In which a difference between measured and modelled pressures is forgotten [s]."""
+_GAP_TIME = 10.0
+"""In which a difference between measured and modelled pressures is expected to fade [s]."""
 _GROWTH_TIME = 0.5
 """In which the growth of that difference fades [s] …"""
 _GROWTH_SEEN = 0.3
@@ -117,7 +117,7 @@ class ChamberLog:
         return self._commands
 
     def follow(self, first: int, coming: Array) -> tuple[air.Chambers, int]:
-        """Return the chambers under what was sent before period ``first`` and what is coming.
+        """Return the chambers under the commands sent before period ``first`` and the coming ones.
 
         Args:
             first: period of the first coming command.
@@ -148,7 +148,7 @@ class ChamberLog:
             result[known] = readings - self._nominal.chambers_beyond(middle[known])
         if not known.all():
             coming = self.model(steps[~known])
-            coming += self.surprise(middle[~known])
+            coming += self.expected_gap(middle[~known])
             result[~known] = coming
         return result
 
@@ -160,25 +160,28 @@ class ChamberLog:
         held = chambers.differential[before:].reshape(-1, self._inputs)
         return held[steps - first * STEPS]
 
-    def surprise(self, time: Array) -> Array:
-        """Return what the last readings show beyond the model (n, M) [Pa], at instants after them.
+    def expected_gap(self, time: Array) -> Array:
+        """Return the expected differences (n, M) [Pa] of the chambers from their model.
 
-        What they differ by is forgotten within `_SURPRISE_TIME`; it grows as it did in the last
-        readings, which fades within `_GROWTH_TIME`: a chamber that vents more slowly than its model
-        is left behind further and further.
+        The difference of the last reading fades within `_GAP_TIME`; first it goes on growing as it
+        did in the last readings, for about `_GROWTH_TIME`: a chamber that vents more slowly than
+        its model is left behind further and further.
+
+        Args:
+            time: (n,) instants after the last reading [s].
         """
         if not self._times or not self._nominal.watched:
             return np.zeros((len(time), self._inputs))
         if self._gap is None:
-            self._gap = self._beyond_model()
+            self._gap = self._last_gap()
         gap, growth = self._gap
         ahead = (time - self._times[-1])[:, None]
         grown = _GROWTH_TIME * (1.0 - np.exp(-ahead / _GROWTH_TIME))
-        surprise: Array = np.exp(-ahead / _SURPRISE_TIME) * gap + grown * growth
-        return surprise
+        expected: Array = np.exp(-ahead / _GAP_TIME) * gap + grown * growth
+        return expected
 
-    def _beyond_model(self) -> tuple[Array, Array]:
-        """Return what the last reading shows beyond the model (M,) [Pa], and its growth [Pa/s]."""
+    def _last_gap(self) -> tuple[Array, Array]:
+        """Return the last reading less the model (M,) [Pa], and how fast that grows [Pa/s]."""
         last = self._times[-1]
         begin = bisect.bisect_left(self._times, last - _GROWTH_SEEN)
         instants = np.array(self._times[begin:])

@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
+from der_planner.model.series import interpolate
+
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -239,3 +241,37 @@ def without_gaps(value: Array, known: Mask, period: float, fade: float) -> Array
     outside = np.maximum(there[0] - place, 0) + np.maximum(place - there[-1], 0)
     faded: Array = result * np.exp(-outside * period / fade)[:, None]
     return faded
+
+
+def chambers_beyond(
+    expected: Array, setpoints: Array, time: ArrayLike, held: ArrayLike
+) -> Array | None:
+    """Return by how much the chambers held more than their model in each period (K, M) [Pa].
+
+    Args:
+        expected: (K, M) mean differential pressures of the model in each period [Pa].
+        setpoints: (K,) beginnings of the periods [s].
+        time: (n,) instants, in any order [s].
+        held: (n, M) differential pressures in the chambers then [Pa].
+
+    Returns:
+        None where no reading was whole.
+
+    Raises:
+        LearningError: shapes that do not fit.
+    """
+    instants, values = np.asarray(time, dtype=float), np.asarray(held, dtype=float)
+    wanted = (len(instants), expected.shape[1])
+    if instants.ndim != 1 or values.shape != wanted:
+        raise LearningError(
+            f"chambers need instants (n,) and pressures {wanted}, got shapes {instants.shape} and "
+            f"{values.shape}: take both from the same recording"
+        )
+    whole = np.isfinite(instants) & np.isfinite(values).all(axis=1)
+    if not whole.any():
+        return None
+    order = np.argsort(instants[whole], kind="stable")
+    instants, values = instants[whole][order], values[whole][order]
+    middle = setpoints + 0.5 * (setpoints[1] - setpoints[0])
+    beyond: Array = interpolate(middle, instants, values) - expected
+    return beyond

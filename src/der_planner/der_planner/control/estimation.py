@@ -58,7 +58,7 @@ class Estimator:
 
     Args:
         nominal: the model's motion under the plan.
-        chambers: what was commanded and measured of the chambers.
+        chambers: their commands and readings.
         settings: of the noise.
         history: states and measurements are kept for this long [s].
 
@@ -93,7 +93,7 @@ class Estimator:
     # What comes in -------------------------------------------------------------------------
 
     def begin(self, time: float) -> None:
-        """Start a second before an instant [s], if not started; what is older is not used."""
+        """Start a second before an instant [s], if not started; older measurements are not used."""
         time = max(time - _WAITED_FOR, -EARLIEST)
         if self._first is None:
             self._first = self._last = math.floor(time / STEP)
@@ -162,7 +162,7 @@ class Estimator:
     # What goes out -------------------------------------------------------------------------
 
     def at(self, time: float) -> Knowledge:
-        """Return what is known at an instant [s], beyond the newest one by the model."""
+        """Return the state at an instant [s]; after the newest measurement it is predicted."""
         self.begin(time)
         j = round(time / STEP)
         if self._first is None:
@@ -202,7 +202,7 @@ class Estimator:
         return float(np.linalg.norm(gap))
 
     def between(self, first: int, last: int) -> tuple[list[Knowledge], list[Knowledge]]:
-        """Return what was expected and what is known at fine steps ``first`` … ``last``.
+        """Return the predicted and the corrected state at fine steps ``first`` … ``last``.
 
         Expected is without the measurements of the step itself; the steps must be in the history.
         """
@@ -225,7 +225,7 @@ class Estimator:
     # The filter ----------------------------------------------------------------------------
 
     def beginning(self, first: int) -> Knowledge:
-        """Return what is known at fine step ``first`` before anything was measured."""
+        """Return the prior state at fine step ``first``, before anything was measured."""
         settings, inputs = self.settings, self.inputs
         deviation = np.repeat(
             [0.03, 0.03, settings.missing_first, settings.gain_first, settings.tip_first],

@@ -179,6 +179,6 @@ class Feedback:
         self._supervisor.late(time, by)
 
     def estimate(self, time: float) -> Estimate:
-        """Return what is known of the limb at an instant [s], past or to come."""
+        """Return the estimate of the limb at an instant [s], past or to come."""
         with _THREADS.limit(limits=1, user_api="blas"):
             return self._estimator.estimate(time)

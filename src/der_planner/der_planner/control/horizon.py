@@ -9,11 +9,12 @@ correction. The corrections c (W, M), added to the plan's commands, then minimis
 where r is c less what makes up for the disturbances d and g, which are known ahead, with |command|
 within the pressure limit, its change within the slew limit and |c| within the authority. ν keeps
 the segments near the model's bend where the tip hardly tells them apart. The chambers' law, with
-its slow venting, is linearised about the commands rolled forward, and of the change that the
-programme finds so much is taken as makes the sum less when it is rolled forward itself. Only
-commands that can be sent are rolled forward. Corrections are straight lines between a few knots,
-close together at first, so that the programme has some thirty unknowns. The horizon is longer than
-a chamber takes to vent: what a shorter one gains now it pays for after its end.
+its slow venting, is linearised about the commands rolled forward. The change that the programme
+finds, a half and a fifth of it are then rolled forward by the law itself, cut to commands that can
+be sent, and the first that makes the sum less is taken, or none. Corrections are straight lines
+between a few knots, close together at first, so that the programme has some thirty unknowns. The
+horizon is longer than a chamber takes to vent: what a shorter one gains now it pays for after its
+end.
 """
 
 from __future__ import annotations
@@ -81,7 +82,7 @@ class Allowed:
 
 
 _SHARES = (1.0, 0.5, 0.2)
-"""Of a change that are tried."""
+"""Shares of the programme's change that are tried, in this order."""
 
 
 class _Rolled(NamedTuple):
@@ -106,11 +107,11 @@ class _Rolled(NamedTuple):
 
 
 class _Free(NamedTuple):
-    """What corrections cost nothing: that of the two periods before, and from now on.
+    """The part of the corrections that makes up for the disturbances d and g, and costs nothing.
 
     Attributes:
-        before: r (2, M) that was sent [Pa].
-        ahead: (W, M) what makes up for d and g [Pa].
+        before: (2, M) what was sent in the two periods before, less that part [Pa].
+        ahead: (W, M) that part in the coming periods [Pa].
     """
 
     before: Array
@@ -126,7 +127,7 @@ class Horizon:
 
     Args:
         nominal: the model's motion under the plan.
-        chambers: what was commanded and measured of the chambers.
+        chambers: their commands and readings.
         settings: sizes and weights.
 
     Attributes:
@@ -201,7 +202,7 @@ class Horizon:
     def _searched(
         self, here: _Rolled, change: Array, known: Knowledge, allowed: Allowed, free: _Free
     ) -> _Rolled:
-        """Return what is reached on the way of a change (W, M) [Pa] that minimises more.
+        """Return the motion with the first of `_SHARES` of a change (W, M) [Pa] that is better.
 
         The programme knows the chambers to first order. Where they vent as fast as they can, a
         small command changes nothing and a larger one fills the other chamber of the pair: the
@@ -216,7 +217,7 @@ class Horizon:
         return here
 
     def _minimised(self, rolled: _Rolled, free: _Free) -> float:
-        """Return what is minimised (see the module) [m²]."""
+        """Return the sum that is minimised, see the module [m²]."""
         run = free.beyond(rolled.correction)
         squares = (rolled.misses**2).sum() + self.settings.bend**2 * (rolled.bends**2).sum()
         return float(squares + sum(((each @ run) ** 2).sum() for each in self._differences))
@@ -278,7 +279,7 @@ class Horizon:
         commands = nominal.commands[periods] + correction
         chambers, before = self._chambers.follow(first, commands)
         middle = (first * STEPS + np.arange(self.window * STEPS) + 0.5) * CONTROL_PERIOD / STEPS
-        held = chambers.differential[before:] + self._chambers.surprise(middle).reshape(
+        held = chambers.differential[before:] + self._chambers.expected_gap(middle).reshape(
             self.window, STEPS, inputs
         )
         fine = nominal.steps(first * STEPS + np.arange(self.window * STEPS))

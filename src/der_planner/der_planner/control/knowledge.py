@@ -1,4 +1,4 @@
-"""What the estimator takes for granted of noise, and what it knows of the limb."""
+"""The estimator's assumptions about noise, and its state."""
 
 from __future__ import annotations
 

@@ -28,12 +28,12 @@ from der_planner.control.disturbance import (
     LearningError,
     Measured,
     Shown,
+    chambers_beyond,
     disturbance,
     moves_with,
     stays_behind,
 )
 from der_planner.control.repeatability import Played, Runs
-from der_planner.model.series import interpolate
 from der_planner.planning.correction import Correction
 from der_planner.planning.errors import PlanningError
 from der_planner.planning.result import Plan
@@ -56,7 +56,7 @@ _WORSE = 1.02
 _SMALLEST_STEP = 0.1
 """α below which learning stops."""
 _ENOUGH_RUNS = 4.0
-"""So many runs must tell what is left from noise before noise can stop learning."""
+"""Learning stops at the noise only when D is worth this many runs."""
 _PATIENCE = 3
 """Runs that bring nothing before learning stops."""
 _NOTHING = 0.05
@@ -70,7 +70,7 @@ _ADAPTED = (
 
 @dataclass(frozen=True)
 class LearningRun:
-    """What one run was worth.
+    """What one run has shown, and what was done with it.
 
     Attributes:
         number: of the run, from 1.
@@ -125,8 +125,8 @@ class Learner:
         self.stopped = ""
         self._correction = self._of_file
         period = float(self._plan.time[1] - self._plan.time[0])
-        self._runs = Runs(self._plan.tip_reference, period, self._correction.lever)
-        self._step, self._pull = 1.0, PULL * self._correction.lever
+        self._runs = Runs(self._plan.tip_reference, period, self._correction.tip_per_pressure)
+        self._step, self._pull = 1.0, PULL * self._correction.tip_per_pressure
         self._best: Played | None = None
         self._levels: list[float] = []
         self._fresh = False
@@ -159,7 +159,7 @@ class Learner:
             commands: (setpoints, M) that were in force in this run, if not those of the plan, for
                 instance with what feedback added [Pa].
             chambers: instants (n,) [s] and what the chambers held then (n, M) [Pa], NaN where it is
-                not known: what feedback on a learned plan takes for granted, not for news.
+                not known. Feedback on the learned plan then does not correct the same again.
 
         Raises:
             LearningError: the arrays do not fit together or to the plan.
@@ -167,7 +167,9 @@ class Learner:
         measured = Measured.build(time, tip, covariance)
         played, mean, largest, astray = self._played(measured, commands)
         seen = float(played.shown.seen.mean())
-        beyond = None if chambers is None else _beyond(played, self._plan.time, *chambers)
+        beyond = None
+        if chambers is not None:
+            beyond = chambers_beyond(played.expected.pressure, self._plan.time, *chambers)
         accepted, said = False, _refusal(seen, astray)
         if said:
             said = f"refused: {said}"
@@ -287,7 +289,7 @@ class Learner:
         return self._seen_by_model(first), _ADAPTED
 
     def _seen_by_model(self, run: Played) -> Played:
-        """Return a run with what it shows beyond the model of now."""
+        """Return a run with its disturbance against the present model."""
         expected = self._correction.expected(run.commands)
         value = run.shown.value + run.expected.tip - expected.tip
         return Played(run.commands, expected, Shown(value, run.shown.variance, run.shown.seen))
@@ -310,7 +312,7 @@ class Learner:
             said += ", the same plan again"
         elif new > _WORSE * old + min(margin, old):
             self._step /= 2
-            self._pull = min(self._pull * _HARDER, _HARDEST * self._correction.lever)
+            self._pull = min(self._pull * _HARDER, _HARDEST * self._correction.tip_per_pressure)
             said += f": worse than the best plan, back to it with a step of {self._step:.2f}"
         else:
             self._step = min(1.0, 2 * self._step)
@@ -340,7 +342,7 @@ class Learner:
         return ""
 
     def _as_plan(self, run: Played) -> Plan:
-        """Return the plan of a run's commands; what is expected of it is what all runs say."""
+        """Return the plan of a run's commands, with the tip that all runs let expect."""
         if np.array_equal(run.commands, self._plan.differential_pressure):
             return self._plan
         return dataclasses.replace(
@@ -351,40 +353,8 @@ class Learner:
         )
 
 
-def _beyond(run: Played, setpoints: Array, time: ArrayLike, held: ArrayLike) -> Array | None:
-    """Return by how much the chambers held more than their model in each period (K, M) [Pa].
-
-    Args:
-        run: as it was played.
-        setpoints: (K,) [s].
-        time: (n,) instants, in any order [s].
-        held: (n, M) differential pressures in the chambers then [Pa].
-
-    Returns:
-        None where no reading was whole.
-
-    Raises:
-        LearningError: shapes that do not fit.
-    """
-    instants, values = np.asarray(time, dtype=float), np.asarray(held, dtype=float)
-    wanted = (len(instants), run.commands.shape[1])
-    if instants.ndim != 1 or values.shape != wanted:
-        raise LearningError(
-            f"chambers need instants (n,) and pressures {wanted}, got shapes {instants.shape} and "
-            f"{values.shape}: take both from the same recording"
-        )
-    whole = np.isfinite(instants) & np.isfinite(values).all(axis=1)
-    if not whole.any():
-        return None
-    order = np.argsort(instants[whole], kind="stable")
-    instants, values = instants[whole][order], values[whole][order]
-    middle = setpoints + 0.5 * (setpoints[1] - setpoints[0])
-    beyond: Array = interpolate(middle, instants, values) - run.expected.pressure
-    return beyond
-
-
 def _refusal(seen: float, astray: str) -> str:
-    """Return why a run must not be used of which this share was seen; empty if it may.
+    """Return why a run must not be used; empty if it may.
 
     Args:
         seen: share of the setpoints at which the tip was seen following.

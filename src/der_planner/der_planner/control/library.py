@@ -76,4 +76,6 @@ def carried_over(fresh: Plan, learned: Plan) -> Plan:
     phase = fresh.time * (learned.duration / fresh.duration)
     expected = np.column_stack([np.interp(phase, learned.time, axis) for axis in shown.T])
     correction = Correction(fresh)
-    return correction.plan(fresh.differential_pressure, expected, PULL * correction.lever)
+    return correction.plan(
+        fresh.differential_pressure, expected, PULL * correction.tip_per_pressure
+    )

@@ -54,7 +54,7 @@ class Sensors:
 
     Attributes:
         frame_rate: of the camera [Hz].
-        latency: from a picture to what was seen on it [s].
+        latency: from a picture to its measurement [s].
         jitter: standard deviation of the latency, which is never below its half [s].
         lead: a command is asked for so long before its instant [s].
         bend_noise, tip_noise, pressure_noise: standard deviations [rad], [m], [Pa].
@@ -73,7 +73,7 @@ class Sensors:
     seen: Callable[[float], bool] = lambda _time: True
 
     def covariance(self, segments: int) -> Array:
-        """Return what is told of the noise of bend angles and tip (M + 2, M + 2)."""
+        """Return the stated covariance of bend angles and tip (M + 2, M + 2)."""
         deviation = np.repeat([self.bend_noise, self.tip_noise], [segments, 2])
         covariance: Array = np.diag(np.maximum(deviation, _SMALLEST) ** 2)
         return covariance

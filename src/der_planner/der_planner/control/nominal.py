@@ -62,8 +62,8 @@ class Nominal:
         before: (M,) command before the first one [Pa].
         effective: (K'·STEPS, M) effective pressures of the fine steps [Pa].
         taken: (K'·STEPS, M) pressures that friction and creep take of them [Pa].
-        watched: the chambers' readings are news: not so on a learned plan of which nobody told what
-            its chambers hold beyond their model.
+        watched: whether readings of the chambers are compared with the model: not on a learned plan
+            that does not say what its chambers hold beyond their model.
         fine_transition, fine_input: (K', 2M, 2M) and (K', 2M, M) of (δθ, δθ̇) in one fine step.
         transition, input: the same of a control period.
     """

@@ -32,7 +32,7 @@ _PRIOR_SHARE = 0.1
 _PRIOR_FACTOR = 3.0
 """One standard deviation of ln ε is the logarithm of this."""
 _FADE = 2.0
-"""Time in which what was learned fades beyond the first and last picture [s]."""
+"""Time in which the disturbance fades beyond the first and last picture [s]."""
 _UNLIKE = 4.0
 """A run that differs from the others by so many standard deviations is not one of them …"""
 _NOTABLE = 1.5e-3
@@ -134,16 +134,16 @@ class Known:
 
 
 class Runs:
-    """All runs of one motion of one limb, and what they say together.
+    """All runs of one motion of one limb, and the disturbance that they show together.
 
     Args:
         reference: r̄ (K, 2) at the setpoints [m].
         period: of the setpoints [s].
-        lever: way of the tip per pressure [m/Pa].
+        tip_per_pressure: way of the tip per pressure [m/Pa].
     """
 
-    def __init__(self, reference: Array, period: float, lever: float) -> None:
-        self._reference, self._period, self._lever = reference, period, lever
+    def __init__(self, reference: Array, period: float, tip_per_pressure: float) -> None:
+        self._reference, self._period, self._tip_per_pressure = reference, period, tip_per_pressure
         self._all: list[Played] = []
         self.repeats = Repeatability()
 
@@ -211,7 +211,7 @@ class Runs:
     def _movement(self, one: Played, other: Played) -> float:
         """Return how far a change of commands moves the tip, segment by segment, squared [m²]."""
         change = one.expected.pressure - other.expected.pressure
-        return float((change**2).sum(axis=1).mean()) / 2 * self._lever**2
+        return float((change**2).sum(axis=1).mean()) / 2 * self._tip_per_pressure**2
 
     def _pairs(self) -> list[Pair]:
         result = []

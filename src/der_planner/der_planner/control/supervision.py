@@ -27,7 +27,7 @@ REASONS = {
     "saturation": "a correction is at its limit of {:.0f} Pa, and the tip far from its path",
     "late": "commands come {:.2f} s after their instant",
 }
-"""Every reason and what is said of it."""
+"""Every reason with the sentence of its warning."""
 
 
 _SHRINKS = 0.7
@@ -46,7 +46,7 @@ class Limits:
         ramp: time in which feedback comes in [s].
         fade: time in which it is taken back [s].
         blind: without a measurement for longer, the tags are lost [s].
-        kept: for so long after that the last disturbances are still counted with [s].
+        kept: time after that in which the last disturbances are still made up for [s].
         inconsistent: squared distance of measurements per coordinate, smoothed; 1 is expected.
         patience: for which measurements may be inconsistent [s].
         saturated: for which a correction may be at its limit [s].

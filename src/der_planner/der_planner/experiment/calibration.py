@@ -92,7 +92,7 @@ class GraphCalibration(GraphPlayer):
         self._last_state = state
 
     def _begin(self, client: GraphClient) -> Playing:
-        client.wait_for(self._publisher.get_subscription_count, 10.0, "the driver to listen")
+        client.wait_for(self._publisher.get_subscription_count, 30.0, "the driver to listen")
         self._start_stamp = first_stamp(_now(client) + 2 * LOOK, LEAD)
         self._next = 0
         return Playing(

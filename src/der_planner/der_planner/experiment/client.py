@@ -27,7 +27,7 @@ READY = (DiagnosticStatus.OK, DiagnosticStatus.WARN)
 
 @dataclass(frozen=True)
 class Patience:
-    """How long a node may take to get ready [s], by what it says of itself.
+    """How long a node may take to get ready [s], by the level of its diagnostics.
 
     Attributes:
         silent: while it says nothing.
@@ -188,7 +188,7 @@ class GraphClient:
         status = self.diagnostics.get(name)
         return {} if status is None else {pair.key: pair.value for pair in status.values}
 
-    def call(self, service: str, timeout: float = 5.0) -> str:
+    def call(self, service: str, timeout: float = 20.0) -> str:
         """Call a std_srvs/Trigger service, e.g. ``pressure_driver/arm``; return its message.
 
         Raises:

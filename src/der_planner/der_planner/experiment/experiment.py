@@ -127,6 +127,8 @@ def _describe(
     """Say what would be done."""
     progress.say(f"limb: {limb.name}, {limb.segment_count} segments, {limb.length:.3f} m")
     progress.say(f"loads: {_loads(limb)}")
+    if limb.other_mounting:
+        progress.say(f"warning: {limb.other_mounting}")
     progress.say(f"stage: {_stage(options)}")
     if options.hardware is not None:
         for node in ("driver", "tracker", "planner", "recorder"):
@@ -156,7 +158,7 @@ def _play(
         # ROS-free: the other branch is imported only where it is used.
         from der_planner.experiment.offline_run import play_offline  # noqa: PLC0415
 
-        return play_offline(trial, options, robot, metadata, learned)
+        return play_offline(trial, options, robot, metadata, progress, learned)
     from der_planner.experiment.graph_run import GraphTrial  # noqa: PLC0415
 
     played = GraphTrial(trial, options, limb, robot, metadata, progress, learned).play()
@@ -179,10 +181,14 @@ def _limb_file(trial: Trial, options: Options, progress: Progress) -> Path | Non
     if path.exists():
         return path
     from der_planner.identification import calibrate_twin  # noqa: PLC0415
+    from der_planner.planning.loads.rest import nearly_buckling  # noqa: PLC0415
 
+    prior = options.mounted(Limb.default())
+    if said := nearly_buckling(prior):
+        progress.say(f"  warning: with the stiffness and mass of the default limb {said}")
     progress.say(f"  calibrating on the twin of seed {trial.seed}")
     begin = time.monotonic()
-    limb, _ = calibrate_twin(trial.seed, options.mounted(Limb.default()))
+    limb, _ = calibrate_twin(trial.seed, prior)
     path.parent.mkdir(parents=True, exist_ok=True)
     limb.to_yaml(path)
     progress.say(f"  calibrated in {time.monotonic() - begin:.1f} s: {path}")

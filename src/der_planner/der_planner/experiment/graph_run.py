@@ -30,6 +30,8 @@ from limb_interfaces import qos, stamps, topics
 PLAN_TIMEOUT = 120.0
 DISCOVERY = 1.0
 """How long the orchestrator listens for another graph before it starts nodes [s]."""
+ARMING = 5.0
+"""For how long the driver may refuse to be armed before the run is given up [s]."""
 VENTED_PRESSURE = 1000.0
 """Differential pressure below which a limb counts as vented [Pa]."""
 
@@ -42,7 +44,7 @@ class Playing:
         begin: ROS time at which the first setpoint takes effect [s].
         length: from the first setpoint to the last [s].
         feed: called at least every 50 ms until the end; publishes what is due, if the orchestrator
-            is the one who publishes.
+            is the one who publishes, or shows what is told of the plan meanwhile.
         plan_id: of the plan, if there is one.
     """
 
@@ -152,7 +154,7 @@ class GraphPlayer(ABC):
 
     def _record(self, client: GraphClient) -> GraphRun:
         bag = Path(client.call("recorder/start"))
-        client.call("pressure_driver/arm")
+        self._arm(client)
         playing = self._begin(client)
         before = {name: process.measure_cpu() for name, process in self._processes.items()}
         begin = time.monotonic()
@@ -164,8 +166,20 @@ class GraphPlayer(ABC):
         }
         factor = client.diagnostic_values("limb_twin").get("real_time_factor", "nan")
         self._vent(client)
-        client.call("recorder/stop", timeout=20.0)
+        client.call("recorder/stop", timeout=60.0)
         return GraphRun(bag, cpu, float(factor), playing.length, playing.plan_id)
+
+    def _arm(self, client: GraphClient) -> None:
+        """Arm the driver; what forbids it for a moment, as a late report of the board, may pass."""
+        end = time.monotonic() + ARMING
+        while True:
+            try:
+                client.call("pressure_driver/arm")
+                return
+            except GraphError:
+                if time.monotonic() > end:
+                    raise
+            client.spin(0.2)
 
     def _await_end(self, client: GraphClient, playing: Playing) -> None:
         length = playing.length
@@ -197,7 +211,7 @@ class GraphPlayer(ABC):
             measured = state.measured_differential if state is not None else []
             return bool(measured) and all(abs(value) < VENTED_PRESSURE for value in measured)
 
-        client.wait_for(vented, 15.0, "the chambers to vent")
+        client.wait_for(vented, 30.0, "the chambers to vent")
 
     def _vent_whatever_happened(self, client: GraphClient) -> None:
         """Vent after an error; a dead driver is started again, since boards have no watchdog."""
@@ -324,7 +338,7 @@ class GraphTrial(GraphPlayer):
         kind, topic = (PathMessage, topics.PATH) if drawn else (MotionCommand, topics.COMMAND)
         publisher = client.node.create_publisher(kind, topic, qos.COMMANDS)
         # The recorder may listen, too.
-        client.wait_for(lambda: self._planner_listens(client, topic), 10.0, "the planner to listen")
+        client.wait_for(lambda: self._planner_listens(client, topic), 30.0, "the planner to listen")
         client.newest.pop(topics.PLAN, None)
         publisher.publish(self._path(drawn) if drawn else self._command())
         plan = client.wait_for(lambda: self._plan_or_refusal(client), PLAN_TIMEOUT, "the plan")
@@ -333,8 +347,25 @@ class GraphTrial(GraphPlayer):
             f"predicted error {plan.predicted_error * 100:.2f} cm"
         )
         return Playing(
-            stamps.seconds(plan.header.stamp), float(plan.time[-1]), plan_id=plan.plan_id
+            stamps.seconds(plan.header.stamp),
+            float(plan.time[-1]),
+            feed=self._warnings_of(client, plan.plan_id),
+            plan_id=plan.plan_id,
         )
+
+    def _warnings_of(self, client: GraphClient, plan_id: str) -> Callable[[], None]:
+        """Return what shows the warnings of a plan once the planner's diagnostics have them."""
+        shown: list[str] = []
+
+        def show() -> None:
+            said = client.diagnostic_values("planner")
+            played = said.get("plan_id") == plan_id and said.get("state") == "streaming"
+            if played and not shown:
+                shown.append(said.get("reason", ""))
+                if shown[0]:
+                    self._progress.say(f"  warning: {shown[0]}")
+
+        return show
 
     def _planner_listens(self, client: GraphClient, topic: str) -> bool:
         found = client.node.get_subscriptions_info_by_topic(client.node.resolve_topic_name(topic))

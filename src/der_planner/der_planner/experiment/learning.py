@@ -45,7 +45,7 @@ def add_run(learner: Learner, run: RunSeries) -> None:
 
 
 def about(learner: Learner, **more: Any) -> dict[str, Any]:
-    """Return what was learned so far, to be kept with a plan.
+    """Return a summary of the runs so far, to be kept with a plan.
 
     Args:
         learner: with its history.
@@ -127,7 +127,7 @@ class TrialLearning:
         return self._learner.stopped
 
     def take(self, run: RunSeries) -> None:
-        """Learn from a finished run, and say what it was worth.
+        """Learn from a finished run, and print what came of it.
 
         Raises:
             GraphError: the run is not one of this motion.

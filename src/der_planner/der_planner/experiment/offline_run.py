@@ -12,6 +12,7 @@ from der_planner.control import Feedback, lockstep
 from der_planner.control.lockstep import Played
 from der_planner.experiment.errors import GraphError
 from der_planner.experiment.options import Options, Trial
+from der_planner.experiment.progress import Progress
 from der_planner.identification.offline import CALIBRATION_RUN
 from der_planner.limb import Limb
 from der_planner.planning import Plan, PlanningError, plan
@@ -29,6 +30,7 @@ def play_offline(
     options: Options,
     robot: Limb,
     metadata: dict[str, Any],
+    progress: Progress,
     learned: Path | None = None,
 ) -> dict[str, Any]:
     """Plan, play and keep one trial; the error is against the twin's true tip, not an image's.
@@ -38,6 +40,7 @@ def play_offline(
         options: of the experiment.
         robot: to plan with, under its loads; the twin is mounted as it is and carries its masses.
         metadata: kept with the arrays.
+        progress: shows the plan's warnings.
         learned: file of a learned plan, which is played in place of a new one.
 
     Raises:
@@ -51,6 +54,8 @@ def play_offline(
             planned = plan(robot, motion, model=trial.model, method=trial.method)
     except PlanningError as error:
         raise GraphError(f"the planner refused: {error}") from error
+    for warning in planned.warnings:
+        progress.say(f"  warning: {warning}")
     played, about_feedback = _play(planned, trial, robot)
     payload, place = robot.payload
     path = options.out / "runs" / f"{trial.name}.npz"

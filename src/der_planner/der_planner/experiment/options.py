@@ -60,7 +60,7 @@ class Trial:
         return name if self.run == 1 else f"{name}_run{self.run}"
 
     def following(self) -> Trial:
-        """Return the next run, which plays what was learned."""
+        """Return the next run, which plays the plan that was learned."""
         return dataclasses.replace(self, method=LEARNED, run=self.run + 1)
 
     @property
@@ -136,13 +136,20 @@ class Options:
         ]
 
 
+class _Help(argparse.ArgumentDefaultsHelpFormatter):
+    """Names the default of an option, unless that is nothing, off or zero."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        return super()._get_help_string(action) if action.default else action.help
+
+
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     result = argparse.ArgumentParser(
         prog="run_experiment.py",
         description="Play motions on the limb (or its twin) and report the tracking error.",
         epilog="Without options: Case 2 (same_direction), DER and PCC, one trial each, on the twin",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        formatter_class=_Help,
     )
     _add_motions(result.add_argument_group("what is played"))
     _add_stage(result.add_argument_group("on what"))

@@ -137,7 +137,7 @@ class NodeProcess:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self.pid, number)
 
-    def stop(self, timeout: float = 8.0) -> int:
+    def stop(self, timeout: float = 20.0) -> int:
         """End it with SIGTERM, after ``timeout`` seconds with SIGKILL; return the exit code."""
         self.measure_cpu()
         self.signal(signal.SIGTERM)

@@ -1,4 +1,4 @@
-"""Does a limb file still fit? Open-loop prediction of a later run against what was seen."""
+"""Does a limb file still fit? Open-loop prediction of a later run against its measured bend."""
 
 from __future__ import annotations
 

@@ -32,6 +32,7 @@ from der_planner.identification.rod_angles import NODES
 from der_planner.limb import CalibratedRange, Limb
 from der_planner.model.response import RodModel
 from der_planner.model.series import CONTROL_PERIOD
+from der_planner.planning.loads.rest import nearly_buckling
 
 Array = NDArray[np.float64]
 
@@ -94,6 +95,7 @@ def fit(
         unknowns, correlation = slow.uncertainties(fitted.values, fitted.jacobian)
     remaining = fitted.problem.remaining(fitted.values)
     found = _finish(limb, to_limb(fitted.limb, fitted.values), air, prepared, remaining)
+    warnings += filter(None, [nearly_buckling(found)])
     pcc_residual = np.full(limb.segment_count, np.nan)
     if "dynamics" in fitted.problem.groups or any(limb.gravity[:2]):
         found, pcc_residual = _with_arcs(found, prepared, offset, warnings)

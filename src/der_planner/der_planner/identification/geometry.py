@@ -28,7 +28,7 @@ CONNECTOR_RANGE = (1e-3, 3e-2)
 BASE_RANGE = (0.0, 3e-2)
 """Of the stiff piece at the clamp [m]."""
 STIFF_PRIOR = 0.01
-"""Standard deviation of what is known of connector and base before [m]."""
+"""Prior standard deviation of connector and base [m]."""
 TIP_ERROR = 1e-3
 """Error of an evenly bent limb at single instants [m], from this bend on: a real one does not bend
 quite evenly …"""
@@ -181,7 +181,7 @@ def _uneven_tip(limb: Limb, time: Array, pressure: Array, nodes: int) -> Array:
 
 
 class UnevenTips:
-    """What tips tell of the weight's share in the bend, whatever the lengths are.
+    """The residual of the tips that tells the weight's share in the bend, for the best lengths.
 
     A pressure and a rest angle bend a segment evenly, weight bends it most where it begins. So the
     tip at given bend angles tells how much of them is the weight's, which bend angles alone hardly

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,11 +43,11 @@ class Unknown:
 
 @dataclass(frozen=True)
 class LoadsFit:
-    """The masses that gravity pulls at, and the stiffness that carries them.
+    """The mass that bends the limb by its weight, and the stiffness that carries it.
 
     Attributes:
         gravity: (2,) in the plane [m/s²].
-        mass: of what moves: segments, connectors and what they carry [kg].
+        mass: `Limb.moving_mass`, without what sits on the stiff base [kg].
         first_moment: of that about the clamp, of the straight limb [kg·m].
         stiffness: (M,) EI [N·m²].
     """
@@ -60,16 +59,13 @@ class LoadsFit:
 
 
 def loads_of(limb: Limb) -> LoadsFit | None:
-    """Return what gravity in the plane pulls at; None without such gravity."""
+    """Return mass, first moment and stiffness of a limb; None without gravity in its plane."""
     if not any(limb.gravity[:2]):
         return None
     straight = replace(limb, gravity=(0.0, 1.0, 0.0))
     weight = weight_of(straight)
     count = limb.segment_count
-    carried = sum(m.mass for m in limb.masses if m.arc_length > limb.base_length)
-    densities = [s.mass_per_length for s in limb.segments]
-    mass = sum(s.mass_per_length * s.length for s in limb.segments) + carried
-    mass += limb.connector_length * sum(0.5 * (a + b) for a, b in pairwise(densities))
+    mass = limb.moving_mass
     return LoadsFit(
         (limb.gravity[0], limb.gravity[1]),
         float(mass),
@@ -99,7 +95,7 @@ class FitReport:
         evaluations: of model and derivatives.
         fit_time: [s].
         warnings: sentences.
-        loads: what gravity pulls at; None for a limb that no gravity pulls in its plane.
+        loads: the limb's weight and what carries it; None without gravity in the plane.
     """
 
     source: str
@@ -206,8 +202,8 @@ class FitReport:
         loads = self.loads
         pull = math.hypot(*loads.gravity)
         line = (
-            f"loads: gravity of {pull:.2f} m/s² in the plane pulls at {1e3 * loads.mass:.0f} g, "
-            f"first moment {1e3 * loads.first_moment:.1f} g·m about the clamp"
+            f"loads: gravity of {pull:.2f} m/s² in the plane pulls at {1e3 * loads.mass:.0f} g "
+            f"beyond the base, first moment {1e3 * loads.first_moment:.1f} g·m about the clamp"
         )
         known = {u.name: u for u in self.unknowns}
         kept = "the mass" if "log_stiffness[0]" in known else "the stiffness"

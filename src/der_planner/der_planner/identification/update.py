@@ -296,7 +296,7 @@ class _Days:
     def changes(
         self, m: int, x: Array, deviation: Array, told: NDArray[np.bool_]
     ) -> tuple[Change, ...]:
-        """Return what was said of a segment."""
+        """Return the changes of a segment's three numbers."""
         old = self._limb.segments[m]
         new = _moved(old, x[3 * m : 3 * m + 3])
         spreads = (GAIN_SPREAD * old.static_gain, REST_SPREAD, _friction_spread(old))

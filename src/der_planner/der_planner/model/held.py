@@ -7,8 +7,8 @@ squares on
     a² |tip(q(w)) − r|² + p² |θ(q(w)) − θ̄|²
 
 with θ the bend angles and θ̄ a guess that decides what the tip leaves open, or with a = 0 the wanted
-bend. Along a path each pose
-starts from the one before it, so that the branch is kept by continuity.
+bend. Along a path each pose starts from the one before it, so that the branch is kept by
+continuity.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ class Poses:
         bend_angles: (K, M) [rad].
         tangents: (K, F, M) ∂q/∂pressures on the rod's free rows [m/Pa].
         misses: (K,) distance of the tip from where it was wanted [m].
-        firmness: (K,) smallest eigenvalue of the static stiffness; not positive: it does not stay.
+        smallest_stiffness: (K,) smallest eigenvalue of the static stiffness; zero or below: the rod
+            does not stay in this pose.
     """
 
     pressures: Array
@@ -50,7 +51,7 @@ class Poses:
     bend_angles: Array
     tangents: Array
     misses: Array
-    firmness: Array
+    smallest_stiffness: Array
 
 
 class Holder:
@@ -107,7 +108,7 @@ class Holder:
             bend_angles(rod, q),
             np.array(slopes),
             np.linalg.norm(q[:, self._tip] - tip, axis=1),
-            np.array([rod.firmness(state, u) for u, state in found]),
+            np.array([rod.smallest_stiffness(state, u) for u, state in found]),
         )
 
     def _pose(

@@ -157,7 +157,7 @@ def _from_pressures(
 def _slow(
     limb: Limb, time: Array, pressure: Array, memory: material.Memory | None
 ) -> tuple[Array, material.MemoryHistory]:
-    """Return effective pressures (K, M) [Pa] along the bend at rest, and what is remembered."""
+    """Return effective pressures (K, M) [Pa] along the bend at rest, and the memory left."""
     bend = material.resting_bend(limb, time, pressure, memory)
     history = material.remember(limb, time, bend, memory)
     return material.without_memory(limb, pressure, material.taken_by(limb, history)), history

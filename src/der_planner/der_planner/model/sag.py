@@ -15,7 +15,7 @@ PIECES = 4
 
 
 def weight_of(limb: Limb) -> Weight:
-    """Return gravity in the plane on the limb's own mass, its connectors' and what it carries.
+    """Return the weight in the plane of segments, connectors and carried masses.
 
     A limb that no gravity pulls in its plane has no pieces.
     """

@@ -109,7 +109,7 @@ class DriverWatch:
         return None
 
     def wait(self, seconds: float) -> Ending | None:
-        """Wait until the driver takes setpoints, at most so long [s]; return what is in the way."""
+        """Wait until the driver takes setpoints, at most so long [s]; return what forbids it."""
         end = self._steady() + seconds
         with self._changed:
             while (found := self.obstacle()) is not None and (left := end - self._steady()) > 0:

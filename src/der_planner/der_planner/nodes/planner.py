@@ -115,8 +115,16 @@ class PlannerNode(Node):
 
     def _current_options(self) -> PlannerOptions:
         """Return the parameters with what may be changed while the node runs as it is now."""
-        nearest = bool(self.get_parameter("nearest_path").value)
-        return replace(self._options, nearest_path=nearest)
+
+        def value(name: str) -> Any:
+            return self.get_parameter(name).value
+
+        return replace(
+            self._options,
+            nearest_path=bool(value("nearest_path")),
+            payload=float(value("payload")),
+            payload_at=float(value("payload_at")),
+        )
 
     def _is_busy(self, plan_id: str) -> bool:
         """Tell whether a plan of this id is being planned or played."""

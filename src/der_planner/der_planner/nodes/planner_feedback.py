@@ -2,7 +2,7 @@
 
 A thread of its own works on what came since, in the order in which it came, and revises the next
 setpoint that can still be reached. The player goes on sending every setpoint a lead before its
-stamp, with the corrections that were last thought of for it; it never waits for this thread.
+stamp, with the newest corrections there are for it; it never waits for this thread.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ _SLOWER = 1.5
 _SMALLEST_BEND, _SMALLEST_TIP = 1e-3, 1e-4
 """Standard deviations that are believed of a tracker: it tells corner noise alone [rad], [m]."""
 _STALE = 10
-"""Setpoints for which corrections that were thought of before are used in full; then they fade."""
+"""Setpoints for which an older solution's corrections are used in full; then they fade."""
 
 
 class Audience(Protocol):
-    """Who publishes; called from this part's thread."""
+    """Publishes the corrector's results; called from the corrector's thread."""
 
     def revise(self, schedule: Schedule, index: int, pressures: Array, revision: int) -> None:
         """Send a setpoint again with other pressures (M,) [Pa]."""
 
     def estimated(self, schedule: Schedule, instant: int, estimate: Estimate, done: Done) -> None:
-        """Show what is known at an instant [ns]."""
+        """Publish the estimate of an instant [ns]."""
 
     def warn(self, text: str) -> None:
         """Say that feedback was taken back."""
@@ -112,7 +112,7 @@ class _Corrected:
             item(receiver)
 
     def pressures(self, index: int) -> Array:
-        """Return the pressures (M,) [Pa] of a setpoint by what was last thought of for it."""
+        """Return the pressures (M,) [Pa] of a setpoint with the newest correction for it."""
         planned = self.schedule.plan.differential_pressure[index]
         limit = self.schedule.plan.limb.pneumatics.pressure_limit
         cut: Array = np.clip(planned + self._correction(index), -limit, limit)
@@ -152,7 +152,7 @@ class Corrector:
 
     @property
     def reason(self) -> str:
-        """Why feedback is out for what is played; empty while it acts, or if there is none."""
+        """Why feedback is out for the plan in force; empty while it acts, or if there is none."""
         with self._wake:
             return self._open[-1].feedback.reason if self._open else ""
 

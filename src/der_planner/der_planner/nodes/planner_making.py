@@ -18,7 +18,7 @@ _FEEDBACK_MARGIN = 500_000_000
 
 
 class PlanMaker:
-    """Plans what is asked for, so that it can be played from where the limb will then be.
+    """Plans a requested motion so that it begins where the limb will then be.
 
     Args:
         options: of the node.

@@ -57,7 +57,7 @@ def reference_message(schedule: Schedule, index: int) -> PointStamped:
 
 
 def estimate_message(schedule: Schedule, instant: int, estimate: Estimate) -> LimbEstimate:
-    """Return what is known of the limb at an instant [ns]."""
+    """Return the estimated state of the limb at an instant [ns]."""
     inputs = len(estimate.bend_angle)
     sigma = np.split(estimate.deviation, np.arange(1, 5) * inputs)
     x, y = estimate.tip

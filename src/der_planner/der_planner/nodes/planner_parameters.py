@@ -51,11 +51,11 @@ def read_parameters(node: Node) -> PlannerOptions:
         limb=_read_limb(read),
         payload=float(
             read("payload", 0.0, "mass [kg] carried beside the limb's own masses, where a command "
-                 "names none", at_least=0.0, at_most=HEAVIEST)
+                 "names none", at_least=0.0, at_most=HEAVIEST, read_only=False)
         ),
         payload_at=float(
             read("payload_at", 0.0, "where, along the limb from its clamp [m]; 0: the tip",
-                 at_least=0.0)
+                 at_least=0.0, read_only=False)
         ),
         model=str(
             read("default_model", "der", "model for paths and for commands that name none",

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 
 class PlannerPublishers:
-    """Publishes what is known of the plan that is being played."""
+    """Publishes the plan that is being played, its setpoints, references and estimates."""
 
     def __init__(self, node: Node) -> None:
         self._clock = node.get_clock()

@@ -1,4 +1,4 @@
-"""From messages that ask for a motion to what is to be planned; what makes no sense is refused."""
+"""Messages that ask for a motion, checked and turned into requests to the planner."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ FURTHEST_STAMP = 600
 
 @dataclass
 class Request:
-    """One thing to plan: what was asked for, and whether it is still wanted.
+    """One motion to plan, and whether it is still wanted.
 
     `limb` is mounted as asked for and carries the payload; a plan that was learned is played as it
     is.

@@ -1,4 +1,4 @@
-"""What the planner plays: its schedules from their planning to their end, whatever ends them."""
+"""The schedules that the planner plays, from their planning to their end."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _MARGIN = 100_000_000
 
 
 class Audience(Protocol):
-    """Who is told what happens on the stage; from the executor's thread or the player's."""
+    """Is told what becomes of the schedules; called from the executor's or the player's thread."""
 
     def scheduled(self, schedule: Schedule) -> None:
         """A plan has its instant; nothing of it was sent yet."""

@@ -131,7 +131,7 @@ class Recorder(Node):
     # Topics
 
     def _discover(self) -> None:
-        """Subscribe to what has appeared, and again where publishers changed their QoS."""
+        """Subscribe to new topics, and again to those whose publishers changed their QoS."""
         for name, types in self.get_topic_names_and_types():
             if not self._is_wanted(name, types[0]):
                 self._unsubscribe(name)
@@ -212,6 +212,16 @@ class Recorder(Node):
 
         return receive
 
+    def _take_what_has_arrived(self) -> None:
+        """Receive what waits: on a busy machine, services may overtake earlier messages."""
+        for name, (waiting, _) in self._subscriptions_by_topic.items():
+            receive, count = self._receiver(name), 0
+            with waiting.handle:
+                take = partial(waiting.handle.take_message, waiting.msg_type, waiting.raw)
+                while count < DEPTH and (taken := take()):
+                    receive(*taken)
+                    count += 1
+
     def _now(self) -> int:
         return int(self.get_clock().now().nanoseconds)
 
@@ -259,6 +269,7 @@ class Recorder(Node):
 
     def _stop(self) -> tuple[bool, str]:
         assert self._session is not None
+        self._take_what_has_arrived()
         status = self._session.stop()
         self._session = None
         self._last_failure = status.failure
@@ -295,6 +306,7 @@ class Recorder(Node):
         if self._session is None:
             response.message = "not recording: start a recording first"
             return response
+        self._take_what_has_arrived()
         self._session.paused = request.data
         response.success = True
         response.message = "paused" if request.data else "recording again"

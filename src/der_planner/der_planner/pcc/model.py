@@ -278,7 +278,7 @@ class Pcc:
         v = self._check("rates", np.zeros(self.segment_count) if rates is None else rates)
         return q, v, inputs, step, self._parts(step), self.arcs
 
-    def firmness(self, bend_angles: ArrayLike) -> float:
+    def smallest_stiffness(self, bend_angles: ArrayLike) -> float:
         """Return the smallest eigenvalue of the stiffness of arcs at rest [N·m/rad]."""
         return float(np.linalg.eigvalsh(self.stiffness_matrix(bend_angles))[0])
 

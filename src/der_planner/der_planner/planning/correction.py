@@ -69,7 +69,7 @@ class Correction:
         self._limb = plan.limb
 
     def of(self, limb: Limb) -> Correction:
-        """Return the same with another limb's model; what it plans names the plan's own limb.
+        """Return the same with another limb's model; its plans still name the plan's own limb.
 
         Args:
             limb: with as many segments.
@@ -84,7 +84,7 @@ class Correction:
         return self._limb
 
     @property
-    def lever(self) -> float:
+    def tip_per_pressure(self) -> float:
         """Largest movement of the tip per differential pressure of a segment at rest [m/Pa]."""
         limb = self._limb
         ahead = np.cumsum([s.length for s in limb.segments][::-1])[::-1]
@@ -169,7 +169,7 @@ class Correction:
     def _solve(
         self, commands: Array, wanted: Array, pull: float, begin: Outcome | None
     ) -> tuple[Outcome, int]:
-        """Return what is best for wanted tips (K, 2) [m], and the steps of all windows.
+        """Return the best commands for wanted tips (K, 2) [m], and the steps of all windows.
 
         Args:
             commands: (K, M) toward which the plan is pulled [Pa].

@@ -57,7 +57,7 @@ class OverloadError(PlanningError):
         point: (x, y) of the tip then, in `limb_base` [m].
         segment: which needs most.
         required_pressure: |differential pressure| that it needs there at rest [Pa].
-        pressure_limit: what it may have [Pa].
+        pressure_limit: largest that is allowed [Pa].
         possible_mass: most that the limb could carry along this motion [kg]; None: it carries
             nothing, or cannot be held without it either.
     """

@@ -2,10 +2,8 @@
 
 A limb of two segments reaches most points in two ways, on either side of the fold where the
 Jacobian loses its rank (the straight limb lies on that fold). A branch is named by how the last
-segment bends
-compared with the fold: ``counter_clockwise`` or ``clockwise``. A whole path is solved at once, each
-point from its own first guess, so that the branch is the guess's and speed is that of one matrix
-code.
+segment bends compared with the fold: ``counter_clockwise`` or ``clockwise``. All points of a path
+are solved in the same matrix operations, each from its own first guess, which decides the branch.
 """
 
 from __future__ import annotations

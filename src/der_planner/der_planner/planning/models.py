@@ -11,7 +11,7 @@ from der_planner.model.material import differential_pressure
 from der_planner.model.response import ArcModel, ArcState
 from der_planner.planning.errors import BucklingError, PlanningError
 from der_planner.planning.inverse import check_reach, is_loaded, solve, static_pressure
-from der_planner.planning.loads.overload import check_load
+from der_planner.planning.loads.overload import check_load, check_stays
 from der_planner.planning.loads.posed import REFERENCE_PRIOR
 from der_planner.planning.motions import Reference
 from der_planner.planning.rod_model import PlanningRod
@@ -50,20 +50,14 @@ class PlanningArcs(ArcModel):
                 "or stiffer, or mount it otherwise"
             )
         near = angles + (home - reference.rest)
-        # What arcs miss of the rod's reach is theirs: the plan says it.
+        # Points that the rod reaches and the arcs miss are no refusal: the plan's error shows them.
         own = solve(self.kinematics, tip, near, REFERENCE_PRIOR)[0]
 
         def needed(limb: Limb) -> Array:
             return differential_pressure(limb, time, static_pressure(limb, own), own)
 
-        falls = np.array([self.pcc.firmness(pose) <= 0 for pose in own])
-        if falls.any():
-            k = int(np.argmax(falls))
-            raise BucklingError(
-                f"the arcs do not stay at their pose of t = {time[k]:.2f} s, tip at "
-                f"({tip[k, 0]:.4f}, {tip[k, 1]:.4f}) m: they would snap through under their load. "
-                "Shrink or move the motion, or mount the limb otherwise"
-            )
+        stiffness = np.array([self.pcc.smallest_stiffness(pose) for pose in own])
+        check_stays(stiffness, time, tip, "arcs")
         check_load(self.limb, time, tip, needed(self.limb), needed)
         return resting_spline(time, own, reference.start)
 

@@ -5,9 +5,9 @@ Unknown are the commands u (K, M) themselves. Minimised is, over the setpoints k
     Σ |tip_k(u) − r̄_k|² + λ Σ |D²(u − u⁰)_k|² + μ Σ |(u − u⁰)_k|²
 
 with u⁰ the commands of a balance of forces (the warm start, smooth and nearly right: `projected`
-for the rod, `paper` for the arcs), D² the second
-difference, |u_k| within the pressure limit and |u_k − u_{k−1}| within the slew limit. The model is
-that of `der_planner.model`, with friction and creep along the motion's known bend.
+for the rod, `paper` for the arcs), D² the second difference, |u_k| within the pressure limit and
+|u_k − u_{k−1}| within the slew limit. The model is that of `der_planner.model`, with friction and
+creep along the motion's known bend.
 
 tip(u) comes from the model's integrator, its derivative from the exact linearisation of that
 integrator, with the chambers' response averaged over each period. A response dies out in seconds,

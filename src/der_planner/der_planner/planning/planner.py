@@ -65,7 +65,8 @@ def plan(
         start: where another motion is left; None: where the vented limb rests.
         progress: called with the share that is done, 0 … 1.
 
-    The plan's `warnings` say where limits cut the wanted pressures.
+    The plan's `warnings` say where limits cut the wanted pressures, and where the limb's numbers
+    are those of another mounting.
 
     Raises:
         PlanningError: unknown model or method.
@@ -84,7 +85,9 @@ def plan(
         report(0.3)
         solved = _followed(physics, spline, reference, method, report)
     bend = sample_spline(spline, reference.time)[0]
-    left = [str(reference.deviation or ""), nearly_buckling(physics.limb)]
+    left = [
+        str(reference.deviation or ""), limb.other_mounting, nearly_buckling(physics.limb)
+    ]  # fmt: skip
     warnings = filter(None, left + solved.warnings + _calibration_warnings(physics.limb, bend))
     return Plan(
         time=reference.time,
@@ -107,7 +110,7 @@ def plan(
 
 
 def _configuration(physics: PlanningModel, reference: Reference, model: str) -> BSpline:
-    """Return q̄(t) of a model; a refusal says where arcs are refused for what they do not know."""
+    """Return q̄(t) of a model; a refusal of arcs that sag out of their plane advises the rod."""
     try:
         return physics.configuration(reference)
     except PlanningError as error:
@@ -134,7 +137,7 @@ def _followed(
     method: str,
     report: Callable[[float], None],
 ) -> _Solved:
-    """Return what `_solve` does.
+    """Call `_solve`; a rod that does not converge becomes a refusal with the remedy.
 
     Raises:
         PlanningError: the rod cannot be simulated along the motion.

@@ -24,7 +24,7 @@ class Plan:
         reference: r̄ and q̄ as functions of time.
         tip_predicted: (K, 2) tip of the model under these commands, with the chambers' lag [m].
         bend_angles: (K, M) of the model's reference configuration [rad].
-        motion, model, method: what was asked for.
+        motion, model, method: names, as they were asked for.
         amplitude, period, cycles: of the motion; 0, 0 and 1 for a path.
         limb: the robot it was made for.
         kinematics: of the model, for drawing.

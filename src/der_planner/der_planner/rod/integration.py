@@ -59,7 +59,7 @@ class Run:
 
 @dataclass
 class _Journey:
-    """A run under way: where it is and what it has gathered."""
+    """A run under way: its state and its recorded samples."""
 
     place: Place
     load: Array

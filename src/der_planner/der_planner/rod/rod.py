@@ -287,7 +287,7 @@ class Rod:
         """Return ∂q/∂u (4N-1, M) [m/Pa] of a state that rests under u (M,) [Pa]."""
         return self._backend.linearise_equilibrium(state, array(u, (self.segment_count,), "u"))
 
-    def firmness(self, state: RodState, u: ArrayLike) -> float:
+    def smallest_stiffness(self, state: RodState, u: ArrayLike) -> float:
         """Return the smallest eigenvalue of the static stiffness of a resting state [N/m …].
 
         Zero or below: the rod under pressures u (M,) [Pa] does not stay there; it buckles.

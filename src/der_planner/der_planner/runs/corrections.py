@@ -1,4 +1,4 @@
-"""What feedback did in a recorded run: what it added, and how soon the board knew of a picture."""
+"""Feedback in a recorded run: its corrections, and the time from a picture to the board."""
 
 from __future__ import annotations
 

@@ -106,7 +106,7 @@ class DriverScene:
 
 @dataclass(frozen=True)
 class PlanScene:
-    """A plan: what it is, and its tip path (K, 2) [m]."""
+    """A plan: its description, and its tip path (K, 2) [m]."""
 
     plan_id: str
     motion: str

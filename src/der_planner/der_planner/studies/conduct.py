@@ -67,7 +67,7 @@ class Piece:
 
 @dataclass
 class _State:
-    """What is left, and what is under way."""
+    """Rows that are left to do, and rows that are under way."""
 
     left: deque[Piece]
     done: int
@@ -81,7 +81,7 @@ class _State:
 
 
 def conduct(study: Study, settings: Settings, progress: Progress) -> dict[str, Kept]:
-    """Play what is missing of a study; return every row that is done, by key, in order.
+    """Play the missing rows of a study; return every row that is done, by key, in order.
 
     Raises:
         StudyError: the folder cannot be written, or no cluster can compute the rows.
@@ -288,7 +288,7 @@ class _Session:
             future.add_done_callback(self._back.put)
 
     def _twin(self, twin: Twin, place: int) -> Future:
-        """Return the calibration of a twin: one task, whatever waits for it."""
+        """Return the calibration of a twin: one task, however many rows wait for it."""
         if twin not in self._state.twins:
             self._state.twins[twin] = self._client.submit(
                 work.calibrate,

@@ -1,4 +1,4 @@
-"""What results depend on beside a row's values, and where what is computed once a machine is kept.
+"""Digests of the sources that results depend on, and the cache of each machine.
 
 Sources are told apart by a digest, so that a cache or a worker of another version is noticed.
 """
@@ -41,7 +41,7 @@ def digest(parts: tuple[str, ...] = EVERYTHING) -> str:
 
 
 def cache() -> Path:
-    """Return the folder of what is computed once a machine: DER_LIMB_CACHE, or ~/.cache/der_limb.
+    """Return the cache folder of this machine: DER_LIMB_CACHE, or ~/.cache/der_limb.
 
     Where neither can be written, a folder of the user's in the system's temporary one.
     """

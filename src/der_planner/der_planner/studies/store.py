@@ -1,4 +1,4 @@
-"""The rows of a study on disk: one small Parquet file for what came together, whole or not there.
+"""The rows of a study on disk: a small Parquet file for each task, whole or not there.
 
 A file is written beside its place and moved there, so a killed process leaves no half of one, and
 it carries the key of its first row as its name, so no row is there twice.

@@ -1,4 +1,4 @@
-"""A study as it is written: the task, its factors, what is kept and what is drawn."""
+"""A study as its file says: the task, its factors, the columns that are kept, the figures."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Study:
 
     Attributes:
         name: of the study, also of its folder.
-        about: what it asks.
+        about: its question, in a sentence.
         task: what a row does.
         grid: factors with their values.
         spreads: factors that are drawn.

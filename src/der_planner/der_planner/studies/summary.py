@@ -1,4 +1,4 @@
-"""The end of a study: the table of all rows, the figures and a page of what came out."""
+"""The end of a study: the table of all rows, the figures, and a page with both."""
 
 from __future__ import annotations
 

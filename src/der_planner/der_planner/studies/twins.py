@@ -1,4 +1,4 @@
-"""Calibrated twins: each computed once a machine, whatever asks for it and however often."""
+"""Calibrated twins: each is computed once on a machine and then read from its cache."""
 
 from __future__ import annotations
 

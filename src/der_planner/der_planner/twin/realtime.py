@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 
 BACKLOG = 0.25
-"""Longest time that is caught up [s]; what is older is dropped and counted."""
+"""Longest delay that is caught up [s]; time beyond it is dropped and counted."""
 TICKS_PER_PERIOD = 4
 
 

@@ -1,6 +1,6 @@
 """Our own protocol for new firmware: binary frames with a checksum and a watchdog on the board.
 
-The specification, for authors of firmware and with test vectors, is a page of the package's README.
+The specification, for authors of firmware and with test vectors, is doc/native_protocol.md.
 """
 
 from __future__ import annotations

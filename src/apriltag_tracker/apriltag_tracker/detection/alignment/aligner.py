@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apriltag_tracker.camera.lens import local_bend
+from apriltag_tracker.camera.lens import COEFFICIENTS, local_bend
 from apriltag_tracker.detection.alignment import fit
-from apriltag_tracker.detection.alignment.pattern import Pattern, tabulate
+from apriltag_tracker.detection.alignment.pattern import Pattern, framed
 from apriltag_tracker.detection.alignment.sampling import side_length
 from apriltag_tracker.detection.alignment.smear import guess_smear
 from apriltag_tracker.family import TAG36H11, Family
@@ -19,21 +18,11 @@ from apriltag_tracker.family import TAG36H11, Family
 USUAL_BLUR = 0.65
 """Of a sharp picture, lens and pixel together: where the first fit starts [px]."""
 
-_STEP = 1.09
-"""Tables exist for blurs in steps of this ratio; a fit is linear in between."""
-
-_TABLES = 96
-_POINTS = 1.7
-"""Points of the table in one standard deviation of the blur."""
-
 _SMEARED = 0.12
 """Correlation of neighbouring residuals from which a smear is looked for."""
 
 _SHORTEST = 0.9
 """A shorter smear cannot be told from blur, and is counted as such [px]."""
-
-_PASSES = 9
-
 
 Lens = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Camera matrix (3, 3) [px] and distortion (8,)."""
@@ -47,7 +36,7 @@ class Alignment:
         corners: (4, 2) px.
         covariance: (8, 8) px² of the corners x0 y0 x1 ….
         blur: standard deviation of lens and pixel together [px].
-        smear: (2,) px, the way during the exposure; its sign is not known.
+        smear: x and y of the way during the exposure [px]; its sign is not known.
         explained: share of the pixels' variance that the pattern explains, covered ones and all.
         kept: share of the weight that was kept: less than 1 where something covers the tag.
         residual: RMS of the pixels that fit [grey levels].
@@ -58,7 +47,7 @@ class Alignment:
     corners: NDArray[np.float64]
     covariance: NDArray[np.float64]
     blur: float
-    smear: NDArray[np.float64]
+    smear: tuple[float, float]
     explained: float
     kept: float
     residual: float
@@ -82,9 +71,9 @@ class Aligner:
 
     def __init__(self, family: Family = TAG36H11, lens: Lens | None = None) -> None:
         self._family = family
-        self._lens = lens
+        self._lens = lens or (np.eye(3), np.zeros(COEFFICIENTS))
         self._border = float(family.border_cells)
-        self._tables: OrderedDict[tuple[int, int], Pattern] = OrderedDict()
+        self._patterns: dict[int, Pattern] = {}
 
     def align(
         self,
@@ -157,8 +146,7 @@ class Aligner:
         return self._fit(image, tag, corners, blur, known)
 
     def _smeared(self, image: NDArray[np.uint8], tag: int, plain: Alignment) -> Alignment | None:
-        cell = side_length(plain.corners) / self._border
-        pattern, bend = self._table(tag, plain.blur / cell), self._bend(plain.corners)
+        pattern, bend = self._pattern(tag), local_bend(plain.corners, *self._lens)
         guess = np.zeros(2)
         blur = guess_smear(image, pattern, plain.corners, bend, plain.blur, guess)
         if math.hypot(*guess) < _SHORTEST:
@@ -196,62 +184,29 @@ class Aligner:
         """Fit with or without smear and turn."""
         result = np.zeros(fit.RESULT_VALUES)
         placed, covariance = np.empty((4, 2)), np.empty((8, 8))
-        start = np.ascontiguousarray(corners)
-        cell, bend = side_length(corners) / self._border, self._bend(start)
         result[0] = blur
         if smear is not None:
             result[1:3], result[8] = smear, turn
-        for attempt in range(3):
-            pattern, free = self._table(tag, result[0] / cell), smear is not None
-            settled = fit.align(
-                image, pattern, start, bend, free, _PASSES, placed, covariance, result
-            )
-            if not settled and attempt > 0:
-                return None
-            if not np.all(np.isfinite(placed)):
-                return None
-            if settled and abs(math.log(result[0] / (cell * pattern.blur))) < math.log(_STEP):
-                break
-            start = placed.copy() if settled else start
-        if not settled or not np.all(np.isfinite(covariance)):
-            return None
-        # Of an arc by an angle a, the mean is nearer to its middle by a² / 24 than the tangent is:
-        # through the arc a pixel sees more of the tag's middle, so that the tag looks larger.
-        middle = placed.mean(axis=0)
-        placed = middle + (placed - middle) * (1.0 - result[8] ** 2 / 24.0)
-        return Alignment(
+        matrix, distortion = self._lens
+        if not fit.place(
+            image,
+            self._pattern(tag),
+            np.ascontiguousarray(corners),
+            matrix,
+            distortion,
+            smear is not None,
             placed,
             covariance,
-            float(result[0]),
-            result[1:3].copy(),
-            float(result[3]),
-            float(result[5]),
-            float(result[4]),
-            float(result[6]),
-            float(result[7]),
+            result,
+        ):
+            return None
+        width, by_x, by_y, explained, residual, kept, gain, alike, _ = result.tolist()
+        return Alignment(
+            placed, covariance, width, (by_x, by_y), explained, kept, residual, gain, alike
         )
 
-    def _bend(self, corners: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how the lens bends lines at a tag, (6,) 1/px."""
-        if self._lens is None:
-            return np.zeros(6)
-        bend: NDArray[np.float64] = local_bend(corners, *self._lens)
-        return bend
-
-    def _table(self, tag: int, blur: float) -> Pattern:
-        """Return the table of a tag's pattern nearest to a blur [cells]."""
-        level = round(math.log(min(max(blur, 0.04), 2.0)) / math.log(_STEP))
-        key = (tag, level)
-        if key in self._tables:
-            self._tables.move_to_end(key)
-            return self._tables[key]
-        near = _STEP**level
-        resolution = min(max(round(_POINTS / near), 5), 16)
-        cells = self._family.seen_cells(tag)
-        entry = Pattern(
-            tabulate(cells, resolution, near), near, self._border, float(self._family.rim)
-        )
-        self._tables[key] = entry
-        if len(self._tables) > _TABLES:
-            self._tables.popitem(last=False)
-        return entry
+    def _pattern(self, tag: int) -> Pattern:
+        if tag not in self._patterns:
+            cells = framed(self._family.seen_cells(tag))
+            self._patterns[tag] = Pattern(cells, self._border, float(self._family.rim))
+        return self._patterns[tag]

@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from apriltag_tracker.camera.lens import local_bend
 from apriltag_tracker.detection.alignment.pattern import Pattern
 from apriltag_tracker.detection.alignment.sampling import (
     RUN,
@@ -63,6 +64,13 @@ _MODEL_ERROR = 0.003
 _WIDE, _WIDE_ERROR = 0.8, 0.02
 """Beyond this blur [px], what the model leaves out grows by so much a pixel of blur: lenses out of
 focus are no Gaussians, and what lies beyond the sheet's edge is blurred into the sheet."""
+
+_PASSES = 9
+"""Steps of one fit at most."""
+
+_OTHER_BLUR = math.log(1.09)
+"""A fit whose blur comes out further from where it began, as a ratio, is made again from there: by
+the blur it is decided how near to the edge of the rim a pixel still shows the tag alone."""
 
 _CAREFUL = 4
 """Steps after which weights change by half only, so that they cannot go to and fro for ever."""
@@ -277,13 +285,12 @@ def _take(
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def align(
+def _align(
     image: NDArray[np.uint8],
     pattern: Pattern,
     start: NDArray[np.float64],
     bend: NDArray[np.float64],
     free_smear: bool,
-    passes: int,
     corners: NDArray[np.float64],
     covariance: NDArray[np.float64],
     result: NDArray[np.float64],
@@ -292,12 +299,11 @@ def align(
 
     Args:
         image: grey image.
-        pattern: of the tag; the blur of the fit may differ by a few percent from that of its table.
+        pattern: of the tag.
         start: (4, 2) px, corners to start from, from the printed lower left counter-clockwise.
         bend: (6,) of `lens.local_bend` at the tag.
         free_smear: whether smear and turn are fitted; they cannot both start from zero, where the
             directions of a smear are alike.
-        passes: at most so many steps of Gauss-Newton.
         corners: (4, 2) px, output.
         covariance: (8, 8) px² of the corners x0 y0 x1 …, output.
         result: (9,) output, see `RESULT_VALUES`; blur, smear and turn in it say where to start.
@@ -317,7 +323,7 @@ def align(
     pixels = new_pixels(room)
     normal, right = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS)
     moved, count = 0.0, 0
-    for step in range(passes):
+    for step in range(_PASSES):
         count = _take(view, h, state, pixels, count, step, result)
         if count == 0:
             return False
@@ -337,3 +343,50 @@ def align(
     bend_back(bend, corners)
     corners += centre
     return moved < 0.1
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def place(
+    image: NDArray[np.uint8],
+    pattern: Pattern,
+    corners: NDArray[np.float64],
+    matrix: NDArray[np.float64],
+    distortion: NDArray[np.float64],
+    free_smear: bool,
+    placed: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    result: NDArray[np.float64],
+) -> bool:
+    """Fit one tag, once more where the blur came out to be another one.
+
+    Args:
+        image: grey image.
+        pattern: of the tag.
+        corners: (4, 2) px, to start from, from the printed lower left counter-clockwise.
+        matrix: (3, 3) of the camera [px].
+        distortion: (8,) of its lens.
+        free_smear: whether smear and turn are fitted; they cannot both start from zero.
+        placed: (4, 2) px, output.
+        covariance: (8, 8) px² of the corners x0 y0 x1 …, output.
+        result: (9,) output, see `RESULT_VALUES`; blur, smear and turn in it say where to start.
+
+    Returns:
+        Whether the fit settled.
+    """
+    bend, start = local_bend(corners, matrix, distortion), corners.copy()
+    settled = False
+    for attempt in range(3):
+        begun = result[0]
+        settled = _align(image, pattern, start, bend, free_smear, placed, covariance, result)
+        if (not settled and attempt > 0) or not np.all(np.isfinite(placed)):
+            return False
+        if settled and abs(math.log(result[0] / begun)) < _OTHER_BLUR:
+            break
+        if settled:
+            start[:] = placed
+    # Of an arc by an angle a, the mean is nearer to its middle by a² / 24 than the tangent is:
+    # through the arc a pixel sees more of the tag's middle, so that the tag looks larger.
+    for axis in range(2):
+        middle = placed[:, axis].mean()
+        placed[:, axis] = middle + (placed[:, axis] - middle) * (1.0 - result[8] ** 2 / 24.0)
+    return settled and bool(np.all(np.isfinite(covariance)))

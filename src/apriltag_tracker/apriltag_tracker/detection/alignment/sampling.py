@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from apriltag_tracker.detection.alignment.pattern import Pattern
+from apriltag_tracker.detection.alignment.pattern import EDGE_VALUES, Pattern, look_at
 
 UNKNOWNS = 16
 """Homography (8), blur [px], smear x, y [px], turn during the exposure [rad], and what is linear:
@@ -175,15 +175,17 @@ def _bounds(h: NDArray[np.float64], rim: float) -> tuple[float, float, float, fl
     return low_x, high_x, low_y, high_y
 
 
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
-def _look_up(
-    table: NDArray[np.float32],
-    resolution: int,
+@njit(cache=True, fastmath=True, error_model="numpy", forceinline=True)  # type: ignore[untyped-decorator]
+def _average(
+    cells: NDArray[np.float64],
+    blur: float,
     c: float,
     r: float,
     dc: float,
     dr: float,
     instants: int,
+    across: NDArray[np.float64],
+    down: NDArray[np.float64],
 ) -> tuple[float, float, float, float, float, float]:
     """Average the pattern over the way of a pixel through it, (dc, dr) cells about (c, r).
 
@@ -191,24 +193,13 @@ def _look_up(
         Value, derivatives by column, row and blur, means of the first two times the instant.
     """
     value, by_c, by_r, by_blur, along_c, along_r = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    one = np.uintp(1)
     for k in range(instants):
         t = (k + 0.5) / instants - 0.5
-        at_c, at_r = (c + t * dc) * resolution, (r + t * dr) * resolution
-        i, j = np.uintp(at_r), np.uintp(at_c)
-        a, b = at_c - j, at_r - i
-        w00, w01 = (1.0 - b) * (1.0 - a), (1.0 - b) * a
-        w10, w11 = b * (1.0 - a), b * a
-        value += w00 * table[i, j, 0] + w01 * table[i, j + one, 0]
-        value += w10 * table[i + one, j, 0] + w11 * table[i + one, j + one, 0]
-        g = w00 * table[i, j, 1] + w01 * table[i, j + one, 1]
-        g += w10 * table[i + one, j, 1] + w11 * table[i + one, j + one, 1]
-        f = w00 * table[i, j, 2] + w01 * table[i, j + one, 2]
-        f += w10 * table[i + one, j, 2] + w11 * table[i + one, j + one, 2]
-        by_blur += w00 * table[i, j, 3] + w01 * table[i, j + one, 3]
-        by_blur += w10 * table[i + one, j, 3] + w11 * table[i + one, j + one, 3]
+        seen, g, f, wider = look_at(cells, blur, c + t * dc, r + t * dr, across, down)
+        value += seen
         by_c += g
         by_r += f
+        by_blur += wider
         along_c += t * g
         along_r += t * f
     share = 1.0 / instants
@@ -235,7 +226,7 @@ def _pixels_of(view: View, h: NDArray[np.float64]) -> tuple[int, int, int, int]:
     )
 
 
-@njit(cache=True, fastmath=True, inline="always")  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True, error_model="numpy", inline="always")  # type: ignore[untyped-decorator]
 def _write_homography(
     rows: NDArray[np.float64],
     i: int,
@@ -252,7 +243,7 @@ def _write_homography(
     rows[6, i], rows[7, i] = along * u * w, along * v * w
 
 
-@njit(cache=True, fastmath=True, inline="always")  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True, error_model="numpy", inline="always")  # type: ignore[untyped-decorator]
 def _square_at(
     back: NDArray[np.float64], x: float, y: float, border: float
 ) -> tuple[float, float, float, float, float, float]:
@@ -271,7 +262,7 @@ def _square_at(
     )
 
 
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def sample_model(
     view: View, h: NDArray[np.float64], state: NDArray[np.float64], pixels: Pixels
 ) -> int:
@@ -286,12 +277,12 @@ def sample_model(
     Returns:
         How many pixels there are.
     """
-    table, centre, cell, rows = view.pattern.table, view.centre, view.cell, pixels.rows
+    cells, centre, cell, rows = view.pattern.cells, view.centre, view.cell, pixels.rows
     border, rim = view.pattern.border, view.pattern.rim
-    whole = border + 2.0 * rim
-    resolution = (table.shape[0] - 1) // int(whole)
+    whole, blur = border + 2.0 * rim, state[0] / cell
+    smeared = state[1] != 0.0 or state[2] != 0.0 or state[3] != 0.0
     back = inverse(h)
-    change = state[0] / cell - view.pattern.blur
+    across, down_edges = np.empty((2, cells.shape[0], EDGE_VALUES))
     first_row, last_row, first, last = _pixels_of(view, h)
     count = 0
     for row in range(first_row, last_row + 1):
@@ -303,19 +294,20 @@ def sample_model(
                     return count
                 x, y = straightened(view.bend, column - centre[0], down)
                 u, v, ux, uy, vx, vy = _square_at(back, x, y, border)
-                # In the table columns run to the right and rows down, from the rim's corner.
+                # Columns of cells run to the right and rows down, from the rim's corner; the
+                # pattern has one more cell around it.
                 c, r = u * border + rim, (1.0 - v) * border + rim
                 smear_x, smear_y = state[1] - state[3] * y, state[2] + state[3] * x
                 dc, dr = ux * smear_x + uy * smear_y, -(vx * smear_x + vy * smear_y)
                 edge_c, edge_r = 0.5 * abs(dc) + view.reach, 0.5 * abs(dr) + view.reach
                 if c < edge_c or c > whole - edge_c or r < edge_r or r > whole - edge_r:
                     continue
-                travel = math.hypot(smear_x, smear_y)
-                instants = 1 if travel < 1e-9 else int(travel / _SPACING) + 3
-                value, by_c, by_r, by_blur, along_c, along_r = _look_up(
-                    table, resolution, c, r, dc, dr, instants
+                instants = 1
+                if smeared:
+                    instants = int(math.sqrt(smear_x**2 + smear_y**2) / _SPACING) + 3
+                value, by_c, by_r, by_blur, along_c, along_r = _average(
+                    cells, blur, c + 1.0, r + 1.0, dc, dr, instants, across, down_edges
                 )
-                value += by_blur * change
                 # Derivatives by the pixel.
                 gx, gy = by_c * ux - by_r * vx, by_c * uy - by_r * vy
                 w = 1.0 / (h[6] * u + h[7] * v + 1.0)

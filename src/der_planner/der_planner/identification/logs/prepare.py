@@ -1,4 +1,4 @@
-"""From a log as recorded to rows that a fit can use, and what is wrong with them."""
+"""From a log as recorded to checked rows on a regular grid that a fit can use."""
 
 from __future__ import annotations
 

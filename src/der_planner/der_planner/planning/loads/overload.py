@@ -1,4 +1,4 @@
-"""Whether pressure can hold a loaded limb along a motion, and how much it could carry."""
+"""Whether a loaded limb stays at the poses of a motion, and whether pressure can hold it there."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.limb import Limb
-from der_planner.planning.errors import OverloadError, PlanningError
+from der_planner.limb import PAYLOAD, Limb
+from der_planner.planning.errors import BucklingError, OverloadError, PlanningError
 from der_planner.rod import ConvergenceError
 
 Array = NDArray[np.float64]
 
 _HALVINGS = 8
-_PAYLOAD = "payload"
 
 
 def check_load(
@@ -39,7 +38,7 @@ def check_load(
     k, segment = np.unravel_index(int(np.abs(pressure).argmax()), pressure.shape)
     carried, possible = 0.0, None
     if limb.masses:
-        named = [mass.mass for mass in limb.masses if mass.name == _PAYLOAD]
+        named = [mass.mass for mass in limb.masses if mass.name == PAYLOAD]
         carried = sum(named) if named else sum(mass.mass for mass in limb.masses)
         share = _possible_share(limb, needed)
         possible = None if share is None else share * carried
@@ -49,8 +48,30 @@ def check_load(
     )  # fmt: skip
 
 
+def check_stays(stiffness: Array, time: Array, tip: Array, what: str) -> None:
+    """Refuse a motion with a pose from which the limb would snap through.
+
+    Args:
+        stiffness: (K,) smallest eigenvalue of the static stiffness at each pose.
+        time: (K,) [s].
+        tip: (K, 2) of the poses [m].
+        what: "limb" or "arcs", for the message.
+
+    Raises:
+        BucklingError: names the first such pose.
+    """
+    falls = stiffness <= 0
+    if falls.any():
+        k = int(np.argmax(falls))
+        raise BucklingError(
+            f"the {what} would snap through under the load at t = {time[k]:.2f} s, tip at "
+            f"({tip[k, 0]:.4f}, {tip[k, 1]:.4f}) m. Shrink or move the motion, or mount the limb "
+            "otherwise"
+        )
+
+
 def _possible_share(limb: Limb, needed: Callable[[Limb], Array]) -> float | None:
-    """Return the share of what it carries that the limb can hold; None: it cannot hold itself."""
+    """Return the share of its masses that the limb can hold; None: not even its own weight."""
 
     def holds(share: float) -> bool:
         try:
@@ -70,11 +91,9 @@ def _possible_share(limb: Limb, needed: Callable[[Limb], Array]) -> float | None
 
 def _with_share(limb: Limb, share: float) -> Limb:
     """Return the limb with a share of its payload; without a payload: of all that it carries."""
-    every = all(mass.name != _PAYLOAD for mass in limb.masses)
+    every = all(mass.name != PAYLOAD for mass in limb.masses)
     masses = tuple(
-        dataclasses.replace(mass, mass=share * mass.mass)
-        if every or mass.name == _PAYLOAD
-        else mass
+        dataclasses.replace(mass, mass=share * mass.mass) if every or mass.name == PAYLOAD else mass
         for mass in limb.masses
     )
     return dataclasses.replace(limb, masses=masses)

@@ -31,7 +31,7 @@ from der_planner.planning.errors import (
     PlanningError,
     UnreachableError,
 )
-from der_planner.planning.loads.overload import check_load
+from der_planner.planning.loads.overload import check_load, check_stays
 from der_planner.planning.loads.rest import stable_rest
 from der_planner.planning.motions import Reference
 from der_planner.planning.ways import Start, resting_spline, sample_spline
@@ -188,7 +188,7 @@ def posed_motion(model: RodModel, reference: Reference, nodes: int) -> PosedMoti
 
 
 def _unreached(limb: Limb, time: Array, tip: Array, poses: Poses) -> UnreachableError | None:
-    """Return what says that poses miss their points (K, 2) [m]; None: they are there."""
+    """Return the error of poses that miss their points (K, 2) [m]; None where none does."""
     missed = poses.misses > _TOLERANCE * limb.length
     if not missed.any() or limb.segment_count == 1:
         return None
@@ -217,14 +217,7 @@ def _poses(model: RodModel, time: Array, tip: Array, guess: Array) -> Poses:
             f"{tip[error.step, 1]:.4f}) m at t = {time[error.step]:.2f} s: it would buckle or snap "
             "through under its load. Shrink or move the motion, or mount the limb otherwise"
         ) from error
-    falls = poses.firmness <= 0
-    if falls.any():
-        k = int(np.argmax(falls))
-        raise BucklingError(
-            f"the limb does not stay at its pose of t = {time[k]:.2f} s, tip at ({tip[k, 0]:.4f}, "
-            f"{tip[k, 1]:.4f}) m: it would snap through under its load. Shrink or move the motion, "
-            "or mount the limb otherwise"
-        )
+    check_stays(poses.smallest_stiffness, time, tip, "limb")
     return poses
 
 

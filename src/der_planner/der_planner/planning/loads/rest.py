@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 _STRAIGHT = 1e-3
 """A limb that rests within this bend [rad] of straight starts there."""
 NEAR = 1.1
-"""A standing limb that would buckle under so many times its load is near that [-]."""
+"""A standing limb that would buckle under less than this multiple of its load is near that [-]."""
 _APART = 1e-3
 """Two resting shapes that are this far apart are two [m]."""
 
@@ -75,7 +75,7 @@ def stable_rest(model: RodModel) -> RodState:
         state = model.rest
     except ConvergenceError as error:
         raise BucklingError(_said(model.limb, "finds no rest under its loads")) from error
-    if rod.firmness(state, vented) <= 0:
+    if rod.smallest_stiffness(state, vented) <= 0:
         raise BucklingError(_said(model.limb, "does not stay upright under its loads"))
     if model.limb.gravity[0] < 0 and _has_a_mirror_image(rod, state):
         raise BucklingError(_said(model.limb, "may fall to either side under its loads"))
@@ -91,7 +91,7 @@ def _has_a_mirror_image(rod: Rod, state: RodState) -> bool:
     except ConvergenceError:
         return False
     apart = np.abs(other.positions - state.positions).max() > _APART
-    return bool(apart) and rod.firmness(other, np.zeros(rod.segment_count)) > 0
+    return bool(apart) and rod.smallest_stiffness(other, np.zeros(rod.segment_count)) > 0
 
 
 def _said(limb: Limb, what: str) -> str:
@@ -116,8 +116,9 @@ def nearly_buckling(limb: Limb) -> str:
         return ""
     return (
         f"the limb stands under {100 / (NEAR * share):.0f} % of the load under which it would "
-        "buckle if it were straight: a few per cent less stiffness or more mass move its tip by "
-        "centimetres. Make it stiffer or lighter, or mount it otherwise"
+        "buckle if it were straight: there a few per cent of stiffness or mass, and friction, move "
+        "its tip by centimetres, which neither rod nor arcs predict. Hang it, or make it stiffer "
+        "or lighter"
     )
 
 
@@ -131,7 +132,7 @@ def critical_share(limb: Limb) -> float:
         gravity = (share * limb.gravity[0], 0.0, 0.0)
         rod = Rod.from_limb(dataclasses.replace(along, gravity=gravity))
         vented = np.zeros(limb.segment_count)
-        if rod.firmness(rod.equilibrium(vented), vented) > 0:
+        if rod.smallest_stiffness(rod.equilibrium(vented), vented) > 0:
             low = share
         else:
             high = share

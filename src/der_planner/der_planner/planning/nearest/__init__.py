@@ -1,4 +1,4 @@
-"""The nearest path that a limb can follow, for a path that leaves what it reaches."""
+"""The nearest path that a limb can follow, for a drawn path that leaves its reach."""
 
 from der_planner.planning.nearest.path import Deviation, NearestPath, line, nearest_path
 

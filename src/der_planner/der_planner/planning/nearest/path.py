@@ -1,4 +1,4 @@
-"""The nearest path that a limb can follow, for a path that leaves what it reaches.
+"""The nearest path that a limb can follow, for a drawn path that leaves its reach.
 
 Two segments reach a thin crescent: most lines that a hand draws leave it. Instead of points, bend
 angles are sought: any smooth course of them within the pressure limit is one that the limb follows.
@@ -180,7 +180,7 @@ def line(tip: Array) -> TipPath:
 
 
 def _sampled(path: TipPath, samples: int) -> tuple[Array, Array]:
-    """Return evenly spaced instants (K,) and what is drawn around each of them (K, A, 2)."""
+    """Return evenly spaced instants (K,) and the drawn points around each of them (K, A, 2)."""
     time = np.linspace(0.0, path.duration, samples)
     each = int(np.clip(math.ceil(len(path.time) / samples), 1, _MOST_AVERAGED))
     offsets = ((np.arange(each) + 0.5) / each - 0.5) * time[1]
@@ -365,7 +365,7 @@ def _free_step(band: Array, slope: Array, held: NDArray[np.bool_], damping: floa
 
 
 def _deviation(drawn: Array, tip: Array, when: Array, slowed: float) -> Deviation:
-    """Compare (K, 2) tips with what is drawn, both evenly spaced along the drawn path."""
+    """Compare tips (K, 2) with the drawn path, both evenly spaced along it."""
     distance = np.linalg.norm(drawn - tip, axis=-1)
     farthest = int(distance.argmax())
     away = distance >= NOTABLE

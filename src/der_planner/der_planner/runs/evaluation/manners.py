@@ -79,7 +79,7 @@ def manners_table(results: Sequence[RunResult]) -> str:
 def plot_latency(
     results: Sequence[RunResult], folder: Path, formats: tuple[str, ...] = ("png", "pdf")
 ) -> list[Path]:
-    """Draw how long after a picture the board first heard of it; nothing where nobody knows.
+    """Draw the time from a picture to the first setpoint corrected by it, where it is known.
 
     Args:
         results: of an experiment; all runs with feedback are counted together.

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.driver import PERIOD
-from benchmarks.page_rig import BrowserError, Rig, report, running
+from benchmarks.page.rig import BrowserError, Rig, report, running
 from der_msgs.msg import ChamberPressures, MotionCommand, PressureSetpoint, PressureState
 from limb_interfaces import qos, topics
 from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds

@@ -1,7 +1,8 @@
-"""Limbs that are drawn, and a drawn limb as a plant: its rod beside its own air, tick by tick."""
+"""Limbs with numbers drawn at random, and such a limb simulated tick by tick: rod and air."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +19,25 @@ _TICK = 1.0 / 60.0
 """Commands at 20 Hz and pictures at 30 Hz come at multiples of it [s]."""
 
 
+def drawn_friction(
+    draw: Callable[[float, float], float], stiffness: float, length: float
+) -> dict[str, float]:
+    """Return fields of a `Segment` for unequal chambers and for friction.
+
+    Friction saturates at 2 to 12 % of the elastic moment at a bend of 0.5 rad.
+
+    Args:
+        draw: gives a number between two others.
+        stiffness: EI of the segment [N·m²].
+        length: of the segment [m].
+    """
+    return {
+        "gain_asymmetry": draw(-0.08, 0.08),
+        "friction_moment": draw(0.02, 0.12) * 0.5 * stiffness / length,
+        "friction_curvature": draw(0.05, 0.25) / length,
+    }
+
+
 def drawn(limb: Limb, generator: np.random.Generator) -> Limb:
     """Return a limb of other numbers than a given one, as one that was never calibrated."""
     draw = generator.uniform
@@ -28,9 +48,7 @@ def drawn(limb: Limb, generator: np.random.Generator) -> Limb:
         return replace(
             day,
             bending_stiffness=stiffness,
-            gain_asymmetry=draw(-0.08, 0.08),
-            friction_moment=draw(0.02, 0.12) * 0.5 * stiffness / known.length,
-            friction_curvature=draw(0.05, 0.25) / known.length,
+            **drawn_friction(draw, stiffness, known.length),
         )
 
     air_of = replace(

@@ -22,8 +22,8 @@ from apriltag_tracker.family import TAG36H11, Family
 from apriltag_tracker.pipeline import LimbTracker
 from apriltag_tracker.synthetic.camera import CameraModel, Optics, Shape, SyntheticCamera
 from apriltag_tracker.tag_map import TagMap
-from benchmarks.tracker_pictures import CONFIG, PERIOD, swing
-from benchmarks.tracker_renderer import Scene, render
+from benchmarks.tracker.pictures import CONFIG, PERIOD, swing
+from benchmarks.tracker.renderer import Scene, render
 
 SCENES = (
     Scene("sharp"),

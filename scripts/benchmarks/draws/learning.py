@@ -14,7 +14,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.drawn_limb import drawn
+from benchmarks.draws.limb import drawn
 from der_planner.control import Learner
 from der_planner.limb import Limb
 from der_planner.model.response import simulate

@@ -1,6 +1,6 @@
 """Does feedback do harm? Drawn limbs, each with a file of small errors and with none of its own.
 
-A limb differs from the default one by the spreads from day to day (`benchmarks.drawn_limb`); its
+A limb differs from the default one by the spreads from day to day (`benchmarks.draws.limb`); its
 outlets are slow and it rubs and creeps. It plays one of the three joint motions at 20 s and at 6 s,
 planned with a file as a calibration would leave it (`calibrated`) and with the default limb's file
 (`default`), in open loop and with feedback. The camera's noise (half to twice the lock-step's), its
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.drawn_limb import DrawnLimb, drawn, nearly, with_slow_air
+from benchmarks.draws.limb import DrawnLimb, drawn, nearly, with_slow_air
 from der_planner.control.feedback import Feedback
 from der_planner.control.lockstep import Sensors, play
 from der_planner.limb import Limb

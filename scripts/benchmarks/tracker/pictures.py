@@ -14,7 +14,7 @@ from apriltag_tracker.synthetic.camera import CameraModel, Frame, Optics, Shape,
 from apriltag_tracker.synthetic.shapes import constant_curvature
 from apriltag_tracker.tag_map import LimbTag, TagMap, WorldTag
 
-CONFIG = Path(__file__).resolve().parents[2] / "src" / "apriltag_tracker" / "config"
+CONFIG = Path(__file__).resolve().parents[3] / "src" / "apriltag_tracker" / "config"
 _SIZE = 0.02
 _HEIGHT = 0.5
 PERIOD = 1.0 / 30.0

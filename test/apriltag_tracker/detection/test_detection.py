@@ -11,7 +11,7 @@ from apriltag_tracker.detection import quads as detection
 from apriltag_tracker.synthetic.camera import CameraModel, Optics, SyntheticCamera
 from apriltag_tracker.synthetic.shapes import constant_curvature
 from apriltag_tracker.tag_map import LimbTag, TagMap, WorldTag
-from benchmarks.tracker_renderer import Scene, render
+from benchmarks.tracker.renderer import Scene, render
 
 pytestmark = pytest.mark.slow
 

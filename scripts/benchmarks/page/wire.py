@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from benchmarks.driver import Seen, evaluate, play_plan
-from benchmarks.page_rig import BrowserError, report, running
+from benchmarks.page.rig import BrowserError, report, running
 
 SETTINGS = {
     "without_page": "without the page",

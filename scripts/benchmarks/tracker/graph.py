@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import array
+import itertools
 import os
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
+from sensor_msgs.msg import CameraInfo, Image
 
+from benchmarks.tracker.pictures import PERIOD, swinging_limb
 from der_msgs.msg import ChamberPressures, LimbState
 from der_planner.experiment.client import GraphClient
 from der_planner.experiment.processes import NodeProcess
@@ -17,6 +21,9 @@ from limb_interfaces.stamps import nanoseconds
 
 _PERIODS = (3.0, 3.0)
 """Of the two segments' pressures [s]."""
+
+_CYCLE = 360
+"""Pictures after which `swinging_limb` is where it began."""
 
 
 def measure_graph(seconds: float) -> dict[str, float]:
@@ -99,3 +106,69 @@ def _press(client: GraphClient) -> None:
         publisher.publish(message)
 
     client.node.create_timer(0.02, publish)
+
+
+def measure_ready_pictures(seconds: float) -> dict[str, float]:
+    """Send rendered pictures of a swinging limb to the tracker's node, stamped as they are sent.
+
+    What is left of the latency is the way to the tracker and its own time: what a camera sees whose
+    stamp is the moment at which its picture is ready.
+    """
+    tags, model, pictures, _ = swinging_limb(_CYCLE, 1.0)
+    lens = model.intrinsics
+    latency: list[float] = []
+    messages = [
+        Image(
+            height=lens.height,
+            width=lens.width,
+            encoding="mono8",
+            step=lens.width,
+            data=array.array("B", frame.image.tobytes()),
+        )
+        for frame in pictures
+    ]
+    info = CameraInfo(
+        height=lens.height,
+        width=lens.width,
+        distortion_model="plumb_bob",
+        d=lens.distortion[:5].tolist(),
+        k=lens.matrix.ravel().tolist(),
+    )
+    with tempfile.TemporaryDirectory() as folder, GraphClient("tracker_benchmark", 97) as client:
+        environment = {**os.environ, "ROS_DOMAIN_ID": "97"}
+        name = "apriltag_tracker"
+        node = NodeProcess(name, name, {}, Path(folder), None, environment, name)
+        try:
+            client.watch([node])
+            client.subscribe(
+                LimbState,
+                topics.LIMB_STATE,
+                qos.STATES,
+                lambda state: latency.append(state.latency) if state.valid else None,
+            )
+            client.node.create_publisher(CameraInfo, topics.CAMERA_INFO, qos.LATCHED).publish(info)
+            images = client.node.create_publisher(Image, topics.IMAGE, qos.SENSOR_DATA)
+            following = itertools.cycle(messages)
+
+            def publish() -> None:
+                message = next(following)
+                message.header.stamp = client.node.get_clock().now().to_msg()
+                images.publish(message)
+
+            client.node.create_timer(PERIOD, publish)
+            client.wait_for(lambda: len(latency) > 60, 60.0, "the tracker")
+            latency.clear()
+            client.spin(seconds)
+        finally:
+            node.stop()
+    result = {
+        "ready_pictures_states_per_s": len(latency) / seconds,
+        "ready_pictures_latency_median_ms": 1e3 * float(np.median(latency)),
+        "ready_pictures_latency_p99_ms": 1e3 * float(np.percentile(latency, 99)),
+    }
+    print(
+        f"\nReady pictures of {len(tags.ids)} tags to the tracker's node, stamped as they are sent"
+    )
+    for key, value in result.items():
+        print(f"  {key:42s} {value:9.3f}")
+    return result

@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 
-from benchmarks.page_rig import BrowserError, Rig, report, running
+from benchmarks.page.rig import BrowserError, Rig, report, running
 from der_msgs.msg import MotionCommand, PressureState
 from limb_interfaces import qos, topics
 

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks import rows as kept
+from benchmarks.draws.limb import drawn_friction
 from der_planner.identification import CalibrationLog, LogError, calibration_run, fit, record_twin
 from der_planner.identification.offline import (
     AMPLITUDE,
@@ -57,7 +58,12 @@ RECORD_NODES = 31
 
 @dataclass(frozen=True)
 class Truth:
-    """What a limb is: of each segment (M,) EI / L [N·m/rad], gain [rad/Pa], rest angle [rad]."""
+    """The true numbers of a limb.
+
+    Attributes:
+        stiffness, gain, rest: (M,) of each segment, EI / L [N·m/rad], [rad/Pa] and [rad].
+        mass, length: of the whole limb from its clamp on [kg, m].
+    """
 
     stiffness: Array
     gain: Array
@@ -81,7 +87,7 @@ class Row:
         stiffness_0, stiffness_1: EI / L of each segment, found over true.
         gain_0, gain_1: bend angle per pressure, found over true.
         rest_0_deg, rest_1_deg: rest angle, found less true.
-        mass: of the prior over the true one.
+        mass: of the whole limb, in the limb file over the true one.
         length_mm: whole length, found less true.
         cpu_s: of the fit, on a shared machine.
         said: warnings, or what went wrong.
@@ -145,9 +151,7 @@ def _rod(generator: Generator, mounting: str) -> Limb:
             rest_curvature=np.deg2rad(draw(-6.0, 6.0)) / length,
             cubic_stiffness=draw(0.0, 0.05) * stiffness * length**2,
             pressure_stiffening=draw(0.0, 5e-6),
-            gain_asymmetry=draw(-0.08, 0.08),
-            friction_moment=draw(0.02, 0.12) * 0.5 * stiffness / length,
-            friction_curvature=draw(0.05, 0.25) / length,
+            **drawn_friction(draw, stiffness, length),
             creep_stiffness=draw(0.0, 0.06) * stiffness,
             creep_time=draw(5.0, 40.0),
             coupling_before=draw(-0.05, 0.05),
@@ -199,9 +203,7 @@ def _rod_log(row: Row, _: Limb) -> tuple[CalibrationLog, Truth]:
         noisy(seen.tip[:-1], TIP_NOISE),
         f"drawn rod {row.number}",
     )
-    mass = sum(s.mass_per_length * s.length for s in limb.segments)
-    mass += sum(item.mass for item in limb.masses)
-    return log, Truth(*_of_segments(limb), mass, limb.length)
+    return log, Truth(*_of_segments(limb), limb.mass, limb.length)
 
 
 def _twin_log(row: Row, prior: Limb) -> tuple[CalibrationLog, Truth]:
@@ -262,7 +264,6 @@ def calibrate(row: Row) -> Row:
         said = traceback.format_exc(limit=-1).replace("\n", " ")
         return replace(row, outcome="exception", said=said)
     stiffness, gain, rest = _of_segments(found)
-    weight = sum(s.mass_per_length * s.length for s in found.segments)
     return replace(
         row,
         outcome="fitted",
@@ -272,7 +273,7 @@ def calibrate(row: Row) -> Row:
         **{f"stiffness_{i}": float(v) for i, v in enumerate(stiffness / truth.stiffness)},
         **{f"gain_{i}": float(v) for i, v in enumerate(gain / truth.gain)},
         **{f"rest_{i}_deg": float(v) for i, v in enumerate(np.degrees(rest - truth.rest))},
-        mass=weight / truth.mass,
+        mass=found.mass / truth.mass,
         length_mm=1000.0 * (found.length - truth.length),
         cpu_s=time.process_time() - begin,
         said="; ".join(report.warnings),

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from apriltag_tracker.detection.alignment.aligner import Aligner
-from apriltag_tracker.detection.alignment.pattern import tabulate
+from apriltag_tracker.detection.alignment.pattern import EDGE_VALUES, framed, look_at
 from apriltag_tracker.family import TAG36H11
 from apriltag_tracker.synthetic.camera import Optics, SyntheticCamera
-from benchmarks.tracker_renderer import Scene, render
+from benchmarks.tracker.renderer import Scene, render
 
 
 def errors_and_nees(scene, seeds=(0, 1)):
@@ -52,16 +52,36 @@ def test_corners_and_their_covariance_are_honest(scene, limit):
         assert np.abs(smears - scene.smear).max() < 0.3
 
 
-def test_the_table_is_the_pattern_and_its_derivatives():
-    cells = TAG36H11.printed_cells(3, 1)
-    table = tabulate(cells, 10, 0.2).astype(float)
-    assert table[55, 55, 0] == pytest.approx(cells[5, 5], abs=0.03)
-    step = 0.1
-    assert np.allclose(
-        table[1:-1, 2:, 0] - table[1:-1, :-2, 0], 2 * step * table[1:-1, 1:-1, 1], atol=0.05
-    )
-    wider = tabulate(cells, 10, 0.202)[:, :, 0] - tabulate(cells, 10, 0.198)[:, :, 0]
-    assert np.allclose(wider, 0.004 * table[:, :, 3], atol=1e-4)
+def blurred_by_sampling(cells, blur, column, row):
+    """Sum the cells' shares of a Gaussian, sampled finely; the outer cells go on for ever."""
+    reach = np.linspace(-6.0 * blur, 6.0 * blur, 601)
+    weights = np.exp(-0.5 * (reach / blur) ** 2)
+    shares = []
+    for place in (row, column):
+        index = np.clip(np.floor(place + reach), 0, len(cells) - 1).astype(int)
+        shares.append(np.bincount(index, weights, len(cells)) / weights.sum())
+    return shares[0] @ cells @ shares[1]
+
+
+@pytest.mark.parametrize("blur", [0.1, 0.2, 0.7, 1.8])
+def test_the_pattern_is_blurred_cells_and_has_its_derivatives(blur):
+    cells = framed(TAG36H11.printed_cells(3, 1))
+    random = np.random.default_rng(4)
+    room = np.empty((2, len(cells), EDGE_VALUES))
+
+    def look(blur, column, row):
+        return np.array(look_at(cells, blur, column, row, *room))
+
+    for column, row in random.uniform(1.0, 11.0, (60, 2)):
+        value, by_column, by_row, by_blur = look(blur, column, row)
+        assert value == pytest.approx(blurred_by_sampling(cells, blur, column, row), abs=6e-3)
+        h = 0.02 * blur
+        for slope, ahead, behind in (
+            (by_column, look(blur, column + h, row), look(blur, column - h, row)),
+            (by_row, look(blur, column, row + h), look(blur, column, row - h)),
+            (by_blur, look(blur + h, column, row), look(blur - h, column, row)),
+        ):
+            assert slope == pytest.approx((ahead[0] - behind[0]) / (2 * h), abs=0.01 / blur)
 
 
 def test_a_pattern_of_another_tag_explains_little():
