@@ -129,7 +129,7 @@ def _play(limb: str, row: Mapping[str, Any]) -> Result:
     return {
         **_errors(planned, tip),
         "pressure_rms_error_pa": float(np.sqrt(np.mean(held**2))),
-        "limits_cut": float(len(planned.warnings) > 0),
+        "plan_warns": float(len(planned.warnings) > 0),
     }
 
 
@@ -288,7 +288,7 @@ TASKS = {
         {
             **_ERRORS,
             "pressure_rms_error_pa": "root mean square of chamber less commanded pressures",
-            "limits_cut": "1 where the plan warns: limits, slow venting, or a range that was left",
+            "plan_warns": "1 where the plan warns: of limits, slow venting, loads, a range that was left",
         },
         _run,
         calibrated=True,
