@@ -288,7 +288,7 @@ TASKS = {
         {
             **_ERRORS,
             "pressure_rms_error_pa": "root mean square of chamber less commanded pressures",
-            "plan_warns": "1 where the plan warns: of limits, slow venting, loads, a range that was left",
+            "plan_warns": "1 where the plan warns: limits, venting, loads, a range that was left",
         },
         _run,
         calibrated=True,
