@@ -41,6 +41,12 @@ REGULAR_TYPES = (
 DEPTH = 200
 IMAGE_DEPTH = 30
 
+LACKING = {
+    "missed": "messages that never arrived",
+    "unsent": "messages left out by a sender that did not keep its rate",
+}
+"""What the diagnostics say of gaps between stamps, by the counter of `StampGaps`."""
+
 
 class Recorder(Node):
     """Subscribes to whatever is published, and writes it between `start` and `stop`."""
@@ -206,7 +212,8 @@ class Recorder(Node):
             if spec.latched:
                 self._latched[name] = (sent, data)
             if spec.type_name in REGULAR_TYPES:
-                self._gaps.setdefault(name, StampGaps()).take(leading_stamp(data))
+                number = info.get("publication_sequence_number", 0)
+                self._gaps.setdefault(name, StampGaps()).take(leading_stamp(data), number)
             if self._session is not None:
                 self._session.put(spec, arrived, sent, data)
 
@@ -334,6 +341,7 @@ class Recorder(Node):
         values: dict[str, object] = {
             "topics": len(self._subscriptions_by_topic),
             "missed": "; ".join(f"{k}: {v.missed}" for k, v in self._gaps.items() if v.missed),
+            "unsent": "; ".join(f"{k}: {v.unsent}" for k, v in self._gaps.items() if v.unsent),
             "not_recorded": "; ".join(f"{k}: {v}" for k, v in self._refused.items()),
         }
         if self._session is None:
@@ -356,8 +364,9 @@ class Recorder(Node):
         if status.dropped:
             lost = f"{status.dropped} messages dropped: the disk is too slow for what is recorded"
             return Health("warning", lost, values)
-        if values["missed"]:
-            return Health("warning", f"messages that never arrived, {values['missed']}", values)
+        for key, what in LACKING.items():
+            if values[key]:
+                return Health("warning", f"{what}, {values[key]}", values)
         return Health("ok", f"{values['state']} into {status.folder}", values)
 
 
