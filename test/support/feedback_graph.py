@@ -165,6 +165,10 @@ class FeedbackGraph:
         newest = self.heard.states[-1]
         return newest.mode == PressureState.TRACKING and not newest.faults
 
+    def board_was_lost(self) -> bool:
+        """Tell whether the driver vents as it did not hear its board in time: a busy machine."""
+        return any("no telemetry" in fault for fault in self.heard.states[-1].faults)
+
     def until(self, instant: int) -> None:
         """Wait for an instant [ns]."""
         self.wait(lambda: self.now() >= instant, "an instant", 60.0)

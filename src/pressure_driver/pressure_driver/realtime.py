@@ -31,10 +31,10 @@ def prefer_thread(priority: int) -> bool:
 def prepare_process(priority: int) -> None:
     """Make this process's other threads stand in the way of a punctual one as little as they can.
 
-    All threads that there are get a lower real-time priority than the punctual one, those of ROS,
-    too: a thread that is displaced by other processes while it holds the interpreter lock keeps it
-    from everybody, and so does one that publishes, with this lock, while a displaced thread of ROS
-    holds what it waits for. Threads that it starts later have its priority from it.
+    The main thread gets a lower real-time priority than the punctual thread: a thread that is
+    displaced by other processes while it holds the interpreter lock keeps it from everybody.
+    Threads of ROS keep ordinary priority: with a real-time one, they could keep a core from the
+    program that holds a lock of the shared memory which they wait for.
 
     Args:
         priority: that the punctual thread will have, 0 for none.
@@ -42,6 +42,4 @@ def prepare_process(priority: int) -> None:
     sys.setswitchinterval(SWITCH_INTERVAL)
     gc.collect()
     gc.freeze()  # what is there at the start stays: collections are fewer and shorter
-    for thread in os.listdir("/proc/self/task") if priority > 1 else ():
-        with contextlib.suppress(OSError):  # no right to it, or the thread has ended
-            os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(priority - 1))
+    prefer_thread(max(priority - 1, 0))

@@ -79,6 +79,7 @@ def test_records_the_graph_between_start_and_stop(graph, tmp_path: Path):
     folder = tmp_path / "run"
     process = start(graph, output=str(folder), metadata='{"motion": "circle", "trial": 3}')
     talker.heard("latched", "fast")
+    talker.arrived("latched")
 
     talker.publishers["fast"].publish(talker.kind(data="before the start"))
     assert graph.client.call("recorder/start") == str(folder)

@@ -235,6 +235,7 @@ class Recorder(Node):
     # Services
 
     def _start(self) -> str:
+        self._take_what_has_arrived()
         metadata = self._run_metadata()
         output = self._parameter("output")
         folder = Path(output) if output else Path(time.strftime("bag_%Y_%m_%d-%H_%M_%S"))
