@@ -140,6 +140,11 @@ def test_sigterm_closes_and_sigkill_loses_what_was_not_flushed(graph, tmp_path: 
     talker = Talker(graph)
     talker.topic("talk")
     for name in ("term", "kill"):
+        # The recorder that has just ended is still counted for a moment.
+        talking = talker.publishers["talk"].get_subscription_count
+        graph.client.wait_for(
+            lambda talking=talking: talking() == 0, 60.0, "no recorder to be left"
+        )
         folder = tmp_path / name
         graph.client.diagnostics.clear()
         process = start(
