@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import gc
 import os
 import sys
 
@@ -40,6 +39,4 @@ def prepare_process(priority: int) -> None:
         priority: that the punctual thread will have, 0 for none.
     """
     sys.setswitchinterval(SWITCH_INTERVAL)
-    gc.collect()
-    gc.freeze()  # what is there at the start stays: collections are fewer and shorter
     prefer_thread(max(priority - 1, 0))
