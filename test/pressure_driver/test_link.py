@@ -11,20 +11,17 @@ import time
 import pytest
 
 from pressure_driver import link, ports
-from pressure_driver.core import CoreSettings, DriverCore
-from pressure_driver.emulator.board import EmulatedBoard
-from pressure_driver.emulator.faults import Faults
+from pressure_driver.core import DriverCore
+from pressure_driver.emulator.board import EmulatedBoard, Faults
 from pressure_driver.emulator.pneumatics import BoardPneumatics
 from pressure_driver.emulator.port import EmulatedPort
 from pressure_driver.emulator.runner import BoardRunner
-from pressure_driver.grid import TickGrid
 from pressure_driver.link import SerialLink
 from pressure_driver.ports import PortError, open_port
 from pressure_driver.protocols import board_protocol, host_protocol
 from pressure_driver.realtime import prefer_thread
 from pressure_driver.safety import Mode
 from pressure_driver.schedule import Setpoint, Verdict
-from pressure_driver.watch.limits import MonitorLimits
 
 PERIOD = 50_000_000
 
@@ -45,7 +42,7 @@ class Rig:
         self.board = EmulatedBoard(board_protocol(protocol), BoardPneumatics(2, 1), 1)
         self.runner = BoardRunner(self.board, self.port, on_command=self.commands.append)
         self.runner.start()
-        settings = CoreSettings(monitor=MonitorLimits(rest_time=0.15))
+        settings = CoreSettings(rest_time=0.15)
         self.core = DriverCore(host_protocol(protocol), settings)
         self.link = SerialLink(str(self.port.link), 115_200, TickGrid(PERIOD), self.core)
         self.link.start()
@@ -73,7 +70,7 @@ class Rig:
 
     @property
     def mode(self):
-        return self.core.snapshot().mode
+        return self.core.mode
 
     def pressurise(self):
         """Arm and play until a chamber is full; a machine that stalls may need several turns."""
@@ -111,7 +108,7 @@ def test_setpoints_arrive_in_order_not_before_their_stamps(rig):
         first_seen.setdefault(value, command.stamp)
     order = [first_seen[v] for v in wanted.values() if v in first_seen]
     assert order == sorted(order)
-    counters = rig.core.snapshot().counters
+    counters = rig.core.counters
     assert len(order) + counters.superseded == len(wanted) == counters.accepted
     for stamp, value in wanted.items():
         if value in first_seen:
@@ -141,7 +138,7 @@ def test_an_unplug_faults_and_the_return_vents(rig):
     rig.play(5)
     rig.have("unplug:0.5")
     wait_for(lambda: rig.mode is Mode.FAULT)
-    assert "serial link lost" in rig.core.snapshot().faults[0]
+    assert "serial link lost" in rig.core.faults[0]
     wait_for(lambda: rig.link.reconnects == 1)
     count = len(rig.commands)
     wait_for(lambda: len(rig.commands) > count + 5)
@@ -163,7 +160,7 @@ def test_a_board_that_takes_no_bytes_does_not_stop_the_ticks(tmp_path):
     """The other end is open but never read: the thread must not hang in a write."""
     master, slave = os.openpty()
     try:
-        core = DriverCore(host_protocol("ezloop"), CoreSettings())
+        core = DriverCore(host_protocol("ezloop"), Settings())
         port = SerialLink(os.ttyname(slave), 115_200, TickGrid(1_000_000), core)
         port.start()
         wait_for(lambda: port.bytes_sent > 3000)
@@ -303,7 +300,7 @@ def test_a_port_that_takes_no_bytes_is_a_fault_and_old_setpoints_are_not_sent_af
         rig.play(4)
         wait_for(lambda: rig.mode is Mode.FAULT)
         assert time.monotonic() - begin < 20.0
-        assert "does not read" in rig.core.snapshot().faults[0]
+        assert "does not read" in rig.core.faults[0]
         termios.tcflow(terminal, termios.TCOON)
     finally:
         os.close(terminal)
@@ -325,7 +322,7 @@ def test_a_vent_overtakes_what_the_board_has_not_read_yet(rig):
     rig.core.vent()
     sent = rig.link.bytes_sent
     rig.link.urge()
-    wait_for(lambda: rig.core.snapshot().mode in (Mode.VENTING, Mode.FAULT))
+    wait_for(lambda: rig.core.mode in (Mode.VENTING, Mode.FAULT))
     wait_for(lambda: rig.link.bytes_sent > sent)
     reading.set()
     wait_for(lambda: len(rig.commands) > before and differences(rig.commands)[-1] == 0.0)
@@ -345,7 +342,7 @@ def test_telemetry_that_comes_too_late_is_no_telemetry(rig):
     rig.arm()
     rig.have("delay:60")
     wait_for(lambda: rig.mode is Mode.FAULT)
-    assert "no telemetry" in rig.core.snapshot().faults[0]
+    assert "no telemetry" in rig.core.faults[0]
 
 
 def test_without_the_right_to_real_time_the_thread_runs_as_well(rig, monkeypatch):

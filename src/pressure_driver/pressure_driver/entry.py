@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import os
+
 from limb_interfaces.entry import run_module
 
 
 def pressure_driver() -> int:
-    """Run the driver."""
+    """Run the driver.
+
+    It publishes asynchronously, unless the user has said otherwise: `rclpy` holds Python's lock
+    while it publishes, and a synchronous publication waits for locks of the middleware.
+    """
+    os.environ.setdefault("RMW_FASTRTPS_PUBLICATION_MODE", "ASYNCHRONOUS")
     return int(run_module("pressure_driver.node"))
 
 
