@@ -65,8 +65,7 @@ class Rig:
         self.url = f"http://127.0.0.1:{port}/"
         graph.start("pressure_driver", "board_emulator", port_link=link)
         self.client.wait_ready(["board_emulator"])
-        # A guardian would end a driver that is stopped for longer than a moment.
-        self.driver = graph.start("pressure_driver", "pressure_driver", port=link, guardian="never")
+        self.driver = graph.start("pressure_driver", "pressure_driver", port=link)
         self.page = graph.start("der_planner", "page", port=port, on_lost_operator=on_lost_operator)
         self.client.wait_ready(["pressure_driver", "page"])
 
