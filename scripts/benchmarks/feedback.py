@@ -21,6 +21,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from benchmarks import feedback_events
+from der_planner.bags.reader import BagReader
+from der_planner.bags.record import ESTIMATE_TYPE
 from der_planner.control import Learner
 from der_planner.control.feedback import Feedback
 from der_planner.control.lockstep import Sensors, play
@@ -28,8 +30,6 @@ from der_planner.identification.offline import calibrate_twin
 from der_planner.limb import Limb
 from der_planner.planning import Motion, Plan, plan
 from der_planner.planning.motions import JOINT_MOTIONS
-from der_planner.runs.record import ESTIMATE_TYPE
-from der_planner.runs.recording.reader import BagReader
 from der_planner.twin.offline import OfflineTwin
 
 Array = NDArray[np.float64]

@@ -24,8 +24,8 @@ from benchmarks import rows as kept
 from der_planner.identification import LogError, calibrate_twin
 from der_planner.limb import Limb, LimbError
 from der_planner.planning import Motion, PlanningError, plan
+from der_planner.results import Comparison, RunResult, compare, format_comparison
 from der_planner.rod import ConvergenceError
-from der_planner.runs.evaluation import Comparison, RunResult, compare, format_comparison
 from der_planner.twin.limb_twin import TwinError
 from der_planner.twin.offline import play
 from workspace_setup.basics import ROOT

@@ -62,7 +62,7 @@ def test_imports_go_downward():
     assert not wrong, "\n".join(wrong)
 
 
-ALLOWED = {"identification": ("twin", "recording", "runs")}
+ALLOWED = {"identification": ("twin", "bags")}
 """Identification reads bags, and plays its excitation on the twin."""
 
 

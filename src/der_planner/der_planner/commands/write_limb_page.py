@@ -14,7 +14,7 @@ from typing import Any
 
 from der_planner.limb import CalibratedRange, Limb, Pneumatics, PointMass, Segment
 from der_planner.limb_declaration import Parameter, Term, parameters
-from der_planner.runs.outputs import OutputError, check_file
+from der_planner.results.outputs import OutputError, check_file
 
 PAGE = Path(__file__).resolve().parents[2] / "doc" / "limb_parameters.md"
 _HEAD = """\
