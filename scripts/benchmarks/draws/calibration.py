@@ -28,8 +28,7 @@ from der_planner.identification.offline import (
     PRESSURE_NOISE,
     TIP_NOISE,
 )
-from der_planner.limb import Limb, PointMass, Segment
-from der_planner.limb_loads import gravity_of
+from der_planner.limb import Limb, PointMass, Segment, gravity_of
 from der_planner.model.response import simulate
 from der_planner.model.series import interpolate, step_middles
 from der_planner.planning import BucklingError
