@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from der_planner.control import Learner
 from der_planner.identification.offline import TIP_NOISE, calibrate_twin
 from der_planner.limb import Limb
-from der_planner.model.response import simulate
+from der_planner.model import simulate
 from der_planner.planning import Motion, Plan, plan
 from der_planner.planning.motions import JOINT_MOTIONS
 from der_planner.twin.offline import play

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from benchmarks.loads import MODELS, STUDY_SEEDS, calibrated, comparisons, read_rows
 from der_planner.limb import Limb
 from der_planner.model.air import pair_of
-from der_planner.model.bending import ArcKinematics
-from der_planner.model.response import simulate
+from der_planner.model import ArcModel
+from der_planner.model import simulate
 from der_planner.rod import RodState
 from der_planner.twin import LimbTwin
 from der_planner.twin.limb_twin import ATMOSPHERE
@@ -57,7 +57,7 @@ def model_shape(limb: Limb, model: str, pressure: Array) -> Array:
     final = simulate(seen, time, pressures=held, model=model).final
     if isinstance(final, RodState):
         return np.stack([final.q[0::4], final.q[1::4]], axis=1)
-    return ArcKinematics(seen).curve(final.angles)
+    return ArcModel(seen).curve(final.angles)
 
 
 def draw_shapes(path: Path, seed: int) -> None:

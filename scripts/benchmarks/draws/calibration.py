@@ -30,7 +30,7 @@ from der_planner.identification.offline import (
 )
 from der_planner.limb import Limb, PointMass, Segment
 from der_planner.limb_loads import gravity_of
-from der_planner.model.response import simulate
+from der_planner.model import simulate
 from der_planner.model.series import interpolate, step_middles
 from der_planner.planning import BucklingError
 from der_planner.planning.loads.rest import rest_of

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from benchmarks.draws.limb import drawn
 from der_planner.control import Learner
 from der_planner.limb import Limb
-from der_planner.model.response import simulate
+from der_planner.model import simulate
 from der_planner.planning import Motion, Plan, plan
 from der_planner.planning.motions import JOINT_MOTIONS
 

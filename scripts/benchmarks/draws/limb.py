@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from der_planner.limb import Limb, Segment
 from der_planner.limb_days import on_another_day
 from der_planner.model import air, material
-from der_planner.model.response import RodModel, simulate
+from der_planner.model import RodModel, simulate
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ import pytest
 from der_planner.limb import VENT_REFERENCE, Limb
 from der_planner.model import material
 from der_planner.model.bending import bend_angles
-from der_planner.model.drive import STEPS
-from der_planner.model.response import RodModel, simulate
+from der_planner.model import STEPS
+from der_planner.model import RodModel, simulate
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import Motion, plan
 from der_planner.planning.rod_model import PlanningRod

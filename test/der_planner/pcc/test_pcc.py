@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from der_planner.limb import Limb
-from der_planner.pcc import Pcc, arc_kernel, kernels
+from der_planner.model import ArcModel, arc_kernel, kernels
 from der_planner.rod import Rod
 
 SEED = 4
@@ -30,7 +30,7 @@ def limb_of(count, **changes):
 
 @pytest.fixture(params=[1, 2, 3, 5], ids="{} segments".format)
 def model(request):
-    return Pcc(limb_of(request.param))
+    return ArcModel(limb_of(request.param))
 
 
 def configurations(model, count=5, scale=1.2):
@@ -104,11 +104,11 @@ def test_inertia_is_symmetric_and_positive_definite(model):
 
 
 def test_straight_segment_has_the_inertia_of_a_parabola():
-    model = Pcc(limb_of(1))
+    model = ArcModel(limb_of(1))
     length, mass = model.lengths[0], model.masses[0]
     inertia = model.matrices(np.zeros(1), np.zeros(1))[0]
     assert inertia[0, 0] == pytest.approx(mass * length**2 / 20, rel=1e-12)
-    lumped = Pcc(limb_of(1), mass="lumped").matrices(np.zeros(1), np.zeros(1))[0]
+    lumped = ArcModel(limb_of(1), mass="lumped").matrices(np.zeros(1), np.zeros(1))[0]
     assert lumped[0, 0] == pytest.approx(mass * length**2 / 4, rel=1e-12)
 
 
@@ -140,7 +140,7 @@ def test_tip_and_its_jacobian_agree(model):
 
 def undamped(count):
     limb = limb_of(count, damping=0.0)
-    return Pcc(dataclasses.replace(limb, gravity=(2.0, -1.0, 0.0)))
+    return ArcModel(dataclasses.replace(limb, gravity=(2.0, -1.0, 0.0)))
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
@@ -167,25 +167,25 @@ def test_pressures_invert_the_forward_dynamics(model):
 
 def test_resting_pressures_are_the_static_ones():
     limb = Limb.default()
-    model, zero = Pcc(limb), np.zeros((1, 2))
+    model, zero = ArcModel(limb), np.zeros((1, 2))
     q = np.array([[0.4, -0.7]])
     np.testing.assert_allclose(model.pressures(q, zero, zero) * limb.static_gain, q, rtol=1e-12)
 
 
 def test_a_simulated_limb_settles_where_the_pressure_holds_it():
     limb = Limb.default()
-    model = Pcc(limb)
+    model = ArcModel(limb)
     pressure = np.array([6000.0, -3000.0])
     angles, _ = model.simulate(np.tile(pressure, (400, 10, 1)), 5e-3)
     np.testing.assert_allclose(angles[-1], pressure * limb.static_gain, rtol=1e-3)
 
 
 def test_bad_input_is_named():
-    model = Pcc(Limb.default())
+    model = ArcModel(Limb.default())
     with pytest.raises(ValueError, match="bend_angles must be 2 finite numbers"):
         model.matrices([1.0], [0.0, 0.0])
     with pytest.raises(ValueError, match="'distributed' or 'lumped'"):
-        Pcc(Limb.default(), mass="spread")
+        ArcModel(Limb.default(), mass="spread")
     with pytest.raises(ValueError, match=r"\(K, S, 2\)"):
         model.simulate(np.zeros((4, 2)), 0.01)
 
@@ -202,8 +202,8 @@ def loaded(count):
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_carried_masses_move_with_their_places(count):
     limb = loaded(count)
-    bare = Pcc(dataclasses.replace(limb, masses=()))
-    model = Pcc(limb)
+    bare = ArcModel(dataclasses.replace(limb, masses=()))
+    model = ArcModel(limb)
     for q, v in configurations(model, count=3):
 
         def places(angles):
@@ -226,7 +226,7 @@ def test_carried_masses_move_with_their_places(count):
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_pressures_at_rest_balance_the_gradient_of_the_energy(count):
-    model = Pcc(loaded(count))
+    model = ArcModel(loaded(count))
     zero = np.zeros(count)
     for q, _ in configurations(model, count=3):
         h = 1e-6
@@ -241,7 +241,7 @@ def test_pressures_at_rest_balance_the_gradient_of_the_energy(count):
 def test_a_loaded_swing_keeps_its_energy():
     limb = loaded(2)
     segments = tuple(dataclasses.replace(s, damping=0.0) for s in limb.segments)
-    model = Pcc(dataclasses.replace(limb, segments=segments))
+    model = ArcModel(dataclasses.replace(limb, segments=segments))
     angles, rates = model.simulate(np.zeros((60, 20, 2)), 1e-3, np.array([0.9, -0.6]))
     energy = [model.energy(q, v) for q, v in zip(angles, rates, strict=True)]
     kinetic = [0.5 * v @ model.matrices(q, v)[0] @ v for q, v in zip(angles, rates, strict=True)]
@@ -254,7 +254,7 @@ def test_a_stiff_limb_is_not_stepped_over_its_fastest_mode():
     segments = tuple(
         dataclasses.replace(s, bending_stiffness=60 * s.bending_stiffness) for s in limb.segments
     )
-    model = Pcc(dataclasses.replace(limb, segments=segments))
+    model = ArcModel(dataclasses.replace(limb, segments=segments))
     pressures = np.full((20, 5, 3), 5e4)
     coarse, _ = model.simulate(pressures, 0.01)
     fine, _ = model.simulate(np.repeat(pressures, 20, axis=1), 0.0005)
@@ -263,7 +263,7 @@ def test_a_stiff_limb_is_not_stepped_over_its_fastest_mode():
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_force_slopes_against_finite_differences(count):
-    model = Pcc(loaded(count))
+    model = ArcModel(loaded(count))
     rng = np.random.default_rng(SEED)
     arcs = model.arcs
 
@@ -285,7 +285,7 @@ def test_force_slopes_against_finite_differences(count):
 
 
 def test_linearisation_and_its_transpose_against_the_simulation():
-    model = Pcc(loaded(2))
+    model = ArcModel(loaded(2))
     rng = np.random.default_rng(SEED)
     pressures = 4e3 * rng.normal(size=(12, 5, 2))
     start, rates = np.array([0.4, -0.2]), np.array([1.0, 2.0])
@@ -314,7 +314,7 @@ def test_many_arcs_rest_as_the_rod_does(mounting):
     count = 12
     part = dataclasses.replace(base.segments[0], length=base.length / count)
     limb = dataclasses.replace(base, segments=(part,) * count).mounted(mounting).carrying(0.03)
-    model = Pcc(limb)
+    model = ArcModel(limb)
     tip = model.tip(model.resting(np.zeros(count)))
     rod = Rod.from_limb(base.mounted(mounting).carrying(0.03), 61)
     np.testing.assert_allclose(tip, rod.tip(rod.equilibrium(np.zeros(2)))[:2], atol=1e-3)

@@ -14,7 +14,7 @@ from der_planner.model.air import (
     vent_memory,
 )
 from der_planner.model.commands import slow_venting
-from der_planner.model.drive import STEPS
+from der_planner.model import STEPS
 from der_planner.model.material import differential_pressure
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import METHODS, Motion, plan, planner

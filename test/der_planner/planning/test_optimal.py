@@ -6,7 +6,7 @@ from scipy.optimize import minimize
 
 from der_planner.limb import Limb
 from der_planner.model import commands
-from der_planner.model.drive import STEPS
+from der_planner.model import STEPS
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import Motion, plan, planner
 from der_planner.planning.optimal import Optimiser, Settings

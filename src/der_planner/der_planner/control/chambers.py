@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from der_planner.control.nominal import STEP, Nominal, Whole
 from der_planner.model import air
-from der_planner.model.drive import STEPS
+from der_planner.model import STEPS
 from der_planner.model.series import CONTROL_PERIOD, interpolate
 
 Array = NDArray[np.float64]

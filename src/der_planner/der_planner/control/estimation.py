@@ -33,7 +33,7 @@ from der_planner.control.chambers import ChamberLog
 from der_planner.control.knowledge import Estimate, EstimatorSettings, Knowledge
 from der_planner.control.nominal import STEP, Nominal
 from der_planner.model import material
-from der_planner.model.drive import STEPS
+from der_planner.model import STEPS
 from der_planner.model.series import CONTROL_PERIOD
 
 Array = NDArray[np.float64]

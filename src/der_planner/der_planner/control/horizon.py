@@ -31,7 +31,7 @@ from der_planner.control.nominal import Nominal
 from der_planner.methods import LEARNED
 from der_planner.model import air, material
 from der_planner.model.commands import within_limits
-from der_planner.model.drive import STEPS
+from der_planner.model import STEPS
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning.quadratic import UnsolvedError, minimise
 from der_planner.planning.result import Plan

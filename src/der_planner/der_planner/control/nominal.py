@@ -22,8 +22,8 @@ from scipy.linalg import expm
 from der_planner.methods import LEARNED
 from der_planner.model import material
 from der_planner.model.balance import Balance
-from der_planner.model.drive import STEPS
-from der_planner.model.response import RodModel, simulate
+from der_planner.model import STEPS
+from der_planner.model import RodModel, simulate
 from der_planner.model.series import CONTROL_PERIOD, interpolate, step_middles
 from der_planner.planning.result import Plan
 from der_planner.planning.ways import resting_spline, sample_spline

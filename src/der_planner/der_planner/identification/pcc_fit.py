@@ -18,7 +18,7 @@ from der_planner.identification.logs.prepare import Prepared
 from der_planner.limb import Limb, Segment
 from der_planner.model.inputs import pressures_between
 from der_planner.model.material import slow_effective_pressure
-from der_planner.model.response import ArcModel
+from der_planner.model import ArcModel
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from der_planner.identification.logs.log import LogError
 from der_planner.limb import Limb
-from der_planner.model.response import simulate
+from der_planner.model import simulate
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from der_planner.identification.parameters import TERMS, column, put, to_limb
 from der_planner.limb import Limb
 from der_planner.model.material import slow_effective_pressure
-from der_planner.model.response import Response, RodModel, simulate
+from der_planner.model import Response, RodModel, simulate
 
 Array = NDArray[np.float64]
 

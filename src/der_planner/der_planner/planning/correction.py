@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
 from der_planner.limb import Limb
-from der_planner.model.drive import STEPS, Bend
-from der_planner.model.response import NODES, simulate
+from der_planner.model.simulation import STEPS, Bend
+from der_planner.model import NODES, simulate
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import models
 from der_planner.planning.errors import PlanningError

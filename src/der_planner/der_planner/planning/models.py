@@ -8,7 +8,7 @@ from scipy.interpolate import BSpline
 
 from der_planner.limb import Limb
 from der_planner.model.material import differential_pressure
-from der_planner.model.response import ArcModel, ArcState
+from der_planner.model import ArcModel, ArcState
 from der_planner.planning.errors import BucklingError, PlanningError
 from der_planner.planning.inverse import check_reach, is_loaded, solve, static_pressure
 from der_planner.planning.loads.overload import check_load, check_stays

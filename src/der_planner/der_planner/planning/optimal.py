@@ -30,8 +30,8 @@ from scipy.linalg import cho_factor, cho_solve
 
 from der_planner.model import air
 from der_planner.model.commands import within_limits
-from der_planner.model.drive import Drive, Window
-from der_planner.model.response import Model, State
+from der_planner.model.simulation import Drive, Window
+from der_planner.model import Model, State
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning.motions import Reference
 from der_planner.planning.quadratic import Band, solve_limited

@@ -14,9 +14,9 @@ from threadpoolctl import ThreadpoolController
 from der_planner.limb import Limb
 from der_planner.model.commands import SlowVenting, slow_venting, within_limits
 from der_planner.model.commands import commands as commands_for
-from der_planner.model.drive import STEPS
+from der_planner.model import STEPS
 from der_planner.model.material import differential_pressure
-from der_planner.model.response import NODES, simulate
+from der_planner.model import NODES, simulate
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import models
 from der_planner.planning.errors import PlanningError

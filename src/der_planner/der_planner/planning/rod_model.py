@@ -8,7 +8,7 @@ from scipy.interpolate import BSpline
 
 from der_planner.limb import Limb
 from der_planner.model.balance import Balance
-from der_planner.model.response import NODES, RodModel
+from der_planner.model import NODES, RodModel
 from der_planner.planning.inverse import (
     NEAREST_TOLERANCE,
     TOLERANCE,

@@ -24,7 +24,7 @@ from der_planner.limb import Limb
 from der_planner.model.bending import bend_angles
 from der_planner.model.held import Holder, Poses
 from der_planner.model.material import differential_pressure
-from der_planner.model.response import RodModel
+from der_planner.model import RodModel
 from der_planner.planning.errors import (
     BucklingError,
     OverloadError,

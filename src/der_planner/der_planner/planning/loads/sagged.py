@@ -16,7 +16,7 @@ from scipy.interpolate import make_interp_spline
 from der_planner.limb import Limb
 from der_planner.model.bending import bend_angles
 from der_planner.model.held import Holder
-from der_planner.model.response import RodModel
+from der_planner.model import RodModel
 from der_planner.model.series import interpolate
 from der_planner.planning.errors import BucklingError
 from der_planner.planning.loads.rest import stable_rest

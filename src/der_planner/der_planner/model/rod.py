@@ -1,19 +1,113 @@
-"""The balance of forces of an evenly bent rod: from a motion to the pressures that it needs.
+"""The rod of a limb as a model, and its balance of forces.
 
-Two inverses of M q̈ + D q̇ − F_int − F_ext = B(q) Λ u, the rod's equation of motion, for
-configurations q̄ of evenly bent segments: the paper's, (B Λ)† on the free rows, and the projection
-on the tangent S = ∂q̄/∂(bend angles), Sᵀ B Λ u = Sᵀ(…) (virtual work).
+`Balance` goes from a motion to the pressures that it needs, by two inverses of M q̈ + D q̇ − F_int −
+F_ext = B(q) Λ u, the rod's equation of motion, for configurations q̄ of evenly bent segments: the
+paper's, (B Λ)† on the free rows, and the projection on the tangent S = ∂q̄/∂(bend angles), Sᵀ B Λ u
+= Sᵀ(…) (virtual work).
 """
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from dataclasses import dataclass
+from functools import cached_property
 
-from der_planner.model.bending import PolylineKinematics
-from der_planner.rod import Rod
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from der_planner.limb import Limb
+from der_planner.model.bending import PolylineKinematics, bend_angles, bend_change, bend_outputs
+from der_planner.model.model import NODES, Model, Outputs, Rollout, State
+from der_planner.rod import Rod, RodState
+from der_planner.rod.linearisation import Linearisation
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RodFirstOrder:
+    """`FirstOrder` of a rod, as far as its trajectory was linearised."""
+
+    rod: Rod
+    q: Array
+    linear: Linearisation
+
+    def tangent(self, effective: Array, start: Array | None = None) -> tuple[Array, Array]:
+        """Return the changes of tip and bend angles, see `FirstOrder.tangent`."""
+        shift = None if start is None else (start, np.zeros_like(start))
+        moved = self.linear.tangent(effective, shift)
+        return moved[:, :2], bend_change(self.rod, self.q, moved[:, 2:])
+
+    def sensitivity(self, pulse: Array | None = None) -> Array:
+        """Return ∂tip/∂input, see `FirstOrder.sensitivity`."""
+        return self.linear.sensitivity(pulse)[:, :2]
+
+
+class RodModel(Model):
+    """A limb's discrete elastic rod.
+
+    Args:
+        limb: the physical parameters.
+        nodes: N of the rod.
+
+    Attributes:
+        rod: with all its nodes.
+        kinematics: of its evenly bent segments.
+    """
+
+    name = "der"
+
+    def __init__(self, limb: Limb, nodes: int = NODES) -> None:
+        super().__init__(limb, nodes)
+        self.rod = Rod.from_limb(limb, nodes)
+        self.kinematics = PolylineKinematics.of_rod(self.rod)
+
+    @cached_property
+    def balance(self) -> Balance:
+        """The balance of forces of the evenly bent rod."""
+        return Balance(self.rod, self.kinematics)
+
+    def resting(self, effective: Array) -> RodState:
+        """Return the rod at rest under effective pressures (M,) [Pa]."""
+        return self.rod.equilibrium(effective)
+
+    def rest_slope(self, state: RodState, effective: Array) -> Array:
+        """Return ∂q/∂effective (F, M) [m/Pa] of a rod at rest, on its free rows."""
+        return self.rod.linearise_equilibrium(state, effective)[self.rod.free]
+
+    def bend_of(self, state: RodState) -> Array:
+        """Return the bend angles (M,) [rad] of a state."""
+        angles: Array = bend_angles(self.rod, state.q[None])[0]
+        return angles
+
+    def state(self, angles: ArrayLike, rates: ArrayLike) -> RodState:
+        """Return the rod evenly bent, at bend angles and rates (M,) [rad], [rad/s]."""
+        position, velocity, _ = self.kinematics.motion(angles, rates, np.zeros(np.shape(rates)))
+        q = self.rod.straight_state().q
+        v = np.zeros_like(q)
+        for axis in range(2):
+            q[axis::4], v[axis::4] = position[:, axis], velocity[:, axis]
+        return self.rod.state(q, v, like=self.rest)
+
+    def run(
+        self, start: State, effective: Array, period: float, linearise: Outputs = ""
+    ) -> Rollout:
+        """Simulate the rod, see `Model.run`."""
+        if not isinstance(start, RodState):
+            raise TypeError("the rod starts from a state of the rod, got one of the arcs")
+        last = 4 * (self.rod.nodes - 1)
+        outputs = [last, last + 1] + (bend_outputs(self.rod) if linearise == "all" else [])
+        trajectory = self.rod.simulate(
+            start,
+            effective,
+            period,
+            substeps=effective.shape[1],
+            linearise=bool(linearise),
+            outputs=outputs if linearise else None,
+        )
+        found, q = trajectory.linearisation, trajectory.q
+        linear = None if found is None else RodFirstOrder(self.rod, q, found)
+        angles, tip = bend_angles(self.rod, q), trajectory.tip[:, :2]
+        return Rollout(angles, tip, trajectory.final, trajectory, linear)
 
 
 class Balance:
