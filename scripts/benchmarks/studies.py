@@ -14,8 +14,6 @@ from distributed import Client, LocalCluster
 
 from benchmarks.rod import cantilever, run_elastica
 from der_planner.experiment.progress import Progress
-from der_planner.limb import Limb
-from der_planner.model.response import simulate, simulate_many
 from der_planner.rod.many import cores
 from der_planner.rod.many import simulate_many as simulate_rods
 from der_planner.studies.conduct import Settings, conduct
@@ -55,7 +53,6 @@ def run(quick: bool) -> Figures:
     """Measure and print; return every figure with its unit in the key."""
     figures: Figures = {"load_average_at_start": f"{os.getloadavg()[0]:.2f}"}
     figures |= _rods(quick)
-    figures |= _limbs(quick)
     figures |= _speed_up(quick)
     return figures | _tasks(quick)
 
@@ -98,31 +95,6 @@ def _rods(quick: bool) -> Figures:
     }
     print(f"{runs} planar rods of 21 nodes, {steps} steps (backward Euler, 5 ms), {cores()} cores")
     for name, value in list(figures.items())[1:]:
-        print(
-            f"  {name:52s} {value:12,.3g}" if float(value) < 10 else f"  {name:52s} {value:12,.0f}"
-        )
-    return figures
-
-
-def _limbs(quick: bool) -> Figures:
-    """`simulate_many` on the default limb, 100 setpoints of 5 steps (two solves each)."""
-    runs, count = (50, 100) if quick else (500, 100)
-    instants = 0.05 * np.arange(count)
-    phase = np.arange(runs)[:, None, None]
-    commands = 6e3 * np.sin(instants[None, :, None] * [1.0, 1.3] + phase)
-    limb = Limb.default()
-    simulate_many(limb, instants, commands=commands[:2])
-    alone, _ = _best(lambda: simulate(limb, instants, commands=commands[0]), 20)
-    wall, processor = _best(lambda: simulate_many(limb, instants, commands=commands), 3)
-    steps = 5 * count
-    figures: Figures = {
-        "limb_single_steps_per_s": steps / alone,
-        "limb_many_steps_per_s": runs * steps / wall,
-        "limb_many_steps_per_processor_s": runs * steps / processor,
-        "limb_share_of_cores_times_single": runs * alone / wall / cores(),
-    }
-    print(f"{runs} runs of the default limb, {steps} steps (sdirk2, 10 ms), with air and material")
-    for name, value in figures.items():
         print(
             f"  {name:52s} {value:12,.3g}" if float(value) < 10 else f"  {name:52s} {value:12,.0f}"
         )
