@@ -8,12 +8,8 @@ import der_planner
 
 ROOT = Path(der_planner.__file__).parent
 LAYERS = {
-    "limb_declaration": 0,
     "methods": 0,
-    "limb_loads": 1,
-    "limb_parameters": 1,
-    "limb_days": 2,
-    "limb": 2,
+    "limb": 1,
     "rod": 3,
     "pcc": 3,
     "model": 4,

@@ -21,42 +21,29 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from der_planner.limb_declaration import (
+from der_planner.limb.declaration import (
     LimbError,
     Parameter,
     check,
     commented,
+    declarations,
     field_names,
     from_mapping,
     number,
     parameter,
-    parameters,
     refuse_unknown,
 )
-from der_planner.limb_loads import GRAVITY, MOUNTINGS, PointMass, gravity_of, mounting_of
-from der_planner.limb_parameters import CalibratedRange, Pneumatics, Segment
-
-__all__ = [
-    "GRAVITY",
-    "MOUNTINGS",
-    "CalibratedRange",
-    "Limb",
-    "LimbError",
-    "Pneumatics",
-    "PointMass",
-    "Segment",
-    "gravity_of",
-    "mounting_of",
-]
+from der_planner.limb.loads import (
+    BEYOND_THE_TIP,
+    PAYLOAD,
+    PointMass,
+    gravity_of,
+    mounting_of,
+)
+from der_planner.limb.parameters import CalibratedRange, Pneumatics, Segment
 
 SCHEMA_VERSION = 1
-VENT_REFERENCE = 10e3
-"""Gauge pressure [Pa] for which `Pneumatics.vent_rate` is given."""
-PAYLOAD = "payload"
-"""Name of the mass that only one run carries."""
-BEYOND_THE_TIP = 5e-3
-"""A payload so little beyond the tip [m] is on it."""
-DEFAULT_LIMB_FILE = Path(__file__).resolve().parent / "data" / "default_limb.yaml"
+DEFAULT_LIMB_FILE = Path(__file__).resolve().parents[1] / "data" / "default_limb.yaml"
 
 
 @dataclass(frozen=True)
@@ -348,12 +335,12 @@ class Limb:
 def sections() -> dict[str, dict[str, Parameter]]:
     """Return the declared parameters by the key of a limb file that holds them; "": itself."""
     return {
-        "": parameters(Limb),
-        "segments": parameters(Segment),
-        "pcc_segments": parameters(Segment),
-        "pneumatics": parameters(Pneumatics),
-        "calibrated": parameters(CalibratedRange),
-        "masses": parameters(PointMass),
+        "": declarations(Limb),
+        "segments": declarations(Segment),
+        "pcc_segments": declarations(Segment),
+        "pneumatics": declarations(Pneumatics),
+        "calibrated": declarations(CalibratedRange),
+        "masses": declarations(PointMass),
     }
 
 

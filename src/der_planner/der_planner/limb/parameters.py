@@ -8,8 +8,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from der_planner.limb_declaration import Term, parameter
+from der_planner.limb.declaration import Term, parameter
 
+VENT_REFERENCE = 10e3
+"""Gauge pressure [Pa] for which `Pneumatics.vent_rate` is given."""
 REST_SPREAD = math.radians(5.0)
 """Of the rest angles of limbs that are made straight [rad]. Without gravity a log tells them to a
 fraction of this; under it a rest angle and a compliance bend the resting limb alike."""

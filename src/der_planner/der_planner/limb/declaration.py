@@ -141,7 +141,7 @@ def parameter(
     }
 
 
-def parameters(kind: Any) -> dict[str, Parameter]:
+def declarations(kind: Any) -> dict[str, Parameter]:
     """Return the declared parameters of a dataclass by name, in their order."""
     return {
         item.name: item.metadata[_KEY] for item in dataclasses.fields(kind) if _KEY in item.metadata
@@ -154,7 +154,7 @@ def check(item: Any, where: str = "") -> None:
     Raises:
         LimbError: a value is out of its range, or 0 where another parameter needs it.
     """
-    for name, declared in parameters(item).items():
+    for name, declared in declarations(item).items():
         value = getattr(item, name)
         for number in value if isinstance(value, tuple) else (value,):
             declared.check(number, where + name)

@@ -19,7 +19,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from der_planner.limb_declaration import LimbError, parameter
+from der_planner.limb.declaration import LimbError, parameter
 
 GRAVITY = 9.81
 """Of the earth [m/s²]."""
@@ -27,6 +27,10 @@ _SAME_GRAVITY = 1e-6
 _ROUNDING = 1e-12
 HEAVIEST = 10.0
 """Largest mass of a limb, or of its payload [kg]: more is a mistake in the unit."""
+PAYLOAD = "payload"
+"""Name of the mass that only one run carries."""
+BEYOND_THE_TIP = 5e-3
+"""Distance beyond the tip [m] up to which a payload is taken to be on the tip."""
 MOST_TILT = 180.0
 """Of a plate about the straight limb, either way [degrees]."""
 MOUNTINGS = {

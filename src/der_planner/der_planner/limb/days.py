@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from der_planner.limb_parameters import Segment
+from der_planner.limb.parameters import Segment
 
 GAIN_SPREAD = 0.35
 """From one day to another, of the logarithm of a gain: a real limb's changed by up to a half."""
