@@ -1,7 +1,7 @@
 """Arrays and compiled kernels of one rod: what rods in a plane and in space share.
 
-The kernels know some coordinates only (in a plane two a node), and with a ghost clamp one node more,
-before the others. A backend goes between their unknowns and the public layout q in R^(4N-1).
+The kernels know some coordinates only (in a plane two a node), and with a ghost clamp one node
+more, before the others. A backend goes between their unknowns and the public layout q in R^(4N-1).
 """
 
 from __future__ import annotations
@@ -176,10 +176,10 @@ class Backend(ABC):
     ) -> Piece:  # fmt: skip
         """Run the kernel from step `begin` on; motion is where positions and velocities go."""
         space = self.work_space(place.base)
-        found = self.kernels.simulate(
+        done, iterations, update, failed = self.kernels.simulate(
             motion, place, pressures, begin, solver, record, space, self.loaded(load)
         )
-        return Piece(*found, record)
+        return Piece(done, iterations, update, failed, record)
 
     def solve_static(
         self, start: RodState, u: Array, load: Array, solver: Solver

@@ -202,7 +202,9 @@ def find_equilibrium(backend: Backend, start: RodState, u: Array, load: Array) -
         ConvergenceError: the parts became too small.
     """
     tolerance = 1e-11 * float(backend.mesh.rest.sum())
-    solver = Solver(h=1.0, extrapolate=np.ones(1), tolerance=tolerance, lever=0.0, limit=_STATIC_LIMIT)
+    solver = Solver(
+        h=1.0, extrapolate=np.ones(1), tolerance=tolerance, lever=0.0, limit=_STATIC_LIMIT
+    )
     state, iterations, update = backend.solve_static(start, u, load, solver)
     if iterations > 0:
         return state

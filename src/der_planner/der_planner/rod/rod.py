@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from der_planner.limb import Limb
-from der_planner.rod.backend import Backend
 from der_planner.rod.integration import Integrator, Method, find_equilibrium
 from der_planner.rod.mesh import (
     Mesh,
@@ -117,10 +116,18 @@ class Rod:
             ValueError: a value is out of range; the message says what was expected and what came.
         """
         require(
-            isinstance(nodes, (int, np.integer)) and nodes >= 3, "nodes", "an int of 3 or more", nodes
+            isinstance(nodes, (int, np.integer)) and nodes >= 3,
+            "nodes",
+            "an int of 3 or more",
+            nodes,
         )
         step = positive(length, "length") / (nodes - 1)
-        for value, name in ((EI, "EI"), (EA, "EA"), (GJ, "GJ"), (mass_per_length, "mass_per_length")):
+        for value, name in (
+            (EI, "EI"),
+            (EA, "EA"),
+            (GJ, "GJ"),
+            (mass_per_length, "mass_per_length"),
+        ):
             positive(value, name)
         pairs = check_segments(segments, nodes)
         gain = array(moment_gain, (len(pairs),), "moment_gain")

@@ -160,7 +160,9 @@ def chain_of(backend: Backend, solved: Solved, rows: NDArray[np.int64]) -> Solve
     """Return recorded solves as the kernels take them."""
     mass, damping = backend.mass.copy(), backend.damping.copy()
     mass[backend.fixed] = damping[backend.fixed] = 0.0
-    return SolveChain(solved.record, mass, damping, solved.rates, solved.extrapolate, solved.steps, rows)
+    return SolveChain(
+        solved.record, mass, damping, solved.rates, solved.extrapolate, solved.steps, rows
+    )
 
 
 def step_matrices(backend: Backend, solved: Solved) -> tuple[Array, Array]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import contextlib
 import logging
+import os
 from collections.abc import Iterator
 
 from distributed import Client, LocalCluster
