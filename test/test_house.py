@@ -1,4 +1,4 @@
-"""Rules of the house that no linter knows: one name for one thing, and short lists of parameters."""
+"""Rules of the house that no linter knows: one name for one thing, short lists of parameters."""
 
 from __future__ import annotations
 
