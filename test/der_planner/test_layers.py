@@ -17,7 +17,6 @@ LAYERS = {
     "planning": 4,
     "bags": 4,
     "results": 5,
-    "runs": 5,
     "control": 5,
     "identification": 6,
     "experiment": 7,
