@@ -14,7 +14,7 @@ import platform
 import time
 from pathlib import Path
 
-from der_planner.runs.outputs import OutputError, check_file
+from der_planner.results.outputs import OutputError, check_file
 
 PARTS = {
     "rod": "rod",

@@ -22,7 +22,7 @@ from der_planner.limb import (
     Term,
     declarations,
 )
-from der_planner.runs.outputs import OutputError, check_file
+from der_planner.results.outputs import OutputError, check_file
 
 PAGE = Path(__file__).resolve().parents[2] / "doc" / "limb_parameters.md"
 _HEAD = """\
