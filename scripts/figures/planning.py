@@ -18,7 +18,7 @@ from der_planner.limb import Limb
 from der_planner.model import ArcModel
 from der_planner.planning import METHODS, Motion, Plan, plan
 from der_planner.planning.inverse import angle_limits, solutions
-from der_planner.runs.outputs import folder_argument
+from der_planner.results.outputs import folder_argument
 from workspace_setup.basics import ROOT
 
 matplotlib.use("Agg")

@@ -12,8 +12,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from der_planner.runs.recording.recover import Recovery, recover_bag
-from der_planner.runs.recording.scan import RecoverError
+from der_planner.bags.recover import Recovery, recover_bag
+from der_planner.bags.scan import RecoverError
 
 
 def _show(fraction: float) -> None:

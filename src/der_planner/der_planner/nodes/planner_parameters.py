@@ -9,8 +9,7 @@ from typing import Any
 
 from rclpy.node import Node
 
-from der_planner.limb import Limb
-from der_planner.limb_loads import HEAVIEST
+from der_planner.limb import HEAVIEST, Limb
 from der_planner.planning import METHODS, PathLimits
 from der_planner.planning.inverse import BRANCHES
 from limb_interfaces.parameters import declare

@@ -11,8 +11,7 @@ from nav_msgs.msg import Path as PathMessage
 from numpy.typing import NDArray
 
 from der_msgs.msg import MotionCommand
-from der_planner.limb import Limb
-from der_planner.limb_loads import HEAVIEST
+from der_planner.limb import HEAVIEST, Limb
 from der_planner.methods import LEARNED
 from der_planner.nodes.planner_parameters import PlannerOptions
 from der_planner.planning import Motion, choose_method

@@ -19,10 +19,10 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-from der_planner.runs.recording.definitions import DefinitionError, find_definition
-from der_planner.runs.recording.layout import RUN_KEY, OfferedQos, TopicSpec
-from der_planner.runs.recording.session import RecordingSession
-from der_planner.runs.recording.writer import COMPRESSIONS, BagWriteError, BagWriter
+from der_planner.bags.definitions import DefinitionError, find_definition
+from der_planner.bags.layout import RUN_KEY, OfferedQos, TopicSpec
+from der_planner.bags.session import RecordingSession
+from der_planner.bags.writer import COMPRESSIONS, BagWriteError, BagWriter
 from limb_interfaces import parameters, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.gaps import StampGaps

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from der_planner.rod.compile import inlined_kernel, kernel
 from der_planner.rod.state import Array
+from der_planner.rod.step_kernel import Body
 
 
 class PlanarRod(NamedTuple):
@@ -29,6 +30,7 @@ class PlanarRod(NamedTuple):
     first: NDArray[np.int64]  # (M,) first edge of each segment
     last: NDArray[np.int64]  # (M,) last edge of each segment
     gain: Array  # (M,) Λ [N/Pa]
+    body: Body
 
 
 class PlanarSpace(NamedTuple):

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from der_planner.rod.compile import kernel
 from der_planner.rod.state import Array
+from der_planner.rod.step_kernel import Base, Body
 
 
 class SpatialRod(NamedTuple):
@@ -35,19 +36,13 @@ class SpatialRod(NamedTuple):
     first: NDArray[np.int64]  # (M,) first edge of each segment
     last: NDArray[np.int64]  # (M,) last edge of each segment
     gain: Array  # (M,) Λ [N/Pa]
-
-
-class Base(NamedTuple):
-    """The reference frames of the state from which a step begins."""
-
-    tangents: Array  # (n-1, 3) t̂
-    directors: Array  # (n-1, 3) d̂
-    twists: Array  # (n,) reference twist [rad]
+    body: Body
 
 
 class SpatialSpace(NamedTuple):
-    """Where the kernels work; nothing in here outlives a call."""
+    """Where the kernels work; but for `base` nothing in here outlives a call."""
 
+    base: Base  # the frames that the angles count from
     x: Array  # (4n-1,) the solution sought
     v: Array  # (4n-1,) its velocity
     acceleration: Array  # (4n-1,) of the last solve
@@ -57,7 +52,8 @@ class SpatialSpace(NamedTuple):
     base_start: Array  # (n, 7) frames there
     s: Array  # (4n-1, 11) symmetric derivative of the residual, by columns
     a: Array  # (4n-1, 21) exact derivative, by rows
-    drag: Array  # (4n-1, 21) viscous matrix times rate, by rows
+    drag: Array  # (4n-1, 21) derivative by −x_n without inertia, by rows
+    turning: Array  # (4n-1, 21) the part of it by the turning of the frames
     frame: Array  # (n-1, 13) t, 1/|e|, m1, m2, d1 of each edge
     twists: Array  # (n,) reference twists [rad]
     own: Array  # (n-1, 4, 5) Hessian by each edge's (e, φ), gradient in the last column
