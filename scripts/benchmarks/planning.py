@@ -14,9 +14,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 
 from der_planner.limb import Limb
-from der_planner.model import ArcModel
-from der_planner.model import STEPS
-from der_planner.model import simulate
+from der_planner.model import STEPS, ArcModel, Initial, simulate
 from der_planner.planning import (
     CONTROL_PERIOD,
     METHODS,
@@ -199,7 +197,7 @@ def _rod_under(result: Plan, chambers: np.ndarray) -> np.ndarray:
         result.time,
         pressures=chambers,
         bend=lambda time: sample_spline(spline, time)[0],
-        start=model.begin(spline, result.reference.start),
+        initial=Initial(model.begin(spline, result.reference.start)),
         steps=STEPS,
     )
     return response.tip

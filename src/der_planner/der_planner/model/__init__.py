@@ -4,6 +4,7 @@
 """
 
 from der_planner.model.arcs import ArcModel
+from der_planner.model.material import Material
 from der_planner.model.model import NODES, ArcState, Model, State
 from der_planner.model.rod import RodModel
 from der_planner.model.series import CONTROL_PERIOD
@@ -16,6 +17,7 @@ __all__ = [
     "ArcModel",
     "ArcState",
     "Initial",
+    "Material",
     "Model",
     "Response",
     "RodModel",

@@ -14,6 +14,7 @@ connectors, and at the masses that the limb carries, which are not damped.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -207,6 +208,11 @@ class ArcModel(Model):
         torque: Array = self.stiffness * bend + self.cubic * bend**3
         return torque
 
+    @cached_property
+    def rest(self) -> ArcState:
+        """The vented arcs at rest."""
+        return self.resting(np.zeros(self.inputs))
+
     def state(self, angles: ArrayLike, rates: ArrayLike) -> ArcState:
         """Return the arcs at bend angles and rates (M,) [rad], [rad/s]."""
         return ArcState(np.asarray(angles, dtype=float), np.asarray(rates, dtype=float))
@@ -258,7 +264,9 @@ class ArcModel(Model):
             potential -= mass * (point.real * arcs.gravity[0] + point.imag * arcs.gravity[1])
         return float(0.5 * v @ M @ v + elastic + potential)
 
-    def pressures(self, angles: ArrayLike, rates: ArrayLike, accelerations: ArrayLike) -> Array:
+    def inverse_dynamics(
+        self, angles: ArrayLike, rates: ArrayLike, accelerations: ArrayLike
+    ) -> Array:
         """Invert the dynamics: u = Λ† τ with τ = M q̈ + (C + D) q̇ + K (q − q_rest) − Q_gravity.
 
         Args:

@@ -145,9 +145,7 @@ def least_pairs(air: Air, time: Array, pressure: Array) -> tuple[Array, NDArray[
 
 
 @njit(cache=True, nogil=True)
-def _least_pairs(
-    wanted: Array, steps: Array, law: AirLaw
-) -> tuple[Array, NDArray[np.bool_]]:
+def _least_pairs(wanted: Array, steps: Array, law: AirLaw) -> tuple[Array, NDArray[np.bool_]]:
     count, inputs = wanted.shape
     chambers = np.empty((2, count, inputs))
     second = np.zeros((count, inputs), dtype=np.bool_)

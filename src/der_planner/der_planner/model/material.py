@@ -101,7 +101,7 @@ class Material:
         times, wanted, angles = self._check(time, effective, bend_angle)
         driven = wanted + self.memory_pressures(times, angles)
         result = np.zeros_like(wanted)
-        # The neighbours' pressures are known but for what their own neighbours change: a contraction.
+        # The neighbours' pressures are known but for what their neighbours change: a contraction.
         for _ in range(_COUPLING_ROUNDS if self._coupling.any() else 1):
             before = result.copy()
             load = driven - before @ self._coupling.T
@@ -271,7 +271,7 @@ class Material:
         return torque
 
     def _begin(self, start: Memory | None) -> Array:
-        """Return bend [rad], z and creep [rad] of each segment (M, 3) at the start; NaN: at rest."""
+        """Return bend [rad], z and creep [rad] (M, 3) at the start; NaN: at rest."""
         if start is None:
             return np.full((self._count, 3), np.nan)
         lengths = np.array([s.length for s in self._segments])

@@ -95,7 +95,8 @@ class Model(ABC):
     kinematics: Kinematics
 
     def __init_subclass__(cls) -> None:
-        Model.kinds[cls.name] = cls
+        if "name" in vars(cls):
+            Model.kinds[cls.name] = cls
 
     def __init__(self, limb: Limb, nodes: int = NODES) -> None:
         self.limb, self.nodes = limb, nodes
@@ -128,7 +129,7 @@ class Model(ABC):
         return self.limb.segment_count
 
     @cached_property
-    def rest(self) -> Any:
+    def rest(self) -> State:
         """The vented limb at rest."""
         return self.resting(np.zeros(self.inputs))
 

@@ -265,7 +265,9 @@ def change_along(
     known = not np.isnan(begin[0, 0])
     z = begin[:, 1].copy() if known else np.zeros(count)
     torque, slope = np.zeros(count), np.zeros((count, count))
-    angle_moved, z_moved, q_moved = np.zeros(count), np.zeros(count), np.zeros(count)
+    angle_moved: Array = np.zeros(count)
+    z_moved: Array = np.zeros(count)
+    q_moved: Array = np.zeros(count)
     for k in range(instants):
         weigh(bend[k], law, torque, slope)
         matrix, right = -slope, np.zeros(count)
@@ -290,7 +292,9 @@ def change_along(
             right[i] -= scale * law.friction[i] * z_kept[i] * z_moved[i]
             right[i] -= scale * law.creep[i] * q_kept[i] * q_moved[i]
             right[i] -= held / stiffer[k, i] * change[1][k, i]
-        after = np.linalg.solve(matrix, right) if k > 0 or not known else np.zeros(count)
+        after: Array = np.zeros(count)
+        if k > 0 or not known:
+            after[:] = np.linalg.solve(matrix, right)
         z_moved = z_kept * z_moved + z_by_change * (after - angle_moved)
         q_moved = q_kept * q_moved + q_by_change * (after - angle_moved)
         angle_moved = after

@@ -18,7 +18,7 @@ from der_planner.limb import Limb
 from der_planner.model.bending import PolylineKinematics, bend_angles, bend_change, bend_outputs
 from der_planner.model.model import NODES, Model, Outputs, Rollout, State
 from der_planner.rod import Rod, RodState
-from der_planner.rod.linearisation import Linearisation
+from der_planner.rod.trajectory import Linearisation
 
 Array = NDArray[np.float64]
 
@@ -39,7 +39,8 @@ class RodFirstOrder:
 
     def sensitivity(self, pulse: Array | None = None) -> Array:
         """Return ∂tip/∂input, see `FirstOrder.sensitivity`."""
-        return self.linear.sensitivity(pulse)[:, :2]
+        moved: Array = self.linear.sensitivity(pulse)[:, :2]
+        return moved
 
 
 class RodModel(Model):
@@ -55,11 +56,17 @@ class RodModel(Model):
     """
 
     name = "der"
+    kinematics: PolylineKinematics
 
     def __init__(self, limb: Limb, nodes: int = NODES) -> None:
         super().__init__(limb, nodes)
         self.rod = Rod.from_limb(limb, nodes)
         self.kinematics = PolylineKinematics.of_rod(self.rod)
+
+    @cached_property
+    def rest(self) -> RodState:
+        """The vented rod at rest."""
+        return self.resting(np.zeros(self.inputs))
 
     @cached_property
     def balance(self) -> Balance:

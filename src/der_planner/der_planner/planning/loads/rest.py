@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.limb import Limb
-from der_planner.model import ArcModel
+from der_planner.model import ArcModel, RodModel
 from der_planner.model.bending import bend_angles
-from der_planner.model import RodModel
 from der_planner.planning.errors import BucklingError
 from der_planner.planning.inverse import solve
 from der_planner.rod import ConvergenceError, Rod, RodState
