@@ -17,7 +17,6 @@ from der_planner.model import material
 from der_planner.model.derivative import Derivative
 from der_planner.model.drive import Bend
 from der_planner.model.inputs import prepare
-from der_planner.model.many import ManyResponses, simulate_many
 from der_planner.model.physics import (
     NODES,
     ArcModel,
@@ -36,7 +35,6 @@ __all__ = [
     "NODES",
     "ArcModel",
     "ArcState",
-    "ManyResponses",
     "Model",
     "Motion",
     "Response",
@@ -45,7 +43,6 @@ __all__ = [
     "State",
     "build",
     "simulate",
-    "simulate_many",
     "tip_and_bend",
 ]
 Array = NDArray[np.float64]
