@@ -138,8 +138,7 @@ def test_commands_invert_slow_venting():
     known, unknown = (
         np.sqrt(((chambers.mean(axis=1) - exact)[20:] ** 2).mean())
         for chambers in (
-            Air(limb.pneumatics).follow(given, 0.05, 5).differential
-            for given in (command, unaware)
+            Air(limb.pneumatics).follow(given, 0.05, 5).differential for given in (command, unaware)
         )
     )
     assert known < 150.0
