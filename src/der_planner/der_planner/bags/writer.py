@@ -315,7 +315,7 @@ class BagWriter:
             self._file.close()
 
     def _lacks_space(self) -> bool:
-        return 0 < self._minimum_free > shutil.disk_usage(self.folder).free
+        return shutil.disk_usage(self.folder).free < self._minimum_free
 
     def _too_little(self) -> str:
         return f"fewer than {self._minimum_free >> 20} MiB are free where {self.folder} lies"
