@@ -13,7 +13,7 @@ from urllib.parse import quote
 
 from benchmarks.page.rig import Rig, running
 from der_msgs.msg import PressureState
-from der_planner.runs.outputs import folder_argument
+from der_planner.results.outputs import folder_argument
 from workspace_setup.basics import ROOT
 
 DOC = ROOT / "src" / "der_planner" / "doc"

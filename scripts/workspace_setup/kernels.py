@@ -20,7 +20,7 @@ from benchmarks.tracker.renderer import Scene, render
 from der_planner.identification.parameters import start_values
 from der_planner.identification.rod_angles import RodAngles
 from der_planner.limb import Limb
-from der_planner.model.response import simulate, simulate_many
+from der_planner.model import simulate
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import METHODS, Motion, plan
 from der_planner.rod import Rod
@@ -94,9 +94,6 @@ def main() -> int:
     parts["rod"] = Rod.from_limb(limb).warm_up
     parts["rod in space"] = _in_space
     parts["twin"] = lambda: play(np.array([0.0, 0.05]), np.zeros((2, 2)))
-    parts["many rods"] = lambda: simulate_many(
-        limb, np.array([0.0, 0.05]), commands=np.zeros((2, 2, 2))
-    )
     parts["camera and tracker"] = _track
     for name, use in parts.items():
         begin = time.monotonic()

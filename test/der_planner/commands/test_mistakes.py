@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from der_planner.bags.reader import parse_run
+from der_planner.bags.writer import RUN_KEY
 from der_planner.experiment.processes import find_executable
-from der_planner.runs.recording.layout import RUN_KEY
-from der_planner.runs.recording.scan import parse_run
 
 SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"
 

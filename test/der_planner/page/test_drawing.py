@@ -15,7 +15,7 @@ from apriltag_tracker.camera.pinhole import project
 from apriltag_tracker.detection.tag import Tag
 from apriltag_tracker.tag_map import TagMap
 from der_planner.limb import Limb, LimbError
-from der_planner.model.bending import ArcKinematics
+from der_planner.model import ArcModel
 from der_planner.page.commands import Load
 from der_planner.page.drawing.kept import DrawingError, Drawings
 from der_planner.page.drawing.preview import Previewer, preview
@@ -28,7 +28,7 @@ from der_planner.planning import PathLimits
 from der_planner.planning.inverse import angle_limits, distance_to_reach
 
 LIMB = Limb.default()
-ARCS = ArcKinematics(LIMB)
+ARCS = ArcModel(LIMB)
 TAG_MAP = Path(__file__).parents[3] / "src" / "apriltag_tracker" / "config" / "tags.yaml"
 
 

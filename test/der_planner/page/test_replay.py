@@ -18,10 +18,10 @@ from fastapi.testclient import TestClient
 from filmed import FilmedRun, pixels
 from runs import FRAMES, TIMES, BagOfRun, reference
 
+from der_planner.bags.reader import BagError
 from der_planner.page.afterwards.playback import Playback, describe
 from der_planner.page.afterwards.replay import add_data
 from der_planner.page.worker import Worker
-from der_planner.runs.recording.reader import BagError
 
 SEEN = FRAMES[FRAMES >= 0]
 OFFSET = np.array([0.0, 0.002])

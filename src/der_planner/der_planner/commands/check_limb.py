@@ -32,7 +32,7 @@ from der_planner.identification import (
     update,
 )
 from der_planner.limb import Limb, LimbError
-from der_planner.runs.outputs import OutputError, check_file
+from der_planner.results.outputs import OutputError, check_file
 
 
 def main() -> int:

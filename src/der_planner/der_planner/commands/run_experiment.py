@@ -15,7 +15,7 @@ import sys
 from der_planner.experiment.errors import GraphError, NodeError, OptionError
 from der_planner.experiment.experiment import run
 from der_planner.experiment.options import parse
-from der_planner.runs.outputs import OutputError
+from der_planner.results.outputs import OutputError
 
 
 def main() -> int:

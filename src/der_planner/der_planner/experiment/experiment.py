@@ -16,7 +16,7 @@ from der_planner.experiment.options import Options, Trial
 from der_planner.experiment.progress import Progress
 from der_planner.limb import Limb, LimbError, mounting_of
 from der_planner.methods import LEARNED
-from der_planner.runs.outputs import check_folder
+from der_planner.results.outputs import check_folder
 
 
 def run(options: Options) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from der_planner.bags.run import RunSeries
 from der_planner.control import Learner, LearningError
 from der_planner.control.library import carried_over, nearest
 from der_planner.experiment.errors import GraphError
@@ -15,7 +16,6 @@ from der_planner.experiment.progress import Progress
 from der_planner.limb import Limb
 from der_planner.planning import Plan, PlanningError, plan
 from der_planner.planning.plan_file import read_plan, write_plan
-from der_planner.runs.run import RunSeries
 
 FOLDER = "learned"
 """Of an experiment's learned plans."""

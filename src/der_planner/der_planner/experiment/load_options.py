@@ -9,8 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from der_planner.experiment.errors import OptionError
-from der_planner.limb import Limb, LimbError, gravity_of
-from der_planner.limb_loads import HEAVIEST
+from der_planner.limb import HEAVIEST, Limb, LimbError, gravity_of
 
 
 class _Once(argparse.Action):

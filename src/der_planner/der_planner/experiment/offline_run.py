@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from der_planner.bags.run import method_name
 from der_planner.control import Feedback, lockstep
 from der_planner.control.lockstep import Played
 from der_planner.experiment.errors import GraphError
@@ -17,8 +18,7 @@ from der_planner.identification.offline import CALIBRATION_RUN
 from der_planner.limb import Limb
 from der_planner.planning import Plan, PlanningError, plan
 from der_planner.planning.plan_file import read_plan
-from der_planner.runs.evaluation import Description, RunSeries
-from der_planner.runs.run import method_name
+from der_planner.results import Description, RunSeries
 from der_planner.twin.offline import OfflineTwin
 
 _AT_REST = 1.0

@@ -10,7 +10,7 @@ from der_planner.experiment.errors import GraphError
 from der_planner.experiment.offline_run import load_arrays
 from der_planner.experiment.options import Options, Trial
 from der_planner.experiment.progress import Progress
-from der_planner.runs.evaluation import (
+from der_planner.results import (
     BagError,
     EvaluationError,
     RunSeries,

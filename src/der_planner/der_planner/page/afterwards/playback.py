@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apriltag_tracker.camera.encodings import ImageError, to_grey
+from der_planner.bags.reader import BagError
+from der_planner.bags.record import NANOSECONDS
+from der_planner.bags.scenes import Scenes
 from der_planner.page.overlay import CURVE_POINTS, PATH_POINTS
 from der_planner.page.situation import CENTIMETRES, MODES, PASCAL_PER_KILOPASCAL
-from der_planner.runs.record import NANOSECONDS
-from der_planner.runs.recording.reader import BagError
-from der_planner.runs.scenes import Scenes
 
 KEPT = 2
 """Bags that stay open, one for each of two windows."""

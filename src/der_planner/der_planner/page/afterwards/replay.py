@@ -10,9 +10,9 @@ from fastapi import FastAPI, Response
 from fastapi.responses import PlainTextResponse
 from nicegui import ui
 
+from der_planner.bags.reader import BagError
 from der_planner.page.afterwards.playback import describe, frame, settle
 from der_planner.page.server import STATIC, Parts
-from der_planner.runs.recording.reader import BagError
 
 ADDRESS = "/replay"
 _UNCACHED = {"Cache-Control": "no-store"}
