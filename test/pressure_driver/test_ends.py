@@ -4,8 +4,6 @@ import contextlib
 import os
 import pty
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -67,28 +65,15 @@ raise SystemExit(run_node(Crashing))
 """
 
 
-def test_an_exception_vents(bench, tmp_path):
+def test_an_exception_vents(bench):
     run = bench()
-    run.driver.stop()
-    run.client.watch([run.board])
-    arguments = ["--ros-args", "-p", f"port:={run.link}"]
-    environment = {**os.environ, "ROS_DOMAIN_ID": str(run.graph.domain_id)}
-    process = subprocess.Popen(
-        [sys.executable, "-c", CRASHING, *arguments], env=environment, stderr=subprocess.PIPE
-    )
-    try:
-        run.states.clear()
-        run.wait(lambda: run.states, "the driver")
-        run.wait(run.publisher.get_subscription_count, "the driver's subscription")
+    with run.other_driver(CRASHING) as process:
         run.pressurise()
         run.publisher.publish(PressureSetpoint(plan_id="crash"))
         run.wait(lambda: process.poll() is not None, "the end of the driver")
         assert process.returncode == 1
         assert b"a callback failed" in process.stderr.read()
         run.wait(run.vented, "vented chambers")
-    finally:
-        process.kill()
-        process.wait()
 
 
 def start_on_terminal(run):

@@ -159,7 +159,9 @@ def vent_port(descriptor: int, command: bytes) -> str:
 
 
 def release_descriptor(descriptor: int) -> None:
-    """Close a descriptor of a port, and take off the locks that other programs respect."""
+    """Close a descriptor of a port, if there is one, and take off the locks of the port."""
+    if descriptor < 0:
+        return
     with contextlib.suppress(OSError):
         fcntl.ioctl(descriptor, termios.TIOCNXCL)
     with contextlib.suppress(OSError):
