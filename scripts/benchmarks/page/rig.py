@@ -21,8 +21,7 @@ from websockets.typing import Origin
 
 from der_msgs.msg import ChamberPressures, PressureState
 from der_planner.experiment.client import GraphClient
-from der_planner.experiment.errors import GraphError
-from der_planner.experiment.processes import NodeProcess
+from der_planner.experiment.processes import GraphError, NodeProcess
 from limb_interfaces import qos, topics
 
 DOMAIN = int(os.environ.get("ROS_DOMAIN_ID") or 95)
