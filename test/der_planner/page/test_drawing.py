@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from der_planner.limb import Limb, LimbError
-from der_planner.model.bending import ArcKinematics
+from der_planner.model import ArcModel
 from der_planner.page.commands import Load
 from der_planner.page.drawing import (
     DrawingError,
@@ -25,7 +25,7 @@ from der_planner.planning import PathLimits
 from der_planner.planning.inverse import angle_limits, distance_to_reach
 
 LIMB = Limb.default()
-ARCS = ArcKinematics(LIMB)
+ARCS = ArcModel(LIMB)
 
 
 def test_the_region_holds_what_the_tip_reaches_and_nothing_else() -> None:

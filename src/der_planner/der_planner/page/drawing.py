@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.limb import Limb
-from der_planner.model.bending import ArcKinematics
+from der_planner.model import ArcModel
 from der_planner.page.commands import Load
 from der_planner.planning import Motion, PathLimits, PlanningError, plan
 from der_planner.planning.inverse import angle_limits, static_pressure
@@ -252,7 +252,7 @@ def reachable_region(limb: Limb) -> list[Array]:
     size = max(4, round(_POSES ** (1 / max(count, 2))))
     axes = [np.linspace(a, b, size) for a, b in zip(low, high, strict=True)]
     poses = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    tips = ArcKinematics(limb).tip(poses)
+    tips = ArcModel(limb).tip(poses)
     limit = limb.pneumatics.pressure_limit * (1 + 1e-9)
     allowed: NDArray[np.bool_] = np.all(np.abs(static_pressure(limb, poses)) <= limit, axis=-1)
     if not allowed.any():

@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from der_planner.pcc.arc_kernel import arc_point, solve_symmetric
+from der_planner.model.arc_kernel import arc_point, solve_symmetric
 
 Vector = NDArray[np.float64]
 Complex = NDArray[np.complex128]

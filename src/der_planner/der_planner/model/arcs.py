@@ -1,7 +1,7 @@
-"""The piecewise-constant-curvature limb: kinematics, exact dynamics and its inverse.
+"""A limb of piecewise constant curvature: kinematics, exact dynamics and its inverse.
 
-Each segment is one circular arc with one bend angle; the mass is spread over the arc (or lumped at
-the end of each segment, as parts of the literature do). The equation of motion is
+Each segment is one circular arc with one bend angle; the mass is spread over the arc. The equation
+of motion is
 
     M(q) q̈ + (C(q, q̇) + D(q)) q̇ + K (q − q_rest) = G u + Q_gravity
 
@@ -13,41 +13,79 @@ connectors, and at the masses that the limb carries, which are not damped.
 
 from __future__ import annotations
 
-from typing import Literal
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from der_planner.limb import Limb
-from der_planner.pcc import arc_kernel, kernels
-from der_planner.pcc.kernels import Arcs
-from der_planner.pcc.linearisation import Linearisation
+from der_planner.model import arc_dynamics as kernels
+from der_planner.model.arc_dynamics import Arcs
+from der_planner.model.arc_kernel import arcs_and_slopes
+from der_planner.model.model import NODES, ArcState, Model, Outputs, Rollout, State
 
-Vector = NDArray[np.float64]
+Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-MassModel = Literal["distributed", "lumped"]
 
 QUADRATURE_POINTS = 8
 """Gauss-Legendre points a segment: exact to rounding for bends below 180 degrees."""
-RESTING_STEPS = 60
-LARGEST_PHASE = 1.0
-"""Of the limb's fastest mode in one step of the integrator [rad]; it is unstable beyond 2.8."""
+_RESTING_STEPS = 60
+"""Newton's steps to the pose at rest at the most."""
+_LARGEST_PHASE = 1.0
+"""Phase of the limb's fastest mode in one step of the integrator [rad]; unstable beyond 2.8."""
 
 
-class Pcc:
-    """A limb of n constant-curvature segments.
+@dataclass(frozen=True)
+class ArcFirstOrder:
+    """`FirstOrder` of arcs along a motion of K intervals, S steps.
+
+    Attributes:
+        tip_by_angle: (K+1, 2, M) ∂tip/∂bend angles [m/rad].
+        by_state: (K, S, 2M, 2M) of each step: the change of bend angles and rates after it by
+            theirs before it.
+        by_pressure: (K, S, 2M, M) by the pressures of the step [rad/Pa], [rad/s/Pa].
+    """
+
+    tip_by_angle: Array
+    by_state: Array
+    by_pressure: Array
+
+    def tangent(self, effective: Array, start: Array | None = None) -> tuple[Array, Array]:
+        """Return the changes of tip and bend angles, see `FirstOrder.tangent`."""
+        count, steps, size, n = self.by_pressure.shape
+        x = np.zeros(size)
+        if start is not None:
+            x[:n] = start
+        moved = np.empty((count + 1, n))
+        moved[0] = x[:n]
+        for k in range(count):
+            for s in range(steps):
+                x = self.by_state[k, s] @ x + self.by_pressure[k, s] @ effective[k, s]
+            moved[k + 1] = x[:n]
+        return np.einsum("kan,kn->ka", self.tip_by_angle, moved), moved
+
+    def sensitivity(self, pulse: Array | None = None) -> Array:
+        """Return ∂tip/∂input, see `FirstOrder.sensitivity`."""
+        steps, n = self.by_pressure.shape[1], self.by_pressure.shape[3]
+        shape = np.ones((steps, n)) if pulse is None else pulse
+        angles = kernels.sensitivity(self.by_state, self.by_pressure, shape)
+        moved: Array = np.einsum("kan,knjm->kajm", self.tip_by_angle, angles)
+        return moved
+
+
+class ArcModel(Model):
+    """A limb of n constant-curvature segments; it is its own `Kinematics`.
 
     Args:
         limb: the physical parameters; the same file as the rod's.
-        mass: ``distributed`` along the arcs, or ``lumped`` at the end of each segment.
-
-    Raises:
-        ValueError: unknown mass model.
     """
 
-    def __init__(self, limb: Limb, mass: MassModel = "distributed") -> None:
+    name = "pcc"
+
+    def __init__(self, limb: Limb, nodes: int = NODES) -> None:
+        super().__init__(limb, nodes)
         segments = limb.segments
-        self.limb = limb
         self.segment_count = limb.segment_count
         self.lengths = np.array([s.length for s in segments])
         self.base = float(limb.base_length)
@@ -55,23 +93,19 @@ class Pcc:
         self.masses = np.array([s.mass_per_length * s.length for s in segments])
         self.stiffness = np.array([s.bending_stiffness / s.length for s in segments])
         self.cubic = np.array([s.cubic_stiffness / s.length**3 for s in segments])
-        self.rest = np.array([s.rest_curvature * s.length for s in segments])
+        self.free_angles = np.array([s.rest_curvature * s.length for s in segments])
         self.material_damping = np.array([s.material_damping for s in segments])
         self.gain = np.array([s.moment_gain for s in segments])
-        if mass == "distributed":
-            nodes, weights = np.polynomial.legendre.leggauss(QUADRATURE_POINTS)
-            self.arcs = self._arcs((nodes + 1) / 2, weights / 2)
-        elif mass == "lumped":
-            self.arcs = self._arcs(np.ones(1), np.ones(1))
-        else:
-            raise ValueError(f"mass must be 'distributed' or 'lumped', got {mass!r}")
+        self.arcs = self._arcs()
+        self.kinematics = self
 
-    def _arcs(self, fractions: Vector, weights: Vector) -> Arcs:
-        """Return the numbers of the kernels; a segment's mass sits at fractions of its length."""
+    def _arcs(self) -> Arcs:
+        """Return the numbers of the kernels, with the mass at quadrature points."""
+        nodes, weights = np.polynomial.legendre.leggauss(QUADRATURE_POINTS)
         # owner, place, beyond, mass, weight and drag of every particle
         particles: list[tuple[int, float, float, float, float, float]] = []
         for j, segment in enumerate(self.limb.segments):
-            for place, weight in zip(fractions, weights * self.masses[j], strict=True):
+            for place, weight in zip((nodes + 1) / 2, weights / 2 * self.masses[j], strict=True):
                 mass = weight * segment.swing_inertia
                 particles.append((j, place, 0.0, mass, weight, weight * segment.damping))
             if j and self.connector:
@@ -92,7 +126,7 @@ class Pcc:
         return Arcs(
             self.lengths, self.connector, np.array(self.limb.gravity[:2], dtype=float),
             owner.astype(np.int64), place, beyond, masses, pulled, drag, self.gain,
-            self.stiffness, self.cubic, self.rest, self.material_damping,
+            self.stiffness, self.cubic, self.free_angles, self.material_damping,
         )  # fmt: skip
 
     def _place(self, arc_length: float) -> tuple[int, float, float]:
@@ -107,7 +141,7 @@ class Pcc:
             left -= length + self.connector
         raise AssertionError("the last segment takes what is left")
 
-    def _check(self, name: str, value: ArrayLike) -> Vector:
+    def _check(self, name: str, value: ArrayLike) -> Array:
         array = np.asarray(value, dtype=float)
         if array.shape != (self.segment_count,) or not np.all(np.isfinite(array)):
             raise ValueError(
@@ -115,19 +149,19 @@ class Pcc:
             )
         return array
 
-    def tip(self, bend_angles: ArrayLike) -> Vector:
+    def tip(self, bend_angles: ArrayLike) -> Array:
         """Return the tip (..., 2) [m] for bend angles (..., n) [rad]."""
         tip = self._joints(np.asarray(bend_angles, dtype=float))[0]
         return np.stack([tip.real, tip.imag], axis=-1)
 
-    def tip_jacobian(self, bend_angles: ArrayLike) -> Vector:
+    def tip_jacobians(self, bend_angles: ArrayLike) -> Array:
         """Return ∂tip/∂bend angles (..., 2, n) [m/rad] for bend angles (..., n) [rad]."""
         angles = np.asarray(bend_angles, dtype=float)
         tip, ends, headings = self._joints(angles)
         columns = headings * self.lengths * _arc_ends(angles)[1] + 1j * (tip[..., None] - ends)
         return np.stack([columns.real, columns.imag], axis=-2)
 
-    def _joints(self, angles: Vector) -> tuple[Complex, Complex, Complex]:
+    def _joints(self, angles: Array) -> tuple[Complex, Complex, Complex]:
         """Return the tip (...), the ends of the segments and their first headings (..., n)."""
         turned = np.cumsum(angles, axis=-1)
         headings = np.exp(1j * (turned - angles))
@@ -137,7 +171,7 @@ class Pcc:
         ends = self.base + np.cumsum(steps, axis=-1) + np.cumsum(between, axis=-1) - between
         return ends[..., -1], ends, headings
 
-    def curve(self, bend_angles: ArrayLike, points_per_segment: int = 12) -> Vector:
+    def curve(self, bend_angles: ArrayLike, points_per_segment: int = 12) -> Array:
         """Return points (P, 2) [m] of the centreline from clamp to tip for one configuration."""
         q = self._check("bend_angles", bend_angles)
         position, heading = complex(self.base), 1 + 0j
@@ -154,7 +188,7 @@ class Pcc:
         line = np.array(points)
         return np.column_stack([line.real, line.imag])
 
-    def matrices(self, bend_angles: ArrayLike, rates: ArrayLike) -> tuple[Vector, Vector, Vector]:
+    def matrices(self, bend_angles: ArrayLike, rates: ArrayLike) -> tuple[Array, Array, Array]:
         """Return inertia M, Coriolis C and damping D, each (n, n), with Ṁ = C + Cᵀ.
 
         Args:
@@ -164,17 +198,36 @@ class Pcc:
         M, C, D, _ = self._inertia(self._check("bend_angles", bend_angles), np.asarray(rates))
         return M, C, D + np.diag(self.stiffness * self.material_damping)
 
-    def _inertia(self, q: Vector, v: Vector) -> tuple[Vector, Vector, Vector, Vector]:
-        result: tuple[Vector, Vector, Vector, Vector] = kernels.inertia(q, v, self.arcs)
+    def _inertia(self, q: Array, v: Array) -> tuple[Array, Array, Array, Array]:
+        result: tuple[Array, Array, Array, Array] = kernels.inertia(q, v, self.arcs)
         return result
 
-    def elastic_torque(self, bend_angles: ArrayLike) -> Vector:
+    def elastic_torque(self, bend_angles: ArrayLike) -> Array:
         """Return the elastic torque (..., n) [N·m] that opposes bend angles (..., n) [rad]."""
-        bend = np.asarray(bend_angles, dtype=float) - self.rest
-        torque: Vector = self.stiffness * bend + self.cubic * bend**3
+        bend = np.asarray(bend_angles, dtype=float) - self.free_angles
+        torque: Array = self.stiffness * bend + self.cubic * bend**3
         return torque
 
-    def resting(self, pressures: ArrayLike) -> Vector:
+    @cached_property
+    def rest(self) -> ArcState:
+        """The vented arcs at rest."""
+        return self.resting(np.zeros(self.inputs))
+
+    def state(self, angles: ArrayLike, rates: ArrayLike) -> ArcState:
+        """Return the arcs at bend angles and rates (M,) [rad], [rad/s]."""
+        return ArcState(np.asarray(angles, dtype=float), np.asarray(rates, dtype=float))
+
+    def resting(self, effective: Array) -> ArcState:
+        """Return the arcs at rest under effective pressures (M,) [Pa] and their weight."""
+        angles = self.resting_angles(effective)
+        return ArcState(angles, np.zeros_like(angles))
+
+    def rest_slope(self, state: ArcState, _effective: Array) -> Array:
+        """Return ∂angles/∂effective (n, n) [rad/Pa] of arcs at rest."""
+        matrix = self.stiffness_matrix(state.angles)
+        return np.asarray(np.linalg.solve(matrix, np.diag(self.gain)))
+
+    def resting_angles(self, pressures: ArrayLike) -> Array:
         """Return the bend angles (n,) [rad] at rest under effective pressures (n,) [Pa] and weight.
 
         By Newton's method on G u + Q_gravity = K (q − q_rest), with steps of at most 0.3 rad along
@@ -182,10 +235,10 @@ class Pcc:
         """
         drive = self.gain * self._check("pressures", pressures)
         still = np.zeros(self.segment_count)
-        q: Vector = self.rest + drive / self.stiffness
+        q: Array = self.free_angles + drive / self.stiffness
         if not self.arcs.gravity.any() and not self.cubic.any():
             return q
-        for _ in range(RESTING_STEPS):
+        for _ in range(_RESTING_STEPS):
             pull = self._inertia(q, still)[3] + drive - self.elastic_torque(q)
             values, vectors = np.linalg.eigh(self.stiffness_matrix(q))
             firm = np.maximum(np.abs(values), 1e-3 * self.stiffness.min())
@@ -199,7 +252,7 @@ class Pcc:
         """Return kinetic plus elastic plus gravity's potential energy [J]."""
         q, v = self._check("bend_angles", bend_angles), self._check("rates", rates)
         M = self._inertia(q, v)[0]
-        bend = q - self.rest
+        bend = q - self.free_angles
         elastic = 0.5 * self.stiffness @ bend**2 + 0.25 * self.cubic @ bend**4
         arcs = self.arcs
         frame = kernels.joints(q, arcs)
@@ -211,7 +264,9 @@ class Pcc:
             potential -= mass * (point.real * arcs.gravity[0] + point.imag * arcs.gravity[1])
         return float(0.5 * v @ M @ v + elastic + potential)
 
-    def pressures(self, angles: ArrayLike, rates: ArrayLike, accelerations: ArrayLike) -> Vector:
+    def inverse_dynamics(
+        self, angles: ArrayLike, rates: ArrayLike, accelerations: ArrayLike
+    ) -> Array:
         """Invert the dynamics: u = Λ† τ with τ = M q̈ + (C + D) q̇ + K (q − q_rest) − Q_gravity.
 
         Args:
@@ -229,64 +284,41 @@ class Pcc:
         for k in range(len(q)):
             M, C, D, weight = self._inertia(q[k], v[k])
             torque[k] += M @ a[k] + (C + D) @ v[k] - weight
-        pressures: Vector = torque / self.gain
+        pressures: Array = torque / self.gain
         return pressures
 
-    def simulate(
-        self,
-        pressures: ArrayLike,
-        step: float,
-        angles: ArrayLike | None = None,
-        rates: ArrayLike | None = None,
-    ) -> tuple[Vector, Vector]:
-        """Roll the model forward from rest, or from a given state.
-
-        Args:
-            pressures: (K, S, n) effective differential pressures [Pa], constant over each step.
-            step: of the Runge-Kutta integrator [s]; an interval lasts S steps.
-            angles: (n,) at the beginning [rad]; at rest if None.
-            rates: (n,) at the beginning [rad/s]; zero if None.
-
-        Returns:
-            Angles [rad] and rates [rad/s], each (K + 1, n), at the interval boundaries.
+    def run(
+        self, start: State, effective: Array, period: float, linearise: Outputs = ""
+    ) -> Rollout:
+        """Simulate the arcs by steps of Runge and Kutta, see `Model.run`.
 
         Raises:
             ValueError: wrong shapes.
         """
-        result: tuple[Vector, Vector] = kernels.simulate(*self._run(pressures, step, angles, rates))
-        return result
-
-    def linearised(
-        self,
-        pressures: ArrayLike,
-        step: float,
-        angles: ArrayLike | None = None,
-        rates: ArrayLike | None = None,
-    ) -> tuple[Vector, Vector, Linearisation]:
-        """Roll the model forward as `simulate`, with the exact linearisation of the motion."""
-        q, v, by_state, by_pressure = kernels.linearised(*self._run(pressures, step, angles, rates))
-        return q, v, Linearisation(by_state, by_pressure)
-
-    def _run(
-        self, pressures: ArrayLike, step: float, angles: ArrayLike | None, rates: ArrayLike | None
-    ) -> tuple[Vector, Vector, Vector, float, int, Arcs]:
-        """Return the arguments of the kernels that roll the model forward."""
-        inputs = np.ascontiguousarray(pressures, dtype=float)
+        if not isinstance(start, ArcState):
+            raise TypeError("the arcs start from a state of the arcs, got one of the rod")
+        inputs = np.ascontiguousarray(effective, dtype=float)
         if inputs.ndim != 3 or inputs.shape[2] != self.segment_count:
             raise ValueError(f"pressures must be (K, S, {self.segment_count}), got {inputs.shape}")
-        q = self._check("angles", self.rest if angles is None else angles)
-        v = self._check("rates", np.zeros(self.segment_count) if rates is None else rates)
-        return q, v, inputs, step, self._parts(step), self.arcs
+        q, v = self._check("angles", start.angles), self._check("rates", start.rates)
+        step, linear = period / inputs.shape[1], None
+        given = (q, v, inputs, step, self._parts(step), self.arcs)
+        if linearise:
+            angles, rates, by_state, by_pressure = kernels.linearised(*given)
+            linear = ArcFirstOrder(self.tip_jacobians(angles), by_state, by_pressure)
+        else:
+            angles, rates = kernels.simulate(*given)
+        return Rollout(angles, self.tip(angles), ArcState(angles[-1], rates[-1]), linear=linear)
 
     def smallest_stiffness(self, bend_angles: ArrayLike) -> float:
         """Return the smallest eigenvalue of the stiffness of arcs at rest [N·m/rad]."""
         return float(np.linalg.eigvalsh(self.stiffness_matrix(bend_angles))[0])
 
-    def stiffness_matrix(self, bend_angles: ArrayLike) -> Vector:
+    def stiffness_matrix(self, bend_angles: ArrayLike) -> Array:
         """Return ∂(elastic less gravity's torque)/∂(bend angles) (n, n) [N·m/rad], symmetric."""
         q = self._check("bend_angles", bend_angles)
         zero = np.zeros_like(q)
-        matrix: Vector = kernels.force_slopes(q, zero, zero, self.arcs)[0]
+        matrix: Array = kernels.force_slopes(q, zero, zero, self.arcs)[0]
         return matrix
 
     def _parts(self, step: float) -> int:
@@ -297,10 +329,10 @@ class Pcc:
         stiff = np.linalg.solve(M, np.diag(self.stiffness))
         rates = np.block([[0 * M, np.eye(len(M))], [-stiff, -drag]])
         fastest = float(np.abs(np.linalg.eigvals(rates)).max())
-        return max(1, int(np.ceil(fastest * step / LARGEST_PHASE)))
+        return max(1, int(np.ceil(fastest * step / _LARGEST_PHASE)))
 
 
-def _arc_ends(angles: Vector) -> tuple[Complex, Complex]:
+def _arc_ends(angles: Array) -> tuple[Complex, Complex]:
     """Return g = ∫₀¹ exp(i angle η) dη and its derivative at angles [rad] of any shape."""
-    arcs, slopes = arc_kernel.arcs_and_slopes(np.ravel(angles))
+    arcs, slopes = arcs_and_slopes(np.ravel(angles))
     return arcs.reshape(angles.shape), slopes.reshape(angles.shape)

@@ -6,16 +6,9 @@ import numpy as np
 import pytest
 
 from der_planner.limb import VENT_REFERENCE, Limb, LimbError
-from der_planner.model import commands
-from der_planner.model.air import (
-    chamber_pressures,
-    derivative,
-    follow_commands,
-    vent_memory,
-)
+from der_planner.model import STEPS, Material, RodModel, commands
+from der_planner.model.air import Air
 from der_planner.model.commands import slow_venting
-from der_planner.model.drive import STEPS
-from der_planner.model.material import differential_pressure
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import METHODS, Motion, plan, planner
 from der_planner.planning.optimal import Optimiser
@@ -35,7 +28,7 @@ def slow(**air):
 def test_a_vented_chamber_falls_by_the_law(exponent, sign):
     air = slow(vent_time_constant=0.01, vent_exponent=exponent, delay=0.0).pneumatics
     start = 7000.0
-    chambers = chamber_pressures(air, np.zeros((60, 1)), 0.05, 5, [sign * start])
+    chambers = Air(air).follow(np.zeros((60, 1)), 0.05, 5, [sign * start]).differential
     pressure = sign * chambers.ravel()
     time = (np.arange(300) + 0.5) * 0.01
     rate = air.vent_rate / VENT_REFERENCE
@@ -55,7 +48,7 @@ def test_the_default_exponent_vents_a_step_as_the_real_limb_does():
     """2.5 s from 90 to 10 % of 7 kPa, and slower by the cube root where the pressure is higher."""
     air = slow(vent_time_constant=0.01, vent_rate=5340.0).pneumatics
     for step, expected in ((7000.0, 2.5), (14_000.0, 2.5 * 2 ** (1 / 3))):
-        pressure = chamber_pressures(air, np.zeros((120, 1)), 0.05, 5, [step]).ravel()
+        pressure = Air(air).follow(np.zeros((120, 1)), 0.05, 5, [step]).differential.ravel()
         between = (pressure < 0.9 * step) & (pressure > 0.1 * step)
         assert np.count_nonzero(between) * 0.01 == pytest.approx(expected, rel=0.02)
 
@@ -63,7 +56,7 @@ def test_the_default_exponent_vents_a_step_as_the_real_limb_does():
 def test_filling_does_not_wait_for_an_outlet():
     command = np.repeat([[2000.0, -3000.0], [5000.0, -9000.0]], 20, axis=0)
     with_limit, without = (
-        chamber_pressures(slow(vent_rate=rate).pneumatics, command, 0.05, 4)
+        Air(slow(vent_rate=rate).pneumatics).follow(command, 0.05, 4).differential
         for rate in (3000.0, 0.0)
     )
     np.testing.assert_array_equal(with_limit, without)
@@ -73,7 +66,7 @@ def test_the_opposite_chamber_makes_up_for_a_slow_one():
     """Beyond zero the command fills the neighbour: the difference falls faster than an outlet."""
     air = slow().pneumatics
     vented, opposed = (
-        chamber_pressures(air, np.full((20, 1), u), 0.05, 4, [8000.0])[-1, -1, 0]
+        Air(air).follow(np.full((20, 1), u), 0.05, 4, [8000.0]).differential[-1, -1, 0]
         for u in (0.0, -3000.0)
     )
     assert opposed == pytest.approx(vented - 3000.0 * (1 - np.exp(-1 / 0.3)), abs=60.0)
@@ -88,14 +81,14 @@ def test_derivatives_by_commands_against_finite_differences(delay, exponent, val
     command = 6e3 * np.column_stack([np.sin(2 * time) ** 3, np.cos(1.3 * time)])
     command += rng.normal(scale=50.0, size=command.shape)
     before = np.array([500.0, 6000.0])
-    exact = derivative(follow_commands(air, command, 0.05, 5, before), 40)
+    exact = Air(air).follow(command, 0.05, 5, before).derivative(40)
     limited = np.isclose(exact[..., 0].sum(axis=(0, 1)), 0.0)
     assert 5 < limited.sum() < 60, "some commands move nothing, most do"
     for _ in range(3):
         direction = np.zeros_like(command)
         direction[40:] = rng.normal(size=(80, 2))
         ahead, behind = (
-            chamber_pressures(air, command + step * direction, 0.05, 5, before)
+            Air(air).follow(command + step * direction, 0.05, 5, before).differential
             for step in (1e-3, -1e-3)
         )
         slope = ((ahead - behind) / 2e-3)[40:]
@@ -107,7 +100,7 @@ def test_a_valve_that_opens_in_proportion_to_its_error_by_small_explicit_steps()
     """From 12 kPa toward 0.7 kPa, where its lag is four times that at 10 kPa, then to nothing."""
     air = slow(vent_exponent=0.5, vent_lag_exponent=0.5, delay=0.0).pneumatics
     command = np.repeat([700.0, 0.0], [140, 60])[:, None]
-    chambers = chamber_pressures(air, command, 0.05, 5, [12_000.0]).ravel()
+    chambers = Air(air).follow(command, 0.05, 5, [12_000.0]).differential.ravel()
     pressure, h = 12_000.0, 1e-4
     for k, goal in enumerate(np.repeat(command.ravel(), 500)):
         if k % 100 == 50:
@@ -121,9 +114,9 @@ def test_a_valve_that_opens_in_proportion_to_its_error_by_small_explicit_steps()
 @pytest.mark.parametrize("valve", [0.0, 0.5])
 def test_what_lies_longer_back_than_the_memory_is_forgotten(valve):
     air = slow(vent_lag_exponent=valve).pneumatics
-    count = int(np.ceil((vent_memory(air) + 25 * 0.13) / 0.05))
+    count = int(np.ceil((Air(air).vent_memory + 25 * 0.13) / 0.05))
     full = np.full(1, air.pressure_limit)
-    pressure = chamber_pressures(air, np.zeros((count, 1)), 0.05, 5, full)
+    pressure = Air(air).follow(np.zeros((count, 1)), 0.05, 5, full).differential
     assert pressure[-1, -1, 0] < 0.2
 
 
@@ -131,17 +124,21 @@ def test_commands_invert_slow_venting():
     limb = slow(slew_limit=1e6, delay=0.03)
     fine = np.arange(401) * 0.025
     wanted = np.column_stack([5e3 * (1 - np.cos(1.3 * fine)), 6e3 * np.sin(1.1 * fine)])
-    command = commands.commands(limb, fine, wanted, np.zeros_like(wanted), 0.05)
+    command = commands.commands(RodModel(limb), fine, wanted, np.zeros_like(wanted), 0.05)
     middle = (np.arange(len(command)) + 0.5) * 0.05
     exact = np.column_stack([np.interp(middle, fine, column) for column in wanted.T])
     ignorant = dataclasses.replace(limb.pneumatics, vent_rate=0.0)
     unaware = commands.commands(
-        dataclasses.replace(limb, pneumatics=ignorant), fine, wanted, np.zeros_like(wanted), 0.05
+        RodModel(dataclasses.replace(limb, pneumatics=ignorant)),
+        fine,
+        wanted,
+        np.zeros_like(wanted),
+        0.05,
     )
     known, unknown = (
         np.sqrt(((chambers.mean(axis=1) - exact)[20:] ** 2).mean())
         for chambers in (
-            chamber_pressures(limb.pneumatics, given, 0.05, 5) for given in (command, unaware)
+            Air(limb.pneumatics).follow(given, 0.05, 5).differential for given in (command, unaware)
         )
     )
     assert known < 150.0
@@ -157,8 +154,8 @@ def test_a_plan_faster_than_the_chambers_vent_warns_and_a_slow_one_does_not(mode
     time, effective, bend = planner.balance(
         *_physics(fast), method if method != "optimal" else "projected"
     )
-    wanted = differential_pressure(slow(), time, effective, bend)
-    numbers = slow_venting(slow().pneumatics, time, wanted)
+    wanted = Material(slow()).differential_pressure(time, effective, bend)
+    numbers = slow_venting(Air(slow().pneumatics), time, wanted)
     assert numbers is not None
     assert numbers.wanted > 1.2 * numbers.possible
     assert f"fall by {numbers.wanted:.0f} Pa/s" in said[0]
@@ -196,7 +193,7 @@ def test_gauss_newton_agrees_with_finite_differences_where_chambers_are_limited(
     reference = Motion.named("asynchronous", period=6.0, cycles=1).reference(limb)
     spline = model.configuration(reference)
     warm = commands.commands(
-        model.limb, *planner.balance(model, spline, reference, "projected"), CONTROL_PERIOD
+        model, *planner.balance(model, spline, reference, "projected"), CONTROL_PERIOD
     )
     solver = Optimiser(model, model.rest, spline, reference, warm, STEPS)
     quadratic = solver._linearise(solver.drive.window(warm[:100]), solver.start, 0.0)

@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.model.bending import bend_angles, bend_change, bend_outputs
-from der_planner.rod import ConvergenceError, Rod, RodState
+from der_planner.model.rod import RodModel
+from der_planner.rod import ConvergenceError, RodState
 
 Array = NDArray[np.float64]
 
@@ -54,21 +55,21 @@ class Poses:
     smallest_stiffness: Array
 
 
-class Holder:
+class PoseFinder:
     """Finds poses of one rod.
 
     Args:
-        rod: with gravity.
-        gain: (M,) bend angle per pressure without loads [rad/Pa]: the scale of the search.
+        model: of a limb under gravity.
         prior: p [m/rad].
         tip_weight: a.
     """
 
-    def __init__(self, rod: Rod, gain: Array, prior: float, tip_weight: float = 1.0) -> None:
-        self.rod, self.gain, self.prior, self.tip_weight = rod, gain, prior, tip_weight
-        tip = 4 * (rod.nodes - 1)
+    def __init__(self, model: RodModel, prior: float, tip_weight: float = 1.0) -> None:
+        self._model, self.rod, self.gain = model, model.rod, model.limb.static_gain
+        self.prior, self.tip_weight = prior, tip_weight
+        tip = 4 * (self.rod.nodes - 1)
         self._tip = [tip, tip + 1]
-        self._outputs = bend_outputs(rod)
+        self._outputs = bend_outputs(self.rod)
 
     def along(self, start: RodState, tip: Array, guess: Array) -> Poses:
         """Return the poses for tips (K, 2) [m], near bend angles (K, M) [rad].
@@ -85,7 +86,7 @@ class Holder:
         state, pressure = start, np.zeros(self.rod.segment_count)
         begin = state.q[self._tip]
         count = int(np.ceil(np.linalg.norm(tip[0] - begin) / _APPROACH))
-        angles = bend_angles(self.rod, state.q[None])[0]
+        angles = self._model.bend_of(state)
         for share in np.arange(1, count) / max(count, 1):
             wanted, near = begin + share * (tip[0] - begin), angles + share * (guess[0] - angles)
             state, pressure = self._pose(state, pressure, wanted, near, 0)
@@ -97,9 +98,9 @@ class Holder:
             except ConvergenceError:
                 state, pressure = self._pose(state, pressure, tip[k], guess[k], k)
             found.append((pressure, state))
-        return self._poses(found, tip)
+        return self._described(found, tip)
 
-    def _poses(self, found: list[tuple[Array, RodState]], tip: Array) -> Poses:
+    def _described(self, found: list[tuple[Array, RodState]], tip: Array) -> Poses:
         rod, q = self.rod, np.array([state.q for _, state in found])
         slopes = [rod.linearise_equilibrium(state, u)[rod.free] for u, state in found]
         return Poses(
@@ -151,7 +152,7 @@ class Holder:
             raise
 
     def _misses(self, state: RodState, tip: Array, guess: Array) -> Array:
-        angles = bend_angles(self.rod, state.q[None])[0]
+        angles = self._model.bend_of(state)
         missed = self.tip_weight * (state.q[self._tip] - tip)
         return np.concatenate([missed, self.prior * (angles - guess)])
 
