@@ -15,6 +15,7 @@ from der_msgs.msg import PressureState
 from der_planner.experiment.client import GraphClient
 from der_planner.experiment.console import Progress
 from der_planner.experiment.processes import (
+    PAGE_TOKEN,
     STOP_ORDER,
     GraphError,
     GraphSetup,
@@ -133,7 +134,7 @@ class GraphPlayer(ABC):
         self._progress.say(f"  ready after {time.monotonic() - begin:.1f} s")
         if "page" in self._processes:
             address = client.diagnostic_values("page").get("url", "unknown")
-            self._progress.say(f"  the operator's page is at {address}")
+            self._progress.say(f"  the operator's page is at {address}?token={PAGE_TOKEN}")
 
     def _begin_process(self, spec: NodeSpec, name: str = "") -> NodeProcess:
         hardware = self._setup.hardware

@@ -7,6 +7,7 @@ import ctypes
 import dataclasses
 import json
 import os
+import secrets
 import signal
 import subprocess
 import time
@@ -30,6 +31,8 @@ STOP_ORDER = (
     "page",
     "board_emulator",
 )
+PAGE_TOKEN = secrets.token_urlsafe()
+"""Opens the page of each run's graph, so that a window that is open stays let in."""
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)
 
@@ -157,7 +160,7 @@ class GraphSetup:
             )  # fmt: skip
             page = {name: planner[name] for name in shared if name in planner}
             page |= {name: value for name, value in rig.tracker.items() if name == "tag_map"}
-            page |= {"port": self.page, "experiments": str(self.bag.parents[2])}
+            page |= {"port": self.page, "token": PAGE_TOKEN}
             specs.append(NodeSpec("der_planner", "page", page))
         return specs
 
