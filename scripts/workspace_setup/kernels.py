@@ -21,7 +21,7 @@ from benchmarks.tracker.renderer import Scene, render
 from der_planner.identification.parameters import start_values
 from der_planner.identification.rod_angles import RodAngles
 from der_planner.limb import Limb
-from der_planner.model.response import simulate
+from der_planner.model import simulate
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import METHODS, Motion, plan
 from der_planner.rod import Rod

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from der_planner.bags.layout import RUN_KEY
-from der_planner.bags.scan import parse_run
+from der_planner.bags.reader import parse_run
+from der_planner.bags.writer import RUN_KEY
 from der_planner.experiment.processes import find_executable
 
 SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"
