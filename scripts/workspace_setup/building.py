@@ -87,8 +87,8 @@ def drop_stale_kernels(source: Path, changed: Iterable[str]) -> None:
 def kernel_jobs() -> list[Job]:
     """Return what compiles kernels that are new or changed, before several nodes do it at once.
 
-    Half of the kernels call none of the other half, so that each has a process of its own. Both need
-    only the sources: the packages may be built beside them.
+    Half of the kernels call none of the other half, so each half has a process of its own. Both
+    need only the sources: the packages may be built beside them.
     """
     source, stamp = ROOT / "src", ROOT / "build" / "kernels.json"
     digests = kernel_digests(source)

@@ -80,8 +80,8 @@ def install_venv() -> None:
     if born.exists() and not born.read_text().endswith(f" {VENV}"):
         # It may be in use: a container or a bind mount shows one folder under two paths.
         raise SetupError(
-            f"{VENV} was made as {born.read_text().split()[-1]}: use the workspace under that path; "
-            "or, if it was moved or copied, remove .venv, build and install and start again"
+            f"{VENV} was made as {born.read_text().split()[-1]}: use the workspace under that "
+            "path; or, if it was moved or copied, remove .venv, build and install and start again"
         )
     if VENV.exists() and (not born.exists() or born.read_text() != f"{python} {VENV}"):
         say(f"{VENV.name} belongs to another Python: making it new")

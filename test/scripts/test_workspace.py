@@ -101,6 +101,7 @@ def test_jobs_run_beside_each_other_and_a_failed_one_is_named(
     assert finished[2:] == ["good"]
 
 
+@pytest.mark.slow
 def test_a_kernel_is_compiled_again_when_one_that_it_calls_has_changed(tmp_path: Path):
     from workspace_setup.building import drop_stale_kernels, kernel_digests
 
