@@ -125,7 +125,7 @@ def test_records_the_graph_between_start_and_stop(graph, tmp_path: Path):
 
 
 def test_second_start_into_the_same_folder_is_refused(graph, tmp_path: Path):
-    from der_planner.experiment.errors import GraphError
+    from der_planner.experiment.processes import GraphError
 
     start(graph, output=str(tmp_path / "run"))
     graph.client.call("recorder/start")
