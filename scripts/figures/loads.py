@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.limb import Limb
+from der_planner.model import ArcModel, Model, simulate
 from der_planner.model.air import pair_of
-from der_planner.model.bending import ArcKinematics
-from der_planner.model.response import simulate
 from der_planner.rod import RodState
 from der_planner.studies.twins import Twin, calibrated, read_limb
 from der_planner.twin import LimbTwin
@@ -53,10 +52,10 @@ def model_shape(limb: Limb, model: str, pressure: Array) -> Array:
     time = np.arange(0.0, HOLD, 0.05)
     held = np.minimum(time / 2.0, 1.0)[:, None] * pressure
     seen = limb.for_model(model)
-    final = simulate(seen, time, pressures=held, model=model).final
+    final = simulate(Model.of(seen, model), time, pressures=held).final
     if isinstance(final, RodState):
         return np.stack([final.q[0::4], final.q[1::4]], axis=1)
-    return ArcKinematics(seen).curve(final.angles)
+    return ArcModel(seen).curve(final.angles)
 
 
 def draw_shapes(path: Path, seed: int) -> None:

@@ -11,7 +11,6 @@ LAYERS = {
     "methods": 0,
     "limb": 1,
     "rod": 2,
-    "pcc": 2,
     "model": 3,
     "twin": 4,
     "planning": 4,

@@ -12,9 +12,7 @@ from der_planner.identification.lengths import fit_geometry, with_lengths
 from der_planner.identification.log import Prepared
 from der_planner.identification.terms import COLUMN, TERMS, FreeTerms, values_of
 from der_planner.limb import Limb
-from der_planner.model.bending import PolylineKinematics
-from der_planner.model.response import RodModel
-from der_planner.rod import Rod
+from der_planner.model import RodModel
 
 pytestmark = pytest.mark.slow
 
@@ -143,10 +141,9 @@ def test_a_limb_that_fits_passes_the_check_and_a_changed_one_does_not(fitted):
 
 def test_lengths_are_recovered_from_tips():
     limb = with_lengths(Limb.default(), np.array([0.1195, 0.1235, 5e-3, 6e-3]))
-    rod = Rod.from_limb(limb, 21)
     generator = np.random.default_rng(2)
     angles = generator.uniform(-0.8, 0.8, (400, 2))
-    tip = PolylineKinematics.of_rod(rod).tip(angles)
+    tip = RodModel(limb).kinematics.tip(angles)
     tip += 2e-4 * generator.standard_normal(tip.shape)
     time, none = 0.05 * np.arange(400), np.zeros((400, 2))
     found = fit_geometry(Limb.default(), CalibrationLog(time, none, none, angles, tip))

@@ -14,7 +14,7 @@ from der_planner.identification.lengths import UnevenTips, uneven_tip, unevennes
 from der_planner.identification.log import Prepared, prepare
 from der_planner.identification.terms import FreeTerms
 from der_planner.limb import Limb, gravity_of
-from der_planner.model.response import RodModel, simulate
+from der_planner.model import RodModel, simulate
 from der_planner.planning import Motion, plan
 
 pytestmark = pytest.mark.slow

@@ -17,7 +17,7 @@ from der_planner.identification.least_squares import (
 )
 from der_planner.identification.log import CalibrationLog, LogError
 from der_planner.limb import Limb, Pneumatics
-from der_planner.model.air import pressures_at_commands
+from der_planner.model.air import Air
 
 Array = NDArray[np.float64]
 
@@ -135,7 +135,7 @@ class _Chambers:
     def residual(self, numbers: Mapping[str, float]) -> Array:
         """Return predicted less measured pressures of the rows [Pa]."""
         law = replace(Limb.default().pneumatics, **{"vent_rate": 0.0, **numbers})
-        predicted = pressures_at_commands(law, self.command, self.period)
+        predicted = Air(law).pressures_at_commands(self.command, self.period)
         return np.asarray((predicted - self.measured)[self.rows])
 
     def fit(self, names: tuple[str, ...], start: Mapping[str, float] | None = None) -> _Found:

@@ -21,8 +21,7 @@ from der_planner.identification.least_squares import (
 )
 from der_planner.identification.log import Prepared
 from der_planner.limb import Limb
-from der_planner.model.material import slow_effective_pressure
-from der_planner.model.response import ArcModel, Response, RodModel, simulate
+from der_planner.model import Material, Model, Response, simulate
 
 Array = NDArray[np.float64]
 
@@ -35,7 +34,7 @@ CORRELATION = 20.0
 """Rows over which an error of the model stays the same (1 s)."""
 SOFTNESS = 3.0
 """Errors beyond this multiple of `ANGLE_ERROR` count less than their square."""
-_STEPS = {RodModel: 1, ArcModel: 2}
+_STEPS = {"der": 1, "pcc": 2}
 """Integrator steps in each row of 50 ms; the page of the identification shows the convergence."""
 _NUDGE = 1e-3
 """Change of an unknown, in units of its scale, for the slope of the effective pressure."""
@@ -46,8 +45,6 @@ _OF_THE_BODY = (
     *("damping", "material_damping", "swing_inertia"),
 )
 """Parameters of a segment that change the body which moves, not only what drives it."""
-
-Body = RodModel | ArcModel
 
 
 class FreeNumbers(Protocol):
@@ -77,38 +74,33 @@ class Predicted(NamedTuple):
     tip_by: Array
 
 
-def body_of(body: Body, limb: Limb) -> Body:
-    """Return the model of another limb, of the same kind and with as many nodes."""
-    return RodModel(limb, NODES) if isinstance(body, RodModel) else ArcModel(limb)
-
-
-def follow(body: Body, log: Prepared, *, linearise: bool = False) -> Response:
-    """Return what a body does under the pressures of a log.
+def follow(model: Model, log: Prepared, *, linearise: bool = False) -> Response:
+    """Return what a model does under the pressures of a log.
 
     Raises:
-        ConvergenceError: it cannot follow, or does not come to rest.
+        RuntimeError: it cannot follow, or does not come to rest.
     """
-    steps = _STEPS[type(body)]
-    return simulate(body, log.log.time, pressures=log.pressure, steps=steps, linearise=linearise)
+    steps = _STEPS[model.name]
+    return simulate(model, log.time, pressures=log.pressure, steps=steps, linearise=linearise)
 
 
-def predicted(free: FreeNumbers, body: Body, log: Prepared, values: Array) -> Predicted:
+def predicted(free: FreeNumbers, model: Model, log: Prepared, values: Array) -> Predicted:
     """Return bend angles and tips along a log with their derivatives by P unknowns.
 
-    What drives the limb goes through the body's exact tangent; stiffness, damping and mass, which
-    change the body itself, are differences of two simulations.
+    What drives the limb goes through the model's exact tangent; stiffness, damping and mass, which
+    change what bends, are differences of two simulations.
 
     Args:
         free: the unknowns.
-        body: of any limb; says which model bends.
+        model: of any limb; says what bends.
         log: prepared.
         values: (P,) of the unknowns.
 
     Raises:
-        ConvergenceError: the body cannot follow.
+        RuntimeError: the model cannot follow.
     """
     limb, scale = free.limb_with(values), free.unknowns.scale
-    response = follow(body_of(body, limb), log, linearise=True)
+    response = follow(model.another(limb), log, linearise=True)
     assert response.derivative is not None
     angles, tip = response.bend_angles, response.tip
     moments, gain = _moments(limb, log, angles), _gain(limb)
@@ -119,7 +111,7 @@ def predicted(free: FreeNumbers, body: Body, log: Prepared, values: Array) -> Pr
             change = (_moments(nudged, log, angles) - moments) / gain / (_NUDGE * scale[place])
             tip_by[:, :, place], angles_by[:, :, place] = response.derivative.by_effective(change)
             continue
-        moved = follow(body_of(body, free.limb_with(values + _STEP * unit)), log)
+        moved = follow(model.another(free.limb_with(values + _STEP * unit)), log)
         tip_by[:, :, place] = (moved.tip - tip) / (_STEP * scale[place])
         angles_by[:, :, place] = (moved.bend_angles - angles) / (_STEP * scale[place])
     return Predicted(angles, tip, angles_by, tip_by)
@@ -136,7 +128,7 @@ def _same_body(limb: Limb, other: Limb) -> bool:
 
 def _moments(limb: Limb, log: Prepared, angles: Array) -> Array:
     """Return the moments (K, M) that drive the limb, less the elastic ones of its bend [N·m]."""
-    driving = _gain(limb) * slow_effective_pressure(limb, log.log.time, log.pressure)
+    driving = _gain(limb) * Material(limb).slow_effective_pressure(log.time, log.pressure)
     lengths = np.array([segment.length for segment in limb.segments])
     rest, linear, cubic = np.array(
         [[s.rest_curvature, s.bending_stiffness, s.cubic_stiffness] for s in limb.segments]
@@ -151,7 +143,7 @@ class BendFit:
 
     Args:
         free: the unknowns.
-        body: of any limb; says which model bends.
+        model: of any limb; says what bends.
         logs: prepared; one or more of the same limb.
         more_rows: further weighted rows of what is predicted along the first log, with their
             derivatives; None: the bend angles alone.
@@ -160,18 +152,18 @@ class BendFit:
     def __init__(
         self,
         free: FreeNumbers,
-        body: Body,
+        model: Model,
         logs: Sequence[Prepared],
         more_rows: Callable[[Predicted], Rows] | None = None,
     ) -> None:
-        self.free, self._body, self._logs, self._more_rows = free, body, logs, more_rows
+        self.free, self._model, self._logs, self._more_rows = free, model, logs, more_rows
         self.search = LeastSquares(free.unknowns, self._rows, SOFTNESS / np.sqrt(CORRELATION))
 
     def _rows(self, values: Array) -> Rows | None:
         weight = 1.0 / (ANGLE_ERROR * np.sqrt(CORRELATION))
         errors, slopes = [], []
         try:
-            found = [predicted(self.free, self._body, log, values) for log in self._logs]
+            found = [predicted(self.free, self._model, log, values) for log in self._logs]
         except RuntimeError:  # also where arcs that buckle under their load do not come to rest
             return None
         for log, part in zip(self._logs, found, strict=True):
@@ -188,17 +180,13 @@ class BendFit:
         """Return measured less predicted bend angles (K, M) of all logs [rad], NaN where unused.
 
         Raises:
-            ConvergenceError: the body cannot follow the logs.
+            RuntimeError: the model cannot follow the logs.
         """
-        body = body_of(self._body, self.free.limb_with(values))
-        return np.concatenate(
-            [
-                np.where(
-                    log.usable[:, None], log.log.bend_angles - follow(body, log).bend_angles, np.nan
-                )
-                for log in self._logs
-            ]
-        )
+        model = self._model.another(self.free.limb_with(values))
+        errors = [log.log.bend_angles - follow(model, log).bend_angles for log in self._logs]
+        for error, log in zip(errors, self._logs, strict=True):
+            error[~log.usable] = np.nan
+        return np.concatenate(errors)
 
     def excess(self, remaining: Array) -> float:
         """Return by how much the data's variance exceeds that of `ANGLE_ERROR` and `CORRELATION`.

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from der_planner.identification.log import CalibrationLog, LogError, bridge, prepare
 from der_planner.limb import Limb
-from der_planner.model.response import simulate
-from der_planner.model.series import CONTROL_PERIOD
+from der_planner.model import CONTROL_PERIOD, Model, simulate
 
 Array = NDArray[np.float64]
 
@@ -65,7 +64,7 @@ def predict(
         LogError: the model cannot follow the pressures, or does not come to rest.
     """
     try:
-        response = simulate(limb, time, pressures=differential_pressure, model=model)
+        response = simulate(Model.of(limb, model), time, pressures=differential_pressure)
     except RuntimeError as error:
         raise LogError(
             f"the {model} model of the limb '{limb.name}' cannot follow this log ({error}): check "

@@ -42,9 +42,7 @@ from der_planner.identification.terms import (
     without,
 )
 from der_planner.limb import CalibratedRange, Limb
-from der_planner.model.response import ArcModel, RodModel
-from der_planner.model.sag import torques
-from der_planner.model.series import CONTROL_PERIOD
+from der_planner.model import CONTROL_PERIOD, ArcModel, Material, RodModel
 from der_planner.planning.loads.rest import nearly_buckling
 
 Array = NDArray[np.float64]
@@ -122,7 +120,7 @@ def fit(
     found = _calibrated(fitted, limb, air, recorded)
     warnings += filter(None, [nearly_buckling(found)])
     pcc_residual = np.full(limb.segment_count, np.nan)
-    if "dynamics" in groups or any(limb.gravity[:2]):
+    if "dynamics" in groups or limb.weighs_in_plane:
         found, pcc_residual = _with_arcs(found, prepared, warnings)
     return found, FitReport(
         source=log.source,
@@ -168,7 +166,7 @@ def _fit_bends_and_lengths(
     bends; that follows from a fitted limb, whose weight depends on its lengths. So both are fitted
     in turn until the lengths stay the same. How unevenly it bends also tells the stiffness.
     """
-    loaded = any(prior.gravity[:2])
+    loaded = prior.weighs_in_plane
     lengths = fit_geometry(prior, prepared.log) if geometry and not loaded else None
     fitted = _fit_bends(lengths.limb if lengths else prior, prepared, groups, lengths)
     bent: Unevenness | None = None
@@ -208,7 +206,7 @@ def _fit_bends(
     names = {term.name for term in TERMS if term.group in ("linear", *groups)}
     if "mass" in groups:
         names.discard("log_stiffness")
-    if "mass" in groups or not any(known.gravity[:2]):
+    if "mass" in groups or not known.weighs_in_plane:
         # Without weight, or with an unknown mass, it is one scale with the stiffness.
         names.discard("log_inertia")
     free = FreeTerms.of(known, names, without(values_of(known, starts=True), groups))
@@ -232,7 +230,7 @@ def _static_start(free: FreeTerms, prepared: Prepared) -> Array:
     pressure, bend = prepared.pressure[rows], prepared.bend[rows]
     if len(pressure) < LEAST_ROWS:
         raise LogError(f"only {len(pressure)} rows of the log can be used: record a whole run")
-    values, weight = free.values.copy(), torques(free.limb, bend)
+    values, weight = free.values.copy(), Material(free.limb).weight_torques(bend)
     doubt = EVEN_ERROR / COMPLIANCE_SPREAD * np.sqrt(len(bend))
     for index, segment in enumerate(free.limb.segments):
         spread = float(np.std(pressure[:, index]))
@@ -314,7 +312,7 @@ def _with_arcs(found: Limb, prepared: Prepared, warnings: list[str]) -> tuple[Li
     differ as well, and the arcs get gains and rest angles of their own from the same log.
     """
     names = {"log_stiffness", "material_damping", "log_damping"}
-    if any(found.gravity[:2]):
+    if found.weighs_in_plane:
         names |= {"gain", "rest_angle"}
     free = FreeTerms.of(found, names)
     problem = BendFit(free, ArcModel(found), [prepared])
@@ -347,6 +345,7 @@ def _calibrated(fitted: _Fitted, prior: Limb, air: AirFit | None, recorded: Prep
     rows, error = recorded.usable, np.sqrt(np.nanmean(fitted.remaining**2, axis=0))
     return replace(
         fitted.limb,
+        pcc_segments=(),
         pneumatics=air.law(prior.pneumatics) if air else prior.pneumatics,
         calibrated=CalibratedRange(
             tuple(float(v) for v in np.abs(recorded.pressure[rows]).max(axis=0)),

@@ -18,9 +18,8 @@ from der_planner.identification.least_squares import (
 )
 from der_planner.identification.log import CalibrationLog, LogError, Prepared
 from der_planner.limb import Limb
-from der_planner.model.bending import PolylineKinematics
-from der_planner.model.response import NODES, RodModel
-from der_planner.rod import ConvergenceError, Rod
+from der_planner.model import NODES, RodModel
+from der_planner.rod import ConvergenceError
 
 Array = NDArray[np.float64]
 
@@ -294,7 +293,7 @@ def with_lengths(limb: Limb, lengths: Array) -> Limb:
 
 def _even_tip(limb: Limb, angles: Array) -> Array:
     """Return the tips (K, 2) of the planners' rod, bent evenly by angles (K, M) [m]."""
-    return PolylineKinematics.of_rod(Rod.from_limb(limb, NODES)).tip(angles)
+    return RodModel(limb).kinematics.tip(angles)
 
 
 def _joints(limb: Limb) -> Array:

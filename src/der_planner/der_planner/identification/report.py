@@ -12,7 +12,7 @@ from der_planner.identification.air import AirFit
 from der_planner.identification.lengths import GeometryFit
 from der_planner.limb import Limb
 from der_planner.limb.parameters import REST_SPREAD
-from der_planner.model.sag import weight_of
+from der_planner.model.resting import weight_of
 
 Array = NDArray[np.float64]
 
@@ -57,7 +57,7 @@ class LoadsFit:
 
 def loads_of(limb: Limb) -> LoadsFit | None:
     """Return mass, first moment and stiffness of a limb; None without gravity in its plane."""
-    if not any(limb.gravity[:2]):
+    if not limb.weighs_in_plane:
         return None
     straight = replace(limb, gravity=(0.0, 1.0, 0.0))
     weight = weight_of(straight)

@@ -29,7 +29,7 @@ from der_planner.identification.least_squares import (
 from der_planner.identification.log import CalibrationLog, LogError, Prepared, prepare
 from der_planner.limb import Limb, Segment
 from der_planner.limb.parameters import REST_SPREAD
-from der_planner.model.response import RodModel
+from der_planner.model import RodModel
 from der_planner.rod import ConvergenceError
 
 Array = NDArray[np.float64]

@@ -73,7 +73,7 @@ class Record(NamedTuple):
 @kernel
 def predict(
     x: Array, x_n: Array, v_n: Array, acceleration: Array, h: float, fixed: Array, far: float,
-    angles: bool,
+    angles: bool
 ) -> None:  # fmt: skip
     """Fill x with a guess of the solution: the last acceleration goes on, unless it leads far.
 

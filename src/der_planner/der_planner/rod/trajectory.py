@@ -149,7 +149,7 @@ class Trajectory:
 
 def linearisation_of(
     backend: Backend, solved: Solved, shape: tuple[int, int], outputs: NDArray[np.int64],
-    rows: NDArray[np.int64],
+    rows: NDArray[np.int64]
 ) -> Linearisation:  # fmt: skip
     """Return the linearisation of solves in shape (K, S); rows are the outputs' in the kernels."""
     chain = chain_of(backend, solved, rows)

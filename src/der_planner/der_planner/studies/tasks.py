@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.limb import Limb, Segment
-from der_planner.model.response import simulate
+from der_planner.model import simulate
 from der_planner.planning import Motion, Plan, plan
 from der_planner.studies import twins
 from der_planner.studies.factors import (

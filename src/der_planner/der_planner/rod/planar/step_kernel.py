@@ -36,7 +36,7 @@ from der_planner.rod.step_kernel import (
 @kernel
 def newton(
     x: Array, x_n: Array, v_n: Array, rate: float, u: Array, solver: Solver,
-    space: PlanarSpace, rod: PlanarRod,
+    space: PlanarSpace, rod: PlanarRod
 ) -> tuple[int, float]:  # fmt: skip
     """Solve M rate ((x − x_n) rate − v_n) + D rate (x − x_n) = F(x) for x, from the guess in x.
 
@@ -82,7 +82,7 @@ def newton(
 @kernel
 def simulate(
     motion: tuple[Array, Array], place: Place, pressures: Array, begin: int, solver: Solver,
-    record: Record, space: PlanarSpace, rod: PlanarRod,
+    record: Record, space: PlanarSpace, rod: PlanarRod
 ) -> tuple[int, int, float, int]:  # fmt: skip
     """Run K intervals of S steps under pressures (K, S, M) from step `begin` on.
 
@@ -134,7 +134,7 @@ def simulate(
 @kernel
 def keep(
     slot: int, x: Array, x_n: Array, rate: float, u: Array, record: Record,
-    space: PlanarSpace, rod: PlanarRod,
+    space: PlanarSpace, rod: PlanarRod
 ) -> None:  # fmt: skip
     """Write the exact linearisation of the solve that led from x_n to x into the record."""
     linearise(x, x_n, rate, u, record.inputs[slot], space, rod)
@@ -149,7 +149,7 @@ def keep(
 @kernel
 def linearise(
     x: Array, x_n: Array, rate: float, u: Array, columns: Array, space: PlanarSpace,
-    rod: PlanarRod,
+    rod: PlanarRod
 ) -> None:  # fmt: skip
     """Fill space.a with the exact derivative J of a solve's residual at x, columns with B(q)Λ.
 

@@ -67,11 +67,7 @@ T, D1 = 0, 10
 
 
 @kernel
-def frames(
-    x: Array,
-    base: Base,
-    frame: Array,
-) -> None:
+def frames(x: Array, base: Base, frame: Array) -> None:
     """Fill frame (n-1, 13): t, 1/|e|, m1, m2 and the transported director of each edge."""
     base_tangent, base_director = base.tangents, base.directors
     for j in range(frame.shape[0]):
@@ -106,11 +102,7 @@ def frames(
 
 
 @kernel
-def reference_twists(
-    frame: Array,
-    before: Array,
-    twists: Array,
-) -> None:
+def reference_twists(frame: Array, before: Array, twists: Array) -> None:
     """Fill twists (n,): angle from P(t_e→t_f) d1_e to d1_f about t_f, the one near `before`."""
     for i in range(1, frame.shape[0]):
         ex, ey, ez = frame[i - 1, 0], frame[i - 1, 1], frame[i - 1, 2]
@@ -133,12 +125,7 @@ def reference_twists(
 
 @kernel
 def node_strains(
-    i: int,
-    frame: Array,
-    twists: Array,
-    x: Array,
-    strain: Array,
-    gradient: Array,
+    i: int, frame: Array, twists: Array, x: Array, strain: Array, gradient: Array
 ) -> None:
     """Fill strain (8,): κ1, κ2, τ, χ, κb and gradient (3, 8) of κ1, κ2, τ by (e, φe, f, φf)."""
     ex, ey, ez, le = frame[i - 1, 0], frame[i - 1, 1], frame[i - 1, 2], frame[i - 1, 3]
@@ -187,14 +174,7 @@ def node_strains(
 
 @kernel
 def add_curvature_hessian(
-    i: int,
-    c1: float,
-    c2: float,
-    c3: float,
-    frame: Array,
-    strain: Array,
-    vectors: Array,
-    h: Array,
+    i: int, c1: float, c2: float, c3: float, frame: Array, strain: Array, vectors: Array, h: Array
 ) -> None:
     """Add c1 ∇²κ1 + c2 ∇²κ2 + c3 ∇²τ, symmetric, to h (8, 8), whose lower triangle is filled.
 

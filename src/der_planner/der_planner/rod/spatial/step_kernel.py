@@ -99,7 +99,7 @@ def largest_change(update: Array) -> tuple[float, float]:
 @kernel
 def newton(
     x: Array, x_n: Array, v_n: Array, rate: float, u: Array, solver: Solver,
-    space: SpatialSpace, rod: SpatialRod,
+    space: SpatialSpace, rod: SpatialRod
 ) -> tuple[int, float]:  # fmt: skip
     """Solve M rate ((x − x_n) rate − v_n) + D rate (x − x_n) = F(x) for x, from the guess in x.
 
@@ -152,7 +152,7 @@ def newton(
 @kernel
 def simulate(
     motion: tuple[Array, Array], place: Place, pressures: Array, begin: int, solver: Solver,
-    record: Record, space: SpatialSpace, rod: SpatialRod,
+    record: Record, space: SpatialSpace, rod: SpatialRod
 ) -> tuple[int, int, float, int]:  # fmt: skip
     """Run K intervals of S steps under pressures (K, S, M) from step `begin` on.
 
@@ -209,7 +209,7 @@ def simulate(
 @kernel
 def keep(
     slot: int, x: Array, x_n: Array, rate: float, u: Array, record: Record,
-    space: SpatialSpace, rod: SpatialRod,
+    space: SpatialSpace, rod: SpatialRod
 ) -> None:  # fmt: skip
     """Write the exact linearisation of the solve that led from x_n to x into the record."""
     linearise(x, x_n, rate, u, record.inputs[slot], space, rod)
@@ -260,7 +260,7 @@ def gauge_of_step(
 @kernel
 def linearise(
     x: Array, x_n: Array, rate: float, u: Array, columns: Array, space: SpatialSpace,
-    rod: SpatialRod,
+    rod: SpatialRod
 ) -> None:  # fmt: skip
     """Fill space.a with the exact derivative J of a solve's residual at x, the frames' base at x_n.
 
