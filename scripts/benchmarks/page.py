@@ -30,7 +30,6 @@ PERIOD = 50_000_000
 """Time [ns] between two setpoints."""
 PRESSURE = 2000.0
 """Both segments hold this differential pressure [Pa] when vent is pressed."""
-SETPOINTS_AHEAD = 24
 FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-sync",
          "--disable-background-networking", "--window-size=1280,800")  # fmt: skip
 LISTEN = """
@@ -68,23 +67,25 @@ class PageGraph:
             page_port = free.getsockname()[1]
         self.url = f"http://127.0.0.1:{page_port}/?token={TOKEN}"
         board = str(folder / "board")
-        self._start("pressure_driver", "board_emulator", {"port_link": board})
-        self.client.wait_for(lambda: os.path.lexists(board), PATIENCE, "the board's port")
-        self._start("pressure_driver", "pressure_driver", {"port": board})
-        self._start("der_planner", "limb_twin", {})
-        self._start("apriltag_tracker", "synthetic_camera", {})
-        self._start("apriltag_tracker", "apriltag_tracker", {})
-        self._start("der_planner", "planner", {})
-        self._start("der_planner", "recorder", {"output": str(folder / "bag")})
-        self._start("der_planner", "page", {"port": page_port, "token": TOKEN})
-        self.client.wait_ready(self._processes)
-
-    def _start(self, package: str, executable: str, parameters: dict[str, object]) -> None:
+        nodes: list[tuple[str, str, dict[str, object]]] = [
+            ("pressure_driver", "board_emulator", {"port_link": board}),
+            ("pressure_driver", "pressure_driver", {"port": board}),
+            ("der_planner", "limb_twin", {}),
+            ("apriltag_tracker", "synthetic_camera", {}),
+            ("apriltag_tracker", "apriltag_tracker", {}),
+            ("der_planner", "planner", {}),
+            ("der_planner", "recorder", {"output": str(folder / "bag")}),
+            ("der_planner", "page", {"port": page_port, "token": TOKEN}),
+        ]
         environment = {**os.environ, "ROS_DOMAIN_ID": str(DOMAIN)}
-        process = NodeProcess(package, executable, parameters, self._folder, None, environment)
-        self._processes[executable] = process
-        self._stack.callback(process.stop)
-        self.client.watch(self._processes.values())
+        for package, executable, parameters in nodes:
+            process = NodeProcess(package, executable, parameters, folder, None, environment)
+            self._processes[executable] = process
+            stack.callback(process.stop)
+            self.client.watch(self._processes.values())
+            if executable == "board_emulator":
+                self.wait(lambda: os.path.lexists(board), "the board's port")
+        self.client.wait_ready(self._processes)
 
     def open_window(self) -> Any:
         """Open the page in a browser of its own, and wait until it shows pictures."""
@@ -114,16 +115,10 @@ class PageGraph:
 
     def arm(self) -> None:
         """Arm the driver as soon as it lets itself be armed: chambers take a while to vent."""
-
-        def armed() -> bool:
+        while self.states[-1].mode != PressureState.ARMED:
             with contextlib.suppress(GraphError):
                 self.client.call("pressure_driver/arm", 20.0)
-                return True
             self.client.spin(0.2)
-            return False
-
-        self.wait(armed, "the driver to be armed")
-        self.wait_mode(PressureState.ARMED)
 
     def measure_cpu(self, seconds: float) -> float:
         """Return the share of a core [%] that the page's process uses during some seconds."""
@@ -140,10 +135,19 @@ def page_graph() -> Iterator[PageGraph]:
         yield PageGraph(Path(folder), stack)
 
 
-def largest_difference(command: ChamberPressures) -> float:
-    """Return the largest differential pressure of a command [Pa]."""
-    chambers = np.array(command.pressure)
-    return float(np.abs(chambers[0::2] - chambers[1::2]).max())
+def send_pressure(publisher: Any, plan_id: str) -> None:
+    """Send setpoints of one pressure in both segments, which last beyond the next press."""
+    start = (time.time_ns() // PERIOD + 4) * PERIOD
+    for index in range(24):
+        message = PressureSetpoint(plan_id=plan_id, index=index)
+        message.differential_pressure = [PRESSURE, PRESSURE]
+        message.header.stamp = stamp_from_nanoseconds(start + index * PERIOD)
+        publisher.publish(message)
+
+
+def first_vent(commands: list[ChamberPressures]) -> ChamberPressures | None:
+    """Return the first command to the board that leaves no pressure in a chamber."""
+    return next((each for each in commands if np.ptp(each.pressure) < 0.5 * PRESSURE), None)
 
 
 def measure_vent(graph: PageGraph, window: Any, count: int) -> list[float]:
@@ -160,17 +164,9 @@ def measure_vent(graph: PageGraph, window: Any, count: int) -> list[float]:
     for number in range(count):
         graph.wait_mode(PressureState.DISARMED)
         graph.arm()
-        start = (time.time_ns() // PERIOD + 4) * PERIOD
-        for index in range(SETPOINTS_AHEAD):
-            message = PressureSetpoint(plan_id=f"vent{number}", index=index)
-            message.differential_pressure = [PRESSURE, PRESSURE]
-            message.header.stamp = stamp_from_nanoseconds(start + index * PERIOD)
-            publisher.publish(message)
+        send_pressure(publisher, f"vent{number}")
+        graph.wait(lambda: graph.states[-1].commanded_differential[0] == PRESSURE, "the pressure")
         del graph.commands[:]
-        graph.wait(
-            lambda: graph.commands and largest_difference(graph.commands[-1]) > 0.9 * PRESSURE,
-            "the pressure",
-        )
         graph.client.spin(float(random.uniform(0.0, 0.1)))  # any place between two ticks
         if number % 2:
             window.find_element("tag name", "body").send_keys(" ")
@@ -178,14 +174,8 @@ def measure_vent(graph: PageGraph, window: Any, count: int) -> list[float]:
             window.find_element("id", "vent").click()
         pressed = float(window.execute_script("return window.presses.at(-1);")) / 1000.0
 
-        def vented(pressed: float = pressed) -> float | None:
-            for command in graph.commands:
-                came = nanoseconds(command.header.stamp) * 1e-9
-                if came >= pressed and largest_difference(command) < 0.5 * PRESSURE:
-                    return came - pressed
-            return None
-
-        taken.append(float(graph.wait(vented, "the vent at the board")))
+        vent = graph.wait(lambda: first_vent(graph.commands), "the vent at the board")
+        taken.append(nanoseconds(vent.header.stamp) * 1e-9 - pressed)
     return taken
 
 

@@ -133,7 +133,7 @@ def test_one_arms_and_everybody_vents(rig: Rig) -> None:
     arm(rig, first)
     second.find_element("id", "vent").send_keys(Keys.ENTER)
     rig.wait_mode(PressureState.DISARMED, PressureState.VENTING)
-    rig.wait(lambda: "Vented" in first.find_element("id", "notice").text, "the driver's answer")
+    rig.wait(lambda: "Vented" in first.find_element("id", "notices").text, "the driver's answer")
 
     rig.wait_mode(PressureState.DISARMED)
     arm(rig, first)
@@ -176,19 +176,19 @@ def test_what_died_is_not_shown_as_live(rig: Rig) -> None:
     rig.wait(lambda: "its process has ended" in browser.execute_script(row), "its row to say why")
     browser.find_element("id", "vent").click()
     rig.wait(
-        lambda: "VENT FAILED" in browser.find_element("id", "notice").text, "the failure to show"
+        lambda: "VENT FAILED" in browser.find_element("id", "notices").text, "the failure to show"
     )
 
     assert not browser.execute_script(f"return {lost}")
     goes_silent(rig, browser, rig.page, lost)
-    assert "No connection" in browser.find_element("id", "notice").text
+    assert "No connection" in browser.find_element("id", "notices").text
     rig.page.signal(signal.SIGCONT)
     rig.wait(lambda: not browser.execute_script(f"return {lost}"), "the server again")
     silent_after(browser, rig.page, signal.SIGKILL, lost)
-    assert "No connection" in browser.find_element("id", "notice").text
+    assert "No connection" in browser.find_element("id", "notices").text
     # As after an hour's sleep, during which the steady clock stands still.
     browser.execute_script("const now = Date.now; Date.now = () => now() + 3600e3;")
-    rig.wait(lambda: "for 36" in browser.find_element("id", "notice").text, "the age to show it")
+    rig.wait(lambda: "for 36" in browser.find_element("id", "notices").text, "the age to show it")
 
 
 def silent_after(browser: Any, process: Any, number: int, shown: str) -> float:
