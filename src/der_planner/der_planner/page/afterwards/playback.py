@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from apriltag_tracker.camera.encodings import ImageError, to_grey
+from apriltag_tracker.camera.images import ImageError, to_grey
 from der_planner.page.overlay import CURVE_POINTS, PATH_POINTS
 from der_planner.page.situation import CENTIMETRES, MODES, PASCAL_PER_KILOPASCAL
 from der_planner.runs.record import NANOSECONDS
