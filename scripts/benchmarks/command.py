@@ -14,7 +14,7 @@ import platform
 import time
 from pathlib import Path
 
-from der_planner.runs.outputs import OutputError, check_file
+from der_planner.results.outputs import OutputError, check_file
 
 PARTS = {
     "rod": "rod",
@@ -24,15 +24,8 @@ PARTS = {
     "recorder": "recorder",
     "identification": "identification",
     "studies": "studies",
-    "loads": "loads",
-    "calibration_draws": "draws.calibration",
-    "learning": "learning",
-    "learning_draws": "draws.learning",
     "feedback": "feedback",
-    "feedback_draws": "draws.feedback",
-    "page": "page.browser",
-    "page_wire": "page.wire",
-    "page_memory": "page.memory",
+    "page": "page",
 }
 """Module of each part, below `benchmarks`; its ``run(quick)`` prints and returns the figures."""
 

@@ -14,9 +14,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 
 from der_planner.limb import Limb
-from der_planner.model.bending import ArcKinematics
-from der_planner.model.drive import STEPS
-from der_planner.model.response import simulate
+from der_planner.model import STEPS, ArcModel, Initial, simulate
 from der_planner.planning import (
     CONTROL_PERIOD,
     METHODS,
@@ -86,7 +84,7 @@ def kinematics_and_gains() -> Figures:
     limb = Limb.default()
     model = PlanningRod(limb)
     opposite = np.radians([45.0, -45.0])
-    gap = np.linalg.norm(model.kinematics.tip(opposite) - ArcKinematics(limb).tip(opposite))
+    gap = np.linalg.norm(model.kinematics.tip(opposite) - ArcModel(limb).tip(opposite))
     # With a short connector, as calibrations find it, the rod's fold lies across this motion.
     joined = dataclasses.replace(limb, connector_length=0.002)
     kinematics = PlanningRod(joined).kinematics
@@ -199,7 +197,7 @@ def _rod_under(result: Plan, chambers: np.ndarray) -> np.ndarray:
         result.time,
         pressures=chambers,
         bend=lambda time: sample_spline(spline, time)[0],
-        start=model.begin(spline, result.reference.start),
+        initial=Initial(model.begin(spline, result.reference.start)),
         steps=STEPS,
     )
     return response.tip

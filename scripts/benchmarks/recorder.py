@@ -22,12 +22,11 @@ from der_msgs.msg import (
     TagDetection,
     TagDetectionArray,
 )
+from der_planner.bags.reader import BagReader
+from der_planner.bags.recover import recover_bag
+from der_planner.bags.topics import OfferedQos, TopicSpec
+from der_planner.bags.writer import BagWriter
 from der_planner.experiment.processes import NodeProcess
-from der_planner.runs.recording.definitions import find_definition
-from der_planner.runs.recording.layout import OfferedQos, TopicSpec
-from der_planner.runs.recording.reader import BagReader
-from der_planner.runs.recording.recover import recover_bag
-from der_planner.runs.recording.writer import BagWriter
 from limb_interfaces.stamps import stamp_from_nanoseconds
 
 SOURCE = """
@@ -149,7 +148,7 @@ def evaluate_long_bag(minutes: float) -> dict[str, float]:
 
 EVALUATE = """
 import resource, sys, time
-from der_planner.runs.evaluation import evaluate_bag
+from der_planner.results import evaluate_bag
 begin = time.perf_counter()
 result = evaluate_bag(sys.argv[1])
 assert abs(result.mean_error_m - 0.005) < 1e-4, result
@@ -174,8 +173,7 @@ def _write_run(path: Path, seconds: float) -> None:
     def write(topic: str, message: object, when: float) -> None:
         kind = f"der_msgs/msg/{type(message).__name__}"
         if topic not in bag.topics:
-            found = find_definition(kind)
-            bag.add_topic(TopicSpec(topic, kind, found.text, found.type_hash, (OfferedQos(),)))
+            bag.add_topic(TopicSpec.installed(topic, kind, (OfferedQos(),)))
         stamp = origin + round(when * 1e9)
         message.header.stamp = stamp_from_nanoseconds(stamp)  # type: ignore[attr-defined]
         bag.write(topic, stamp, stamp, serialize_message(message))

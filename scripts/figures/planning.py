@@ -15,10 +15,10 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from der_planner.limb import Limb
-from der_planner.model.bending import ArcKinematics
+from der_planner.model import ArcModel
 from der_planner.planning import METHODS, Motion, Plan, plan
 from der_planner.planning.inverse import angle_limits, solutions
-from der_planner.runs.outputs import folder_argument
+from der_planner.results.outputs import folder_argument
 from workspace_setup.basics import ROOT
 
 matplotlib.use("Agg")
@@ -70,7 +70,7 @@ def draw_methods(path: Path) -> None:
 def draw_branches(path: Path) -> None:
     """The tip's reach, its fold, and the two ways to one point."""
     limb = Limb.default()
-    kinematics = ArcKinematics(limb)
+    kinematics = ArcModel(limb)
     low, high = angle_limits(limb)
     figure, axes = plt.subplots(figsize=(5, 4.5), layout="constrained")
     grid = np.stack(

@@ -15,8 +15,8 @@ import numpy as np
 from benchmarks.rod import cantilever, run_elastica
 from der_planner.limb import Limb
 from der_planner.model.bending import PolylineKinematics
+from der_planner.results.outputs import folder_argument
 from der_planner.rod import Rod, RodState
-from der_planner.runs.outputs import folder_argument
 from workspace_setup.basics import ROOT
 
 matplotlib.use("Agg")

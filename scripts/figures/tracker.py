@@ -25,7 +25,7 @@ from apriltag_tracker.synthetic.camera import (
 )
 from apriltag_tracker.tag_map import TagMap
 from benchmarks.tracker.pictures import CONDITIONS
-from der_planner.runs.outputs import folder_argument
+from der_planner.results.outputs import folder_argument
 from der_planner.twin import LimbTwin
 from workspace_setup.basics import ROOT
 

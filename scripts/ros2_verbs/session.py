@@ -1,4 +1,4 @@
-"""A hidden node that looks at the graph, and what every verb asks of it."""
+"""A hidden node that looks at the graph, and the QoS of a command's publisher or subscription."""
 
 from __future__ import annotations
 
@@ -7,87 +7,66 @@ import contextlib
 import os
 import time
 from collections.abc import Callable
-from types import TracebackType
 from typing import Any
 
 import rclpy
-from rclpy.expand_topic_name import expand_topic_name
-from rclpy.parameter import Parameter
+from rclpy.exceptions import InvalidTopicNameException
+from rclpy.qos import DurabilityPolicy, QoSPresetProfiles, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
-from rclpy.validate_full_topic_name import validate_full_topic_name
 
-from ros2_verbs.cli import CommandError, Interruption
+from ros2_verbs.cli import CommandError
+from ros2_verbs.messages import interface
 
-HIDDEN_PREFIX = "_"
-_AT_LEAST, _AT_MOST = 1.5, 6.0
-"""How long discovery lasts [s]. The answer to the first announcements of a new participant may stay
-away; it then sees the others when these announce themselves again: the nodes of this workspace
-every 0.5 s, by the profile in FASTRTPS_DEFAULT_PROFILES_FILE, but others every 3 s."""
-_QUIET, _QUIET_WHEN_FOUND = 0.5, 0.2
-"""For how long nothing new must have come [s]."""
+AT_LEAST, AT_MOST = 1.5, 6.0
+"""Shortest and longest time [s] of discovery.
 
-
-def add_session_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of every verb that looks at the graph."""
-    parser.add_argument(
-        "--spin-time",
-        type=float,
-        metavar="SPIN_TIME",
-        help="Spin time in seconds to wait for discovery (default: until nothing new appears, at "
-        "least 1.5; nodes from outside of this workspace may need 4)",
-    )
-    parser.add_argument(
-        "-s", "--use-sim-time", action="store_true", help="Enable ROS simulation time"
-    )
-    parser.add_argument(
-        "--no-daemon", action="store_true", help="Does nothing: there is no daemon here"
-    )
+The answer to the first announcements of a new participant may stay away; it then sees the others
+when these announce themselves again: the nodes of this workspace every 0.5 s, by the profile in
+FASTRTPS_DEFAULT_PROFILES_FILE, but others every 3 s.
+"""
+QUIET, QUIET_WHEN_FOUND = 0.5, 0.2
+"""Time [s] without anything new that ends discovery: in general, and once the wanted is there."""
 
 
 def is_hidden(name: str) -> bool:
     """Tell whether a name of a topic, service or node is hidden by convention."""
-    return any(part.startswith(HIDDEN_PREFIX) for part in name.split("/") if part)
-
-
-def absolute(name: str) -> str:
-    """Return a node's name with the slash in front."""
-    return name if name.startswith("/") else f"/{name}"
+    return any(part.startswith("_") for part in name.split("/") if part)
 
 
 class Session:
     """A node for the time of one command; a context manager.
 
     Args:
-        options: with ``spin_time`` and ``use_sim_time``, see `add_session_arguments`.
-        name: of the node; hidden and unique if empty.
+        options: of the command line; with ``signals``, and ``spin_time`` where the verb has it.
     """
 
-    def __init__(self, options: argparse.Namespace, name: str = "") -> None:
+    def __init__(self, options: argparse.Namespace) -> None:
         self._spin_time: float | None = getattr(options, "spin_time", None)
-        # SIGINT and SIGTERM are Python's exceptions here; a context that a signal handler shuts
-        # down under a waiting command ends in one of several errors.
+        self._signals = options.signals
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-        simulated = getattr(options, "use_sim_time", False)
-        self.node = rclpy.create_node(
-            name or f"{HIDDEN_PREFIX}ros2cli_{os.getpid()}",
-            start_parameter_services=False,
-            parameter_overrides=[Parameter("use_sim_time", value=True)] if simulated else [],
-        )
+        self.node = rclpy.create_node(f"_ros2cli_{os.getpid()}", start_parameter_services=False)
 
     def __enter__(self) -> Session:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        Interruption.noticed()
+    def __exit__(self, *_: object) -> None:
         with contextlib.suppress(Exception):
             self.node.destroy_node()
-        with contextlib.suppress(Exception):
             rclpy.try_shutdown()
+
+    def spin(self, seconds: float = 0.1) -> None:
+        """Take what has come, for at most some time; raise `EndedBySignal` after a signal."""
+        rclpy.spin_once(self.node, timeout_sec=seconds)
+        self._signals.check()
+
+    def wait(self, condition: Callable[[], Any], timeout: float = float("inf")) -> bool:
+        """Spin until a condition holds, at most for a time [s]; tell whether it does."""
+        end = time.monotonic() + timeout
+        while not condition():
+            if time.monotonic() > end:
+                return False
+            self.spin()
+        return True
 
     def discover(self, enough: Callable[[], Any] = lambda: False) -> None:
         """Wait until the graph is known: for the spin time if given, else until it is quiet.
@@ -103,19 +82,19 @@ class Session:
             if picture != seen:
                 seen, changed = picture, now
             elapsed, quiet = now - start, now - changed
-            if quiet >= _QUIET_WHEN_FOUND and enough():
+            if quiet >= QUIET_WHEN_FOUND and enough():
                 return
             if self._spin_time is not None:
                 if elapsed >= self._spin_time:
                     return
-            elif elapsed >= _AT_MOST or (elapsed >= _AT_LEAST and quiet >= _QUIET):
+            elif elapsed >= AT_MOST or (elapsed >= AT_LEAST and quiet >= QUIET):
                 return
-            time.sleep(0.02)
+            self.spin(0.02)
 
-    def nodes(self) -> list[tuple[str, str]]:
-        """Return name and namespace of every node, sorted by the full name."""
+    def nodes(self) -> list[str]:
+        """Return the full name of every node, sorted."""
         found = self.node.get_node_names_and_namespaces()
-        return sorted(found, key=lambda item: full_name(*item))
+        return sorted(f"{space.rstrip('/')}/{name}" for name, space in found)
 
     def topics(self) -> dict[str, list[str]]:
         """Return the types of every topic, sorted by name."""
@@ -125,6 +104,18 @@ class Session:
         """Return the types of every service, sorted by name."""
         return dict(sorted(self.node.get_service_names_and_types()))
 
+    def find_node(self, name: str) -> str:
+        """Discover until a node is there; return its full name.
+
+        Raises:
+            CommandError: there is no such node.
+        """
+        wanted = f"/{name.lstrip('/')}"
+        self.discover(lambda: wanted in self.nodes())
+        if wanted not in self.nodes():
+            raise CommandError("Node not found")
+        return wanted
+
     def expand(self, topic: str) -> str:
         """Return the full name of a topic.
 
@@ -132,24 +123,31 @@ class Session:
             CommandError: it is not a valid name.
         """
         try:
-            expanded: str = expand_topic_name(
-                topic, self.node.get_name(), self.node.get_namespace()
-            )
-            validate_full_topic_name(expanded)
-        except Exception as error:
+            return str(self.node.resolve_topic_name(topic))
+        except InvalidTopicNameException as error:
             raise CommandError(str(error)) from error
-        return expanded
 
-    def find_node(self, name: str, include_hidden: bool = True) -> bool:
-        """Discover until a node is there; tell whether it is."""
-        wanted = absolute(name)
-        if not include_hidden and wanted.rsplit("/", 1)[-1].startswith(HIDDEN_PREFIX):
-            return False
-        self.discover(lambda: self._has_node(wanted))
-        return self._has_node(wanted)
+    def topic_type(self, topic: str) -> Any:
+        """Return the class of a topic's messages, None if the topic is not there.
 
-    def _has_node(self, wanted: str) -> bool:
-        return any(full_name(*item) == wanted for item in self.nodes())
+        Raises:
+            CommandError: the topic has several types, or one that is not installed.
+        """
+        types = self.topics().get(topic, [])
+        if len(types) > 1:
+            raise CommandError(f"Topic '{topic}' has more than one type: [{', '.join(types)}]")
+        return interface(types[0], "msg") if types else None
+
+    def answer(self, future: Any) -> Any:
+        """Wait for the answer to a call.
+
+        Raises:
+            CommandError: the answer is an error.
+        """
+        self.wait(future.done)
+        if future.result() is None:
+            raise CommandError(f"Exception while calling service: {future.exception()!r}")
+        return future.result()
 
     def call(self, kind: Any, service: str, request: Any) -> Any:
         """Call a service of a node and return the response.
@@ -158,48 +156,31 @@ class Session:
             CommandError: the service does not appear within 5 s, or its answer is an error.
         """
         client = self.node.create_client(kind, service)
-        if not client.wait_for_service(timeout_sec=5.0):
+        if not self.wait(client.service_is_ready, 5.0):
             raise CommandError("Wait for service timed out")
-        return self.answer(client, request)
-
-    def answer(self, client: Any, request: Any) -> Any:
-        """Send a request to a service that is there and wait for the response.
-
-        Raises:
-            CommandError: the answer is an error.
-        """
-        future = client.call_async(request)
-        while not future.done():
-            rclpy.spin_once(self.node, timeout_sec=0.1)
-        if future.result() is None:
-            raise CommandError(f"Exception while calling service: {future.exception()!r}")
-        return future.result()
+        return self.answer(client.call_async(request))
 
 
-def print_names(found: dict[str, list[str]], show_types: bool) -> None:
-    """Print the names of topics, services or actions a line, with their types if asked for."""
-    for name, types in found.items():
-        print(f"{name} [{', '.join(types)}]" if show_types else name)
-
-
-def print_types(
-    options: argparse.Namespace, name: str, known: Callable[[Session], dict[str, list[str]]]
-) -> int:
-    """Print the types of a topic or service; return the exit code, 1 if it is not there.
+def qos_profile(options: argparse.Namespace, preset: str, publishers: list[Any]) -> QoSProfile:
+    """Return a QoS profile: as the command line says, else one that hears every publisher.
 
     Args:
-        options: of the session.
-        name: of the topic or service.
-        known: `Session.topics` or `Session.services`.
+        options: with the ``--qos-…`` arguments.
+        preset: name of the profile where the command line names none.
+        publishers: endpoint information with ``qos_profile``; empty to publish.
     """
-    with Session(options) as session:
-        session.discover(lambda: name in known(session))
-        types = known(session).get(name, [])
-    for kind in types:
-        print(kind)
-    return 0 if types else 1
-
-
-def full_name(name: str, namespace: str) -> str:
-    """Return a node's full name."""
-    return f"{namespace}{'' if namespace.endswith('/') else '/'}{name}"
+    shared = QoSPresetProfiles.get_from_short_key(options.qos_profile or preset)
+    profile = QoSProfile(**{slot[1:]: getattr(shared, slot[1:]) for slot in QoSProfile.__slots__})
+    for policy, kind, strong, weak in (
+        ("reliability", ReliabilityPolicy, "RELIABLE", "BEST_EFFORT"),
+        ("durability", DurabilityPolicy, "TRANSIENT_LOCAL", "VOLATILE"),
+    ):
+        given = getattr(options, f"qos_{policy}")
+        if given is not None:
+            setattr(profile, policy, kind[given.upper()])
+        elif publishers and options.qos_profile is None:
+            strict = all(getattr(each.qos_profile, policy) == kind[strong] for each in publishers)
+            setattr(profile, policy, kind[strong if strict else weak])
+    if options.qos_depth is not None:
+        profile.depth = options.qos_depth
+    return profile

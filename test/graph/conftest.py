@@ -11,7 +11,7 @@ from der_planner.limb import DEFAULT_LIMB_FILE
 
 # Replayed bags are those of the evaluation's tests, and of the recorder's.
 UNIT_TESTS = Path(__file__).parents[1] / "der_planner"
-sys.path[:0] = [str(UNIT_TESTS / "evaluation"), str(UNIT_TESTS / "recording")]
+sys.path[:0] = [str(UNIT_TESTS / "results"), str(UNIT_TESTS / "bags")]
 
 RIG = """
 driver: {{port: {port}, protocol: ezloop}}

@@ -47,9 +47,9 @@ def short_run(folder: Path, duration: float = 18.0) -> tuple[Path, np.ndarray]:
 
 
 def test_the_graph_calibrates_as_one_process_does(tmp_path: Path):
+    from der_planner.bags.reader import BagReader
     from der_planner.identification import read_bag
     from der_planner.limb import Limb
-    from der_planner.runs.recording.reader import BagReader
 
     excitation, pressure = short_run(tmp_path)
 

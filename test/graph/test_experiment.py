@@ -18,7 +18,7 @@ from domain import own_domain
 from der_planner.experiment.client import GraphClient
 from der_planner.limb import CalibratedRange, Limb, gravity_of
 from der_planner.planning.plan_file import read_plan
-from der_planner.runs.evaluation import load_run
+from der_planner.results import load_run
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 TWIN_NODES = {
@@ -118,7 +118,7 @@ def experiment(tmp_path: Path) -> Iterator:
 
 def last_board_command(bag: Path) -> np.ndarray:
     """Return the differential pressures [Pa] that the board was told last, as the bag has it."""
-    from der_planner.runs.recording.reader import BagReader
+    from der_planner.bags.reader import BagReader
 
     last = None
     with BagReader(bag) as reader:

@@ -41,7 +41,8 @@ class DiagnosticsPublisher:
     """Calls ``report`` once a second and publishes what it returns, the CPU time and the process.
 
     A node that starts speaks more often until it is ready and others had the time to find it, so
-    that nobody who waits for it waits for its next second.
+    that nobody who waits for it waits for its next second. Meanwhile it listens, too: a node of its
+    name that another process began earlier ends it, with a sentence that names both and the remedy.
 
     Args:
         node: the node that the status is about.
@@ -54,6 +55,10 @@ class DiagnosticsPublisher:
         self._report = report
         self._hardware_id = hardware_id
         self._publisher = node.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, qos.STATES)
+        self._process, self._started = f"{socket.gethostname()}:{os.getpid()}", time.time()
+        self._others = node.create_subscription(
+            DiagnosticArray, topics.DIAGNOSTICS, self._look_for_namesake, qos.STATES
+        )
         self._used, self._looked = time.process_time(), time.monotonic()
         self._cpu = 0.0
         self._slow_from = time.monotonic() + _FIRST_TIME
@@ -65,7 +70,21 @@ class DiagnosticsPublisher:
             self._slow_from = min(self._slow_from, now + _FIRST_READY)
         if now >= self._slow_from:
             self._node.destroy_timer(self._timer)
+            self._node.destroy_subscription(self._others)
             self._timer = self._node.create_timer(_INTERVAL, self.publish)
+
+    def _look_for_namesake(self, message: DiagnosticArray) -> None:
+        """End this node where an older one of its name is alive; one that was killed is silent."""
+        own = self._node.get_fully_qualified_name()
+        for status in message.status:
+            said = {pair.key: pair.value for pair in status.values}
+            process, started = said.get("process", ""), float(said.get("started", "inf"))
+            if status.name == own and process != self._process and started < self._started:
+                self._node.fatal_error = (
+                    f"a node {own} is running already (process {process}): end it first, give this "
+                    "one another name or namespace (--ros-args -r __ns:=/OTHER), or set another "
+                    "ROS_DOMAIN_ID"
+                )
 
     def publish(self) -> str:
         """Publish now, without waiting for the next second; return the level."""
@@ -73,7 +92,8 @@ class DiagnosticsPublisher:
         values = {
             **health.values,
             "cpu_percent": f"{self._measure_cpu():.0f}",
-            "process": f"{socket.gethostname()}:{os.getpid()}",
+            "process": self._process,
+            "started": f"{self._started:.3f}",
         }
         status = DiagnosticStatus(
             level=_LEVELS[health.level],

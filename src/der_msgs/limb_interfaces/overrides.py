@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 from limb_interfaces.parameters import ParameterError
 
@@ -23,6 +25,8 @@ def check_overrides(
 ) -> None:
     """Warn of every parameter value that nothing took; call it when all parameters are declared.
 
+    From then on a parameter that is set and not declared is refused by its name, too.
+
     Args:
         node: the node.
         refuse: raise instead: for a node on which a limit that is silently left at its default
@@ -33,11 +37,24 @@ def check_overrides(
         ParameterError: with ``refuse``, a value was taken by no parameter; names it and what it
             may have been meant to be.
     """
+    node.add_pre_set_parameters_callback(lambda given: _only_declared(node, given))
     found = [*_unknown_names(node), *_foreign_files(node, arguments)]
     if found and refuse:
         raise ParameterError("; ".join(found))
     for text in found:
         node.get_logger().warning(text)
+
+
+def _only_declared(node: Node, given: list[Parameter]) -> list[Parameter]:
+    """Return the parameters that are set; rclpy would refuse others without their names.
+
+    Raises:
+        ParameterNotDeclaredException: the node has not declared one of them.
+    """
+    unknown = [each.name for each in given if not node.has_parameter(each.name)]
+    if unknown:
+        raise ParameterNotDeclaredException(unknown)
+    return given
 
 
 def _unknown_names(node: Node) -> Iterator[str]:

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "recording"))
-sys.path.insert(0, str(Path(__file__).parent.parent / "evaluation"))
+sys.path.insert(0, str(Path(__file__).parent.parent / "bags"))
+sys.path.insert(0, str(Path(__file__).parent.parent / "results"))
 
 from runs import BagOfRun
 

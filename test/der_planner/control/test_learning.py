@@ -9,7 +9,7 @@ from link_chain import LinkChain
 
 from der_planner.control import Learner, LearningError
 from der_planner.limb import Limb
-from der_planner.model.response import simulate
+from der_planner.model import simulate
 from der_planner.planning import CONTROL_PERIOD, Motion, plan
 
 LIMB = Limb.default()

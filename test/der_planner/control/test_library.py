@@ -9,7 +9,7 @@ import pytest
 from der_planner.control import Learner
 from der_planner.control.library import carried_over, nearest
 from der_planner.limb import Limb
-from der_planner.model.response import simulate
+from der_planner.model import simulate
 from der_planner.planning import Motion, plan
 from der_planner.planning.plan_file import write_plan
 

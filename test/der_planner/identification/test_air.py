@@ -10,7 +10,7 @@ from der_planner.identification.air import AirFit, fit_air
 from der_planner.identification.excitation import PERIOD, calibration_run, steps, waves
 from der_planner.identification.report import FitReport
 from der_planner.limb import Limb, Pneumatics
-from der_planner.model.air import chamber_pressures, pair_of, pressures_at_commands
+from der_planner.model.air import Air, pair_of
 from pressure_driver.emulator import pneumatics as emulator
 
 AIR = replace(Limb.default().pneumatics, time_constant=0.3, vent_time_constant=0.12, delay=0.04)
@@ -24,7 +24,7 @@ def log_of(command: np.ndarray, measured: np.ndarray) -> CalibrationLog:
 
 def synthetic_log(air: Pneumatics, command: np.ndarray, noise: float = 5.0) -> CalibrationLog:
     """Pressures at the instants of the commands, by substeps ten times finer than the fit's."""
-    held = chamber_pressures(air, command, PERIOD, 20)
+    held = Air(air).follow(command, PERIOD, 20).differential
     before = np.concatenate([np.zeros((1, command.shape[1])), held[:-1, -1]])
     measured = 0.5 * (before + held[:, 0])
     return log_of(command, measured + noise * np.random.default_rng(0).normal(size=command.shape))
@@ -109,7 +109,9 @@ def test_a_vented_step_of_the_emulated_board_is_predicted(quick):
     measured = emulated_log(4, command).measured_differential
     falling = slice(122, None)
     missed = {
-        name: np.abs(pressures_at_commands(air, command, PERIOD) - measured)[falling].max(axis=0)
+        name: np.abs(Air(air).pressures_at_commands(command, PERIOD) - measured)[falling].max(
+            axis=0
+        )
         for name, air in {
             "law": law(found),
             "lag": replace(law(found), vent_rate=0.0),
@@ -150,7 +152,9 @@ def test_the_default_exponent_is_that_of_a_real_limb(shared_data):
         for rate in np.linspace(3500.0, 9000.0, 56):
             air = replace(AIR, vent_rate=rate, vent_exponent=exponent, vent_time_constant=0.01)
             start = pressure[rows[:1]]
-            fall = chamber_pressures(replace(air, delay=0.0), np.zeros((120, 1)), 0.05, 5, start)
+            fall = (
+                Air(replace(air, delay=0.0)).follow(np.zeros((120, 1)), 0.05, 5, start).differential
+            )
             predicted = np.interp(instants, 0.005 + 0.01 * np.arange(600), fall.ravel())
             misfits.append(float(np.sqrt(np.mean((predicted - pressure[rows]) ** 2))))
         return min(misfits)

@@ -19,7 +19,7 @@ from der_planner.identification.logs.prepare import prepare
 from der_planner.identification.parameters import column, start_values
 from der_planner.identification.rod_angles import NODES, RodAngles
 from der_planner.limb import Limb, gravity_of
-from der_planner.model.response import RodModel, simulate
+from der_planner.model import RodModel, simulate
 from der_planner.planning import Motion, plan
 
 pytestmark = pytest.mark.slow

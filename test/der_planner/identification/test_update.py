@@ -17,7 +17,7 @@ from der_planner.identification import (
     update,
 )
 from der_planner.limb import Limb
-from der_planner.model.response import simulate
+from der_planner.model import simulate
 
 LIMB = Limb.default()
 RUBBING = replace(

@@ -17,14 +17,14 @@ from der_planner.limb import (
     LimbError,
     Pneumatics,
     Segment,
+    declarations,
 )
-from der_planner.limb_declaration import parameters
 
 LIMB = Limb.default()
 DECLARED = [
     pytest.param(kind, name, id=f"{kind.__name__}.{name}")
     for kind in (Segment, Pneumatics)
-    for name in parameters(kind)
+    for name in declarations(kind)
 ]
 
 
@@ -45,8 +45,8 @@ def test_the_default_limb_file_is_what_is_written(tmp_path):
 
 @pytest.mark.parametrize("kind", [Segment, Pneumatics, CalibratedRange])
 def test_every_field_is_declared_with_unit_meaning_and_choice(kind):
-    assert list(parameters(kind)) == [item.name for item in dataclasses.fields(kind)]
-    for declared in parameters(kind).values():
+    assert list(declarations(kind)) == [item.name for item in dataclasses.fields(kind)]
+    for declared in declarations(kind).values():
         assert declared.unit
         assert declared.text
         assert declared.choose
@@ -54,7 +54,7 @@ def test_every_field_is_declared_with_unit_meaning_and_choice(kind):
 
 @pytest.mark.parametrize(("kind", "name"), DECLARED)
 def test_a_value_out_of_range_is_refused_by_name_range_and_value(kind, name):
-    declared = parameters(kind)[name]
+    declared = declarations(kind)[name]
     wrong = [math.nan, math.inf]
     if math.isfinite(declared.low):
         wrong.append(
@@ -80,7 +80,7 @@ def test_a_parameter_that_another_needs_may_not_be_zero():
 @pytest.mark.parametrize(("kind", "name"), DECLARED)
 def test_unit_and_meaning_stand_behind_every_key(kind, name, tmp_path):
     LIMB.to_yaml(tmp_path / "limb.yaml")
-    declared = parameters(kind)[name]
+    declared = declarations(kind)[name]
     lines = [
         line
         for line in (tmp_path / "limb.yaml").read_text(encoding="utf-8").splitlines()
@@ -109,7 +109,7 @@ def test_an_older_limb_file_with_retired_keys_is_read(tmp_path):
 
 
 def test_the_fit_has_an_unknown_for_each_declaration_and_finds_its_value_again():
-    declared = [item.fit for item in parameters(Segment).values() if item.fit]
+    declared = [item.fit for item in declarations(Segment).values() if item.fit]
     assert sorted(term.name for term in TERMS) == sorted(term.name for term in declared)
     rng = np.random.default_rng(3)
     low, high = (np.array([getattr(term, end) for term in TERMS]) for end in ("low", "high"))

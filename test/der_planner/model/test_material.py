@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from der_planner.limb import Limb, LimbError
-from der_planner.model import material
+from der_planner.model.material import Material, dahl, maxwell
 
 
 def rubbing(**changes: float) -> Limb:
@@ -37,16 +37,16 @@ WANTED = 11_000.0 * np.stack([np.sin(TIME / 3), np.sin(TIME / 5)], axis=1)
 
 def test_differential_and_effective_pressure_are_inverse():
     limb = rubbing()
-    given = material.differential_pressure(limb, TIME, WANTED, BEND)
+    given = Material(limb).differential_pressure(TIME, WANTED, BEND)
     np.testing.assert_allclose(
-        material.effective_pressure(limb, TIME, given, BEND), WANTED, atol=1e-8
+        Material(limb).effective_pressure(TIME, given, BEND), WANTED, atol=1e-8
     )
     assert np.abs(given - WANTED).max() > 300.0
 
 
 def test_a_plain_limb_feels_what_its_chambers_hold():
     np.testing.assert_array_equal(
-        material.effective_pressure(Limb.default(), TIME, WANTED, BEND), WANTED
+        Material(Limb.default()).effective_pressure(TIME, WANTED, BEND), WANTED
     )
 
 
@@ -54,21 +54,21 @@ def test_friction_saturates_closes_its_loops_and_does_not_depend_on_rate():
     angle = np.concatenate(
         [np.linspace(0, 2, 400), np.linspace(2, -2, 800), np.linspace(-2, 2, 800)]
     )
-    z = material.dahl(angle, 0.1)
+    z = dahl(angle, 0.1)
     assert np.abs(z).max() <= 1.0
     assert z[399] == pytest.approx(1.0, abs=1e-6)
     assert z[1199] == pytest.approx(-1.0, abs=1e-6)
     np.testing.assert_allclose(z[-1], z[399], atol=1e-6)
-    np.testing.assert_allclose(material.dahl(angle[::4], 0.1)[-1], z[-1], atol=1e-6)
+    np.testing.assert_allclose(dahl(angle[::4], 0.1)[-1], z[-1], atol=1e-6)
     # half way round after 0.1 ln 2 from saturation
-    turned = material.dahl(np.array([0.0, 5.0, 5.0 - 0.1 * np.log(2)]), 0.1)
+    turned = dahl(np.array([0.0, 5.0, 5.0 - 0.1 * np.log(2)]), 0.1)
     assert turned[-1] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_creep_relaxes_exponentially():
     time = np.linspace(0, 20, 401)
     strain = np.where(time > 0, 1.0, 0.0)
-    q = material.maxwell(time, strain, 4.0)
+    q = maxwell(time, strain, 4.0)
     np.testing.assert_allclose(q[1:], q[1] * np.exp(-(time[1:] - time[1]) / 4.0), rtol=1e-12)
 
 
@@ -79,8 +79,8 @@ def test_resting_bend_is_where_moment_and_effective_pressure_agree():
         replace(s, cubic_stiffness=cubic * s.bending_stiffness * s.length**2) for s in limb.segments
     ]
     limb = replace(limb, segments=tuple(stiffer))
-    bend = material.resting_bend(limb, TIME, WANTED)
-    effective = material.effective_pressure(limb, TIME, WANTED, bend)
+    bend = Material(limb).resting_bend(TIME, WANTED)
+    effective = Material(limb).effective_pressure(TIME, WANTED, bend)
     bent = bend - np.array([s.rest_curvature * s.length for s in limb.segments])
     held = bent + cubic * bent**3
     np.testing.assert_allclose(held[1:], (limb.static_gain * effective)[1:], atol=1e-9)
@@ -93,11 +93,11 @@ def test_coupling_adds_the_share_of_the_neighbours_pressure():
         limb,
         segments=(replace(first, coupling_after=0.04), replace(second, coupling_before=-0.02)),
     )
-    felt = material.effective_pressure(coupled, TIME, WANTED, BEND)
+    felt = Material(coupled).effective_pressure(TIME, WANTED, BEND)
     expected = WANTED + WANTED[:, ::-1] * [0.04, -0.02]
     np.testing.assert_allclose(felt, expected, rtol=1e-12)
     alone = replace(limb, segments=(replace(first, coupling_before=0.04), second))
-    np.testing.assert_array_equal(material.effective_pressure(alone, TIME, WANTED, BEND), WANTED)
+    np.testing.assert_array_equal(Material(alone).effective_pressure(TIME, WANTED, BEND), WANTED)
     with pytest.raises(LimbError, match="coupling_after"):
         replace(limb, segments=(replace(first, coupling_after=0.6), second))
 
@@ -106,7 +106,7 @@ def test_too_much_stiffening_is_refused_by_its_name():
     limb = rubbing()
     segments = tuple(replace(s, pressure_stiffening=1e-4) for s in limb.segments)
     with pytest.raises(ValueError, match="pressure_stiffening"):
-        material.differential_pressure(replace(limb, segments=segments), TIME, WANTED, BEND)
+        Material(replace(limb, segments=segments)).differential_pressure(TIME, WANTED, BEND)
 
 
 def test_limb_file_keeps_everything(tmp_path):

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from der_planner.limb import Limb
-from der_planner.model.bending import ArcKinematics, PolylineKinematics, bend_angles
+from der_planner.model import ArcModel
+from der_planner.model.bending import PolylineKinematics, bend_angles
 from der_planner.planning import inverse
 from der_planner.planning.rod_model import PlanningRod
 from der_planner.rod import Rod
 
 LIMB = Limb.default()
-ARCS = ArcKinematics(LIMB)
+ARCS = ArcModel(LIMB)
 CHAIN = PlanningRod(LIMB).kinematics
 
 
@@ -50,7 +51,7 @@ def test_a_stiff_base_moves_the_limb_along_x():
     angles = [0.9, -0.4]
     q = PolylineKinematics.of_rod(rod).configuration(angles)
     np.testing.assert_allclose(model.kinematics.nodes(angles), rod.positions(q)[:, :2], atol=1e-14)
-    for with_base, without in ((model.kinematics, CHAIN), (ArcKinematics(based), ARCS)):
+    for with_base, without in ((model.kinematics, CHAIN), (ArcModel(based), ARCS)):
         np.testing.assert_allclose(
             with_base.tip(angles), without.tip(angles) + np.array([7e-3, 0.0])
         )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from der_planner.limb import GRAVITY, Limb
-from der_planner.model.response import RodModel
+from der_planner.model import RodModel
 from der_planner.planning import (
     METHODS,
     BucklingError,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from der_planner.limb import Limb
-from der_planner.model.bending import ArcKinematics
+from der_planner.model import ArcModel
 from der_planner.planning import NAMES, Motion, PathLimits, PlanningError, UnreachableError
 from der_planner.planning.motions import JOINT_MOTIONS
 from der_planner.planning.paths import TipPath
@@ -59,7 +59,7 @@ def test_named_motions_follow_the_papers_formulas_after_the_fade(name, second):
 def test_reference_is_the_tip_of_the_arcs():
     for name in NAMES:
         reference = Motion.named(name, amplitude=0.6, period=5.0).reference(LIMB)
-        tip = ArcKinematics(LIMB).tip(reference.bend_angles)
+        tip = ArcModel(LIMB).tip(reference.bend_angles)
         np.testing.assert_allclose(reference.tip, tip, atol=1e-12)
 
 
@@ -173,7 +173,7 @@ def test_an_unreachable_path_names_time_point_and_distance():
 
 def test_a_pose_beyond_the_pressure_limit_says_what_it_would_need():
     weak = Limb("weak", LIMB.segments, type(LIMB.pneumatics)(10e3, 9e3, 9e3, 0.15))
-    tip = ArcKinematics(weak).tip(np.radians([[45.0, 45.0], [46.0, 46.0]]))
+    tip = ArcModel(weak).tip(np.radians([[45.0, 45.0], [46.0, 46.0]]))
     with pytest.raises(UnreachableError, match=r"it would need 1\d\.\d kPa") as caught:
         Motion.from_tip_path([0.0, 1.0], tip).reference(weak)
     assert caught.value.required_pressure == pytest.approx(12.4e3, rel=0.01)

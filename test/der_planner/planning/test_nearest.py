@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from der_planner.limb import Limb
-from der_planner.model.bending import ArcKinematics
+from der_planner.model import ArcModel
 from der_planner.planning import Motion, PlanningError, plan
 from der_planner.planning.inverse import BRANCHES, angle_limits, distance_to_reach
 
 LIMB = Limb.default()
-ARCS = ArcKinematics(LIMB)
+ARCS = ArcModel(LIMB)
 CENTRE = ARCS.tip([0.9, 0.9])
 TURN = np.linspace(0.0, 2 * np.pi, 90)
 RING = np.column_stack([np.cos(TURN), np.sin(TURN)])
@@ -106,7 +106,7 @@ def test_a_branch_that_was_named_is_kept():
 @pytest.mark.parametrize("segments", [1, 3])
 def test_other_numbers_of_segments(segments):
     limb = replace(LIMB, segments=(LIMB.segments[0],) * segments)
-    centre = ArcKinematics(limb).tip(np.full(segments, 0.6))
+    centre = ArcModel(limb).tip(np.full(segments, 0.6))
     reference = Motion.from_tip_path(None, centre + 0.02 * RING, nearest=True).reference(limb)
     assert reference.bend_angles.shape == (len(reference.time), segments)
     assert reference.deviation.mean < 0.015

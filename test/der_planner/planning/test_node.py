@@ -165,46 +165,37 @@ def test_a_path_is_planned_and_a_new_command_takes_over_without_a_jump(planner):
     assert np.abs(np.diff(pressures, axis=0)).max() <= 9000 * 0.05 + 1e-6
 
 
-def test_each_motion_has_the_loads_of_its_time(planner):
-    """By parameter, by command, from out of another motion, and by a parameter that was set."""
+def test_each_plan_has_the_loads_of_its_time(planner):
+    """By parameter, by command, and by a parameter that was set."""
     from rcl_interfaces.msg import Parameter, ParameterValue
     from rcl_interfaces.srv import SetParameters
 
-    node = planner(payload=0.02, mounting="hanging")
-    node.command(plan_id="parameters", model="pcc")
-    node.client.wait_for(lambda: len(node.received("parameters")) > 10, 60.0, "setpoints")
-    node.command(plan_id="heavier", payload=0.05, payload_at=0.2)
-    node.wait_state("done")
-    node.command(plan_id="tilted", payload=0.03, mounting="10", model="pcc")
-    node.wait_plan("tilted")
-    node.wait_state("done")
+    node = planner(payload=0.02, mounting="hanging", auto_start=False)
+
+    def loads(plan_id, **fields):
+        node.command(plan_id=plan_id, model="pcc", **fields)
+        plan = node.wait_plan(plan_id)
+        return plan.payload, plan.payload_at, *plan.gravity[:2]
+
+    assert loads("parameters") == (0.02, 0.0, 9.81, 0.0)
+    assert loads("heavier", payload=0.05, payload_at=0.2) == (0.05, 0.2, 9.81, 0.0)
+    tilted = (0.03, 0.0, 0.0, pytest.approx(-1.7035, abs=1e-4))
+    assert loads("tilted", payload=0.03, mounting="10") == tilted
     client = node.client.node.create_client(SetParameters, "planner/set_parameters")
     node.client.wait_for(client.service_is_ready, 30.0, "the parameters")
     nothing = Parameter(name="payload", value=ParameterValue(type=3, double_value=0.0))
-    answer = client.call_async(SetParameters.Request(parameters=[nothing]))
+    unknown = Parameter(name="paylod", value=ParameterValue(type=3, double_value=0.0))
+    answer = client.call_async(SetParameters.Request(parameters=[nothing, unknown]))
     node.client.wait_for(answer.done, 30.0, "the answer")
-    assert answer.result().results[0].successful
-    node.command(plan_id="bare", model="pcc")
-    node.wait_plan("bare")
-    plans = {plan.plan_id: plan for plan in node.plans}
-    loads = {name: (p.payload, p.payload_at, *p.gravity[:2]) for name, p in plans.items()}
-    assert loads == {
-        "parameters": (0.02, 0.0, 9.81, 0.0),
-        "heavier": (0.05, 0.2, 9.81, 0.0),
-        "tilted": (0.03, 0.0, 0.0, pytest.approx(-1.7035, abs=1e-4)),
-        "bare": (0.0, 0.0, 9.81, 0.0),
-    }
-    # The heavier motion took over where the first one was: neither setpoints nor reference jump.
-    first, second = node.received("parameters"), node.received("heavier")
-    assert 10 < len(first) < len(plans["parameters"].time)
-    both = np.array([m.differential_pressure for m in (*first, *second)])
-    assert np.abs(np.diff(both, axis=0)).max() <= 9000 * 0.05 + 1e-6
-    left = np.array(plans["parameters"].tip_predicted).reshape(-1, 2)[len(first)]
-    assert np.linalg.norm(np.array(plans["heavier"].tip_reference[:2]) - left) < 0.015
+    taken, refused = answer.result().results
+    assert taken.successful
+    assert not refused.successful
+    assert "paylod" in refused.reason
+    assert loads("bare") == (0.0, 0.0, 9.81, 0.0)
 
 
 def test_start_and_stop(planner):
-    from der_planner.experiment.errors import GraphError
+    from der_planner.experiment.processes import GraphError
 
     node = planner(auto_start=False)
     with pytest.raises(GraphError, match="no plan yet"):
@@ -314,24 +305,29 @@ def test_the_action_tells_how_it_goes_and_how_it_ended(planner):
     node.client.wait_for(action.server_is_ready, 30.0, "the action")
     heard = []
 
-    def play(motion="asynchronous", plan_id="", period=2.0):
+    def play(motion="asynchronous", plan_id="", period=2.0, amplitude=0.3):
         command = MotionCommand(
-            motion=motion, amplitude=0.3, period=period, cycles=1, plan_id=plan_id
+            motion=motion, amplitude=amplitude, period=period, cycles=1, plan_id=plan_id
         )
         sent = action.send_goal_async(
             PlayMotion.Goal(command=command), lambda message: heard.append(message.feedback)
         )
         node.client.wait_for(sent.done, 30.0, "the goal to be accepted")
-        return sent.result(), sent.result().get_result_async()
+        handle = sent.result()
+        return handle, handle.get_result_async() if handle.accepted else None
 
     def result_of(future):
         node.client.wait_for(future.done, 60.0, "the result")
         return future.result()
 
-    _, refused = play("jump")
+    handle, _ = play("jump")
+    assert not handle.accepted
+    node.client.wait_for(lambda: "'jump' is unknown" in node.state()["last_refusal"], 30.0, "why")
+
+    _, refused = play(amplitude=1.7)
     answer = result_of(refused)
     assert answer.result.outcome == "refused"
-    assert "'jump' is unknown" in answer.result.reason
+    assert "out of reach" in answer.result.reason
 
     _, whole = play(plan_id="whole")
     answer = result_of(whole)
@@ -352,6 +348,17 @@ def test_the_action_tells_how_it_goes_and_how_it_ended(planner):
     _, new = play("same_direction", plan_id="new")
     assert result_of(old).result.outcome == "replaced"
     assert result_of(new).result.outcome == "finished"
+
+
+def test_a_second_node_of_a_name_ends_with_the_remedy_and_the_first_goes_on(graph):
+    first = graph.start("der_planner", "recorder", "first")
+    graph.client.wait_ready(["recorder"])
+    second = graph.start("der_planner", "recorder", "second")
+    graph.client.wait_for(lambda: not second.alive, 60.0, "the second one to give up")
+    assert second.stop() == 1
+    assert f":{first.pid}): end it first" in second.last_words()
+    assert "/limb/recorder is running already" in second.last_words()
+    assert first.alive
 
 
 def test_what_no_parameter_took_is_said(planner, graph, tmp_path):

@@ -5,8 +5,7 @@ import pytest
 from scipy.optimize import minimize
 
 from der_planner.limb import Limb
-from der_planner.model import commands
-from der_planner.model.drive import STEPS
+from der_planner.model import STEPS, commands
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import Motion, plan, planner
 from der_planner.planning.optimal import Optimiser, Settings
@@ -21,7 +20,7 @@ def solver_for(limb, motion, **settings):
     reference = motion.reference(limb)
     spline = model.configuration(reference)
     warm = commands.commands(
-        model.limb, *planner.balance(model, spline, reference, "projected"), CONTROL_PERIOD
+        model, *planner.balance(model, spline, reference, "projected"), CONTROL_PERIOD
     )
     begin = model.begin(spline, reference.start)
     return Optimiser(model, begin, spline, reference, warm, STEPS, Settings(**settings))

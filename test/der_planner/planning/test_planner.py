@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from der_planner.limb import CalibratedRange, Limb
-from der_planner.model import commands
-from der_planner.model.air import chamber_pressures
+from der_planner.model import RodModel, commands
+from der_planner.model.air import Air
 from der_planner.model.bending import bend_angles
 from der_planner.planning import (
     METHODS,
@@ -335,7 +335,7 @@ def test_held_commands_reach_the_chambers_as_the_lag_says():
     air = changed(LIMB, {"delay": 0.02}).pneumatics
     command = np.zeros((40, 1))
     command[4:] = 1000.0
-    chambers = chamber_pressures(air, command, 0.05, 10)
+    chambers = Air(air).follow(command, 0.05, 10).differential
     time = ((np.arange(400) + 0.5) * 0.005).reshape(40, 10, 1) - 0.2 - 0.02
     exact = np.where(time > 0, 1000.0 * (1 - np.exp(-time / air.time_constant)), 0.0)
     np.testing.assert_allclose(chambers, exact, atol=1e-9)
@@ -346,8 +346,8 @@ def test_commands_invert_hold_lag_and_delay():
     fine = np.arange(401) * 0.025
     wanted = np.column_stack([4e3 * (1 - np.cos(fine)), 2e3 * np.sin(0.7 * fine) ** 2])
     bend = np.zeros_like(wanted)
-    command = commands.commands(limb, fine, wanted, bend, 0.05)
-    chambers = chamber_pressures(limb.pneumatics, command, 0.05, 5)
+    command = commands.commands(RodModel(limb), fine, wanted, bend, 0.05)
+    chambers = Air(limb.pneumatics).follow(command, 0.05, 5).differential
     middle = (np.arange(len(command) * 5) + 0.5) * 0.01
     exact = np.column_stack([np.interp(middle, fine, column) for column in wanted.T])
     assert np.abs(chambers.reshape(-1, 2) - exact)[50:].max() < 60.0

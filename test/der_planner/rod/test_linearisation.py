@@ -89,22 +89,6 @@ def test_linearised_step_is_the_derivative_of_the_step(rod, method):
     np.testing.assert_allclose(B, expected_B, atol=1e-6 * np.abs(B).max())
 
 
-def test_it_needs_the_derivative_of_the_couples():
-    """Couples turn with their edges: A depends on u also where q and v are held."""
-    rod = limb_rod()
-    state = rod.equilibrium([5e3, 5e3])
-    calm, _ = rod.linearise_step(state, [5e3, 5e3], 1e-4, "backward_euler")
-    # internal stiffness alone: the implicit step without the couples' derivative
-    free = rod.free
-    mass = rod.mass_diagonal[free]
-    after = rod.step(state, [5e3, 5e3], 1e-4, "backward_euler")
-    without = np.diag((mass / 1e-4 + rod.damping_diagonal[free]) / 1e-4)
-    right = without.copy()
-    without += rod.stiffness(after)[np.ix_(free, free)]
-    difference = np.abs(np.linalg.solve(without, right) - calm[: len(free), : len(free)]).max()
-    assert difference > 1e-5
-
-
 @pytest.fixture(
     scope="module",
     params=[

@@ -85,32 +85,3 @@ def test_first_frequency_with_a_tip_mass_is_that_of_euler_and_bernoulli():
     root = np.sqrt(rod.mass_diagonal[free])
     squares = np.linalg.eigvalsh(stiffness / root[:, None] / root)
     assert np.sqrt(squares[0]) == pytest.approx(exact, rel=2e-3)
-
-
-@pytest.mark.parametrize("plane", ["xy", None])
-def test_the_linearisation_knows_the_masses(plane):
-    limb = Limb.default().mounted("hanging").carrying(0.05)
-    rod = Rod.from_limb(limb, 13, plane=plane)
-    state = rod.equilibrium([3000.0, -1000.0])
-    u = np.array([[4000.0, 2000.0]] * 6)
-    change = np.array([[300.0, -200.0]] * 6)
-    motion = rod.simulate(state, u, 0.01, linearise=True)
-    ahead = rod.simulate(state, u + 1e-3 * change, 0.01).tip
-    behind = rod.simulate(state, u - 1e-3 * change, 0.01).tip
-    slope = ((ahead - behind) / 2e-3)[:, : motion.linearisation.outputs.size]
-    np.testing.assert_allclose(motion.linearisation.tangent(change), slope, atol=2e-7)
-
-
-def test_an_undamped_loaded_rod_keeps_its_energy():
-    rod = rod_of(41, gravity=(9.81, 0.0, 0.0), masses=[(0.25, 0.05), (0.11, 0.02)])
-    bent = rod_of(41, masses=[(0.25, 0.05), (0.11, 0.02)], gravity=(0.0, -6.0, 0.0))
-    state = rod.state(bent.equilibrium([]).q)
-    motion = rod.simulate(state, np.zeros((60, 0)), 0.01, substeps=5, method="midpoint")
-
-    def energies(q, v):
-        kinetic = 0.5 * rod.mass_diagonal @ v**2
-        return kinetic, kinetic + rod.energy(q) - rod.external_force @ q
-
-    kinetic, total = np.array([energies(*pair) for pair in zip(motion.q, motion.v, strict=True)]).T
-    assert np.ptp(kinetic) > 5e-3
-    assert np.ptp(total) < 0.01 * np.ptp(kinetic)

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_bvp
 
 from der_planner.rod import ConvergenceError, Rod
 
@@ -20,34 +19,6 @@ def cantilever(nodes: int, clamp: str = "ghost", plane="xz", axial: float = 1.0)
         GJ=YOUNG / 3 * 2 * INERTIA, mass_per_length=1240 * AREA, clamp=clamp,
         gravity=(0, 0, -9.81), plane=plane,
     )  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def elastica() -> np.ndarray:
-    """Tip (x, z) of the inextensible cantilever under its weight, by collocation."""
-
-    def slope(s, y):
-        bending = WEIGHT * (LENGTH - s) * np.cos(y[0]) / (YOUNG * INERTIA)
-        return np.array([y[1], bending, np.cos(y[0]), np.sin(y[0])])
-
-    def ends(a, b):
-        return np.array([a[0], b[1], a[2], a[3]])
-
-    solution = solve_bvp(slope, ends, np.linspace(0, LENGTH, 50), np.zeros((4, 50)), tol=1e-10)
-    assert solution.success
-    return solution.y[2:, -1]
-
-
-def test_elastica_under_gravity(elastica):
-    assert elastica[1] == pytest.approx(-66.38e-3, abs=5e-6)
-    errors = []
-    for nodes in (11, 21, 41, 81):
-        rod = cantilever(nodes, axial=1e4)
-        tip = rod.tip(rod.equilibrium([]))[[0, 2]]
-        errors.append(np.linalg.norm(tip - elastica))
-    assert errors[1] < 0.005 * abs(elastica[1])
-    order = np.log2(np.array(errors[:-1]) / errors[1:])
-    assert order.min() > 1.8
 
 
 @pytest.mark.parametrize("plane", ["xz", None])

@@ -20,8 +20,7 @@ import dataclasses
 import sys
 from pathlib import Path
 
-from der_planner.experiment.errors import OptionError
-from der_planner.experiment.load_options import add_load_options, as_loaded, check_loads
+from der_planner.experiment.console import OptionError, add_load_options, as_loaded, check_loads
 from der_planner.identification import (
     CalibrationLog,
     ColumnMap,
@@ -32,7 +31,7 @@ from der_planner.identification import (
     update,
 )
 from der_planner.limb import Limb, LimbError
-from der_planner.runs.outputs import OutputError, check_file
+from der_planner.results.outputs import OutputError, check_file
 
 
 def main() -> int:

@@ -24,8 +24,8 @@ from der_planner.control.hindsight import Filmed, Smoothed, smooth
 from der_planner.limb import LimbError
 from der_planner.planning import Plan, PlanningError
 from der_planner.planning.plan_file import read_plan
-from der_planner.runs.evaluation import BagError, EvaluationError, RunSeries, load_run
-from der_planner.runs.outputs import OutputError, check_file
+from der_planner.results import BagError, EvaluationError, RunSeries, load_run
+from der_planner.results.outputs import OutputError, check_file
 
 Array = NDArray[np.float64]
 

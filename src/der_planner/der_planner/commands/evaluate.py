@@ -13,7 +13,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from der_planner.runs.evaluation import (
+from der_planner.results import (
     BagError,
     EvaluationError,
     Settings,
@@ -24,9 +24,9 @@ from der_planner.runs.evaluation import (
     write_report,
     write_results,
 )
-from der_planner.runs.evaluation.alignment import WINDOWS
-from der_planner.runs.evaluation.overlay import write_video
-from der_planner.runs.outputs import OutputError, check_file, check_folder
+from der_planner.results.alignment import WINDOWS
+from der_planner.results.outputs import OutputError, check_file, check_folder
+from der_planner.results.overlay import write_video
 
 
 def _arguments() -> argparse.Namespace:

@@ -16,13 +16,13 @@ from pathlib import Path
 
 from der_planner.commands.recorded_plan import check_same, plan_of
 from der_planner.control import Learner, LearningError
-from der_planner.experiment.errors import GraphError
 from der_planner.experiment.learning import about, add_run
+from der_planner.experiment.processes import GraphError
 from der_planner.limb import LimbError
 from der_planner.planning import PlanningError
 from der_planner.planning.plan_file import read_plan, write_plan
-from der_planner.runs.evaluation import BagError, EvaluationError, load_run
-from der_planner.runs.outputs import OutputError, check_file
+from der_planner.results import BagError, EvaluationError, load_run
+from der_planner.results.outputs import OutputError, check_file
 
 
 def main() -> int:

@@ -11,7 +11,7 @@ from der_planner.control import LearningError
 from der_planner.limb import Limb
 from der_planner.planning import Motion, Plan, PlanningError, plan
 from der_planner.planning.motions import NAMES
-from der_planner.runs.evaluation import RunSeries
+from der_planner.results import RunSeries
 
 _SAME_POINT = 2e-3
 """References whose points lie further apart than this [m] are not of one motion."""

@@ -28,13 +28,13 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
-from der_planner.runs.recording.reader import (
+from der_planner.bags.reader import (
     BagError,
     BagReader,
     RawMessage,
     RecordedTopic,
 )
-from der_planner.runs.recording.replay import (
+from der_planner.bags.replay import (
     NANOSECONDS,
     ReplaySettings,
     choose_topics,

@@ -12,17 +12,25 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from der_planner.limb import CalibratedRange, Limb, Pneumatics, PointMass, Segment
-from der_planner.limb_declaration import Parameter, Term, parameters
-from der_planner.runs.outputs import OutputError, check_file
+from der_planner.limb import (
+    CalibratedRange,
+    Limb,
+    Parameter,
+    Pneumatics,
+    PointMass,
+    Segment,
+    Term,
+    declarations,
+)
+from der_planner.results.outputs import OutputError, check_file
 
 PAGE = Path(__file__).resolve().parents[2] / "doc" / "limb_parameters.md"
 _HEAD = """\
 # The parameters of a limb
 
 Written by `python3 scripts/write_limb_page.py` from
-[limb_parameters.py](../der_planner/limb_parameters.py), [limb.py](../der_planner/limb.py) and
-[limb_loads.py](../der_planner/limb_loads.py): change them there.
+[parameters.py](../der_planner/limb/parameters.py), [limb.py](../der_planner/limb/limb.py) and
+[loads.py](../der_planner/limb/loads.py): change them there.
 
 All values are SI. A key without a default has to be in the limb file. "Fit" is the unknown by
 which the [calibration](identification.md) finds the value: its unit, its bounds, and ± the standard
@@ -48,7 +56,7 @@ def _section(title: str, kind: Any) -> Iterator[str]:
     yield "| key | unit | range | default | meaning | how to choose | fit |"
     yield "|---|---|---|---|---|---|---|"
     defaults = {item.name: item.default for item in dataclasses.fields(kind)}
-    for name, declared in parameters(kind).items():
+    for name, declared in declarations(kind).items():
         cells = (
             f"`{name}`",
             declared.unit,

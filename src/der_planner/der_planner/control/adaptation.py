@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from der_planner.limb import Limb, LimbError, Segment
-from der_planner.limb_days import LARGEST_CHANGES, on_another_day
+from der_planner.limb.days import LARGEST_CHANGES, on_another_day
 from der_planner.planning.correction import Correction
 from der_planner.planning.errors import PlanningError
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from der_planner.control.nominal import STEP, Nominal, Whole
-from der_planner.model import air
-from der_planner.model.drive import STEPS
+from der_planner.model import STEPS
+from der_planner.model.air import Chambers
 from der_planner.model.series import CONTROL_PERIOD, interpolate
 
 Array = NDArray[np.float64]
@@ -45,12 +45,12 @@ class ChamberLog:
 
     def __init__(self, nominal: Nominal, kept: float = _KEPT) -> None:
         self._nominal, self._kept = nominal, kept
-        self._inputs = nominal.limb.segment_count
+        self._inputs = nominal.model.inputs
         self._times: list[float] = []
         self._readings: list[Array] = []
         self._gap: tuple[Array, Array] | None = None
         self._last: int | None = None
-        self._remembered = int(np.ceil(air.memory_of(nominal.limb.pneumatics) / CONTROL_PERIOD))
+        self._remembered = int(np.ceil(nominal.model.air.memory / CONTROL_PERIOD))
         self._origin = -self._remembered - _BEFORE
         self._commands = np.tile(nominal.before, (-self._origin, 1))
 
@@ -116,7 +116,7 @@ class ChamberLog:
             self._commands = np.concatenate([self._commands, np.array(more)])
         return self._commands
 
-    def follow(self, first: int, coming: Array) -> tuple[air.Chambers, int]:
+    def follow(self, first: int, coming: Array) -> tuple[Chambers, int]:
         """Return the chambers under the commands sent before period ``first`` and the coming ones.
 
         Args:
@@ -129,8 +129,7 @@ class ChamberLog:
         begin = max(first - self._remembered, self._origin + 1)
         table = self._table(first)
         past = table[begin - self._origin : first - self._origin]
-        chambers = air.follow_commands(
-            self._nominal.limb.pneumatics,
+        chambers = self._nominal.model.air.follow(
             np.concatenate([past, coming]),
             CONTROL_PERIOD,
             STEPS,

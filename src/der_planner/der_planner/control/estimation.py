@@ -32,8 +32,8 @@ from numpy.typing import ArrayLike, NDArray
 from der_planner.control.chambers import ChamberLog
 from der_planner.control.knowledge import Estimate, EstimatorSettings, Knowledge
 from der_planner.control.nominal import STEP, Nominal
-from der_planner.model import material
-from der_planner.model.drive import STEPS
+from der_planner.model import STEPS
+from der_planner.model.material import Memory
 from der_planner.model.series import CONTROL_PERIOD
 
 Array = NDArray[np.float64]
@@ -79,7 +79,7 @@ class Estimator:
         self.nominal, self.chambers = nominal, chambers
         self._kept = round(history / STEP)
         self.settings = settings or EstimatorSettings()
-        self.inputs = nominal.limb.segment_count
+        self.inputs = nominal.model.inputs
         self.innovations: list[tuple[float, float, int]] = []
         self.too_late = 0
         self.newest = -math.inf
@@ -233,7 +233,7 @@ class Estimator:
         )
         zero = np.zeros(inputs)
         here = self.nominal.steps(first)
-        memory = material.Memory(self.nominal.fine_bend[here], zero, zero)
+        memory = Memory(self.nominal.fine_bend[here], zero, zero)
         mean, effective = np.zeros(4 * inputs + 2), self.nominal.effective[here]
         return Knowledge(mean, np.diag(deviation**2), zero, memory, zero, effective)
 
@@ -279,7 +279,7 @@ class Estimator:
         memory, taken = known.memory, known.taken
         if first % STEPS == 0:
             memory, taken = self._remember(known, nominal.fine_bend[steps[0]] + known.slow)
-        effective = material.without_memory(nominal.limb, held, taken)
+        effective = nominal.model.material.without_memory(held, taken)
         push = nominal.fine_input[k]
         pushed = (effective - nominal.effective[steps]) @ push.T
         move, noise = self._moves[k].copy(), self._noises[k]
@@ -323,15 +323,15 @@ class Estimator:
         )
         return moves, noises
 
-    def _remember(self, known: Knowledge, bend: Array) -> tuple[material.Memory, Array]:
+    def _remember(self, known: Knowledge, bend: Array) -> tuple[Memory, Array]:
         """Return memory and taken pressures once the limb has come to a bend (M,) [rad]."""
-        limb = self.nominal.limb
-        if not any(s.friction_moment > 0 or s.creep_stiffness > 0 for s in limb.segments):
+        material = self.nominal.model.material
+        if not material.has_memory:
             return known.memory, known.taken
         history = material.remember(
-            limb, np.array([0.0, CONTROL_PERIOD]), np.stack([known.memory.bend, bend]), known.memory
+            np.array([0.0, CONTROL_PERIOD]), np.stack([known.memory.bend, bend]), known.memory
         )
-        return history.at(-1), material.taken_by(limb, history)[-1]
+        return history.at(-1), material.pressure_taken(history)[-1]
 
     def _output(self, bend: Array, change: Array) -> Array:
         """Return ∂(bend angles, tip)/∂x (M + 2, 4M + 2)."""

@@ -15,7 +15,7 @@ from der_planner.control.chambers import ChamberLog
 from der_planner.control.estimation import Estimator
 from der_planner.control.knowledge import EstimatorSettings
 from der_planner.control.nominal import STEP, Nominal
-from der_planner.model.drive import STEPS
+from der_planner.model import STEPS
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning.result import Plan
 

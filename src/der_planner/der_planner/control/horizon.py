@@ -29,9 +29,9 @@ from der_planner.control.chambers import ChamberLog
 from der_planner.control.knowledge import Knowledge
 from der_planner.control.nominal import Nominal
 from der_planner.methods import LEARNED
-from der_planner.model import air, material
+from der_planner.model import STEPS
+from der_planner.model.air import Chambers
 from der_planner.model.commands import within_limits
-from der_planner.model.drive import STEPS
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning.quadratic import UnsolvedError, minimise
 from der_planner.planning.result import Plan
@@ -98,7 +98,7 @@ class _Rolled(NamedTuple):
 
     first: int
     correction: Array
-    chambers: air.Chambers
+    chambers: Chambers
     before: int
     held: Array
     effective: Array
@@ -142,7 +142,7 @@ class Horizon:
         self.window = self.settings.knots[-1] + 1
         self._hats = _hats(self.settings.knots)
         self._guess: tuple[int, Array] | None = None
-        inputs = nominal.limb.segment_count
+        inputs = nominal.model.inputs
         weights = (1, self.settings.change), (2, self.settings.smoothness)
         self._differences = [
             weight * np.diff(np.eye(self.window + 2), order, axis=0)[2 - order :]
@@ -232,8 +232,8 @@ class Horizon:
 
         They are led by dead time and lag of the chambers.
         """
-        nominal, inputs = self._nominal, self._nominal.limb.segment_count
-        air_of = nominal.limb.pneumatics
+        nominal, inputs = self._nominal, self._nominal.model.inputs
+        air_of = nominal.model.air.pneumatics
         lead = round((air_of.delay + air_of.time_constant) / CONTROL_PERIOD)
         periods = nominal.periods(first + lead + np.arange(-2, self.window))
         planned = nominal.effective.reshape(-1, STEPS, inputs)[periods].mean(axis=1)
@@ -243,7 +243,7 @@ class Horizon:
 
     def _disturbance(self, known: Knowledge) -> tuple[Array, Array]:
         """Return d [Pa] and g, (M,) each."""
-        inputs = self._nominal.limb.segment_count
+        inputs = self._nominal.model.inputs
         _, missing, gain, _ = np.split(known.mean, np.arange(2, 5) * inputs)
         return missing, gain
 
@@ -259,7 +259,7 @@ class Horizon:
         planned = self._nominal.commands[self._nominal.periods(first + np.arange(self.window))]
         wanted = planned + np.clip(correction, -allowed.authority, allowed.authority)
         commands, _ = within_limits(
-            wanted, self._nominal.limb.pneumatics, CONTROL_PERIOD, self._chambers.sent(first - 1)
+            wanted, self._nominal.model.air, CONTROL_PERIOD, self._chambers.sent(first - 1)
         )
         kept: Array = commands - planned
         return kept
@@ -274,7 +274,7 @@ class Horizon:
 
     def _roll(self, first: int, correction: Array, known: Knowledge) -> _Rolled:
         """Return what corrections (W, M) [Pa] from a control period on lead to."""
-        nominal, inputs = self._nominal, self._nominal.limb.segment_count
+        nominal, inputs = self._nominal, self._nominal.model.inputs
         periods = nominal.periods(first + np.arange(self.window))
         commands = nominal.commands[periods] + correction
         chambers, before = self._chambers.follow(first, commands)
@@ -285,9 +285,8 @@ class Horizon:
         fine = nominal.steps(first * STEPS + np.arange(self.window * STEPS))
         here = nominal.steps(first * STEPS)
         taken = nominal.taken[fine] + (known.taken - nominal.taken[here])
-        effective = material.without_memory(
-            nominal.limb, held, taken.reshape(self.window, STEPS, inputs)
-        )
+        taken = taken.reshape(self.window, STEPS, inputs)
+        effective = nominal.model.material.without_memory(held, taken)
         missing, gain = self._disturbance(known)
         planned = nominal.effective[fine].reshape(self.window, STEPS, inputs).mean(axis=1)
         push = effective.mean(axis=1) * (1.0 + gain) + missing - planned
@@ -305,11 +304,11 @@ class Horizon:
 
     def _derivatives(self, rolled: _Rolled, known: Knowledge) -> tuple[Array, Array]:
         """Return ∂misses (W, 2, knots·M) and ∂bends (W, M, knots·M) by the knots' corrections."""
-        nominal, inputs = self._nominal, self._nominal.limb.segment_count
-        slopes = material.slopes(nominal.limb, rolled.held, rolled.effective).matrix.mean(axis=1)
+        nominal, inputs = self._nominal, self._nominal.model.inputs
+        slopes = nominal.model.material.slopes(rolled.held, rolled.effective).mean(axis=1)
         slopes = slopes * (1.0 + self._disturbance(known)[1])[None, :, None]
         # Pressures by the knots' corrections, then swing by these, period after period.
-        reached = air.derivative(rolled.chambers, rolled.before).mean(axis=1)
+        reached = rolled.chambers.derivative(rolled.before).mean(axis=1)
         reached = np.einsum("wvb,vn->wnb", reached, self._hats)
         periods = nominal.periods(rolled.first + np.arange(self.window))
         driven = np.einsum("wsb,wnb->wsnb", nominal.input[periods] @ slopes, reached)

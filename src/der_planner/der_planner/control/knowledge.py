@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.model import material
+from der_planner.model.material import Memory
 
 Array = NDArray[np.float64]
 
@@ -96,7 +96,7 @@ class Knowledge:
     mean: Array
     covariance: Array
     slow: Array
-    memory: material.Memory
+    memory: Memory
     taken: Array
     effective: Array
     strange: float = 1.0

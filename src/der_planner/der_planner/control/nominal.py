@@ -6,8 +6,8 @@ linear system of second order in its M bend angles,
     M_w δθ̈ + D_w δθ̇ + K_w δθ = δw
 
 with δw the change of the effective pressures [Pa]. M_w, D_w and K_w are the derivatives of the
-projected balance of forces (`der_planner.model.balance`) by acceleration, rate and bend along the
-motion, so that weight and pose count. Friction and creep are part of δw.
+projected balance of forces (`model.rod.Balance`) by acceleration, rate and bend along the motion,
+so that weight and pose count. Friction and creep are part of δw.
 """
 
 from __future__ import annotations
@@ -20,10 +20,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.linalg import expm
 
 from der_planner.methods import LEARNED
-from der_planner.model import material
-from der_planner.model.balance import Balance
-from der_planner.model.drive import STEPS
-from der_planner.model.response import RodModel, simulate
+from der_planner.model import STEPS, Initial, RodModel, simulate
 from der_planner.model.series import CONTROL_PERIOD, interpolate, step_middles
 from der_planner.planning.result import Plan
 from der_planner.planning.ways import resting_spline, sample_spline
@@ -53,7 +50,7 @@ class Nominal:
         plan: whose commands, reference and limb are taken.
 
     Attributes:
-        limb: of the plan.
+        model: rod of the plan's limb.
         kinematics: of the rod's evenly bent segments.
         commands: (K', M) of the plan, then held [Pa].
         reference: (K', 2) r̄ [m].
@@ -69,8 +66,8 @@ class Nominal:
     """
 
     def __init__(self, plan: Plan) -> None:
-        self.limb = plan.limb
         model = RodModel(plan.limb)
+        self.model = model
         self.kinematics = model.kinematics
         held = np.repeat(plan.differential_pressure[-1:], _HELD, axis=0)
         self.commands = np.concatenate([plan.differential_pressure, held])
@@ -84,8 +81,9 @@ class Nominal:
             time,
             commands=self.commands,
             bend=lambda instants: sample_spline(spline, instants)[0],
-            start=None if start is None else model.state(spline(0.0), spline(0.0, 1)),
-            before=self.before,
+            initial=Initial(
+                None if start is None else model.state(spline(0.0), spline(0.0, 1)), self.before
+            ),
         )
         self.reference = np.concatenate(
             [plan.tip_reference, np.repeat(plan.tip_reference[-1:], _HELD, axis=0)]
@@ -101,11 +99,11 @@ class Nominal:
         self.effective = response.effective_pressure.reshape(-1, inputs)
         middle = step_middles(count, STEPS)
         self.fine_bend = sample_spline(spline, middle)[0]
-        self.taken = material.memory_pressures(plan.limb, middle, self.fine_bend)
+        self.taken = model.material.memory_pressures(middle, self.fine_bend)
         beyond = plan.chambers_beyond
         self.watched = beyond is not None or not plan.method.startswith(LEARNED)
         self._beyond = np.zeros((1, inputs)) if beyond is None else beyond
-        self._linearise(Balance(model.rod, model.kinematics), time)
+        self._linearise(time)
 
     @property
     def count(self) -> int:
@@ -164,8 +162,8 @@ class Nominal:
         change: Array = np.linalg.solve(square, load[..., None])[..., 0]
         return change
 
-    def _linearise(self, balance: Balance, time: Array) -> None:
-        q = self._bend_spline(time)
+    def _linearise(self, time: Array) -> None:
+        balance, q = self.model.balance.projected, self._bend_spline(time)
         v, a = self._bend_spline(time, 1), self._bend_spline(time, 2)
         count, inputs = q.shape
         each = []
@@ -176,7 +174,7 @@ class Nominal:
                 moved = [q, v, a], [q, v, a]
                 for sign, case in zip((1.0, -1.0), moved, strict=True):
                     case[place] = case[place] + sign * size * np.eye(inputs)[i]
-                difference = balance.projected(*moved[0]) - balance.projected(*moved[1])
+                difference = balance(*moved[0]) - balance(*moved[1])
                 columns.append(difference / (2 * size))
             each.append(np.stack(columns, axis=2))
         stiffness, damping, mass = each

@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 
 from der_planner.identification.logs.log import CalibrationLog, LogError
 from der_planner.limb import Limb, Pneumatics
-from der_planner.model.air import pressures_at_commands
+from der_planner.model.air import Air
 
 Array = NDArray[np.float64]
 
@@ -100,7 +100,9 @@ def fit_air(log: CalibrationLog, period: float) -> AirFit:
     falling = known & _after_no_step(np.abs(command), period, rising=True)
     found = _solve(command, measured - offset, falling, period, _START[:_VENTING])
     lags = _solve(command, measured - offset, smooth, period, _START[:_LAGS])
-    without = (pressures_at_commands(_air(lags.x), command, period) + offset - measured)[falling]
+    without = (Air(_air(lags.x)).pressures_at_commands(command, period) + offset - measured)[
+        falling
+    ]
     venting = _shown(found) and found.spread < BETTER * float(np.sqrt(np.mean(without**2)))
     found = found if venting else lags
     valve = None
@@ -142,7 +144,7 @@ def _solve(
     count = len(start)
 
     def residual(x: Array) -> Array:
-        difference: Array = (pressures_at_commands(_air(x), command, period) - measured)[rows]
+        difference: Array = (Air(_air(x)).pressures_at_commands(command, period) - measured)[rows]
         return difference
 
     def jacobian(x: Array) -> Array:

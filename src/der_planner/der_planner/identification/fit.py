@@ -30,7 +30,7 @@ from der_planner.identification.problem import Problem
 from der_planner.identification.report import FitReport, LoadsFit, Unknown, loads_of
 from der_planner.identification.rod_angles import NODES
 from der_planner.limb import CalibratedRange, Limb
-from der_planner.model.response import RodModel
+from der_planner.model import RodModel
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning.loads.rest import nearly_buckling
 

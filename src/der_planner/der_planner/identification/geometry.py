@@ -13,8 +13,8 @@ from scipy.optimize import least_squares
 from der_planner.identification.logs.log import CalibrationLog, LogError
 from der_planner.identification.rod_angles import Predicted
 from der_planner.limb import Limb
+from der_planner.model import NODES, RodModel, simulate
 from der_planner.model.bending import PolylineKinematics
-from der_planner.model.response import NODES, RodModel, simulate
 from der_planner.rod import ConvergenceError, Rod
 
 Array = NDArray[np.float64]

@@ -9,8 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.limb import Limb, Segment
-from der_planner.limb_declaration import Parameter, Term, parameters
+from der_planner.limb import Limb, Parameter, Segment, Term, declarations
 
 Array = NDArray[np.float64]
 
@@ -22,7 +21,7 @@ OPTIONAL = ("mass",)
 measured forces shows only ratios of stiffness, gain and mass, so one of them must be given."""
 _ORDER = ("linear", *GROUPS, *OPTIONAL)
 _FITTED: dict[str, Parameter] = {
-    key: declared for key, declared in parameters(Segment).items() if declared.fit
+    key: declared for key, declared in declarations(Segment).items() if declared.fit
 }
 TERMS: tuple[Term, ...] = tuple(
     sorted(

@@ -16,9 +16,9 @@ from scipy.optimize import least_squares
 
 from der_planner.identification.logs.prepare import Prepared
 from der_planner.limb import Limb, Segment
-from der_planner.model.inputs import pressures_between
-from der_planner.model.material import slow_effective_pressure
-from der_planner.model.response import ArcModel
+from der_planner.model import ArcModel
+from der_planner.model.material import Material
+from der_planner.model.simulation import means_between
 
 Array = NDArray[np.float64]
 
@@ -50,8 +50,8 @@ def fit_pcc(limb: Limb, prepared: Prepared, offset: Array) -> tuple[tuple[Segmen
     """
     time = prepared.log.time
     pressure = prepared.pressure - offset
-    effective = slow_effective_pressure(limb, time, pressure)
-    held = pressures_between(effective, STEPS)
+    effective = Material(limb).slow_effective_pressure(time, pressure)
+    held = means_between(effective, STEPS)
     period = float(time[1] - time[0])
     count = limb.segment_count
     rows = prepared.usable

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from der_planner.identification.logs.log import LogError
 from der_planner.limb import Limb
-from der_planner.model.response import simulate
+from der_planner.model import Model, simulate
 
 Array = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ def predict(
         LogError: the model cannot follow the pressures, or does not come to rest.
     """
     try:
-        response = simulate(limb, time, pressures=differential_pressure, model=model)
+        response = simulate(Model.of(limb, model), time, pressures=differential_pressure)
     except RuntimeError as error:
         raise LogError(
             f"the {model} model of the limb '{limb.name}' cannot follow this log ({error}): check "

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from der_planner.identification.air import AirFit
 from der_planner.identification.geometry import GeometryFit
 from der_planner.limb import Limb
-from der_planner.limb_parameters import REST_SPREAD
-from der_planner.model.sag import weight_of
+from der_planner.limb.parameters import REST_SPREAD
+from der_planner.model.resting import weight_of
 
 Array = NDArray[np.float64]
 

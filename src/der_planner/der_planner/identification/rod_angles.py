@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from der_planner.identification.parameters import TERMS, column, put, to_limb
 from der_planner.limb import Limb
-from der_planner.model.material import slow_effective_pressure
-from der_planner.model.response import Response, RodModel, simulate
+from der_planner.model import Response, RodModel, simulate
+from der_planner.model.material import Material
 
 Array = NDArray[np.float64]
 
@@ -98,7 +98,7 @@ class RodAngles:
     def effective(self, values: Array) -> Array:
         """Return the effective pressures (K, M) [Pa] of the unknowns (M, T)."""
         limb = to_limb(self._prior, values)
-        return slow_effective_pressure(limb, self._time, self._pressure)
+        return Material(limb).slow_effective_pressure(self._time, self._pressure)
 
     def _simulate(self, model: RodModel, linearise: bool = False) -> Response:
         return simulate(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from der_planner.identification.logs.log import LogError
 from der_planner.limb import Limb
-from der_planner.model.sag import torques
+from der_planner.model.material import Material
 
 Array = NDArray[np.float64]
 
@@ -53,7 +53,7 @@ def static_start(limb: Limb, pressure: Array, bend: Array) -> StaticStart:
     """
     if len(pressure) < LEAST_ROWS:
         raise LogError(f"only {len(pressure)} rows of the log can be used: record a whole run")
-    weight = torques(limb, bend)
+    weight = Material(limb).weight_torques(bend)
     columns = []
     for index, segment in enumerate(limb.segments):
         spread = float(np.std(pressure[:, index]))

@@ -37,8 +37,8 @@ from der_planner.identification.problem import (
 from der_planner.identification.report import CALIBRATE_AGAIN, Change, Update
 from der_planner.identification.rod_angles import NODES
 from der_planner.limb import Limb, Segment
-from der_planner.limb_days import GAIN_SPREAD, LARGEST_CHANGES, REST_SPREAD, on_another_day
-from der_planner.model.response import RodModel, simulate
+from der_planner.limb.days import GAIN_SPREAD, LARGEST_CHANGES, REST_SPREAD, on_another_day
+from der_planner.model import RodModel, simulate
 from der_planner.rod import ConvergenceError
 
 Array = NDArray[np.float64]

@@ -1,6 +1,26 @@
-"""Pressure in, shape out: what a limb does under its commands, for the rod and for the arcs.
+"""One limb as a model: its air, its material, and the rod or the arcs that bend under them.
 
-`air` and `material` are the two laws between a command and the pressure that a linear limb feels,
-`commands` is their inverse, `bending` says what a bend angle is, `balance` inverts the limb's own
-dynamics, and `response.simulate` puts all of it together, with its exact derivative.
+`Model.of(limb, "der")` is built once and passed; `simulate` rolls it forward.
 """
+
+from der_planner.model.arcs import ArcModel
+from der_planner.model.material import Material
+from der_planner.model.model import NODES, ArcState, Model, State
+from der_planner.model.rod import RodModel
+from der_planner.model.series import CONTROL_PERIOD
+from der_planner.model.simulation import STEPS, Initial, Response, simulate
+
+__all__ = [
+    "CONTROL_PERIOD",
+    "NODES",
+    "STEPS",
+    "ArcModel",
+    "ArcState",
+    "Initial",
+    "Material",
+    "Model",
+    "Response",
+    "RodModel",
+    "State",
+    "simulate",
+]

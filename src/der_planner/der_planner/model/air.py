@@ -51,15 +51,91 @@ class AirLaw(NamedTuple):
     lag_exponent: float  # m; 0 = the lag is the same at all pressures
 
 
-def law_of(air: Pneumatics) -> AirLaw:
-    """Return the numbers of a limb's air that its compiled law takes."""
-    return AirLaw(
-        air.time_constant,
-        air.vent_lag,
-        air.vent_rate / VENT_REFERENCE,
-        air.vent_exponent,
-        air.vent_lag_exponent if air.vent_rate > 0 else 0.0,
-    )
+class Air:
+    """The air of one limb.
+
+    Args:
+        pneumatics: lag, dead time, venting and limits.
+
+    Attributes:
+        pneumatics: as given.
+        law: its numbers for compiled functions.
+        vents_slowly: whether outlets hold chambers up.
+    """
+
+    def __init__(self, pneumatics: Pneumatics) -> None:
+        self.pneumatics = pneumatics
+        self.vents_slowly = pneumatics.vent_rate > 0
+        self.law = AirLaw(
+            pneumatics.time_constant,
+            pneumatics.vent_lag,
+            pneumatics.vent_rate / VENT_REFERENCE,
+            pneumatics.vent_exponent,
+            pneumatics.vent_lag_exponent if self.vents_slowly else 0.0,
+        )
+
+    def follow(
+        self, command: ArrayLike, period: float, steps: int, before: ArrayLike | None = None
+    ) -> Chambers:
+        """Return what both chambers of each pair do under commands.
+
+        Args:
+            command: (K, M) [Pa], each held for ``period`` [s].
+            period: [s].
+            steps: S, in which the result is sampled; the law is solved exactly in each.
+            before: (M,) command in force before the first one, which the chambers had reached; none
+                (vented) if None.
+        """
+        given = np.ascontiguousarray(command, dtype=float)
+        start = np.zeros(given.shape[1]) if before is None else np.array(before, dtype=float)
+        target = pair_of(_delayed(given, start, self.pneumatics.delay / period * steps, steps))
+        middle, pair = _chamber_pressures(target, pair_of(start), period / steps, self.law)
+        differential = middle.reshape(-1, steps, middle.shape[1])
+        return Chambers(self, period, steps, start, differential, pair, target)
+
+    def pressures_at_commands(self, command: Array, period: float, steps: int = 2) -> Array:
+        """Return the differential pressures (K, M) [Pa] at the instants of commands (K, M) [Pa].
+
+        They are read off straight lines between the middles of ``steps`` steps a period.
+        """
+        middle = self.follow(command, period, steps).differential[:, 0]
+        # The middle of the first step comes half a step after the instant.
+        instants = np.arange(len(command)) * period
+        return interpolate(instants, instants + 0.5 * period / steps, middle)
+
+    def even_pulse(self, period: float, steps: int) -> Array:
+        """Return the change (R,) of the pressure in the steps after one command rises by one [-].
+
+        For a limb whose outlets never hold a chamber up; with the mean lag of filling and venting,
+        so that it is exact where the two are alike.
+        """
+        of = self.pneumatics
+        mean = 0.5 * (of.time_constant + of.vent_lag)
+        reach = int(np.ceil((of.delay + 12 * mean) / period)) + 1
+        command = np.zeros((reach, 1))
+        command[0] = 1.0
+        even = Air(replace(of, time_constant=mean, vent_time_constant=0.0, vent_rate=0.0))
+        return even.follow(command, period, steps).differential.ravel()
+
+    @property
+    def memory(self) -> float:
+        """For how long after a command its chambers can still tell of it [s]."""
+        of = self.pneumatics
+        little_left = 1.0 / float(lag_rate(_REMEMBERED, self.law))
+        lag = max(of.time_constant, of.vent_lag, 0.1 * little_left)
+        return of.delay + 25 * lag + self.vent_memory
+
+    @property
+    def vent_memory(self) -> float:
+        """How long the fullest chamber takes until hardly anything is left in it [s]."""
+        if not self.vents_slowly:
+            return 0.0
+        of, speed = self.pneumatics, self.law.vent_speed
+        power = 1.0 - of.vent_exponent
+        full, empty = of.pressure_limit / VENT_REFERENCE, _EMPTY / VENT_REFERENCE
+        if power < _TUBE:
+            return float(np.log(full / empty)) / speed
+        return float(full**power - empty**power) / power / speed
 
 
 @dataclass(frozen=True)
@@ -67,7 +143,7 @@ class Chambers:
     """What the chambers do under K commands, each held for S steps.
 
     Attributes:
-        air: lag, dead time and venting.
+        air: that fills and vents them.
         period: of a command [s].
         steps: S.
         before: (M,) command and differential pressure before the first command [Pa].
@@ -76,7 +152,7 @@ class Chambers:
         target: (K·S, M, 2) what both chambers are commanded to hold, after the dead time [Pa].
     """
 
-    air: Pneumatics
+    air: Air
     period: float
     steps: int
     before: Array
@@ -84,52 +160,20 @@ class Chambers:
     pair: Array
     target: Array
 
+    def derivative(self, first: int = 0) -> Array:
+        """Return ∂(differential pressure in the middle of a step)/∂command (W, S, W, M) [-].
 
-def follow_commands(
-    air: Pneumatics,
-    command: ArrayLike,
-    period: float,
-    steps: int,
-    before: ArrayLike | None = None,
-) -> Chambers:
-    """Return what both chambers of each pair do under commands.
-
-    Args:
-        air: lag, dead time and venting.
-        command: (K, M) [Pa], each held for ``period`` [s].
-        period: [s].
-        steps: S, in which the result is sampled; the law is solved exactly in each.
-        before: (M,) command in force before the first one, which the chambers had reached; none
-            (vented) if None.
-    """
-    given = np.ascontiguousarray(command, dtype=float)
-    start = np.zeros(given.shape[1]) if before is None else np.array(before, dtype=float)
-    target = pair_of(_delayed(given, start, air.delay / period * steps, steps))
-    middle, pair = _chamber_pressures(target, pair_of(start), period / steps, law_of(air))
-    differential = middle.reshape(-1, steps, middle.shape[1])
-    return Chambers(air, period, steps, start, differential, pair, target)
-
-
-def chamber_pressures(
-    air: Pneumatics,
-    command: ArrayLike,
-    period: float,
-    steps: int,
-    before: ArrayLike | None = None,
-) -> Array:
-    """Return `follow_commands(…).differential` (K, S, M) alone [Pa]."""
-    return follow_commands(air, command, period, steps, before).differential
-
-
-def pressures_at_commands(air: Pneumatics, command: Array, period: float, steps: int = 2) -> Array:
-    """Return the differential pressures (K, M) [Pa] at the instants of commands (K, M) [Pa].
-
-    They are read off straight lines between the middles of ``steps`` steps a period.
-    """
-    middle = chamber_pressures(air, command, period, steps)[:, 0]
-    # The middle of the first step comes half a step after the instant.
-    instants = np.arange(len(command)) * period
-    return interpolate(instants, instants + 0.5 * period / steps, middle)
+        Row (w, s) is step s of command ``first + w``, the third index the command that is changed;
+        only the W commands from ``first`` on count. Exact but where a command is zero: there it
+        counts as positive.
+        """
+        negative = self.target[..., 1] > 0
+        delay = self.air.pneumatics.delay / self.period * self.steps
+        before = np.concatenate([pair_of(self.before)[None], self.pair[:-1]])
+        slopes = _slopes(before, self.target, self.period / self.steps, self.air.law)
+        last = len(self.target) // self.steps
+        spread: Array = _spread(slopes, negative, delay, self.steps, first, last)
+        return spread
 
 
 def pair_of(differential: Array) -> Array:
@@ -146,25 +190,6 @@ def _delayed(command: Array, start: Array, delay: float, steps: int) -> Array:
         padded = np.concatenate([np.tile(start, (whole + 1, 1)), held])
         held = (1 - part) * padded[1 : len(held) + 1] + part * padded[: len(held)]
     return held
-
-
-def memory_of(air: Pneumatics) -> float:
-    """Return for how long after a command its chambers can still tell of it [s]."""
-    little_left = 1.0 / float(lag_rate(_REMEMBERED, law_of(air)))
-    lag = max(air.time_constant, air.vent_lag, 0.1 * little_left)
-    return air.delay + 25 * lag + vent_memory(air)
-
-
-def vent_memory(air: Pneumatics) -> float:
-    """Return how long the fullest chamber takes until hardly anything is left in it [s]."""
-    if air.vent_rate == 0:
-        return 0.0
-    power = 1.0 - air.vent_exponent
-    full, empty = air.pressure_limit / VENT_REFERENCE, _EMPTY / VENT_REFERENCE
-    speed = law_of(air).vent_speed
-    if power < _TUBE:
-        return float(np.log(full / empty)) / speed
-    return float(full**power - empty**power) / power / speed
 
 
 @njit(cache=True, nogil=True)
@@ -221,31 +246,6 @@ def _chamber_pressures(target: Array, start: Array, h: float, law: AirLaw) -> tu
                 pair[k, m, side] = state
                 middle[k, m] = between if side == 0 else middle[k, m] + sign * between
     return middle, pair
-
-
-# The derivative --------------------------------------------------------------------------------
-
-
-def derivative(chambers: Chambers, first: int = 0) -> Array:
-    """Return ∂(differential pressure in the middle of a step)/∂command (W, S, W, M) [-].
-
-    Row (w, s) is step s of command ``first + w``, the third index the command that is changed; only
-    the W commands from ``first`` on count. Exact but where a command is zero: there it counts as
-    positive.
-    """
-    negative = chambers.target[..., 1] > 0
-    delay = chambers.air.delay / chambers.period * chambers.steps
-    last = len(chambers.target) // chambers.steps
-    spread: Array = _spread(_step_slopes(chambers), negative, delay, chambers.steps, first, last)
-    return spread
-
-
-def _step_slopes(chambers: Chambers) -> Array:
-    """Return what each step keeps (4, N, M, 2), see `_slopes`."""
-    before = np.concatenate([pair_of(chambers.before)[None], chambers.pair[:-1]])
-    h = chambers.period / chambers.steps
-    slopes: Array = _slopes(before, chambers.target, h, law_of(chambers.air))
-    return slopes
 
 
 @njit(cache=True, nogil=True)
@@ -311,17 +311,3 @@ def _spread(
                     change[side] = by[2] * change[side] + by[3] * goal
                     result[n // steps - first, n % steps, k - first, m] += middle
     return result
-
-
-def even_pulse(air: Pneumatics, period: float, steps: int) -> Array:
-    """Return the change (R,) of the pressure in the steps after one command is raised by one [-].
-
-    For a limb whose outlets never hold a chamber up; with the mean lag of filling and venting, so
-    that it is exact where the two are alike.
-    """
-    mean = 0.5 * (air.time_constant + air.vent_lag)
-    reach = int(np.ceil((air.delay + 12 * mean) / period)) + 1
-    command = np.zeros((reach, 1))
-    command[0] = 1.0
-    even = replace(air, time_constant=mean, vent_time_constant=0.0, vent_rate=0.0)
-    return follow_commands(even, command, period, steps).differential.ravel()

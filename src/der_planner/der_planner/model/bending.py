@@ -14,8 +14,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from der_planner.limb import Limb
-from der_planner.pcc import Pcc
 from der_planner.rod import Rod
 
 Array = NDArray[np.float64]
@@ -71,19 +69,6 @@ def bend_change(rod: Rod, q: Array, moved: Array) -> Array:
         columns.append((dx * (y2 - y1) - dy * (x2 - x1)) / square)
     relative: Array = np.diff(np.stack(columns, axis=1), axis=1, prepend=0.0)
     return relative
-
-
-def bend_gradient(rod: Rod, q: Array, weight: Array) -> Array:
-    """Return the gradient (K, 4M) of Σ weight · bend by `bend_outputs`, for weights (K, M)."""
-    # A bend angle is the difference of two headings: heading i counts in bend i and in bend i + 1.
-    by_heading = weight - np.concatenate([weight[:, 1:], np.zeros((len(weight), 1))], axis=1)
-    result = np.empty((len(q), 4 * weight.shape[1]))
-    for place, (a, b) in enumerate(end_edges(rod)):
-        dx, dy, square = _edge(q, a, b)
-        share = by_heading[:, place] / square
-        columns = np.stack([dy * share, -dx * share, -dy * share, dx * share], axis=1)
-        result[:, 4 * place : 4 * place + 4] = columns
-    return result
 
 
 def _edge(q: Array, first: int, second: int) -> tuple[Array, Array, Array]:
@@ -197,26 +182,6 @@ class PolylineKinematics:
             _points(1j * spin * edges),
             _points((1j * twirl - spin**2) * edges),
         )
-
-
-class ArcKinematics:
-    """The tip of constant-curvature arcs; exact for a continuous limb that bends evenly."""
-
-    def __init__(self, limb: Limb) -> None:
-        self.segment_count = limb.segment_count
-        self._model = Pcc(limb)
-
-    def tip(self, bend_angles: ArrayLike) -> Array:
-        """Return the tip (..., 2) [m] for bend angles (..., M) [rad]."""
-        return self._model.tip(bend_angles)
-
-    def tip_jacobians(self, bend_angles: ArrayLike) -> Array:
-        """Return ∂tip/∂bend angles (..., 2, M) [m/rad]."""
-        return self._model.tip_jacobian(bend_angles)
-
-    def curve(self, bend_angles: ArrayLike) -> Array:
-        """Return points (P, 2) [m] of the centreline of one configuration (M,) [rad]."""
-        return self._model.curve(bend_angles)
 
 
 def _points(edges: NDArray[np.complex128]) -> Array:

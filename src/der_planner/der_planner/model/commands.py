@@ -8,9 +8,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from der_planner.limb import VENT_REFERENCE, Limb, Pneumatics
-from der_planner.model import air as law
-from der_planner.model import material
+from der_planner.limb import VENT_REFERENCE
+from der_planner.model.air import Air, AirLaw, fallen
+from der_planner.model.model import Model
 from der_planner.model.series import interpolate
 
 Array = NDArray[np.float64]
@@ -19,7 +19,7 @@ _SHARES_BEFORE = (0.0, 0.2, 0.4, 0.6, 0.8)
 """Shares of a ramp that may come before the jump that it replaces."""
 
 
-def commands(limb: Limb, time: Array, effective: Array, bend: Array, period: float) -> Array:
+def commands(model: Model, time: Array, effective: Array, bend: Array, period: float) -> Array:
     """Return the commands (K, M) [Pa] under which the limb feels effective pressures.
 
     The pressure that is wanted in the middle of a command's period, a dead time later, is led by
@@ -28,24 +28,22 @@ def commands(limb: Limb, time: Array, effective: Array, bend: Array, period: flo
     slew limit, part of it ahead of the jump.
 
     Args:
-        limb: calibrated limb.
+        model: of the limb.
         time: (F,) fine grid [s] from 0 that reaches past the last command by period and dead time.
         effective: (F, M) [Pa].
         bend: (F, M) bend angles along the motion [rad].
         period: of the commands [s].
     """
-    pressure = material.differential_pressure(limb, time, effective, bend)
-    air = limb.pneumatics
+    air, delay = model.air, model.air.pneumatics.delay
+    pressure = model.material.differential_pressure(time, effective, bend)
     led = leading_commands(air, time, pressure)
-    last = time[-1] - period - air.delay
-    instants = np.arange(round(last / period) + 1) * period + period / 2 + air.delay
+    last = time[-1] - period - delay
+    instants = np.arange(round(last / period) + 1) * period + period / 2 + delay
     wanted = interpolate(instants, time, led)
-    return _drawn_out(air, wanted, period, time, pressure) if air.vent_rate > 0 else wanted
+    return _drawn_out(air, wanted, period, time, pressure) if air.vents_slowly else wanted
 
 
-def _drawn_out(
-    air: Pneumatics, command: Array, period: float, time: Array, pressure: Array
-) -> Array:
+def _drawn_out(air: Air, command: Array, period: float, time: Array, pressure: Array) -> Array:
     """Return commands (K, M) [Pa] within the slew limit that bring the wanted pressures about best.
 
     How much of each ramp comes before its jump is chosen, segment by segment, by simulating the
@@ -53,11 +51,11 @@ def _drawn_out(
     """
     instants = (np.arange(len(command)) + 0.5) * period
     wanted = interpolate(instants, time, pressure)
-    step = air.slew_limit * period
+    step = air.pneumatics.slew_limit * period
     best, least = command, np.full(command.shape[1], np.inf)
     for share in _SHARES_BEFORE:
         ramps = _limit_slew(_advanced(command, step, share), command[0], step)
-        held = law.chamber_pressures(air, ramps, period, 2, pressure[0]).mean(axis=1)
+        held = air.follow(ramps, period, 2, pressure[0]).differential.mean(axis=1)
         missed = ((held - wanted) ** 2).sum(axis=0)
         best, least = np.where(missed < least, ramps, best), np.minimum(missed, least)
     return best
@@ -77,7 +75,7 @@ def _advanced(command: Array, step: float, share: float) -> Array:
 
 
 def within_limits(
-    pressures: ArrayLike, air: Pneumatics, period: float, initial: ArrayLike | None = None
+    pressures: ArrayLike, air: Air, period: float, initial: ArrayLike | None = None
 ) -> tuple[Array, float]:
     """Return commands (K, M) [Pa] that keep the limits, and the largest change made to them [Pa].
 
@@ -89,8 +87,8 @@ def within_limits(
     """
     wanted = np.asarray(pressures, dtype=float)
     start = np.zeros(wanted.shape[1]) if initial is None else np.array(initial, dtype=float)
-    limit = air.pressure_limit
-    kept = _limit_slew(np.clip(wanted, -limit, limit), start, air.slew_limit * period)
+    limit, step = air.pneumatics.pressure_limit, air.pneumatics.slew_limit * period
+    kept = _limit_slew(np.clip(wanted, -limit, limit), start, step)
     return kept, float(np.abs(kept - wanted).max(initial=0.0))
 
 
@@ -108,7 +106,7 @@ def _limit_slew(wanted: Array, start: Array, step: float) -> Array:
 # The inverse of lag and venting ----------------------------------------------------------------
 
 
-def leading_commands(air: Pneumatics, time: Array, pressure: Array) -> Array:
+def leading_commands(air: Air, time: Array, pressure: Array) -> Array:
     """Return what the chambers have to be commanded (F, M) [Pa] to hold wanted pressures in time.
 
     The inverse of lag and venting; the dead time is the caller's, who asks for later pressures.
@@ -119,8 +117,8 @@ def leading_commands(air: Pneumatics, time: Array, pressure: Array) -> Array:
         time: (F,) rising instants [s].
         pressure: (F, M) wanted differential pressures [Pa].
     """
-    fill, vent = air.time_constant, air.vent_lag
-    if air.vent_rate == 0:
+    fill, vent = air.law.fill_lag, air.law.vent_lag
+    if not air.vents_slowly:
         slope = np.gradient(pressure, time, axis=0)
         led: Array = pressure + np.where(pressure * slope >= 0, fill, vent) * slope
         return led
@@ -128,28 +126,26 @@ def leading_commands(air: Pneumatics, time: Array, pressure: Array) -> Array:
     slope = np.gradient(chambers, time, axis=1)
     # Below a tenth of the reference a lag would ask for less than nothing.
     full = np.maximum(chambers / VENT_REFERENCE, 0.1)
-    lag = np.where(slope >= 0, fill, vent * full**-air.vent_lag_exponent)
+    lag = np.where(slope >= 0, fill, vent * full**-air.law.lag_exponent)
     pair = np.maximum(chambers + lag * slope, 0.0)
     filled: Array = np.where(second, -pair[1], pair[0])
     return filled
 
 
-def least_pairs(air: Pneumatics, time: Array, pressure: Array) -> tuple[Array, NDArray[np.bool_]]:
+def least_pairs(air: Air, time: Array, pressure: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Return the least gauge pressures (2, F, M) [Pa] of chambers whose difference is wanted.
 
     Also which chamber the command has to fill (F, M): the second, or the first. Arguments as of
     `leading_commands`.
     """
     pairs: tuple[Array, NDArray[np.bool_]] = _least_pairs(
-        np.ascontiguousarray(pressure), np.diff(time), law.law_of(air)
+        np.ascontiguousarray(pressure), np.diff(time), air.law
     )
     return pairs
 
 
 @njit(cache=True, nogil=True)
-def _least_pairs(
-    wanted: Array, steps: Array, numbers: law.AirLaw
-) -> tuple[Array, NDArray[np.bool_]]:
+def _least_pairs(wanted: Array, steps: Array, law: AirLaw) -> tuple[Array, NDArray[np.bool_]]:
     count, inputs = wanted.shape
     chambers = np.empty((2, count, inputs))
     second = np.zeros((count, inputs), dtype=np.bool_)
@@ -158,8 +154,8 @@ def _least_pairs(
         for k in range(count):
             if k > 0:
                 h = steps[k - 1]
-                left = law.fallen(left, 0.0, h, numbers)[0]
-                right = law.fallen(right, 0.0, h, numbers)[0]
+                left = fallen(left, 0.0, h, law)[0]
+                right = fallen(right, 0.0, h, law)[0]
             gap = wanted[k, m] + right - left
             second[k, m] = gap < 0.0
             left, right = left + max(gap, 0.0), right + max(-gap, 0.0)
@@ -186,19 +182,20 @@ class SlowVenting:
     opposite: float
 
 
-def slow_venting(air: Pneumatics, time: Array, pressure: Array) -> SlowVenting | None:
+def slow_venting(air: Air, time: Array, pressure: Array) -> SlowVenting | None:
     """Return the worst of the pressures (F, M) [Pa] that should fall too fast at times (F,) [s].
 
     None for a limb whose outlets never hold a chamber up.
     """
-    if air.vent_rate == 0:
+    if not air.vents_slowly:
         return None
     chambers, _ = least_pairs(air, time, pressure)
     both = np.minimum(chambers[0], chambers[1])
     j = int(np.argmax(both.max(axis=0)))
     fall = -np.gradient(np.abs(pressure[:, j]), time)
     held = np.maximum(chambers[0, :, j], chambers[1, :, j])
-    possible = air.vent_rate * (held / VENT_REFERENCE) ** air.vent_exponent
+    of = air.pneumatics
+    possible = of.vent_rate * (held / VENT_REFERENCE) ** of.vent_exponent
     k = int(np.argmax(fall - possible))
     return SlowVenting(
         j, float(time[k]), float(fall[k]), float(possible[k]), float(both[:, j].max())

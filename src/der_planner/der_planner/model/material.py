@@ -20,15 +20,15 @@ about it is small and fast and hardly changes them.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from der_planner.limb import Limb, Segment
-from der_planner.model.resting import RestingLaw, RestingSlopes, rest_along, rest_slopes
-from der_planner.model.sag import weight_of
+from der_planner.limb import Limb
+from der_planner.model.resting import RestingLaw, change_along, rest_along, weight_of
 
 Array = NDArray[np.float64]
 
@@ -53,160 +53,6 @@ class Memory:
     creep: Array
 
 
-# Along a known bend ----------------------------------------------------------------------------
-
-
-def differential_pressure(
-    limb: Limb, time: ArrayLike, effective: ArrayLike, bend_angle: ArrayLike
-) -> Array:
-    """Return the differential pressures (K, M) [Pa] that make a limb feel these effective ones.
-
-    Args:
-        limb: calibrated limb.
-        time: (K,) rising [s].
-        effective: (K, M) what the linear model wants [Pa].
-        bend_angle: (K, M) bend along the motion [rad].
-
-    Raises:
-        ValueError: shapes do not fit, or the stiffening makes a pressure unreachable.
-    """
-    times, wanted, angles = _check(limb, time, effective, bend_angle)
-    held = wanted + memory_pressures(limb, times, angles)
-    coupling = coupling_matrix(limb)
-    result = np.zeros_like(wanted)
-    # The neighbours' pressures are known but for what their own neighbours change: a contraction.
-    for _ in range(_COUPLING_ROUNDS if coupling.any() else 1):
-        before = result.copy()
-        load = held - before @ coupling.T
-        for index, segment in enumerate(limb.segments):
-            result[:, index] = _own_pressure(segment, index, load[:, index], wanted[:, index])
-        if np.abs(result - before).max(initial=0.0) < _SAME_PRESSURE:
-            break
-    return result
-
-
-def _own_pressure(segment: Segment, index: int, load: Array, wanted: Array) -> Array:
-    """Return u (K,) [Pa] of w (1 + s |u|) = u (1 + a sgn u) − load + w, linear on either side."""
-    side = np.sign(load)
-    slope = 1.0 + segment.gain_asymmetry * side
-    slope = slope - segment.pressure_stiffening * wanted * side
-    if not np.all(slope > 0.1):
-        raise ValueError(
-            f"segment {index} is too stiff for an effective pressure of "
-            f"{np.abs(wanted).max():.0f} Pa: check its pressure_stiffening"
-        )
-    pressure: Array = load / slope
-    return pressure
-
-
-def effective_pressure(
-    limb: Limb, time: ArrayLike, differential: ArrayLike, bend_angle: ArrayLike
-) -> Array:
-    """Return the (K, M) effective pressures [Pa] of chamber pressures (K, M) along a known bend.
-
-    The inverse of `differential_pressure`, with the same arguments.
-    """
-    times, measured, angles = _check(limb, time, differential, bend_angle)
-    return without_memory(limb, measured, memory_pressures(limb, times, angles))
-
-
-def without_memory(limb: Limb, differential: Array, memory: Array) -> Array:
-    """Return effective pressures w (…, M) [Pa] where friction and creep are known.
-
-    Args:
-        limb: calibrated limb.
-        differential: (…, M) pressures in the chambers [Pa].
-        memory: (…, M) pressure that friction and creep take [Pa].
-    """
-    driven, stiffer, _, _ = _drive(limb, differential)
-    effective: Array = (driven - memory) / stiffer
-    return effective
-
-
-def _drive(limb: Limb, differential: Array) -> tuple[Array, Array, Array, Array]:
-    """Return u (1 + a sgn u) + Σ c u [Pa], 1 + s |u|, and their slopes by the own u, all (…, M)."""
-    asymmetry = np.array([s.gain_asymmetry for s in limb.segments])
-    stiffening = np.array([s.pressure_stiffening for s in limb.segments])
-    side = np.sign(differential)
-    gain = 1.0 + asymmetry * side
-    driven = differential * gain + differential @ coupling_matrix(limb).T
-    return driven, 1.0 + stiffening * np.abs(differential), gain, stiffening * side
-
-
-@dataclass(frozen=True)
-class Slopes:
-    """∂w/∂u of effective pressures where the bend is known: no instant changes another.
-
-    Attributes:
-        own: (…, M) ∂w_i/∂u_i without the coupling.
-        crossed: (…, M, M) ∂w_i/∂u_j by the coupling alone; zero for i = j.
-    """
-
-    own: Array
-    crossed: Array
-
-    @property
-    def matrix(self) -> Array:
-        """(…, M, M) ∂w_i/∂u_j."""
-        return self.crossed + self.own[..., None] * np.eye(self.own.shape[-1])
-
-    def tangent(self, change: Array) -> Array:
-        """Return the change (…, M) of the effective pressures by one of the chambers' (…, M)."""
-        moved: Array = np.einsum("...ij,...j->...i", self.matrix, change)
-        return moved
-
-    def adjoint(self, weight: Array) -> Array:
-        """Return Σ weight · ∂w/∂u (…, M), the transpose of `tangent`, for weights (…, M)."""
-        gradient: Array = np.einsum("...ij,...i->...j", self.matrix, weight)
-        return gradient
-
-
-def slopes(limb: Limb, differential: Array, effective: Array) -> Slopes:
-    """Return ∂w/∂u at differential pressures and the effective ones they became, (…, M) [Pa]."""
-    _, stiffer, gain, stiffening = _drive(limb, differential)
-    own = (gain - stiffening * effective) / stiffer
-    return Slopes(own, coupling_matrix(limb) / stiffer[..., None])
-
-
-def coupling_matrix(limb: Limb) -> Array:
-    """Return c (M, M): moment on segment i by pressure j, over that of its own [-]."""
-    count = limb.segment_count
-    matrix = np.zeros((count, count))
-    for index, segment in enumerate(limb.segments):
-        if index > 0:
-            matrix[index, index - 1] = segment.coupling_before
-        if index < count - 1:
-            matrix[index, index + 1] = segment.coupling_after
-    return matrix
-
-
-def memory_pressures(
-    limb: Limb, time: Array, bend_angle: Array, start: Memory | None = None
-) -> Array:
-    """Return the (K, M) pressures that friction and creep take along bend histories (K, M) [Pa].
-
-    Args:
-        limb: calibrated limb.
-        time: (K,) rising [s].
-        bend_angle: (K, M) [rad].
-        start: what they remember at ``time[0]``; None: a limb that has rested.
-    """
-    return taken_by(limb, remember(limb, time, bend_angle, start))
-
-
-def taken_by(limb: Limb, history: MemoryHistory) -> Array:
-    """Return the (K, M) pressures that friction and creep take, from what they remember [Pa]."""
-    columns = []
-    for index, segment in enumerate(limb.segments):
-        total = np.zeros(len(history.bend))
-        if segment.friction_moment > 0:
-            total += segment.friction_moment * history.friction[:, index]
-        if segment.creep_stiffness > 0:
-            total += segment.creep_stiffness * history.creep[:, index]
-        columns.append(total / segment.moment_gain)
-    return np.column_stack(columns)
-
-
 class MemoryHistory(NamedTuple):
     """Bend angle [rad], friction's z and creep's strain q [1/m] of K instants, each (K, M)."""
 
@@ -219,19 +65,264 @@ class MemoryHistory(NamedTuple):
         return Memory(self.bend[index], self.friction[index], self.creep[index])
 
 
-def remember(
-    limb: Limb, time: Array, bend_angle: Array, start: Memory | None = None
-) -> MemoryHistory:
-    """Return z and q along bend histories (K, M) [rad]; arguments as of `memory_pressures`."""
-    friction, creep = np.zeros_like(bend_angle), np.zeros_like(bend_angle)
+class Material:
+    """The material of one limb.
+
+    Args:
+        limb: calibrated limb.
+
+    Attributes:
+        has_memory: whether it rubs or creeps.
+    """
+
+    def __init__(self, limb: Limb) -> None:
+        segments = limb.segments
+        self._limb, self._segments, self._count = limb, segments, limb.segment_count
+        self._asymmetry = np.array([s.gain_asymmetry for s in segments])
+        self._stiffening = np.array([s.pressure_stiffening for s in segments])
+        self._coupling = _coupling_matrix(limb)
+        self.has_memory = any(s.friction_moment > 0 or s.creep_stiffness > 0 for s in segments)
+
+    # Along a known bend ------------------------------------------------------------------------
+
+    def differential_pressure(
+        self, time: ArrayLike, effective: ArrayLike, bend_angle: ArrayLike
+    ) -> Array:
+        """Return the differential pressures (K, M) [Pa] that make a limb feel effective ones.
+
+        Args:
+            time: (K,) rising [s].
+            effective: (K, M) what the linear model wants [Pa].
+            bend_angle: (K, M) bend along the motion [rad].
+
+        Raises:
+            ValueError: shapes do not fit, or the stiffening makes a pressure unreachable.
+        """
+        times, wanted, angles = self._check(time, effective, bend_angle)
+        driven = wanted + self.memory_pressures(times, angles)
+        result = np.zeros_like(wanted)
+        # The neighbours' pressures are known but for what their neighbours change: a contraction.
+        for _ in range(_COUPLING_ROUNDS if self._coupling.any() else 1):
+            before = result.copy()
+            load = driven - before @ self._coupling.T
+            # w (1 + s |u|) = u (1 + a sgn u) − load + w is linear on either side of zero.
+            side = np.sign(load)
+            slope = 1.0 + self._asymmetry * side
+            slope = slope - self._stiffening * wanted * side
+            stiff = ~np.all(slope > 0.1, axis=0)
+            if stiff.any():
+                index = int(np.argmax(stiff))
+                raise ValueError(
+                    f"segment {index} is too stiff for an effective pressure of "
+                    f"{np.abs(wanted[:, index]).max():.0f} Pa: check its pressure_stiffening"
+                )
+            result = load / slope
+            if np.abs(result - before).max(initial=0.0) < _SAME_PRESSURE:
+                break
+        return result
+
+    def effective_pressure(
+        self, time: ArrayLike, differential: ArrayLike, bend_angle: ArrayLike
+    ) -> Array:
+        """Return the (K, M) effective pressures [Pa] of chamber pressures (K, M), known bend.
+
+        The inverse of `differential_pressure`, with the same arguments.
+        """
+        times, measured, angles = self._check(time, differential, bend_angle)
+        return self.without_memory(measured, self.memory_pressures(times, angles))
+
+    def without_memory(self, differential: Array, memory: Array) -> Array:
+        """Return effective pressures w (…, M) [Pa] where friction and creep are known.
+
+        Args:
+            differential: (…, M) pressures in the chambers [Pa].
+            memory: (…, M) pressure that friction and creep take [Pa].
+        """
+        driven, stiffer, _, _ = self._drive(differential)
+        effective: Array = (driven - memory) / stiffer
+        return effective
+
+    def slopes(self, differential: Array, effective: Array) -> Array:
+        """Return ∂w_i/∂u_j (…, M, M) where the bend is known: no instant changes another.
+
+        Args:
+            differential: (…, M) pressures in the chambers [Pa].
+            effective: (…, M) what they became [Pa].
+        """
+        _, stiffer, gain, stiffening = self._drive(differential)
+        own = (gain - stiffening * effective) / stiffer
+        slopes: Array = self._coupling / stiffer[..., None] + own[..., None] * np.eye(self._count)
+        return slopes
+
+    def _drive(self, differential: Array) -> tuple[Array, Array, Array, Array]:
+        """Return u (1 + a sgn u) + Σ c u [Pa], 1 + s |u|, and their slopes by the own u, (…, M)."""
+        side = np.sign(differential)
+        gain = 1.0 + self._asymmetry * side
+        driven = differential * gain + differential @ self._coupling.T
+        stiffer = 1.0 + self._stiffening * np.abs(differential)
+        return driven, stiffer, gain, self._stiffening * side
+
+    # What friction and creep remember ----------------------------------------------------------
+
+    def remember(
+        self, time: Array, bend_angle: Array, start: Memory | None = None
+    ) -> MemoryHistory:
+        """Return z and q along bend histories (K, M) [rad]; arguments as of `memory_pressures`."""
+        friction, creep = np.zeros_like(bend_angle), np.zeros_like(bend_angle)
+        for index, segment in enumerate(self._segments):
+            angle = np.ascontiguousarray(bend_angle[:, index])
+            z, q = (0.0, 0.0) if start is None else (start.friction[index], start.creep[index])
+            if segment.friction_moment > 0:
+                friction[:, index] = dahl(angle, segment.friction_curvature * segment.length, z)
+            if segment.creep_stiffness > 0:
+                creep[:, index] = maxwell(time, angle / segment.length, segment.creep_time, q)
+        return MemoryHistory(bend_angle, friction, creep)
+
+    def pressure_taken(self, history: MemoryHistory) -> Array:
+        """Return the (K, M) pressures that friction and creep take, by what they remember [Pa]."""
+        columns = [
+            (s.friction_moment * history.friction[:, i] + s.creep_stiffness * history.creep[:, i])
+            / s.moment_gain
+            for i, s in enumerate(self._segments)
+        ]
+        return np.column_stack(columns)
+
+    def memory_pressures(
+        self, time: Array, bend_angle: Array, start: Memory | None = None
+    ) -> Array:
+        """Return the (K, M) pressures that friction and creep take along bend histories [Pa].
+
+        Args:
+            time: (K,) rising [s].
+            bend_angle: (K, M) [rad].
+            start: what they remember at ``time[0]``; None: a limb that has rested.
+        """
+        return self.pressure_taken(self.remember(time, bend_angle, start))
+
+    # Along the bend at rest --------------------------------------------------------------------
+
+    def slow_effective_pressure(self, time: ArrayLike, differential: ArrayLike) -> Array:
+        """Return effective pressures (K, M) [Pa] of chamber pressures (K, M) [Pa] alone.
+
+        Friction and creep act along the bend of `resting_bend`.
+        """
+        times, pressures = np.asarray(time, dtype=float), np.asarray(differential, dtype=float)
+        return self.slow(times, pressures)[0]
+
+    def slow(
+        self, time: Array, differential: Array, start: Memory | None = None
+    ) -> tuple[Array, Memory]:
+        """Return the same, and what friction and creep remember at the end."""
+        history = self.remember(time, self.resting_bend(time, differential, start), start)
+        return self.without_memory(differential, self.pressure_taken(history)), history.at(-1)
+
+    def resting_bend(
+        self, time: ArrayLike, differential: ArrayLike, start: Memory | None = None
+    ) -> Array:
+        """Return the bend angles (K, M) [rad] of a slow motion under chamber pressures [Pa].
+
+        Without inertia each segment bends by its own moment and the limb's weight; friction and
+        creep are solved for at each instant together with the bend, since they act along it.
+
+        Args:
+            time: (K,) rising [s].
+            differential: (K, M) [Pa].
+            start: bend and memory at ``time[0]``; None: at rest under the first pressures, without
+                any.
+        """
+        driven, stiffer, _, _ = self._drive(np.asarray(differential, dtype=float))
+        bend: Array = rest_along(
+            np.ascontiguousarray(time, dtype=float),
+            np.ascontiguousarray(driven),
+            np.ascontiguousarray(stiffer),
+            self.resting_law,
+            self._begin(start),
+        )
+        return bend
+
+    def slow_change(
+        self, time: Array, differential: Array, change: Array, start: Memory | None = None
+    ) -> Array:
+        """Return the first-order change (K, M) of the effective pressures along the bend at rest.
+
+        Args:
+            time: (K,) [s].
+            differential: (K, M) in the chambers [Pa].
+            change: (K, M) of them [Pa].
+            start: as of `resting_bend`.
+        """
+        bend = self.resting_bend(time, differential, start)
+        effective, _ = self.slow(time, differential, start)
+        _, stiffer, gain, stiffening = self._drive(differential)
+        moved = change * gain + change @ self._coupling.T, change * stiffening
+        taken = change_along(
+            np.ascontiguousarray(time), stiffer, bend, self.resting_law, self._begin(start), moved
+        )
+        result: Array = (moved[0] - taken - effective * moved[1]) / stiffer
+        return result
+
+    def weight_torques(self, bend_angle: Array) -> Array:
+        """Return the torques (K, M) of the weight on the bend angles (K, M) [N·m]."""
+        weight = self.resting_law.weight
+        heading = bend_angle @ weight.turning.T
+        x, y = weight.gravity
+        turns = weight.lever * (y * np.cos(heading) - x * np.sin(heading))
+        torque: Array = turns @ weight.turning
+        return torque
+
+    def _begin(self, start: Memory | None) -> Array:
+        """Return bend [rad], z and creep [rad] (M, 3) at the start; NaN: at rest."""
+        if start is None:
+            return np.full((self._count, 3), np.nan)
+        lengths = np.array([s.length for s in self._segments])
+        return np.stack([start.bend, start.friction, start.creep * lengths], axis=1)
+
+    @cached_property
+    def resting_law(self) -> RestingLaw:
+        """What the bend at rest depends on."""
+        columns = [
+            (
+                s.static_gain,
+                s.cubic_stiffness / s.bending_stiffness / s.length**2,
+                s.rest_curvature * s.length,
+                s.friction_moment / s.moment_gain,
+                max(s.friction_curvature * s.length, 1e-6),
+                s.creep_stiffness / s.length / s.moment_gain,
+                max(s.creep_time, 1e-6),
+                s.bending_stiffness / s.length,
+            )
+            for s in self._segments
+        ]
+        gain, cubic, rest, friction, turn, creep, relaxation, stiffness = np.array(columns).T.copy()
+        return RestingLaw(
+            gain, cubic, rest, friction, turn, creep, relaxation, stiffness, weight_of(self._limb)
+        )
+
+    def _check(
+        self, time: ArrayLike, pressure: ArrayLike, bend_angle: ArrayLike
+    ) -> tuple[Array, Array, Array]:
+        times = np.asarray(time, dtype=float)
+        pressures = np.asarray(pressure, dtype=float)
+        angles = np.asarray(bend_angle, dtype=float)
+        expected = (times.size, self._count)
+        if times.ndim != 1 or pressures.shape != expected or angles.shape != expected:
+            raise ValueError(
+                f"expected time (K,), pressures and bend angles (K, {self._count}); got "
+                f"{times.shape}, {pressures.shape}, {angles.shape}"
+            )
+        return times, pressures, angles
+
+
+def _coupling_matrix(limb: Limb) -> Array:
+    """Return c (M, M): moment on segment i by pressure j, over that of its own [-]."""
+    count = limb.segment_count
+    matrix = np.zeros((count, count))
     for index, segment in enumerate(limb.segments):
-        angle = np.ascontiguousarray(bend_angle[:, index])
-        z, q = (0.0, 0.0) if start is None else (start.friction[index], start.creep[index])
-        if segment.friction_moment > 0:
-            friction[:, index] = dahl(angle, segment.friction_curvature * segment.length, z)
-        if segment.creep_stiffness > 0:
-            creep[:, index] = maxwell(time, angle / segment.length, segment.creep_time, q)
-    return MemoryHistory(bend_angle, friction, creep)
+        if index > 0:
+            matrix[index, index - 1] = segment.coupling_before
+        if index < count - 1:
+            matrix[index, index + 1] = segment.coupling_after
+    return matrix
 
 
 @njit(cache=True)
@@ -256,125 +347,3 @@ def maxwell(time: Array, strain: Array, relaxation: float, start: float = 0.0) -
         keep = np.exp(-rate)
         q[k] = q[k - 1] * keep + (strain[k] - strain[k - 1]) * (1.0 - keep) / rate
     return q
-
-
-# Along the bend at rest ------------------------------------------------------------------------
-
-
-def slow_effective_pressure(limb: Limb, time: ArrayLike, differential: ArrayLike) -> Array:
-    """Return effective pressures (K, M) [Pa] of chamber pressures (K, M) [Pa] alone.
-
-    Friction and creep act along the bend of `resting_bend`.
-    """
-    return effective_pressure(limb, time, differential, resting_bend(limb, time, differential))
-
-
-def resting_bend(
-    limb: Limb, time: ArrayLike, differential: ArrayLike, start: Memory | None = None
-) -> Array:
-    """Return the bend angles (K, M) [rad] of a slow motion under chamber pressures (K, M) [Pa].
-
-    Without inertia each segment bends by its own moment and the limb's weight; friction and creep
-    are solved for at each instant together with the bend, since they act along it.
-
-    Args:
-        limb: calibrated limb.
-        time: (K,) rising [s].
-        differential: (K, M) [Pa].
-        start: bend and memory at ``time[0]``; None: at rest under the first pressures, without any.
-    """
-    times = np.ascontiguousarray(time, dtype=float)
-    pressures = np.asarray(differential, dtype=float)
-    driven, stiffer, _, _ = (np.ascontiguousarray(part) for part in _drive(limb, pressures))
-    bend: Array = rest_along(times, driven, stiffer, resting_law(limb), _begin(limb, start))
-    return bend
-
-
-def _begin(limb: Limb, start: Memory | None) -> Array:
-    """Return bend [rad], z and creep [rad] of each segment (M, 3) at the start; NaN: at rest."""
-    if start is None:
-        return np.full((limb.segment_count, 3), np.nan)
-    lengths = np.array([s.length for s in limb.segments])
-    return np.stack([start.bend, start.friction, start.creep * lengths], axis=1)
-
-
-def resting_law(limb: Limb) -> RestingLaw:
-    """Return what the bend at rest depends on."""
-    columns = [
-        (
-            s.static_gain,
-            s.cubic_stiffness / s.bending_stiffness / s.length**2,
-            s.rest_curvature * s.length,
-            s.friction_moment / s.moment_gain,
-            max(s.friction_curvature * s.length, 1e-6),
-            s.creep_stiffness / s.length / s.moment_gain,
-            max(s.creep_time, 1e-6),
-            s.bending_stiffness / s.length,
-        )
-        for s in limb.segments
-    ]
-    gain, cubic, rest, friction, turn, creep, relaxation, stiffness = np.array(columns).T.copy()
-    return RestingLaw(
-        gain, cubic, rest, friction, turn, creep, relaxation, stiffness, weight_of(limb)
-    )
-
-
-class SlowSlopes:
-    """∂w/∂u of effective pressures along the bend at rest, where each instant changes later ones.
-
-    Args:
-        limb: calibrated limb.
-        time: (K,) [s].
-        differential: (K, M) [Pa].
-        effective: (K, M) of `slow_effective_pressure` [Pa].
-        start: as of `resting_bend`.
-    """
-
-    def __init__(
-        self,
-        limb: Limb,
-        time: Array,
-        differential: Array,
-        effective: Array,
-        start: Memory | None = None,
-    ) -> None:
-        self._effective = effective
-        _, self._stiffer, self._gain, self._stiffening = _drive(limb, differential)
-        self._coupling = coupling_matrix(limb)
-        law = resting_law(limb)
-        bend = resting_bend(limb, time, differential, start)
-        times = np.ascontiguousarray(time)
-        steps = rest_slopes(times, self._stiffer, bend, law, _begin(limb, start))
-        self._memory = RestingSlopes(law, steps)
-
-    def tangent(self, change: Array) -> Array:
-        """Return the change (K, M) of the effective pressures by one of the chambers' (K, M)."""
-        driven = change * self._gain + change @ self._coupling.T
-        stiffer = change * self._stiffening
-        memory = self._memory.tangent(driven, stiffer)
-        moved: Array = (driven - memory - self._effective * stiffer) / self._stiffer
-        return moved
-
-    def adjoint(self, weight: Array) -> Array:
-        """Return Σ weight · ∂w/∂u (K, M), the transpose of `tangent`, for weights (K, M)."""
-        scaled = weight / self._stiffer
-        by_driven, by_stiffer = self._memory.adjoint(scaled)
-        driven = scaled - by_driven
-        stiffer = -scaled * self._effective - by_stiffer
-        gradient: Array = driven * self._gain + driven @ self._coupling
-        return gradient + stiffer * self._stiffening
-
-
-def _check(
-    limb: Limb, time: ArrayLike, pressure: ArrayLike, bend_angle: ArrayLike
-) -> tuple[Array, Array, Array]:
-    times = np.asarray(time, dtype=float)
-    pressures = np.asarray(pressure, dtype=float)
-    angles = np.asarray(bend_angle, dtype=float)
-    expected = (times.size, limb.segment_count)
-    if times.ndim != 1 or pressures.shape != expected or angles.shape != expected:
-        raise ValueError(
-            f"expected time (K,), pressures and bend angles (K, {limb.segment_count}); got "
-            f"{times.shape}, {pressures.shape}, {angles.shape}"
-        )
-    return times, pressures, angles

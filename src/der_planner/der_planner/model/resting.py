@@ -13,15 +13,18 @@ quite evenly, and no other use is made of this bend.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from der_planner.limb import Limb
+
 Array = NDArray[np.float64]
 
+_PIECES = 4
+"""Straight pieces of a segment that carry its weight."""
 _ROUNDS = 200
 """Sweeps over the segments at the most; without weight one is enough."""
 _LARGEST_STEP = 0.3
@@ -53,6 +56,42 @@ class Weight(NamedTuple):
     lever: Array  # (E,) first moment of the piece, and its length times the mass beyond [kg·m]
     turning: Array  # (E, M) share of each bend angle in the heading
     gravity: Array  # (2,) [m/s²]
+
+
+def weight_of(limb: Limb) -> Weight:
+    """Return the weight in the plane of segments, connectors and carried masses.
+
+    A limb that no gravity pulls in its plane has no pieces.
+    """
+    gravity = np.array(limb.gravity[:2], dtype=float)
+    count = limb.segment_count
+    if not gravity.any():
+        return Weight(np.zeros(0), np.zeros((0, count)), gravity)
+    lengths, masses, turning = [], [], []
+    for index, segment in enumerate(limb.segments):
+        if index and limb.connector_length:
+            before = limb.segments[index - 1].mass_per_length
+            mean = 0.5 * (before + segment.mass_per_length)
+            lengths.append(limb.connector_length)
+            masses.append(mean * limb.connector_length)
+            turning.append((np.arange(count) < index).astype(float))
+        for piece in range(_PIECES):
+            lengths.append(segment.length / _PIECES)
+            masses.append(segment.mass_per_length * segment.length / _PIECES)
+            share = (np.arange(count) < index).astype(float)
+            share[index] = (piece + 0.5) / _PIECES
+            turning.append(share)
+    length, mass = np.array(lengths), np.array(masses)
+    ends = limb.base_length + np.cumsum(length)
+    first = 0.5 * mass * length
+    for item in limb.masses:
+        if item.arc_length <= limb.base_length:
+            continue
+        piece = min(int(np.searchsorted(ends, item.arc_length)), len(ends) - 1)
+        mass[piece] += item.mass
+        first[piece] += item.mass * (item.arc_length - ends[piece] + length[piece])
+    beyond = np.append(np.cumsum(mass[::-1])[::-1][1:], 0.0)
+    return Weight(first + length * beyond, np.array(turning), gravity)
 
 
 @njit(cache=True)
@@ -205,126 +244,59 @@ def balanced_bend(
     return angle
 
 
-class StepSlopes(NamedTuple):
-    """Derivatives of each step, by the last θ, z, q and by this instant's drive.
-
-    The change of the angles is ``inverse`` times the sum of the terms `angle_by_…`. The first
-    entries are those of the start: at rest under ``driven[0]``, or given and fixed.
-    """
-
-    inverse: Array  # (K, M, M)
-    angle_by_angle: Array  # (K, M)
-    angle_by_friction: Array  # (K, M) [rad]
-    angle_by_creep: Array  # (K, M)
-    angle_by_driven: Array  # (K, M) [rad/Pa]
-    angle_by_stiffer: Array  # (K, M) [rad]
-    friction_kept: Array  # (K, M)
-    friction_by_change: Array  # (K, M) [1/rad]
-    creep_kept: Array  # (K, M)
-    creep_by_change: Array  # (K, M)
-
-
 @njit(cache=True)
-def rest_slopes(
-    time: Array, stiffer: Array, bend: Array, law: RestingLaw, begin: Array
-) -> StepSlopes:
-    """Return the derivatives of each step along bend angles (K, M) found by `rest_along`.
+def change_along(
+    time: Array,
+    stiffer: Array,
+    bend: Array,
+    law: RestingLaw,
+    begin: Array,
+    change: tuple[Array, Array],
+) -> Array:
+    """Return the change (K, M) of f z + c q [Pa] by changes (K, M) of ``driven`` and ``stiffer``.
 
-    By the implicit function theorem on the step's residual φ + k φ³ − W(θ) − g (driven − f z' − c
-    q') / stiffer = 0 with z' = s + (z − s) exp(−|Δθ| / turn), s the sign of Δθ, and q' = keep q +
-    share Δθ.
+    First order, along bend angles (K, M) found by `rest_along`, by the implicit function theorem on
+    the step's residual φ + k φ³ − W(θ) − g (driven − f z' − c q') / stiffer = 0 with z' = s + (z −
+    s) exp(−|Δθ| / turn), s the sign of Δθ, and q' = keep q + share Δθ. The start is at rest under
+    ``driven[0]``, or given and fixed.
     """
     instants, count = bend.shape
-    shape = (instants, count)
-    inverse = np.zeros((instants, count, count))
-    angle, friction, creep = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-    by_driven, by_stiffer = np.zeros(shape), np.zeros(shape)
-    z_kept, z_change = np.zeros(shape), np.zeros(shape)
-    q_kept, q_change = np.zeros(shape), np.zeros(shape)
+    result = np.empty((instants, count))
     known = not np.isnan(begin[0, 0])
     z = begin[:, 1].copy() if known else np.zeros(count)
     torque, slope = np.zeros(count), np.zeros((count, count))
+    angle_moved: Array = np.zeros(count)
+    z_moved: Array = np.zeros(count)
+    q_moved: Array = np.zeros(count)
     for k in range(instants):
         weigh(bend[k], law, torque, slope)
-        matrix = -slope
+        matrix, right = -slope, np.zeros(count)
+        z_kept, z_by_change = np.zeros(count), np.zeros(count)
+        q_kept, q_by_change = np.zeros(count), np.zeros(count)
         for i in range(count):
             bent = bend[k, i] - law.rest[i]
             scale = law.gain[i] / stiffer[k, i]
             if k > 0:
                 rate = (time[k] - time[k - 1]) / law.relaxation[i]
-                change = bend[k, i] - bend[k - 1, i]
-                sign = 1.0 if change >= 0.0 else -1.0
-                z_kept[k, i] = np.exp(-abs(change) / law.turn[i])
-                z_change[k, i] = (1.0 - z[i] * sign) * z_kept[k, i] / law.turn[i]
-                q_kept[k, i] = np.exp(-rate)
-                q_change[k, i] = (1.0 - q_kept[k, i]) / rate
-                z[i] = sign + (z[i] - sign) * z_kept[k, i]
-            rub = scale * (law.friction[i] * z_change[k, i] + law.creep[i] * q_change[k, i])
+                turned = bend[k, i] - bend[k - 1, i]
+                sign = 1.0 if turned >= 0.0 else -1.0
+                z_kept[i] = np.exp(-abs(turned) / law.turn[i])
+                z_by_change[i] = (1.0 - z[i] * sign) * z_kept[i] / law.turn[i]
+                q_kept[i] = np.exp(-rate)
+                q_by_change[i] = (1.0 - q_kept[i]) / rate
+                z[i] = sign + (z[i] - sign) * z_kept[i]
+            rub = scale * (law.friction[i] * z_by_change[i] + law.creep[i] * q_by_change[i])
             matrix[i, i] += 1.0 + 3.0 * law.cubic[i] * bent**2 + rub
-            angle[k, i] = rub
-            friction[k, i] = -scale * law.friction[i] * z_kept[k, i]
-            creep[k, i] = -scale * law.creep[i] * q_kept[k, i]
-            by_driven[k, i] = scale
             held = bent + law.cubic[i] * bent**3 - torque[i]
-            by_stiffer[k, i] = -held / stiffer[k, i]
+            right[i] = rub * angle_moved[i] + scale * change[0][k, i]
+            right[i] -= scale * law.friction[i] * z_kept[i] * z_moved[i]
+            right[i] -= scale * law.creep[i] * q_kept[i] * q_moved[i]
+            right[i] -= held / stiffer[k, i] * change[1][k, i]
+        after: Array = np.zeros(count)
         if k > 0 or not known:
-            inverse[k] = np.linalg.inv(matrix)
-    return StepSlopes(
-        inverse, angle, friction, creep, by_driven, by_stiffer, z_kept, z_change, q_kept, q_change
-    )
-
-
-@dataclass(frozen=True)
-class RestingSlopes:
-    """First-order change of what friction and creep take, by the drive."""
-
-    law: RestingLaw
-    steps: StepSlopes
-
-    def tangent(self, driven: Array, stiffer: Array) -> Array:
-        """Return the change (K, M) of f z + c q [Pa] by changes (K, M) of the drive."""
-        result: Array = _tangent(self.law, self.steps, driven, stiffer)
-        return result
-
-    def adjoint(self, weight: Array) -> tuple[Array, Array]:
-        """Return the gradient of Σ weight (f z + c q) by ``driven`` and ``stiffer``, (K, M)."""
-        gradients: tuple[Array, Array] = _adjoint(self.law, self.steps, weight)
-        return gradients
-
-
-@njit(cache=True)
-def _tangent(law: RestingLaw, steps: StepSlopes, driven: Array, stiffer: Array) -> Array:
-    result = np.empty(driven.shape)
-    angle, z, q = np.zeros(law.gain.size), np.zeros(law.gain.size), np.zeros(law.gain.size)
-    for k in range(driven.shape[0]):
-        right = (
-            steps.angle_by_angle[k] * angle
-            + steps.angle_by_friction[k] * z
-            + steps.angle_by_creep[k] * q
-            + steps.angle_by_driven[k] * driven[k]
-            + steps.angle_by_stiffer[k] * stiffer[k]
-        )
-        after = (steps.inverse[k] * right).sum(axis=1)
-        z = steps.friction_kept[k] * z + steps.friction_by_change[k] * (after - angle)
-        q = steps.creep_kept[k] * q + steps.creep_by_change[k] * (after - angle)
-        angle = after
-        result[k] = law.friction * z + law.creep * q
+            after[:] = np.linalg.solve(matrix, right)
+        z_moved = z_kept * z_moved + z_by_change * (after - angle_moved)
+        q_moved = q_kept * q_moved + q_by_change * (after - angle_moved)
+        angle_moved = after
+        result[k] = law.friction * z_moved + law.creep * q_moved
     return result
-
-
-@njit(cache=True)
-def _adjoint(law: RestingLaw, steps: StepSlopes, weight: Array) -> tuple[Array, Array]:
-    driven, stiffer = np.empty(weight.shape), np.empty(weight.shape)
-    # gradients by the state after step k
-    angle, z, q = np.zeros(law.gain.size), np.zeros(law.gain.size), np.zeros(law.gain.size)
-    for k in range(weight.shape[0] - 1, -1, -1):
-        z = z + weight[k] * law.friction
-        q = q + weight[k] * law.creep
-        moved = z * steps.friction_by_change[k] + q * steps.creep_by_change[k]
-        total = (steps.inverse[k].T * (angle + moved)).sum(axis=1)
-        driven[k] = total * steps.angle_by_driven[k]
-        stiffer[k] = total * steps.angle_by_stiffer[k]
-        angle = total * steps.angle_by_angle[k] - moved
-        z = z * steps.friction_kept[k] + total * steps.angle_by_friction[k]
-        q = q * steps.creep_kept[k] + total * steps.angle_by_creep[k]
-    return driven, stiffer

@@ -8,47 +8,67 @@ import sys
 import threading
 import time as clock
 from collections.abc import Callable
-from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
 from nav_msgs.msg import Path as PathMessage
-from numpy.typing import NDArray
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from der_msgs.msg import LimbState, MotionCommand, PressureState
 from der_planner.control.feedback import Feedback
-from der_planner.control.knowledge import Estimate
-from der_planner.nodes.driver_watch import DriverWatch, Ending
-from der_planner.nodes.planner_action import MotionAction
-from der_planner.nodes.planner_feedback import Corrector, Done
-from der_planner.nodes.planner_making import PlanMaker
-from der_planner.nodes.planner_parameters import PlannerOptions, read_parameters
-from der_planner.nodes.planner_publishers import PlannerPublishers
-from der_planner.nodes.planner_requests import Request, from_command, from_path, new_plan_id
-from der_planner.nodes.planner_stage import Stage
-from der_planner.nodes.planner_status import PlannerStatus
-from der_planner.planning import Plan
-from der_planner.planning.streaming import Schedule
+from der_planner.nodes.planner_feedback import Corrector
+from der_planner.nodes.planner_requests import (
+    MotionAction,
+    PlannerOptions,
+    Request,
+    from_command,
+    from_path,
+    new_plan_id,
+    read_parameters,
+)
+from der_planner.nodes.planner_streaming import (
+    MARGIN,
+    DriverWatch,
+    Ending,
+    PlannerPublishers,
+    Playback,
+)
+from der_planner.planning import METHODS, Motion, Plan, plan
+from der_planner.planning.streaming import Schedule, first_stamp
 from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.overrides import check_overrides
 from limb_interfaces.runner import run_node
 from limb_interfaces.stamps import NANOSECONDS
 
-Array = NDArray[np.float64]
-
 _ARMING_PATIENCE = 0.5
-"""[s] for the state of a driver that was armed just now to arrive."""
+"""The state of a driver that was armed just now is waited for this long [s]."""
+_FEEDBACK_MARGIN = 500_000_000
+"""Making feedback ready for a plan takes less than this [ns]."""
 
 
 class Cancelled(Exception):  # noqa: N818 - not an error
     """A newer command or `stop` made this plan useless."""
 
 
-class Obstructed(Exception):  # noqa: N818 - not an error
-    """The driver takes no setpoints; the argument is the `Ending`."""
+class Status(NamedTuple):
+    """The node's state, the plan that it is about, and why.
+
+    States: starting, idle, planning, streaming, done, refused, error, and the outcomes of a plan
+    that the driver ended (vented, fault, lost).
+    """
+
+    state: str = "starting"
+    plan_id: str = ""
+    reason: str = ""
+
+
+_LEVELS = {
+    "starting": "stale",
+    **dict.fromkeys(("error", "failed", "fault", "lost"), "error"),
+    **dict.fromkeys(("refused", "vented"), "warning"),
+}
+"""Levels of the diagnostics in states that say it all."""
 
 
 class PlannerNode(Node):
@@ -59,23 +79,24 @@ class PlannerNode(Node):
         self._options = read_parameters(self)
         check_overrides(self)
         self._lock = threading.Lock()
-        self._status = PlannerStatus()
+        self._status = Status()
+        self._progress = 0.0  # share of the planning or of the playing that is done
+        self._last_refusal = ""
         self._request: Request | None = None
         self._newest: tuple[str, Plan, bool] | None = None
         self._work: queue.SimpleQueue[Request | None] = queue.SimpleQueue()
         self._output = PlannerPublishers(self)
         self._diagnostics = DiagnosticsPublisher(self, self._health)
         self._driver = DriverWatch(clock.monotonic, self._options.driver_timeout)
-        self._stage = Stage(self, self._driver, self._now, self._options.lead)
-        self._corrector = Corrector(self, self._now)
-        self._maker = PlanMaker(self._options, lambda: self._stage.position, self._now)
-        self._action = MotionAction(self, self._take_command, self._stop_plan, self._stage.find)
+        self._playback = Playback(self, self._driver, self._now, self._options.lead)
+        self._corrector = Corrector(self._output, self.get_logger().warning, self._now)
+        self._action = MotionAction(
+            self, self._refuses, self._on_command, self._stop_plan, self._playback.find
+        )
         self._planning = threading.Thread(target=self._run, name="planning", daemon=True)
         self._planning.start()
         self.create_subscription(PressureState, topics.PRESSURE_STATE, self._on_driver, qos.STATES)
-        self.create_subscription(
-            LimbState, topics.LIMB_STATE, self._corrector.take_state, qos.STATES
-        )
+        self.create_subscription(LimbState, topics.LIMB_STATE, self._on_limb, qos.STATES)
         self.create_subscription(MotionCommand, topics.COMMAND, self._on_command, qos.COMMANDS)
         self.create_subscription(PathMessage, topics.PATH, self._on_path, qos.COMMANDS)
         self.create_service(Trigger, "~/start", self._on_start)
@@ -85,13 +106,16 @@ class PlannerNode(Node):
     # What comes in -------------------------------------------------------------------------
 
     def _on_driver(self, message: PressureState) -> None:
-        self._stage.take_state(message)
-        self._corrector.take_pressures(message)
+        self._playback.update(message)
+        self._corrector.add_pressures(message)
 
-    def _on_command(self, message: MotionCommand) -> None:
-        self._take_command(message, lambda _: None)
+    def _on_limb(self, message: LimbState) -> None:
+        self._corrector.add_state(message)
+        self._action.compare(message)
 
-    def _take_command(self, message: MotionCommand, begin: Callable[[str], None]) -> None:
+    def _on_command(
+        self, message: MotionCommand, begin: Callable[[str], None] = lambda _: None
+    ) -> None:
         """Plan a command or refuse it; ``begin`` is told the plan's id before either."""
         wanted = message.plan_id
         if not wanted or self._is_busy(wanted):
@@ -102,51 +126,57 @@ class PlannerNode(Node):
                 raise ValueError(
                     f"plan '{wanted}' is being planned or played: name another, or none"
                 )
-            if self._stage.is_spent(wanted):
-                raise ValueError(
-                    f"plan '{wanted}' was ended by the driver, which takes no more of it: give the "
-                    "command another plan_id, or none"
-                )
-            request = from_command(message, self._current_options(), self._now())
+            self._accept(self._checked(message))
         except ValueError as error:
             self._refuse(message.plan_id, str(error))
-            return
-        self._accept(request)
+
+    def _refuses(self, message: MotionCommand) -> bool:
+        """Tell whether a goal's command cannot be planned, having said why."""
+        try:
+            self._checked(message)
+        except ValueError as error:
+            self._refuse(message.plan_id or new_plan_id(), str(error))
+            return True
+        return False
+
+    def _checked(self, message: MotionCommand) -> Request:
+        """Return what a command asks for.
+
+        Raises:
+            ValueError: it cannot be planned; says why.
+        """
+        if self._playback.is_spent(message.plan_id):
+            raise ValueError(
+                f"plan '{message.plan_id}' was ended by the driver, which takes no more of it: "
+                "give the command another plan_id, or none"
+            )
+        return from_command(message, self._current_options(), self._now())
 
     def _current_options(self) -> PlannerOptions:
         """Return the parameters with what may be changed while the node runs as it is now."""
-
-        def value(name: str) -> Any:
-            return self.get_parameter(name).value
-
-        return replace(
-            self._options,
-            nearest_path=bool(value("nearest_path")),
-            payload=float(value("payload")),
-            payload_at=float(value("payload_at")),
-        )
+        changeable = ("nearest_path", "payload", "payload_at")
+        now: dict[str, Any] = {name: self.get_parameter(name).value for name in changeable}
+        return dataclasses.replace(self._options, **now)
 
     def _is_busy(self, plan_id: str) -> bool:
         """Tell whether a plan of this id is being planned or played."""
-        with self._stage.lock:
+        with self._playback.lock:
             request = self._request
             planned = request is not None and request.plan_id == plan_id
-            return planned or self._stage.find(plan_id) is not None
+            return planned or self._playback.find(plan_id) is not None
 
     def _on_path(self, message: PathMessage) -> None:
         plan_id = new_plan_id()
         try:
-            request = from_path(message, plan_id, self._current_options(), self._now())
+            self._accept(from_path(message, plan_id, self._current_options(), self._now()))
         except (ValueError, IndexError) as error:
             self._refuse(plan_id, str(error))
-            return
-        self._accept(request)
 
     def _on_start(self, _: Any, response: Any) -> Any:
         """Play the newest plan, again if it was played before."""
         with self._lock:
             newest = self._newest
-        position = self._stage.position
+        position = self._playback.position
         obstacle = self._driver.obstacle()
         if newest is None:
             response.message = "no plan yet: ask for a motion first"
@@ -159,84 +189,36 @@ class PlannerNode(Node):
         else:
             plan_id, result, corrected = newest
             feedback = Feedback(result) if corrected else None
-            schedule = self._play(self._stage.unspent(plan_id), result, 0, feedback)
+            schedule = self._play(self._playback.unspent(plan_id), result, 0, feedback)
             response.success = True
-            ahead = (schedule.start - self._now()) / NANOSECONDS
             response.message = (
                 f"plays plan {schedule.plan_id} ({result.motion}) for {result.duration:.0f} s, "
-                f"beginning in {max(ahead, 0.0):.1f} s"
+                f"beginning in {max(self._seconds_until(schedule.start), 0.0):.1f} s"
             )
         return response
 
     def _on_stop(self, _: Any, response: Any) -> Any:
         """Cancel planning and streaming; the driver holds, then vents."""
         planning, playing = self._end_all("stopped", "it was asked to stop")
-        self._status.set("idle", reason="stopped as asked")
+        self._status = Status("idle", self._status.plan_id, "stopped as asked")
+        ended = ["cancelled the plan in the making"] * planning + ["stopped streaming"] * playing
         response.success = True
-        response.message = {
-            (True, True): "cancelled the plan in the making and stopped streaming",
-            (True, False): "cancelled the plan in the making",
-            (False, True): "stopped streaming",
-            (False, False): "nothing was running",
-        }[(planning, playing)]
+        response.message = " and ".join(ended) or "nothing was running"
         return response
 
     def _stop_plan(self, plan_id: str) -> None:
         """Stop as the service does, if this plan is still planned or played."""
-        with self._stage.lock:
+        with self._playback.lock:
             if self._is_busy(plan_id):
                 self._end_all("stopped", "the action was cancelled")
-                self._status.set("idle", reason="stopped by a cancelled action")
-
-    # Ends ----------------------------------------------------------------------------------
-
-    def _end_all(self, outcome: str, reason: str) -> tuple[bool, bool]:
-        """Cancel planning, stop streaming; tell whether there was either."""
-        with self._stage.lock:
-            request = self._request
-            if request is not None:
-                request.cancelled.set()
-            playing = self._stage.stop(outcome, reason)
-        if request is not None:
-            self._action.end(request.plan_id, outcome, reason)
-        return request is not None, playing
-
-    def abandoned(self, plan_id: str, ending: Ending) -> None:
-        """Everything was stopped because of the driver: plan nothing to go on with either."""
-        self._end_all(ending.outcome, ending.reason)
-        self._status.set(ending.outcome, plan_id, reason=ending.reason)
-        self._diagnostics.publish()
-
-    def ended(self, schedule: Schedule, outcome: str, reason: str) -> None:
-        """Log how the playing of a plan ended, and tell who asked for it."""
-        current = self._status.read()[:2] == (schedule.plan_id, "streaming")
-        if outcome == "finished" and current:
-            self._status.set("done", schedule.plan_id, progress=1.0)
-        text = f"plan {schedule.plan_id} {outcome} after {self._stage.share(schedule)}"
-        if outcome in ("vented", "fault", "lost"):
-            self.get_logger().error(f"{text}: {reason}")
-        else:
-            self.get_logger().info(f"{text}: {reason}" if reason else text)
-        self._corrector.forget(schedule)
-        self._action.end(schedule.plan_id, outcome, reason)
-
-    def _refuse(self, plan_id: str, reason: str) -> None:
-        """Refuse a plan; what is being planned or played meanwhile stays the state of the node."""
-        self.get_logger().warning(f"plan {plan_id} refused: {reason}")
-        self._status.refused(f"plan {plan_id}: {reason}")
-        with self._lock:
-            planned = self._request is not None and self._request.plan_id != plan_id
-        if not planned and not self._stage.busy:
-            self._status.set("refused", plan_id, reason=reason)
-        self._action.end(plan_id, "refused", reason)
-        self._diagnostics.publish()
+                self._status = Status("idle", plan_id, "stopped by a cancelled action")
 
     # Planning ------------------------------------------------------------------------------
 
     def _accept(self, request: Request) -> None:
         with self._lock:
             replaced, self._request = self._request, request
-        self._status.refused("")
+        self._last_refusal = ""
         if replaced is not None:
             replaced.cancelled.set()
             self._action.end(replaced.plan_id, "replaced", f"by plan {request.plan_id}")
@@ -244,24 +226,36 @@ class PlannerNode(Node):
             f"plan {request.plan_id} accepted: {request.motion.name}, {request.model} "
             f"{request.method}"
         )
-        self._status.set("planning", request.plan_id, progress=0.0)
+        self._status = Status("planning", request.plan_id)
         self._work.put(request)
 
+    def _refuse(self, plan_id: str, reason: str) -> None:
+        """Refuse a plan; what is being planned or played meanwhile stays the state of the node."""
+        self.get_logger().warning(f"plan {plan_id} refused: {reason}")
+        self._last_refusal = f"plan {plan_id}: {reason}"
+        with self._lock:
+            planned = self._request is not None and self._request.plan_id != plan_id
+        if not planned and not self._playback.busy:
+            self._status = Status("refused", plan_id, reason)
+        self._action.end(plan_id, "refused", reason)
+        self._diagnostics.publish()
+
     def _run(self) -> None:
-        self._warm_up()
-        while True:
-            request = self._work.get()
-            if request is None:
-                return
+        """Plan one request after the other; every failure becomes a refusal with its reason."""
+        try:
+            self._warm_up()
+            if self._status == Status():
+                self._status = Status("idle")
+        except Exception as error:
+            self.get_logger().error(f"the limb cannot be planned for: {error}")
+            self._status = Status("error", reason=str(error))
+        while (request := self._work.get()) is not None:
+            failure = ""
             try:
-                self._plan(request)
-                failure = ""
+                failure = self._plan(request)
             except Cancelled:
                 self.get_logger().info(f"plan {request.plan_id} was cancelled")
-                failure = ""
-            except Obstructed as error:
-                failure = f"planned, but not played: {error.args[0].reason}"
-            except Exception as error:  # every failure becomes a refusal with its reason
+            except Exception as error:
                 failure = str(error) or type(error).__name__
             with self._lock:
                 if self._request is request:
@@ -270,22 +264,18 @@ class PlannerNode(Node):
                 self._refuse(request.plan_id, failure)
 
     def _warm_up(self) -> None:
-        """Compile every kernel before the node says that it is ready."""
-        try:
-            self._maker.warm_up()
-        except Exception as error:
-            self.get_logger().error(f"the limb cannot be planned for: {error}")
-            self._status.set("error", reason=str(error))
-            return
-        self._status.ready()
+        """Compile every kernel, so that no plan has to wait for it."""
+        quick = Motion.named("asynchronous", amplitude=0.1, period=2.0, cycles=1)
+        for model, methods in METHODS.items():
+            for method in methods:
+                found = plan(self._options.limb, quick, model, method, nodes=self._options.nodes)
+        # The last of them has compiled whatever feedback calls as well.
+        Feedback(found)
 
-    def _plan(self, request: Request) -> None:
-        def progress(share: float) -> None:
-            if request.cancelled.is_set():
-                raise Cancelled
-            self._status.progress = share
-
-        stamp, start, result = self._maker.make(request, progress)
+    def _plan(self, request: Request) -> str:
+        """Plan what was asked for and play it; return why it cannot be played, or nothing."""
+        self._status = Status("planning", request.plan_id)
+        stamp, result = self._make(request)
         feedback = Feedback(result) if request.feedback else None
         if feedback is not None:
             result = dataclasses.replace(result, method=f"{result.method} + feedback")
@@ -293,15 +283,52 @@ class PlannerNode(Node):
             self.get_logger().warning(f"plan {request.plan_id}: {warning}")
         with self._lock:
             self._newest = (request.plan_id, result, request.feedback)
-        if self._options.auto_start:
-            obstacle = self._driver.wait(_ARMING_PATIENCE)
-            if obstacle is not None:
-                raise Obstructed(obstacle)
-            begin = stamp if start is not None else request.start
-            self._play(request.plan_id, result, begin, feedback, request.cancelled)
-        else:
+        if not self._options.auto_start:
             self._output.plan(Schedule(request.plan_id, result, 0))
-            self._status.set("done", request.plan_id, reason="waits to be started", progress=1.0)
+            self._status = Status("done", request.plan_id, "waits to be started")
+        elif (obstacle := self._driver.wait(_ARMING_PATIENCE)) is not None:
+            return f"planned, but not played: {obstacle.reason}"
+        else:
+            self._play(request.plan_id, result, stamp, feedback, request.cancelled)
+        return ""
+
+    def _make(self, request: Request) -> tuple[int, Plan]:
+        """Return when a plan can begin [ns], and the plan.
+
+        A motion that is being played goes on meanwhile; the new one takes over where it then is. If
+        planning took too long for that, the plan is made again from a later instant.
+
+        Raises:
+            ValueError: it cannot be planned; says why.
+        """
+
+        def progress(share: float) -> None:
+            if request.cancelled.is_set():
+                raise Cancelled
+            self._progress = share
+
+        lead, spare = self._options.lead, _FEEDBACK_MARGIN if request.feedback else 0
+        allowance = MARGIN + spare
+        while True:
+            progress(0.0)
+            begun = clock.monotonic()
+            stamp = first_stamp(self._now() + allowance, lead, request.start)
+            position = self._playback.position
+            start = None if position is None else position[0].leave(stamp)
+            result = request.learned
+            if result is None:
+                result = plan(
+                    request.limb, request.motion, request.model, request.method,
+                    nodes=self._options.nodes, start=start, progress=progress,
+                )  # fmt: skip
+            elif start is not None:
+                raise ValueError("a learned plan begins at rest: send it after this motion")
+            progress(1.0)
+            if start is None:
+                return request.start, result
+            if stamp - lead - spare > self._now():
+                return stamp, result
+            allowance = 2 * round((clock.monotonic() - begun) * NANOSECONDS) + spare + MARGIN
 
     # Streaming -----------------------------------------------------------------------------
 
@@ -313,10 +340,10 @@ class PlannerNode(Node):
         feedback: Feedback | None,
         cancelled: threading.Event | None = None,
     ) -> Schedule:
-        with self._stage.lock:
+        with self._playback.lock:
             if cancelled is not None and cancelled.is_set():
                 raise Cancelled
-            schedule = self._stage.play(plan_id, result, start)
+            schedule = self._playback.play(plan_id, result, start)
             if feedback is not None:
                 self._corrector.follow(schedule, feedback)
             return schedule
@@ -324,65 +351,100 @@ class PlannerNode(Node):
     def scheduled(self, schedule: Schedule) -> None:
         """A plan has its instant: publish it before its first setpoint."""
         result = schedule.plan
-        self._status.set(
-            "streaming", schedule.plan_id, reason="; ".join(result.warnings), progress=0.0
-        )
+        self._status = Status("streaming", schedule.plan_id, "; ".join(result.warnings))
+        self._progress = 0.0
         self._output.plan(schedule)
-        ahead = (schedule.start - self._now()) / NANOSECONDS
         self.get_logger().info(
             f"plan {schedule.plan_id} planned in {result.solve_time:.2f} s: {schedule.count} "
-            f"setpoints over {result.time[-1]:.1f} s, the first in {ahead:.2f} s"
+            f"setpoints over {result.time[-1]:.1f} s, the first in "
+            f"{self._seconds_until(schedule.start):.2f} s"
         )
 
     def send(self, schedule: Schedule, index: int) -> None:
         """Publish one setpoint and where the tip should be at its instant."""
         if index == 0:
             self.get_logger().info(f"plan {schedule.plan_id} started")
-        pressures = self._corrector.pressures(schedule, index)
-        self._output.setpoint(schedule, index, pressures)
+        self._output.setpoint(schedule, index, self._corrector.pressures(schedule, index))
         self._output.reference(schedule, index)
-        self._status.progress = (index + 1) / schedule.count
+        self._progress = (index + 1) / schedule.count
 
-    def revise(self, schedule: Schedule, index: int, pressures: Array, revision: int) -> None:
-        """Publish a setpoint that was sent already with other pressures (M,) [Pa]."""
-        self._output.setpoint(schedule, index, pressures, revision)
+    def _end_all(self, outcome: str, reason: str) -> tuple[bool, bool]:
+        """Cancel planning, stop streaming; tell whether there was either."""
+        with self._playback.lock:
+            request = self._request
+            if request is not None:
+                request.cancelled.set()
+            playing = self._playback.stop(outcome, reason)
+        if request is not None:
+            self._action.end(request.plan_id, outcome, reason)
+        return request is not None, playing
 
-    def estimated(self, schedule: Schedule, instant: int, estimate: Estimate, done: Done) -> None:
-        """Publish what feedback knows of the limb at an instant [ns]."""
-        self._output.estimate(schedule, instant, estimate, done)
+    def abandoned(self, plan_id: str, ending: Ending) -> None:
+        """Everything was stopped because of the driver: plan nothing to go on with either."""
+        self._end_all(ending.outcome, ending.reason)
+        self._status = Status(ending.outcome, plan_id, ending.reason)
+        self._diagnostics.publish()
 
-    def warn(self, text: str) -> None:
-        """Say that feedback was taken back."""
-        self.get_logger().warning(text)
+    def ended(self, schedule: Schedule, outcome: str, reason: str) -> None:
+        """Log how the playing of a plan ended, and tell who asked for it."""
+        current = self._status[:2] == ("streaming", schedule.plan_id)
+        if outcome == "finished" and current:
+            self._status = Status("done", schedule.plan_id)
+        text = f"plan {schedule.plan_id} {outcome} after {self._playback.share(schedule)}"
+        if outcome in ("vented", "fault", "lost"):
+            self.get_logger().error(f"{text}: {reason}")
+        else:
+            self.get_logger().info(f"{text}: {reason}" if reason else text)
+        self._corrector.forget(schedule)
+        self._action.end(schedule.plan_id, outcome, reason)
 
     def _now(self) -> int:
         return int(self.get_clock().now().nanoseconds)
+
+    def _seconds_until(self, instant: int) -> float:
+        return (instant - self._now()) / NANOSECONDS
 
     # What it says of itself ----------------------------------------------------------------
 
     def _health(self) -> Health:
         with self._lock:
             newest = None if self._newest is None else self._newest[1]
+        (state, plan_id, reason), refusal = self._status, self._last_refusal
         values = {
+            "state": state,
+            "plan_id": plan_id,
+            "reason": reason,
+            "last_refusal": refusal,
+            "progress": f"{self._progress:.3f}",
             "limb": self._options.limb.name,
             "driver": self._driver.mode or "not heard",
             "feedback": self._corrector.reason,
             "learned_plans": self._options.learned_plans,
         }
-        return self._status.health(newest, values)
+        if newest is not None:
+            values["predicted_error_m"] = f"{newest.predicted_error:.6f}"
+            values["pressure_margin_pa"] = f"{newest.pressure_margin:.0f}"
+            values["slew_margin_pa_per_s"] = f"{newest.slew_margin:.0f}"
+            values["solve_time_s"] = f"{newest.solve_time:.3f}"
+        if state in _LEVELS:
+            return Health(_LEVELS[state], f"{state}: {reason or 'kernels compile'}", values)
+        if refusal:
+            return Health("warning", f"{state}; refused {refusal}", values)
+        warned = state == "streaming" and reason
+        return Health("warning" if warned else "ok", reason or state, values)
 
     def _show(self) -> None:
         """Ten times a second: end what is over, tell who asked, show the reference limb."""
-        self._stage.end_what_is_over()
-        self._action.tell(*self._status.read())
-        position = self._stage.position
+        self._playback.end_what_is_over()
+        self._action.tell(self._status.plan_id, self._status.state, self._progress)
+        position = self._playback.position
         if position is not None:
             self._output.reference_limb(*position, self._options.lead)
 
     def close(self) -> None:
         """Stop streaming and planning; called once before the node goes."""
         self._end_all("stopped", "the planner was ended")
-        self._stage.close()
+        self._playback.close()
         self._corrector.close()
         self._work.put(None)
 

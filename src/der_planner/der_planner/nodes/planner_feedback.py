@@ -11,60 +11,30 @@ import threading
 import time as clock
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from der_msgs.msg import LimbState, PressureState
 from der_planner.control.feedback import Feedback
-from der_planner.control.knowledge import Estimate
+from der_planner.nodes.planner_streaming import PlannerPublishers
 from der_planner.planning.streaming import GRID, Schedule
 from limb_interfaces.stamps import NANOSECONDS, nanoseconds
 
 Array = NDArray[np.float64]
 
 _TRAVEL = 0.015
-"""A revision is sent at least so long before its stamp [s], for the driver to have it."""
+"""A revision is sent at least this long [s] before its stamp, so that the driver has it in time."""
 _LONGEST_AHEAD = 0.15
-"""However slow this machine is, the setpoint that is revised is at most so far ahead [s]."""
+"""The setpoint that is revised is at most this far ahead [s], however slow this machine is."""
 _SLOWER = 1.5
-"""A solution may take so many times what the last ones took."""
-_SMALLEST_BEND, _SMALLEST_TIP = 1e-3, 1e-4
-"""Standard deviations that are believed of a tracker: it tells corner noise alone [rad], [m]."""
+"""A solution may take this many times as long as the last ones took."""
+_SMALLEST_BEND = 1e-3
+"""A bend angle's standard deviation counts as at least this [rad]: trackers tell corner noise."""
+_SMALLEST_TIP = 1e-4
+"""The tip's standard deviation counts as at least this [m], for the same reason."""
 _STALE = 10
-"""Setpoints for which an older solution's corrections are used in full; then they fade."""
-
-
-class Audience(Protocol):
-    """Publishes the corrector's results; called from the corrector's thread."""
-
-    def revise(self, schedule: Schedule, index: int, pressures: Array, revision: int) -> None:
-        """Send a setpoint again with other pressures (M,) [Pa]."""
-
-    def estimated(self, schedule: Schedule, instant: int, estimate: Estimate, done: Done) -> None:
-        """Publish the estimate of an instant [ns]."""
-
-    def warn(self, text: str) -> None:
-        """Say that feedback was taken back."""
-
-
-@dataclass(frozen=True)
-class Done:
-    """What one revision was.
-
-    Attributes:
-        correction: (M,) [Pa].
-        share: of it that acts.
-        reason: why feedback is out; empty while it acts.
-        solve_time: [s].
-    """
-
-    correction: Array
-    share: float
-    reason: str
-    solve_time: float
+"""Corrections of an older solution are used in full for this many setpoints; then they fade."""
 
 
 class _Corrected:
@@ -136,12 +106,15 @@ class Corrector:
     """Corrects the schedules that are played; see the module.
 
     Args:
-        audience: publishes.
+        output: publishes revised setpoints and estimates.
+        warn: says that feedback was taken back.
         now: present ROS time [ns].
     """
 
-    def __init__(self, audience: Audience, now: Callable[[], int]) -> None:
-        self._audience, self._now = audience, now
+    def __init__(
+        self, output: PlannerPublishers, warn: Callable[[str], None], now: Callable[[], int]
+    ) -> None:
+        self._output, self._warn, self._now = output, warn, now
         self._wake = threading.Condition()
         self._inbox: deque[Callable[[_Corrected], None]] = deque(maxlen=200)
         self._open: list[_Corrected] = []
@@ -179,7 +152,7 @@ class Corrector:
         self._post(lambda each: self._was_sent(each, schedule, index, pressures))
         return pressures
 
-    def take_pressures(self, state: PressureState) -> None:
+    def add_pressures(self, state: PressureState) -> None:
         """Take in what the chambers hold."""
         measured = np.array(state.measured_differential)
         if not len(measured) or not np.isfinite(state.telemetry_age):
@@ -187,7 +160,7 @@ class Corrector:
         stamp = nanoseconds(state.header.stamp) - round(state.telemetry_age * NANOSECONDS)
         self._post(lambda each: each.feedback.pressures(each.time_of(stamp), measured))
 
-    def take_state(self, state: LimbState) -> None:
+    def add_state(self, state: LimbState) -> None:
         """Take in what a picture showed."""
         if not state.valid:
             return
@@ -247,7 +220,7 @@ class Corrector:
             # Whatever goes wrong here, the plan goes on without feedback.
             self.forget(each.schedule)
             text = f"{type(error).__name__}: {error}"
-            self._audience.warn(f"plan {each.schedule.plan_id}: feedback failed, {text}")
+            self._warn(f"plan {each.schedule.plan_id}: feedback failed, {text}")
 
     def _revise(self, each: _Corrected) -> None:
         """Revise the next setpoint of a schedule that can still be reached."""
@@ -265,18 +238,20 @@ class Corrector:
         if left > 0:
             revision = each.revisions[index] = each.revisions.get(index, 0) + 1
             each.revisions.pop(index - 100, None)
-            self._audience.revise(schedule, index, pressures, revision)
+            self._output.setpoint(schedule, index, pressures, revision)
         else:
             feedback.late(index * GRID / NANOSECONDS, -left)
         each.coming = feedback.coming()
         for warned in feedback.warnings[each.warned :]:
             text = f"plan {schedule.plan_id}, {warned.time:.2f} s: feedback is taken back, "
-            self._audience.warn(f"{text}{warned.name}: {warned.message}")
+            self._warn(f"{text}{warned.name}: {warned.message}")
         each.warned = len(feedback.warnings)
         instant = max(now, schedule.start)
         estimate = feedback.estimate(each.time_of(instant))
-        done = Done(pressures - planned, feedback.share, feedback.reason, took)
-        self._audience.estimated(schedule, instant, estimate, done)
+        self._output.estimate(
+            schedule, instant, estimate, correction=(pressures - planned).tolist(),
+            share=feedback.share, reason=feedback.reason, solve_time=took,
+        )  # fmt: skip
 
     def _replaced(self, each: _Corrected, index: int) -> bool:
         """Tell whether another schedule has taken over by a setpoint's instant."""

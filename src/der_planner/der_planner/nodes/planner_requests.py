@@ -1,25 +1,35 @@
-"""Messages that ask for a motion, checked and turned into requests to the planner."""
+"""What is asked of the planner: its parameters, the messages that ask for a motion, its action."""
 
 from __future__ import annotations
 
+import functools
+import math
 import threading
 import uuid
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from nav_msgs.msg import Path as PathMessage
 from numpy.typing import NDArray
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.action.server import ServerGoalHandle
+from rclpy.node import Node
 
-from der_msgs.msg import MotionCommand
-from der_planner.limb import Limb
-from der_planner.limb_loads import HEAVIEST
+from der_msgs.action import PlayMotion
+from der_msgs.msg import LimbState, MotionCommand
+from der_planner.limb import HEAVIEST, Limb
 from der_planner.methods import LEARNED
-from der_planner.nodes.planner_parameters import PlannerOptions
-from der_planner.planning import Motion, choose_method
+from der_planner.planning import METHODS, Motion, PathLimits, choose_method
+from der_planner.planning.inverse import BRANCHES
 from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD
 from der_planner.planning.plan_file import learned_plan
 from der_planner.planning.result import Plan
+from der_planner.planning.streaming import GRID, Schedule
 from limb_interfaces import topics
+from limb_interfaces.parameters import declare
 from limb_interfaces.stamps import NANOSECONDS, nanoseconds
 
 Array = NDArray[np.float64]
@@ -28,6 +38,106 @@ OLDEST_STAMP = 10
 """A start further back than this [s] is a mistake; a shorter delay is travel and typing."""
 FURTHEST_STAMP = 600
 """A start that lies further ahead than this [s] is a mistake: another clock, or another epoch."""
+
+
+@dataclass(frozen=True)
+class PlannerOptions:
+    """The node's parameters, checked; times in ns where they meet stamps, else in s.
+
+    `limb` is mounted as the parameters say, and does not carry the payload yet.
+    """
+
+    limb: Limb
+    payload: float
+    payload_at: float
+    model: str
+    method: str
+    nodes: int
+    lead: int
+    auto_start: bool
+    branch: str
+    limits: PathLimits
+    nearest_path: bool
+    driver_timeout: float
+    learned_plans: str
+    feedback: bool
+
+
+def read_parameters(node: Node) -> PlannerOptions:
+    """Declare and check the planner's parameters.
+
+    Raises:
+        ParameterError: a value is out of range; names it.
+        LimbError: the limb file cannot be used.
+    """
+    read: Any = functools.partial(declare, node)
+    learned_plans = read(
+        "learned_plans", "", "folder of learned plans: a command of the method 'learned' names one "
+        "of them in place of its motion"
+    )  # fmt: skip
+    return PlannerOptions(
+        limb=_read_limb(read),
+        payload=read(
+            "payload", 0.0, "mass [kg] carried beside the limb's own masses, where a command names "
+            "none", at_least=0.0, at_most=HEAVIEST, read_only=False
+        ),
+        payload_at=read(
+            "payload_at", 0.0, "where, along the limb from its clamp [m]; 0: the tip",
+            at_least=0.0, read_only=False
+        ),
+        model=read(
+            "default_model", "der", "model for paths and for commands that name none",
+            choices=tuple(METHODS)
+        ),
+        method=read(
+            "default_method", "", "method where none is named; empty: the best",
+            choices=("", *METHODS["der"])
+        ),
+        nodes=read("nodes", 21, "nodes of the rod", at_least=6, at_most=201),
+        lead=round(
+            NANOSECONDS * read("lead_time", 0.2, "time between sending a setpoint and its stamp "
+                               "[s]", at_least=0.05, at_most=2.0)
+        ),
+        auto_start=read("auto_start", True, "play a plan as soon as it is ready"),
+        branch=read(
+            "branch", "", "side of the fold for paths and shapes; empty: the least pressure",
+            choices=("", *BRANCHES)
+        ),
+        limits=PathLimits(
+            read("path_speed", 0.03, "speed along a path without times [m/s]",
+                 at_least=1e-3, at_most=1.0),
+            read("path_acceleration", 0.05, "acceleration along and across it [m/s^2]",
+                 at_least=1e-3, at_most=10.0),
+        ),
+        nearest_path=read(
+            "nearest_path", False, "follow the nearest path that the limb can follow where a path "
+            "leaves its reach, instead of refusing it", read_only=False
+        ),
+        driver_timeout=read(
+            "driver_timeout", 1.0, "silence of the driver [s] after which it counts as dead",
+            at_least=0.2, at_most=60.0
+        ),
+        # As other processes find it.
+        learned_plans=str(Path(learned_plans).expanduser().resolve()) if learned_plans else "",
+        feedback=read(
+            "feedback", False, "correct plans of the rod while they are played, where a command "
+            "does not ask for it"
+        ),
+    )  # fmt: skip
+
+
+def _read_limb(read: Any) -> Limb:
+    """Return the limb of the file that is named, mounted as the parameter says."""
+    limb_file = read("limb_file", "", "limb file (YAML); empty: the default limb")
+    mounting = read(
+        "mounting", "", "horizontal, hanging, standing, sideways or degrees of tilt; empty: "
+        "gravity as in the limb file"
+    )  # fmt: skip
+    limb = Limb.from_yaml(limb_file) if limb_file else Limb.default()
+    return limb.mounted(mounting) if mounting else limb
+
+
+# Messages that ask for a motion ------------------------------------------------------------------
 
 
 @dataclass
@@ -54,15 +164,6 @@ def new_plan_id() -> str:
     return uuid.uuid4().hex[:8]
 
 
-def loaded(limb: Limb, payload: float, at: float) -> Limb:
-    """Return the limb with a payload [kg] at an arc length [m]; 0 is the tip.
-
-    Raises:
-        LimbError: the payload is negative, or its place is not on the limb.
-    """
-    return limb.carrying(payload, at or None)
-
-
 def start_of(stamp: int, now: int) -> int:
     """Check the instant at which a motion is to start.
 
@@ -73,10 +174,8 @@ def start_of(stamp: int, now: int) -> int:
     Raises:
         ValueError: it lies too far back or ahead to be meant; says how far.
     """
-    if stamp == 0:
-        return 0
     ahead = (stamp - now) / NANOSECONDS
-    if -OLDEST_STAMP <= ahead <= FURTHEST_STAMP:
+    if stamp == 0 or -OLDEST_STAMP <= ahead <= FURTHEST_STAMP:
         return stamp
     where = f"{ahead:.0f} s ahead" if ahead > 0 else f"{-ahead:.0f} s ago"
     raise ValueError(
@@ -92,69 +191,40 @@ def from_command(message: MotionCommand, options: PlannerOptions, now: int) -> R
         ValueError: a field has a value that cannot be planned; names it.
     """
     start = start_of(nanoseconds(message.header.stamp), now)
-    limb = _asked_for(message, options)
+    limb = options.limb.mounted(message.mounting) if message.mounting else options.limb
+    if message.payload < 0 or message.payload > HEAVIEST:
+        raise ValueError(f"the payload is {message.payload} kg: give 0 to {HEAVIEST:g} kg")
+    limb = _carrying(limb, message if message.payload else options)
     if message.path and (message.motion or message.method == LEARNED):
         raise ValueError(
             "the command has a path, and a motion or a learned plan beside it: give one of them"
         )
+    learned: Plan | None = None
     if message.method == LEARNED:
-        return _from_learned(message, limb, options, start)
-    model = message.model or options.model
-    motion = _drawn(message, options) if message.path else _named(message, options)
-    method = choose_method(model, message.method or options.method)
-    feedback = _corrected(message, model, options)
-    return Request(message.plan_id, limb, motion, model, method, start, feedback=feedback)
-
-
-def _named(message: MotionCommand, options: PlannerOptions) -> Motion:
-    return Motion.named(
-        message.motion,
-        amplitude=message.amplitude or DEFAULT_AMPLITUDE,
-        period=message.period or DEFAULT_PERIOD,
-        cycles=message.cycles or DEFAULT_CYCLES,
-        branch=options.branch,
-    )
-
-
-def _drawn(message: MotionCommand, options: PlannerOptions) -> Motion:
-    tip = np.array([(point.x, point.y) for point in message.path])
-    return _along_path(None, tip, options, message.nearest_path or options.nearest_path)
-
-
-def _along_path(time: Array | None, tip: Array, options: PlannerOptions, nearest: bool) -> Motion:
-    return Motion.from_tip_path(
-        time, tip, branch=options.branch, limits=options.limits, nearest=nearest
-    )
-
-
-def _from_learned(
-    message: MotionCommand, limb: Limb, options: PlannerOptions, start: int
-) -> Request:
-    """Return the learned plan whose name stands in place of the motion's."""
-    plan = learned_plan(options.learned_plans, message.motion, limb)
-    motion = Motion(plan.motion, plan.amplitude, plan.period, plan.cycles)
-    feedback = _corrected(message, plan.model, options)
-    return Request(message.plan_id, plan.limb, motion, plan.model, LEARNED, start, plan, feedback)
-
-
-def _asked_for(message: MotionCommand, options: PlannerOptions) -> Limb:
-    """Return the limb mounted and loaded as a command says."""
-    limb = options.limb.mounted(message.mounting) if message.mounting else options.limb
-    if message.payload < 0 or message.payload > HEAVIEST:
-        raise ValueError(f"the payload is {message.payload} kg: give 0 to {HEAVIEST:g} kg")
-    carried = message.payload, message.payload_at
-    if message.payload == 0:
-        carried = options.payload, options.payload_at
-    return loaded(limb, *carried)
-
-
-def _corrected(message: MotionCommand, model: str, options: PlannerOptions) -> bool:
-    """Tell whether a plan of a model is to be corrected while it is played."""
+        # Its name stands in place of the motion's.
+        learned = learned_plan(options.learned_plans, message.motion, limb)
+        motion = Motion(learned.motion, learned.amplitude, learned.period, learned.cycles)
+        limb, model, method = learned.limb, learned.model, LEARNED
+    else:
+        model = message.model or options.model
+        if message.path:
+            tip = np.array([(point.x, point.y) for point in message.path])
+            motion = _along_path(None, tip, options, message.nearest_path or options.nearest_path)
+        else:
+            motion = Motion.named(
+                message.motion,
+                amplitude=message.amplitude or DEFAULT_AMPLITUDE,
+                period=message.period or DEFAULT_PERIOD,
+                cycles=message.cycles or DEFAULT_CYCLES,
+                branch=options.branch,
+            )
+        method = choose_method(model, message.method or options.method)
     if message.feedback and model != "der":
         raise ValueError(
             f"feedback corrects plans of the rod, not of the model {model}: ask for der"
         )
-    return message.feedback or (options.feedback and model == "der")
+    feedback = message.feedback or (options.feedback and model == "der")
+    return Request(message.plan_id, limb, motion, model, method, start, learned, feedback)
 
 
 def from_path(message: PathMessage, plan_id: str, options: PlannerOptions, now: int) -> Request:
@@ -171,7 +241,139 @@ def from_path(message: PathMessage, plan_id: str, options: PlannerOptions, now: 
     time = (np.array(stamps) - stamps[0]) * 1e-9 if any(stamps) else None
     motion = _along_path(time, tip.reshape(-1, 2), options, options.nearest_path)
     start = start_of(nanoseconds(message.header.stamp), now)
-    limb = loaded(options.limb, options.payload, options.payload_at)
     method = choose_method(options.model, options.method)
     feedback = options.feedback and options.model == "der"
+    limb = _carrying(options.limb, options)
     return Request(plan_id, limb, motion, options.model, method, start, feedback=feedback)
+
+
+def _carrying(limb: Limb, load: MotionCommand | PlannerOptions) -> Limb:
+    """Return the limb with the payload of a command or of the parameters; at 0 it is at the tip."""
+    return limb.carrying(load.payload, load.payload_at or None)
+
+
+def _along_path(time: Array | None, tip: Array, options: PlannerOptions, nearest: bool) -> Motion:
+    return Motion.from_tip_path(
+        time, tip, branch=options.branch, limits=options.limits, nearest=nearest
+    )
+
+
+# The action --------------------------------------------------------------------------------------
+
+
+@dataclass
+class _Goal:
+    """One goal, and how far the tracked tip was from the reference so far."""
+
+    handle: ServerGoalHandle
+    errors_sum: float = 0.0
+    errors: int = 0
+
+    @property
+    def tip_error(self) -> float:
+        """Mean distance [m]; NaN while no tip was tracked."""
+        return self.errors_sum / self.errors if self.errors else math.nan
+
+
+class MotionAction:
+    """Serves `planner/play_motion`. The planner plans and plays; this keeps who asked and tells.
+
+    A goal stays ACCEPTED until it ends: rclpy's executor spins without rest while a callback waits,
+    so no callback waits here.
+
+    Args:
+        node: the planner.
+        refuse: returns whether a command cannot be planned, and has then said why.
+        begin: takes a command; tells the id of its plan before it is planned or refused.
+        stop: ends the plan of an id.
+        schedule: returns the schedule of a plan that is being played, or None.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        refuse: Callable[[MotionCommand], bool],
+        begin: Callable[[MotionCommand, Callable[[str], None]], None],
+        stop: Callable[[str], None],
+        schedule: Callable[[str], Schedule | None],
+    ) -> None:
+        self._refuse, self._begin, self._stop, self._schedule = refuse, begin, stop, schedule
+        self._lock = threading.Lock()
+        self._goals: dict[str, _Goal] = {}
+        self._server = ActionServer(
+            node,
+            PlayMotion,
+            "~/play_motion",
+            execute_callback=self._conclude_unknown,
+            goal_callback=self._on_request,
+            handle_accepted_callback=self._on_goal,
+            cancel_callback=self._on_cancel,
+        )
+
+    def _on_request(self, goal: PlayMotion.Goal) -> GoalResponse:
+        return GoalResponse.REJECT if self._refuse(goal.command) else GoalResponse.ACCEPT
+
+    def _on_goal(self, handle: ServerGoalHandle) -> None:
+        def keep(plan_id: str) -> None:
+            with self._lock:
+                self._goals[plan_id] = _Goal(handle)
+
+        self._begin(handle.request.command, keep)
+
+    def _on_cancel(self, handle: ServerGoalHandle) -> CancelResponse:
+        with self._lock:
+            found = [name for name, goal in self._goals.items() if goal.handle == handle]
+        for plan_id in found:
+            # The answer to the cancel request must be out before the goal ends.
+            threading.Timer(0.05, self._stop, [plan_id]).start()
+        return CancelResponse.ACCEPT if found else CancelResponse.REJECT
+
+    def compare(self, state: LimbState) -> None:
+        """Compare the tracked tip with the reference at the stamp of its image."""
+        if not self._goals or not state.valid:
+            return
+        stamp = nanoseconds(state.header.stamp)
+        with self._lock:
+            goals = list(self._goals.items())
+        for plan_id, goal in goals:
+            schedule = self._schedule(plan_id)
+            at = math.nan if schedule is None else (stamp - schedule.start) / GRID
+            if schedule is not None and 0 <= at <= schedule.count - 1:
+                rows, tips = np.arange(schedule.count), schedule.plan.tip_reference.T
+                x, y = (np.interp(at, rows, tip) for tip in tips)
+                goal.errors_sum += math.hypot(state.tip.x - x, state.tip.y - y)
+                goal.errors += 1
+
+    def tell(self, plan_id: str, state: str, progress: float) -> None:
+        """Publish feedback to who asked for a plan, if anybody did."""
+        with self._lock:
+            goal = self._goals.get(plan_id)
+        if goal is not None:
+            goal.handle.publish_feedback(
+                PlayMotion.Feedback(state=state, progress=progress, tip_error=goal.tip_error)
+            )
+
+    def end(self, plan_id: str, outcome: str, reason: str) -> None:
+        """Give who asked for a plan its result; may be called from any thread, and twice."""
+        with self._lock:
+            goal = self._goals.pop(plan_id, None)
+        if goal is None:
+            return
+        result = PlayMotion.Result(
+            outcome=outcome, reason=reason, plan_id=plan_id, tip_error=goal.tip_error
+        )
+
+        def conclude(handle: ServerGoalHandle) -> Any:
+            if handle.is_cancel_requested:
+                handle.canceled()
+            elif outcome == "finished":
+                handle.succeed()
+            else:
+                handle.abort()
+            return result
+
+        goal.handle.execute(conclude)
+
+    def _conclude_unknown(self, handle: ServerGoalHandle) -> Any:
+        handle.abort()
+        return PlayMotion.Result(outcome="failed", reason="the goal was executed by nobody")

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
 from der_planner.limb import Limb
-from der_planner.model.drive import STEPS, Bend
-from der_planner.model.response import NODES, simulate
+from der_planner.model import NODES, Initial, simulate
 from der_planner.model.series import CONTROL_PERIOD
+from der_planner.model.simulation import STEPS, Bend
 from der_planner.planning import models
 from der_planner.planning.errors import PlanningError
 from der_planner.planning.inverse import solve
@@ -109,8 +109,10 @@ class Correction:
                 np.arange(len(commands)) * CONTROL_PERIOD,
                 commands=commands,
                 bend=bend,
-                start=self._physics.begin(self._spline, start),
-                before=None if start is None else start.pressure,
+                initial=Initial(
+                    self._physics.begin(self._spline, start),
+                    None if start is None else start.pressure,
+                ),
             )
         except ConvergenceError as error:
             raise _not_followed(error) from error

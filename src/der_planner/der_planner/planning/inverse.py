@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
 from der_planner.limb import Limb
+from der_planner.model import ArcModel
 from der_planner.model.bending import Kinematics
 from der_planner.model.series import interpolate
-from der_planner.pcc import Pcc
 from der_planner.planning.errors import PlanningError, UnreachableError
 
 Array = NDArray[np.float64]
@@ -94,7 +94,7 @@ def static_pressure(limb: Limb, bend_angles: ArrayLike) -> Array:
     if is_loaded(limb):
         angles = np.asarray(bend_angles, dtype=float)
         flat = angles.reshape(-1, angles.shape[-1])
-        held: Array = Pcc(limb).pressures(flat, 0 * flat, 0 * flat)
+        held: Array = ArcModel(limb).inverse_dynamics(flat, 0 * flat, 0 * flat)
         return held.reshape(angles.shape)
     lengths = np.array([s.length for s in limb.segments])
     curvature = np.asarray(bend_angles, dtype=float) / lengths

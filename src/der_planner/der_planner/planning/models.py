@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from der_planner.limb import Limb
-from der_planner.model.material import differential_pressure
-from der_planner.model.response import ArcModel, ArcState
+from der_planner.model import ArcModel, ArcState
+from der_planner.model.material import Material
 from der_planner.planning.errors import BucklingError, PlanningError
-from der_planner.planning.inverse import check_reach, is_loaded, solve, static_pressure
+from der_planner.planning.inverse import check_reach, solve, static_pressure
 from der_planner.planning.loads.overload import check_load, check_stays
 from der_planner.planning.loads.posed import REFERENCE_PRIOR
 from der_planner.planning.motions import Reference
@@ -40,7 +40,7 @@ class PlanningArcs(ArcModel):
             OverloadError: gravity's load takes more than the pressure limit.
         """
         time, tip, angles = reference.time, reference.tip, reference.bend_angles
-        if not is_loaded(self.limb):
+        if not self.is_loaded:
             check_reach(self.limb, self.kinematics, time, tip, angles, np.zeros(len(time)))
             return reference.spline
         home = self.rest.angles
@@ -54,9 +54,9 @@ class PlanningArcs(ArcModel):
         own = solve(self.kinematics, tip, near, REFERENCE_PRIOR)[0]
 
         def needed(limb: Limb) -> Array:
-            return differential_pressure(limb, time, static_pressure(limb, own), own)
+            return Material(limb).differential_pressure(time, static_pressure(limb, own), own)
 
-        stiffness = np.array([self.pcc.smallest_stiffness(pose) for pose in own])
+        stiffness = np.array([self.smallest_stiffness(pose) for pose in own])
         check_stays(stiffness, time, tip, "arcs")
         check_load(self.limb, time, tip, needed(self.limb), needed)
         return resting_spline(time, own, reference.start)
@@ -72,7 +72,7 @@ class PlanningArcs(ArcModel):
         """
         if method not in METHODS["pcc"]:
             raise PlanningError(f"the PCC model has no balance '{method}'")
-        return self.pcc.pressures(*sample_spline(spline, time))
+        return self.inverse_dynamics(*sample_spline(spline, time))
 
 
 def build(limb: Limb, model: str, nodes: int) -> PlanningRod | PlanningArcs:

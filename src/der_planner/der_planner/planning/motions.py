@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BSpline
 
 from der_planner.limb import Limb
-from der_planner.model.bending import ArcKinematics
+from der_planner.model import ArcModel
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import paths, shapes
 from der_planner.planning.errors import PlanningError
@@ -243,7 +243,7 @@ class Motion:
         count = round(time[-1] / CONTROL_PERIOD) + 1
         instants = np.arange(count) * CONTROL_PERIOD
         sampled = sample_spline(spline, instants)[0]
-        tip = ArcKinematics(limb).tip(sampled) + rest.offset
+        tip = ArcModel(limb).tip(sampled) + rest.offset
         if limb.gravity[2]:
             tip = sagged_tips(limb, instants, sampled, rest.bend_angles)
         return Reference(instants, tip, sampled, spline, rest.bend_angles, start, deviation)
@@ -270,7 +270,7 @@ class Motion:
         return np.append(time, total + closing[1:]), np.concatenate([angles, back[1:]])
 
     def _tip_motion(self, limb: Limb, rest: Rest) -> tuple[Array, Array, Deviation | None]:
-        kinematics = ArcKinematics(limb)
+        kinematics = ArcModel(limb)
         path = self.path
         if path is None:
             path = shapes.draw(
@@ -290,7 +290,7 @@ class Motion:
     def _nearest_motion(
         self, limb: Limb, rest: Rest, path: paths.TipPath
     ) -> tuple[Array, Array, Deviation]:
-        kinematics = ArcKinematics(limb)
+        kinematics = ArcModel(limb)
         offset = rest.offset
         found = nearest_path(limb, kinematics, path, offset, self.limits, self.branch)
         if limb.gravity[2]:

@@ -28,11 +28,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_factor, cho_solve
 
-from der_planner.model import air
+from der_planner.model import Initial, Model, State
 from der_planner.model.commands import within_limits
-from der_planner.model.drive import Drive, Window
-from der_planner.model.response import Model, State
 from der_planner.model.series import CONTROL_PERIOD
+from der_planner.model.simulation import Drive, Window
 from der_planner.planning.motions import Reference
 from der_planner.planning.quadratic import Band, solve_limited
 from der_planner.planning.ways import sample_spline
@@ -136,7 +135,7 @@ class Optimiser:
     ) -> None:
         self.model = model
         self.settings = settings or Settings()
-        vented = model.limb.pneumatics.vent_rate > 0
+        vented = model.air.vents_slowly
         self.nearness = self.settings.nearness_vented if vented else self.settings.nearness
         wanted = reference.tip if offset is None else reference.tip - offset
         self.target = np.concatenate([wanted[1:], wanted[-1:]])
@@ -146,9 +145,13 @@ class Optimiser:
         self.before = np.zeros(inputs) if start is None else start.pressure
         self.start = begin
         self.drive = Drive(
-            model.limb, lambda time: sample_spline(spline, time)[0], count, substeps, self.before
+            model,
+            lambda time: sample_spline(spline, time)[0],
+            count,
+            substeps,
+            Initial(before=self.before),
         )
-        pulse = air.even_pulse(model.limb.pneumatics, CONTROL_PERIOD, substeps)
+        pulse = model.air.even_pulse(CONTROL_PERIOD, substeps)
         self._pulse = np.tile(pulse[:, None], (1, inputs))
 
     def run(
@@ -176,12 +179,12 @@ class Optimiser:
             # The window before may have moved away from what was guessed of this one: a search that
             # begins beyond a limit may find nothing better within it.
             command[first:], _ = within_limits(
-                command[first:], self.model.limb.pneumatics, CONTROL_PERIOD, before
+                command[first:], self.model.air, CONTROL_PERIOD, before
             )
             used, met = self.improve(command, state, first, last)
             steps, limited = steps + used, limited + met
             window = self.drive.window(command[:keep], first)
-            motion = self.model.shoot(state, window.effective, CONTROL_PERIOD)
+            motion = self.model.run(state, window.effective, CONTROL_PERIOD)
             tip[first:keep] = motion.tip[:-1]
             state, first, before = motion.final, keep, command[keep - 1]
             progress(first / count)
@@ -225,26 +228,26 @@ class Optimiser:
     ) -> tuple[float, Array, Window]:
         """Return the cost, the misses (W, 2) [m] and the pressures of a window."""
         window = self.drive.window(command[:last], first)
-        motion = self.model.shoot(state, window.effective, CONTROL_PERIOD)
+        motion = self.model.run(state, window.effective, CONTROL_PERIOD)
         misses = motion.tip[1:] - self.target[first:last]
         cost = float((misses**2).sum()) + self._roughness(command, first, last)
         return cost, misses, window
 
     def _linearise(self, window: Window, state: State, damping: float) -> Quadratic:
         """Return the quadratic model of the cost around the commands of a window."""
-        motion = self.model.shoot(state, window.effective, CONTROL_PERIOD, linearise=True)
-        if motion.sensitivity is None:
+        linear = self.model.run(state, window.effective, CONTROL_PERIOD, "tip").linear
+        if linear is None:
             raise AssertionError("a linearised motion has its sensitivity")
-        slope = window.slopes.own.mean(axis=1)
-        if self.model.limb.pneumatics.vent_rate > 0:
+        slope = np.diagonal(window.slopes, axis1=-2, axis2=-1).mean(axis=1)
+        if self.model.air.vents_slowly:
             # A chamber that falls as fast as its outlet lets it does not react to its command: the
             # chambers' response differs from command to command.
-            held = motion.sensitivity(None)[1:] * slope
+            held = linear.sensitivity(None)[1:] * slope
             spread = window.by_command().mean(axis=1)
             products = np.moveaxis(held, 3, 0) @ np.moveaxis(spread, 2, 0)[:, None]
             sensitivity = np.moveaxis(products, 0, 3)
         else:
-            sensitivity = motion.sensitivity(self._pulse)[1:] * slope
+            sensitivity = linear.sensitivity(self._pulse)[1:] * slope
         size, inputs = slope.shape
         J = sensitivity.reshape(2 * size, size * inputs)
         second = _second_difference(size)

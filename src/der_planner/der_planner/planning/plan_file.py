@@ -16,7 +16,7 @@ import yaml
 from numpy.typing import NDArray
 
 from der_planner.limb import Limb, LimbError
-from der_planner.model.response import NODES
+from der_planner.model import NODES
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import models
 from der_planner.planning.errors import PlanningError

@@ -12,11 +12,9 @@ from scipy.interpolate import BSpline
 from threadpoolctl import ThreadpoolController
 
 from der_planner.limb import Limb
+from der_planner.model import NODES, STEPS, Initial, simulate
 from der_planner.model.commands import SlowVenting, slow_venting, within_limits
 from der_planner.model.commands import commands as commands_for
-from der_planner.model.drive import STEPS
-from der_planner.model.material import differential_pressure
-from der_planner.model.response import NODES, simulate
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import models
 from der_planner.planning.errors import PlanningError
@@ -159,10 +157,9 @@ def _solve(
     report: Callable[[float], None],
 ) -> _Solved:
     """Return commands that keep the limits, and what the model expects of them."""
-    air = physics.limb.pneumatics
     optimal = method == "optimal"
     time, effective, bend = balance(physics, spline, reference, "projected" if optimal else method)
-    wanted = commands_for(physics.limb, time, effective, bend, CONTROL_PERIOD)
+    wanted = commands_for(physics, time, effective, bend, CONTROL_PERIOD)
     if optimal:
         begin = physics.begin(spline, reference.start)
         solver = Optimiser(physics, begin, spline, reference, wanted, STEPS)
@@ -175,14 +172,14 @@ def _solve(
         details: dict[str, float] = {"steps": outcome.steps, "limited_windows": outcome.limited}
     else:
         before = None if reference.start is None else reference.start.pressure
-        commands, cut = within_limits(wanted, air, CONTROL_PERIOD, before)
+        commands, cut = within_limits(wanted, physics.air, CONTROL_PERIOD, before)
         tip = tip_under(physics, spline, commands, reference.start)
         said = (
             f"limits cut the wanted pressures by up to {cut:.0f} Pa" if cut > _NOTABLE_CUT else ""
         )
         details = {}
-    pressure = differential_pressure(physics.limb, time, effective, bend)
-    slow = slow_venting(air, time, pressure)
+    pressure = physics.material.differential_pressure(time, effective, bend)
+    slow = slow_venting(physics.air, time, pressure)
     warnings = _vent_warnings(slow, _mean_distance(tip, reference))
     if said and not (optimal and warnings):
         warnings.insert(0, f"{said}: {_excess(physics.limb, wanted)}")
@@ -234,8 +231,7 @@ def tip_under(
         np.arange(len(commands)) * CONTROL_PERIOD,
         commands=commands,
         bend=lambda time: sample_spline(spline, time)[0],
-        start=physics.begin(spline, start),
-        before=None if start is None else start.pressure,
+        initial=Initial(physics.begin(spline, start), None if start is None else start.pressure),
     )
     return response.tip[:-1]
 

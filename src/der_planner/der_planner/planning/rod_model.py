@@ -7,13 +7,11 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from der_planner.limb import Limb
-from der_planner.model.balance import Balance
-from der_planner.model.response import NODES, RodModel
+from der_planner.model import NODES, RodModel
 from der_planner.planning.inverse import (
     NEAREST_TOLERANCE,
     TOLERANCE,
     check_reach,
-    is_loaded,
     solve,
 )
 from der_planner.planning.loads.posed import REFERENCE_PRIOR, PosedMotion, posed_motion
@@ -42,9 +40,7 @@ class PlanningRod(RodModel):
 
     def __init__(self, limb: Limb, nodes: int = NODES) -> None:
         super().__init__(limb, nodes)
-        self._nodes = nodes
         self._posed: PosedMotion | None = None
-        self.balance = Balance(self.rod, self.kinematics)
 
     def configuration(self, reference: Reference) -> BSpline:
         """Return the rod's bend angles (M,) [rad] as a spline of time that follows r̄(t).
@@ -56,8 +52,8 @@ class PlanningRod(RodModel):
             OverloadError: gravity's load takes more than the pressure limit.
             BucklingError: the rod does not stay at a pose on the way.
         """
-        if is_loaded(self.limb):
-            self._posed = posed_motion(self, reference, self._nodes)
+        if self.is_loaded:
+            self._posed = posed_motion(self, reference, self.nodes)
             return self._posed.bend
         time, tip, guess = reference.time, reference.tip, reference.bend_angles
         if self.limb.segment_count == 1:

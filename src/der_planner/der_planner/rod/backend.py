@@ -1,93 +1,229 @@
-"""What the planar and the spatial backend take and return."""
+"""Arrays and compiled kernels of one rod: what rods in a plane and in space share.
+
+The kernels know some coordinates only (in a plane two a node), and with a ghost clamp one node
+more, before the others. A backend goes between their unknowns and the public layout q in R^(4N-1).
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from der_planner.rod import banded_kernel
 from der_planner.rod.mesh import Mesh
 from der_planner.rod.state import Array, RodState
-from der_planner.rod.step_kernel import Body, Record, Solver
+from der_planner.rod.step_kernel import Base, Body, Place, Record, Solver
 
 
-@dataclass(frozen=True)
-class Place:
-    """Where a run is, in the kernels' coordinates; the kernels move it on.
+class Piece(NamedTuple):
+    """What one call of a simulation kernel did."""
+
+    done: int  # index of the step that failed, or the number of all steps
+    iterations: int  # Newton iterations
+    update: float  # size of the last update [m]
+    failed_iterations: int  # of the solve that failed, 0 if none did
+    record: Record  # the linearisation; only the solves of the steps done are filled
+
+
+class StepKernels(NamedTuple):
+    """The compiled functions of one kind of rod: those of its module `step_kernel`."""
+
+    simulate: Callable[..., Any]
+    newton: Callable[..., Any]
+    linearise: Callable[..., Any]
+
+
+class Backend(ABC):
+    """What integration, linearisation and statics need of a rod; planar or spatial.
 
     Attributes:
-        x: (n,) positions and angles. v: (n,) their rate.
-        tangents: (edges, 3) and directors: (edges, 3) of the reference frames, twists: (nodes,);
-            empty for a planar rod.
+        mesh: the numbers of the rod.
+        index: indices into q of the coordinates that the kernels have.
+        offset: unknowns of the ghost node, before those of q.
+        size: n, unknowns of the kernels.
+        fixed: unknowns that do not move.
+        free: indices into q that move. free_rows: the same as unknowns.
+        mass: (n,). damping: (n,).
+        unknowns_per_node: 2 in a plane, 4 in space.
+        turning_edges: edges whose angle counts from a frame that turns; none in a plane.
+        lever: an angle counts times this as a length in a Newton update [m].
+        rod: the named tuple of numbers that the kernels take; a subclass fills it.
     """
 
-    x: Array
-    v: Array
-    tangents: Array
-    directors: Array
-    twists: Array
+    kernels: StepKernels
+    unknowns_per_node: int
+    turning_edges = 0
+    lever = 0.0
+    rod: Any
 
+    def __init__(self, mesh: Mesh, index: NDArray[np.int64]) -> None:
+        self.mesh = mesh
+        self.index = index
+        self.offset = self.unknowns_per_node * int(mesh.ghost)
+        self.size = len(index) + self.offset
+        clamped = set(mesh.clamped.tolist())
+        fixed = [k + self.offset for k, d in enumerate(index) if d in clamped]
+        self.fixed = np.array([*range(self.offset), *fixed], dtype=np.int64)
+        self.free = np.array([d for d in index if d not in clamped], dtype=np.int64)
+        self.free_rows = self.rows(self.free)
+        self.mass = self.rates(mesh.mass_diagonal)
+        self.damping = self.rates(mesh.damping_diagonal)
 
-@dataclass(frozen=True)
-class Piece:
-    """What one call of a simulation kernel did.
+    # ------------------------------------------------------- what a plane and space do differently
 
-    Attributes:
-        done: index of the step that failed, or the number of all steps.
-        iterations: Newton iterations. update: size of the last update [m].
-        failed_iterations: of the solve that failed, 0 if none did.
-        record: the linearisation; only the solves of the steps done are filled.
-    """
+    @abstractmethod
+    def work_space(self, base: Base) -> Any:
+        """Return new work arrays for kernels that start from these frames."""
 
-    done: int
-    iterations: int
-    update: float
-    failed_iterations: int
-    record: Record
+    @abstractmethod
+    def frames(self, state: RodState) -> Base:
+        """Return copies of the reference frames of a state, with the ghost edge's."""
 
+    @abstractmethod
+    def public_state(self, q: Array, v: Array, base: Base, like: RodState) -> RodState:
+        """Return the state at q, v with frames of the kernels, or as in `like` in a plane."""
 
-class Backend(Protocol):
-    """What integration, linearisation and statics need of a planar or a spatial rod."""
+    @abstractmethod
+    def carry_frames(self, base: RodState, q: Array, v: Array) -> RodState:
+        """Return a state at q whose frames are those of `base`, transported."""
 
-    mesh: Mesh
-    index: NDArray[np.int64]  # indices into q of the coordinates that the kernels have
-    offset: int  # kernel unknowns of the ghost node, before those of q
-    size: int  # n
-    fixed: NDArray[np.int64]  # kernel unknowns that do not move
-    free: NDArray[np.int64]  # indices into q that move
-    free_rows: NDArray[np.int64]  # the same as kernel unknowns
-    mass: Array  # (n,)
-    damping: Array  # (n,)
-    lever: float  # an angle counts times this as a length [m]
+    # ------------------------------------------------------------------------------ coordinates
+
+    def ghosted(self, values: Array, ghost: float = 0.0) -> Array:
+        """Return values of edges or nodes with one more for what the ghost clamp adds."""
+        added = np.full((int(self.mesh.ghost), *values.shape[1:]), ghost)
+        return np.concatenate([added, values])
+
+    def segment_edges(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the first and the last edge of each segment (M,), counted with the ghost's."""
+        pairs = np.array(self.mesh.segments, dtype=np.int64).reshape(-1, 2)
+        first = pairs[:, 0] + int(self.mesh.ghost)
+        return first, first + pairs[:, 1] - 2
+
+    def unknowns(self, q: Array) -> Array:
+        """Return the kernels' coordinates (n,) of q (4N-1,)."""
+        own: Array = q[self.index]
+        ghost = own[: self.offset].copy()
+        if self.offset:
+            ghost[0] -= self.mesh.rest[0]
+            ghost[3:] = 0.0
+        return np.concatenate([ghost, own])
+
+    def rates(self, v: Array) -> Array:
+        """Return a velocity or force (4N-1,) in the kernels' coordinates (n,)."""
+        return np.concatenate([np.zeros(self.offset), v[self.index]])
+
+    def rows(self, indices: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the unknowns at indices into q; -1 for what the kernels do not have."""
+        lookup = {int(d): k + self.offset for k, d in enumerate(self.index)}
+        return np.array([lookup.get(int(d), -1) for d in indices], dtype=np.int64)
+
+    def restore(self, x: Array, base: Array) -> Array:
+        """Return (…, 4N-1) from unknowns (…, n); what they lack is as in `base` (4N-1,)."""
+        result = np.broadcast_to(base, (*x.shape[:-1], base.shape[0])).copy()
+        result[..., self.index] = x[..., self.offset :]
+        return result
+
+    def full(self, values: Array) -> Array:
+        """Return (4N-1, …) from values of the unknowns (n, …), zero where there are none."""
+        result = np.zeros((4 * self.mesh.nodes - 1, *values.shape[1:]))
+        result[self.index] = values[self.offset :]
+        return result
+
+    def full_matrix(self, matrix: Array) -> Array:
+        """Return (4N-1, 4N-1) from a matrix (n, n) of the unknowns."""
+        return self.full(self.full(matrix).T).T
 
     def place(self, state: RodState) -> Place:
         """Return a state in the kernels' coordinates, free to be changed."""
-        ...
+        return Place(self.unknowns(state.q), self.rates(state.v), self.frames(state))
 
     def state(self, place: Place, like: RodState) -> RodState:
         """Return the public state at a place; what a plane does not have is as in `like`."""
-        ...
+        q, v = self.restore(place.x, like.q), self.restore(place.v, like.v)
+        return self.public_state(q, v, place.base, like)
 
-    def restore(self, x: Array, base: Array) -> Array:
-        """Return (…, 4N-1) from kernel coordinates (…, n); what they lack is as in `base`."""
-        ...
+    # ---------------------------------------------------------------------------------- kernels
 
-    def body(self, load: Array) -> Body:
-        """Return what moves under a load (4N-1,)."""
-        ...
+    def loaded(self, load: Array) -> Any:
+        """Return the numbers of the rod under a load (4N-1,) [N]."""
+        return self.rod._replace(body=self.rod.body._replace(load=self.rates(load)))
+
+    def body(self) -> Body:
+        """Return what moves, without a load."""
+        return Body(self.mass, self.damping, np.zeros(self.size), self.fixed)
 
     def new_record(self, solves: int) -> Record:
         """Return an unfilled record of so many solves."""
-        ...
+        band = (self.size, 5 * self.unknowns_per_node + 1)
+        edges = self.turning_edges
+        gauges = solves if edges else 0
+        drags = solves if edges or self.mesh.viscous.any() else 0
+        return Record(
+            factors=np.empty((solves, *band)),
+            back=np.empty((drags, *band)),
+            inputs=np.empty((solves, self.size, len(self.mesh.gain))),
+            gauge=np.empty((gauges, edges, 6)),
+        )
 
     def simulate(
         self, place: Place, motion: tuple[Array, Array], pressures: Array, begin: int,
         solver: Solver, load: Array, record: Record,
     ) -> Piece:  # fmt: skip
         """Run the kernel from step `begin` on; motion is where positions and velocities go."""
-        ...
+        space = self.work_space(place.base)
+        done, iterations, update, failed = self.kernels.simulate(
+            motion, place, pressures, begin, solver, record, space, self.loaded(load)
+        )
+        return Piece(done, iterations, update, failed, record)
+
+    def solve_static(
+        self, start: RodState, u: Array, load: Array, solver: Solver
+    ) -> tuple[RodState, int, float]:
+        """Solve the balance of forces from `start`; iterations are negative without convergence."""
+        x, base = self.unknowns(start.q), self.frames(start)
+        solver = solver._replace(lever=self.lever)
+        iterations, update = self.kernels.newton(
+            x, x.copy(), np.zeros(self.size), 0.0, u, solver, self.work_space(base),
+            self.loaded(load),
+        )  # fmt: skip
+        if iterations < 0:
+            return start, iterations, update
+        q = self.restore(x, start.q)
+        return self.public_state(q, 0.0 * q, base, start), iterations, update
+
+    def linearise_equilibrium(self, state: RodState, u: Array) -> Array:
+        """Return ∂q/∂u (4N-1, M) of a resting state."""
+        band, columns = self._static(state, u)
+        banded_kernel.factor_general(band)
+        banded_kernel.solve_columns(band, columns)
+        return self.full(columns)
+
+    def static_stiffness(self, state: RodState, u: Array) -> Array:
+        """Return −∂(F_int + B Λ u)/∂q (4N-1, 4N-1); rows of what is held are those of a unit."""
+        return self.full_matrix(general_band_to_dense(self._static(state, u)[0]))
+
+    def _static(self, state: RodState, u: Array) -> tuple[Array, Array]:
+        x, space = self.unknowns(state.q), self.work_space(self.frames(state))
+        columns = np.zeros((self.size, len(u)))
+        self.kernels.linearise(x, x, 0.0, u, columns, space, self.rod)
+        return space.a, columns
+
+    @abstractmethod
+    def energy(self, state: RodState) -> float:
+        """Return the elastic energy [J]."""
+
+    @abstractmethod
+    def gradient_and_hessian(self, state: RodState) -> tuple[Array, Array]:
+        """Return ∇E (4N-1,) and ∇²E (4N-1, 4N-1), frames re-based at the state."""
+
+    @abstractmethod
+    def input_matrix(self, state: RodState) -> Array:
+        """Return B(q)Λ (4N-1, M)."""
 
 
 def band_to_dense(band: Array) -> Array:

@@ -1,4 +1,8 @@
-"""Time integration: each method is a chain of backward Euler solves; a step may be cut."""
+"""Time integration and statics.
+
+Each method is a chain of backward Euler solves; a step that does not converge may be cut. A resting
+state is found by Newton's method, with load stepping where that fails.
+"""
 
 from __future__ import annotations
 
@@ -9,16 +13,17 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.rod.backend import Backend, Piece, Place
-from der_planner.rod.errors import ConvergenceError
-from der_planner.rod.linearisation import Solved
+from der_planner.rod.backend import Backend, Piece
 from der_planner.rod.mesh import require
-from der_planner.rod.state import Array, RodState
-from der_planner.rod.step_kernel import Record, Solver
+from der_planner.rod.state import Array, ConvergenceError, RodState
+from der_planner.rod.step_kernel import Place, Record, Solver
+from der_planner.rod.trajectory import Solved
 
 Method = Literal["sdirk2", "midpoint", "backward_euler"]
 
-_LIMIT = 30  # Newton iterations of a solve
+_LIMIT = 30  # most Newton iterations of a solve in time
+_STATIC_LIMIT = 40  # most Newton iterations of a solve at rest
+_SMALLEST_PART = 1.0 / 4096.0  # of a load that is raised in parts
 _GAMMA = 1.0 - math.sqrt(0.5)
 # fraction of the step that a solve goes over, and e of each solve: see step_kernel
 _STAGES = {
@@ -185,3 +190,44 @@ def _solved(journey: _Journey) -> Solved:
     return Solved(
         record, np.concatenate(journey.rates), np.concatenate(journey.extrapolates), steps
     )
+
+
+def find_equilibrium(backend: Backend, start: RodState, u: Array, load: Array) -> RodState:
+    """Return the resting state under u (M,) [Pa] and load (4N-1,) [N], going there from `start`.
+
+    Newton's method is tried on the whole load first. If it fails, the load is raised from zero in
+    parts that shrink where it fails and grow where it works.
+
+    Raises:
+        ConvergenceError: the parts became too small.
+    """
+    tolerance = 1e-11 * float(backend.mesh.rest.sum())
+    solver = Solver(
+        h=1.0, extrapolate=np.ones(1), tolerance=tolerance, lever=0.0, limit=_STATIC_LIMIT
+    )
+    state, iterations, update = backend.solve_static(start, u, load, solver)
+    if iterations > 0:
+        return state
+    state = RodState(start.q, 0.0 * start.v, start.directors, start.reference_twist)
+    reached, part, spent = 0.0, 0.125, -iterations
+    index = 0
+    while reached < 1.0:
+        target = min(1.0, reached + part)
+        guess = state
+        trial, iterations, update = backend.solve_static(guess, target * u, target * load, solver)
+        spent += abs(iterations)
+        if iterations > 0:
+            state = trial
+            reached = target
+            part *= 2.0 if iterations < 8 else 1.0
+            index += 1
+            continue
+        part *= 0.5
+        if part < _SMALLEST_PART:
+            raise ConvergenceError(
+                f"no equilibrium beyond {reached:.4f} of the load (load step {index}, {spent} "
+                f"Newton iterations, last update {update:.3g}): is it about to buckle or coil? "
+                "Start from a nearer state or simulate with damping",
+                step=index, residual=update, iterations=spent, state=state,
+            )  # fmt: skip
+    return state

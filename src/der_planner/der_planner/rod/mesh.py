@@ -185,51 +185,7 @@ def clamped_indices(clamp: str, fixed: Sequence[int], nodes: int) -> NDArray[np.
     return np.array(sorted({*held[clamp], *map(int, fixed)}), dtype=np.int64)
 
 
-def uniform_mesh(
-    *, length: float, nodes: int, EI: float, EA: float, GJ: float, mass_per_length: float,
-    damping: float, clamp: str, gravity: ArrayLike, segments: Sequence[tuple[int, int]],
-    moment_gain: ArrayLike, material_damping: float, rest_curvature: ArrayLike, rest_twist: float,
-    fixed: Sequence[int], masses: Sequence[tuple[float, float]],
-) -> Mesh:  # fmt: skip
-    """Return the mesh of `Rod.uniform`; see there for the arguments."""
-    require(
-        isinstance(nodes, (int, np.integer)) and nodes >= 3, "nodes", "an int of 3 or more", nodes
-    )
-    step = positive(length, "length") / (nodes - 1)
-    for value, name in ((EI, "EI"), (EA, "EA"), (GJ, "GJ"), (mass_per_length, "mass_per_length")):
-        positive(value, name)
-    pairs = check_segments(segments, nodes)
-    gain = array(moment_gain, (len(pairs),), "moment_gain")
-    ghost = clamp == "ghost"
-    cell = _cells(np.full(nodes - 1, step), ghost)
-    inverse = np.divide(1.0, cell, out=np.zeros(nodes), where=cell > 0)
-    curvature = array(rest_curvature, (2,), "rest_curvature")
-    edge_mass = np.full(nodes - 1, mass_per_length * step)
-    return Mesh(
-        rest=np.full(nodes - 1, step),
-        axial=np.full(nodes - 1, float(EA)),
-        edge_mass=edge_mass,
-        swung_mass=edge_mass,
-        edge_inertia=edge_mass * (2.0 * EI / EA),
-        edge_damping=np.full(nodes - 1, not_negative(damping, "damping")),
-        bend=EI * inverse,
-        twist=GJ * inverse,
-        cubic=np.zeros(nodes),
-        viscous=EI * not_negative(material_damping, "material_damping") * inverse,
-        rest_kappa=2.0 * np.tan(0.5 * np.outer(cell, curvature)),
-        rest_twist=float(rest_twist) * cell,
-        gravity=array(gravity, (3,), "gravity"),
-        ghost=ghost,
-        clamped=clamped_indices(clamp, fixed, nodes),
-        segments=pairs,
-        gain=np.array(
-            [g * (c - 1) / ((c - 2) * step) for g, (_, c) in zip(gain, pairs, strict=True)]
-        ),
-        point_mass=_on_nodes(masses, np.full(nodes - 1, step)),
-    )
-
-
-def _on_nodes(masses: Sequence[tuple[float, float]], rest: Array) -> Array:
+def masses_on_nodes(masses: Sequence[tuple[float, float]], rest: Array) -> Array:
     """Return the (N,) nodes' shares of masses (arc length from node 0 [m], mass [kg]).
 
     A mass between two nodes is split between them by the lever: its sum and its first moment stay.
@@ -247,7 +203,7 @@ def _on_nodes(masses: Sequence[tuple[float, float]], rest: Array) -> Array:
     return result
 
 
-def _cells(rest: Array, ghost: bool) -> Array:
+def voronoi_lengths(rest: Array, ghost: bool) -> Array:
     """Return the (N,) Voronoi lengths of the nodes that bend, 0 for those that do not."""
     cells = np.zeros(len(rest) + 1)
     cells[1:-1] = 0.5 * (rest[:-1] + rest[1:])
@@ -309,7 +265,7 @@ def limb_mesh(limb: Limb, nodes: int, clamp: str) -> Mesh:
         clamped=clamped_indices(clamp, (), nodes),
         segments=pairs,
         gain=gain,
-        point_mass=_on_nodes(
+        point_mass=masses_on_nodes(
             [(max(m.arc_length - limb.base_length, 0.0), m.mass) for m in limb.masses], rest
         ),
         base=limb.base_length,

@@ -9,15 +9,24 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from der_planner.limb import Limb
-from der_planner.rod.backend import Backend
-from der_planner.rod.integration import Integrator, Method
-from der_planner.rod.linearisation import linearisation_of, step_matrices
-from der_planner.rod.mesh import Mesh, array, by_step, limb_mesh, positive, require, uniform_mesh
+from der_planner.rod.integration import Integrator, Method, find_equilibrium
+from der_planner.rod.mesh import (
+    Mesh,
+    array,
+    by_step,
+    check_segments,
+    clamped_indices,
+    limb_mesh,
+    masses_on_nodes,
+    not_negative,
+    positive,
+    require,
+    voronoi_lengths,
+)
 from der_planner.rod.planar.backend import PlanarBackend
 from der_planner.rod.spatial.backend import SpatialBackend
 from der_planner.rod.state import Array, RodState, positions_of
-from der_planner.rod.statics import find_equilibrium
-from der_planner.rod.trajectory import Trajectory
+from der_planner.rod.trajectory import Trajectory, linearisation_of, step_matrices
 
 Plane = Literal["xy", "xz"]
 
@@ -106,12 +115,49 @@ class Rod:
         Raises:
             ValueError: a value is out of range; the message says what was expected and what came.
         """
-        mesh = uniform_mesh(
-            length=length, nodes=nodes, EI=EI, EA=EA, GJ=GJ, mass_per_length=mass_per_length,
-            damping=damping, clamp=clamp, gravity=gravity, segments=segments,
-            moment_gain=moment_gain, material_damping=material_damping,
-            rest_curvature=rest_curvature, rest_twist=rest_twist, fixed=fixed, masses=masses,
-        )  # fmt: skip
+        require(
+            isinstance(nodes, (int, np.integer)) and nodes >= 3,
+            "nodes",
+            "an int of 3 or more",
+            nodes,
+        )
+        step = positive(length, "length") / (nodes - 1)
+        for value, name in (
+            (EI, "EI"),
+            (EA, "EA"),
+            (GJ, "GJ"),
+            (mass_per_length, "mass_per_length"),
+        ):
+            positive(value, name)
+        pairs = check_segments(segments, nodes)
+        gain = array(moment_gain, (len(pairs),), "moment_gain")
+        ghost = clamp == "ghost"
+        cell = voronoi_lengths(np.full(nodes - 1, step), ghost)
+        inverse = np.divide(1.0, cell, out=np.zeros(nodes), where=cell > 0)
+        curvature = array(rest_curvature, (2,), "rest_curvature")
+        edge_mass = np.full(nodes - 1, mass_per_length * step)
+        mesh = Mesh(
+            rest=np.full(nodes - 1, step),
+            axial=np.full(nodes - 1, float(EA)),
+            edge_mass=edge_mass,
+            swung_mass=edge_mass,
+            edge_inertia=edge_mass * (2.0 * EI / EA),
+            edge_damping=np.full(nodes - 1, not_negative(damping, "damping")),
+            bend=EI * inverse,
+            twist=GJ * inverse,
+            cubic=np.zeros(nodes),
+            viscous=EI * not_negative(material_damping, "material_damping") * inverse,
+            rest_kappa=2.0 * np.tan(0.5 * np.outer(cell, curvature)),
+            rest_twist=float(rest_twist) * cell,
+            gravity=array(gravity, (3,), "gravity"),
+            ghost=ghost,
+            clamped=clamped_indices(clamp, fixed, nodes),
+            segments=pairs,
+            gain=np.array(
+                [g * (c - 1) / ((c - 2) * step) for g, (_, c) in zip(gain, pairs, strict=True)]
+            ),
+            point_mass=masses_on_nodes(masses, np.full(nodes - 1, step)),
+        )
         return cls(mesh, plane)
 
     @classmethod
@@ -343,11 +389,6 @@ class Rod:
 
     def _as_state(self, state: RodState | ArrayLike) -> RodState:
         return state if isinstance(state, RodState) else self.state(state)
-
-    @property
-    def backend(self) -> Backend:
-        """What holds the kernels' arrays: `simulate_many` stacks those of many rods."""
-        return self._backend
 
     def output_indices(self, outputs: Sequence[int] | None) -> NDArray[np.int64]:
         """Return the indices into q (P,) of outputs; of the tip's free coordinates for None.

@@ -24,7 +24,7 @@ from der_planner.rod.state import Array
 from der_planner.rod.step_kernel import Record
 
 
-class Chain(NamedTuple):
+class SolveChain(NamedTuple):
     """The solves of a simulation in their order, and what of them is an output."""
 
     record: Record
@@ -37,7 +37,7 @@ class Chain(NamedTuple):
 
 
 @kernel
-def advance(solve: int, dq: Array, dv: Array, y: Array, before: Array, chain: Chain) -> None:
+def advance(solve: int, dq: Array, dv: Array, y: Array, before: Array, chain: SolveChain) -> None:
     """Advance the columns dq, dv (n, C) by one solve, given B δu in y (n, C).
 
     before (n, C) is work space, used in space.
@@ -82,7 +82,7 @@ def put_outputs(dq: Array, outputs: Array, out: Array) -> None:
 
 
 @kernel
-def ends_interval(solve: int, steps: int, chain: Chain) -> bool:
+def ends_interval(solve: int, steps: int, chain: SolveChain) -> bool:
     """Return whether this is the last solve of an interval of so many steps."""
     if solve + 1 == chain.steps.shape[0]:
         return True
@@ -90,7 +90,7 @@ def ends_interval(solve: int, steps: int, chain: Chain) -> bool:
 
 
 @allocating_kernel
-def tangent(change: Array, start: Array, chain: Chain, out: Array) -> None:
+def tangent(change: Array, start: Array, chain: SolveChain, out: Array) -> None:
     """Fill out (K+1, P) with the change of the outputs for a change (K, S, M) of the inputs.
 
     start (2, n) is the change of the initial q and v.
@@ -115,7 +115,7 @@ def tangent(change: Array, start: Array, chain: Chain, out: Array) -> None:
 
 
 @allocating_kernel
-def adjoint(weight: Array, chain: Chain, gradient: Array, start: Array) -> None:
+def adjoint(weight: Array, chain: SolveChain, gradient: Array, start: Array) -> None:
     """Fill gradient (K, S, M) and start (2, n): `tangent` transposed, times weight (K+1, P)."""
     _, steps, count = gradient.shape
     record = chain.record
@@ -170,7 +170,7 @@ def gauge_transposed(gauge: Array, lq: Array, before: Array) -> None:
 
 @allocating_kernel
 def sensitivity(
-    pulse: Array, intervals: int, steps: int, chunk: int, chain: Chain, out: Array
+    pulse: Array, intervals: int, steps: int, chunk: int, chain: SolveChain, out: Array
 ) -> None:
     """Fill out (K+1, P, K, M): each output's change by a unit pulse of each input.
 

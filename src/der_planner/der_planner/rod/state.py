@@ -1,4 +1,4 @@
-"""The state of a rod."""
+"""The state of a rod, and what is raised when the next one cannot be found."""
 
 from __future__ import annotations
 
@@ -44,3 +44,23 @@ def positions_of(q: Array) -> Array:
     padded = np.concatenate([q, np.zeros((*q.shape[:-1], 1))], axis=-1)
     nodes = padded.shape[-1] // 4
     return padded.reshape(*q.shape[:-1], nodes, 4)[..., :3].copy()
+
+
+class ConvergenceError(RuntimeError):
+    """Newton's iteration did not converge; nothing wrong was returned.
+
+    Attributes:
+        step: index of the time step (or load step) that failed, 0 for a single step.
+        residual: largest component of the last Newton update [m or rad].
+        iterations: Newton iterations spent in the failed step.
+        state: the last converged state, from which a caller may go on with a shorter step.
+    """
+
+    def __init__(
+        self, message: str, *, step: int, residual: float, iterations: int, state: RodState
+    ) -> None:
+        super().__init__(message)
+        self.step = step
+        self.residual = residual
+        self.iterations = iterations
+        self.state = state

@@ -30,6 +30,22 @@ class Body(NamedTuple):
     fixed: NDArray[np.int64]  # indices of the unknowns that do not move
 
 
+class Base(NamedTuple):
+    """The reference frames of the state from which a step begins; empty for a planar rod."""
+
+    tangents: Array  # (n-1, 3) t̂
+    directors: Array  # (n-1, 3) d̂
+    twists: Array  # (n,) reference twist [rad]
+
+
+class Place(NamedTuple):
+    """Where a run is, in the kernels' coordinates; the kernels move it on."""
+
+    x: Array  # (unknowns,) positions [m] and angles [rad]
+    v: Array  # (unknowns,) their rate
+    base: Base
+
+
 class Solver(NamedTuple):
     """How a step is solved."""
 
@@ -57,7 +73,7 @@ class Record(NamedTuple):
 @kernel
 def predict(
     x: Array, x_n: Array, v_n: Array, acceleration: Array, h: float, fixed: Array, far: float,
-    angles: bool,
+    angles: bool
 ) -> None:  # fmt: skip
     """Fill x with a guess of the solution: the last acceleration goes on, unless it leads far.
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 from collections.abc import Iterator
 
 from distributed import Client, LocalCluster
 from distributed.comm import CommClosedError
 
-from der_planner.rod.many import cores
 from der_planner.studies import identity, work
 from der_planner.studies.errors import StudyError
 
@@ -39,7 +39,7 @@ def local(workers: int | None) -> Iterator[Client]:
     logging.getLogger("distributed").setLevel(logging.ERROR)
     try:
         cluster = LocalCluster(
-            n_workers=workers or cores(),
+            n_workers=workers or len(os.sched_getaffinity(0)),
             threads_per_worker=1,
             processes=True,
             host="127.0.0.1",

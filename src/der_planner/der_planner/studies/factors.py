@@ -14,9 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from der_planner.limb import MOUNTINGS, LimbError, gravity_of
-from der_planner.limb_declaration import parameters
-from der_planner.limb_parameters import Pneumatics, Segment
+from der_planner.limb import MOUNTINGS, LimbError, Pneumatics, Segment, declarations, gravity_of
 from der_planner.planning import METHODS
 from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD, NAMES
 from der_planner.studies.errors import StudyError
@@ -154,7 +152,7 @@ def limb_parameters() -> dict[str, tuple[str, str]]:
     return {
         name: (part, declared.text)
         for part, kind in (("segments", Segment), ("pneumatics", Pneumatics))
-        for name, declared in parameters(kind).items()
+        for name, declared in declarations(kind).items()
         if name not in _NOT_VARIED
     }
 

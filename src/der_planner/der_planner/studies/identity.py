@@ -18,7 +18,7 @@ from pathlib import Path
 import der_planner
 import pressure_driver
 
-_LIMB = ("limb*.py", "rod", "pcc", "model")
+_LIMB = ("limb", "rod", "pcc", "model")
 CALIBRATION = (*_LIMB, "identification", "twin")
 """Parts of der_planner on which a calibrated twin depends."""
 EVERYTHING = (*CALIBRATION, "planning", "control", "runs", "studies/tasks.py", "studies/twins.py")

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from der_planner.runs.evaluation.html import document, figure, table
+from der_planner.results.html import document, figure, table
 from der_planner.studies import identity
 from der_planner.studies.errors import StudyError
 from der_planner.studies.figures import draw, quantity

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.limb import Limb, Segment
-from der_planner.model.response import simulate_many
+from der_planner.model import simulate
 from der_planner.planning import Motion, Plan, plan
 from der_planner.studies import twins
 from der_planner.studies.factors import (
@@ -223,9 +223,10 @@ def _one(found: list[Result] | Exception) -> Result | Exception:
 
 def _simulated(limb: str, motion: str, rows: Sequence[Mapping[str, Any]]) -> list[Result]:
     planned = _plan_once(limb, motion)
-    true = [loaded(with_errors(limb_of(limb), row), row) for row in rows]
-    response = simulate_many(true, planned.time, commands=planned.differential_pressure)
-    return [_errors(planned, tip[:-1]) for tip in response.tip]
+    true = (loaded(with_errors(limb_of(limb), row), row) for row in rows)
+    commands = planned.differential_pressure
+    tips = [simulate(each, planned.time, commands=commands).tip for each in true]
+    return [_errors(planned, tip[:-1]) for tip in tips]
 
 
 @lru_cache(maxsize=8)

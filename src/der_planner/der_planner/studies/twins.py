@@ -24,7 +24,7 @@ class Twin:
         seed: of the hardware.
         calibration: "quick" (90 s) or "long" (200 s).
         noise: of tags and board, as a multiple of the usual one.
-        mounting: see `der_planner.limb_loads`.
+        mounting: see `der_planner.limb.loads`.
     """
 
     seed: int

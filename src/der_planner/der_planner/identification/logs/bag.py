@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from der_planner.bags.reader import BagError
+from der_planner.bags.record import PRESSURE_TYPE, STATE_TYPE, BagRecord, LimbRecord, read_record
+from der_planner.bags.run import Stream
+from der_planner.bags.series import stream
 from der_planner.identification.logs.log import CalibrationLog, LogError
 from der_planner.model.series import CONTROL_PERIOD, interpolate
-from der_planner.runs.record import PRESSURE_TYPE, STATE_TYPE, BagRecord, LimbRecord, read_record
-from der_planner.runs.recording.reader import BagError
-from der_planner.runs.run import Stream
-from der_planner.runs.series import stream
 
 Array = NDArray[np.float64]
 

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline, make_interp_spline
 
 from der_planner.limb import Limb
+from der_planner.model import RodModel
 from der_planner.model.bending import bend_angles
-from der_planner.model.held import Holder, Poses
-from der_planner.model.material import differential_pressure
-from der_planner.model.response import RodModel
+from der_planner.model.material import Material
+from der_planner.model.poses import PoseFinder, Poses
 from der_planner.planning.errors import (
     BucklingError,
     OverloadError,
@@ -208,7 +208,7 @@ def _through(time: Array, values: Array, start: Start | None) -> BSpline:
 
 
 def _poses(model: RodModel, time: Array, tip: Array, guess: Array) -> Poses:
-    holder = Holder(model.rod, model.limb.static_gain, REFERENCE_PRIOR)
+    holder = PoseFinder(model, REFERENCE_PRIOR)
     try:
         poses = holder.along(stable_rest(model), tip, guess)
     except ConvergenceError as error:
@@ -224,6 +224,6 @@ def _poses(model: RodModel, time: Array, tip: Array, guess: Array) -> Poses:
 def _needed(limb: Limb, time: Array, poses: Poses) -> Array:
     """Return the differential pressures (K, M) [Pa] that hold poses."""
     try:
-        return differential_pressure(limb, time, poses.pressures, poses.bend_angles)
+        return Material(limb).differential_pressure(time, poses.pressures, poses.bend_angles)
     except ValueError as error:
         raise PlanningError(str(error)) from error

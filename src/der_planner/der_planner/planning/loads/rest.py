@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.limb import Limb
-from der_planner.model.bending import ArcKinematics, bend_angles
-from der_planner.model.response import RodModel
+from der_planner.model import ArcModel, RodModel
+from der_planner.model.bending import bend_angles
 from der_planner.planning.errors import BucklingError
 from der_planner.planning.inverse import solve
 from der_planner.rod import ConvergenceError, Rod, RodState
@@ -57,7 +57,7 @@ def rest_of(limb: Limb) -> Rest:
     model = RodModel(limb)
     state = stable_rest(model)
     near = bend_angles(model.rod, state.q[None])
-    arcs = ArcKinematics(limb)
+    arcs = ArcModel(limb)
     angles = solve(arcs, state.q[None, -3:-1], near)[0][0]
     if np.abs(angles).max() < _STRAIGHT:
         angles = np.zeros_like(angles)

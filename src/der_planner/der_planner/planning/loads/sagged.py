@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
 from der_planner.limb import Limb
+from der_planner.model import RodModel
 from der_planner.model.bending import bend_angles
-from der_planner.model.held import Holder
-from der_planner.model.response import RodModel
+from der_planner.model.poses import PoseFinder
 from der_planner.model.series import interpolate
 from der_planner.planning.errors import BucklingError
 from der_planner.planning.loads.rest import stable_rest
@@ -46,7 +46,7 @@ def sagged_tips(limb: Limb, time: Array, angles: Array, rest: Array) -> Array:
     count = max(8, math.ceil((time[-1] - time[0]) / _STEP) + 1)
     instants = np.linspace(time[0], time[-1], count)
     wanted = interpolate(instants, time, angles) + (home - rest)
-    holder = Holder(model.rod, limb.static_gain, prior=1.0, tip_weight=0.0)
+    holder = PoseFinder(model, prior=1.0, tip_weight=0.0)
     try:
         poses = holder.along(state, np.tile(state.q[-3:-1], (count, 1)), wanted)
     except ConvergenceError as error:

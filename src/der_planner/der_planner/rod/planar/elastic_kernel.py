@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from der_planner.rod.compile import inlined_kernel, kernel
 from der_planner.rod.state import Array
+from der_planner.rod.step_kernel import Body
 
 
 class PlanarRod(NamedTuple):
@@ -29,6 +30,7 @@ class PlanarRod(NamedTuple):
     first: NDArray[np.int64]  # (M,) first edge of each segment
     last: NDArray[np.int64]  # (M,) last edge of each segment
     gain: Array  # (M,) Λ [N/Pa]
+    body: Body
 
 
 class PlanarSpace(NamedTuple):
@@ -50,11 +52,7 @@ class PlanarSpace(NamedTuple):
 
 
 @kernel
-def edges_and_turns(
-    x: Array,
-    edge: Array,
-    turn: Array,
-) -> None:
+def edges_and_turns(x: Array, edge: Array, turn: Array) -> None:
     """Fill edge (n-1, 3) with t and 1/|e|, turn (n,) with κ at the interior nodes."""
     n = turn.shape[0]
     for j in range(n - 1):
@@ -233,11 +231,7 @@ def assemble(
 
 
 @kernel
-def turning_rate(
-    v: Array,
-    edge: Array,
-    i: int,
-) -> float:
+def turning_rate(v: Array, edge: Array, i: int) -> float:
     """Return dθ/dt at node i for node velocities v."""
     total = 0.0
     for side in range(2):
@@ -250,13 +244,7 @@ def turning_rate(
 
 
 @kernel
-def unsymmetric(
-    v: Array,
-    rate: float,
-    u: Array,
-    space: PlanarSpace,
-    rod: PlanarRod,
-) -> None:
+def unsymmetric(v: Array, rate: float, u: Array, space: PlanarSpace, rod: PlanarRod) -> None:
     """Complete space.a to the exact derivative; fill space.drag with c κ'² ∇θ ∇θᵀ times rate.
 
     Missing in `assemble` are −(Λu/|e|) n̂ tᵀ of a couple that keeps its force while its edge

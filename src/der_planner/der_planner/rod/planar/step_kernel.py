@@ -24,7 +24,7 @@ from der_planner.rod.planar.elastic_kernel import (
 )
 from der_planner.rod.state import Array
 from der_planner.rod.step_kernel import (
-    Body,
+    Place,
     Record,
     Solver,
     add_inertia,
@@ -36,7 +36,7 @@ from der_planner.rod.step_kernel import (
 @kernel
 def newton(
     x: Array, x_n: Array, v_n: Array, rate: float, u: Array, solver: Solver,
-    space: PlanarSpace, body: Body, rod: PlanarRod,
+    space: PlanarSpace, rod: PlanarRod
 ) -> tuple[int, float]:  # fmt: skip
     """Solve M rate ((x − x_n) rate − v_n) + D rate (x − x_n) = F(x) for x, from the guess in x.
 
@@ -44,7 +44,7 @@ def newton(
     without convergence.
     """
     residual, v, s, a = space.residual, space.v, space.s, space.a
-    fixed, limit = body.fixed, solver.limit
+    body, fixed, limit = rod.body, rod.body.fixed, solver.limit
     size = x.shape[0]
     largest, careful = 2.0 * smallest(rod.rest), 0.1 * smallest(rod.rest)
     update = np.inf
@@ -81,19 +81,21 @@ def newton(
 
 @kernel
 def simulate(
-    q: Array, v: Array, x_n: Array, v_n: Array, pressures: Array, begin: int, solver: Solver,
-    record: Record, space: PlanarSpace, body: Body, rod: PlanarRod,
+    motion: tuple[Array, Array], place: Place, pressures: Array, begin: int, solver: Solver,
+    record: Record, space: PlanarSpace, rod: PlanarRod
 ) -> tuple[int, int, float, int]:  # fmt: skip
     """Run K intervals of S steps under pressures (K, S, M) from step `begin` on.
 
-    x_n, v_n (2n,) hold the state before that step, and in the end the state after the last step or
-    before the one that failed. q, v (K+1, 2n) receive the state after each interval, the record
-    the linearisation of the solves unless it is empty.
+    `place` holds the state before that step, and in the end the state after the last step or
+    before the one that failed. `motion`, q and v (K+1, 2n), receives the state after each interval,
+    the record the linearisation of the solves unless it is empty.
 
     Returns (index of the failed step or K·S, Newton iterations, last update, iterations of the
     failed solve or 0).
     """
     intervals, steps, _ = pressures.shape
+    q, v = motion
+    x_n, v_n = place.x, place.v
     x, acceleration = space.x, space.acceleration
     acceleration[:] = 0.0
     stages = solver.extrapolate.shape[0]
@@ -105,13 +107,13 @@ def simulate(
         put(x_n, space.x_start)
         put(v_n, space.v_start)
         for stage in range(stages):
-            predict(x, x_n, v_n, acceleration, solver.h, body.fixed, far, False)
+            predict(x, x_n, v_n, acceleration, solver.h, rod.body.fixed, far, False)
             iterations = -1
             update = np.inf
             for attempt in range(2):
                 if attempt == 1:  # the guess may have been at fault: once more from rest
                     put(x_n, x)
-                iterations, update = newton(x, x_n, v_n, rate, u, solver, space, body, rod)
+                iterations, update = newton(x, x_n, v_n, rate, u, solver, space, rod)
                 if iterations > 0:
                     break
             if iterations < 0:
@@ -121,7 +123,7 @@ def simulate(
             total += iterations
             if record.factors.shape[0] > 0:
                 slot = (index - begin) * stages + stage
-                keep(slot, x, x_n, rate, u, record, space, body, rod)
+                keep(slot, x, x_n, rate, u, record, space, rod)
             go_on(x, x_n, v_n, acceleration, rate, solver.extrapolate[stage])
         if step == steps - 1:
             put(x_n, q[k + 1])
@@ -132,10 +134,10 @@ def simulate(
 @kernel
 def keep(
     slot: int, x: Array, x_n: Array, rate: float, u: Array, record: Record,
-    space: PlanarSpace, body: Body, rod: PlanarRod,
+    space: PlanarSpace, rod: PlanarRod
 ) -> None:  # fmt: skip
     """Write the exact linearisation of the solve that led from x_n to x into the record."""
-    linearise(x, x_n, rate, u, record.inputs[slot], space, body, rod)
+    linearise(x, x_n, rate, u, record.inputs[slot], space, rod)
     factor_general(space.a)
     for d in range(x.shape[0]):
         put(space.a[d], record.factors[slot, d])
@@ -146,14 +148,14 @@ def keep(
 
 @kernel
 def linearise(
-    x: Array, x_n: Array, rate: float, u: Array, columns: Array, space: PlanarSpace, body: Body,
-    rod: PlanarRod,
+    x: Array, x_n: Array, rate: float, u: Array, columns: Array, space: PlanarSpace,
+    rod: PlanarRod
 ) -> None:  # fmt: skip
     """Fill space.a with the exact derivative J of a solve's residual at x, columns with B(q)Λ.
 
     space.drag receives the part by −x_n that is not inertia. Fixed unknowns have unit rows in J.
     """
-    v, s, fixed = space.v, space.s, body.fixed
+    v, s, body, fixed = space.v, space.s, rod.body, rod.body.fixed
     for k in range(x.shape[0]):
         v[k] = (x[k] - x_n[k]) * rate
     assemble(x, v, rate, u, rate < 0.0, space.residual, space, rod)

@@ -148,13 +148,7 @@ def unsymmetric(u: Array, space: SpatialSpace, rod: SpatialRod) -> None:
 
 
 @kernel
-def add_to_edge(
-    j: int,
-    r: int,
-    c: int,
-    value: float,
-    a: Array,
-) -> None:
+def add_to_edge(j: int, r: int, c: int, value: float, a: Array) -> None:
     """Add ∂(force by edge j)_r/∂(edge j)_c to the general band a of the nodes."""
     row, column = 4 * j + r, 4 * j + c
     a[row, 10 + column - row] += value

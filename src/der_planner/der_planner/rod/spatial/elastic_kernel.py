@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from der_planner.rod.compile import kernel
 from der_planner.rod.state import Array
+from der_planner.rod.step_kernel import Base, Body
 
 
 class SpatialRod(NamedTuple):
@@ -35,19 +36,13 @@ class SpatialRod(NamedTuple):
     first: NDArray[np.int64]  # (M,) first edge of each segment
     last: NDArray[np.int64]  # (M,) last edge of each segment
     gain: Array  # (M,) Λ [N/Pa]
-
-
-class Base(NamedTuple):
-    """The reference frames of the state from which a step begins."""
-
-    tangents: Array  # (n-1, 3) t̂
-    directors: Array  # (n-1, 3) d̂
-    twists: Array  # (n,) reference twist [rad]
+    body: Body
 
 
 class SpatialSpace(NamedTuple):
-    """Where the kernels work; nothing in here outlives a call."""
+    """Where the kernels work; but for `base` nothing in here outlives a call."""
 
+    base: Base  # the frames that the angles count from
     x: Array  # (4n-1,) the solution sought
     v: Array  # (4n-1,) its velocity
     acceleration: Array  # (4n-1,) of the last solve
@@ -57,7 +52,8 @@ class SpatialSpace(NamedTuple):
     base_start: Array  # (n, 7) frames there
     s: Array  # (4n-1, 11) symmetric derivative of the residual, by columns
     a: Array  # (4n-1, 21) exact derivative, by rows
-    drag: Array  # (4n-1, 21) viscous matrix times rate, by rows
+    drag: Array  # (4n-1, 21) derivative by −x_n without inertia, by rows
+    turning: Array  # (4n-1, 21) the part of it by the turning of the frames
     frame: Array  # (n-1, 13) t, 1/|e|, m1, m2, d1 of each edge
     twists: Array  # (n,) reference twists [rad]
     own: Array  # (n-1, 4, 5) Hessian by each edge's (e, φ), gradient in the last column
@@ -71,11 +67,7 @@ T, D1 = 0, 10
 
 
 @kernel
-def frames(
-    x: Array,
-    base: Base,
-    frame: Array,
-) -> None:
+def frames(x: Array, base: Base, frame: Array) -> None:
     """Fill frame (n-1, 13): t, 1/|e|, m1, m2 and the transported director of each edge."""
     base_tangent, base_director = base.tangents, base.directors
     for j in range(frame.shape[0]):
@@ -110,11 +102,7 @@ def frames(
 
 
 @kernel
-def reference_twists(
-    frame: Array,
-    before: Array,
-    twists: Array,
-) -> None:
+def reference_twists(frame: Array, before: Array, twists: Array) -> None:
     """Fill twists (n,): angle from P(t_e→t_f) d1_e to d1_f about t_f, the one near `before`."""
     for i in range(1, frame.shape[0]):
         ex, ey, ez = frame[i - 1, 0], frame[i - 1, 1], frame[i - 1, 2]
@@ -137,12 +125,7 @@ def reference_twists(
 
 @kernel
 def node_strains(
-    i: int,
-    frame: Array,
-    twists: Array,
-    x: Array,
-    strain: Array,
-    gradient: Array,
+    i: int, frame: Array, twists: Array, x: Array, strain: Array, gradient: Array
 ) -> None:
     """Fill strain (8,): κ1, κ2, τ, χ, κb and gradient (3, 8) of κ1, κ2, τ by (e, φe, f, φf)."""
     ex, ey, ez, le = frame[i - 1, 0], frame[i - 1, 1], frame[i - 1, 2], frame[i - 1, 3]
@@ -191,14 +174,7 @@ def node_strains(
 
 @kernel
 def add_curvature_hessian(
-    i: int,
-    c1: float,
-    c2: float,
-    c3: float,
-    frame: Array,
-    strain: Array,
-    vectors: Array,
-    h: Array,
+    i: int, c1: float, c2: float, c3: float, frame: Array, strain: Array, vectors: Array, h: Array
 ) -> None:
     """Add c1 ∇²κ1 + c2 ∇²κ2 + c3 ∇²τ, symmetric, to h (8, 8), whose lower triangle is filled.
 

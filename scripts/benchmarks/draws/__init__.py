@@ -1,1 +1,0 @@
-"""Limbs with numbers drawn at random: does a calibration, learning or feedback fail on any?"""

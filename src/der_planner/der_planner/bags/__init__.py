@@ -1,0 +1,1 @@
+"""Bags: written by the recorder, read, recovered, replayed, and turned into arrays."""

@@ -1,0 +1,219 @@
+"""Read bags without ROS: MCAP or sqlite3, ours or rosbag2's, finished or killed.
+
+Definitions come from the bag itself, so a bag of other machines and other versions of the messages
+reads the same. Only the topics that are asked for are touched.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from mcap.reader import make_reader
+from rosbags.interfaces import MessageDefinitionFormat
+from rosbags.rosbag2 import Reader
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+from der_planner.bags.recover import RecoverError, recover_bag
+from der_planner.bags.topics import DefinitionError, find_definition
+from der_planner.bags.writer import RUN_KEY
+
+
+class BagError(ValueError):
+    """A path is no readable bag; the message says what is wrong and what helps."""
+
+
+@dataclass(frozen=True)
+class RecordedTopic:
+    """One topic of a bag.
+
+    Attributes:
+        name: as recorded.
+        type_name: ``package/msg/Name``.
+        message_count: in the whole bag.
+        reliable: every publisher was; true where the bag does not say.
+        latched: every publisher kept its last messages for late subscribers.
+    """
+
+    name: str
+    type_name: str
+    message_count: int
+    reliable: bool = True
+    latched: bool = False
+
+
+@dataclass(frozen=True)
+class RawMessage:
+    """One message as recorded: log time in ns, serialized CDR."""
+
+    topic: str
+    type_name: str
+    log_time: int
+    data: bytes
+
+
+class BagReader:
+    """An open bag; a context manager.
+
+    Args:
+        path: a bag folder, or one ``.mcap`` or ``.db3`` file.
+
+    Attributes:
+        unfinished: its recorder was killed, or it is damaged: what is whole of it is read, from a
+            recovered copy in the temporary folder.
+
+    Raises:
+        BagError: nothing readable is there.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._stack = contextlib.ExitStack()
+        self.unfinished = False
+        if not self.path.exists():
+            raise BagError(f"no bag at {self.path}")
+        try:
+            self._reader = self._open()
+        except (RecoverError, OSError) as error:
+            self._stack.close()
+            raise BagError(f"cannot read the bag {self.path}: {error}") from error
+        self._store = get_typestore(Stores.EMPTY)
+        for connection in self._reader.connections:
+            self._register(connection)
+
+    def __enter__(self) -> BagReader:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stack.close()
+
+    def _open(self) -> Reader:
+        try:
+            return self._stack.enter_context(Reader(self.path))
+        except Exception as error:  # rosbags raises many kinds for what is not whole
+            if self.path.suffix == ".db3":
+                raise RecoverError(str(error)) from error
+        self.unfinished = True
+        folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="bag_")))
+        recovered = recover_bag(self.path, folder / self.path.stem).folder
+        return self._stack.enter_context(Reader(recovered))
+
+    def _register(self, connection: Any) -> None:
+        name, definition = connection.msgtype, connection.msgdef
+        if name in self._store.types:
+            return
+        if definition.format == MessageDefinitionFormat.IDL:
+            types = get_types_from_idl(definition.data)
+        elif definition.format == MessageDefinitionFormat.MSG:
+            types = get_types_from_msg(definition.data, name)
+        else:
+            # Sqlite3 bags of old carry no definitions: take those of this machine, if it has them.
+            try:
+                types = get_types_from_msg(find_definition(name).text, name)
+            except DefinitionError:
+                return
+        self._store.register({k: v for k, v in types.items() if k not in self._store.types})
+
+    @property
+    def topics(self) -> dict[str, RecordedTopic]:
+        """The bag's topics by name."""
+        found: dict[str, RecordedTopic] = {}
+        for connection in self._reader.connections:
+            name, count = connection.topic, connection.msgcount
+            if name in found:
+                count += found[name].message_count
+            profiles = getattr(connection.ext, "offered_qos_profiles", [])
+            found[name] = RecordedTopic(
+                name,
+                connection.msgtype,
+                count,
+                reliable=all(p.reliability.name != "BEST_EFFORT" for p in profiles),
+                latched=bool(profiles)
+                and all(p.durability.name == "TRANSIENT_LOCAL" for p in profiles),
+            )
+        return found
+
+    @property
+    def start(self) -> int:
+        """Log time of the first message [ns]."""
+        return int(self._reader.start_time)
+
+    @property
+    def end(self) -> int:
+        """Log time of the last message [ns]."""
+        return int(self._reader.end_time - 1)
+
+    def run(self) -> dict[str, Any]:
+        """Return what the recorder was told of the run; empty for bags of other recorders."""
+        custom = self._reader.storage.metadata.custom or {}
+        path = Path(self._reader.path)
+        if RUN_KEY not in custom and path.suffix == ".mcap":
+            with path.open("rb") as file:
+                for record in make_reader(file).iter_metadata():
+                    if record.name == RUN_KEY:
+                        custom = record.metadata
+        return parse_run(custom)
+
+    def raw(
+        self,
+        topics: Sequence[str] | None = None,
+        start: int | None = None,
+        stop: int | None = None,
+    ) -> Iterator[RawMessage]:
+        """Yield messages in the order of their log times, file after file.
+
+        Args:
+            topics: names; every topic if None.
+            start: first log time [ns].
+            stop: log time before which to stop [ns].
+        """
+        wanted = [c for c in self._reader.connections if topics is None or c.topic in topics]
+        if wanted:
+            for connection, log_time, data in self._reader.messages(wanted, start, stop):
+                yield RawMessage(connection.topic, connection.msgtype, log_time, bytes(data))
+
+    def messages(
+        self,
+        topics: Sequence[str] | None = None,
+        start: int | None = None,
+        stop: int | None = None,
+    ) -> Iterator[tuple[str, int, Any]]:
+        """Yield (topic, log time [ns], message) with arrays as numpy arrays; as `raw` otherwise."""
+        for message in self.raw(topics, start, stop):
+            yield message.topic, message.log_time, self._deserialize(message)
+
+    def _deserialize(self, message: RawMessage) -> Any:
+        try:
+            return self._store.deserialize_cdr(message.data, message.type_name)
+        except SerdeError:
+            # rclpy's serialize_message reserves space for the alignment of empty sequences and
+            # leaves it behind the content: more bytes than needed are no damage, fewer are.
+            definition = self._store.get_msgdef(message.type_name)
+            little = bool(message.data[1])
+            read = definition.deserialize_cdr_le if little else definition.deserialize_cdr_be
+            body = message.data[4:]
+            content, used = read(body, 0, definition.cls, self._store)
+            if used > len(body):
+                raise
+            return content
+
+
+def parse_run(custom_data: dict[str, str]) -> dict[str, Any]:
+    """Return the run's description (the recorder's parameter ``metadata``); empty if none."""
+    try:
+        value = json.loads(custom_data.get(RUN_KEY, "") or "{}")
+    except (json.JSONDecodeError, TypeError):  # no JSON, or no text at all
+        return {}
+    return value if isinstance(value, dict) else {}

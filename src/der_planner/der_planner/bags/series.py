@@ -1,0 +1,265 @@
+"""The only way from a bag to arrays: one limb's run, times counted from its first setpoint.
+
+`record` reads the bag; here one plan of one limb is chosen from it, and what was recorded while
+that plan was played becomes a `RunSeries`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from der_planner.bags.columns import Columns
+from der_planner.bags.corrections import Revisions, described, latencies
+from der_planner.bags.record import (
+    NANOSECONDS,
+    PLAN_TYPE,
+    BagRecord,
+    LimbRecord,
+    planned_commands,
+    read_record,
+)
+from der_planner.bags.run import (
+    Array,
+    BoardLog,
+    Description,
+    EvaluationError,
+    RunSeries,
+    Stream,
+    method_name,
+)
+
+
+def load_run(
+    path: str | Path,
+    *,
+    plan_id: str = "",
+    namespace: str = "",
+    progress: Callable[[float], None] | None = None,
+) -> RunSeries:
+    """Read one run from its bag.
+
+    Args:
+        path: bag folder or file.
+        plan_id: which plan of the bag; the one with the most recorded setpoints if empty.
+        namespace: of the limb, e.g. ``/limb``; needed only where limbs of several have plans.
+        progress: called with the fraction of the bag's time that was read.
+
+    Raises:
+        EvaluationError: the bag has no plan, or no limb state while it was played, or several
+            limbs have plans and none is named.
+        BagError: the bag cannot be read.
+    """
+    record = read_record(path, progress=progress)
+    return run_of(record, _choose_limb(record, namespace, plan_id), plan_id)
+
+
+@dataclass(frozen=True)
+class _Setpoints:
+    """Setpoints of one plan in the order of their indices, each as it was revised last."""
+
+    index: NDArray[np.int64]
+    stamp: NDArray[np.int64]
+    value: Array
+
+
+def _setpoints(limb: LimbRecord, plan_id: str, segment_count: int) -> _Setpoints:
+    if plan_id not in limb.setpoints:
+        none = np.empty(0, dtype=np.int64)
+        return _Setpoints(none, none, np.empty((0, segment_count)))
+    rows = limb.setpoints[plan_id]
+    backward = np.array(limb.setpoint_indices[plan_id])[::-1]
+    index, last = np.unique(backward, return_index=True)
+    last = len(backward) - 1 - last
+    return _Setpoints(index, rows.stamps()[last], rows.values(segment_count)[last])
+
+
+def _feedback(limb: LimbRecord, plan: Any, setpoints: _Setpoints) -> dict[str, Any]:
+    """Return what feedback did to a plan's setpoints, by the key of a run's `extra`."""
+    planned = planned_commands(plan)
+    usable = setpoints.index < len(planned)
+    added = setpoints.value[usable] - planned[setpoints.index[usable]]
+    if not len(added):
+        return {}
+    taken = latencies(limb.revisions.get(plan.plan_id, Revisions()), limb.seen())
+    return {"feedback": described(added, taken)}
+
+
+def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
+    """Return the run of one limb of a bag.
+
+    Args:
+        record: of the bag.
+        namespace: of the limb, one of ``record.limbs``.
+        plan_id: which plan; the one with the most recorded setpoints if empty.
+
+    Raises:
+        EvaluationError: this limb has no such plan, or no state while it was played.
+    """
+    limb, where = record.limbs[namespace], _place(record, namespace)
+    chosen = _choose_plan(limb, where, plan_id)
+    stamp, plan = limb.plans[chosen]
+    segment_count = int(plan.segment_count)
+    setpoints = _setpoints(limb, chosen, segment_count)
+    times = np.array(plan.time)
+    origin = _origin(stamp, times, setpoints)
+    if origin == 0:
+        raise EvaluationError(
+            f"{where}: the plan '{chosen}' carries no stamp and none of its setpoints was recorded"
+        )
+    about = _feedback(limb, plan, setpoints) if chosen in limb.revised else {}
+    end = times[-1]
+    played = int(setpoints.index[-1]) if len(setpoints.index) else len(times) - 1
+    faults = [text for when, text in limb.faults if 0 <= (when - origin) / NANOSECONDS <= end]
+    tip = stream(limb.tip, 2, origin)
+    if not len(tip) or tip.time[-1] < 0 or tip.time[0] > end:
+        raise EvaluationError(
+            f"{where}: no limb state was recorded while the plan was played: did the tracker run?"
+            f"{_others_seen(record, namespace)}"
+        )
+    return RunSeries(
+        description=_describe(plan, record, namespace, about),
+        reference=Stream(times, np.array(plan.tip_reference).reshape(-1, 2)),
+        predicted=Stream(times, np.array(plan.tip_predicted).reshape(-1, 2)),
+        tip=tip,
+        bend_angle=stream(limb.angles, segment_count, origin),
+        tip_covariance=stream(limb.covariance, 4, origin),
+        setpoints=Stream(times, _commands(plan, setpoints)),
+        commanded=stream(limb.commanded, segment_count, origin),
+        measured=stream(limb.measured, segment_count, origin),
+        truth=stream(limb.truth, 2, origin) if len(limb.truth) else None,
+        board=_board(limb, setpoints, origin),
+        faults=tuple(dict.fromkeys(faults)),
+        finished=played == len(times) - 1 and tip.time[-1] >= end - 1.0,
+        origin=origin,
+    )
+
+
+def _commands(plan: Any, setpoints: _Setpoints) -> Array:
+    """Return the commands (K, M) [Pa] as they were sent; as planned where none was recorded."""
+    command = np.array(plan.differential_pressure, dtype=float)
+    command = command.reshape(len(plan.time), -1).copy()
+    known = setpoints.index < len(command)
+    known &= np.isfinite(setpoints.value).all(axis=1)
+    command[setpoints.index[known]] = setpoints.value[known]
+    return command
+
+
+def stream(columns: Columns, width: int, origin: int) -> Stream:
+    """Return rows in the order of their stamps, each stamp once, times [s] since ``origin`` [ns].
+
+    Args:
+        columns: rows with stamps [ns].
+        width: numbers in a row; NaN throughout where the rows have another width.
+        origin: instant that becomes time 0 [ns].
+    """
+    stamps, first = np.unique(columns.stamps(), return_index=True)
+    return Stream((stamps - origin) / NANOSECONDS, columns.values(width)[first])
+
+
+def _place(record: BagRecord, namespace: str) -> str:
+    """Return a name of the limb for messages: the bag, and the namespace where it has several."""
+    return f"{record.path}, {namespace}" if len(record.limbs) > 1 else str(record.path)
+
+
+def _others_seen(record: BagRecord, namespace: str) -> str:
+    others = [name for name, limb in record.limbs.items() if name != namespace and len(limb.tip)]
+    if not others:
+        return ""
+    return f" (The states of {', '.join(sorted(others))} are another limb's and do not count.)"
+
+
+def _choose_limb(record: BagRecord, namespace: str, plan_id: str) -> str:
+    if namespace:
+        if namespace not in record.limbs:
+            known = ", ".join(sorted(record.limbs)) or "none"
+            raise EvaluationError(f"{record.path}: no limb {namespace}, only {known}")
+        return namespace
+    played = record.played
+    if plan_id:
+        named = [name for name in played if plan_id in record.limbs[name].usable_plans]
+        played = named or played
+    if not played:
+        raise EvaluationError(
+            f"{record.path}: holds no {PLAN_TYPE}: was the recorder started before the planner "
+            "planned?"
+        )
+    if len(played) > 1:
+        raise EvaluationError(
+            f"{record.path}: holds runs of several limbs, {', '.join(sorted(played))}: name one"
+        )
+    return played[0]
+
+
+def _choose_plan(limb: LimbRecord, where: str, plan_id: str) -> str:
+    usable = limb.usable_plans
+    if not usable:
+        raise EvaluationError(
+            f"{where}: holds no {PLAN_TYPE}: was the recorder started before the planner planned?"
+        )
+    if plan_id:
+        if plan_id not in usable:
+            raise EvaluationError(f"{where}: no plan '{plan_id}', only {', '.join(sorted(usable))}")
+        return plan_id
+    return max(usable, key=lambda name: (len(limb.setpoints.get(name, ())), usable[name][0]))
+
+
+def _origin(stamp: int, times: Array, setpoints: _Setpoints) -> int:
+    """Return the instant of the first setpoint [ns]: of the setpoints played, else of the plan."""
+    usable = (setpoints.stamp > 0) & (setpoints.index < len(times))
+    if not usable.any():
+        return stamp
+    planned = np.rint(times[setpoints.index[usable]] * NANOSECONDS).astype(np.int64)
+    starts = np.sort(setpoints.stamp[usable] - planned)
+    return int(starts[len(starts) // 2])  # a mean of int64 stamps would lose nanoseconds
+
+
+def _board(limb: LimbRecord, setpoints: _Setpoints, origin: int) -> BoardLog | None:
+    if not len(limb.board) or not len(setpoints.index):
+        return None
+    stamps = limb.board.stamps()
+    return BoardLog(
+        setpoint_time=(setpoints.stamp - origin) / NANOSECONDS,
+        setpoint=setpoints.value,
+        command_time=(stamps - origin) / NANOSECONDS,
+        command=limb.board.values(setpoints.value.shape[1]),
+    )
+
+
+def _loads(plan: Any) -> dict[str, Any]:
+    """Return the loads of a plan by the fields of `Description`; older bags name none."""
+    x, y, z = (float(value) for value in getattr(plan, "gravity", (0.0, 0.0, 0.0)))
+    return {
+        "gravity": (x, y, z),
+        "payload": float(getattr(plan, "payload", 0.0)),
+        "payload_at": float(getattr(plan, "payload_at", 0.0)),
+    }
+
+
+def _describe(
+    plan: Any, record: BagRecord, namespace: str, feedback: dict[str, Any]
+) -> Description:
+    known = {"motion", "model", "method", "trial", "seed", "limb"}
+    run = record.run
+    # A plan along a path is named "path"; the recorder was told which one.
+    drawn = plan.motion in ("", "path")
+    return Description(
+        motion=(run.get("motion") if drawn else "") or plan.motion,
+        model=plan.model or run.get("model", ""),
+        method=method_name(plan.method or run.get("method", ""), run.get("learned_from")),
+        trial=int(run.get("trial", -1)),
+        seed=int(run.get("seed", -1)),
+        amplitude=float(plan.amplitude),
+        period=float(plan.period),
+        cycles=int(plan.cycles),
+        limb=str(plan.limb or run.get("limb", "")),
+        bag=str(record.path),
+        namespace=namespace,
+        **_loads(plan),
+        extra={**{key: value for key, value in run.items() if key not in known}, **feedback},
+    )

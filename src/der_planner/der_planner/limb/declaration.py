@@ -1,0 +1,225 @@
+"""What a parameter of a limb is declared with, and what follows from the declaration.
+
+A dataclass field carries a `Parameter` in its metadata. From it come the check of the value, the
+comment behind the key in a limb file, the row in doc/limb_parameters.md and the unknown of the fit.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+_KEY = "parameter"
+
+
+class LimbError(ValueError):
+    """A limb description is incomplete or impossible; the message says where and why."""
+
+
+@dataclass(frozen=True)
+class Term:
+    """The unknown of the fit that stands for a parameter, in units that angles and pressures tell.
+
+    Attributes:
+        name: as reports print it.
+        unit: of its value.
+        scale: a typical value; the solver works in multiples of it.
+        low, high: bounds.
+        spread: standard deviation before any data; infinite where nothing is known.
+        group: the model term that it belongs to; `linear` is always fitted.
+        shared: one value for all segments.
+        per: powers of other parameters: unknown = parameter · Π other^power. They are declared
+            before this parameter.
+        relative: the unknown is ln(parameter / prior's), and `per` is not used.
+        start: where the search starts if the limb has 0.
+        neighbour: place of the segment that it couples to, relative to its own; 0 for none.
+        kept: a fit without its group keeps the prior's value; otherwise the term is off.
+    """
+
+    name: str
+    unit: str
+    scale: float
+    low: float
+    high: float
+    spread: float
+    group: str
+    shared: bool = False
+    per: Mapping[str, int] = field(default_factory=dict)
+    relative: bool = False
+    start: float = 0.0
+    neighbour: int = 0
+    kept: bool = False
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One declared number.
+
+    Attributes:
+        unit: SI; "-" for none.
+        text: what it is.
+        choose: how to find its value.
+        low, high: range that a limb file may give.
+        low_allowed, high_allowed: whether the ends belong to the range.
+        needs: the parameter without which (at 0) this one is not read; where that one is not 0,
+            this one may not be 0 either.
+        fit: the unknown of the fit; None if the fit keeps the prior's value.
+    """
+
+    unit: str
+    text: str
+    choose: str
+    low: float = -math.inf
+    high: float = math.inf
+    low_allowed: bool = True
+    high_allowed: bool = True
+    needs: str = ""
+    fit: Term | None = None
+
+    @property
+    def range(self) -> str:
+        """The range in words, with the unit."""
+        unit = "" if self.unit == "-" else f" {self.unit}"
+        bounds = []
+        if math.isfinite(self.low):
+            bounds.append(f"{'at least' if self.low_allowed else 'above'} {self.low:g}{unit}")
+        if math.isfinite(self.high):
+            bounds.append(f"{'at most' if self.high_allowed else 'below'} {self.high:g}{unit}")
+        return " and ".join(bounds) or f"finite{', in' + unit if unit else ''}"
+
+    def check(self, value: float, where: str) -> None:
+        """Raise a `LimbError` that names ``where``, unit, range and value if out of range."""
+        above = value >= self.low if self.low_allowed else value > self.low
+        below = value <= self.high if self.high_allowed else value < self.high
+        if not (math.isfinite(value) and above and below):
+            raise LimbError(f"{where} must be {self.range}, got {value}")
+
+
+def parameter(
+    unit: str,
+    text: str,
+    choose: str,
+    *,
+    above: float | None = None,
+    least: float | None = None,
+    below: float | None = None,
+    most: float | None = None,
+    needs: str = "",
+    fit: Term | None = None,
+) -> dict[str, Parameter]:
+    """Return the metadata of a dataclass field that declares a parameter.
+
+    Args:
+        unit: SI; "-" for none.
+        text: what it is.
+        choose: how to find its value.
+        above: lower end of the range, not allowed itself.
+        least: lower end of the range, allowed.
+        below: upper end of the range, not allowed itself.
+        most: upper end of the range, allowed.
+        needs: as `Parameter`.
+        fit: the unknown of the fit, if any.
+    """
+    low = above if above is not None else least
+    high = below if below is not None else most
+    return {
+        _KEY: Parameter(
+            unit=unit,
+            text=text,
+            choose=choose,
+            low=-math.inf if low is None else low,
+            high=math.inf if high is None else high,
+            low_allowed=above is None,
+            high_allowed=below is None,
+            needs=needs,
+            fit=fit,
+        )
+    }
+
+
+def declarations(kind: Any) -> dict[str, Parameter]:
+    """Return the declared parameters of a dataclass by name, in their order."""
+    return {
+        item.name: item.metadata[_KEY] for item in dataclasses.fields(kind) if _KEY in item.metadata
+    }
+
+
+def check(item: Any, where: str = "") -> None:
+    """Check every declared parameter of a dataclass instance; ``where`` precedes its name.
+
+    Raises:
+        LimbError: a value is out of its range, or 0 where another parameter needs it.
+    """
+    for name, declared in declarations(item).items():
+        value = getattr(item, name)
+        for number in value if isinstance(value, tuple) else (value,):
+            declared.check(number, where + name)
+        if value == 0 and declared.needs and getattr(item, declared.needs) != 0:
+            raise LimbError(
+                f"{where}{name} must be above 0 {declared.unit} where {declared.needs} is not 0, "
+                f"got {value}"
+            )
+
+
+def commented(text: str, sections: Mapping[str, Mapping[str, Parameter]]) -> str:
+    """Return YAML text in block style with unit and meaning behind each declared key.
+
+    Args:
+        text: one mapping, whose values are numbers, lists or mappings of declared keys.
+        sections: declared parameters by the top-level key that holds them; "" for the top level.
+    """
+    return "".join(f"{line}\n" for line in _commented_lines(text, sections))
+
+
+def _commented_lines(text: str, sections: Mapping[str, Mapping[str, Parameter]]) -> Iterator[str]:
+    section = ""
+    for line in text.splitlines():
+        match = re.match(r"([- ]*)(\w+):", line)
+        declared = None
+        if match:
+            if not match[1]:
+                section = match[2]
+            declared = sections.get(section if match[1] else "", {}).get(match[2])
+        yield f"{line}  # [{declared.unit}] {declared.text}" if declared else line
+
+
+def field_names(kind: Any) -> set[str]:
+    """Return the names of a dataclass's fields."""
+    return {item.name for item in dataclasses.fields(kind)}
+
+
+def refuse_unknown(content: Mapping[str, Any], known: set[str], where: str) -> None:
+    """Raise a `LimbError` that names a key that is not known, and those that are."""
+    unknown = sorted(str(key) for key in content if key not in known)
+    if unknown:
+        raise LimbError(
+            f"unknown key {where}{unknown[0]}: the keys here are {', '.join(sorted(known))}"
+        )
+
+
+def number(value: object, key: str) -> float:
+    """Return a number of a limb file; raise a `LimbError` that names its key if it is none."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        hint = " (YAML reads 1e-3 as text: write 1.0e-3)" if isinstance(value, str) else ""
+        raise LimbError(f"{key} must be a number, got {value!r}{hint}")
+    return float(value)
+
+
+def from_mapping(kind: Any, content: object, where: str, retired: Collection[str] = ()) -> Any:
+    """Return a dataclass of numbers from the mapping of a limb file, without its retired keys.
+
+    Raises:
+        LimbError: no mapping, a key is missing, unknown or no number; ``where`` is named.
+    """
+    if not isinstance(content, Mapping):
+        raise LimbError(f"{where} must be a mapping of keys, got {content!r}")
+    content = {key: v for key, v in content.items() if key not in retired}
+    refuse_unknown(content, field_names(kind), f"{where}.")
+    for item in dataclasses.fields(kind):
+        if item.default is dataclasses.MISSING and item.name not in content:
+            raise LimbError(f"{where}.{item.name} is missing")
+    return kind(**{key: number(value, f"{where}.{key}") for key, value in content.items()})

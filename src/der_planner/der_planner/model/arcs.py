@@ -1,0 +1,338 @@
+"""A limb of piecewise constant curvature: kinematics, exact dynamics and its inverse.
+
+Each segment is one circular arc with one bend angle; the mass is spread over the arc. The equation
+of motion is
+
+    M(q) q̈ + (C(q, q̇) + D(q)) q̇ + K (q − q_rest) = G u + Q_gravity
+
+with q the (n,) bend angles [rad], u the (n,) differential pressures [Pa] and G the moment gains.
+Damping is the same physical damping as the rod's: mass-proportional per segment, ∫ c μ JᵀJ ds, plus
+Kelvin-Voigt in the stiffness. Gravity pulls in the plane at the distributed mass, at that of the
+connectors, and at the masses that the limb carries, which are not damped.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from der_planner.limb import Limb
+from der_planner.model import arc_dynamics as kernels
+from der_planner.model.arc_dynamics import Arcs
+from der_planner.model.arc_kernel import arcs_and_slopes
+from der_planner.model.model import NODES, ArcState, Model, Outputs, Rollout, State
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+QUADRATURE_POINTS = 8
+"""Gauss-Legendre points a segment: exact to rounding for bends below 180 degrees."""
+_RESTING_STEPS = 60
+"""Newton's steps to the pose at rest at the most."""
+_LARGEST_PHASE = 1.0
+"""Phase of the limb's fastest mode in one step of the integrator [rad]; unstable beyond 2.8."""
+
+
+@dataclass(frozen=True)
+class ArcFirstOrder:
+    """`FirstOrder` of arcs along a motion of K intervals, S steps.
+
+    Attributes:
+        tip_by_angle: (K+1, 2, M) ∂tip/∂bend angles [m/rad].
+        by_state: (K, S, 2M, 2M) of each step: the change of bend angles and rates after it by
+            theirs before it.
+        by_pressure: (K, S, 2M, M) by the pressures of the step [rad/Pa], [rad/s/Pa].
+    """
+
+    tip_by_angle: Array
+    by_state: Array
+    by_pressure: Array
+
+    def tangent(self, effective: Array, start: Array | None = None) -> tuple[Array, Array]:
+        """Return the changes of tip and bend angles, see `FirstOrder.tangent`."""
+        count, steps, size, n = self.by_pressure.shape
+        x = np.zeros(size)
+        if start is not None:
+            x[:n] = start
+        moved = np.empty((count + 1, n))
+        moved[0] = x[:n]
+        for k in range(count):
+            for s in range(steps):
+                x = self.by_state[k, s] @ x + self.by_pressure[k, s] @ effective[k, s]
+            moved[k + 1] = x[:n]
+        return np.einsum("kan,kn->ka", self.tip_by_angle, moved), moved
+
+    def sensitivity(self, pulse: Array | None = None) -> Array:
+        """Return ∂tip/∂input, see `FirstOrder.sensitivity`."""
+        steps, n = self.by_pressure.shape[1], self.by_pressure.shape[3]
+        shape = np.ones((steps, n)) if pulse is None else pulse
+        angles = kernels.sensitivity(self.by_state, self.by_pressure, shape)
+        moved: Array = np.einsum("kan,knjm->kajm", self.tip_by_angle, angles)
+        return moved
+
+
+class ArcModel(Model):
+    """A limb of n constant-curvature segments; it is its own `Kinematics`.
+
+    Args:
+        limb: the physical parameters; the same file as the rod's.
+    """
+
+    name = "pcc"
+
+    def __init__(self, limb: Limb, nodes: int = NODES) -> None:
+        super().__init__(limb, nodes)
+        segments = limb.segments
+        self.segment_count = limb.segment_count
+        self.lengths = np.array([s.length for s in segments])
+        self.base = float(limb.base_length)
+        self.connector = float(limb.connector_length)
+        self.masses = np.array([s.mass_per_length * s.length for s in segments])
+        self.stiffness = np.array([s.bending_stiffness / s.length for s in segments])
+        self.cubic = np.array([s.cubic_stiffness / s.length**3 for s in segments])
+        self.free_angles = np.array([s.rest_curvature * s.length for s in segments])
+        self.material_damping = np.array([s.material_damping for s in segments])
+        self.gain = np.array([s.moment_gain for s in segments])
+        self.arcs = self._arcs()
+        self.kinematics = self
+
+    def _arcs(self) -> Arcs:
+        """Return the numbers of the kernels, with the mass at quadrature points."""
+        nodes, weights = np.polynomial.legendre.leggauss(QUADRATURE_POINTS)
+        # owner, place, beyond, mass, weight and drag of every particle
+        particles: list[tuple[int, float, float, float, float, float]] = []
+        for j, segment in enumerate(self.limb.segments):
+            for place, weight in zip((nodes + 1) / 2, weights / 2 * self.masses[j], strict=True):
+                mass = weight * segment.swing_inertia
+                particles.append((j, place, 0.0, mass, weight, weight * segment.damping))
+            if j and self.connector:
+                # Two Gauss points carry the moments of a straight piece exactly.
+                before = self.limb.segments[j - 1]
+                half = 0.25 * self.connector * (before.mass_per_length + segment.mass_per_length)
+                drag = 0.5 * half * (before.damping + segment.damping)
+                mass = 0.5 * half * (before.swing_inertia + segment.swing_inertia)
+                for share in (0.5 - np.sqrt(1 / 12), 0.5 + np.sqrt(1 / 12)):
+                    beyond = share * self.connector
+                    particles.append((j - 1, 1.0, beyond, mass, half, drag))
+        particles += [
+            (*self._place(item.arc_length), item.mass, item.mass, 0.0)
+            for item in self.limb.masses
+            if item.arc_length > self.base
+        ]
+        owner, place, beyond, masses, pulled, drag = np.array(particles, dtype=float).T.copy()
+        return Arcs(
+            self.lengths, self.connector, np.array(self.limb.gravity[:2], dtype=float),
+            owner.astype(np.int64), place, beyond, masses, pulled, drag, self.gain,
+            self.stiffness, self.cubic, self.free_angles, self.material_damping,
+        )  # fmt: skip
+
+    def _place(self, arc_length: float) -> tuple[int, float, float]:
+        """Return segment, fraction of it and distance past its end [m] of a place on the limb."""
+        left = arc_length - self.base
+        for j, length in enumerate(self.lengths):
+            last = j == self.segment_count - 1
+            if left <= length or last:
+                return j, min(left / length, 1.0), 0.0
+            if left <= length + self.connector:
+                return j, 1.0, left - length
+            left -= length + self.connector
+        raise AssertionError("the last segment takes what is left")
+
+    def _check(self, name: str, value: ArrayLike) -> Array:
+        array = np.asarray(value, dtype=float)
+        if array.shape != (self.segment_count,) or not np.all(np.isfinite(array)):
+            raise ValueError(
+                f"{name} must be {self.segment_count} finite numbers, one a segment, got {value!r}"
+            )
+        return array
+
+    def tip(self, bend_angles: ArrayLike) -> Array:
+        """Return the tip (..., 2) [m] for bend angles (..., n) [rad]."""
+        tip = self._joints(np.asarray(bend_angles, dtype=float))[0]
+        return np.stack([tip.real, tip.imag], axis=-1)
+
+    def tip_jacobians(self, bend_angles: ArrayLike) -> Array:
+        """Return ∂tip/∂bend angles (..., 2, n) [m/rad] for bend angles (..., n) [rad]."""
+        angles = np.asarray(bend_angles, dtype=float)
+        tip, ends, headings = self._joints(angles)
+        columns = headings * self.lengths * _arc_ends(angles)[1] + 1j * (tip[..., None] - ends)
+        return np.stack([columns.real, columns.imag], axis=-2)
+
+    def _joints(self, angles: Array) -> tuple[Complex, Complex, Complex]:
+        """Return the tip (...), the ends of the segments and their first headings (..., n)."""
+        turned = np.cumsum(angles, axis=-1)
+        headings = np.exp(1j * (turned - angles))
+        steps = headings * self.lengths * _arc_ends(angles)[0]
+        between = np.exp(1j * turned) * self.connector
+        between[..., -1] = 0.0
+        ends = self.base + np.cumsum(steps, axis=-1) + np.cumsum(between, axis=-1) - between
+        return ends[..., -1], ends, headings
+
+    def curve(self, bend_angles: ArrayLike, points_per_segment: int = 12) -> Array:
+        """Return points (P, 2) [m] of the centreline from clamp to tip for one configuration."""
+        q = self._check("bend_angles", bend_angles)
+        position, heading = complex(self.base), 1 + 0j
+        points = [0j, position] if self.base else [0j]
+        for j, angle in enumerate(q):
+            if j:
+                position += heading * self.connector
+                points.append(position)
+            fractions = np.arange(1, points_per_segment + 1) / points_per_segment
+            arcs = fractions * _arc_ends(fractions * angle)[0]
+            points += list(position + heading * self.lengths[j] * arcs)
+            position = points[-1]
+            heading *= np.exp(1j * angle)
+        line = np.array(points)
+        return np.column_stack([line.real, line.imag])
+
+    def matrices(self, bend_angles: ArrayLike, rates: ArrayLike) -> tuple[Array, Array, Array]:
+        """Return inertia M, Coriolis C and damping D, each (n, n), with Ṁ = C + Cᵀ.
+
+        Args:
+            bend_angles: (n,) [rad].
+            rates: (n,) [rad/s].
+        """
+        M, C, D, _ = self._inertia(self._check("bend_angles", bend_angles), np.asarray(rates))
+        return M, C, D + np.diag(self.stiffness * self.material_damping)
+
+    def _inertia(self, q: Array, v: Array) -> tuple[Array, Array, Array, Array]:
+        result: tuple[Array, Array, Array, Array] = kernels.inertia(q, v, self.arcs)
+        return result
+
+    def elastic_torque(self, bend_angles: ArrayLike) -> Array:
+        """Return the elastic torque (..., n) [N·m] that opposes bend angles (..., n) [rad]."""
+        bend = np.asarray(bend_angles, dtype=float) - self.free_angles
+        torque: Array = self.stiffness * bend + self.cubic * bend**3
+        return torque
+
+    @cached_property
+    def rest(self) -> ArcState:
+        """The vented arcs at rest."""
+        return self.resting(np.zeros(self.inputs))
+
+    def state(self, angles: ArrayLike, rates: ArrayLike) -> ArcState:
+        """Return the arcs at bend angles and rates (M,) [rad], [rad/s]."""
+        return ArcState(np.asarray(angles, dtype=float), np.asarray(rates, dtype=float))
+
+    def resting(self, effective: Array) -> ArcState:
+        """Return the arcs at rest under effective pressures (M,) [Pa] and their weight."""
+        angles = self.resting_angles(effective)
+        return ArcState(angles, np.zeros_like(angles))
+
+    def rest_slope(self, state: ArcState, _effective: Array) -> Array:
+        """Return ∂angles/∂effective (n, n) [rad/Pa] of arcs at rest."""
+        matrix = self.stiffness_matrix(state.angles)
+        return np.asarray(np.linalg.solve(matrix, np.diag(self.gain)))
+
+    def resting_angles(self, pressures: ArrayLike) -> Array:
+        """Return the bend angles (n,) [rad] at rest under effective pressures (n,) [Pa] and weight.
+
+        By Newton's method on G u + Q_gravity = K (q − q_rest), with steps of at most 0.3 rad along
+        which the energy falls: beyond the load that buckles the straight limb, a bent one is found.
+        """
+        drive = self.gain * self._check("pressures", pressures)
+        still = np.zeros(self.segment_count)
+        q: Array = self.free_angles + drive / self.stiffness
+        if not self.arcs.gravity.any() and not self.cubic.any():
+            return q
+        for _ in range(_RESTING_STEPS):
+            pull = self._inertia(q, still)[3] + drive - self.elastic_torque(q)
+            values, vectors = np.linalg.eigh(self.stiffness_matrix(q))
+            firm = np.maximum(np.abs(values), 1e-3 * self.stiffness.min())
+            step = vectors @ ((vectors.T @ pull) / firm)
+            q = q + step * min(1.0, 0.3 / max(float(np.abs(step).max()), 1e-12))
+            if np.abs(step).max() < 1e-10:
+                break
+        return q
+
+    def energy(self, bend_angles: ArrayLike, rates: ArrayLike) -> float:
+        """Return kinetic plus elastic plus gravity's potential energy [J]."""
+        q, v = self._check("bend_angles", bend_angles), self._check("rates", rates)
+        M = self._inertia(q, v)[0]
+        bend = q - self.free_angles
+        elastic = 0.5 * self.stiffness @ bend**2 + 0.25 * self.cubic @ bend**4
+        arcs = self.arcs
+        frame = kernels.joints(q, arcs)
+        slopes = kernels.arc_slopes(q, arcs, frame, 2)
+        J, H = np.zeros(q.size, dtype=complex), np.zeros((q.size, q.size), dtype=complex)
+        potential = 0.0
+        for p, mass in enumerate(arcs.weight):
+            point = self.base + kernels.point_derivatives(q, arcs, frame, p, slopes, J, H)
+            potential -= mass * (point.real * arcs.gravity[0] + point.imag * arcs.gravity[1])
+        return float(0.5 * v @ M @ v + elastic + potential)
+
+    def inverse_dynamics(
+        self, angles: ArrayLike, rates: ArrayLike, accelerations: ArrayLike
+    ) -> Array:
+        """Invert the dynamics: u = Λ† τ with τ = M q̈ + (C + D) q̇ + K (q − q_rest) − Q_gravity.
+
+        Args:
+            angles: (K, n) [rad].
+            rates: (K, n) [rad/s].
+            accelerations: (K, n) [rad/s²].
+
+        Returns:
+            (K, n) differential pressures [Pa].
+        """
+        q, v, a = (
+            np.atleast_2d(np.asarray(x, dtype=float)) for x in (angles, rates, accelerations)
+        )
+        torque = self.elastic_torque(q) + self.stiffness * self.material_damping * v
+        for k in range(len(q)):
+            M, C, D, weight = self._inertia(q[k], v[k])
+            torque[k] += M @ a[k] + (C + D) @ v[k] - weight
+        pressures: Array = torque / self.gain
+        return pressures
+
+    def run(
+        self, start: State, effective: Array, period: float, linearise: Outputs = ""
+    ) -> Rollout:
+        """Simulate the arcs by steps of Runge and Kutta, see `Model.run`.
+
+        Raises:
+            ValueError: wrong shapes.
+        """
+        if not isinstance(start, ArcState):
+            raise TypeError("the arcs start from a state of the arcs, got one of the rod")
+        inputs = np.ascontiguousarray(effective, dtype=float)
+        if inputs.ndim != 3 or inputs.shape[2] != self.segment_count:
+            raise ValueError(f"pressures must be (K, S, {self.segment_count}), got {inputs.shape}")
+        q, v = self._check("angles", start.angles), self._check("rates", start.rates)
+        step, linear = period / inputs.shape[1], None
+        given = (q, v, inputs, step, self._parts(step), self.arcs)
+        if linearise:
+            angles, rates, by_state, by_pressure = kernels.linearised(*given)
+            linear = ArcFirstOrder(self.tip_jacobians(angles), by_state, by_pressure)
+        else:
+            angles, rates = kernels.simulate(*given)
+        return Rollout(angles, self.tip(angles), ArcState(angles[-1], rates[-1]), linear=linear)
+
+    def smallest_stiffness(self, bend_angles: ArrayLike) -> float:
+        """Return the smallest eigenvalue of the stiffness of arcs at rest [N·m/rad]."""
+        return float(np.linalg.eigvalsh(self.stiffness_matrix(bend_angles))[0])
+
+    def stiffness_matrix(self, bend_angles: ArrayLike) -> Array:
+        """Return ∂(elastic less gravity's torque)/∂(bend angles) (n, n) [N·m/rad], symmetric."""
+        q = self._check("bend_angles", bend_angles)
+        zero = np.zeros_like(q)
+        matrix: Array = kernels.force_slopes(q, zero, zero, self.arcs)[0]
+        return matrix
+
+    def _parts(self, step: float) -> int:
+        """Return in how many parts the integrator takes a step, by the fastest mode of the limb."""
+        zero = np.zeros(self.segment_count)
+        M, _, D, _ = self._inertia(zero, zero)
+        drag = np.linalg.solve(M, D + np.diag(self.stiffness * self.material_damping))
+        stiff = np.linalg.solve(M, np.diag(self.stiffness))
+        rates = np.block([[0 * M, np.eye(len(M))], [-stiff, -drag]])
+        fastest = float(np.abs(np.linalg.eigvals(rates)).max())
+        return max(1, int(np.ceil(fastest * step / _LARGEST_PHASE)))
+
+
+def _arc_ends(angles: Array) -> tuple[Complex, Complex]:
+    """Return g = ∫₀¹ exp(i angle η) dη and its derivative at angles [rad] of any shape."""
+    arcs, slopes = arcs_and_slopes(np.ravel(angles))
+    return arcs.reshape(angles.shape), slopes.reshape(angles.shape)

@@ -1,0 +1,383 @@
+"""What goes out of the planner: schedules, played as long as the driver takes setpoints."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from geometry_msgs.msg import Point, PointStamped
+from numpy.typing import NDArray
+from rclpy.node import Node
+from std_msgs.msg import ColorRGBA, Header
+from visualization_msgs.msg import Marker, MarkerArray
+
+from der_msgs.msg import LimbEstimate, PressurePlan, PressureSetpoint, PressureState
+from der_planner.control.knowledge import Estimate
+from der_planner.planning.result import Plan
+from der_planner.planning.streaming import GRID, Player, Schedule, first_stamp
+from limb_interfaces import qos, topics
+from limb_interfaces.stamps import stamp_from_nanoseconds
+
+Array = NDArray[np.float64]
+
+MARGIN = 100_000_000
+"""A plan starts this much [ns] after the earliest instant, so that its message travels first."""
+
+REFERENCE = ColorRGBA(r=0.1, g=0.6, b=0.2, a=1.0)
+PREDICTED = ColorRGBA(r=0.9, g=0.5, b=0.1, a=1.0)
+ESTIMATED = ColorRGBA(r=0.1, g=0.4, b=0.9, a=0.7)
+LIMB = ColorRGBA(r=0.1, g=0.6, b=0.2, a=0.5)
+
+
+# What is published -------------------------------------------------------------------------------
+
+
+class PlannerPublishers:
+    """Publishes the plan that is being played, its setpoints, references, estimates, markers."""
+
+    def __init__(self, node: Node) -> None:
+        self._clock = node.get_clock()
+        self._plans = node.create_publisher(PressurePlan, topics.PLAN, qos.LATCHED)
+        self._setpoints = node.create_publisher(
+            PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINT_STREAM
+        )
+        self._references = node.create_publisher(PointStamped, topics.TIP_REFERENCE, qos.STATES)
+        self._markers = node.create_publisher(MarkerArray, topics.SHAPE_MARKERS, qos.STATES)
+        self._estimates = node.create_publisher(LimbEstimate, topics.ESTIMATE, qos.STATES)
+
+    def plan(self, schedule: Schedule) -> None:
+        """Publish a whole plan, stamped with its first setpoint, and both its tip paths."""
+        result = schedule.plan
+        payload, place = result.limb.payload
+        self._plans.publish(
+            PressurePlan(
+                header=_header(schedule.start), plan_id=schedule.plan_id,
+                motion=result.motion, model=result.model, method=result.method,
+                amplitude=result.amplitude, period=result.period, cycles=result.cycles,
+                limb=result.limb.name, gravity=result.limb.gravity,
+                payload=payload, payload_at=place, segment_count=result.limb.segment_count,
+                time=result.time.tolist(),
+                differential_pressure=result.differential_pressure.ravel().tolist(),
+                tip_reference=result.tip_reference.ravel().tolist(),
+                tip_predicted=result.tip_predicted.ravel().tolist(),
+                solve_time=result.solve_time, predicted_error=result.predicted_error,
+            )
+        )  # fmt: skip
+        self._draw(
+            self._line("reference_path", result.tip_reference, REFERENCE, 0.001),
+            self._line("predicted_path", result.tip_predicted, PREDICTED, 0.0007),
+        )
+
+    def setpoint(self, schedule: Schedule, index: int, pressures: Array, revision: int = 0) -> None:
+        """Publish one setpoint (M,) [Pa], stamped with the instant at which it takes effect."""
+        message = PressureSetpoint(plan_id=schedule.plan_id, index=index, revision=revision)
+        message.header = _header(schedule.stamp(index))
+        message.differential_pressure = pressures.tolist()
+        self._setpoints.publish(message)
+
+    def reference(self, schedule: Schedule, index: int) -> None:
+        """Publish where the tip should be at a setpoint's instant."""
+        header, tip = _header(schedule.stamp(index)), schedule.plan.tip_reference[index]
+        self._references.publish(PointStamped(header=header, point=_points([tip])[0]))
+
+    def estimate(
+        self, schedule: Schedule, instant: int, estimate: Estimate, **about: object
+    ) -> None:
+        """Publish what feedback knows of the limb at an instant [ns], and what it did about it.
+
+        Args:
+            schedule: that is played.
+            instant: of the estimate.
+            estimate: of the limb.
+            about: fields of the message: correction (M,) [Pa], share, reason, solve_time [s].
+        """
+        inputs = len(estimate.bend_angle)
+        sigma = np.split(estimate.deviation, np.arange(1, 5) * inputs)
+        curve = schedule.plan.kinematics.curve(estimate.bend_angle)
+        self._estimates.publish(
+            LimbEstimate(
+                header=_header(instant), plan_id=schedule.plan_id,
+                tip=_points([estimate.tip])[0], tip_covariance=estimate.tip_covariance.ravel(),
+                bend_angle=estimate.bend_angle.tolist(), bend_angle_sigma=sigma[0].tolist(),
+                bend_rate=estimate.bend_rate.tolist(),
+                missing_pressure=estimate.missing_pressure.tolist(),
+                missing_pressure_sigma=sigma[2].tolist(),
+                gain_error=estimate.gain_error.tolist(), gain_error_sigma=sigma[3].tolist(),
+                tip_offset=estimate.tip_offset, curve=_points(curve), age=min(estimate.age, 1e9),
+                **about,
+            )
+        )  # fmt: skip
+        self._draw(self._line("estimate", curve, ESTIMATED, 0.004))
+
+    def reference_limb(self, schedule: Schedule, index: int, lead: int) -> None:
+        """Draw the reference limb as it should be now, ``lead`` [ns] before setpoint ``index``."""
+        curve = schedule.plan.curve(max(0, index - 1 - lead // GRID))
+        self._draw(self._line("limb", curve, LIMB, 0.006))
+
+    def _draw(self, *markers: Marker) -> None:
+        self._markers.publish(MarkerArray(markers=list(markers)))
+
+    def _line(self, name: str, points: Array, color: ColorRGBA, width: float) -> Marker:
+        marker = Marker(ns=f"planner/{name}", id=0, type=Marker.LINE_STRIP, action=Marker.ADD)
+        marker.header = Header(stamp=self._clock.now().to_msg(), frame_id=topics.BASE_FRAME)
+        marker.pose.orientation.w = 1.0
+        marker.scale.x, marker.color, marker.points = width, color, _points(points)
+        return marker
+
+
+def _header(instant: int) -> Header:
+    """Return the header of an instant [ns] in the limb's frame."""
+    return Header(stamp=stamp_from_nanoseconds(instant), frame_id=topics.BASE_FRAME)
+
+
+def _points(places: Array | Sequence[Array]) -> list[Point]:
+    return [Point(x=float(x), y=float(y)) for x, y in places]
+
+
+# The driver --------------------------------------------------------------------------------------
+
+_NAMES = {
+    getattr(PressureState, name): name
+    for name in ("DISARMED", "ARMED", "TRACKING", "HOLDING", "VENTING", "FAULT")
+}
+_REMEDY = "arm the driver, then play the plan again"
+
+
+@dataclass(frozen=True)
+class Ending:
+    """Why nothing may be streamed to the driver now.
+
+    Attributes:
+        outcome: vented, fault or lost: as in `der_msgs/action/PlayMotion`.
+        reason: a sentence with the remedy.
+    """
+
+    outcome: str
+    reason: str
+
+
+class DriverWatch:
+    """Keeps the driver's newest state; its methods may be called from any thread.
+
+    A planner that has never heard a driver streams: the listener may be one that tells nothing of
+    itself. From the first `pressure_state` on, a driver that is silent, disarmed or in fault gets
+    nothing.
+
+    Args:
+        steady: returns the present time of a steady clock [s].
+        timeout: [s] after which a driver that says nothing counts as dead.
+    """
+
+    def __init__(self, steady: Callable[[], float], timeout: float) -> None:
+        self._steady, self._timeout = steady, timeout
+        self._changed = threading.Condition()
+        self._mode: int | None = None
+        self._faults: list[str] = []
+        self._heard = 0.0
+        self._told_to_vent = False
+
+    @property
+    def mode(self) -> str:
+        """Name of the driver's newest mode; empty before the first."""
+        with self._changed:
+            return "" if self._mode is None else _NAMES.get(self._mode, str(self._mode))
+
+    def update(self, state: PressureState, begun: Sequence[str]) -> Ending | None:
+        """Keep a new state; return why everything must be stopped because of it, or None.
+
+        The driver vents by itself only after HOLDING. A ramp down at the end of an earlier plan
+        does not concern the next one.
+
+        Args:
+            state: from the driver.
+            begun: ids of the plans whose first setpoint is due already.
+        """
+        with self._changed:
+            before, self._mode = self._mode, int(state.mode)
+            self._faults, self._heard = list(state.faults), self._steady()
+            begins = self._mode == PressureState.VENTING and before != self._mode
+            if begins:
+                self._told_to_vent = before != PressureState.HOLDING
+            self._changed.notify_all()
+        if begins and state.plan_id in begun:
+            return Ending("vented", f"the driver vents the limb: {_REMEDY}")
+        if begins and before in (PressureState.ARMED, PressureState.TRACKING):
+            return Ending("vented", f"the driver was told to vent: {_REMEDY}")
+        stopped = self._mode in (PressureState.DISARMED, PressureState.FAULT)
+        return self.obstacle() if stopped else None
+
+    def obstacle(self) -> Ending | None:
+        """Return why the driver takes no setpoints now; None if it does, or was never heard."""
+        with self._changed:
+            mode, age = self._mode, self._steady() - self._heard
+            if mode is None:
+                return None
+            if age > self._timeout:
+                return Ending(
+                    "lost",
+                    f"the driver has said nothing for {age:.1f} s: see whether it runs and the "
+                    f"limb is vented, then {_REMEDY}",
+                )
+            if mode == PressureState.FAULT:
+                faults = "; ".join(self._faults) or "no reason given"
+                return Ending(
+                    "fault", f"the driver is in FAULT ({faults}): remove the cause, {_REMEDY}"
+                )
+            if mode == PressureState.DISARMED:
+                return Ending("vented", f"the driver is DISARMED: {_REMEDY}")
+            if mode == PressureState.VENTING and self._told_to_vent:
+                return Ending("vented", f"the driver is VENTING: wait, {_REMEDY}")
+        return None
+
+    def wait(self, seconds: float) -> Ending | None:
+        """Wait until the driver takes setpoints, at most so long [s]; return what forbids it."""
+        end = self._steady() + seconds
+        with self._changed:
+            while (found := self.obstacle()) is not None and (left := end - self._steady()) > 0:
+                self._changed.wait(left)
+        return found
+
+
+# Playing -----------------------------------------------------------------------------------------
+
+
+class PlaybackListener(Protocol):
+    """Is told what becomes of the schedules; called from the executor's or the player's thread."""
+
+    def scheduled(self, schedule: Schedule) -> None:
+        """A plan has its instant; nothing of it was sent yet."""
+
+    def send(self, schedule: Schedule, index: int) -> None:
+        """One setpoint is due to be sent."""
+
+    def abandoned(self, plan_id: str, ending: Ending) -> None:
+        """Everything was stopped because of the driver."""
+
+    def ended(self, schedule: Schedule, outcome: str, reason: str) -> None:
+        """A plan is over."""
+
+
+class Playback:
+    """Plays schedules through a `Player` as long as the driver takes setpoints.
+
+    Args:
+        listener: is told.
+        driver: what is known of the driver.
+        now: present ROS time [ns].
+        lead: how long before its stamp a setpoint is sent [ns].
+    """
+
+    def __init__(
+        self, listener: PlaybackListener, driver: DriverWatch, now: Callable[[], int], lead: int
+    ) -> None:
+        self._listener, self._driver, self._now, self._lead = listener, driver, now, lead
+        self.lock = threading.RLock()
+        """Held where playing begins and where it is ended."""
+        self._open: list[Schedule] = []  # played, or waiting for their start; oldest first
+        self._spent: set[str] = set()
+        self._player = Player(now, self._send, lambda _: None, lead)
+
+    @property
+    def position(self) -> tuple[Schedule, int] | None:
+        """The schedule in force and the index of its next setpoint, or None."""
+        return self._player.position
+
+    @property
+    def busy(self) -> bool:
+        """Whether a plan is played or waits for its start."""
+        return bool(self._open)
+
+    def find(self, plan_id: str) -> Schedule | None:
+        """Return the schedule of a plan that is not over."""
+        return next((s for s in self._open if s.plan_id == plan_id), None)
+
+    def is_spent(self, plan_id: str) -> bool:
+        """Tell whether the driver ended this plan: it takes no more setpoints of it."""
+        return plan_id in self._spent
+
+    def unspent(self, plan_id: str) -> str:
+        """Return the id, with a number where the driver takes no more setpoints of it."""
+        names = itertools.chain([plan_id], (f"{plan_id}-{n}" for n in itertools.count(2)))
+        return next(name for name in names if name not in self._spent)
+
+    def play(self, plan_id: str, plan: Plan, start: int) -> Schedule:
+        """Schedule a plan at an instant [ns], 0: as soon as possible; after what is played now."""
+        with self.lock:
+            margin = MARGIN if start == 0 else 0
+            earliest = first_stamp(self._now() + margin, self._lead, start)
+            position = self.position
+            if position is not None and plan.reference.start is None:
+                earliest = max(earliest, position[0].stamp(position[0].count))
+            schedule = Schedule(plan_id, plan, earliest)
+            self._listener.scheduled(schedule)
+            self._open.append(schedule)
+            self._player.play(schedule)
+        return schedule
+
+    def stop(self, outcome: str, reason: str) -> bool:
+        """Send nothing more; tell whether anything was being sent."""
+        with self.lock:
+            playing = self._player.stop()
+            ended, self._open = self._open, []
+        for schedule in ended:
+            self._listener.ended(schedule, outcome, reason)
+        return playing
+
+    def update(self, state: PressureState) -> None:
+        """Keep what the driver says of itself; stop if it vents or has a fault."""
+        now = self._now()
+        ending = self._driver.update(state, [s.plan_id for s in self._open if s.start < now])
+        if ending is not None:
+            self._abandon(ending)
+
+    def end_what_is_over(self) -> None:
+        """Call a plan finished once its last setpoint has taken effect; call it now and then."""
+        now = self._now()
+        with self.lock:
+            over = [s for s in self._open if s.stamp(s.count - 1) <= now]
+            self._open = [s for s in self._open if s not in over]
+        for schedule in over:
+            self._listener.ended(schedule, "finished", "")
+
+    def close(self) -> None:
+        """End the player's thread."""
+        self._player.close()
+
+    def _send(self, schedule: Schedule, index: int) -> None:
+        """Send one setpoint, unless the driver takes none: then everything is stopped."""
+        if schedule not in self._open:
+            return
+        obstacle = self._driver.obstacle()
+        if obstacle is not None:
+            self._abandon(obstacle)
+            return
+        if index == 0:
+            self._replace(schedule)
+        self._listener.send(schedule, index)
+
+    def _replace(self, schedule: Schedule) -> None:
+        """End the motion that a new one takes over from, if it was not played to its end."""
+        with self.lock:
+            before = itertools.takewhile(lambda s: s is not schedule, self._open)
+            over = [s for s in before if s.stamp(s.count - 1) >= schedule.start]
+            self._open = [s for s in self._open if s not in over]
+        for other in over:
+            self._listener.ended(other, "replaced", f"by plan {schedule.plan_id}")
+
+    def _abandon(self, ending: Ending) -> None:
+        with self.lock:
+            if not self._open:
+                return
+            plan_id = self._open[-1].plan_id
+            self._spent.update(schedule.plan_id for schedule in self._open)
+            self.stop(ending.outcome, ending.reason)
+        self._listener.abandoned(plan_id, ending)
+
+    def share(self, schedule: Schedule) -> str:
+        """Return how many of a schedule's setpoints have been due by now, of how many."""
+        due = min(max((self._now() - schedule.start) // GRID + 1, 0), schedule.count)
+        return f"{due} of {schedule.count} setpoints"

@@ -1,0 +1,221 @@
+"""Figures of runs. Drawn without a display and without pyplot's global state."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from der_planner.bags.run import Array, RunSeries, Stream
+from der_planner.results import style
+from der_planner.results.alignment import error_series
+from der_planner.results.table import CASE
+
+FORMATS = ("png", "pdf")
+CM = 100.0
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure [inch] with a canvas of its own."""
+    figure = Figure(figsize=(width, height))
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def by_motion(runs: Sequence[RunSeries]) -> dict[str, list[RunSeries]]:
+    """Return the runs of each motion, and of each limb where there are several, by their title."""
+    several = len({run.description.namespace for run in runs} - {""}) > 1
+    found: dict[str, list[RunSeries]] = {}
+    for run in runs:
+        about = run.description
+        title = f"Case {CASE[about.motion]}" if about.motion in CASE else about.motion
+        if several:
+            title += f", {about.namespace}"
+        found.setdefault(title, []).append(run)
+    return found
+
+
+def plot_tip(
+    runs: Sequence[RunSeries], folder: Path, formats: tuple[str, ...] = FORMATS
+) -> list[Path]:
+    """Draw tip against reference, a row per motion: the path, and x, y over time.
+
+    Args:
+        runs: any number, of any motions and models.
+        folder: where ``tip.png`` and ``tip.pdf`` go.
+        formats: file name endings.
+
+    Returns:
+        The written files.
+    """
+    motions = by_motion(runs)
+    with style.paper_style():
+        figure = new_figure(style.PAGE, 2.1 * len(motions))
+        axes = figure.subplots(len(motions), 3, squeeze=False)
+        for row, (title, members) in zip(axes, motions.items(), strict=True):
+            _draw_tip_row(row, title, members)
+        handles, labels = axes[0][0].get_legend_handles_labels()
+        unique = dict(zip(labels, handles, strict=True))
+        figure.legend(unique.values(), unique.keys(), loc="outside upper center", ncols=4)
+        return style.save(figure, folder, "tip", formats)
+
+
+def _draw_tip_row(row: Sequence[Axes], title: str, runs: Sequence[RunSeries]) -> None:
+    plane, over_x, over_y = row
+    for index, run in enumerate(runs):
+        model = run.description.model
+        look: dict[str, Any] = {
+            "color": style.colour(model, index),
+            "alpha": 0.9 if len(runs) <= 4 else 0.5,
+            "lw": 1.0,
+            "ls": style.DASHES.get(model, "-."),
+        }
+        inside = (run.tip.time >= 0) & (run.tip.time <= run.reference.time[-1])
+        time, tip = run.tip.time[inside], run.tip.value[inside] * CM
+        plane.plot(tip[:, 0], tip[:, 1], label=f"{model.upper()}, measured", **look)
+        over_x.plot(time, tip[:, 0], **look)
+        over_y.plot(time, tip[:, 1], **look)
+    reference = runs[0].reference
+    black: dict[str, Any] = {"color": style.REFERENCE, "lw": 0.9, "ls": ":"}
+    value = reference.value * CM
+    plane.plot(value[:, 0], value[:, 1], label="reference", **black)
+    over_x.plot(reference.time, value[:, 0], **black)
+    over_y.plot(reference.time, value[:, 1], **black)
+    plane.set_aspect("equal", adjustable="datalim")
+    plane.set(xlabel="x [cm]", ylabel="y [cm]", title=title)
+    over_x.set(xlabel="time [s]", ylabel="x [cm]")
+    over_y.set(xlabel="time [s]", ylabel="y [cm]")
+
+
+def plot_error(
+    runs: Sequence[RunSeries], folder: Path, formats: tuple[str, ...] = FORMATS
+) -> list[Path]:
+    """Draw the tip error over time: mean and one standard deviation over trials per model.
+
+    Args:
+        runs: any number; a column per motion.
+        folder: where ``error.png`` and ``error.pdf`` go.
+        formats: file name endings.
+    """
+    motions = by_motion(runs)
+    with style.paper_style():
+        wide = style.PAGE if len(motions) > 1 else style.COLUMN
+        figure = new_figure(wide, 2.2)
+        axes = figure.subplots(1, len(motions), squeeze=False, sharey=True)[0]
+        for axis, (title, members) in zip(axes, motions.items(), strict=True):
+            for index, (label, same) in enumerate(_by_model(members).items()):
+                time, mean, deviation = mean_error(same)
+                model = same[0].description.model
+                look = style.colour(model, index)
+                axis.plot(
+                    time, mean * CM, color=look, ls=style.DASHES.get(model, "-."), label=label
+                )
+                low = np.maximum(mean - deviation, 0.0)
+                axis.fill_between(
+                    time, low * CM, (mean + deviation) * CM, color=look, alpha=0.2, lw=0
+                )
+            axis.set(xlabel="time [s]", title=title)
+            axis.set_ylim(bottom=0.0)
+        axes[0].set_ylabel("tip error [cm]")
+        handles = {
+            label: handle
+            for axis in axes
+            for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
+        }
+        figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=4)
+        return style.save(figure, folder, "error", formats)
+
+
+def _by_model(runs: Sequence[RunSeries]) -> dict[str, list[RunSeries]]:
+    found: dict[str, list[RunSeries]] = {}
+    for run in runs:
+        about = run.description
+        name = f"{about.model.upper()} ({about.method})" if about.method else about.model.upper()
+        found.setdefault(name, []).append(run)
+    return found
+
+
+def mean_error(runs: Sequence[RunSeries], rate: float = 20.0) -> tuple[Array, Array, Array]:
+    """Return time, mean and standard deviation of |r − r̄| over runs on a common grid [s, m, m].
+
+    A gap in one run does not count there: at each instant the mean is over the runs that have a
+    valid image within 0.1 s. The deviation is 0 where only one has.
+    """
+    last = min(float(run.reference.time[-1]) for run in runs)
+    grid = np.arange(0.0, last, 1.0 / rate)
+    rows = np.full((len(runs), len(grid)), np.nan)
+    for row, run in zip(rows, runs, strict=True):
+        series = error_series(run)
+        row[:] = np.interp(grid, series.time, series.distance)
+        nearest = np.searchsorted(series.time, grid).clip(1, len(series.time) - 1)
+        away = np.minimum(
+            np.abs(grid - series.time[nearest - 1]), np.abs(series.time[nearest] - grid)
+        )
+        row[away > 0.1] = np.nan
+    known = np.isfinite(rows)
+    count = known.sum(axis=0)
+    keep = count > 0
+    filled = np.where(known, rows, 0.0)[:, keep]
+    mean = filled.sum(axis=0) / count[keep]
+    squares = np.where(known[:, keep], (filled - mean) ** 2, 0.0).sum(axis=0)
+    deviation = np.sqrt(squares / np.maximum(1, count[keep] - 1))
+    return grid[keep], mean, deviation
+
+
+def plot_pressures(
+    runs: Sequence[RunSeries], folder: Path, formats: tuple[str, ...] = FORMATS
+) -> list[Path]:
+    """Draw commanded and measured differential pressures, a row per motion, a column per segment.
+
+    The first run of each model stands for its trials. Returns nothing where no run has pressures.
+    """
+    runs = [run for run in runs if len(run.commanded)]
+    if not runs:
+        return []
+    motions = by_motion(runs)
+    segments = runs[0].commanded.value.shape[1]
+    with style.paper_style():
+        figure = new_figure(style.PAGE, 1.9 * len(motions))
+        axes = figure.subplots(len(motions), segments, squeeze=False, sharex="row")
+        for row, (title, members) in zip(axes, motions.items(), strict=True):
+            for index, (label, same) in enumerate(_by_model(members).items()):
+                _draw_pressures(row, same[0], label, style.colour(same[0].description.model, index))
+            for segment, axis in enumerate(row):
+                axis.set(xlabel="time [s]", ylabel=f"Δp, segment {segment + 1} [kPa]")
+            row[0].set_title(title)
+        handles, labels = axes[0][0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=4)
+        return style.save(figure, folder, "pressures", formats)
+
+
+def _draw_pressures(row: Sequence[Axes], run: RunSeries, label: str, look: str) -> None:
+    last = run.reference.time[-1]
+
+    def cut(stream: Stream) -> Stream:
+        inside = (stream.time >= 0) & (stream.time <= last)
+        return Stream(stream.time[inside], stream.value[inside] / 1000.0)
+
+    commanded = cut(run.commanded)
+    measured = cut(run.measured)
+    for segment, axis in enumerate(row):
+        axis.plot(
+            commanded.time,
+            commanded.value[:, segment],
+            color=look,
+            ls=":",
+            lw=0.9,
+            label=f"{label}, commanded",
+        )
+        if len(measured):
+            axis.plot(
+                measured.time,
+                measured.value[:, segment],
+                color=look,
+                ls=style.DASHES.get(run.description.model, "-."),
+                label=f"{label}, measured",
+            )

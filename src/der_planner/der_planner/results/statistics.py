@@ -1,0 +1,281 @@
+"""Over trials: mean, deviation, and whether one model is better than another.
+
+Only runs that can be compared are compared; the others are left out and the reason is kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from der_planner.bags.run import Array
+from der_planner.results.metrics import RunResult, json_value
+
+RESAMPLES = 10_000
+CONFIDENCE = 0.95
+SEED = 20260
+SAME_REFERENCE = 1e-4
+"""References nearer than that [m] are the same."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """One row of the table: mean and standard deviation over trials [m].
+
+    ``std_…`` is the sample standard deviation (n − 1) of the trials' values, NaN for one trial.
+    """
+
+    motion: str
+    model: str
+    method: str
+    trials: int
+    mean_error_m: float
+    mean_error_x_m: float
+    mean_error_y_m: float
+    std_error_m: float
+    std_error_x_m: float
+    std_error_y_m: float
+    max_error_m: float
+    valid_fraction: float
+    predicted_error_m: float
+    problems: tuple[str, ...] = ()
+    namespace: str = ""
+    loads: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what ``results.json`` holds."""
+        return {key: json_value(value) for key, value in asdict(self).items()}
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Mean error of the baseline minus that of a model on one motion.
+
+    Attributes:
+        motion: of both.
+        model, baseline: with their methods, e.g. ``der optimal``.
+        difference_m: positive where the model is better [m]; NaN where refused.
+        low_m, high_m: bootstrap interval of `confidence` [m]; NaN with fewer than two trials.
+        ratio: baseline over model.
+        paired: trials were paired by seed.
+        trials: (of the model, of the baseline).
+        confidence: of the interval.
+        refused: why there is no figure; empty where there is one.
+        namespace: of the limb, where the runs are of several; else empty.
+        loads: mounting and payload; empty for a horizontal limb without payload.
+    """
+
+    motion: str
+    model: str
+    baseline: str
+    difference_m: float = float("nan")
+    low_m: float = float("nan")
+    high_m: float = float("nan")
+    ratio: float = float("nan")
+    paired: bool = False
+    trials: tuple[int, int] = (0, 0)
+    confidence: float = CONFIDENCE
+    refused: str = ""
+    namespace: str = ""
+    loads: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what ``results.json`` holds."""
+        return {key: json_value(value) for key, value in asdict(self).items()}
+
+
+Key = tuple[str, str, str, str, str]
+
+
+def group(results: Sequence[RunResult]) -> dict[Key, list[RunResult]]:
+    """Return the runs by namespace, loads, motion, model and method, in the order they came.
+
+    The namespace is the same for all where the runs name one only: a run without a bag has none.
+    """
+    named = sorted({result.namespace for result in results} - {""})
+    only = named[0] if len(named) == 1 else ""
+    found: dict[Key, list[RunResult]] = {}
+    for result in results:
+        key = (result.namespace or only, result.loads, result.motion, result.model, result.method)
+        found.setdefault(key, []).append(result)
+    return found
+
+
+def summarise(results: Sequence[RunResult]) -> list[Summary]:
+    """Return one row per limb, loads, motion, model and method: mean and deviation over trials.
+
+    Runs with problems count as well: they happened. The row names them.
+    """
+    return [_summary(key, runs) for key, runs in group(results).items()]
+
+
+def _summary(key: Key, runs: Sequence[RunResult]) -> Summary:
+    namespace, loads, motion, model, method = key
+    errors = np.array([[r.mean_error_m, r.mean_error_x_m, r.mean_error_y_m] for r in runs])
+    mean = errors.mean(axis=0)
+    deviation = errors.std(axis=0, ddof=1) if len(runs) > 1 else np.full(3, np.nan)
+    return Summary(
+        motion=motion,
+        model=model,
+        method=method,
+        trials=len(runs),
+        mean_error_m=float(mean[0]),
+        mean_error_x_m=float(mean[1]),
+        mean_error_y_m=float(mean[2]),
+        std_error_m=float(deviation[0]),
+        std_error_x_m=float(deviation[1]),
+        std_error_y_m=float(deviation[2]),
+        max_error_m=max(run.max_error_m for run in runs),
+        valid_fraction=float(np.mean([run.valid_fraction for run in runs])),
+        predicted_error_m=float(np.mean([run.predicted_error_m for run in runs])),
+        problems=tuple(f"trial {run.trial}: {text}" for run in runs for text in run.problems),
+        namespace=namespace,
+        loads=loads,
+    )
+
+
+@dataclass
+class _Side:
+    """The runs of one side of a comparison."""
+
+    name: str
+    runs: list[RunResult] = field(default_factory=list)
+
+    @property
+    def errors(self) -> Array:
+        return np.array([run.mean_error_m for run in self.runs])
+
+
+def compare(results: Sequence[RunResult], baseline: str = "pcc") -> list[Comparison]:
+    """Compare every model with the baseline: same limb, same loads, same motion.
+
+    Args:
+        results: of all runs.
+        baseline: name of the model to compare with.
+
+    Returns:
+        One comparison per limb, loads, motion and (model, method) against each baseline method.
+        A pair whose runs followed different references, or were not played to the end, is refused.
+    """
+    groups = group(results)
+    several = len({namespace for namespace, *_ in groups}) > 1
+    found = []
+    for (namespace, loads, motion, model, method), runs in groups.items():
+        if model == baseline:
+            continue
+        for (*other, other_model, other_method), others in groups.items():
+            if other == [namespace, loads, motion] and other_model == baseline:
+                one = _Side(f"{model} {method}".strip(), runs)
+                two = _Side(f"{other_model} {other_method}".strip(), others)
+                comparison = _compare(motion, one, two)
+                where = namespace if several else ""
+                found.append(replace(comparison, namespace=where, loads=loads))
+    return found
+
+
+def why_not_comparable(results: Sequence[RunResult]) -> str:
+    """Say why runs of one motion must not be compared; empty if they may."""
+    for run in results:
+        if run.problems:
+            return f"{run.bag or run.motion} (trial {run.trial}): {'; '.join(run.problems)}"
+    for name, unit in (("amplitude_rad", " rad"), ("period_s", " s"), ("cycles", "")):
+        values = sorted({round(getattr(run, name), 6) for run in results})
+        if len(values) > 1:
+            listed = ", ".join(f"{value:g}{unit}" for value in values)
+            return f"different {name.split('_')[0]}: {listed}"
+    if len({bool(run.removed_lag_s) for run in results}) > 1:
+        return "the lag was removed from some runs only"
+    windows = {(round(run.window_s[0], 3), round(run.window_s[1], 3)) for run in results}
+    if len(windows) > 1:
+        return f"different windows: {', '.join(f'{a:g} to {b:g} s' for a, b in sorted(windows))}"
+    apart = _references_apart(results)
+    if apart > SAME_REFERENCE:
+        return f"the tip references are up to {apart * 1000:.1f} mm apart"
+    return ""
+
+
+def _references_apart(results: Sequence[RunResult]) -> float:
+    """Return the largest distance between references that ought to be the same [m].
+
+    A plan starts where the vented limb rests, so trials on differently drawn twins lead in from
+    different places: there each trial is compared with itself. Runs that share no trial must agree.
+    """
+    groups: dict[tuple[int, int], list[Array]] = {}
+    for run in results:
+        if run.reference_points_m:
+            path = np.array(run.reference_points_m)
+            groups.setdefault((run.trial, run.seed), []).append(path)
+    sets = list(groups.values())
+    if not any(len(paths) > 1 for paths in sets):
+        sets = [[path for paths in sets for path in paths]]
+    gaps = [float(np.abs(path - paths[0]).max()) for paths in sets for path in paths[1:]]
+    return max(gaps, default=0.0)
+
+
+def _compare(motion: str, one: _Side, two: _Side) -> Comparison:
+    reason = why_not_comparable([*one.runs, *two.runs])
+    counts = (len(one.runs), len(two.runs))
+    if reason:
+        return Comparison(motion, one.name, two.name, trials=counts, refused=reason)
+    pairs = _pairs(one.runs, two.runs)
+    difference = float(two.errors.mean() - one.errors.mean())
+    low, high = (
+        _bootstrap([pairs], _mean)
+        if pairs is not None
+        else _bootstrap([one.errors, two.errors], _difference_of_means)
+    )
+    return Comparison(
+        motion,
+        one.name,
+        two.name,
+        difference_m=difference,
+        low_m=low,
+        high_m=high,
+        ratio=float(two.errors.mean() / one.errors.mean()),
+        paired=pairs is not None,
+        trials=counts,
+    )
+
+
+def _pairs(one: list[RunResult], two: list[RunResult]) -> Array | None:
+    """Return baseline minus model for every seed, if both have the same seeds, each once."""
+    first = {run.seed: run.mean_error_m for run in one}
+    second = {run.seed: run.mean_error_m for run in two}
+    same = first.keys() == second.keys() and len(first) == len(one) == len(two)
+    if not same or -1 in first:
+        return None
+    return np.array([second[seed] - first[seed] for seed in sorted(first)])
+
+
+def _bootstrap(samples: Sequence[Array], statistic: Callable[..., Any]) -> tuple[float, float]:
+    """Return the percentile interval of a statistic of samples that were drawn independently [m].
+
+    NaN where a sample has fewer than two values. The seed is fixed: the same runs give the same
+    interval.
+    """
+    if min(len(sample) for sample in samples) < 2:
+        return float("nan"), float("nan")
+    # It takes most of a second to import: only who compares trials pays for it.
+    from scipy.stats import bootstrap  # noqa: PLC0415
+
+    found = bootstrap(
+        samples,
+        statistic,
+        n_resamples=RESAMPLES,
+        confidence_level=CONFIDENCE,
+        method="percentile",
+        vectorized=True,
+        rng=np.random.default_rng(SEED),
+    )
+    return float(found.confidence_interval.low), float(found.confidence_interval.high)
+
+
+def _mean(sample: Array, axis: int = -1) -> Array:
+    return np.asarray(np.mean(sample, axis=axis))
+
+
+def _difference_of_means(one: Array, two: Array, axis: int = -1) -> Array:
+    return np.asarray(np.mean(two, axis=axis) - np.mean(one, axis=axis))

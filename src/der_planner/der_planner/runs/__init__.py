@@ -1,1 +1,0 @@
-"""Recorded runs: bags written, read and repaired (`recording`), and their errors (`evaluation`)."""

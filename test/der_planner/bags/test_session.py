@@ -1,0 +1,107 @@
+"""The queue and thread between the node and the disk."""
+
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from bags import START, TEXT, read_texts, spec, string
+
+from der_planner.bags import writer
+from der_planner.bags.reader import BagReader
+from der_planner.bags.session import RecordingSession
+from der_planner.bags.writer import BagWriteError, BagWriter
+
+TALK = "/talk"
+
+
+def wait_until(condition, timeout: float = 20.0) -> None:
+    done = threading.Event()
+    for _ in range(int(timeout / 0.01)):
+        if condition():
+            return
+        done.wait(0.01)
+    raise AssertionError("condition not met in time")
+
+
+def test_everything_queued_is_written_at_stop(tmp_path: Path):
+    session = RecordingSession(BagWriter(tmp_path / "run"))
+    topic = spec(TALK, TEXT)
+    for index in range(500):
+        assert session.put(topic, START + index, START, string(str(index)))
+    status = session.stop()
+    assert (status.messages, status.dropped, status.failure) == (500, 0, "")
+    assert session.stop() == status
+    assert read_texts(tmp_path / "run") == [str(i) for i in range(500)]
+
+
+def test_flush_without_new_messages_makes_the_file_readable(tmp_path: Path):
+    session = RecordingSession(BagWriter(tmp_path / "run"), flush_interval=0.02)
+    session.put(spec(TALK, TEXT), START, START, string("early"))
+    seen: list[str] = []
+
+    def on_disk() -> bool:
+        try:
+            with BagReader(tmp_path / "run") as bag:
+                seen[:] = [message.data for _, _, message in bag.messages()]
+        except ValueError:
+            return False
+        return seen == ["early"]
+
+    wait_until(on_disk)
+    session.stop()
+
+
+def test_pause_ignores_messages(tmp_path: Path):
+    session = RecordingSession(BagWriter(tmp_path / "run"))
+    topic = spec(TALK, TEXT)
+    session.put(topic, START, START, string("before"))
+    session.paused = True
+    assert not session.put(topic, START + 1, START, string("meanwhile"))
+    session.paused = False
+    session.put(topic, START + 2, START, string("after"))
+    session.stop()
+    assert read_texts(tmp_path / "run") == ["before", "after"]
+
+
+def test_full_queue_drops_and_counts(tmp_path: Path):
+    release = threading.Event()
+
+    class SlowBag(BagWriter):
+        def write(self, *arguments):
+            release.wait(20.0)
+            super().write(*arguments)
+
+    session = RecordingSession(SlowBag(tmp_path / "run"), queue_bytes=10_000)
+    topic = spec(TALK, TEXT)
+    taken = sum(session.put(topic, START + i, START, string("x" * 1_000)) for i in range(50))
+    assert 5 < taken < 15
+    assert session.status().dropped == 50 - taken
+    release.set()
+    assert session.stop().messages == taken
+    assert len(read_texts(tmp_path / "run")) == taken
+
+
+def test_little_space_stops_with_a_whole_bag_and_says_so_at_once(tmp_path: Path, monkeypatch):
+    free = [1 << 30]
+    monkeypatch.setattr(writer.shutil, "disk_usage", lambda _: SimpleNamespace(free=free[0]))
+    told: list[str] = []
+    session = RecordingSession(
+        BagWriter(tmp_path / "run", minimum_free=1 << 20),
+        flush_interval=0.02,
+        on_failure=told.append,
+    )
+    topic = spec(TALK, TEXT)
+    session.put(topic, START, START, string("kept"))
+    wait_until(lambda: session.status().messages == 1)
+    free[0] = 1000
+    wait_until(lambda: told)
+    assert "fewer than 1 MiB are free" in told[0]
+    assert session.status().failure == told[0]
+    assert not session.put(topic, START + 1, START, string("too late"))
+    session.stop()
+    assert read_texts(tmp_path / "run") == ["kept"]
+    with BagReader(tmp_path / "run") as bag:
+        assert not bag.unfinished
+    with pytest.raises(BagWriteError, match="fewer than 1 MiB are free"):
+        BagWriter(tmp_path / "next", minimum_free=1 << 20)

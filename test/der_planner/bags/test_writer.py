@@ -1,0 +1,177 @@
+"""Bags on disk, read back by rosbags and by mcap's own reader."""
+
+import errno
+import os
+import shutil
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+import yaml
+from bags import SECOND, START, TEXT, read_texts, spec, string
+from mcap.reader import make_reader
+from rosbags.rosbag2 import Reader
+
+from der_planner.bags.reader import BagReader
+from der_planner.bags.writer import METADATA_FILE, RUN_KEY, BagWriteError, BagWriter
+
+
+def fill(bag: BagWriter, count: int, step: int = SECOND // 10, first: int = 0) -> None:
+    bag.add_topic(spec("/talk", TEXT))
+    for index in range(first, first + count):
+        bag.write("/talk", START + index * step, START + index * step - 5, string(f"word {index}"))
+
+
+def test_rosbags_and_mcap_read_what_was_written(tmp_path: Path):
+    bag = BagWriter(tmp_path / "run", {RUN_KEY: '{"motion": "circle"}'})
+    fill(bag, 25)
+    assert bag.close() == tmp_path / "run"
+    words = [f"word {index}" for index in range(25)]
+    assert read_texts(tmp_path / "run") == words
+    with (tmp_path / "run" / "run_0.mcap").open("rb") as file:
+        found = list(make_reader(file, validate_crcs=True).iter_messages())
+    assert [message.data for _, _, message in found] == [string(word) for word in words]
+    schema, channel, message = found[0]
+    assert message.publish_time == START - 5
+    assert (schema.name, schema.encoding, channel.message_encoding) == (TEXT, "ros2msg", "cdr")
+    assert set(channel.metadata) == {"offered_qos_profiles", "topic_type_hash"}
+    with BagReader(tmp_path / "run") as reader:
+        assert reader.run() == {"motion": "circle"}
+
+
+def test_metadata_says_what_rosbag2_needs(tmp_path: Path):
+    bag = BagWriter(tmp_path / "run", {RUN_KEY: "{}"})
+    fill(bag, 11)
+    bag.add_topic(spec("/plan", TEXT, latched=True))
+    bag.write("/plan", START + 3 * SECOND, START, string("plan"))
+    bag.close()
+    document = yaml.safe_load((tmp_path / "run" / METADATA_FILE).read_text())
+    info = document["rosbag2_bagfile_information"]
+    assert info["version"] == 9
+    assert info["storage_identifier"] == "mcap"
+    assert info["relative_file_paths"] == ["run_0.mcap"]
+    assert info["message_count"] == 12
+    assert info["starting_time"]["nanoseconds_since_epoch"] == START
+    assert info["duration"]["nanoseconds"] == 3 * SECOND
+    counts = {
+        entry["topic_metadata"]["name"]: entry["message_count"]
+        for entry in info["topics_with_message_count"]
+    }
+    assert counts == {"/talk": 11, "/plan": 1}
+    profile = info["topics_with_message_count"][1]["topic_metadata"]["offered_qos_profiles"][0]
+    assert profile["durability"] == "transient_local"
+    with Reader(tmp_path / "run") as reader:
+        assert reader.message_count == 12
+        assert reader.duration == 3 * SECOND + 1
+
+
+def test_bytes_behind_the_content_are_no_damage_but_missing_ones_are(tmp_path: Path):
+    """As rclpy's serialize_message leaves them after empty sequences of doubles."""
+    bag = BagWriter(tmp_path / "run")
+    bag.add_topic(spec("/talk", TEXT))
+    bag.write("/talk", START, START, string("whole") + bytes(8))
+    bag.write("/talk", START + 1, START, string("cut short")[:-4])
+    with BagReader(bag.close()) as reader:
+        messages = reader.messages()
+        assert next(messages)[2].data == "whole"
+        with pytest.raises(Exception, match=r"String|string|Truncated|size"):
+            next(messages)
+
+
+@pytest.mark.parametrize("how", ["size", "time"])
+def test_split_repeats_latched_messages(tmp_path: Path, how: str):
+    options = {"split_bytes": 20_000} if how == "size" else {"split_seconds": 2.0}
+    bag = BagWriter(tmp_path / "run", compression="none", chunk_size=2_000, **options)
+    bag.add_topic(spec("/plan", TEXT, latched=True))
+    bag.write("/plan", START, START, string("the plan"))
+    fill(bag, 60 if how == "time" else 900)
+    bag.close()
+    files = sorted((tmp_path / "run").glob("*.mcap"))
+    assert len(files) >= 3
+    for file in files:
+        with file.open("rb") as stream:
+            messages = list(make_reader(stream).iter_messages())
+        assert messages[0][1].topic == "/plan"
+        assert messages[0][2].data == string("the plan")
+        assert messages[0][2].publish_time == START
+    texts = read_texts(tmp_path / "run")
+    assert texts.count("the plan") == len(files)
+    assert [t for t in texts if t != "the plan"] == [
+        f"word {i}" for i in range(60 if how == "time" else 900)
+    ]
+
+
+def test_small_messages_do_not_share_chunks_with_large_ones(tmp_path: Path):
+    bag = BagWriter(tmp_path / "run", compression="none")
+    for name in ("/talk", "/image"):
+        bag.add_topic(spec(name, TEXT))
+    for index in range(60):
+        when = START + index * SECOND // 30
+        bag.write("/talk", when, when, string(f"word {index}"))
+        bag.write("/image", when + 5, when, string("x" * 200_000))
+        if index % 30 == 29:
+            bag.flush()
+    bag.close()
+    with (tmp_path / "run" / "run_0.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    topics = {number: channel.topic for number, channel in summary.channels.items()}
+    held = [{topics[n] for n in index.message_index_offsets} for index in summary.chunk_indexes]
+    assert held.count({"/image"}) == 60
+    assert held.count({"/talk"}) == 2
+    assert len(held) == 62
+    everything = [text[:4] for text in read_texts(tmp_path / "run")]
+    assert everything == ["word", "xxxx"] * 60  # still in the order of time
+
+
+def test_a_folder_with_content_is_refused(tmp_path: Path):
+    (tmp_path / "mine.txt").write_text("precious")
+    with pytest.raises(BagWriteError, match="not empty"):
+        BagWriter(tmp_path)
+    assert (tmp_path / "mine.txt").read_text() == "precious"
+
+
+FULL_DISK = """
+    import resource, sys
+    sys.path.insert(0, {here!r})
+    from pathlib import Path
+    from bags import START, SECOND, TEXT, spec, string
+    from der_planner.bags.writer import BagWriter, BagWriteError
+    resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, resource.RLIM_INFINITY))
+    bag = BagWriter(Path({folder!r}), compression="none", chunk_size=4_000)
+    bag.add_topic(spec("/talk", TEXT))
+    try:
+        for index in range(10_000):
+            bag.write("/talk", START + index, START, string(f"word {{index}}"))
+            if index % 20 == 19:
+                bag.flush()
+    except BagWriteError as error:
+        print(error)
+        sys.exit(3)
+"""
+
+
+def test_a_file_that_cannot_grow_is_reported_and_readable(tmp_path: Path):
+    """The kernel's file size limit refuses a write in its middle, as a full disk does."""
+    folder = tmp_path / "run"
+    code = FULL_DISK.format(here=str(Path(__file__).parent), folder=str(folder))
+    ended = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)], check=False, capture_output=True, text=True
+    )
+    assert ended.returncode == 3, ended.stderr
+    assert os.strerror(errno.EFBIG) in ended.stdout
+    assert f"scripts/recover_bag.py {folder} saves what was written" in ended.stdout
+    with BagReader(folder) as reader:
+        texts = [message.data for _, _, message in reader.messages()]
+    assert len(texts) > 200
+    assert texts == [f"word {i}" for i in range(len(texts))]
+
+
+def test_a_removed_folder_is_reported(tmp_path: Path):
+    bag = BagWriter(tmp_path / "run")
+    fill(bag, 12)
+    shutil.rmtree(tmp_path / "run")
+    with pytest.raises(BagWriteError, match="was removed while it was recorded"):
+        bag.flush()
+    assert not (tmp_path / "run").exists()

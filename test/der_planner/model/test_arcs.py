@@ -1,0 +1,322 @@
+"""The PCC model against definitions: energies, finite differences, limits that are known."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from der_planner.limb import Limb
+from der_planner.model import ArcModel, arc_kernel
+from der_planner.model import arc_dynamics as kernels
+from der_planner.rod import Rod
+
+SEED = 4
+
+
+def limb_of(count, **changes):
+    base = Limb.default()
+    rng = np.random.default_rng(count)
+    segments = tuple(
+        dataclasses.replace(
+            base.segments[0],
+            length=float(rng.uniform(0.08, 0.15)),
+            mass_per_length=float(rng.uniform(0.5, 1.5)),
+            bending_stiffness=float(rng.uniform(0.01, 0.03)),
+            **changes,
+        )
+        for _ in range(count)
+    )
+    return dataclasses.replace(base, segments=segments, connector_length=0.01)
+
+
+@pytest.fixture(params=[1, 2, 3, 5], ids="{} segments".format)
+def model(request):
+    return ArcModel(limb_of(request.param))
+
+
+def configurations(model, count=5, scale=1.2):
+    rng = np.random.default_rng(SEED)
+    return rng.normal(scale=scale, size=(count, 2, model.segment_count))
+
+
+def material_points(model, q, points=4001):
+    """Points of the centreline with mass fractions, straight from the definition of an arc."""
+    s = (np.arange(points) + 0.5) / points
+    heading, start, result, masses = 0.0, 0j, [], []
+    for j, length in enumerate(model.lengths):
+        if j:
+            straight = np.exp(1j * heading) * model.connector
+            density = 0.5 * (model.masses / model.lengths)[j - 1 : j + 1].sum()
+            result.append(start + s * straight)
+            masses.append(np.full(points, density * model.connector / points))
+            start += straight
+        step = length / points
+        middle = np.exp(1j * (heading + q[j] * s)) * step
+        chain = start + np.cumsum(middle) - middle / 2
+        result.append(chain)
+        masses.append(np.full(points, model.masses[j] / points))
+        start += middle.sum()
+        heading += q[j]
+    return np.concatenate(result), np.concatenate(masses)
+
+
+def test_inertia_is_that_of_the_kinetic_energy(model):
+    for q, v in configurations(model, count=2):
+        h = 1e-5
+        ahead, mass = material_points(model, q + h * v)
+        behind, _ = material_points(model, q - h * v)
+        kinetic = 0.5 * (mass * np.abs((ahead - behind) / (2 * h)) ** 2).sum()
+        inertia, _, _ = model.matrices(q, v)
+        assert 0.5 * v @ inertia @ v == pytest.approx(kinetic, rel=1e-5)
+
+
+def test_rate_of_inertia_is_coriolis_plus_its_transpose(model):
+    for q, v in configurations(model):
+        h = 1e-5
+        ahead, behind = model.matrices(q + h * v, v)[0], model.matrices(q - h * v, v)[0]
+        rate = (ahead - behind) / (2 * h)
+        coriolis = model.matrices(q, v)[1]
+        np.testing.assert_allclose(coriolis + coriolis.T, rate, atol=1e-8 * np.abs(rate).max())
+
+
+def test_coriolis_terms_are_christoffel_symbols(model):
+    n, h = model.segment_count, 1e-5
+    for q, v in configurations(model, count=2):
+        slopes = np.array(
+            [
+                (model.matrices(q + h * e, v)[0] - model.matrices(q - h * e, v)[0]) / (2 * h)
+                for e in np.eye(n)
+            ]
+        )  # slopes[k, i, j] = ∂M_ij/∂q_k
+        symbols = 0.5 * (
+            np.einsum("kij,k->ij", slopes, v)
+            + np.einsum("jik,k->ij", slopes, v)
+            - np.einsum("ijk,k->ij", slopes, v)
+        )
+        coriolis = model.matrices(q, v)[1]
+        np.testing.assert_allclose(coriolis, symbols, atol=1e-8 * np.abs(symbols).max() + 1e-14)
+
+
+def test_inertia_is_symmetric_and_positive_definite(model):
+    for q, v in configurations(model):
+        inertia = model.matrices(q, v)[0]
+        np.testing.assert_allclose(inertia, inertia.T, rtol=1e-12)
+        assert np.linalg.eigvalsh(inertia).min() > 0
+
+
+def test_straight_segment_has_the_inertia_of_a_parabola():
+    model = ArcModel(limb_of(1))
+    length, mass = model.lengths[0], model.masses[0]
+    inertia = model.matrices(np.zeros(1), np.zeros(1))[0]
+    assert inertia[0, 0] == pytest.approx(mass * length**2 / 20, rel=1e-12)
+
+
+@pytest.mark.parametrize("order", [0, 1, 2, 3])
+def test_arc_functions_are_smooth_where_series_and_quotient_meet(order):
+    z = arc_kernel.SERIES_BELOW
+    below, above = (
+        arc_kernel.arc_moments(z - 1e-12)[order],
+        arc_kernel.arc_moments(z + 1e-12)[order],
+    )
+    assert abs(below - above) < 1e-11
+    eta, weight = np.polynomial.legendre.leggauss(40)
+    eta, weight = (eta + 1) / 2, weight / 2
+    for value in (-7.0, -0.3, -1e-9, 0.0, 1e-300, 0.499, 0.501, 3.0):
+        exact = (weight * eta**order * np.exp(1j * value * eta)).sum()
+        assert abs(arc_kernel.arc_moments(value)[order] - exact) < 1e-13
+
+
+def test_tip_and_its_jacobian_agree(model):
+    h = 1e-6
+    for q, _ in configurations(model):
+        columns = [
+            (model.tip(q + h * e) - model.tip(q - h * e)) / (2 * h)
+            for e in np.eye(model.segment_count)
+        ]
+        np.testing.assert_allclose(model.tip_jacobians(q), np.array(columns).T, atol=1e-9)
+        np.testing.assert_allclose(model.curve(q)[-1], model.tip(q), atol=1e-14)
+
+
+def rolled(model, pressures, step, angles=None, rates=None):
+    """Angles and rates (K+1, n) from a given state, else straight, by the kernel itself."""
+    still = np.zeros(model.segment_count)
+    q, v = (still if given is None else given for given in (angles, rates))
+    return kernels.simulate(q, v, pressures, step, model._parts(step), model.arcs)
+
+
+def undamped(count):
+    limb = limb_of(count, damping=0.0)
+    return ArcModel(dataclasses.replace(limb, gravity=(2.0, -1.0, 0.0)))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_undamped_motion_keeps_its_energy(count):
+    model = undamped(count)
+    q0, v0 = np.linspace(0.5, -0.4, count), np.linspace(1.0, -2.0, count)
+    angles, rates = rolled(model, np.zeros((100, 20, count)), 5e-4, q0, v0)
+    energies = np.array([model.energy(q, v) for q, v in zip(angles, rates, strict=True)])
+    swing = np.ptp(
+        [0.5 * v @ model.matrices(q, v)[0] @ v for q, v in zip(angles, rates, strict=True)]
+    )
+    assert swing > 1e-4
+    assert np.ptp(energies) < 1e-5 * swing
+
+
+def test_pressures_invert_the_forward_dynamics(model):
+    rng = np.random.default_rng(SEED)
+    q, v, a = rng.normal(size=(3, 6, model.segment_count))
+    pressures = model.inverse_dynamics(q, v, a)
+    for k in range(len(q)):
+        back = kernels.acceleration(q[k], v[k], model.gain * pressures[k], model.arcs)
+        np.testing.assert_allclose(back, a[k], rtol=1e-9, atol=1e-9)
+
+
+def test_resting_pressures_are_the_static_ones():
+    limb = Limb.default()
+    model, zero = ArcModel(limb), np.zeros((1, 2))
+    q = np.array([[0.4, -0.7]])
+    np.testing.assert_allclose(
+        model.inverse_dynamics(q, zero, zero) * limb.static_gain, q, rtol=1e-12
+    )
+
+
+def test_a_simulated_limb_settles_where_the_pressure_holds_it():
+    limb = Limb.default()
+    model = ArcModel(limb)
+    pressure = np.array([6000.0, -3000.0])
+    angles, _ = rolled(model, np.tile(pressure, (400, 10, 1)), 5e-3)
+    np.testing.assert_allclose(angles[-1], pressure * limb.static_gain, rtol=1e-3)
+
+
+def test_bad_input_is_named():
+    model = ArcModel(Limb.default())
+    with pytest.raises(ValueError, match="bend_angles must be 2 finite numbers"):
+        model.matrices([1.0], [0.0, 0.0])
+    with pytest.raises(ValueError, match=r"\(K, S, 2\)"):
+        model.run(model.rest, np.zeros((4, 2)), 0.01)
+
+
+def loaded(count):
+    """A limb under gravity with masses in a segment, on a connector and at the tip."""
+    limb = limb_of(count)
+    first = limb.segments[0].length
+    limb = dataclasses.replace(limb, gravity=(6.0, -7.0, 0.0), base_length=0.03)
+    limb = limb.carrying(0.03).carrying(0.02, at=0.03 + 0.4 * first)
+    return limb.carrying(0.05, at=0.03 + first + 0.004) if count > 1 else limb
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_carried_masses_move_with_their_places(count):
+    limb = loaded(count)
+    bare = ArcModel(dataclasses.replace(limb, masses=()))
+    model = ArcModel(limb)
+    for q, v in configurations(model, count=3):
+
+        def places(angles):
+            curve = bare.curve(angles, points_per_segment=500)
+            steps = np.append(0.0, np.cumsum(np.hypot(*np.diff(curve, axis=0).T)))
+            s = np.array([m.arc_length for m in limb.masses]) * steps[-1] / limb.length
+            return np.stack([np.interp(s, steps, axis) for axis in curve.T], axis=1)
+
+        h = 1e-4
+        mass = np.array([m.mass for m in limb.masses])
+        rate = (places(q + h * v) - places(q - h * v)) / (2 * h)
+        added = 0.5 * v @ (model.matrices(q, v)[0] - bare.matrices(q, v)[0]) @ v
+        assert added == pytest.approx(0.5 * (mass * (rate**2).sum(axis=1)).sum(), rel=1e-4)
+        height = -places(q) @ np.array(limb.gravity[:2])
+        assert model.energy(q, 0 * q) - bare.energy(q, 0 * q) == pytest.approx(
+            (mass * height).sum(), rel=1e-4
+        )
+        np.testing.assert_allclose(model.matrices(q, v)[2], bare.matrices(q, v)[2], rtol=1e-12)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_pressures_at_rest_balance_the_gradient_of_the_energy(count):
+    model = ArcModel(loaded(count))
+    zero = np.zeros(count)
+    for q, _ in configurations(model, count=3):
+        h = 1e-6
+        slope = [
+            (model.energy(q + h * e, zero) - model.energy(q - h * e, zero)) / (2 * h)
+            for e in np.eye(count)
+        ]
+        torque = model.inverse_dynamics(q, zero, zero)[0] * model.gain
+        np.testing.assert_allclose(torque, slope, rtol=1e-6, atol=1e-9)
+
+
+def test_a_loaded_swing_keeps_its_energy():
+    limb = loaded(2)
+    segments = tuple(dataclasses.replace(s, damping=0.0) for s in limb.segments)
+    model = ArcModel(dataclasses.replace(limb, segments=segments))
+    angles, rates = rolled(model, np.zeros((60, 20, 2)), 1e-3, np.array([0.9, -0.6]))
+    energy = [model.energy(q, v) for q, v in zip(angles, rates, strict=True)]
+    kinetic = [0.5 * v @ model.matrices(q, v)[0] @ v for q, v in zip(angles, rates, strict=True)]
+    assert np.ptp(kinetic) > 1e-3
+    assert np.ptp(energy) < 3e-5 * np.ptp(kinetic)
+
+
+def test_a_stiff_limb_is_not_stepped_over_its_fastest_mode():
+    limb = limb_of(3)
+    segments = tuple(
+        dataclasses.replace(s, bending_stiffness=60 * s.bending_stiffness) for s in limb.segments
+    )
+    model = ArcModel(dataclasses.replace(limb, segments=segments))
+    pressures = np.full((20, 5, 3), 5e4)
+    coarse, _ = rolled(model, pressures, 0.01)
+    fine, _ = rolled(model, np.repeat(pressures, 20, axis=1), 0.0005)
+    np.testing.assert_allclose(coarse, fine, atol=0.15 * np.abs(fine).max())
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_force_slopes_against_finite_differences(count):
+    model = ArcModel(loaded(count))
+    rng = np.random.default_rng(SEED)
+    arcs = model.arcs
+
+    def force(q, v, a):
+        M, C, D, weight = kernels.inertia(q, v, arcs)
+        elastic = model.elastic_torque(q) + model.stiffness * model.material_damping * v
+        return M @ a + (C + D) @ v + elastic - weight
+
+    for _ in range(3):
+        q, v, a = rng.normal(size=(3, count))
+        q *= 0.8
+        by_angle, by_rate = kernels.force_slopes(q, v, a, arcs)
+        h = 1e-5
+        for i, step in enumerate(h * np.eye(count)):
+            column = (force(q + step, v, a) - force(q - step, v, a)) / (2 * h)
+            np.testing.assert_allclose(by_angle[:, i], column, rtol=1e-6, atol=1e-8)
+            column = (force(q, v + step, a) - force(q, v - step, a)) / (2 * h)
+            np.testing.assert_allclose(by_rate[:, i], column, rtol=1e-6, atol=1e-8)
+
+
+def test_linearisation_against_the_simulation():
+    model = ArcModel(loaded(2))
+    rng = np.random.default_rng(SEED)
+    pressures = 4e3 * rng.normal(size=(12, 5, 2))
+    start, rates = np.array([0.4, -0.2]), np.array([1.0, 2.0])
+    linear = model.run(model.state(start, rates), pressures, 0.05, "all").linear
+    change, shift = rng.normal(size=pressures.shape), 1e-4 * rng.normal(size=2)
+    ends = [
+        rolled(model, pressures + s * change, 0.01, start + s * shift, rates)[0]
+        for s in (1.0, -1.0)
+    ]
+    _, moved = linear.tangent(change, shift)
+    np.testing.assert_allclose(moved, (ends[0] - ends[1]) / 2, rtol=1e-5, atol=1e-10)
+    pulse = rng.uniform(size=(9, 2))
+    raised = np.zeros((14, 5, 2))
+    raised.reshape(-1, 2)[15:24] = pulse * [0.0, 1.0]
+    column = linear.sensitivity(pulse)[:, :, 3, 1]
+    np.testing.assert_allclose(column, linear.tangent(raised[:12])[0], rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize("mounting", ["hanging", "sideways", "25"])
+def test_many_arcs_rest_as_the_rod_does(mounting):
+    base = Limb.default()
+    count = 12
+    part = dataclasses.replace(base.segments[0], length=base.length / count)
+    limb = dataclasses.replace(base, segments=(part,) * count).mounted(mounting).carrying(0.03)
+    model = ArcModel(limb)
+    tip = model.tip(model.rest.angles)
+    rod = Rod.from_limb(base.mounted(mounting).carrying(0.03), 61)
+    np.testing.assert_allclose(tip, rod.tip(rod.equilibrium(np.zeros(2)))[:2], atol=1e-3)

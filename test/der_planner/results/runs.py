@@ -1,0 +1,181 @@
+"""Synthetic runs with known errors, as arrays and as bags."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from bags import SECOND, START, spec, store
+
+from der_planner.bags.writer import RUN_KEY, BagWriter
+from der_planner.results import Description, RunSeries
+
+PERIOD, CYCLES = 4.0, 2
+TIMES = np.arange(0.0, PERIOD * CYCLES + 1.0 + 1e-9, 0.05)
+FRAMES = np.arange(-0.5, TIMES[-1] + 0.5, 1 / 30) + 0.011
+
+
+def reference(time: np.ndarray) -> np.ndarray:
+    """Return a tip path (N, 2) [m]."""
+    phase = 2 * np.pi * np.asarray(time) / PERIOD
+    return np.column_stack([0.2 + 0.02 * np.cos(phase), 0.06 * np.sin(phase)])
+
+
+def series(
+    tip, *, model="der", trial=0, seed=0, motion="same_direction", time=FRAMES, **changes
+) -> RunSeries:
+    """Return a run whose measured tip is given at `FRAMES`."""
+    about = {
+        "method": "paper",
+        "trial": trial,
+        "seed": seed,
+        "amplitude": 0.7,
+        "period": PERIOD,
+        "cycles": CYCLES,
+    }
+    about.update(changes)
+    return RunSeries.from_arrays(
+        Description(motion, model, **about),
+        time=time,
+        tip=tip,
+        reference_time=TIMES,
+        tip_reference=reference(TIMES),
+        tip_predicted=reference(TIMES) + np.array([0.001, 0.0]),
+    )
+
+
+class BagOfRun:
+    """Writes the messages of one run into a bag, with rosbags' serializer."""
+
+    def __init__(
+        self,
+        folder: Path,
+        writer: BagWriter | None = None,
+        run: str = "{}",
+        namespace: str = "/limb",
+    ) -> None:
+        self.namespace = namespace
+        self.types = store()
+        self.bag = writer or BagWriter(folder, {RUN_KEY: run})
+        self.start = START + 7 * SECOND
+
+    def stamp(self, seconds: float) -> int:
+        return self.start + round(seconds * SECOND)
+
+    def header(self, seconds: float):
+        stamp = self.stamp(seconds)
+        kinds = self.types.types
+        return kinds["std_msgs/msg/Header"](
+            stamp=kinds["builtin_interfaces/msg/Time"](sec=stamp // SECOND, nanosec=stamp % SECOND),
+            frame_id="limb_base",
+        )
+
+    def write(self, topic: str, kind: str, seconds: float, latched: bool = False, **fields) -> None:
+        topic = topic.replace("/limb", self.namespace, 1)
+        name = f"der_msgs/msg/{kind}"
+        message = self.types.types[name](header=self.header(seconds), **fields)
+        self.bag.add_topic(spec(topic, name, latched))
+        data = bytes(self.types.serialize_cdr(message, name))
+        # A message arrives some time after its stamp; the evaluation must go by the stamp.
+        self.bag.write(topic, self.stamp(seconds + 0.03), self.stamp(seconds + 0.02), data)
+
+    def plan(self, plan_id="p", model="der", stamp=0.0, gravity=(0.0, 0.0, 0.0)) -> None:
+        zeros = np.zeros(2 * len(TIMES))
+        self.write(
+            "/limb/plan",
+            "PressurePlan",
+            stamp,
+            latched=True,
+            plan_id=plan_id,
+            motion="same_direction",
+            model=model,
+            method="paper",
+            amplitude=0.7,
+            period=PERIOD,
+            cycles=CYCLES,
+            limb="test limb",
+            gravity=np.array(gravity),
+            payload=0.02 if any(gravity) else 0.0,
+            payload_at=0.244 if any(gravity) else 0.0,
+            segment_count=2,
+            time=TIMES,
+            differential_pressure=zeros,
+            tip_reference=reference(TIMES).ravel(),
+            tip_predicted=reference(TIMES).ravel(),
+            solve_time=0.1,
+            predicted_error=0.0,
+        )
+
+    def setpoint(self, index: int, value, plan_id="p", revision=0) -> None:
+        self.write(
+            "/limb/pressure_setpoint",
+            "PressureSetpoint",
+            TIMES[index],
+            plan_id=plan_id,
+            index=index,
+            revision=revision,
+            differential_pressure=np.asarray(value, dtype=float),
+        )
+
+    def state(self, seconds: float, tip, valid=True, topic="/limb/state") -> None:
+        kinds = self.types.types
+        nan = float("nan")
+        x, y = tip if valid else (nan, nan)
+        self.write(
+            topic,
+            "LimbState",
+            seconds,
+            valid=valid,
+            reason="",
+            tip=kinds["geometry_msgs/msg/Point"](x=float(x), y=float(y), z=0.0),
+            tip_covariance=np.zeros(4),
+            tip_systematic=np.zeros(4),
+            bend_angle=np.array([0.1, 0.2]),
+            bend_angle_sigma=np.zeros(2),
+            curvature=np.zeros(2),
+            elongation=1.0,
+            residual=0.0,
+            curve=[],
+            tags_used=5,
+            latency=0.02,
+        )
+
+    def pressure(self, seconds: float, commanded, measured, mode=2, faults=()) -> None:
+        kinds = self.types.types
+        self.write(
+            "/limb/pressure_state",
+            "PressureState",
+            seconds,
+            mode=mode,
+            faults=list(faults),
+            plan_id="p",
+            index=0,
+            setpoint_stamp=kinds["builtin_interfaces/msg/Time"](sec=0, nanosec=0),
+            commanded_differential=np.asarray(commanded, dtype=float),
+            measured_differential=np.asarray(measured, dtype=float),
+            commanded_chamber=np.zeros(4),
+            measured_chamber=np.zeros(4),
+            valve_opening=np.zeros(4),
+            supply_pressure=0.0,
+            telemetry_age=0.0,
+            round_trip=0.0,
+            setpoints_accepted=0,
+            setpoints_executed=0,
+            setpoints_late=0,
+            setpoints_duplicate=0,
+            setpoints_refused=0,
+            bytes_sent=0,
+            bytes_received=0,
+        )
+
+    def command(self, seconds: float, differential, sequence: int) -> None:
+        chambers = np.repeat(101_300.0, 4)
+        for segment, value in enumerate(differential):
+            chambers[2 * segment + (value < 0)] += abs(value)
+        self.write(
+            "/limb/twin/board_commands",
+            "ChamberPressures",
+            seconds,
+            sequence=sequence,
+            pressure=np.round(chambers, -2),
+        )

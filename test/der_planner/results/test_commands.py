@@ -1,0 +1,61 @@
+"""The commands on bags, as people call them."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from runs import FRAMES, TIMES, BagOfRun, reference
+
+pytestmark = pytest.mark.slow
+
+SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"
+
+
+def run(script: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(SCRIPTS / script), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+
+
+@pytest.fixture(scope="module")
+def experiment(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("experiment")
+    for model, error in (("der", 0.002), ("pcc", 0.008)):
+        bag = BagOfRun(folder / "bags" / model, run=json.dumps({"trial": 1, "seed": 1}))
+        bag.plan(model=model)
+        for index in range(len(TIMES)):
+            bag.setpoint(index, [0.0, 0.0])
+        for when in FRAMES:
+            bag.state(when, reference(when)[0] + [0.0, error])
+        bag.bag.close()
+    return folder
+
+
+def test_evaluate_an_experiment_and_a_bag_that_is_none(experiment: Path, tmp_path: Path):
+    missing = tmp_path / "missing"
+    done = run("evaluate.py", experiment, missing, "--results", tmp_path)
+    assert done.returncode == 1
+    assert f"error: no bag at {missing}" in done.stderr
+    assert "0.60 cm less error" in done.stdout
+    document = json.loads((tmp_path / "results.json").read_text())
+    errors = {entry["model"]: entry["mean_error_m"] for entry in document["runs"]}
+    assert errors == {
+        "der": pytest.approx(0.002, abs=5e-5),
+        "pcc": pytest.approx(0.008, abs=5e-5),
+    }
+
+
+def test_recover_says_what_it_did(experiment: Path):
+    bag = experiment / "bags" / "der"
+    done = run("recover_bag.py", bag)
+    assert done.returncode == 0
+    assert "whole, nothing to recover" in done.stdout
+    (bag / "metadata.yaml").unlink()
+    file = bag / "der_0.mcap"
+    file.write_bytes(file.read_bytes()[:-40])
+    done = run("recover_bag.py", bag, bag / "metadata.yaml.missing")
+    assert done.returncode == 1
+    assert f"saved in {bag}_recovered; lost: " in done.stdout
+    assert "metadata.yaml.missing" in done.stderr
+    assert run("evaluate.py", f"{bag}_recovered").returncode == 0

@@ -1,0 +1,202 @@
+"""The page, the figures over camera frames and the film, from bags with images."""
+
+import base64
+import csv
+import json
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from filmed import FilmedRun, pixels
+from runs import FRAMES, TIMES, BagOfRun, reference, series
+
+from der_planner.bags.images import gray
+from der_planner.results import (
+    EvaluationError,
+    compare,
+    evaluate_bags,
+    evaluate_run,
+    load_run,
+    write_report,
+)
+from der_planner.results.overlay import plot_shapes, write_video
+from der_planner.results.snapshots import fit_projection, take_snapshots
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("filmed") / "run"
+    run = FilmedRun(path, run=json.dumps({"trial": 1, "seed": 1, "commit": "c0ffee"}))
+    run.plan()
+    run.calibration()
+    random = np.random.default_rng(2)
+    for index, when in enumerate(FRAMES[FRAMES >= 0]):
+        run.state(when, reference(when)[0] + np.array([0.0, 0.002]))
+        if index % 10 == 0:
+            run.frame(when, shade=index % 250)
+            run.tags(when, random.uniform([0.0, -0.1], [0.24, 0.1], (5, 2)))
+    for index in range(len(TIMES)):
+        run.setpoint(index, [0.0, 0.0])
+    run.bag.close()
+    return path
+
+
+def test_projection_is_found_from_the_tags_alone(bag: Path):
+    project = fit_projection(load_run(bag))
+    points = np.random.default_rng(3).uniform([0.0, -0.1], [0.24, 0.1], (50, 2))
+    assert project.residual < 0.02
+    assert np.abs(project(points) - pixels(points)).max() < 0.05
+    assert project(np.empty((0, 2))).shape == (0, 2)
+
+
+def test_snapshot_is_the_nearest_frame(bag: Path):
+    frames = FRAMES[FRAMES >= 0]
+    asked = float(frames[40]) + 0.02
+    (shot,) = take_snapshots(load_run(bag), [asked])
+    assert shot.frame.shape == (240, 320)
+    assert np.all(shot.frame == 40)
+    assert shot.planned.shape == (0, 2)
+
+
+def test_colour_images_become_gray():
+    class Message:
+        encoding, height, width, step = "bgr8", 2, 2, 8
+        data = bytes([255, 0, 0, 0, 255, 0, 9, 9] * 2)
+
+    blue, green = gray(Message)[0]
+    assert blue < green
+    Message.encoding = "bayer_rggb8"
+    assert gray(Message) is None
+
+
+class Links(HTMLParser):
+    """Collects what a page would load, and checks that tags are balanced."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.sources: list[str] = []
+        self.open: list[str] = []
+        self.text: list[str] = []
+
+    def handle_starttag(self, tag, attributes):
+        self.sources += [v for k, v in attributes if k in ("src", "href", "srcset") and v]
+        if tag not in ("meta", "img", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def test_report_is_one_page_with_everything_in_it(bag: Path, tmp_path: Path):
+    run = load_run(bag)
+    other = series(reference(FRAMES) + np.array([0.0, 0.01]), model="pcc", trial=1, seed=1)
+    results = [evaluate_run(run), evaluate_run(other)]
+    report = write_report([run, other], results, tmp_path, title="Errors <of a lab>")
+    names = {path.name for path in report.files}
+    assert names >= {"results.json", "table.md", "table.csv", "table.tex", "report.html"}
+    assert names >= {f"{n}.{e}" for n in ("tip", "error", "shapes") for e in ("png", "pdf")}
+    page = Links()
+    text = report.page.read_text()
+    page.feed(text)
+    assert page.open == []
+    assert page.sources
+    assert all(source.startswith("data:image/png;base64,") for source in page.sources)
+    assert "url(" not in text
+    assert "Errors <of a lab>" in page.text
+    assert "c0ffee" in "".join(page.text)
+    (found,) = compare(results)
+    assert f"{found.difference_m * 100:.2f} cm less error" in "".join(page.text)
+    with (tmp_path / "table.csv").open() as file:
+        rows = {row["model"]: float(row["mean_error_m"]) for row in csv.DictReader(file)}
+    assert rows["der"] == pytest.approx(0.002, abs=5e-5)
+    assert rows["pcc"] == pytest.approx(0.01, abs=5e-5)
+
+
+def test_report_takes_figures_that_are_drawn_already(tmp_path: Path):
+    run = series(reference(FRAMES))
+    drawn = [tmp_path / f"tip.{ending}" for ending in ("png", "pdf")]
+    for path in drawn:
+        path.write_bytes(f"the {path.suffix} of an earlier drawing".encode())
+    seen = []
+    report = write_report(
+        [run], [evaluate_run(run)], tmp_path / "report", drawn=drawn, progress=seen.append
+    )
+    for path in drawn:
+        assert (tmp_path / "report" / path.name).read_bytes() == path.read_bytes()
+    assert base64.b64encode(drawn[0].read_bytes()).decode() in report.page.read_text()
+    assert "figure error" in seen
+    assert "figure tip" not in seen
+    assert (tmp_path / "report" / "error.pdf").exists()
+
+
+def test_film_has_every_frame(bag: Path, tmp_path: Path):
+    path = write_video(load_run(bag), tmp_path / "film.mp4")
+    film = cv2.VideoCapture(str(path))
+    count = 0
+    while film.read()[0]:
+        count += 1
+    assert count == len(FRAMES[FRAMES >= 0][::10])
+
+
+def test_bag_without_images_has_shapes_but_no_film(tmp_path: Path):
+    run = BagOfRun(tmp_path / "plain")
+    run.plan()
+    for when in FRAMES:
+        run.state(when, reference(when)[0])
+    run.setpoint(0, [0.0, 0.0])
+    run.setpoint(len(TIMES) - 1, [0.0, 0.0])
+    run.bag.close()
+    loaded = load_run(tmp_path / "plain")
+    assert fit_projection(loaded) is None
+    assert len(plot_shapes([loaded], tmp_path)) == 2
+    with pytest.raises(EvaluationError, match="no camera calibration"):
+        write_video(loaded, tmp_path / "film.mp4")
+    assert plot_shapes([series(reference(FRAMES))], tmp_path) == []
+
+
+def test_bags_in_parallel_keep_their_order_and_their_errors(bag: Path, tmp_path: Path):
+    missing = tmp_path / "missing"
+    seen = []
+    found = evaluate_bags(
+        [bag, missing, bag],
+        workers=2,
+        progress=lambda done, total, _: seen.append((done, total)),
+    )
+    assert [entry.path for entry in found] == [bag, missing, bag]
+    assert f"no bag at {missing}" in found[1].error
+    assert found[0].result == found[2].result
+    assert seen == [(1, 3), (2, 3), (3, 3)]
+    alone = evaluate_bags([bag], workers=1)
+    assert alone[0].result == found[0].result
+
+
+def test_a_browser_draws_the_page_from_disk_without_network(bag: Path, tmp_path: Path):
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("needs Chromium: sudo apt-get install chromium")
+    run = load_run(bag)
+    page = write_report([run], [evaluate_run(run)], tmp_path / "report").page
+    picture = tmp_path / "page.png"
+    subprocess.run(
+        [
+            browser, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run",
+            "--disable-background-networking", "--disable-component-update", "--disable-sync",
+            "--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={tmp_path / 'profile'}",
+            "--window-size=1000,1400", f"--screenshot={picture}", page.as_uri(),
+        ],
+        check=True,
+        capture_output=True,
+        timeout=120,
+    )  # fmt: skip
+    drawn = cv2.imread(str(picture))
+    # Text and figures in colour: a page whose figures are missing has neither.
+    saturation = drawn.max(axis=2).astype(int) - drawn.min(axis=2)
+    assert (saturation > 60).sum() > 500
+    assert (drawn.max(axis=2) < 80).sum() > 2000

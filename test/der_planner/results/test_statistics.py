@@ -1,0 +1,206 @@
+"""Means over trials, comparisons, and what must not be compared."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+from runs import FRAMES, reference, series
+
+from der_planner.bags.run import BoardLog
+from der_planner.results import (
+    compare,
+    csv_table,
+    evaluate_run,
+    format_table,
+    latex_table,
+    markdown_table,
+    read_results,
+    summarise,
+    write_results,
+)
+from der_planner.results.selfcheck import check_board
+
+
+def result(error: float, model="der", trial=0, **changes):
+    found = evaluate_run(
+        series(reference(FRAMES) + np.array([0.0, error]), model=model, trial=trial, seed=trial)
+    )
+    return dataclasses.replace(found, **{"mean_error_m": error, **changes})
+
+
+DER = [result(e, trial=t) for t, e in enumerate([0.010, 0.012, 0.014])]
+PCC = [result(e, "pcc", t) for t, e in enumerate([0.020, 0.021, 0.025])]
+
+
+def test_mean_and_sample_deviation_over_trials():
+    (row,) = summarise(DER)
+    assert row.trials == 3
+    assert row.mean_error_m == pytest.approx(0.012)
+    assert row.std_error_m == pytest.approx(0.002)
+    assert row.max_error_m == max(run.max_error_m for run in DER)
+    assert math.isnan(summarise(DER[:1])[0].std_error_m)
+
+
+def test_paired_difference_and_interval():
+    (found,) = compare([*DER, *PCC])
+    assert found.paired
+    assert found.difference_m == pytest.approx(0.010)
+    # Every resampled mean lies between the least and the largest difference.
+    assert 0.0089 < found.low_m <= found.difference_m <= found.high_m < 0.0111
+    assert found.ratio == pytest.approx(22.0 / 12.0)
+    assert compare([*DER, *PCC])[0] == found
+
+
+def test_interval_covers_the_truth_as_often_as_it_says():
+    random = np.random.default_rng(1)
+    covered = 0
+    for _ in range(60):
+        one = [
+            dataclasses.replace(DER[0], seed=i, mean_error_m=0.01 + random.normal(0, 1e-3))
+            for i in range(12)
+        ]
+        two = [
+            dataclasses.replace(PCC[0], seed=i, mean_error_m=0.02 + random.normal(0, 1e-3))
+            for i in range(12)
+        ]
+        (found,) = compare([*one, *two])
+        covered += found.low_m <= 0.01 <= found.high_m
+    assert 50 <= covered <= 60
+
+
+def test_unpaired_trials_and_single_trials():
+    shifted = [dataclasses.replace(run, seed=run.seed + 10) for run in PCC]
+    (found,) = compare([*DER, *shifted])
+    assert not found.paired
+    assert found.low_m < found.difference_m < found.high_m
+    (single,) = compare([DER[0], PCC[0]])
+    assert single.difference_m == pytest.approx(0.010)
+    assert math.isnan(single.low_m)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"period_s": 6.0}, "different period: 4 s, 6 s"),
+        ({"amplitude_rad": 0.5}, "different amplitude: 0.5 rad, 0.7 rad"),
+        ({"problems": ("the driver reported a fault: x",)}, "fault"),
+        ({"removed_lag_s": 0.1}, "lag was removed from some"),
+        ({"window_s": (1.0, 8.0)}, "different windows"),
+        (
+            {"reference_points_m": tuple((x, y + 0.006) for x, y in DER[0].reference_points_m)},
+            "up to 6.0 mm apart",
+        ),
+    ],
+)
+def test_what_is_not_comparable_is_refused_with_the_reason(change, reason):
+    (found,) = compare([*DER, *PCC[:2], dataclasses.replace(PCC[2], **change)])
+    assert reason in found.refused
+    assert math.isnan(found.difference_m)
+    assert "not compared" in format_table(summarise([*DER, *PCC]), [found])
+
+
+def test_a_comparison_under_different_methods_says_so():
+    runs = [dataclasses.replace(run, method="optimal") for run in [*DER, *PCC]]
+    (same,) = compare(runs)
+    assert "methods differ" not in format_table([], [same])
+    (mixed,) = compare([*runs[:3], *(dataclasses.replace(r, method="paper") for r in PCC)])
+    assert "der optimal against pcc paper (methods differ" in format_table(
+        [*summarise(runs)], [mixed]
+    )
+
+
+def test_other_motions_are_not_mixed():
+    other = [dataclasses.replace(run, motion="asynchronous") for run in PCC]
+    assert compare([*DER, *other]) == []
+    assert len(summarise([*DER, *other])) == 2
+
+
+def test_other_loads_are_not_mixed():
+    hung = [dataclasses.replace(run, mounting="hanging", payload_kg=0.02) for run in [*DER, *PCC]]
+    level, loaded = compare([*DER, *PCC, *hung])
+    assert (level.loads, loaded.loads) == ("", "hanging, 20 g")
+    rows = summarise([*DER, *PCC, *hung])
+    assert len(rows) == 4
+    text = format_table(rows, [level, loaded])
+    assert "same_direction (hanging, 20 g): der" in text
+    assert "loads" not in format_table(summarise(DER))
+    for table in (markdown_table(rows), csv_table(rows), latex_table(rows)):
+        assert "hanging, 20 g" in table
+
+
+def test_results_file(tmp_path):
+    path = write_results([*DER, *PCC], tmp_path)
+    document = json.loads(path.read_text())
+    needed = {
+        "motion", "model", "method", "trial", "seed", "mean_error_m", "mean_error_x_m",
+        "mean_error_y_m", "max_error_m", "valid_fraction", "bag",
+    }  # fmt: skip
+    assert all(needed <= entry.keys() for entry in document["runs"])
+    assert len(document["runs"]) == 6
+    assert [entry["trials"] for entry in document["summary"]] == [3, 3]
+    assert document["comparisons"][0]["difference_m"] == pytest.approx(0.01)
+    assert [run.mean_error_m for run in read_results(path)] == [
+        run.mean_error_m for run in [*DER, *PCC]
+    ]
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_tables_hold_the_same_numbers():
+    rows = summarise([*DER, *PCC])
+    text, markdown, latex, csv = (
+        format_table(rows),
+        markdown_table(rows),
+        latex_table(rows),
+        csv_table(rows),
+    )
+    assert "1.20 ± 0.20" in text
+    assert "1.20 ± 0.20" in markdown
+    assert r"1.20 \pm 0.20" in latex
+    assert latex.count(r"\\") == 3
+    head, first, _ = csv.splitlines()
+    values = dict(zip(head.split(","), first.split(","), strict=True))
+    assert float(values["mean_error_m"]) == pytest.approx(0.012)
+    markdown_columns = {line.count("|") for line in markdown.splitlines()}
+    assert markdown_columns == {10}
+
+
+def board(count=50, **changes) -> BoardLog:
+    time = 0.05 * np.arange(count)
+    value = np.column_stack([4000 * np.sin(time), -4000 * np.cos(time)])
+    arrays = {
+        "setpoint_time": time,
+        "setpoint": value,
+        "command_time": time + 0.003,
+        "command": np.round(value, -2),
+    }
+    return BoardLog(**{**arrays, **changes})
+
+
+def test_board_receives_all_in_time():
+    found = check_board(board())
+    assert (found.received, found.lost, found.out_of_order) == (50, 0, 0)
+    assert found.lateness_p99 == pytest.approx(0.003)
+    assert found.value_error <= 50.0
+
+
+def test_lost_late_and_swapped_commands_are_told_apart():
+    whole = board()
+    keep = np.arange(50) != 20
+    lost = check_board(board(command_time=whole.command_time[keep], command=whole.command[keep]))
+    assert (lost.received, lost.lost) == (49, 1)
+    assert lost.lateness_max == pytest.approx(0.003)
+
+    time = whole.command_time.copy()
+    time[20] += 0.12
+    order = np.argsort(time, kind="stable")
+    late = check_board(board(command_time=time[order], command=whole.command[order]))
+    assert late.lost == 0
+    assert late.out_of_order == 1
+    assert late.lateness_max == pytest.approx(0.123)
+
+    values = whole.command.copy()
+    values[20] += 3000.0
+    wrong = check_board(board(command=values))
+    assert wrong.lost == 1

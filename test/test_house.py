@@ -1,0 +1,57 @@
+"""Rules of the house that no linter knows: one name for one thing, short lists of parameters."""
+
+from __future__ import annotations
+
+import ast
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TypeVar
+
+ROOT = Path(__file__).resolve().parents[1]
+MOST_PARAMETERS = 8
+
+NAMED_TWICE = {
+    "Audience", "Body", "Chain", "Frame", "Hardware", "Linearisation", "Motion", "Outcome", "Piece",
+    "Playback", "Played", "Report", "Run", "Settings", "Slopes", "Snapshot", "Track", "Window",
+}  # fmt: skip
+"""Public class names that mean two things today; no name may be added."""
+
+MANY_PARAMETERS = {
+    "_average", "_draw_box", "_locate", "_report", "_third", "balance", "balanced_bend",
+    "draw_tags", "from_arrays", "keep", "linearise", "newton", "node_specs", "parameter", "place",
+    "place_tags", "play", "prepare", "simulate", "simulate_many", "simulate_range", "solve_shape",
+    "uniform", "uniform_mesh",
+}  # fmt: skip
+"""Functions with more than `MOST_PARAMETERS` today; no name may be added."""
+
+Kind = TypeVar("Kind", bound=ast.AST)
+
+
+def definitions(kind: type[Kind]) -> Iterator[tuple[Path, Kind]]:
+    """Yield every definition of a kind in the sources and scripts, with its file."""
+    for folder in ("src", "scripts"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, kind):
+                    yield path.relative_to(ROOT), node
+
+
+def test_a_public_class_name_means_one_thing():
+    places = defaultdict(list)
+    for path, node in definitions(ast.ClassDef):
+        if not node.name.startswith("_"):
+            places[node.name].append(str(path))
+    twice = {name: where for name, where in places.items() if len(where) > 1}
+    assert twice.keys() <= NAMED_TWICE, twice
+
+
+def test_no_function_has_many_parameters():
+    many = {}
+    for path, node in definitions(ast.FunctionDef):
+        given = node.args
+        names = [each.arg for each in (*given.posonlyargs, *given.args, *given.kwonlyargs)]
+        count = len([name for name in names if name not in ("self", "cls")])
+        if count > MOST_PARAMETERS:
+            many[node.name] = f"{path}: {count}"
+    assert many.keys() <= MANY_PARAMETERS, many
