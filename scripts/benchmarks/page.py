@@ -6,7 +6,6 @@ import contextlib
 import os
 import shutil
 import socket
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -17,12 +16,11 @@ import numpy as np
 
 from der_msgs.msg import ChamberPressures, MotionCommand, PressureSetpoint, PressureState
 from der_planner.experiment.client import GraphClient
-from der_planner.experiment.processes import GraphError, NodeProcess
+from der_planner.experiment.processes import PAGE_TOKEN, GraphError, GraphSetup, NodeProcess
 from limb_interfaces import qos, topics
 from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
 
-DOMAIN = int(os.environ.get("ROS_DOMAIN_ID") or 95)
-TOKEN = "token-of-the-benchmark"
+DOMAIN = "95"
 PATIENCE = 120.0
 """A node or a browser may take this time [s] to start on a loaded machine."""
 PERIOD = 50_000_000
@@ -55,7 +53,7 @@ class PageGraph:
         self._folder, self._stack = folder, stack
         self._processes: dict[str, NodeProcess] = {}
         self._windows = 0
-        self.client = stack.enter_context(GraphClient("benchmark", DOMAIN))
+        self.client = stack.enter_context(GraphClient("benchmark"))
         self.commands: list[ChamberPressures] = []
         self.states: list[PressureState] = []
         subscribe = self.client.subscribe
@@ -64,25 +62,15 @@ class PageGraph:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             page_port = free.getsockname()[1]
-        self.url = f"http://127.0.0.1:{page_port}/?token={TOKEN}"
+        self.url = f"http://127.0.0.1:{page_port}/?token={PAGE_TOKEN}"
         board = str(folder / "board")
-        nodes: list[tuple[str, str, dict[str, object]]] = [
-            ("pressure_driver", "board_emulator", {"port_link": board}),
-            ("pressure_driver", "pressure_driver", {"port": board}),
-            ("der_planner", "limb_twin", {}),
-            ("apriltag_tracker", "synthetic_camera", {}),
-            ("apriltag_tracker", "apriltag_tracker", {}),
-            ("der_planner", "planner", {}),
-            ("der_planner", "recorder", {"output": str(folder / "bag")}),
-            ("der_planner", "page", {"port": page_port, "token": TOKEN}),
-        ]
-        environment = {**os.environ, "ROS_DOMAIN_ID": str(DOMAIN)}
-        for package, executable, parameters in nodes:
-            process = NodeProcess(package, executable, parameters, folder, None, environment)
-            self._processes[executable] = process
+        setup = GraphSetup(bag=folder / "bag", metadata={}, planner={}, page=page_port)
+        for spec in setup.nodes(board):
+            process = NodeProcess(spec.package, spec.executable, spec.parameters, folder)
+            self._processes[spec.executable] = process
             stack.callback(process.stop)
             self.client.watch(self._processes.values())
-            if executable == "board_emulator":
+            if spec.executable == "board_emulator":
                 self.wait(lambda: os.path.lexists(board), "the board's port")
         self.client.wait_ready(self._processes)
 
@@ -130,6 +118,7 @@ class PageGraph:
 @contextlib.contextmanager
 def page_graph() -> Iterator[PageGraph]:
     """Run the whole graph with the page in a folder of its own."""
+    os.environ.setdefault("ROS_DOMAIN_ID", DOMAIN)
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
         yield PageGraph(Path(folder), stack)
 
@@ -201,7 +190,6 @@ def run(quick: bool) -> dict[str, float]:
     seconds, presses = (10.0, 10) if quick else (30.0, 100)
     with page_graph() as graph:
         window = graph.open_window()
-        print(f"page: vent, load {os.getloadavg()[0]:.1f} …", file=sys.stderr, flush=True)
         taken = 1000.0 * np.array(measure_vent(graph, window, presses))
         figures = {f"vent_press_to_first_byte_p{p}_ms": float(np.percentile(taken, p))
                    for p in (50, 99, 100)}  # fmt: skip
