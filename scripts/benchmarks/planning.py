@@ -14,7 +14,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 
 from der_planner.limb import Limb
-from der_planner.model import STEPS, ArcModel, Initial, simulate
+from der_planner.model import STEPS, ArcModel, simulate
 from der_planner.planning import (
     CONTROL_PERIOD,
     METHODS,
@@ -24,9 +24,7 @@ from der_planner.planning import (
     plan,
     rod_model,
 )
-from der_planner.planning.loads.posed import REFERENCE_PRIOR
-from der_planner.planning.rod_model import PlanningRod
-from der_planner.planning.ways import sample_spline
+from der_planner.planning.configuration import REFERENCE_PRIOR, configure
 
 CASES = ("asynchronous", "same_direction", "opposite_direction")
 METHODS_OF = [(model, method) for model, methods in METHODS.items() for method in methods]
@@ -82,13 +80,13 @@ def predicted(quick: bool) -> Figures:
 def kinematics_and_gains() -> Figures:
     """How far the rod's polyline is from the arcs, what its fold costs, and what the gains do."""
     limb = Limb.default()
-    model = PlanningRod(limb)
+    model = RodModel(limb)
     opposite = np.radians([45.0, -45.0])
     gap = np.linalg.norm(model.kinematics.tip(opposite) - ArcModel(limb).tip(opposite))
     # With a short connector, as calibrations find it, the rod's fold lies across this motion.
     joined = dataclasses.replace(limb, connector_length=0.002)
-    kinematics = PlanningRod(joined).kinematics
-    reference = Motion.named("asynchronous").reference(joined)
+    kinematics = RodModel(joined).kinematics
+    reference = Motion.named("asynchronous").reference(Workspace(RodModel(joined)))
     figures: Figures = {"tip_arcs_to_polyline_at_45_and_-45_degrees_mm": float(gap) * 1e3}
     print(f"\nArcs and polyline at 45/-45 degrees: tips {gap * 1e3:.1f} mm apart")
     for name, pull in (("exact", inverse.PRIOR_WEIGHT), ("smooth", REFERENCE_PRIOR)):
@@ -190,14 +188,13 @@ def _rod_under(result: Plan, chambers: np.ndarray) -> np.ndarray:
     Its distance from the played tip is the identification's part of the error: no open-loop plan on
     this model can do better but by luck.
     """
-    model = PlanningRod(result.limb)
-    spline = model.configuration(result.reference)
+    configuration = configure(RodModel(result.limb), result.reference)
     response = simulate(
-        model,
+        configuration.model,
         result.time,
         pressures=chambers,
-        bend=lambda time: sample_spline(spline, time)[0],
-        initial=Initial(model.begin(spline, result.reference.start)),
+        bend=configuration.bend_at,
+        initial=configuration.initial,
         steps=STEPS,
     )
     return response.tip

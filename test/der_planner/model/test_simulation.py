@@ -15,7 +15,7 @@ from der_planner.model.bending import bend_angles
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import Motion, plan
 from der_planner.planning.rod_model import PlanningRod
-from der_planner.planning.ways import sample_spline
+from der_planner.planning.transitions import sample_spline
 
 
 def everything() -> Limb:

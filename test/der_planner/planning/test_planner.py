@@ -19,7 +19,7 @@ from der_planner.planning import (
 )
 from der_planner.planning.inverse import static_pressure
 from der_planner.planning.rod_model import PlanningRod
-from der_planner.planning.ways import resting_spline
+from der_planner.planning.transitions import resting_spline
 
 LIMB = Limb.default()
 CASES = ("asynchronous", "same_direction", "opposite_direction")
