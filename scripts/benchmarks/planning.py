@@ -20,9 +20,10 @@ from der_planner.planning import (
     METHODS,
     Motion,
     Plan,
+    Workspace,
+    configuration,
     inverse,
     plan,
-    rod_model,
 )
 from der_planner.planning.configuration import REFERENCE_PRIOR, configure
 
@@ -105,10 +106,10 @@ def kinematics_and_gains() -> Figures:
             f"largest acceleration {twirl:.2f} rad/s2"
         )
     motion = Motion.named("same_direction", period=6.0)
-    gains = rod_model.POSITION_GAIN, rod_model.VELOCITY_GAIN
-    rod_model.POSITION_GAIN = rod_model.VELOCITY_GAIN = 0.0
+    gains = configuration.POSITION_GAIN, configuration.VELOCITY_GAIN
+    configuration.POSITION_GAIN = configuration.VELOCITY_GAIN = 0.0
     without = plan(limb, motion, "der", "paper").predicted_error
-    rod_model.POSITION_GAIN, rod_model.VELOCITY_GAIN = gains
+    configuration.POSITION_GAIN, configuration.VELOCITY_GAIN = gains
     effect = plan(limb, motion, "der", "paper").predicted_error / without - 1
     figures["paper_gains_change_of_error_percent"] = effect * 100
     print(f"  K_p, K_d of paper change its predicted error by {effect * 100:+.3f} %")
@@ -188,13 +189,13 @@ def _rod_under(result: Plan, chambers: np.ndarray) -> np.ndarray:
     Its distance from the played tip is the identification's part of the error: no open-loop plan on
     this model can do better but by luck.
     """
-    configuration = configure(RodModel(result.limb), result.reference)
+    motion = configure(RodModel(result.limb), result.reference)
     response = simulate(
-        configuration.model,
+        motion.model,
         result.time,
         pressures=chambers,
-        bend=configuration.bend_at,
-        initial=configuration.initial,
+        bend=motion.bend_at,
+        initial=motion.initial,
         steps=STEPS,
     )
     return response.tip
