@@ -14,7 +14,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 
 from der_planner.limb import Limb
-from der_planner.model import STEPS, ArcModel, simulate
+from der_planner.model import STEPS, ArcModel, RodModel, simulate
 from der_planner.planning import (
     CONTROL_PERIOD,
     METHODS,

@@ -70,7 +70,7 @@ def test_windows_agree_with_one_window():
     motion = Motion.named("opposite_direction", period=6.0, cycles=1)
     whole = solver_for(LIMB, motion, window=1000, settled=1000).run()
     windows = solver_for(LIMB, motion).run()
-    assert len(windows.commands) > 1.2 * Settings().window
+    assert len(windows.commands) > 1.2 * OptimiserSettings().window
     assert np.abs(whole.tip - windows.tip).max() < 5e-5
     assert np.abs(whole.commands - windows.commands).max() < 60.0
 
