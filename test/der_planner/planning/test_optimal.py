@@ -78,9 +78,8 @@ def test_windows_agree_with_one_window():
 def test_predicted_tip_is_the_one_the_rod_gives_again():
     motion = Motion.named("asynchronous", period=5.0, cycles=2)
     result = plan(LIMB, motion, "der", "optimal")
-    model = RodModel(LIMB)
-    spline = model.configuration(result.reference)
-    again = planner.tip_under(model, spline, result.differential_pressure)
+    configuration = configure(RodModel(LIMB), result.reference)
+    again = planner.tip_under(configuration, result.differential_pressure)
     np.testing.assert_allclose(result.tip_predicted, again, atol=1e-10)
 
 
