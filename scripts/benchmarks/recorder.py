@@ -22,10 +22,9 @@ from der_msgs.msg import (
     TagDetection,
     TagDetectionArray,
 )
-from der_planner.bags.definitions import find_definition
-from der_planner.bags.layout import OfferedQos, TopicSpec
 from der_planner.bags.reader import BagReader
 from der_planner.bags.recover import recover_bag
+from der_planner.bags.topics import OfferedQos, TopicSpec
 from der_planner.bags.writer import BagWriter
 from der_planner.experiment.processes import NodeProcess
 from limb_interfaces.stamps import stamp_from_nanoseconds
@@ -174,8 +173,7 @@ def _write_run(path: Path, seconds: float) -> None:
     def write(topic: str, message: object, when: float) -> None:
         kind = f"der_msgs/msg/{type(message).__name__}"
         if topic not in bag.topics:
-            found = find_definition(kind)
-            bag.add_topic(TopicSpec(topic, kind, found.text, found.type_hash, (OfferedQos(),)))
+            bag.add_topic(TopicSpec.installed(topic, kind, (OfferedQos(),)))
         stamp = origin + round(when * 1e9)
         message.header.stamp = stamp_from_nanoseconds(stamp)  # type: ignore[attr-defined]
         bag.write(topic, stamp, stamp, serialize_message(message))

@@ -12,9 +12,7 @@ class StampGaps:
 
     The period is the interval below which a tenth of the last `window` ones lie: so even if most
     messages are lost, the few neighbours that both arrive tell it. A gap of k periods is k − 1
-    missed messages; one longer than ``pause`` is a source that paused, and counts none. Where the
-    publisher's own numbers follow each other, nothing was lost on the way: what is missing was
-    never sent.
+    missed messages; one longer than ``pause`` is a source that paused, and counts none.
 
     Args:
         window: intervals that tell the period.
@@ -29,9 +27,6 @@ class StampGaps:
         """Messages so far."""
         self.missed = 0
         """Messages that were not received between them."""
-        self.unsent = 0
-        """Messages that the source left out between them."""
-        self._number = 0
 
     @property
     def period(self) -> float:
@@ -43,18 +38,13 @@ class StampGaps:
             return 0
         return sorted(self._intervals)[len(self._intervals) // 10]
 
-    def take(self, stamp: int, number: int = 0) -> int:
+    def take(self, stamp: int) -> int:
         """Take the stamp [ns] of a message; return how many were missed just before it.
 
         Stamps of zero mean nothing. A stamp that goes back begins anew: a replay.
-
-        Args:
-            stamp: of the message.
-            number: that its publisher counts it by; 0 if unknown.
         """
         if stamp <= 0:
             return 0
-        follows, self._number = 0 < self._number == number - 1, number
         self.received += 1
         before, self._newest = self._newest, stamp
         interval = stamp - before
@@ -63,8 +53,5 @@ class StampGaps:
         self._intervals.append(interval)
         period = self._period()
         missing = round(interval / period) - 1 if period else 0
-        if follows:
-            self.unsent += missing
-            return 0
         self.missed += missing
         return missing

@@ -6,8 +6,7 @@ from pathlib import Path
 
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from der_planner.bags.definitions import find_definition
-from der_planner.bags.layout import OfferedQos, TopicSpec
+from der_planner.bags.topics import OfferedQos, TopicSpec, find_definition
 
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
@@ -31,16 +30,8 @@ def store():
 
 def spec(name: str, type_name: str, latched: bool = False) -> TopicSpec:
     """Return a topic with one publisher."""
-    definition = find_definition(type_name)
     durability = "transient_local" if latched else "volatile"
-    return TopicSpec(
-        name,
-        type_name,
-        definition.text,
-        definition.type_hash,
-        (OfferedQos(durability=durability),),
-        latched,
-    )
+    return TopicSpec.installed(name, type_name, (OfferedQos(durability=durability),))
 
 
 def string(text: str) -> bytes:

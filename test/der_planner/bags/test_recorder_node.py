@@ -1,19 +1,21 @@
 """The recorder as a process on a graph."""
 
+import itertools
 import os
 import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
-from bags import read_texts
+from bags import START, read_texts, spec
 from rclpy.duration import Duration
+from rclpy.serialization import serialize_message
+from std_msgs.msg import Header
 
 from der_planner.bags.reader import BagReader
-from der_planner.bags.recover import recover_bag
+from der_planner.bags.writer import BagWriter
 
 pytestmark = pytest.mark.graph
 SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"
@@ -123,7 +125,7 @@ def test_records_the_graph_between_start_and_stop(graph, tmp_path: Path):
 
 
 def test_second_start_into_the_same_folder_is_refused(graph, tmp_path: Path):
-    from der_planner.experiment.errors import GraphError
+    from der_planner.experiment.processes import GraphError
 
     start(graph, output=str(tmp_path / "run"))
     graph.client.call("recorder/start")
@@ -136,65 +138,74 @@ def test_second_start_into_the_same_folder_is_refused(graph, tmp_path: Path):
         graph.client.call("recorder/stop")
 
 
-def test_sigterm_closes_and_sigkill_loses_what_was_not_flushed(graph, tmp_path: Path):
-    talker = Talker(graph)
-    talker.topic("talk")
-    for name in ("term", "kill"):
-        # The recorder that has just ended is still counted for a moment.
-        talking = talker.publishers["talk"].get_subscription_count
-        graph.client.wait_for(
-            lambda talking=talking: talking() == 0, 60.0, "no recorder to be left"
-        )
-        folder = tmp_path / name
-        graph.client.diagnostics.clear()
-        process = start(
-            graph, output=str(folder), autostart=True, flush_interval=0.5, topics="/limb/talk"
-        )
-        talker.heard("talk")
-        said: list[str] = []
-        written: list[tuple[float, int]] = []
-
-        def old(written=written) -> int:
-            """Return how many messages were written two seconds ago, or earlier."""
-            ago = time.monotonic() - 2.0
-            return max((count for when, count in written if when < ago), default=0)
-
-        def more(name=name, said=said, written=written, old=old) -> bool:
-            said.append(f"{name} {len(said)}")
-            talker.publishers["talk"].publish(talker.kind(data=said[-1]))
-            graph.client.spin(0.02)
-            written.append((time.monotonic(), int(value(graph, "messages") or 0)))
-            return old() > 0 if name == "kill" else written[-1][1] > 0
-
-        graph.client.wait_for(more, 60.0, "messages in the bag")
-        graph.client.watch([])
-        if name == "term":
-            talker.arrived("talk")
-            assert process.stop() == 0
-            assert read_texts(folder) == said
-            continue
-        # Half a second between flushes, and what a busy machine adds.
-        safe = old()
-        process.signal(signal.SIGKILL)
-        process.stop()
-        recover_bag(folder)
-        kept = read_texts(folder)
-        assert kept == said[: len(kept)]
-        assert len(kept) >= safe > 0
-
-
-def test_removed_folder_is_reported_and_node_lives_on(graph, tmp_path: Path):
+def test_sigterm_closes_the_bag(graph, tmp_path: Path):
     talker = Talker(graph)
     talker.topic("talk")
     process = start(graph, output=str(tmp_path / "run"), autostart=True, topics="/limb/talk")
     talker.heard("talk")
-    talker.say("talk", "kept")
-    graph.client.wait_for(lambda: int(value(graph, "messages") or 0) > 0, 30.0, "a message")
+    for index in range(20):
+        talker.say("talk", f"word {index}")
+    talker.arrived("talk")
+    graph.client.watch([])
+    assert process.stop() == 0
+    assert read_texts(tmp_path / "run") == talker.sent
+
+
+def test_what_a_stopped_recorder_missed_is_counted(graph, tmp_path: Path):
+    from std_msgs.msg import UInt8MultiArray
+
+    sender = graph.client.node.create_publisher(UInt8MultiArray, "data", 10)
+    process = start(graph, output=str(tmp_path / "run"), autostart=True, topics="/limb/data")
+    graph.client.wait_for(sender.get_subscription_count, 30.0, "the recorder")
+    # The recorder counts once it has looked at the graph and knows that there is one sender.
+    graph.client.spin(1.0)
+    sent = 0
+
+    def send(count: int) -> None:
+        nonlocal sent
+        for _ in range(count):
+            sender.publish(UInt8MultiArray(data=bytes(20_000)))
+            sent += 1
+            graph.client.spin(0.005)
+
+    send(10)
+    process.signal(signal.SIGSTOP)
+    send(400)
+    process.signal(signal.SIGCONT)
+    send(10)
+    assert sender.wait_for_all_acked(Duration(seconds=30))
+    graph.client.call("recorder/stop")
+    with BagReader(tmp_path / "run") as bag:
+        written = bag.topics["/limb/data"].message_count
+    (line,) = [text for text in process.log.read_text().splitlines() if "closed" in text]
+    missed = int(line.split(" missed")[0].split()[-1])
+    assert missed > 0
+    assert written + missed == sent
+
+
+def test_a_bag_that_cannot_be_written_is_reported_at_once(graph, tmp_path: Path):
+    from der_planner.experiment.processes import GraphError
+
+    talker = Talker(graph)
+    talker.topic("talk")
+    process = start(graph, output=str(tmp_path / "run"), autostart=True, topics="/limb/talk")
+    talker.heard("talk")
     shutil.rmtree(tmp_path / "run")
+    graph.client.wait_for(lambda: "was removed" in process.log.read_text(), 30.0, "the log")
     graph.client.wait_for(lambda: value(graph, "state") == "failed", 30.0, "the failure")
     assert "was removed" in graph.client.diagnostics["recorder"].message
+    (tmp_path / "run").write_text("a file is in the way")
+    with pytest.raises(GraphError, match="cannot write a bag into"):
+        graph.client.call("recorder/start")
     assert process.alive
-    assert "kept" in read_texts(tmp_path / "run")
+
+
+def test_a_start_without_space_is_refused(graph, tmp_path: Path):
+    from der_planner.experiment.processes import GraphError
+
+    start(graph, output=str(tmp_path / "run"), minimum_free=1 << 60)
+    with pytest.raises(GraphError, match=r"MiB are free where .*: nothing is recorded"):
+        graph.client.call("recorder/start")
 
 
 @pytest.mark.parametrize(
@@ -241,86 +252,39 @@ def test_replay_publishes_the_recorded_bytes(graph, tmp_path: Path):
     assert "nothing was published" in late.stderr
 
 
-def test_recorded_images_give_the_same_states_at_every_replay(graph, tmp_path: Path):
-    folder = tmp_path / "run"
-    film(graph, folder, count=12)
-    first, second = (track(graph, folder, name) for name in ("one", "two"))
-    assert len(first) > 8  # images are best effort: a loaded machine may lose one
-    assert sum(valid for _, valid, *_ in first) > 8
-    assert repr(first) == repr(second)  # bit for bit, and NaN is NaN
-
-
-def film(graph, folder: Path, count: int) -> None:
-    """Record frames of the synthetic camera of a bending limb."""
-    import numpy as np
-    from geometry_msgs.msg import Point
-    from sensor_msgs.msg import Image
-
-    from apriltag_tracker.synthetic.shapes import constant_curvature
-    from der_msgs.msg import LimbShape
-    from limb_interfaces import qos, stamps, topics
-
-    camera = graph.start("apriltag_tracker", "synthetic_camera")
-    recorder = start(graph, output=str(folder), record_images=True)
-    graph.client.wait_for(
-        lambda: "synthetic_camera" in graph.client.diagnostics, 90.0, "the camera's compilation"
-    )
-    graph.client.subscribe(Image, topics.IMAGE, qos.IMAGES)
-    shapes = graph.client.node.create_publisher(LimbShape, topics.TWIN_SHAPE, qos.STATES)
-    graph.client.wait_for(lambda: shapes.get_subscription_count() >= 2, 30.0, "the camera")
-    graph.client.call("recorder/start")
-    for index in range(count):
-        shape = constant_curvature((0.122, 0.122), [0.05 * index, 0.03 * index])
-        message = LimbShape(
-            arc_length=np.asarray(shape.arc_length).tolist(),
-            points=[Point(x=float(x), y=float(y)) for x, y in shape.points],
-            heading=np.asarray(shape.heading).tolist(),
-        )
-        message.header.stamp = stamps.stamp_from_nanoseconds(10**18 + index * 33_000_000)
-        shapes.publish(message)
-        graph.client.wait_for(
-            lambda stamp=message.header.stamp: (
-                topics.IMAGE in graph.client.newest
-                and graph.client.newest[topics.IMAGE].header.stamp == stamp
-            ),
-            30.0,
-            "the frame",
-        )
-    graph.client.spin(0.5)
-    graph.client.call("recorder/stop")
-    camera.stop()
-    recorder.stop()
-    graph.client.watch([])
-
-
-def track(graph, folder: Path, name: str) -> list[tuple]:
-    """Replay the images through a new tracker and return its states."""
+def test_stepping_waits_for_each_answer(graph, tmp_path: Path):
     from der_msgs.msg import LimbState
-    from limb_interfaces import qos
+    from limb_interfaces import qos, stamps
 
-    states: list[tuple] = []
+    bag = BagWriter(tmp_path / "run")
+    bag.add_topic(spec("/limb/asked", "der_msgs/msg/LimbState"))
+    for index in range(20):
+        message = LimbState(header=Header(stamp=stamps.stamp_from_nanoseconds(START + index)))
+        bag.write("/limb/asked", START + index, START, serialize_message(message))
+    bag.close()
+    events: list[tuple[str, int]] = []
+    answers = graph.client.node.create_publisher(LimbState, "answered", qos.STATES)
 
-    def keep(message: LimbState) -> None:
-        tip = (message.tip.x, message.tip.y)
-        states.append((message.header.stamp.nanosec, message.valid, *tip, *message.bend_angle))
+    def answer(message: LimbState) -> None:
+        number = stamps.nanoseconds(message.header.stamp) - START
+        events.append(("asked", number))
+        if events.count(("asked", number)) == 1 and number == 7:
+            return  # lost once: it is asked again
+        graph.client.spin(0.01)
+        events.append(("answered", number))
+        answers.publish(message)
 
-    graph.client.subscribe(LimbState, "state", qos.STATES, keep)
-    graph.client.diagnostics.clear()
-    tracker = graph.start("apriltag_tracker", "apriltag_tracker", name=f"tracker_{name}")
-    graph.client.wait_for(
-        lambda: "apriltag_tracker" in graph.client.diagnostics, 90.0, "the tracker"
-    )
-    command = [sys.executable, str(SCRIPTS / "replay_bag.py"), str(folder), "--rate", "0"]
-    command += ["--topics", "/limb/camera/image_raw", "/limb/camera/camera_info"]
-    command += ["--step-by", "/limb/camera/image_raw=/limb/state", "--wait", "30"]
+    graph.client.subscribe(LimbState, "asked", qos.STATES, answer)
+    command = [sys.executable, str(SCRIPTS / "replay_bag.py"), str(tmp_path / "run")]
+    command += ["--rate", "0", "--step-by", "/limb/asked=/limb/answered", "--wait", "30"]
     environment = {**os.environ, "ROS_DOMAIN_ID": str(graph.domain_id)}
     with subprocess.Popen(command, env=environment) as replay:
         graph.client.wait_for(lambda: replay.poll() is not None, 120.0, "the replay")
         assert replay.returncode == 0
-    graph.client.wait_for(lambda: states, 30.0, "states")
-    graph.client.spin(0.5)
-    tracker.stop()
-    return list(states)
+    assert [number for what, number in events if what == "answered"] == list(range(20))
+    assert events.count(("asked", 7)) == 2
+    for before, after in itertools.pairwise(events):
+        assert before[0] == "answered" or after[1] == before[1]
 
 
 def test_a_recorder_with_another_name_has_its_parameters_and_its_own_services(graph, tmp_path):
@@ -345,22 +309,3 @@ def test_a_recorder_with_another_name_has_its_parameters_and_its_own_services(gr
     graph.client.call("rec2/stop")
     log = (tmp_path / "second.log").read_text()
     assert "'recrod_images' is set, but /limb/rec2 has none: did you mean 'record_images'?" in log
-
-
-def test_states_that_were_never_sent_are_not_taken_for_lost(graph, tmp_path):
-    from der_msgs.msg import LimbState
-    from limb_interfaces import qos, stamps, topics
-
-    start(graph, output=str(tmp_path / "run"), autostart=True)
-    states = graph.client.node.create_publisher(LimbState, topics.LIMB_STATE, qos.STATES)
-    graph.client.wait_for(states.get_subscription_count, 30.0, "the recorder")
-    for index in range(60):
-        if index % 3 == 2 or index < 10:  # as a camera that leaves out two of three
-            message = LimbState()
-            message.header.stamp = stamps.stamp_from_nanoseconds(10**15 + index * 33_333_333)
-            states.publish(message)
-            graph.client.spin(0.01)
-    graph.client.wait_for(lambda: value(graph, "unsent"), 30.0, "the count")
-    graph.client.wait_for(lambda: value(graph, "unsent") == "/limb/state: 33", 30.0, "all of them")
-    assert "left out by a sender" in graph.client.diagnostics["recorder"].message
-    assert value(graph, "missed") == ""

@@ -2,12 +2,15 @@
 
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
+import pytest
 from bags import START, TEXT, read_texts, spec, string
 
+from der_planner.bags import writer
 from der_planner.bags.reader import BagReader
 from der_planner.bags.session import RecordingSession
-from der_planner.bags.writer import BagWriter
+from der_planner.bags.writer import BagWriteError, BagWriter
 
 TALK = "/talk"
 
@@ -22,7 +25,7 @@ def wait_until(condition, timeout: float = 20.0) -> None:
 
 
 def test_everything_queued_is_written_at_stop(tmp_path: Path):
-    session = RecordingSession(BagWriter(tmp_path / "run"), minimum_free=0)
+    session = RecordingSession(BagWriter(tmp_path / "run"))
     topic = spec(TALK, TEXT)
     for index in range(500):
         assert session.put(topic, START + index, START, string(str(index)))
@@ -33,7 +36,7 @@ def test_everything_queued_is_written_at_stop(tmp_path: Path):
 
 
 def test_flush_without_new_messages_makes_the_file_readable(tmp_path: Path):
-    session = RecordingSession(BagWriter(tmp_path / "run"), flush_interval=0.02, minimum_free=0)
+    session = RecordingSession(BagWriter(tmp_path / "run"), flush_interval=0.02)
     session.put(spec(TALK, TEXT), START, START, string("early"))
     seen: list[str] = []
 
@@ -50,7 +53,7 @@ def test_flush_without_new_messages_makes_the_file_readable(tmp_path: Path):
 
 
 def test_pause_ignores_messages(tmp_path: Path):
-    session = RecordingSession(BagWriter(tmp_path / "run"), minimum_free=0)
+    session = RecordingSession(BagWriter(tmp_path / "run"))
     topic = spec(TALK, TEXT)
     session.put(topic, START, START, string("before"))
     session.paused = True
@@ -69,7 +72,7 @@ def test_full_queue_drops_and_counts(tmp_path: Path):
             release.wait(20.0)
             super().write(*arguments)
 
-    session = RecordingSession(SlowBag(tmp_path / "run"), queue_bytes=10_000, minimum_free=0)
+    session = RecordingSession(SlowBag(tmp_path / "run"), queue_bytes=10_000)
     topic = spec(TALK, TEXT)
     taken = sum(session.put(topic, START + i, START, string("x" * 1_000)) for i in range(50))
     assert 5 < taken < 15
@@ -79,22 +82,26 @@ def test_full_queue_drops_and_counts(tmp_path: Path):
     assert len(read_texts(tmp_path / "run")) == taken
 
 
-def test_little_space_stops_with_a_whole_bag(tmp_path: Path):
+def test_little_space_stops_with_a_whole_bag_and_says_so_at_once(tmp_path: Path, monkeypatch):
     free = [1 << 30]
+    monkeypatch.setattr(writer.shutil, "disk_usage", lambda _: SimpleNamespace(free=free[0]))
+    told: list[str] = []
     session = RecordingSession(
-        BagWriter(tmp_path / "run"),
+        BagWriter(tmp_path / "run", minimum_free=1 << 20),
         flush_interval=0.02,
-        minimum_free=1 << 20,
-        free_bytes=lambda _: free[0],
+        on_failure=told.append,
     )
     topic = spec(TALK, TEXT)
     session.put(topic, START, START, string("kept"))
     wait_until(lambda: session.status().messages == 1)
     free[0] = 1000
-    wait_until(lambda: session.status().failure != "")
-    assert "fewer than 1 MiB are free" in session.status().failure
+    wait_until(lambda: told)
+    assert "fewer than 1 MiB are free" in told[0]
+    assert session.status().failure == told[0]
     assert not session.put(topic, START + 1, START, string("too late"))
     session.stop()
     assert read_texts(tmp_path / "run") == ["kept"]
     with BagReader(tmp_path / "run") as bag:
         assert not bag.unfinished
+    with pytest.raises(BagWriteError, match="fewer than 1 MiB are free"):
+        BagWriter(tmp_path / "next", minimum_free=1 << 20)

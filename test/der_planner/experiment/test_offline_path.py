@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from der_planner.experiment.errors import GraphError
 from der_planner.experiment.experiment import run
 from der_planner.experiment.options import parse
+from der_planner.experiment.processes import GraphError
 from der_planner.limb import CalibratedRange, Limb
 from der_planner.model import RodModel
 from der_planner.planning import Workspace

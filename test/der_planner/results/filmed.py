@@ -8,7 +8,7 @@ from bags import spec
 from rosbags.typesys import get_types_from_msg
 from runs import BagOfRun
 
-from der_planner.bags.definitions import find_definition
+from der_planner.bags.topics import find_definition
 
 CAMERA = np.array([[300.0, 0.0, 158.0], [0.0, 305.0, 121.0], [0.0, 0.0, 1.0]])
 DISTORTION = np.array([-0.12, 0.03, 0.001, -0.0005, 0.0])

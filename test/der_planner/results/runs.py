@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 from bags import SECOND, START, spec, store
 
-from der_planner.bags.layout import RUN_KEY
-from der_planner.bags.writer import BagWriter
+from der_planner.bags.writer import RUN_KEY, BagWriter
 from der_planner.results import Description, RunSeries
 
 PERIOD, CYCLES = 4.0, 2

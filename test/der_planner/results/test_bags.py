@@ -8,8 +8,7 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from runs import FRAMES, TIMES, BagOfRun, reference
 
-from der_planner.bags.layout import RUN_KEY
-from der_planner.bags.writer import BagWriter
+from der_planner.bags.writer import RUN_KEY, BagWriter
 from der_planner.identification import LogError, read_bag
 from der_planner.results import (
     EvaluationError,

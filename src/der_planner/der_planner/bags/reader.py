@@ -7,6 +7,7 @@ reads the same. Only the topics that are asked for are touched.
 from __future__ import annotations
 
 import contextlib
+import json
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -14,15 +15,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import yaml
+from mcap.reader import make_reader
 from rosbags.interfaces import MessageDefinitionFormat
-from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag2 import Reader
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
-from der_planner.bags.layout import METADATA_FILE, RUN_KEY
-from der_planner.bags.recover import copy_finished
-from der_planner.bags.scan import RecoverError, bag_files, parse_run, scan_file
+from der_planner.bags.recover import RecoverError, recover_bag
+from der_planner.bags.topics import DefinitionError, find_definition
+from der_planner.bags.writer import RUN_KEY
 
 
 class BagError(ValueError):
@@ -64,6 +65,10 @@ class BagReader:
     Args:
         path: a bag folder, or one ``.mcap`` or ``.db3`` file.
 
+    Attributes:
+        unfinished: its recorder was killed, or it is damaged: what is whole of it is read, from a
+            recovered copy in the temporary folder.
+
     Raises:
         BagError: nothing readable is there.
     """
@@ -75,18 +80,13 @@ class BagReader:
         if not self.path.exists():
             raise BagError(f"no bag at {self.path}")
         try:
-            self._readers = [self._stack.enter_context(reader) for reader in self._open()]
-        except (ReaderError, RecoverError, OSError, AssertionError) as error:
+            self._reader = self._open()
+        except (RecoverError, OSError) as error:
             self._stack.close()
-            raise BagError(
-                f"cannot read the bag {self.path}: {error}. If its recorder was killed, "
-                f"scripts/recover_bag.py {self.path} repairs it"
-            ) from error
+            raise BagError(f"cannot read the bag {self.path}: {error}") from error
         self._store = get_typestore(Stores.EMPTY)
-        self._known: set[str] = set()
-        for reader in self._readers:
-            for connection in reader.connections:
-                self._register(connection)
+        for connection in self._reader.connections:
+            self._register(connection)
 
     def __enter__(self) -> BagReader:
         return self
@@ -99,97 +99,72 @@ class BagReader:
     ) -> None:
         self._stack.close()
 
-    def _open(self) -> list[Reader]:
-        """Return readers of the bag's parts; unfinished files are read from a finished copy."""
-        whole = self.path.is_file() or (self.path / METADATA_FILE).exists()
-        if whole:
-            with contextlib.suppress(ReaderError):
-                reader = Reader(self.path)
-                reader.open()
-                reader.close()
-                return [Reader(self.path)]
-        if self.path.suffix == ".db3":
-            return [Reader(self.path)]
+    def _open(self) -> Reader:
+        try:
+            return self._stack.enter_context(Reader(self.path))
+        except Exception as error:  # rosbags raises many kinds for what is not whole
+            if self.path.suffix == ".db3":
+                raise RecoverError(str(error)) from error
         self.unfinished = True
-        readers = []
-        for file in bag_files(self.path):
-            if scan_file(file).complete:
-                readers.append(Reader(file))
-                continue
-            folder = self._stack.enter_context(tempfile.TemporaryDirectory(prefix="bag_"))
-            readers.append(Reader(copy_finished(file, Path(folder) / file.name)))
-        return readers
+        folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="bag_")))
+        recovered = recover_bag(self.path, folder / self.path.stem).folder
+        return self._stack.enter_context(Reader(recovered))
 
     def _register(self, connection: Any) -> None:
-        if connection.msgtype in self._known:
+        name, definition = connection.msgtype, connection.msgdef
+        if name in self._store.types:
             return
-        definition = connection.msgdef
-        if definition.format == MessageDefinitionFormat.NONE:
-            self._register_from_installation(connection.msgtype)
-            return
-        parse = (
-            (lambda text, _: get_types_from_idl(text))
-            if definition.format == MessageDefinitionFormat.IDL
-            else get_types_from_msg
-        )
-        types = parse(definition.data, connection.msgtype)
-        self._store.register({k: v for k, v in types.items() if k not in self._known})
-        self._known.update(types)
-
-    def _register_from_installation(self, type_name: str) -> None:
-        """Sqlite3 bags of old carry no definitions: take those of this machine, if it has them."""
-        from der_planner.bags.definitions import (  # noqa: PLC0415 - rarely needed
-            DefinitionError,
-            find_definition,
-        )
-
-        with contextlib.suppress(DefinitionError):
-            types = get_types_from_msg(find_definition(type_name).text, type_name)
-            self._store.register({k: v for k, v in types.items() if k not in self._known})
-            self._known.update(types)
+        if definition.format == MessageDefinitionFormat.IDL:
+            types = get_types_from_idl(definition.data)
+        elif definition.format == MessageDefinitionFormat.MSG:
+            types = get_types_from_msg(definition.data, name)
+        else:
+            # Sqlite3 bags of old carry no definitions: take those of this machine, if it has them.
+            try:
+                types = get_types_from_msg(find_definition(name).text, name)
+            except DefinitionError:
+                return
+        self._store.register({k: v for k, v in types.items() if k not in self._store.types})
 
     @property
     def topics(self) -> dict[str, RecordedTopic]:
         """The bag's topics by name."""
         found: dict[str, RecordedTopic] = {}
-        for reader in self._readers:
-            for connection in reader.connections:
-                name, count = connection.topic, connection.msgcount
-                if name in found:
-                    count += found[name].message_count
-                profiles = getattr(connection.ext, "offered_qos_profiles", [])
-                found[name] = RecordedTopic(
-                    name,
-                    connection.msgtype,
-                    count,
-                    reliable=all(p.reliability.name != "BEST_EFFORT" for p in profiles),
-                    latched=bool(profiles)
-                    and all(p.durability.name == "TRANSIENT_LOCAL" for p in profiles),
-                )
+        for connection in self._reader.connections:
+            name, count = connection.topic, connection.msgcount
+            if name in found:
+                count += found[name].message_count
+            profiles = getattr(connection.ext, "offered_qos_profiles", [])
+            found[name] = RecordedTopic(
+                name,
+                connection.msgtype,
+                count,
+                reliable=all(p.reliability.name != "BEST_EFFORT" for p in profiles),
+                latched=bool(profiles)
+                and all(p.durability.name == "TRANSIENT_LOCAL" for p in profiles),
+            )
         return found
 
     @property
     def start(self) -> int:
         """Log time of the first message [ns]."""
-        return int(min(reader.start_time for reader in self._readers))
+        return int(self._reader.start_time)
 
     @property
     def end(self) -> int:
         """Log time of the last message [ns]."""
-        return int(max(reader.end_time - 1 for reader in self._readers))
+        return int(self._reader.end_time - 1)
 
     def run(self) -> dict[str, Any]:
         """Return what the recorder was told of the run; empty for bags of other recorders."""
-        if self.path.is_dir() and (self.path / METADATA_FILE).exists():
-            document = yaml.safe_load((self.path / METADATA_FILE).read_text()) or {}
-            custom = document.get("rosbag2_bagfile_information", {}).get("custom_data") or {}
-            if RUN_KEY in custom:
-                return parse_run(custom)
-        with contextlib.suppress(RecoverError):
-            for file in bag_files(self.path):
-                if file.suffix == ".mcap" and (custom := _leading_metadata(file)):
-                    return parse_run(custom)
-        return {}
+        custom = self._reader.storage.metadata.custom or {}
+        path = Path(self._reader.path)
+        if RUN_KEY not in custom and path.suffix == ".mcap":
+            with path.open("rb") as file:
+                for record in make_reader(file).iter_metadata():
+                    if record.name == RUN_KEY:
+                        custom = record.metadata
+        return parse_run(custom)
 
     def raw(
         self,
@@ -204,11 +179,9 @@ class BagReader:
             start: first log time [ns].
             stop: log time before which to stop [ns].
         """
-        for reader in self._readers:
-            wanted = [c for c in reader.connections if topics is None or c.topic in topics]
-            if not wanted:
-                continue
-            for connection, log_time, data in reader.messages(wanted, start, stop):
+        wanted = [c for c in self._reader.connections if topics is None or c.topic in topics]
+        if wanted:
+            for connection, log_time, data in self._reader.messages(wanted, start, stop):
                 yield RawMessage(connection.topic, connection.msgtype, log_time, bytes(data))
 
     def messages(
@@ -237,18 +210,10 @@ class BagReader:
             return content
 
 
-def _leading_metadata(path: Path) -> dict[str, str]:
-    """Read the metadata record that the recorder writes at the start of a file."""
-    from mcap.records import Metadata  # noqa: PLC0415 - only for bags without metadata.yaml
-    from mcap.stream_reader import StreamReader  # noqa: PLC0415
-
-    with path.open("rb") as file:
-        try:
-            for count, record in enumerate(StreamReader(file, emit_chunks=True).records):
-                if isinstance(record, Metadata) and record.name == RUN_KEY:
-                    return dict(record.metadata)
-                if count > 2:
-                    break
-        except Exception:  # whatever a damaged file makes of the parser: no description then
-            return {}
-    return {}
+def parse_run(custom_data: dict[str, str]) -> dict[str, Any]:
+    """Return the run's description (the recorder's parameter ``metadata``); empty if none."""
+    try:
+        value = json.loads(custom_data.get(RUN_KEY, "") or "{}")
+    except (json.JSONDecodeError, TypeError):  # no JSON, or no text at all
+        return {}
+    return value if isinstance(value, dict) else {}

@@ -1,203 +1,290 @@
-"""Repair what a killed recorder leaves: files without an index, a bag without ``metadata.yaml``.
+"""Save what a killed recorder, a full disk or a damaged disk left of a bag, in a new bag.
 
-An MCAP file is a sequence of records that starts and ends with the same eight bytes; the index at
-its end is a convenience that can be rebuilt from the chunks. The repair keeps every byte of every
-whole chunk where it is, cuts what was half written behind the last one, and appends the index, so
-it needs almost no space and takes one read of the file. Format: https://mcap.dev/spec.
+An MCAP file is a sequence of records between two magic numbers; messages lie in chunks that carry
+checksums, and the index at the end only helps to find them (https://mcap.dev/spec). Every chunk
+that is whole is read, wherever it lies, and its messages are written again. The source is only
+read.
 """
 
 from __future__ import annotations
 
-import os
-import shutil
+import contextlib
+import mmap
+import re
 import struct
-import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
-from mcap.data_stream import RecordBuilder
+from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import DataEnd, Footer, MessageIndex, Statistics, SummaryOffset
+from mcap.records import Channel, Chunk, Message, Metadata, Schema
+from mcap.stream_reader import breakup_chunk
 
-from der_planner.bags.layout import METADATA_FILE, BagSummary, FileSummary, TopicSpec
-from der_planner.bags.scan import MAGIC, FileScan, RecoverError, bag_files, scan_file
+from der_planner.bags.topics import TopicSpec, parse_qos
+from der_planner.bags.writer import METADATA_FILE, RUN_KEY, BagWriter
 
-
-def finish_file(path: Path, progress: Callable[[float], None] | None = None) -> FileScan:
-    """Cut the half-written end of a file and append its index; a finished file stays as it is.
-
-    Args:
-        path: an MCAP file.
-        progress: called with the fraction read.
-
-    Returns:
-        What was found, before the repair.
-
-    Raises:
-        RecoverError: it is no MCAP file.
-        OSError: it cannot be read or written.
-    """
-    scan = scan_file(path, progress)
-    if scan.complete:
-        return scan
-    ending = _ending(scan)
-    with path.open("r+b") as file:
-        file.truncate(scan.data_end)
-        file.seek(scan.data_end)
-        file.write(ending)
-        file.flush()
-        os.fsync(file.fileno())
-    return scan
+MAGIC = b"\x89MCAP0\r\n"
+_HEAD = struct.Struct("<BQ")
+_CHUNK_HEAD = struct.Struct("<QQQII")
+_CHUNK = re.compile(rb"\x06.{6}\0\0.{28}(?:\0{4}|\x03\0{3}lz4|\x04\0{3}zstd)", re.DOTALL)
+"""What a chunk begins with: opcode, length, two times, size, checksum, name of the compression."""
+_DEFINITIONS = {
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.METADATA: Metadata,
+}
 
 
-def copy_finished(path: Path, copy: Path) -> Path:
-    """Copy the whole records of an unfinished file and its new index; the original stays as it is.
-
-    Raises:
-        RecoverError: it holds no whole message.
-        OSError: no space for the copy.
-    """
-    scan = scan_file(path)
-    if not scan.message_count:
-        raise RecoverError(f"{path} holds no whole message")
-    shutil.copyfile(path, copy)
-    with copy.open("r+b") as file:
-        file.truncate(scan.data_end)
-        file.seek(scan.data_end)
-        file.write(_ending(scan))
-    return copy
-
-
-def _ending(scan: FileScan) -> bytes:
-    """Return the end of the data section, the summary and the footer."""
-    tail = RecordBuilder()
-    _complete_message_index(scan, tail)
-    DataEnd(0).write(tail)
-    closing = tail.end()
-    start = scan.data_end + len(closing)
-    summary = RecordBuilder()
-    offsets: list[SummaryOffset] = []
-    groups: list[tuple[Opcode, list[Any]]] = [
-        (Opcode.SCHEMA, list(scan.schemas.values())),
-        (Opcode.CHANNEL, list(scan.channels.values())),
-        (Opcode.STATISTICS, [_statistics(scan)]),
-        (Opcode.CHUNK_INDEX, scan.chunks),
-        (Opcode.METADATA_INDEX, [index for index, _ in scan.metadata]),
-    ]
-    for opcode, records in groups:
-        begin = summary.count
-        for record in records:
-            record.write(summary)
-        if records:
-            offsets.append(SummaryOffset(opcode, start + begin, summary.count - begin))
-    offset_start = start + summary.count
-    for offset in offsets:
-        offset.write(summary)
-    body = summary.end()
-    head = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, offset_start)
-    checksum = zlib.crc32(head, zlib.crc32(body))
-    footer = RecordBuilder()
-    Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=checksum).write(
-        footer
-    )
-    return bytes(closing + body + footer.end() + MAGIC)
-
-
-def _complete_message_index(scan: FileScan, tail: RecordBuilder) -> None:
-    """Add the message indexes that the last chunk lacks: readers skip channels without one."""
-    if not scan.chunks:
-        return
-    chunk = scan.chunks[-1]
-    begin = tail.count
-    for number, entries in scan.last_messages.items():
-        if number not in chunk.message_index_offsets:
-            chunk.message_index_offsets[number] = scan.data_end + tail.count
-            MessageIndex(number, entries).write(tail)
-    chunk.message_index_length += tail.count - begin
-
-
-def _statistics(scan: FileScan) -> Statistics:
-    return Statistics(
-        attachment_count=0,
-        channel_count=len(scan.channels),
-        channel_message_counts=dict(scan.channel_counts),
-        chunk_count=len(scan.chunks),
-        message_count=scan.message_count,
-        message_end_time=scan.last,
-        message_start_time=scan.first,
-        metadata_count=len(scan.metadata),
-        schema_count=len(scan.schemas),
-    )
+class RecoverError(ValueError):
+    """A file is no bag or holds nothing that can be saved."""
 
 
 @dataclass(frozen=True)
 class Recovery:
-    """What a repair found and did.
+    """What was found in a bag, and where it was saved.
 
     Attributes:
-        path: of the bag.
-        repaired: files that got their index back.
-        message_count: in the whole bag now.
-        lost_bytes: cut from the ends of files.
-        damaged_chunks: chunks that could not be read; they stay in the file, out of its index.
-        wrote_metadata: ``metadata.yaml`` was missing or out of date.
+        source: the bag, which is as it was.
+        folder: the new bag; None where the source is whole and nothing was written.
+        message_count: that could be read.
+        damaged_chunks: whose checksum or content is wrong; their messages are lost.
+        lost_bytes: in damaged chunks and in what is no record.
+        unnamed: messages that could be read, but whose topic nothing in the file tells.
         duration: from the first to the last message [s].
     """
 
-    path: Path
-    repaired: tuple[str, ...]
+    source: Path
+    folder: Path | None
     message_count: int
-    lost_bytes: int
     damaged_chunks: int
-    wrote_metadata: bool
+    lost_bytes: int
+    unnamed: int
     duration: float
 
 
-def recover_bag(path: Path, progress: Callable[[float], None] | None = None) -> Recovery:
-    """Repair a bag folder, or one MCAP file, in place.
+class _Record(NamedTuple):
+    opcode: int
+    begin: int
+    end: int
 
-    Args:
-        path: folder of the bag or an MCAP file.
-        progress: called with the fraction of the present file.
 
-    Raises:
-        RecoverError: there is nothing to repair in it: no MCAP file, no whole message.
-        OSError: it cannot be read or written.
-    """
-    path = Path(path)
-    files = bag_files(path)
-    scans = [finish_file(file, progress) for file in files]
-    if not any(scan.message_count for scan in scans):
-        raise RecoverError(f"{path} holds no whole message: nothing can be recovered")
-    repaired = tuple(scan.path.name for scan in scans if not scan.complete)
-    wrote = path.is_dir() and (bool(repaired) or not (path / METADATA_FILE).exists())
-    if wrote:
-        _summary(scans).write(path)
-    first = min(scan.first for scan in scans if scan.message_count)
-    return Recovery(
-        path=path,
-        repaired=repaired,
-        message_count=sum(scan.message_count for scan in scans),
-        lost_bytes=sum(scan.lost_bytes for scan in scans),
-        damaged_chunks=sum(scan.damaged_chunks for scan in scans),
-        wrote_metadata=wrote,
-        duration=(max(scan.last for scan in scans) - first) * 1e-9,
+class _File:
+    """One MCAP file that is read as far as it is whole; what is not is counted."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.finished = False
+        self.compression = "zstd"
+        self.custom_data: dict[str, str] = {}
+        self.damaged_chunks = self.lost_bytes = self.unnamed = 0
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        with path.open("rb") as file:
+            is_empty = path.stat().st_size == 0
+            self._data = b"" if is_empty else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        closing = len(MAGIC) if self._data[-len(MAGIC) :] == MAGIC else 0
+        self._end = len(self._data) - closing
+        self._read_definitions()
+
+    def _read_definitions(self) -> None:
+        """Read what stands outside of the chunks: it may tell what a damaged chunk had told."""
+        for record in self._records():
+            if record.opcode in _DEFINITIONS:
+                # Whatever the parser makes of damaged bytes: there are more records.
+                with contextlib.suppress(Exception):
+                    self._learn(_DEFINITIONS[record.opcode].read(self._stream(record)))
+            elif record.opcode == Opcode.FOOTER:
+                self.finished = record.end == self._end < len(self._data)
+
+    def messages(
+        self, progress: Callable[[float], None] | None = None
+    ) -> Iterator[tuple[TopicSpec, Message]]:
+        """Yield what can be read, in the order of the file.
+
+        Args:
+            progress: called with the fraction read.
+        """
+        specs: dict[int, TopicSpec] = {}
+        self.damaged_chunks = self.lost_bytes = self.unnamed = 0
+        for record in self._records(count=True):
+            for message in self._messages_of(record):
+                channel = self._channels.get(message.channel_id)
+                if channel is None or channel.schema_id not in self._schemas:
+                    self.unnamed += 1
+                    continue
+                if channel.id not in specs:
+                    specs[channel.id] = _topic_spec(channel, self._schemas[channel.schema_id])
+                yield specs[channel.id], message
+            if progress is not None:
+                progress(record.end / len(self._data))
+
+    def _messages_of(self, record: _Record) -> list[Message]:
+        """Return the messages of a record, none of a damaged chunk."""
+        if record.opcode == Opcode.MESSAGE:
+            return [Message.read(self._stream(record), record.end - record.begin)]
+        if record.opcode != Opcode.CHUNK:
+            return []
+        try:
+            chunk = Chunk.read(self._stream(record))
+            found = breakup_chunk(chunk, validate_crc=True)
+        except Exception:  # whatever a decompressor or parser makes of damaged bytes
+            self.damaged_chunks += 1
+            self.lost_bytes += record.end - record.begin
+            return []
+        self.compression = chunk.compression or "none"
+        for each in found:
+            self._learn(each)
+        return [each for each in found if isinstance(each, Message)]
+
+    def _learn(self, record: object) -> None:
+        if isinstance(record, Schema):
+            self._schemas[record.id] = record
+        elif isinstance(record, Channel):
+            self._channels[record.id] = record
+        elif isinstance(record, Metadata) and record.name == RUN_KEY:
+            self.custom_data = dict(record.metadata)
+
+    def _records(self, count: bool = False) -> Iterator[_Record]:
+        """Yield the records; where the bytes are none, go on at the next chunk.
+
+        Args:
+            count: count the bytes between as lost.
+        """
+        place = len(MAGIC) if self._data[: len(MAGIC)] == MAGIC else 0
+        while place < self._end:
+            record = self._record_at(place)
+            if record is not None:
+                yield record
+                place = record.end
+                continue
+            found = _CHUNK.search(self._data, place + 1)
+            after = found.start() if found else self._end
+            self.lost_bytes += (after - place) * count
+            place = after
+
+    def _record_at(self, place: int) -> _Record | None:
+        begin = place + _HEAD.size
+        if begin > len(self._data):
+            return None
+        opcode, length = _HEAD.unpack_from(self._data, place)
+        if not 0 < opcode <= max(Opcode) or begin + length > len(self._data):
+            return None
+        record = _Record(opcode, begin, begin + length)
+        return None if opcode == Opcode.CHUNK and not self._is_chunk(record) else record
+
+    def _is_chunk(self, record: _Record) -> bool:
+        """Tell whether the lengths inside a chunk fit its own."""
+        inside = record.begin + _CHUNK_HEAD.size
+        if inside > record.end:
+            return False
+        name_length = _CHUNK_HEAD.unpack_from(self._data, record.begin)[-1]
+        inside += name_length + 8
+        if inside > record.end:
+            return False
+        (length,) = struct.unpack_from("<Q", self._data, inside - 8)
+        return bool(inside + length == record.end)
+
+    def _stream(self, record: _Record) -> ReadDataStream:
+        return ReadDataStream(BytesIO(self._data[record.begin : record.end]))
+
+
+def _topic_spec(channel: Channel, schema: Schema) -> TopicSpec:
+    return TopicSpec(
+        name=channel.topic,
+        type_name=schema.name,
+        definition=schema.data.decode(),
+        type_hash=channel.metadata.get("topic_type_hash", ""),
+        qos=parse_qos(channel.metadata.get("offered_qos_profiles", "")),
+        encoding=schema.encoding,
     )
 
 
-def _summary(scans: list[FileScan]) -> BagSummary:
-    topics: dict[str, TopicSpec] = {}
-    counts: dict[str, int] = {}
-    custom: dict[str, str] = {}
-    for scan in scans:
-        for spec in scan.topics():
-            topics.setdefault(spec.name, spec)
-        for topic, count in scan.counts.items():
-            counts[topic] = counts.get(topic, 0) + count
-        custom.update(scan.run_data())
-    files = [
-        FileSummary(scan.path.name, scan.message_count, scan.first, scan.last) for scan in scans
-    ]
-    return BagSummary(files, list(topics.values()), counts, custom)
+def bag_files(path: Path) -> list[Path]:
+    """Return the MCAP files of a bag in the order of their numbers.
+
+    Raises:
+        RecoverError: there are none.
+    """
+    if path.is_file():
+        return [path]
+    found = sorted(path.glob("*.mcap"), key=_file_number)
+    if not found:
+        raise RecoverError(f"{path} holds no MCAP file")
+    return found
+
+
+def _file_number(path: Path) -> tuple[int, str]:
+    tail = path.stem.rsplit("_", 1)[-1]
+    return (int(tail) if tail.isdigit() else 0, path.name)
+
+
+def recover_bag(
+    path: Path, folder: Path | None = None, progress: Callable[[float], None] | None = None
+) -> Recovery:
+    """Write every message of a bag that can be read into a new bag.
+
+    Args:
+        path: folder of the bag or an MCAP file; it is only read.
+        folder: of the new bag; if None, PATH_recovered, and nothing is written for a whole bag.
+        progress: called with the fraction of the present file.
+
+    Raises:
+        RecoverError: there is no MCAP file, or no message whose topic is known.
+        BagWriteError: the new bag cannot be written: its folder is there already, or no space.
+        OSError: the bag cannot be read.
+    """
+    path = Path(path)
+    files = [_File(file) for file in bag_files(path)]
+    has_index = all(file.finished for file in files)
+    if folder is None and has_index and (path.is_file() or (path / METADATA_FILE).exists()):
+        report = _copy(path, files, None, progress)
+        if not report.lost_bytes and not report.unnamed:
+            return report
+    report = _copy(
+        path,
+        files,
+        folder or path.with_name(path.name.removesuffix(".mcap") + "_recovered"),
+        progress,
+    )
+    if report.message_count:
+        return report
+    raise RecoverError(f"{path} holds no whole message: nothing can be recovered")
+
+
+def _copy(
+    source: Path,
+    files: list[_File],
+    folder: Path | None,
+    progress: Callable[[float], None] | None,
+) -> Recovery:
+    """Read all files, write their messages into a folder if there is one, and count."""
+    custom = {key: text for file in files for key, text in file.custom_data.items()}
+    bag = None
+    count, first, last = 0, 0, 0
+    for file in files:
+        for spec, message in file.messages(progress):
+            if folder is not None:
+                bag = bag or BagWriter(folder, custom, compression=file.compression)
+                bag.add_topic(spec)
+                bag.write(spec.name, message.log_time, message.publish_time, message.data)
+            first = min(first, message.log_time) if count else message.log_time
+            last = max(last, message.log_time)
+            count += 1
+    unnamed = sum(file.unnamed for file in files)
+    if unnamed and not count:
+        raise RecoverError(
+            f"{source}: {unnamed} messages can be read, but what their topics are was in a damaged "
+            "part of the file: nothing can be recovered"
+        )
+    return Recovery(
+        source=source,
+        folder=bag.close() if bag is not None else None,
+        message_count=count,
+        damaged_chunks=sum(file.damaged_chunks for file in files),
+        lost_bytes=sum(file.lost_bytes for file in files),
+        unnamed=unnamed,
+        duration=(last - first) * 1e-9,
+    )

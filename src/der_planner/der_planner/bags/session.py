@@ -7,19 +7,17 @@ subscription. The queue is bounded in bytes: what does not fit is counted, never
 from __future__ import annotations
 
 import queue
-import shutil
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from der_planner.bags.layout import TopicSpec
+from der_planner.bags.topics import TopicSpec
 from der_planner.bags.writer import BagWriteError, BagWriter
 
 QUEUE_BYTES = 256 << 20
 FLUSH_INTERVAL = 1.0
-MINIMUM_FREE = 64 << 20
 
 
 @dataclass(frozen=True)
@@ -52,11 +50,11 @@ class RecordingSession:
 
     Args:
         writer: of the bag, just opened.
-        flush_interval: a killed process loses at most the last so many seconds [s].
+        flush_interval: between flushes [s]; a killed process loses what came after the last one.
         queue_bytes: bound of what waits for the disk.
-        minimum_free: stop cleanly when the disk has fewer free bytes; 0 = do not look.
+        on_failure: called with the reason, on the session's thread, when the recording stops by
+            itself.
         clock: monotonic seconds.
-        free_bytes: returns the free bytes of a folder's disk.
     """
 
     def __init__(
@@ -65,16 +63,14 @@ class RecordingSession:
         *,
         flush_interval: float = FLUSH_INTERVAL,
         queue_bytes: int = QUEUE_BYTES,
-        minimum_free: int = MINIMUM_FREE,
+        on_failure: Callable[[str], None] = lambda _: None,
         clock: Callable[[], float] = time.monotonic,
-        free_bytes: Callable[[Path], int] = lambda folder: shutil.disk_usage(folder).free,
     ) -> None:
         self._writer = writer
         self._flush_interval = flush_interval
         self._limit = queue_bytes
-        self._minimum_free = minimum_free
+        self._on_failure = on_failure
         self._clock = clock
-        self._free_bytes = free_bytes
         self._queue: queue.SimpleQueue[tuple[TopicSpec, int, int, bytes] | None]
         self._queue = queue.SimpleQueue()
         self._queued = 0
@@ -137,6 +133,8 @@ class RecordingSession:
             self._failure = str(error)
         except Exception as error:  # a bug must not look like a good recording
             self._failure = f"the bag writer failed: {error!r}"
+        if self._failure:
+            self._on_failure(self._failure)
 
     def _drain(self) -> None:
         due = self._clock() + self._flush_interval
@@ -149,7 +147,7 @@ class RecordingSession:
             except queue.Empty:
                 pass
             if self._clock() >= due:
-                self._flush()
+                self._writer.flush()
                 due = self._clock() + self._flush_interval
 
     def _write(self, spec: TopicSpec, log_time: int, publish_time: int, data: bytes) -> None:
@@ -157,13 +155,3 @@ class RecordingSession:
             self._queued -= len(data)
         self._writer.add_topic(spec)
         self._writer.write(spec.name, log_time, publish_time, data)
-
-    def _flush(self) -> None:
-        self._writer.flush()
-        if self._minimum_free and self._free_bytes(self._writer.folder) < self._minimum_free:
-            self._writer.close()
-            raise BagWriteError(
-                f"fewer than {self._minimum_free >> 20} MiB are free where {self._writer.folder} "
-                "lies: recording stopped, the bag is closed and complete up to here. Free some "
-                "space and start again"
-            )

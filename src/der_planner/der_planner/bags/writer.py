@@ -1,40 +1,42 @@
-"""Write a bag: raw CDR in MCAP files with embedded definitions, safe at every flush.
+"""Write a bag as rosbag2 lays it out: raw CDR in MCAP files with embedded definitions.
 
 rosbag2's own writer keeps a chunk open until it is full; here every `flush` ends the chunk and
-hands it to the operating system, so a killed process leaves whole chunks and `recover` only has to
-add the index. After a write that fails (full disk) the file is cut behind its last whole chunk and
-finished there; after its folder is removed it is written again.
+hands it to the operating system, so a killed process leaves whole chunks. A bag whose writing was
+cut short has no index and no ``metadata.yaml``: `recover` makes a whole bag of it.
+``metadata.yaml`` (version 9, Jazzy) lists files and topics; ``ros2 bag info`` and ``ros2 bag play``
+read it first. Field names and their meaning: rosbag2's ``BagMetadata``.
 """
 
 from __future__ import annotations
 
 import contextlib
-import os
+import shutil
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any
 
+import yaml
+from mcap.data_stream import RecordBuilder
+from mcap.records import Channel, Schema
 from mcap.writer import CompressionType, Writer
 
-from der_planner.bags.layout import (
-    RUN_KEY,
-    BagSummary,
-    FileSummary,
-    TopicSpec,
-    file_name,
-)
-from der_planner.bags.recover import finish_file
-from der_planner.bags.scan import scan_file
+from der_planner.bags.topics import TopicSpec
 
 COMPRESSIONS = {
     "none": CompressionType.NONE,
     "lz4": CompressionType.LZ4,
     "zstd": CompressionType.ZSTD,
 }
+METADATA_FILE = "metadata.yaml"
+RUN_KEY = "run"
+"""Name of the MCAP metadata record, and of the custom-data entry, that holds the run's JSON."""
 CHUNK_SIZE = 1 << 20
 LARGE = 1 << 17
 """Messages of so many bytes get a chunk of their own, so that whoever reads only the small ones
 does not have to read the images between them."""
+REPEATS = 3
+"""A topic's definition is repeated outside of chunks at so many flushes after its first message."""
 PROFILE = "ros2"
 LIBRARY = "der_planner recorder"
 
@@ -43,44 +45,20 @@ class BagWriteError(OSError):
     """The bag cannot be written any further; the message says why and what is left of it."""
 
 
-class _Sink:
-    """An unbuffered file, so that a failed write is seen by the call that caused it."""
+@dataclass
+class FileSummary:
+    """What one file of the bag holds; times in ns, both 0 without messages."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.file: BinaryIO = path.open("x+b", buffering=0)
-        self.position = 0
+    name: str
+    message_count: int = 0
+    first: int = 0
+    last: int = 0
 
-    def write(self, data: bytes | bytearray | memoryview) -> int:
-        view = memoryview(data)
-        while view:
-            written = os.write(self.file.fileno(), view)
-            self.position += written
-            view = view[written:]
-        return len(data)
-
-    def tell(self) -> int:
-        return self.position
-
-    def flush(self) -> None:
-        """Nothing waits here: every write went to the operating system."""
-
-    def is_still_there(self) -> bool:
-        """Tell whether the path still leads to the open file."""
-        try:
-            named, opened = os.stat(self.path), os.fstat(self.file.fileno())
-        except OSError:
-            return False
-        return (named.st_dev, named.st_ino) == (opened.st_dev, opened.st_ino)
-
-    def save_again(self) -> None:
-        """Copy the content of a removed file to its path, whose folder is made again."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with self.path.open("wb") as copy:
-            offset = 0
-            while block := os.pread(self.file.fileno(), 1 << 20, offset):
-                copy.write(block)
-                offset += len(block)
+    def add(self, log_time: int) -> None:
+        """Count a message."""
+        self.first = log_time if self.message_count == 0 else min(self.first, log_time)
+        self.last = max(self.last, log_time)
+        self.message_count += 1
 
 
 class BagWriter:
@@ -93,9 +71,11 @@ class BagWriter:
         split_bytes: begin a new file after this many bytes; 0 = never.
         split_seconds: begin a new file after this recorded time [s]; 0 = never.
         chunk_size: largest chunk [bytes] before compression.
+        minimum_free: close the bag when the disk has fewer free bytes; 0 = do not look.
 
     Raises:
-        BagWriteError: the folder exists with something in it or cannot be made.
+        BagWriteError: the folder exists with something in it, cannot be made, or lies on a disk
+            with too little space.
     """
 
     def __init__(
@@ -107,6 +87,7 @@ class BagWriter:
         split_bytes: int = 0,
         split_seconds: float = 0.0,
         chunk_size: int = CHUNK_SIZE,
+        minimum_free: int = 0,
     ) -> None:
         self.folder = Path(folder)
         self.custom_data = dict(custom_data or {})
@@ -114,20 +95,24 @@ class BagWriter:
         self._split_bytes = split_bytes
         self._split_time = round(split_seconds * 1e9)
         self._chunk_size = chunk_size
+        self._minimum_free = minimum_free
         self._topics: dict[str, TopicSpec] = {}
         self._counts: dict[str, int] = {}
         self._latched: dict[str, tuple[int, bytes]] = {}
         self._files: list[FileSummary] = []
-        self._sink: _Sink | None = None
-        self._safe_end = 0
         self._small: list[tuple[TopicSpec, int, int, bytes]] = []
         self._small_bytes = 0
         self._sequences: dict[str, int] = {}
-        self.bytes_finished = 0
+        self._bytes_finished = 0
+        self.byte_count = 0
+        """Bytes in all files; what waits for the next flush is not counted."""
+        self._closed = False
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             if any(self.folder.iterdir()):
                 raise BagWriteError(f"the bag folder {self.folder} is not empty: name another one")
+            if self._lacks_space():
+                raise BagWriteError(f"{self._too_little()}: nothing is recorded")
             self._open_file()
         except BagWriteError:
             raise
@@ -143,11 +128,6 @@ class BagWriter:
     def message_count(self) -> int:
         """Messages written, repeated latched ones included."""
         return sum(self._counts.values())
-
-    @property
-    def byte_count(self) -> int:
-        """Bytes in all files; what waits for the next flush is not counted."""
-        return self.bytes_finished + (self._sink.tell() if self._sink else 0)
 
     @property
     def file_count(self) -> int:
@@ -170,13 +150,13 @@ class BagWriter:
             data: serialized CDR with its four-byte header.
 
         Raises:
-            BagWriteError: the storage refused; the bag is finished with what it already held.
+            BagWriteError: the storage refused; the bag stays as it is, without an index.
         """
         spec = self._topics[topic]
         if spec.latched:
             self._latched[topic] = (publish_time, data)
         if self._is_full(log_time):
-            self.split(log_time)
+            self._split(log_time)
             if spec.latched:
                 return  # just written as the repeated message of the new file
         with self._guarded():
@@ -186,18 +166,46 @@ class BagWriter:
         """End the chunk and hand everything to the operating system.
 
         Raises:
-            BagWriteError: as `write`, or the bag's folder was removed meanwhile; in that case it is
-                made again with everything recorded so far.
+            BagWriteError: as `write`, or the bag's folder was removed meanwhile, or the disk has
+                too little space left; in that last case the bag was closed and is whole.
         """
-        if self._sink is None:
-            return
         with self._guarded():
             self._emit_small()
-            self._safe_end = self._sink.tell()
-        if not self._sink.is_still_there():
-            self._save_vanished()
+            self._repeat_definitions()
+        if not (self.folder / self._files[-1].name).exists():
+            self._abandon()
+            raise BagWriteError(
+                f"the bag {self.folder} was removed while it was recorded: what it held is lost"
+            )
+        if self._lacks_space():
+            self.close()
+            raise BagWriteError(
+                f"{self._too_little()}: recording stopped, the bag is closed and complete up to "
+                "here. Free some space and start again"
+            )
 
-    def split(self, log_time: int) -> None:
+    def close(self) -> Path:
+        """Finish the bag and return its folder; may be called twice.
+
+        Raises:
+            BagWriteError: as `write`.
+        """
+        if not self._closed:
+            with self._guarded():
+                self._finish_file()
+                self._write_metadata()
+            self._closed = True
+        return self.folder
+
+    def _is_full(self, log_time: int) -> bool:
+        present = self._files[-1]
+        if present.message_count == 0:
+            return False
+        by_size = 0 < self._split_bytes <= self._file.tell()
+        by_time = 0 < self._split_time <= log_time - present.first
+        return by_size or by_time
+
+    def _split(self, log_time: int) -> None:
         """Finish the present file and begin the next with the latched messages."""
         with self._guarded():
             self._finish_file()
@@ -205,50 +213,27 @@ class BagWriter:
             for topic, (publish_time, data) in self._latched.items():
                 self._append(self._topics[topic], log_time, publish_time, data)
 
-    def close(self) -> Path:
-        """Finish the bag and return its folder; may be called twice.
-
-        Raises:
-            BagWriteError: the index could not be written; `recover` can add it later.
-        """
-        if self._sink is not None:
-            if not self._sink.is_still_there():
-                self._save_vanished()
-            with self._guarded():
-                self._finish_file()
-                self._write_metadata()
-        return self.folder
-
-    def _is_full(self, log_time: int) -> bool:
-        present = self._files[-1]
-        if self._sink is None or present.message_count == 0:
-            return False
-        by_size = 0 < self._split_bytes <= self._sink.tell()
-        by_time = 0 < self._split_time <= log_time - present.first
-        return by_size or by_time
-
     def _open_file(self) -> None:
-        name = file_name(self.folder, len(self._files))
-        self._sink = _Sink(self.folder / name)
+        name = f"{self.folder.name}_{len(self._files)}.mcap"
+        self._file = (self.folder / name).open("xb")
         self._writer = Writer(
-            self._sink,  # has the three methods that the writer calls
-            chunk_size=self._chunk_size,
-            compression=self._compression,
+            self._file, chunk_size=self._chunk_size, compression=self._compression
         )
         self._files.append(FileSummary(name))
-        self._channels: dict[str, int] = {}
-        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, Channel] = {}
+        self._schemas: dict[str, Schema] = {}
+        self._repeats: dict[str, int] = {}
         self._writer.start(profile=PROFILE, library=LIBRARY)
         if self.custom_data:
             self._writer.add_metadata(RUN_KEY, self.custom_data)
-        self._safe_end = self._sink.tell()
+        self._file.flush()
 
     def _append(self, spec: TopicSpec, log_time: int, publish_time: int, data: bytes) -> None:
         self._files[-1].add(log_time)
         self._counts[spec.name] += 1
         if len(data) >= LARGE:
             self._emit(spec, log_time, publish_time, data)
-            self._writer.flush()
+            self._end_chunk()
             return
         self._small.append((spec, log_time, publish_time, data))
         self._small_bytes += len(data)
@@ -261,7 +246,11 @@ class BagWriter:
             self._emit(*message)
         self._small.clear()
         self._small_bytes = 0
+        self._end_chunk()
+
+    def _end_chunk(self) -> None:
         self._writer.flush()
+        self.byte_count = self._bytes_finished + self._file.tell()
 
     def _emit(self, spec: TopicSpec, log_time: int, publish_time: int, data: bytes) -> None:
         if spec.name not in self._channels:
@@ -269,7 +258,7 @@ class BagWriter:
         sequence = self._sequences.get(spec.name, 0)
         self._sequences[spec.name] = sequence + 1
         self._writer.add_message(
-            channel_id=self._channels[spec.name],
+            channel_id=self._channels[spec.name].id,
             log_time=log_time,
             publish_time=publish_time,
             sequence=sequence & 0xFFFFFFFF,
@@ -278,103 +267,101 @@ class BagWriter:
 
     def _register(self, spec: TopicSpec) -> None:
         if spec.type_name not in self._schemas:
-            self._schemas[spec.type_name] = self._writer.register_schema(
-                name=spec.type_name, encoding="ros2msg", data=spec.definition.encode()
-            )
-        self._channels[spec.name] = self._writer.register_channel(
-            topic=spec.name,
-            message_encoding="cdr",
-            schema_id=self._schemas[spec.type_name],
-            metadata={
-                "offered_qos_profiles": spec.qos_yaml(),
-                "topic_type_hash": spec.type_hash,
-            },
-        )
+            text = spec.definition.encode()
+            number = self._writer.register_schema(spec.type_name, spec.encoding, text)
+            self._schemas[spec.type_name] = Schema(number, text, spec.encoding, spec.type_name)
+        about = {"offered_qos_profiles": spec.qos_yaml(), "topic_type_hash": spec.type_hash}
+        schema = self._schemas[spec.type_name].id
+        number = self._writer.register_channel(spec.name, "cdr", schema, about)
+        self._channels[spec.name] = Channel(number, spec.name, "cdr", about, schema)
+        self._repeats[spec.name] = REPEATS
+
+    def _repeat_definitions(self) -> None:
+        """Write what is known of young topics again, outside of chunks.
+
+        A topic's schema and channel lie in the chunk of its first message: if that chunk were
+        damaged, nobody could read the others.
+        """
+        records = RecordBuilder()
+        for name in self._repeats:
+            self._schemas[self._topics[name].type_name].write(records)
+            self._channels[name].write(records)
+        self._file.write(records.end())
+        self._end_chunk()
+        self._repeats = {name: left - 1 for name, left in self._repeats.items() if left > 1}
 
     def _finish_file(self) -> None:
-        assert self._sink is not None
         self._emit_small()
         self._writer.finish()
-        self.bytes_finished += self._sink.tell()
-        self._sink.file.close()
-        self._sink = None
-
-    def _write_metadata(self) -> None:
-        BagSummary(self._files, list(self._topics.values()), self._counts, self.custom_data).write(
-            self.folder
-        )
+        self.byte_count = self._bytes_finished = self._bytes_finished + self._file.tell()
+        self._file.close()
 
     @contextlib.contextmanager
     def _guarded(self) -> Iterator[None]:
-        """Turn a refused write into a finished bag and a BagWriteError."""
+        """Turn a refused write into a BagWriteError."""
         try:
             yield
         except OSError as error:
+            self._abandon()
             raise BagWriteError(
-                f"recording into {self.folder} stopped: {error}. {self._salvage()}"
+                f"recording into {self.folder} stopped: {error}. Free some space, then "
+                f"scripts/recover_bag.py {self.folder} saves what was written"
             ) from error
 
-    def _salvage(self) -> str:
-        """Cut off what was half written, finish the file there, and say how that went."""
-        sink, self._sink = self._sink, None
-        try:
-            try:
-                self._finish_cut(sink)
-            except OSError:
-                # No room even for the index: give back the chunks since the last flush.
-                if sink is None:
-                    raise
-                os.truncate(sink.path, self._safe_end)
-                self._finish_cut(sink)
-        except OSError as error:
-            return (
-                f"Its index could not be written either ({error}): free some space, then "
-                f"scripts/recover_bag.py {self.folder} repairs it"
-            )
-        finally:
-            if sink is not None:
-                sink.file.close()
-        return "Every whole chunk is in the bag, which is closed and readable"
-
-    def _finish_cut(self, sink: _Sink | None) -> None:
-        if sink is not None:
-            finish_file(sink.path)
-            found = scan_file(sink.path)
-            self.bytes_finished += sink.path.stat().st_size
-            self._recount(sink.path.name, found.log_times, found.counts)
-        self._write_metadata()
-
-    def _recount(self, name: str, times: tuple[int, int], counts: Mapping[str, int]) -> None:
-        """Take over what the last file really holds after it was cut."""
-        lost_file = self._files[-1]
-        assert lost_file.name == name
-        self._files[-1] = FileSummary(name, sum(counts.values()), *times)
-        earlier = _counts_of_finished(self.folder, [entry.name for entry in self._files[:-1]])
-        self._counts = {
-            topic: counts.get(topic, 0) + earlier.get(topic, 0) for topic in self._topics
-        }
-
-    def _save_vanished(self) -> None:
-        """The folder was removed under the open file: write everything again, then stop."""
-        sink, self._sink = self._sink, None
-        assert sink is not None
+    def _abandon(self) -> None:
+        """Leave the bag as it is."""
+        self._closed = True
         with contextlib.suppress(OSError):
-            self._emit_small()
-            self._writer.finish()
-        try:
-            sink.save_again()
-            self._write_metadata()
-            left = "What this file of the bag held was saved again in the same place"
-        except OSError as error:
-            left = f"It could not be made again ({error}): the recording is lost"
-        finally:
-            sink.file.close()
-        raise BagWriteError(f"the bag {self.folder} was removed while it was recorded. {left}")
+            self._file.close()
 
+    def _lacks_space(self) -> bool:
+        return shutil.disk_usage(self.folder).free < self._minimum_free
 
-def _counts_of_finished(folder: Path, names: list[str]) -> dict[str, int]:
-    total: dict[str, int] = {}
-    for name in names:
-        for topic, count in scan_file(folder / name).counts.items():
-            total[topic] = total.get(topic, 0) + count
-    return total
+    def _too_little(self) -> str:
+        return f"fewer than {self._minimum_free >> 20} MiB are free where {self.folder} lies"
+
+    def _write_metadata(self) -> None:
+        """Write ``metadata.yaml``, whole or not at all."""
+        text = yaml.safe_dump({"rosbag2_bagfile_information": self._metadata()}, sort_keys=False)
+        unfinished = self.folder / f".{METADATA_FILE}.part"
+        unfinished.write_text(text, encoding="utf-8")
+        unfinished.replace(self.folder / METADATA_FILE)
+
+    def _metadata(self) -> dict[str, Any]:
+        filled = [entry for entry in self._files if entry.message_count]
+        first = min((entry.first for entry in filled), default=0)
+        last = max((entry.last for entry in filled), default=0)
+        return {
+            "version": 9,
+            "storage_identifier": "mcap",
+            "duration": {"nanoseconds": last - first},
+            "starting_time": {"nanoseconds_since_epoch": first},
+            "message_count": self.message_count,
+            "topics_with_message_count": [
+                {
+                    "topic_metadata": {
+                        "name": spec.name,
+                        "type": spec.type_name,
+                        "serialization_format": "cdr",
+                        "offered_qos_profiles": [profile.as_mapping() for profile in spec.qos],
+                        "type_description_hash": spec.type_hash,
+                    },
+                    "message_count": self._counts[spec.name],
+                }
+                for spec in self._topics.values()
+            ],
+            "compression_format": "",
+            "compression_mode": "",
+            "relative_file_paths": [entry.name for entry in self._files],
+            "files": [
+                {
+                    "path": entry.name,
+                    "starting_time": {"nanoseconds_since_epoch": entry.first},
+                    "duration": {"nanoseconds": entry.last - entry.first},
+                    "message_count": entry.message_count,
+                }
+                for entry in self._files
+            ],
+            "custom_data": self.custom_data,
+            "ros_distro": "jazzy",
+        }

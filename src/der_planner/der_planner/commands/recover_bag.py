@@ -1,9 +1,10 @@
-"""Repair bags that a kill, a crash or a full disk left without their index.
+"""Save what can be read of bags that a kill, a crash, a full or a damaged disk left.
 
 python3 scripts/recover_bag.py out/bags/same_direction_der_1
+python3 scripts/recover_bag.py run.mcap --out saved/run
 
-The files are repaired in place: whole chunks stay as they are, what was half written behind the
-last one is cut, index and metadata.yaml are added. A bag that is whole is left alone.
+The bag itself stays as it is: its whole messages go into a new bag, BAG_recovered or that of --out.
+For a bag that is whole nothing is written, unless --out names where.
 """
 
 from __future__ import annotations
@@ -12,8 +13,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from der_planner.bags.recover import Recovery, recover_bag
-from der_planner.bags.scan import RecoverError
+from der_planner.bags.recover import RecoverError, Recovery, recover_bag
 
 
 def _show(fraction: float) -> None:
@@ -21,34 +21,38 @@ def _show(fraction: float) -> None:
         print(f"\r  {fraction:4.0%}", end="", file=sys.stderr, flush=True)
 
 
-def describe(report: Recovery) -> str:
+def describe(found: Recovery) -> str:
     """Return a sentence on what was found and done."""
-    held = f"{report.message_count} messages over {report.duration:.1f} s"
-    if not report.repaired and not report.wrote_metadata:
-        return f"{report.path}: whole, nothing to repair ({held})"
-    done = [f"index of {name} added" for name in report.repaired]
-    if report.wrote_metadata:
-        done.append("metadata.yaml written")
-    if report.lost_bytes:
-        done.append(f"{report.lost_bytes} bytes of an unfinished record cut")
-    if report.damaged_chunks:
-        done.append(f"{report.damaged_chunks} damaged chunks left out of the index")
-    return f"{report.path}: {', '.join(done)}; holds {held}"
+    held = f"{found.message_count} messages over {found.duration:.1f} s"
+    if found.folder is None:
+        return f"{found.source}: whole, nothing to recover ({held})"
+    lost = []
+    if found.damaged_chunks:
+        lost.append(f"{found.damaged_chunks} damaged chunks")
+    if found.lost_bytes:
+        lost.append(f"{found.lost_bytes} bytes")
+    if found.unnamed:
+        lost.append(f"{found.unnamed} messages whose topic nothing tells")
+    return f"{found.source}: {held} saved in {found.folder}; lost: {', '.join(lost) or 'nothing'}"
 
 
 def main() -> int:
-    """Run the command line; 0 when every bag is whole now, 1 otherwise."""
+    """Run the command line; 0 when something was saved of every bag, 1 otherwise."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="folder or .mcap file")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="the new bag, for one BAG")
+    options = parser.parse_args()
+    if options.out is not None and len(options.bags) > 1:
+        parser.error("--out names one new bag: give one BAG")
     failed = 0
-    for path in parser.parse_args().bags:
+    for path in options.bags:
         try:
-            report = recover_bag(path, _show)
+            found = recover_bag(path, options.out, _show)
         except (RecoverError, OSError) as error:
             print(f"error: {error}", file=sys.stderr)
             failed += 1
             continue
-        print(("\r" if sys.stderr.isatty() else "") + describe(report))
+        print(("\r" if sys.stderr.isatty() else "") + describe(found))
     return 1 if failed else 0

@@ -5,9 +5,9 @@ from __future__ import annotations
 import importlib
 import json
 import re
-import struct
 import sys
 import time
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -19,33 +19,51 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-from der_planner.bags.definitions import DefinitionError, find_definition
-from der_planner.bags.layout import RUN_KEY, OfferedQos, TopicSpec
 from der_planner.bags.session import RecordingSession
-from der_planner.bags.writer import COMPRESSIONS, BagWriteError, BagWriter
+from der_planner.bags.topics import DefinitionError, OfferedQos, TopicSpec
+from der_planner.bags.writer import COMPRESSIONS, RUN_KEY, BagWriteError, BagWriter
 from limb_interfaces import parameters, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
-from limb_interfaces.gaps import StampGaps
 from limb_interfaces.overrides import check_overrides
 from limb_interfaces.runner import run_node
-from limb_interfaces.stamps import NANOSECONDS
 
 IMAGE_TYPE = "sensor_msgs/msg/Image"
-REGULAR_TYPES = (
-    IMAGE_TYPE,
-    "der_msgs/msg/LimbState",
-    "der_msgs/msg/PressureState",
-    "der_msgs/msg/TagDetectionArray",
-)
-"""Streams of a steady rate, of which the stamps tell what did not arrive."""
 DEPTH = 200
+"""This many messages of a topic may wait for the node."""
 IMAGE_DEPTH = 30
+"""This many images of a topic may wait for the node."""
 
-LACKING = {
-    "missed": "messages that never arrived",
-    "unsent": "messages left out by a sender that did not keep its rate",
-}
-"""What the diagnostics say of gaps between stamps, by the counter of `StampGaps`."""
+
+@dataclass
+class _Source:
+    """One topic that the recorder listens to.
+
+    Attributes:
+        spec: of the topic.
+        subscription: to it.
+        newest: instant of sending [ns] and content of the last message of a latched topic.
+        missed: messages that were sent while a bag was recorded, and never arrived.
+    """
+
+    spec: TopicSpec
+    subscription: Subscription | None = None
+    newest: tuple[int, bytes] | None = None
+    missed: int = 0
+    _number: int = 0
+    _counts: bool = False
+
+    def lacking_before(self, number: int) -> int:
+        """Return how many messages did not arrive before one, by its publisher's own count."""
+        before, self._number = self._number, number
+        if number <= before:
+            self._counts = False  # another publisher, or the same one begins anew
+        return number - before - 1 if self._counts and before else 0
+
+    def count_again(self, publishers: int) -> None:
+        """Count only where there is one publisher: messages do not tell whose number they bear."""
+        if publishers == 1 and not self._counts:
+            self._number = 0
+        self._counts = publishers == 1
 
 
 class Recorder(Node):
@@ -55,13 +73,10 @@ class Recorder(Node):
         super().__init__("recorder", namespace=topics.NAMESPACE)
         self._declare_parameters()
         check_overrides(self)
-        self._gaps: dict[str, StampGaps] = {}
         self._session: RecordingSession | None = None
         self._last_failure = ""
         self._last_bag = ""
-        self._subscriptions_by_topic: dict[str, tuple[Subscription, tuple[OfferedQos, ...]]] = {}
-        self._specs: dict[str, TopicSpec] = {}
-        self._latched: dict[str, tuple[int, bytes]] = {}
+        self._sources: dict[str, _Source] = {}
         self._refused: dict[str, str] = {}
         self._marks = 0
         self.create_service(Trigger, "~/start", self._on_start)
@@ -145,20 +160,19 @@ class Recorder(Node):
             if len(types) > 1:
                 self._refuse(name, f"has several types: {', '.join(types)}")
                 continue
-            qos = offered_qos(self.get_publishers_info_by_topic(name))
-            present = self._subscriptions_by_topic.get(name)
-            if present is None:
+            publishers = self.get_publishers_info_by_topic(name)
+            qos = offered_qos(publishers)
+            source = self._sources.get(name)
+            if source is not None and qos and qos != source.spec.qos:
+                if _profile(source.spec) == _profile(replace(source.spec, qos=qos)):
+                    source.spec = replace(source.spec, qos=qos)
+                else:
+                    self._unsubscribe(name)
+                    source = None
+            if source is None:
                 self._subscribe(name, types[0], qos)
-            elif (
-                qos
-                and qos != present[1]
-                and _profile(types[0], qos) != _profile(types[0], present[1])
-            ):
-                self._unsubscribe(name)
-                self._subscribe(name, types[0], qos)
-            elif qos and not present[1]:
-                self._subscriptions_by_topic[name] = (present[0], qos)
-                self._describe(name, types[0], qos)
+            else:
+                source.count_again(len(publishers))
 
     def _is_wanted(self, name: str, type_name: str) -> bool:
         if type_name == IMAGE_TYPE and not self._parameter("record_images"):
@@ -176,61 +190,47 @@ class Recorder(Node):
         if name in self._refused:
             return
         try:
-            self._describe(name, type_name, qos)
+            spec = TopicSpec.installed(name, type_name, qos)
             package, _, short = type_name.split("/")
             message_class = getattr(importlib.import_module(f"{package}.msg"), short)
         except (DefinitionError, ImportError, AttributeError, ValueError) as error:
             self._refuse(name, str(error))
             return
-        subscription = self.create_subscription(
-            message_class,
-            name,
-            self._receiver(name),
-            _profile(type_name, qos),
-            raw=True,
-        )
-        self._subscriptions_by_topic[name] = (subscription, qos)
-
-    def _describe(self, name: str, type_name: str, qos: tuple[OfferedQos, ...]) -> None:
-        definition = find_definition(type_name)
-        # /rosout is latched, too, but an old log line is no state that a new file should repeat.
-        latched = name != "/rosout" and _is_latched(qos)
-        self._specs[name] = TopicSpec(
-            name, type_name, definition.text, definition.type_hash, qos, latched
+        source = self._sources[name] = _Source(spec)
+        source.subscription = self.create_subscription(
+            message_class, name, partial(self._receive, source), _profile(spec), raw=True
         )
 
     def _unsubscribe(self, name: str) -> None:
-        present = self._subscriptions_by_topic.pop(name, None)
-        if present is not None:
-            self.destroy_subscription(present[0])
+        source = self._sources.pop(name, None)
+        if source is not None:
+            self.destroy_subscription(source.subscription)
 
-    def _receiver(self, name: str):
-        def receive(data: bytes, info: dict[str, int]) -> None:
-            arrived = self._now()
-            sent = info.get("source_timestamp", 0) or arrived
-            spec = self._specs[name]
-            if spec.latched:
-                self._latched[name] = (sent, data)
-            if spec.type_name in REGULAR_TYPES:
-                number = info.get("publication_sequence_number", 0)
-                self._gaps.setdefault(name, StampGaps()).take(leading_stamp(data), number)
-            if self._session is not None:
-                self._session.put(spec, arrived, sent, data)
-
-        return receive
+    def _receive(self, source: _Source, data: bytes, info: dict[str, int]) -> None:
+        arrived = self._now()
+        sent = info.get("source_timestamp", 0) or arrived
+        lacking = source.lacking_before(info.get("publication_sequence_number") or 0)
+        if source.spec.latched:
+            source.newest = (sent, data)
+        if self._session is not None:
+            source.missed += lacking
+            self._session.put(source.spec, arrived, sent, data)
 
     def _take_what_has_arrived(self) -> None:
         """Receive what waits: on a busy machine, services may overtake earlier messages."""
-        for name, (waiting, _) in self._subscriptions_by_topic.items():
-            receive, count = self._receiver(name), 0
+        for source in self._sources.values():
+            waiting, count = source.subscription, 0
             with waiting.handle:
                 take = partial(waiting.handle.take_message, waiting.msg_type, waiting.raw)
                 while count < DEPTH and (taken := take()):
-                    receive(*taken)
+                    self._receive(source, *taken)
                     count += 1
 
     def _now(self) -> int:
         return int(self.get_clock().now().nanoseconds)
+
+    def _missed(self) -> dict[str, int]:
+        return {name: each.missed for name, each in self._sources.items() if each.missed}
 
     # Services
 
@@ -248,20 +248,22 @@ class Recorder(Node):
             compression=compression,
             split_bytes=self._parameter("split_size"),
             split_seconds=self._parameter("split_duration"),
+            minimum_free=self._parameter("minimum_free"),
         )
         self._session = RecordingSession(
             writer,
             flush_interval=self._parameter("flush_interval"),
             queue_bytes=self._parameter("queue_size"),
-            minimum_free=self._parameter("minimum_free"),
+            on_failure=self.get_logger().error,
         )
         self._last_failure = ""
         self._marks = 0
-        self._gaps.clear()
         self._discover()
         now = self._now()
-        for name, (sent, data) in self._latched.items():
-            self._session.put(self._specs[name], now, sent, data)
+        for source in self._sources.values():
+            source.missed = 0
+            if source.newest is not None:
+                self._session.put(source.spec, now, *source.newest)
         self.get_logger().info(f"recording into {writer.folder}")
         return str(writer.folder)
 
@@ -283,10 +285,11 @@ class Recorder(Node):
         self._last_failure = status.failure
         self._last_bag = str(status.folder)
         if status.failure:
-            self.get_logger().error(status.failure)
             return False, status.failure
-        text = f"{status.folder}: {status.messages} messages, {status.dropped} dropped"
-        self.get_logger().info(f"closed {text}")
+        self.get_logger().info(
+            f"closed {status.folder}: {status.messages} messages, {status.dropped} dropped, "
+            f"{sum(self._missed().values())} missed"
+        )
         return True, str(status.folder)
 
     def _on_start(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -327,10 +330,7 @@ class Recorder(Node):
         self._marks += 1
         label = self._parameter("mark_label") or f"mark {self._marks}"
         name = f"{self.get_fully_qualified_name()}/mark"
-        definition = find_definition("std_msgs/msg/String")
-        spec = TopicSpec(
-            name, definition.name, definition.text, definition.type_hash, (OfferedQos(),)
-        )
+        spec = TopicSpec.installed(name, "std_msgs/msg/String", (OfferedQos(),))
         now = self._now()
         paused, self._session.paused = self._session.paused, False
         response.success = self._session.put(spec, now, now, serialize_message(String(data=label)))
@@ -340,9 +340,8 @@ class Recorder(Node):
 
     def _health(self) -> Health:
         values: dict[str, object] = {
-            "topics": len(self._subscriptions_by_topic),
-            "missed": "; ".join(f"{k}: {v.missed}" for k, v in self._gaps.items() if v.missed),
-            "unsent": "; ".join(f"{k}: {v.unsent}" for k, v in self._gaps.items() if v.unsent),
+            "topics": len(self._sources),
+            "missed": "; ".join(f"{name}: {count}" for name, count in self._missed().items()),
             "not_recorded": "; ".join(f"{k}: {v}" for k, v in self._refused.items()),
         }
         if self._session is None:
@@ -365,9 +364,8 @@ class Recorder(Node):
         if status.dropped:
             lost = f"{status.dropped} messages dropped: the disk is too slow for what is recorded"
             return Health("warning", lost, values)
-        for key, what in LACKING.items():
-            if values[key]:
-                return Health("warning", f"{what}, {values[key]}", values)
+        if values["missed"]:
+            return Health("warning", f"messages that never arrived, {values['missed']}", values)
         return Health("ok", f"{values['state']} into {status.folder}", values)
 
 
@@ -385,28 +383,16 @@ def offered_qos(endpoints: list[TopicEndpointInfo]) -> tuple[OfferedQos, ...]:
     return tuple(sorted(found, key=repr))
 
 
-def leading_stamp(data: bytes) -> int:
-    """Return the stamp [ns] of a serialized message whose first field is a std_msgs/Header."""
-    little = data[1] & 1
-    sec, nanosec = struct.unpack_from("<iI" if little else ">iI", data, 4)
-    return int(sec * NANOSECONDS + nanosec)
-
-
-def _is_latched(offered: tuple[OfferedQos, ...]) -> bool:
-    return bool(offered) and all(q.durability == "transient_local" for q in offered)
-
-
-def _profile(type_name: str, offered: tuple[OfferedQos, ...]) -> QoSProfile:
+def _profile(spec: TopicSpec) -> QoSProfile:
     """Return the strictest profile that every publisher still matches."""
-    is_image = type_name == IMAGE_TYPE
-    reliable = not is_image and all(q.reliability == "reliable" for q in offered)
+    is_image = spec.type_name == IMAGE_TYPE
+    reliable = not is_image and all(q.reliability == "reliable" for q in spec.qos)
+    kept = bool(spec.qos) and all(q.durability == "transient_local" for q in spec.qos)
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
         depth=IMAGE_DEPTH if is_image else DEPTH,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL
-        if _is_latched(offered)
-        else DurabilityPolicy.VOLATILE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if kept else DurabilityPolicy.VOLATILE,
     )
 
 
