@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from der_planner.limb import Limb
 from der_planner.model import ArcModel
 from der_planner.page.commands import Load
-from der_planner.planning import Motion, PathLimits, PlanningError, plan
-from der_planner.planning import Workspace
+from der_planner.planning import Motion, PathLimits, PlanningError, Workspace, plan
 from der_planner.planning.paths import read_csv
 
 Array = NDArray[np.float64]
