@@ -37,7 +37,7 @@ from der_planner.identification.update import adapted
 from der_planner.limb import Limb, LimbError
 from der_planner.planning.correction import Correction
 from der_planner.planning.errors import PlanningError
-from der_planner.planning.result import Plan
+from der_planner.planning.plan_file import Plan
 
 Array = NDArray[np.float64]
 

@@ -43,7 +43,7 @@ from der_planner.identification.terms import (
 )
 from der_planner.limb import CalibratedRange, Limb
 from der_planner.model import CONTROL_PERIOD, ArcModel, Material, RodModel
-from der_planner.planning.loads.rest import nearly_buckling
+from der_planner.planning.loads import nearly_buckling
 
 Array = NDArray[np.float64]
 
