@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 from runs import FRAMES, reference, series
 
-from der_planner.bags.corrections import Revisions, described, latencies
+from der_planner.bags.record import Revisions
+from der_planner.bags.series import described, latencies
 from der_planner.results import evaluate_run
 from der_planner.results.manners import manner, manners_table, side_by_side
 
