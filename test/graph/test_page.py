@@ -2,39 +2,29 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 import signal
-import socket
 import time
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote, urlsplit
+from urllib.parse import urljoin, urlsplit
 
 import pytest
-from browsers import signal_browser
-from filmed import FilmedRun
-from runs import FRAMES, reference
+from browsers import (
+    NEEDS_CHROMIUM,
+    open_browser,
+    requested_hosts,
+    signal_browser,
+    start_page,
+    webdriver,
+)
 
 from der_msgs.msg import PressurePlan, PressureState
 from limb_interfaces import qos, topics
 
-webdriver = pytest.importorskip("selenium.webdriver")
 Keys = webdriver.Keys
-CHROMIUM, CHROMEDRIVER = shutil.which("chromium"), shutil.which("chromedriver")
-pytestmark = [
-    pytest.mark.graph,
-    pytest.mark.skipif(
-        not (CHROMIUM and CHROMEDRIVER),
-        reason="no Chromium to open the page with: sudo apt-get install chromium chromium-driver",
-    ),
-]
-FLAGS = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync",
-)  # fmt: skip
+pytestmark = [pytest.mark.graph, NEEDS_CHROMIUM]
 OLD = """
 const watch = arguments[0], done = arguments[arguments.length - 1], begin = performance.now();
 const look = () => new Function("return " + watch)()
@@ -59,27 +49,15 @@ class Rig:
         link = f"/tmp/der_limb_page_test_{uuid.uuid4().hex[:8]}"
         self.states: list[Any] = []
         self.client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES, self.states.append)
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            port = free.getsockname()[1]
-        self.url = f"http://127.0.0.1:{port}/"
         graph.start("pressure_driver", "board_emulator", port_link=link)
         self.client.wait_ready(["board_emulator"])
         # A guardian would end a driver that is stopped for longer than a moment.
         self.driver = graph.start("pressure_driver", "pressure_driver", port=link, guardian="never")
-        self.page = graph.start("der_planner", "page", port=port, on_lost_operator=on_lost_operator)
+        self.page, self.url = start_page(graph, on_lost_operator=on_lost_operator)
         self.client.wait_ready(["pressure_driver", "page"])
 
     def open(self) -> Any:
-        options = webdriver.ChromeOptions()
-        options.binary_location = CHROMIUM
-        profile = self.folder / f"profile{len(self.browsers)}"
-        for flag in (*FLAGS, f"--user-data-dir={profile}", "--window-size=1280,800"):
-            options.add_argument(flag)
-        options.set_capability("goog:loggingPrefs", {"performance": "ALL"})
-        service = webdriver.ChromeService(CHROMEDRIVER)
-        browser = webdriver.Chrome(options=options, service=service)
-        browser.set_script_timeout(90)
+        browser = open_browser(self.folder / f"profile{len(self.browsers)}")
         self.browsers.append(browser)
         browser.get(self.url)
         self.wait(lambda: browser.execute_script("return !!page.data"), "live data")
@@ -163,27 +141,13 @@ def test_one_arms_and_everybody_vents(rig: Rig) -> None:
     rig.wait_mode(PressureState.DISARMED)
     signal_browser(first, signal.SIGKILL)
     rig.wait(lambda: enabled(second, "take"), "the desk to be free again")
-    second.get(f"{rig.url}setup")
+    second.get(urljoin(rig.url, "/setup"))
     arm(rig, second)
     rig.wait(lambda: second.find_element("id", "mode").text == "ARMED", "the page to know")
     press(rig, second, "fill-1-right")
     rig.wait(lambda: min(rig.states[-1].measured_differential) < -3000.0, "the chamber to fill")
     assert abs(rig.states[-1].measured_differential[0]) < 1000.0
-    hosts = {urlsplit(url).netloc for url in requested(second)}
-    assert hosts == {urlsplit(rig.url).netloc}
-
-
-def requested(browser: Any) -> list[str]:
-    """Return the addresses of every request and websocket of a window."""
-    found = []
-    for entry in browser.get_log("performance"):
-        message = json.loads(entry["message"])["message"]
-        parameters = message["params"]
-        if message["method"] == "Network.requestWillBeSent":
-            found.append(parameters["request"]["url"])
-        elif message["method"] == "Network.webSocketCreated":
-            found.append(parameters["url"])
-    return [url for url in found if urlsplit(url).scheme in ("http", "https", "ws", "wss")]
+    assert requested_hosts(second) == {urlsplit(rig.url).netloc}
 
 
 @pytest.mark.parametrize("rig", ["continue"], indirect=True)
@@ -246,39 +210,3 @@ def goes_silent(rig: Rig, browser: Any, process: Any, shown: str) -> None:
         process.signal(signal.SIGCONT)
         rig.wait(lambda: not browser.execute_script(f"return {shown}"), "live data again")
         took.append(silent_after(browser, process, signal.SIGSTOP, shown))
-
-
-def test_a_replayed_bag_is_never_taken_for_live(rig: Rig, tmp_path: Path) -> None:
-    bag = tmp_path / "filmed"
-    run = FilmedRun(bag)
-    run.plan()
-    run.calibration()
-    for index, when in enumerate(FRAMES[FRAMES >= 0]):
-        run.state(when, reference(when)[0])
-        run.pressure(when, [1000.0, 0.0], [900.0, 0.0])
-        if index % 5 == 0:
-            run.frame(when, shade=100)
-    run.bag.close()
-    browser = rig.open()
-    rig.client.call("pressure_driver/arm", 20.0)
-    browser.get(f"{rig.url}replay?bag={quote(str(bag), safe='')}")
-    rig.wait(lambda: browser.execute_script("return page.replay.frames > 0"), "a frame")
-    rig.wait(lambda: browser.find_element("id", "mode").text == "ARMED", "the live driver's mode")
-    assert browser.title == "REPLAY"
-    assert "driver then: tracking" in browser.find_element("id", "replay-mode").text
-    slider = browser.find_element("id", "replay-slider")
-    slider.send_keys(Keys.END)
-    end = float(slider.get_attribute("max"))
-    rig.wait(
-        lambda: browser.execute_script("return page.replay.shown") == pytest.approx(end, abs=0.2),
-        "the end of the recording",
-    )
-    slider.send_keys(Keys.HOME)
-    browser.find_element("id", "replay-play").click()
-    rig.wait(lambda: browser.execute_script("return page.replay.shown > 0.5"), "the replay to run")
-    slider.send_keys(" ")  # the space bar vents the live limb, whatever is replayed
-    rig.wait_mode(PressureState.DISARMED, PressureState.VENTING)
-    rig.wait_mode(PressureState.DISARMED)
-
-    browser.get(f"{rig.url}replay?bag=/nowhere")
-    rig.wait(lambda: "no bag at" in browser.find_element("id", "replay-note").text, "the reason")

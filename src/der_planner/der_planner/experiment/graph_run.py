@@ -18,7 +18,13 @@ from nav_msgs.msg import Path as PathMessage
 from der_msgs.msg import MotionCommand, PressurePlan, PressureState
 from der_planner.experiment.client import GraphClient
 from der_planner.experiment.errors import GraphError, NodeError
-from der_planner.experiment.node_specs import STOP_ORDER, Hardware, NodeSpec, node_specs
+from der_planner.experiment.node_specs import (
+    PAGE_TOKEN,
+    STOP_ORDER,
+    Hardware,
+    NodeSpec,
+    node_specs,
+)
 from der_planner.experiment.options import Options, Trial
 from der_planner.experiment.processes import NodeProcess
 from der_planner.experiment.progress import Progress
@@ -150,7 +156,7 @@ class GraphPlayer(ABC):
         self._progress.say(f"  ready after {time.monotonic() - begin:.1f} s")
         if "page" in self._processes:
             address = client.diagnostic_values("page").get("url", "unknown")
-            self._progress.say(f"  the operator's page is at {address}")
+            self._progress.say(f"  the operator's page is at {address}?token={PAGE_TOKEN}")
 
     def _record(self, client: GraphClient) -> GraphRun:
         bag = Path(client.call("recorder/start"))

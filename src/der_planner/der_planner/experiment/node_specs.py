@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import secrets
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -74,6 +75,10 @@ class Hardware:
         return hardware
 
 
+PAGE_TOKEN = secrets.token_urlsafe()
+"""Opens the page of each run's graph, so that a window that is open stays let in."""
+
+
 @dataclass(frozen=True)
 class NodeSpec:
     """What is needed to start one node."""
@@ -131,24 +136,18 @@ def node_specs(
         specs.append(NodeSpec("der_planner", "planner", {**planner, **rig.planner}))
     specs.append(NodeSpec("der_planner", "recorder", recorder))
     if page is not None:
-        specs.append(
-            NodeSpec(
-                "der_planner", "page", page_parameters(page, planner or {}, rig, bag.parents[2])
-            )
-        )
+        specs.append(NodeSpec("der_planner", "page", page_parameters(page, planner or {}, rig)))
     return specs
 
 
-def page_parameters(
-    port: int, planner: dict[str, Any], rig: Hardware, experiments: Path
-) -> dict[str, Any]:
+def page_parameters(port: int, planner: dict[str, Any], rig: Hardware) -> dict[str, Any]:
     """Return the parameters of a page that draws with the planner's limb on the tracker's tags."""
     shared = ("limb_file", "mounting", "payload", "payload_at", "path_speed", "path_acceleration")
     all_of_planner = {**planner, **rig.planner}
     parameters = {name: all_of_planner[name] for name in shared if name in all_of_planner}
     if "tag_map" in rig.tracker:
         parameters["tag_map"] = rig.tracker["tag_map"]
-    return {"port": port, "experiments": str(experiments), **parameters}
+    return {"port": port, "token": PAGE_TOKEN, **parameters}
 
 
 def twin_loads(limb: Limb | None) -> dict[str, Any]:

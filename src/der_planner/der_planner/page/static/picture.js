@@ -2,7 +2,6 @@
 "use strict";
 (() => {
   const LEAST = 30, TRAIL = 10000; // ms
-  const REGION_EVERY = 15; // pictures: the reachable region moves in the picture only with the camera
   const wait = (time) => new Promise((done) => setTimeout(done, time));
   const SLOW = 0.4, QUICK = 0.1, COARSE = 320; // s on the way: pictures are asked for small where it takes long; px
   let number = 0, trail = [], coarse = false;
@@ -21,7 +20,7 @@
     context.setLineDash([]);
   }
 
-  // Draws a picture, or a plain background where there is none, and what belongs over it.
+  // Draws a picture and what belongs over it.
   function draw(canvas, image, over, tips) {
     // Everything is given in pixels of the camera, and drawn no finer than the window shows it.
     const [width, height] = over.size, scale = Math.min(1, shownWidth(canvas) / width);
@@ -29,13 +28,12 @@
     if (canvas.width !== across || canvas.height !== down) { canvas.width = across; canvas.height = down; }
     const context = canvas.getContext("2d");
     context.setTransform(across / width, 0, 0, down / height, 0, 0);
-    if (image) context.drawImage(image, 0, 0, width, height);
-    else { context.fillStyle = "#3a424b"; context.fillRect(0, 0, width, height); }
+    context.drawImage(image, 0, 0, width, height);
     line(context, over.path, "#30c060", 2.5);
     line(context, over.planned, "#9be8b4", 5);
     for (const tag of over.tags) line(context, [0, 2, 4, 6].map((i) => [tag[i], tag[i + 1]]), "#2e9bff", 2, true);
     line(context, over.curve, "#ff7828", 3);
-    line(context, over.estimate || [], "#ff5fd0", 4, false, [10, 12]); // the measured limb shows in its gaps
+    line(context, over.estimate, "#ff5fd0", 4, false, [10, 12]); // the measured limb shows in its gaps
     line(context, tips, "#ffd84a", 2);
     for (const [point, colour] of [[over.tip, "#ff7828"], [over.reference, "#30c060"]]) {
       if (!point) continue;
@@ -47,7 +45,6 @@
     }
     context.setTransform(1, 0, 0, 1, 0, 0);
   }
-  page.drawOver = draw;
 
   const shownWidth = (canvas) => Math.round(canvas.clientWidth * (window.devicePixelRatio || 1)) || 1280;
 
@@ -62,9 +59,8 @@
     const canvas = document.getElementById("picture");
     if (!canvas || document.hidden) return 300;
     const begin = performance.now();
-    const load = page.sketch.load, region = page.sketch.on && (!page.region || page.pictures % REGION_EVERY === 0);
     // The server answers when there is a newer picture, so that none waits to be asked for.
-    const address = `/picture?after=${number}&wait=1&width=${coarse ? COARSE : shownWidth(canvas)}${region ? `&region=1&${load}` : ""}`;
+    const address = `/picture?after=${number}&wait=1&width=${coarse ? COARSE : shownWidth(canvas)}`;
     const answer = await fetch(address, { signal: AbortSignal.timeout(10000) });
     if (answer.status !== 200) return answer.status === 204 ? 0 : 1000;
     const body = await answer.arrayBuffer(), size = new DataView(body).getUint32(0);
@@ -75,7 +71,6 @@
     page.pictureAt = begin / 1000 + over.waited;
     const way = performance.now() / 1000 - page.pictureAt;
     coarse = way > SLOW || (coarse && way > QUICK);
-    if (over.region && load === page.sketch.load) page.region = over.region;
     draw(canvas, image, over, trailWith(over.tip));
     const note = document.getElementById("view-note");
     if (note && note.textContent !== over.problem) note.textContent = over.problem;

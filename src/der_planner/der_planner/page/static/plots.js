@@ -5,22 +5,17 @@
   const samples = [];
 
   page.listeners.push((data) => {
-    if (page.replay) return; // the curves are a recording's
     const now = performance.now() / 1000, { driver, limb, sources } = data;
     const heard = sources.driver.fresh ? driver : null, seen = sources.tracker.fresh && limb && limb.valid ? limb : null;
     samples.push({ at: now, measured: heard?.measured_kpa, commanded: heard?.commanded_kpa, bend: seen?.bend_deg, error: seen ? [seen.error_cm] : null });
     while (samples.length && now - samples[0].at > SPAN) samples.shift();
-    if (!document.hidden) page.plotCurves(samples, samples, now);
+    if (document.hidden) return;
+    plot("plot-pressure", now, [["measured", false], ["commanded", true]], 1);
+    plot("plot-bend", now, [["bend", false]], 5);
+    plot("plot-error", now, [["error", false]], 0.2, 0);
   });
 
-  // Draws what the driver and the tracker said in the last `SPAN` seconds before an instant.
-  page.plotCurves = (driver, limb, now) => {
-    plot("plot-pressure", driver, now, [["measured", false], ["commanded", true]], 1);
-    plot("plot-bend", limb, now, [["bend", false]], 5);
-    plot("plot-error", limb, now, [["error", false]], 0.2, 0);
-  };
-
-  function plot(id, samples, now, curves, least, floor = null) {
+  function plot(id, now, curves, least, floor = null) {
     const canvas = document.getElementById(id);
     if (!canvas) return;
     const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;

@@ -1,9 +1,10 @@
 // Draws on the picture with mouse or finger, and shows what the server says about the drawing.
 "use strict";
-page.sketch = (() => {
+page.drawing = (() => {
   const INSIDE = "#ffffff", OUTSIDE = "#ff4040";
-  let load = "", on = false, clean = true, points = [], preview = null, begun = 0, pointer = null;
-  const canvas = () => document.getElementById("sketch");
+  const REGION_INTERVAL = 1000; // ms: the reachable region moves in the picture only with the camera
+  let load = "", region = null, on = false, clean = true, points = [], preview = null, begun = 0, pointer = null;
+  const canvas = () => document.getElementById("drawing");
 
   function pathOf(outlines) {
     const path = new Path2D();
@@ -34,11 +35,11 @@ page.sketch = (() => {
     context.clearRect(0, 0, target.width, target.height);
     clean = !on;
     if (!on) return;
-    const region = page.region ? pathOf(page.region) : null;
-    if (region) { context.fillStyle = "rgba(60, 200, 255, .28)"; context.fill(region); }
+    const reachable = region ? pathOf(region) : null;
+    if (reachable) { context.fillStyle = "rgba(60, 200, 255, .28)"; context.fill(reachable); }
     // Each piece in the colour of where it lies.
     for (let k = 1; k < points.length; k += 1) {
-      const inside = !region || context.isPointInPath(region, points[k][0], points[k][1]);
+      const inside = !reachable || context.isPointInPath(reachable, points[k][0], points[k][1]);
       line(context, [points[k - 1], points[k]], inside ? INSIDE : OUTSIDE, 4);
     }
     if (!preview || !preview.path.length) return;
@@ -82,11 +83,26 @@ page.sketch = (() => {
   document.addEventListener("pointercancel", end);
   setInterval(() => { if (!document.hidden) draw(); }, 60);
 
+  async function askForRegion() {
+    if (!on || document.hidden) return;
+    const asked = load;
+    const answer = await fetch(`/region?${asked}`, { signal: AbortSignal.timeout(30000) });
+    if (answer.ok && asked === load) region = await answer.json();
+  }
+
+  (async () => {
+    for (;;) {
+      try { await askForRegion(); } catch (error) { /* the banner says that the server is away */ }
+      await new Promise((done) => setTimeout(done, on && !region ? 100 : REGION_INTERVAL));
+    }
+  })();
+
   return {
     get on() { return on; },
     get load() { return load; },
+    get region() { return region; },
     // What is reachable depends on the load: it is asked for anew, and not shown as if it held meanwhile.
-    carry(wanted) { const next = new URLSearchParams(wanted).toString(); if (next !== load) { load = next; page.region = null; } },
+    setLoad(wanted) { const next = new URLSearchParams(wanted).toString(); if (next !== load) { load = next; region = null; } },
     get points() { return points; },
     get preview() { return preview; },
     turn(wanted) { on = wanted; canvas()?.classList.toggle("on", on); document.getElementById("draw-legend")?.toggleAttribute("hidden", !on); if (!on) { points = []; preview = null; } },
