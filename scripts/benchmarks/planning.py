@@ -14,19 +14,18 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 
 from der_planner.limb import Limb
-from der_planner.model import STEPS, ArcModel, Initial, simulate
+from der_planner.model import STEPS, ArcModel, RodModel, simulate
 from der_planner.planning import (
     CONTROL_PERIOD,
     METHODS,
     Motion,
     Plan,
+    Workspace,
+    configuration,
     inverse,
     plan,
-    rod_model,
 )
-from der_planner.planning.loads.posed import REFERENCE_PRIOR
-from der_planner.planning.rod_model import PlanningRod
-from der_planner.planning.ways import sample_spline
+from der_planner.planning.configuration import REFERENCE_PRIOR, configure
 
 CASES = ("asynchronous", "same_direction", "opposite_direction")
 METHODS_OF = [(model, method) for model, methods in METHODS.items() for method in methods]
@@ -82,13 +81,13 @@ def predicted(quick: bool) -> Figures:
 def kinematics_and_gains() -> Figures:
     """How far the rod's polyline is from the arcs, what its fold costs, and what the gains do."""
     limb = Limb.default()
-    model = PlanningRod(limb)
+    model = RodModel(limb)
     opposite = np.radians([45.0, -45.0])
     gap = np.linalg.norm(model.kinematics.tip(opposite) - ArcModel(limb).tip(opposite))
     # With a short connector, as calibrations find it, the rod's fold lies across this motion.
     joined = dataclasses.replace(limb, connector_length=0.002)
-    kinematics = PlanningRod(joined).kinematics
-    reference = Motion.named("asynchronous").reference(joined)
+    kinematics = RodModel(joined).kinematics
+    reference = Motion.named("asynchronous").reference(Workspace(RodModel(joined)))
     figures: Figures = {"tip_arcs_to_polyline_at_45_and_-45_degrees_mm": float(gap) * 1e3}
     print(f"\nArcs and polyline at 45/-45 degrees: tips {gap * 1e3:.1f} mm apart")
     for name, pull in (("exact", inverse.PRIOR_WEIGHT), ("smooth", REFERENCE_PRIOR)):
@@ -107,10 +106,10 @@ def kinematics_and_gains() -> Figures:
             f"largest acceleration {twirl:.2f} rad/s2"
         )
     motion = Motion.named("same_direction", period=6.0)
-    gains = rod_model.POSITION_GAIN, rod_model.VELOCITY_GAIN
-    rod_model.POSITION_GAIN = rod_model.VELOCITY_GAIN = 0.0
+    gains = configuration.POSITION_GAIN, configuration.VELOCITY_GAIN
+    configuration.POSITION_GAIN = configuration.VELOCITY_GAIN = 0.0
     without = plan(limb, motion, "der", "paper").predicted_error
-    rod_model.POSITION_GAIN, rod_model.VELOCITY_GAIN = gains
+    configuration.POSITION_GAIN, configuration.VELOCITY_GAIN = gains
     effect = plan(limb, motion, "der", "paper").predicted_error / without - 1
     figures["paper_gains_change_of_error_percent"] = effect * 100
     print(f"  K_p, K_d of paper change its predicted error by {effect * 100:+.3f} %")
@@ -190,14 +189,13 @@ def _rod_under(result: Plan, chambers: np.ndarray) -> np.ndarray:
     Its distance from the played tip is the identification's part of the error: no open-loop plan on
     this model can do better but by luck.
     """
-    model = PlanningRod(result.limb)
-    spline = model.configuration(result.reference)
+    motion = configure(RodModel(result.limb), result.reference)
     response = simulate(
-        model,
+        motion.model,
         result.time,
         pressures=chambers,
-        bend=lambda time: sample_spline(spline, time)[0],
-        initial=Initial(model.begin(spline, result.reference.start)),
+        bend=motion.bend_at,
+        initial=motion.initial,
         steps=STEPS,
     )
     return response.tip

@@ -1,15 +1,79 @@
-"""Options by which a command is told how a limb is mounted and what it carries in a run."""
+"""What the commands share on a terminal: steps and bars, one interrupt, options of loads."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
 import math
+import signal
+import sys
+import time
 from collections.abc import Sequence
+from types import FrameType
 from typing import Any
 
-from der_planner.experiment.errors import OptionError
 from der_planner.limb import HEAVIEST, Limb, LimbError, gravity_of
+
+
+class OptionError(ValueError):
+    """The command line or the hardware file asks for something impossible; says what and why."""
+
+
+class Progress:
+    """Prints steps to stderr; redraws a bar on a terminal, prints it rarely elsewhere."""
+
+    def __init__(self) -> None:
+        self._terminal = sys.stderr.isatty()
+        self._last_shown = -1e9
+        self._open_line = False
+
+    def say(self, text: str) -> None:
+        """Print one line."""
+        self._end_bar()
+        print(text, file=sys.stderr, flush=True)
+
+    def bar(self, done: float, total: float, text: str, unit: str = "s") -> None:
+        """Show that ``done`` of ``total`` seconds, or of another unit, are over."""
+        now = time.monotonic()
+        finished = done >= total
+        if now - self._last_shown < (0.2 if self._terminal else 15.0) and not finished:
+            return
+        self._last_shown = -1e9 if finished else now
+        share = min(max(done / total, 0.0), 1.0) if total > 0 else 1.0
+        line = f"  [{'#' * int(30 * share):<30}] {max(done, 0.0):5.0f} / {total:.0f} {unit} {text}"
+        if self._terminal:
+            print(f"\r{line:<100}", end="", file=sys.stderr, flush=True)
+            self._open_line = True
+            if finished:
+                self._end_bar()
+        else:
+            print(line, file=sys.stderr, flush=True)
+
+    def _end_bar(self) -> None:
+        if self._open_line:
+            print(file=sys.stderr)
+            self._open_line = False
+
+
+def interrupt_once() -> None:
+    """Turn the first signal that ends a run into a KeyboardInterrupt with its name.
+
+    The signals are `limb_interfaces.entry.END_SIGNALS`; later ones are ignored, so that they do not
+    cut the venting short.
+    """
+    # Without ROS there is nothing to vent, and this package is not there.
+    from limb_interfaces.entry import END_SIGNALS  # noqa: PLC0415
+
+    def interrupt(number: int, _frame: FrameType | None) -> None:
+        for each in END_SIGNALS:
+            signal.signal(each, signal.SIG_IGN)
+        raise KeyboardInterrupt(signal.Signals(number).name)
+
+    for each in END_SIGNALS:
+        signal.signal(each, interrupt)
+
+
+# Loads -------------------------------------------------------------------------------------------
 
 
 class _Once(argparse.Action):
