@@ -23,8 +23,17 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from workspace_setup.basics import APT_ROS, INSIDE, PACKAGES, ROOT, VENV, SetupError, say
-from workspace_setup.building import build, compile_kernels
+from workspace_setup.basics import (
+    APT_ROS,
+    INSIDE,
+    PACKAGES,
+    ROOT,
+    VENV,
+    SetupError,
+    run_jobs,
+    say,
+)
+from workspace_setup.building import build_jobs, kernel_jobs
 from workspace_setup.environment import environment
 from workspace_setup.python_packages import install_venv, venv_is_complete, write_lock
 
@@ -52,8 +61,7 @@ def ensure() -> None:
     with _only_one_setup():
         if not venv_is_complete():
             install_venv()
-        build()
-        compile_kernels()
+        run_jobs(*build_jobs(), *kernel_jobs())
 
 
 def enter() -> None:

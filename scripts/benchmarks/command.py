@@ -25,9 +25,7 @@ PARTS = {
     "identification": "identification",
     "studies": "studies",
     "feedback": "feedback",
-    "page": "page.browser",
-    "page_wire": "page.wire",
-    "page_memory": "page.memory",
+    "page": "page",
 }
 """Module of each part, below `benchmarks`; its ``run(quick)`` prints and returns the figures."""
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import psutil
 from distributed import Client, LocalCluster
 
-from der_planner.experiment.progress import Progress
+from der_planner.experiment.console import Progress
 from der_planner.studies.conduct import Settings, conduct
 from der_planner.studies.study import Study
 from der_planner.studies.tasks import TASKS

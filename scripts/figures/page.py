@@ -9,9 +9,9 @@ import argparse
 import math
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import urljoin
 
-from benchmarks.page.rig import Rig, running
+from benchmarks.page import PageGraph, page_graph
 from der_msgs.msg import PressureState
 from der_planner.results.outputs import folder_argument
 from workspace_setup.basics import ROOT
@@ -23,10 +23,9 @@ TELEPHONE = {"width": 390, "height": 844, "deviceScaleFactor": 2, "mobile": True
 SETTLING = 1.5
 """[s] for a window to lay itself out in another size."""
 CENTRE = """
-const box = document.getElementById('sketch').getBoundingClientRect();
+const box = document.getElementById('drawing').getBoundingClientRect();
 const [width, height] = page.pictureSize;
-const outline = page.region[0];
-const top = outline.reduce((best, point) => (point[1] < best[1] ? point : best));
+const top = page.drawing.region[0].reduce((best, point) => (point[1] < best[1] ? point : best));
 return [box.left + top[0] * box.width / width, box.top + top[1] * box.height / height];
 """
 """Where the reachable region is highest, in the window."""
@@ -35,30 +34,29 @@ const field = [...document.querySelectorAll('input')].find((one) => one.ariaLabe
 field.focus();
 field.select();
 """
-BAG = "return page.data.nodes.find((node) => node.name === 'recorder').values.bag;"
 RING = 17
 """[px] Radius of the drawn ring in the window."""
 POINTS = 24
 
 
-class Camera:
+class Photographer:
     """Takes pictures of a window.
 
     Args:
-        rig: that runs.
+        graph: that runs.
         folder: where the pictures go.
     """
 
-    def __init__(self, rig: Rig, folder: Path) -> None:
-        self.rig = rig
-        self.window = rig.browse()
+    def __init__(self, graph: PageGraph, folder: Path) -> None:
+        self.graph = graph
+        self.window = graph.open_window()
         self._folder = folder
         self.resize(DESKTOP)
 
     def resize(self, screen: dict[str, Any]) -> None:
         """Give the window the size of a screen."""
         self.window.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
-        self.rig.client.spin(SETTLING)
+        self.graph.client.spin(SETTLING)
 
     def take(self, name: str) -> None:
         """Write what the window shows."""
@@ -67,7 +65,7 @@ class Camera:
 
     def wait(self, script: str, what: str) -> Any:
         """Return what a script returns in the window once it is something."""
-        return self.rig.wait(lambda: self.window.execute_script(script), what)
+        return self.graph.wait(lambda: self.window.execute_script(script), what)
 
     def press(self, name: str) -> None:
         """Press a button when it can be pressed."""
@@ -81,14 +79,14 @@ class Camera:
         self.window.switch_to.active_element.send_keys(text)
 
 
-def draw_ring(camera: Camera) -> None:
+def draw_ring(photographer: Photographer) -> None:
     """Draw a ring where the tip reaches farthest, and wait for its preview."""
     from selenium.webdriver import ActionChains  # noqa: PLC0415 - only this and the tests need it
 
-    camera.press("draw")
-    camera.wait("return page.sketch.on && !!page.region", "the reachable region")
-    x, y = camera.window.execute_script(CENTRE)
-    actions = ActionChains(camera.window, duration=20)
+    photographer.press("draw")
+    photographer.wait("return page.drawing.on && !!page.drawing.region", "the reachable region")
+    x, y = photographer.window.execute_script(CENTRE)
+    actions = ActionChains(photographer.window, duration=20)
     pointer = actions.w3c_actions.pointer_action
     angles = [2.0 * math.pi * index / POINTS for index in range(POINTS + 1)]
     places = [(int(x + RING * math.cos(a)), int(y + 6 + RING * math.sin(a))) for a in angles]
@@ -98,7 +96,7 @@ def draw_ring(camera: Camera) -> None:
         pointer.move_to_location(*place)
     pointer.pointer_up()
     actions.perform()
-    camera.wait("return !!page.sketch.preview", "a preview")
+    photographer.wait("return !!page.drawing.preview", "a preview")
 
 
 def main() -> int:
@@ -106,42 +104,33 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("folder", nargs="?", type=folder_argument, default=DOC)
     folder = parser.parse_args().folder
-    with running() as rig:
-        camera = Camera(rig, folder)
-        camera.press("take")
-        camera.press("arm")
-        draw_ring(camera)
-        camera.press("play-drawing")
-        rig.wait_mode(PressureState.TRACKING)
-        camera.rig.client.spin(6.0)
-        camera.take("page_desktop.png")
-        camera.resize(TELEPHONE)
-        camera.take("page_phone.png")
-        camera.resize(TALL)
-        camera.press("draw")
-        camera.press("stop")
-        rig.wait_mode(PressureState.ARMED)
-        camera.write("Payload [g]", "20")
-        camera.write("Period [s]", "12")
-        camera.write("Note for the recording", "20 g at the tip")
-        camera.press("record")
-        camera.press("play")
-        rig.wait_mode(PressureState.TRACKING)
-        camera.rig.client.spin(15.0)
-        camera.take("page_playing.png")
-        camera.press("unrecord")
-        camera.resize(DESKTOP)
-        bag = camera.wait(
-            "return page.data.nodes.find((n) => n.name === 'recorder').values.bag", ""
-        )
-        camera.window.get(f"{rig.url}setup")
-        camera.rig.client.spin(SETTLING)
-        camera.take("page_setup.png")
-        camera.window.get(f"{rig.url}replay?bag={quote(str(bag), safe='')}")
-        camera.wait("return page.replay.frames > 0", "the recording")
-        slider = camera.window.find_element("id", "replay-slider")
-        for _ in range(70):
-            slider.send_keys("\ue014")  # the arrow to the right
-        camera.rig.client.spin(2.0 * SETTLING)
-        camera.take("page_replay.png")
+    with page_graph() as graph:
+        photographer = Photographer(graph, folder)
+        press = photographer.press
+        press("take")
+        press("arm")
+        draw_ring(photographer)
+        press("play-drawing")
+        graph.wait_mode(PressureState.TRACKING)
+        graph.client.spin(6.0)
+        photographer.take("page_desktop.png")
+        photographer.resize(TELEPHONE)
+        photographer.take("page_phone.png")
+        photographer.resize(TALL)
+        press("draw")
+        press("stop")
+        graph.wait_mode(PressureState.ARMED)
+        photographer.write("Payload [g]", "20")
+        photographer.write("Period [s]", "12")
+        photographer.write("Note for the recording", "20 g at the tip")
+        press("record")
+        press("play")
+        graph.wait_mode(PressureState.TRACKING)
+        graph.client.spin(15.0)
+        photographer.take("page_playing.png")
+        press("unrecord")
+        photographer.resize(DESKTOP)
+        photographer.window.get(urljoin(graph.url, "/setup"))
+        graph.client.spin(SETTLING)
+        photographer.take("page_setup.png")
     return 0

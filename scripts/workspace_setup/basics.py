@@ -7,13 +7,23 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 VENV = ROOT / ".venv"
 APT_ROS = Path("/opt/ros/jazzy")
 PACKAGES = ("der_msgs", "der_planner", "pressure_driver", "apriltag_tracker")
 INSIDE = "DER_LIMB_WORKSPACE"
+"""Environment variable that names the workspace in which a process runs."""
+FOREIGN = (
+    "VIRTUAL_ENV", "PYTHONPATH", "PYTHONHOME", "AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH",
+    "COLCON_PREFIX_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE", "LD_LIBRARY_PATH", INSIDE,
+)  # fmt: skip
+"""Environment variables that another workspace, virtual environment or ROS may have set."""
+PROGRESS = 10.0
+"""Time [s] between two lines of progress."""
 
 
 class SetupError(RuntimeError):
@@ -39,40 +49,60 @@ def file_digest(paths: list[Path], extra: str = "") -> str:
     return total.hexdigest()
 
 
-def run_logged(command: list[str], log: Path, what: str, environment: dict[str, str]) -> None:
-    """Run a long command with its output in a log file and a running clock on a terminal."""
-    log.parent.mkdir(parents=True, exist_ok=True)
-    started = time.monotonic()
-    say(f"{what} (log: {log.relative_to(ROOT)})")
-    with log.open("wb") as output:
-        process = subprocess.Popen(command, stdout=output, stderr=output, env=environment, cwd=ROOT)
-        while process.poll() is None:
-            time.sleep(0.2)
-            if sys.stderr.isatty():
-                elapsed = time.monotonic() - started
-                print(f"\r[setup]   {elapsed:4.0f} s", end="", file=sys.stderr, flush=True)
-    if sys.stderr.isatty():
-        print(file=sys.stderr)
-    if process.returncode != 0:
-        tail = "\n".join(log.read_text(errors="replace").splitlines()[-15:])
-        raise SetupError(f"{what} failed. The end of {log.relative_to(ROOT)}:\n{tail}")
-    say(f"{what}: done in {time.monotonic() - started:.0f} s")
+class Job(NamedTuple):
+    """A long command: what it does, its words, its environment, and the name of its log file."""
+
+    what: str
+    command: list[str]
+    environment: dict[str, str]
+    log_name: str
+    finish: Callable[[], None] = lambda: None
+    """Called when the command has succeeded."""
+
+    @property
+    def log(self) -> Path:
+        """Return the file that its output goes to."""
+        return ROOT / "log" / f"{self.log_name}.log"
+
+
+def run_jobs(*jobs: Job) -> None:
+    """Run commands beside each other; say every `PROGRESS` seconds which of them still run.
+
+    Raises:
+        SetupError: a command failed; the others have ended, too, and the message ends its log.
+    """
+    started = said = time.monotonic()
+    running: list[tuple[Job, subprocess.Popen[bytes]]] = []
+    failed = []
+    for job in jobs:
+        job.log.parent.mkdir(exist_ok=True)
+        say(f"{job.what} (log: {job.log.relative_to(ROOT)})")
+        with job.log.open("wb") as output:
+            process = subprocess.Popen(
+                job.command, stdout=output, stderr=output, env=job.environment, cwd=ROOT
+            )
+        running.append((job, process))
+    while running:
+        time.sleep(0.2)
+        seconds = time.monotonic() - started
+        for job, process in [each for each in running if each[1].poll() is not None]:
+            running.remove((job, process))
+            if process.returncode == 0:
+                job.finish()
+                say(f"{job.what}: done in {seconds:.0f} s")
+            else:
+                failed.append(job)
+        if running and time.monotonic() - said >= PROGRESS:
+            said = time.monotonic()
+            say(f"{seconds:.0f} s: {'; '.join(job.what for job, _ in running)}")
+    for job in failed:
+        tail = "\n".join(job.log.read_text(errors="replace").splitlines()[-15:])
+        raise SetupError(f"{job.what} failed. The end of {job.log.relative_to(ROOT)}:\n{tail}")
 
 
 def clean_environment() -> dict[str, str]:
     """Return the caller's environment without another workspace, venv or ROS in it."""
     environment = dict(os.environ)
-    foreign = (
-        "VIRTUAL_ENV",
-        "PYTHONPATH",
-        "PYTHONHOME",
-        "AMENT_PREFIX_PATH",
-        "CMAKE_PREFIX_PATH",
-        "COLCON_PREFIX_PATH",
-        "_ROS_WHEELS_BOOTSTRAP_COMPLETE",
-        "LD_LIBRARY_PATH",
-        INSIDE,
-    )
-    for name in foreign:
+    for name in FOREIGN:
         environment.pop(name, None)
     return environment

@@ -4,66 +4,58 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from workspace_setup.basics import PACKAGES, ROOT, VENV, clean_environment, file_digest, run_logged
-from workspace_setup.environment import environment, ros_setup_lines
+from workspace_setup.basics import PACKAGES, ROOT, VENV, Job, clean_environment, file_digest
+from workspace_setup.environment import ros_setup_lines
 
+INSTALL = ROOT / "install"
 _COMPILED = re.compile(r"^@(\w+\.)?(njit|\w*kernel)\b", re.MULTILINE)
 _ONE_GROUP = ("apriltag_tracker",)
-
-
-def _build_inputs() -> list[Path]:
-    """List what the built workspace depends on; Python sources are linked, not copied."""
-    found = [
-        path
-        for path in (ROOT / "src" / "der_msgs").rglob("*")
-        if path.is_file() and "__pycache__" not in path.parts
-    ]
-    for package in PACKAGES[1:]:
-        folder = ROOT / "src" / package
-        found += [folder / name for name in ("package.xml", "setup.py", "setup.cfg")]
-    return found
+HALVES = ("plane", "space")
+"""Halves of the kernels; `workspace_setup.kernels` says what belongs to each."""
 
 
 def _build_digest() -> str:
-    configuration = sorted(
-        str(path.relative_to(ROOT))
-        for package in PACKAGES[1:]
-        for path in (ROOT / "src" / package / "config").glob("*.*")
-    )
-    return file_digest(
-        _build_inputs(), extra=(VENV / "made-for.txt").read_text() + "\n".join(configuration)
-    )
+    """Hash what the built workspace depends on; Python sources are linked, not copied."""
+    messages, *python_packages = (ROOT / "src" / package for package in PACKAGES)
+    inputs = [
+        path for path in messages.rglob("*") if path.is_file() and "__pycache__" not in path.parts
+    ]
+    names = []
+    for folder in python_packages:
+        inputs += [folder / name for name in ("package.xml", "setup.py", "setup.cfg")]
+        names += [str(path.relative_to(ROOT)) for path in folder.glob("config/*.*")]
+    made_for = (VENV / "made-for.txt").read_text()
+    return file_digest(inputs, extra=made_for + "\n".join(sorted(names)))
 
 
-def build() -> None:
-    """Build the packages with colcon, unless nothing that they depend on has changed."""
-    stamp = ROOT / "build" / "workspace.json"
-    digest = _build_digest()
-    if stamp.exists() and json.loads(stamp.read_text()).get("digest") == digest:
-        return
+def build_jobs() -> list[Job]:
+    """Return the job that builds the packages; none if all are there and nothing has changed."""
+    stamp, digest = ROOT / "build" / "workspace.json", _build_digest()
+    built = all((INSTALL / name / "share" / name).is_dir() for name in PACKAGES)
+    if built and stamp.exists() and json.loads(stamp.read_text()).get("digest") == digest:
+        return []
+
+    def finish() -> None:
+        stamp.write_text(json.dumps({"digest": digest}))
+        (ROOT / "build" / "environment.json").unlink(missing_ok=True)
+
     # `colcon` from the system would build for the system's Python.
-    script = "\n".join(
-        [
-            "set -e",
-            *ros_setup_lines(),
-            f'"{VENV}/bin/python" -m colcon --log-base log build --base-paths src '
-            f"--symlink-install --packages-select {' '.join(PACKAGES)} "
-            f"--cmake-args -DCMAKE_BUILD_TYPE=Release -DBUILD_TESTING=OFF "
-            f'-DPython3_EXECUTABLE="{VENV}/bin/python" -DPYTHON_EXECUTABLE="{VENV}/bin/python"',
-        ]
-    )
-    run_logged(
-        ["bash", "-c", script],
-        ROOT / "log" / "colcon.log",
-        f"building {', '.join(PACKAGES)} with colcon",
-        clean_environment(),
-    )
-    stamp.write_text(json.dumps({"digest": digest}))
-    (ROOT / "build" / "environment.json").unlink(missing_ok=True)
+    python = f"{VENV}/bin/python"
+    lines = [
+        "set -e",
+        *ros_setup_lines(),
+        f'"{python}" -m colcon --log-base log build --base-paths src '
+        f"--symlink-install --packages-select {' '.join(PACKAGES)} "
+        f"--cmake-args -DCMAKE_BUILD_TYPE=Release -DBUILD_TESTING=OFF "
+        f'-DPython3_EXECUTABLE="{python}" -DPYTHON_EXECUTABLE="{python}"',
+    ]
+    what = f"building {', '.join(PACKAGES)} with colcon"
+    return [Job(what, ["bash", "-c", "\n".join(lines)], clean_environment(), "colcon", finish)]
 
 
 def kernel_digests(source: Path) -> dict[str, str]:
@@ -92,16 +84,36 @@ def drop_stale_kernels(source: Path, changed: Iterable[str]) -> None:
             cache.unlink(missing_ok=True)
 
 
-def compile_kernels() -> None:
-    """Compile the kernels that are new or changed, before several nodes start and do it at once."""
+def kernel_jobs() -> list[Job]:
+    """Return what compiles kernels that are new or changed, before several nodes do it at once.
+
+    Half of the kernels call none of the other half, so each half has a process of its own. Both
+    need only the sources: the packages may be built beside them.
+    """
     source, stamp = ROOT / "src", ROOT / "build" / "kernels.json"
     digests = kernel_digests(source)
     known = json.loads(stamp.read_text()) if stamp.exists() else {}
     changed = [name for name, digest in digests.items() if known.get(name) != digest]
     if not changed:
-        return
+        return []
     drop_stale_kernels(source, changed)
-    command = [str(VENV / "bin" / "python"), str(ROOT / "scripts" / "compile_kernels.py")]
-    what = f"compiling the kernels of {', '.join(changed)}"
-    run_logged(command, ROOT / "log" / "kernels.log", what, environment())
-    stamp.write_text(json.dumps(digests, indent=1) + "\n")
+    paths = [str(ROOT / "scripts"), *(str(source / package) for package in PACKAGES[1:])]
+    inside = {**clean_environment(), "PYTHONPATH": os.pathsep.join(paths)}
+    done: list[str] = []
+
+    def finish() -> None:
+        done.append("half")
+        if len(done) == len(HALVES):
+            stamp.parent.mkdir(exist_ok=True)
+            stamp.write_text(json.dumps(digests, indent=1) + "\n")
+
+    return [
+        Job(
+            f"compiling kernels of {half}",
+            [str(VENV / "bin" / "python"), "-m", "workspace_setup.kernels", half],
+            inside,
+            f"kernels_{half}",
+            finish,
+        )
+        for half in HALVES
+    ]

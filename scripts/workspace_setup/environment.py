@@ -53,7 +53,6 @@ def _captured_environment() -> dict[str, str]:
 def environment() -> dict[str, str]:
     """Return the environment in which nodes, scripts and tests of this workspace run."""
     result = clean_environment()
-    result.pop("PYTHONHOME", None)
     caller_path = result.get("PATH", "")
     for name, value in _captured_environment().items():
         result[name] = f"{value}{os.pathsep}{caller_path}" if name == "PATH" else value

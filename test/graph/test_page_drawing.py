@@ -3,35 +3,30 @@
 from __future__ import annotations
 
 import contextlib
-import json
-import shutil
 import signal
-import socket
 import uuid
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
-from browsers import signal_browser
+from browsers import (
+    NEEDS_CHROMIUM,
+    open_browser,
+    requested_hosts,
+    signal_browser,
+    start_page,
+    webdriver,
+)
 
 from der_msgs.msg import PressurePlan, PressureState
 from limb_interfaces import qos, topics
 
-webdriver = pytest.importorskip("selenium.webdriver")
-CHROMIUM, CHROMEDRIVER = shutil.which("chromium"), shutil.which("chromedriver")
-pytestmark = [
-    pytest.mark.graph,
-    pytest.mark.slow,
-    pytest.mark.skipif(
-        not (CHROMIUM and CHROMEDRIVER),
-        reason="no Chromium to open the page with: sudo apt-get install chromium chromium-driver",
-    ),
-]
+pytestmark = [pytest.mark.graph, pytest.mark.slow, NEEDS_CHROMIUM]
 PLACE = """
-const box = document.getElementById('sketch').getBoundingClientRect(), region = page.region[0];
+const canvas = document.getElementById('drawing'), box = canvas.getBoundingClientRect();
+const region = page.drawing.region[0];
 const right = region.reduce((best, point) => (point[0] > best[0] ? point : best));
-const canvas = document.getElementById('sketch');
 const across = box.width / canvas.width, down = box.height / canvas.height;
 return [box.left + right[0] * across, box.top + right[1] * down];
 """
@@ -47,9 +42,6 @@ field.select();
 def url(graph: Any, tmp_path: Path) -> str:
     """Start a twin with everything, and return the page's address."""
     link = f"/tmp/der_limb_page_test_{uuid.uuid4().hex[:8]}"
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
     graph.start("pressure_driver", "board_emulator", port_link=link)
     graph.client.wait_ready(["board_emulator"])
     graph.start("pressure_driver", "pressure_driver", port=link)
@@ -58,22 +50,15 @@ def url(graph: Any, tmp_path: Path) -> str:
     for package, executable in nodes:
         graph.start(package, executable)
     graph.start("der_planner", "planner", default_method="projected")
-    graph.start("der_planner", "page", port=port, drawings=str(tmp_path / "drawings"),
-                on_lost_operator="stop")  # fmt: skip
+    _, url = start_page(graph, drawings=str(tmp_path / "drawings"), on_lost_operator="stop")
     names = [executable for _, executable in nodes]
     graph.client.wait_ready(["pressure_driver", "planner", "page", *names])
-    return f"http://127.0.0.1:{port}/"
+    return url
 
 
 @pytest.fixture
 def browser(tmp_path: Path) -> Any:
-    options = webdriver.ChromeOptions()
-    options.binary_location = CHROMIUM
-    for flag in ("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run",
-                 f"--user-data-dir={tmp_path / 'profile'}", "--window-size=1280,900"):  # fmt: skip
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"performance": "ALL"})
-    window = webdriver.Chrome(options=options, service=webdriver.ChromeService(CHROMEDRIVER))
+    window = open_browser(tmp_path / "profile")
     yield window
     with contextlib.suppress(Exception):  # it may have been killed
         window.quit()
@@ -104,7 +89,7 @@ def test_a_drawing_is_previewed_played_and_kept(
 
     client.wait_for(armed, 60.0, "the driver to be armed")
     press("draw")
-    wait("return page.sketch.on && !!page.region", "the reachable region")
+    wait("return page.drawing.on && !!page.drawing.region", "the reachable region")
     x, y = browser.execute_script(PLACE)
     actions = webdriver.ActionChains(browser, duration=20)
     pointer = actions.w3c_actions.pointer_action
@@ -114,7 +99,7 @@ def test_a_drawing_is_previewed_played_and_kept(
         pointer.move_to_location(int(x) - 2 + (4 * step if step < 6 else 0), int(y) + 20 - 4 * step)
     pointer.pointer_up()
     actions.perform()
-    wait("return !!page.sketch.preview && page.sketch.preview.poses.length > 0", "a preview")
+    wait("return !!page.drawing.preview && page.drawing.preview.poses.length > 0", "a preview")
     said = browser.find_element("id", "preview").text
     assert "leaves what the limb reaches" in said
     assert "kPa" in said
@@ -124,7 +109,7 @@ def test_a_drawing_is_previewed_played_and_kept(
     client.wait_for((tmp_path / "drawings" / "hand.csv").exists, 60.0, "the kept drawing")
     browser.execute_script(SELECT, "Payload [g]")
     browser.switch_to.active_element.send_keys("20")
-    wait("return page.sketch.load.startsWith('payload=0.02&')", "the load to be reckoned with")
+    wait("return page.drawing.load.startsWith('payload=0.02&')", "the load to be reckoned with")
     press("play-drawing")  # once it is planned anew
     client.wait_for(lambda: topics.PLAN in client.newest, 60.0, "the plan")
     assert client.newest[topics.PLAN].payload == pytest.approx(0.02)
@@ -133,14 +118,7 @@ def test_a_drawing_is_previewed_played_and_kept(
         60.0,
         "the driver to follow the drawing",
     )
-    entries = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
-    asked = [
-        entry["params"]["request"]["url"]
-        for entry in entries
-        if entry["method"] == "Network.requestWillBeSent"
-    ]
-    hosts = {urlsplit(address).netloc for address in asked if address.startswith("http")}
-    assert hosts == {urlsplit(url).netloc}
+    assert requested_hosts(browser) == {urlsplit(url).netloc}
 
     slow = {"offline": False, "latency": 600, "downloadThroughput": 5000, "uploadThroughput": 5000}
     browser.execute_cdp_cmd("Network.emulateNetworkConditions", slow)

@@ -81,7 +81,7 @@ def rig(graph):
 
 
 def test_a_disarmed_driver_is_sent_nothing_and_start_plays_once_it_is_armed(rig):
-    from der_planner.experiment.errors import GraphError
+    from der_planner.experiment.processes import GraphError
 
     rig.command("early")
     rig.wait(lambda: rig.said("state") == "refused", "the refusal")

@@ -1,4 +1,6 @@
-"""Set-up says what the machine lacks, by name and with the remedy."""
+"""The set-up: what it needs, what it notices, and what it leaves alone."""
+
+from __future__ import annotations
 
 import os
 import shutil
@@ -21,35 +23,35 @@ def bare_clone(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def _setup(clone: Path, path: Path) -> subprocess.CompletedProcess[str]:
-    base = Path(sys.base_prefix) / "bin" / "python3"
-    clean = {"PATH": str(path), "HOME": os.environ.get("HOME", "/")}
-    return subprocess.run(
-        [base, clone / "scripts" / "workspace.py", "setup"],
-        env=clean,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=200,
-    )
+def _complaint(clone: Path, path: str = os.environ["PATH"]) -> str:
+    """Return what a set-up that is refused says."""
+    result = subprocess.run(
+        [Path(sys.base_prefix) / "bin" / "python3", clone / "scripts" / "workspace.py", "setup"],
+        env={"PATH": path, "HOME": os.environ.get("HOME", "/")},
+        capture_output=True, text=True, check=False, timeout=200,
+    )  # fmt: skip
+    assert result.returncode == 1
+    return result.stderr
 
 
 def test_a_machine_without_compiler_is_told_the_command(bare_clone: Path, tmp_path: Path):
-    empty = tmp_path / "bin"
-    empty.mkdir()
-    result = _setup(bare_clone, empty)
-    assert result.returncode == 1
-    assert "no C++ compiler: sudo apt-get install g++" in result.stderr
+    assert "no C++ compiler: sudo apt-get install g++" in _complaint(bare_clone, str(tmp_path))
     assert not (bare_clone / ".venv").exists()
 
 
-def test_an_unsupported_python_is_named(bare_clone: Path, tmp_path: Path):
+def test_an_unsupported_python_is_named(bare_clone: Path):
     script = bare_clone / "scripts" / "workspace_setup" / "python_packages.py"
     script.write_text(script.read_text().replace("((3, 10), (3, 13))", "((3, 5), (3, 6))"))
-    result = _setup(bare_clone, tmp_path)
-    assert result.returncode == 1
     version = f"{sys.version_info[0]}.{sys.version_info[1]}"
-    assert f"this is Python {version}" in result.stderr
+    assert f"this is Python {version}" in _complaint(bare_clone)
+
+
+def test_an_environment_that_was_made_under_another_path_is_left_alone(bare_clone: Path):
+    made_for = bare_clone / ".venv" / "made-for.txt"
+    made_for.parent.mkdir()
+    made_for.write_text(f"{sys.version_info[:2]} {sys.base_prefix} /elsewhere/.venv")
+    assert "was made as /elsewhere/.venv" in _complaint(bare_clone)
+    assert made_for.exists()
 
 
 def test_the_environment_holds_nothing_of_another_workspace(monkeypatch: pytest.MonkeyPatch):
@@ -64,15 +66,42 @@ def test_the_environment_holds_nothing_of_another_workspace(monkeypatch: pytest.
         assert f"install/{package}" in inside["AMENT_PREFIX_PATH"]
 
 
-def _answer(source: Path) -> str:
-    package = source / "robot"
-    command = "from robot.inner.caller import twice; print(twice())"
-    found = subprocess.run(
-        [sys.executable, "-c", command], cwd=package, capture_output=True, text=True, check=True
-    )
-    return found.stdout.strip()
+def test_a_package_that_is_gone_is_built_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    from workspace_setup import building
+
+    assert building.build_jobs() == []
+    for package in building.PACKAGES:
+        (tmp_path / package).symlink_to(ROOT / "install" / package)
+    monkeypatch.setattr(building, "INSTALL", tmp_path)
+    assert building.build_jobs() == []
+    (tmp_path / "der_planner").unlink()
+    assert len(building.build_jobs()) == 1
 
 
+def test_jobs_run_beside_each_other_and_a_failed_one_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    from workspace_setup import basics
+
+    monkeypatch.setattr(basics, "ROOT", tmp_path)
+    monkeypatch.setattr(basics, "PROGRESS", 0.1)
+    finished = []
+
+    def job(name: str, script: str) -> basics.Job:
+        command = ["/bin/sh", "-c", script]
+        return basics.Job(name, command, {}, name, lambda: finished.append(name))
+
+    # Each waits for the other's file.
+    meet = "touch {0}; while [ ! -e {1} ]; do :; done; /bin/sleep 0.5"
+    basics.run_jobs(job("one", meet.format("a", "b")), job("two", meet.format("b", "a")))
+    assert sorted(finished) == ["one", "two"]
+    assert "one; two" in capsys.readouterr().err
+    with pytest.raises(basics.SetupError, match=r"bad failed(.|\n)*why"):
+        basics.run_jobs(job("bad", "echo why; exit 3"), job("good", "true"))
+    assert finished[2:] == ["good"]
+
+
+@pytest.mark.slow
 def test_a_kernel_is_compiled_again_when_one_that_it_calls_has_changed(tmp_path: Path):
     from workspace_setup.building import drop_stale_kernels, kernel_digests
 
@@ -85,24 +114,20 @@ def test_a_kernel_is_compiled_again_when_one_that_it_calls_has_changed(tmp_path:
         "from numba import njit\nfrom robot.inner.called import one\n\n\n"
         "@njit(cache=True)\ndef twice():\n    return 2 * one()\n"
     )
+
+    def answer() -> str:
+        command = [sys.executable, "-c", "from robot.inner.caller import *; print(twice())"]
+        return subprocess.check_output(command, cwd=tmp_path / "robot", text=True).strip()
+
     (inner / "plain.py").write_text("HERE = 1\n")
     before = kernel_digests(tmp_path)
     assert list(before) == ["robot/inner"]
-    assert _answer(tmp_path) == "2"
+    assert answer() == "2"
     (inner / "plain.py").write_text("HERE = 2\n")
     assert kernel_digests(tmp_path) == before
-
     text = (inner / "called.py").read_text()
     (inner / "called.py").write_text(text.replace("return 1", "return 10"))
     assert kernel_digests(tmp_path) != before
-    assert _answer(tmp_path) == "2", "numba notices by itself now: the caches need not be dropped"
+    assert answer() == "2", "numba notices by itself now: the caches need not be dropped"
     drop_stale_kernels(tmp_path, ["robot/inner"])
-    assert _answer(tmp_path) == "20"
-
-
-def test_every_kernel_of_the_workspace_is_in_a_group():
-    from workspace_setup.building import kernel_digests
-
-    with_kernels = {"model", "pcc", "rod", "twin"}
-    groups = {"apriltag_tracker", *(f"der_planner/{name}" for name in with_kernels)}
-    assert set(kernel_digests(ROOT / "src")) == groups
+    assert answer() == "20"

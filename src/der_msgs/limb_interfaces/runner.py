@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
@@ -25,7 +25,11 @@ class ClosableNode(Protocol):
         """Vent, flush, release: called exactly once, before the node is destroyed."""
 
 
-def run_node(create: Callable[[], Node], arguments: Sequence[str] | None = None) -> int:
+def run_node(
+    create: Callable[[], Node],
+    arguments: Sequence[str] | None = None,
+    create_executor: Callable[[], Executor] = SingleThreadedExecutor,
+) -> int:
     r"""Create a node, spin it until a signal ends it, close it, and return the exit code.
 
     The signals are those of `limb_interfaces.entry.END_SIGNALS`: Ctrl-C, SIGTERM, a terminal that
@@ -38,6 +42,7 @@ def run_node(create: Callable[[], Node], arguments: Sequence[str] | None = None)
     Args:
         create: makes the node; an exception ends the process with exit code 1 and its message.
         arguments: command line, `sys.argv` if None.
+        create_executor: makes what spins the node.
 
     Returns:
         0 after one of these signals, 1 after an error.
@@ -59,7 +64,7 @@ def run_node(create: Callable[[], Node], arguments: Sequence[str] | None = None)
     try:
         node = create()
         _keep_for_good()
-        executor = SingleThreadedExecutor()
+        executor = create_executor()
         executor.add_node(node)
         while rclpy.ok() and not stop.is_set():
             executor.spin_once(timeout_sec=0.1)

@@ -125,7 +125,7 @@ def test_records_the_graph_between_start_and_stop(graph, tmp_path: Path):
 
 
 def test_second_start_into_the_same_folder_is_refused(graph, tmp_path: Path):
-    from der_planner.experiment.errors import GraphError
+    from der_planner.experiment.processes import GraphError
 
     start(graph, output=str(tmp_path / "run"))
     graph.client.call("recorder/start")
@@ -184,7 +184,7 @@ def test_what_a_stopped_recorder_missed_is_counted(graph, tmp_path: Path):
 
 
 def test_a_bag_that_cannot_be_written_is_reported_at_once(graph, tmp_path: Path):
-    from der_planner.experiment.errors import GraphError
+    from der_planner.experiment.processes import GraphError
 
     talker = Talker(graph)
     talker.topic("talk")
@@ -201,7 +201,7 @@ def test_a_bag_that_cannot_be_written_is_reported_at_once(graph, tmp_path: Path)
 
 
 def test_a_start_without_space_is_refused(graph, tmp_path: Path):
-    from der_planner.experiment.errors import GraphError
+    from der_planner.experiment.processes import GraphError
 
     start(graph, output=str(tmp_path / "run"), minimum_free=1 << 60)
     with pytest.raises(GraphError, match=r"MiB are free where .*: nothing is recorded"):

@@ -88,10 +88,3 @@ def test_a_missing_parameter_file_is_named_by_the_node():
     assert ended.returncode == 1
     assert "/nowhere/planner.yaml" in ended.stderr
     assert "Traceback" not in ended.stderr
-
-
-def test_help_of_the_kernels_compiles_nothing():
-    line = [sys.executable, str(SCRIPTS / "compile_kernels.py"), "--help"]
-    ended = subprocess.run(line, capture_output=True, text=True, check=False, timeout=200)
-    assert ended.returncode == 0
-    assert "usage: compile_kernels.py" in ended.stdout

@@ -10,7 +10,7 @@ from limb_interfaces.entry import END_SIGNALS
 
 PROGRAM = """
 import signal
-from der_planner.experiment.interrupts import interrupt_once
+from der_planner.experiment.console import interrupt_once
 interrupt_once()
 try:
     print("ready", flush=True)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from der_planner.experiment.errors import OptionError
+from der_planner.experiment.console import OptionError
 from der_planner.experiment.experiment import run
 from der_planner.experiment.options import parse
 from der_planner.planning.plan_file import read_plan

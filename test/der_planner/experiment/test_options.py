@@ -4,9 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from der_planner.experiment.errors import OptionError
-from der_planner.experiment.experiment import run
-from der_planner.experiment.ledger import Ledger
+from der_planner.experiment.console import OptionError
+from der_planner.experiment.experiment import Ledger, run
 from der_planner.experiment.options import METHODS, parse
 from der_planner.limb import Limb, PointMass
 from der_planner.planning.motions import NAMES

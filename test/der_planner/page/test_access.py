@@ -1,109 +1,54 @@
-"""Where the page may listen, and whom it lets in."""
+"""Where the page may listen, whom it lets in, and who commands."""
 
 from __future__ import annotations
 
 import socket
-from pathlib import Path
 
 import pytest
+from fastapi import FastAPI, WebSocket
+from fastapi.testclient import TestClient
+from starlette.websockets import WebSocketDisconnect
 
-from der_planner.page.access import (
-    SESSION_LIFE,
-    AccessError,
-    Binding,
-    Sessions,
-    listen,
-    read_password,
-    same_origin,
-)
+from der_planner.page.access import AccessError, AccessFilter, Binding, Desk
 
-PASSWORD = "correct horse battery"
+TOKEN = "a token of this test"
+HOST = "127.0.0.1:8080"
+ORIGIN = f"http://{HOST}"
+SOCKET = f"ws://{HOST}/live"
+"""The test client asks for websockets of another host unless it is told."""
 
 
 @pytest.fixture
-def pem(tmp_path: Path) -> dict[str, str]:
-    files = {}
-    for name in ("certificate", "private_key"):
-        path = tmp_path / f"{name}.pem"
-        path.write_text("any")
-        files[name] = str(path)
-    return files
+def access() -> AccessFilter:
+    app = FastAPI()
+    app.get("/read")(lambda: "data")
+    app.post("/vent")(lambda: "vented")
+
+    @app.websocket("/live")
+    async def live(websocket: WebSocket) -> None:
+        await websocket.accept()
+
+    return AccessFilter(app, Binding(token=TOKEN), 8080)
 
 
-@pytest.mark.parametrize("address", ["127.0.0.1", "127.0.0.5", "::1"])
-def test_a_loopback_address_needs_no_password(address: str) -> None:
-    Binding(address=address).check()
-
-
-@pytest.mark.parametrize("address", ["0.0.0.0", "192.168.1.4", "::"])
-def test_other_addresses_need_a_password_and_tls(address: str, pem: dict[str, str]) -> None:
-    with pytest.raises(AccessError, match=r"password_file.*certificate.*TLS"):
-        Binding(address=address).check()
-    with pytest.raises(AccessError, match=r"TLS.*certificate"):
-        Binding(address=address, password=PASSWORD).check()
-    Binding(address=address, password=PASSWORD, **pem).check()
-
-
-def test_what_is_half_given_is_refused(pem: dict[str, str]) -> None:
-    with pytest.raises(AccessError, match="set both"):
-        Binding(certificate=pem["certificate"]).check()
-    with pytest.raises(AccessError, match="not there"):
-        Binding(certificate=pem["certificate"], private_key="/nowhere.pem").check()
-    with pytest.raises(AccessError, match="12 or more"):
-        Binding(password="short").check()
-    with pytest.raises(AccessError, match="no IP address"):
-        Binding(address="localhost:8080").check()
-
-
-def test_only_listed_names_are_answered() -> None:
-    assert Binding().hosts(8080) == {"127.0.0.1:8080", "localhost:8080", "[::1]:8080"}
-    assert "lab.example:8080" in Binding(host_names=("Lab.example",)).hosts(8080)
-    assert "127.0.0.1:8080" not in Binding(address="192.168.1.4").hosts(8080)
-    assert "192.168.1.4" in Binding(address="192.168.1.4", certificate="c").hosts(443)
+def client(access: AccessFilter, cookie: bool = True, **headers: str) -> TestClient:
+    found = TestClient(access, base_url=ORIGIN, headers=headers, follow_redirects=False)
+    if cookie:
+        found.cookies.set("limb_token_8080", TOKEN, domain="127.0.0.1")
+    return found
 
 
 @pytest.mark.parametrize(
-    ("origin", "same"),
-    [
-        ("http://127.0.0.1:8080", True),
-        ("https://127.0.0.1:8080", False),
-        ("http://127.0.0.1:8081", False),
-        ("http://127.0.0.1:8080.evil.example", False),
-        ("http://evil.example", False),
-        ("null", False),
-    ],
+    ("given", "message"),
+    [({"address": "localhost:8080"}, "no IP address"), ({"token": "short"}, "12 or more")],
 )
-def test_an_origin_is_scheme_name_and_port(origin: str, same: bool) -> None:
-    assert same_origin(origin, "127.0.0.1:8080", "http") is same
+def test_what_protects_nothing_is_refused(given: dict[str, str], message: str) -> None:
+    with pytest.raises(AccessError, match=message):
+        Binding(**given)
 
 
-def test_the_password_file_is_for_its_owner_only(tmp_path: Path) -> None:
-    file = tmp_path / "password"
-    file.write_text(PASSWORD + "\n")
-    file.chmod(0o644)
-    with pytest.raises(AccessError, match="chmod 600"):
-        read_password(str(file))
-    file.chmod(0o600)
-    assert read_password(str(file)) == PASSWORD
-    assert read_password("") == ""
-    file.write_text("")
-    with pytest.raises(AccessError, match="empty"):
-        read_password(str(file))
-
-
-def test_a_session_opens_with_the_password_and_ends() -> None:
-    now = 0.0
-    sessions = Sessions(PASSWORD, lambda: now)
-    assert sessions.open("wrong") is None
-    token = sessions.open(PASSWORD)
-    assert token is not None
-    assert sessions.holds(token)
-    assert not sessions.holds(token + "x")
-    assert not sessions.holds("")
-    for now in (0.9 * SESSION_LIFE, 1.8 * SESSION_LIFE):  # noqa: B007 - read by the clock
-        assert sessions.holds(token)
-    now += SESSION_LIFE + 1.0
-    assert not sessions.holds(token)
+def test_a_token_is_drawn_for_each_page() -> None:
+    assert len({Binding().token for _ in range(3)}) == 3
 
 
 def test_a_taken_port_is_named_with_the_remedy() -> None:
@@ -112,4 +57,113 @@ def test_a_taken_port_is_named_with_the_remedy() -> None:
         other.listen()
         port = other.getsockname()[1]
         with pytest.raises(AccessError, match=f"port {port}.*set the parameter 'port'"):
-            listen(Binding(port=port))
+            Binding(port=port).listen()
+
+
+def test_only_listed_names_are_answered() -> None:
+    assert Binding().names() == {"127.0.0.1", "localhost", "::1"}
+    assert "lab.example" in Binding(host_names=("Lab.example",)).names()
+    assert Binding(address="192.168.1.4").names() == {"192.168.1.4"}
+
+
+def test_the_address_with_the_token_opens_the_page_and_is_remembered(access: AccessFilter) -> None:
+    browser = client(access, cookie=False, origin=ORIGIN)
+    for path in ("/read", "/read?token=of another page", "/read?token=ä"):
+        assert browser.get(path).status_code == 401
+    assert browser.post("/vent").status_code == 401
+    assert browser.post(f"/vent?token={TOKEN}").status_code == 401  # a command is no first visit
+    with pytest.raises(WebSocketDisconnect), browser.websocket_connect(SOCKET):
+        pass
+    answer = browser.get(f"/read?token={TOKEN}")
+    assert (answer.status_code, answer.headers["location"]) == (303, f"{ORIGIN}/read")
+    assert "HttpOnly" in answer.headers["set-cookie"]
+    assert browser.get("/read").status_code == 200
+    assert browser.post("/vent").status_code == 200
+    with browser.websocket_connect(SOCKET):
+        pass
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"origin": "http://evil.example"},
+        {"origin": "null"},
+        {"origin": "http://127.0.0.1:9999"},
+        {"origin": f"{ORIGIN}.evil.example"},
+        {},  # no browser sends a command without an origin
+        {"host": "evil.example:8080", "origin": "http://evil.example:8080"},
+    ],
+)
+def test_a_page_elsewhere_neither_vents_nor_listens(
+    access: AccessFilter, headers: dict[str, str]
+) -> None:
+    elsewhere = client(access, **headers)
+    assert elsewhere.post("/vent").status_code == 403
+    with pytest.raises(WebSocketDisconnect), elsewhere.websocket_connect(SOCKET):
+        pass
+    assert access.refused == 2
+
+
+@pytest.mark.parametrize("host", ["evil.example:8080", "127.0.0.1.evil.example:8080", "[::1"])
+def test_reading_by_another_name_is_refused(access: AccessFilter, host: str) -> None:
+    answer = client(access, host=host).get("/read")
+    assert answer.status_code == 403
+    assert "host_names" in answer.text
+
+
+@pytest.mark.parametrize(
+    ("site", "mode", "status"),
+    [
+        ("cross-site", "no-cors", 403),
+        ("same-site", "no-cors", 403),
+        ("cross-site", "navigate", 200),
+        ("same-origin", "cors", 200),
+    ],
+)
+def test_other_pages_read_nothing_but_may_link_here(
+    access: AccessFilter, site: str, mode: str, status: int
+) -> None:
+    headers = {"sec-fetch-site": site, "sec-fetch-mode": mode}
+    assert client(access, **headers).get("/read").status_code == status
+
+
+def test_answers_forbid_frames_and_other_machines(access: AccessFilter) -> None:
+    for headers in (client(access).get("/read").headers, client(access, False).get("/").headers):
+        assert headers["x-frame-options"] == "DENY"
+        assert "default-src 'self'" in headers["content-security-policy"]
+        assert "frame-ancestors 'none'" in headers["content-security-policy"]
+
+
+def test_one_commands_and_others_watch() -> None:
+    lost: list[str] = []
+    desk = Desk(lambda: lost.append("operator"))
+    assert desk.take("a")
+    assert not desk.take("b")
+    assert desk.may_command("a")
+    assert not desk.may_command("b")
+    desk.disconnected("b")
+    assert desk.may_command("a")
+    assert not lost
+    desk.disconnected("a")
+    assert lost == ["operator"]
+    assert desk.take("b")
+    desk.leave("b")
+    desk.disconnected("b")
+    assert lost == ["operator"]
+    assert desk.operator is None
+
+
+def test_a_window_that_is_loaded_anew_still_commands() -> None:
+    lost: list[str] = []
+    desk = Desk(lambda: lost.append("operator"))
+    desk.connected("a", "tab 1")
+    desk.connected("b", "tab 2")
+    assert desk.take("a")
+    desk.connected("c", "tab 2")
+    assert desk.may_command("a")
+    desk.connected("d", "tab 1")
+    assert desk.operator == "d"
+    desk.disconnected("a")
+    assert not lost
+    desk.disconnected("d")
+    assert lost == ["operator"]

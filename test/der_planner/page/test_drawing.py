@@ -1,41 +1,36 @@
-"""Drawing a path: what is reachable, from pixels to metres, previews, kept drawings."""
+"""Drawing a path: what is reachable, previews, kept drawings."""
 
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from apriltag_tracker.camera import CameraPose, Intrinsics
-from apriltag_tracker.camera.pinhole import project
-from apriltag_tracker.detection.tag import Tag
-from apriltag_tracker.tag_map import TagMap
 from der_planner.limb import Limb, LimbError
 from der_planner.model import ArcModel
 from der_planner.page.commands import Load
-from der_planner.page.drawing.kept import DrawingError, Drawings
-from der_planner.page.drawing.preview import Previewer, preview
-from der_planner.page.drawing.region import reachable_region
-from der_planner.page.drawing.sketch import summary
-from der_planner.page.drawing.studio import Studio, drawn_pixels
-from der_planner.page.overlay import Overlay
-from der_planner.page.situation import LimbView
-from der_planner.planning import PathLimits
-from der_planner.planning.inverse import angle_limits, distance_to_reach
+from der_planner.page.drawing import (
+    DrawingError,
+    DrawingFolder,
+    Previewer,
+    drawn_pixels,
+    preview,
+    reachable_region,
+)
+from der_planner.page.drawing_panel import summary
+from der_planner.planning import PathLimits, Workspace
 
 LIMB = Limb.default()
 ARCS = ArcModel(LIMB)
-TAG_MAP = Path(__file__).parents[3] / "src" / "apriltag_tracker" / "config" / "tags.yaml"
+SPACE = Workspace(ARCS)
 
 
 def test_the_region_holds_what_the_tip_reaches_and_nothing_else() -> None:
     outlines = reachable_region(LIMB)
-    low, high = angle_limits(LIMB)
-    poses = np.random.default_rng(2).uniform(low, high, (300, 2))
+    poses = np.random.default_rng(2).uniform(SPACE.low, SPACE.high, (300, 2))
 
     def inside(point: np.ndarray, margin: float) -> bool:
         scaled = [np.float32(outline) for outline in outlines]
@@ -47,66 +42,25 @@ def test_the_region_holds_what_the_tip_reaches_and_nothing_else() -> None:
     assert all(inside(tip, 1.5e-3) for tip in ARCS.tip(poses))
     for point in np.random.default_rng(3).uniform((-0.1, -0.3), (0.3, 0.3), (60, 2)):
         if inside(point, 0.0):
-            assert distance_to_reach(LIMB, ARCS, point, [0.3, 0.3]) < 1.5e-3
+            assert SPACE.distance_to_reach(point, [0.3, 0.3]) < 1.5e-3
 
 
-def test_pixels_become_metres_where_they_are_drawn() -> None:
-    tags, now = TagMap.from_yaml(str(TAG_MAP)), 0.0
-    overlay = Overlay(tags, clock=lambda: now)
-    pixels = np.array([[500.0, 300.0], [700.0, 420.0]])
-    assert overlay.on_plane(pixels) is None
-    assert overlay.pixels_of(pixels) == []
-    camera = Intrinsics.create(
-        1280, 720, [1400, 0, 640, 0, 1400, 360, 0, 0, 1], [-0.1, 0.05, 0, 0, 0], "plumb_bob"
-    )
-    pose = CameraPose.looking_down((0.12, 0.0, 0.8), turn=0.2, tilt=(0.05, -0.03))
-    seen = [
-        Tag(entry.id, project(camera, pose, entry.corners()), np.eye(8) * 1e-4, 0.01, 40.0, 1.0)
-        for entry in tags.world
-    ]  # fmt: skip
-    overlay.put_camera(camera)
-    overlay.put_tags(1, seen)
-    on_plane = overlay.on_plane(pixels)
-    assert on_plane is not None
-    height = max(tag.height for tag in tags.limb)
-    back = project(camera, pose, np.column_stack([on_plane, np.full(2, height)]))
-    np.testing.assert_allclose(back, pixels, atol=0.5)
-    np.testing.assert_allclose(overlay.pixels_of(on_plane), pixels, atol=0.2)
-    overlay.put_estimate(on_plane)
-    overlay.put_planned(on_plane)
-    np.testing.assert_allclose(overlay.at(1, None)["estimate"], pixels, atol=0.2)
-    broken = np.vstack([on_plane, [[math.nan, 0.1], [0.1, math.inf]]])
-    overlay.put_estimate(broken)
-    shown = overlay.at(1, (math.nan, 0.0))  # what is nowhere is left out: it is no JSON either
-    assert len(shown["estimate"]) == len(pixels)
-    assert shown["reference"] is None
-    now = 1.0
-    shown = overlay.at(1, None)
-    assert (shown["estimate"], shown["planned"]) == ([], [])  # nobody plans or corrects any more
-
-    # A picture that the tracker says nothing of shows neither limb nor tags of an earlier one.
-    x, y = (float(value) for value in on_plane[0])
-    overlay.put_limb(LimbView(1, True, "", (x, y), (0.0, 0.0), ((0.0, 0.0), (x, y))))
-    near, far = overlay.at(200_000_000, None), overlay.at(2_000_000_000, None)
-    assert near["tip"] is not None
-    assert len(near["tags"]) == len(seen)
-    assert (far["tip"], far["curve"], far["tags"]) == (None, [], [])
-    assert "tracker" in far["problem"]
-
-
-def test_a_load_decides_what_is_reached_and_what_draws(tmp_path: Path) -> None:
-    studio = Studio(LIMB, PathLimits(), tmp_path, carried=Load(0.01))
-    assert studio.limb_under(Load()) == LIMB.carrying(0.01)
-    assert studio.limb_under(Load(0.02, 0.1, "hanging")) == LIMB.mounted("hanging").carrying(
+def test_a_load_decides_what_is_reached_and_what_draws() -> None:
+    previewer = Previewer(LIMB, PathLimits(), carried=Load(0.01))
+    assert previewer.limb_under(Load()) == LIMB.carrying(0.01)
+    assert previewer.limb_under(Load(0.02, 0.1, "hanging")) == LIMB.mounted("hanging").carrying(
         0.02, 0.1
     )
-    assert studio.limb_under(Load(0.0, 0.1, "90")).payload == (0.01, 0.0)  # as the planner has it
-    lying, sideways = (studio.region(Load(0.03, 0.0, name)) for name in ("", "sideways"))
+    assert previewer.limb_under(Load(0.0, 0.1, "90")).payload == (
+        0.01,
+        0.0,
+    )  # as the planner has it
+    lying, sideways = (previewer.region(Load(0.03, 0.0, name)) for name in ("", "sideways"))
     height = [np.ptp(np.vstack(outlines)[:, 1]) for outlines in (lying, sideways)]
     assert height[1] < 0.9 * height[0]  # the weight is lifted on one side
-    assert studio.region(Load(0.03)) is studio.region(Load(0.03))
+    assert previewer.region(Load(0.03)) is previewer.region(Load(0.03))
     with pytest.raises(LimbError, match="arc_length"):
-        studio.limb_under(Load(0.02, 9.0))
+        previewer.limb_under(Load(0.02, 9.0))
 
 
 @pytest.mark.parametrize(
@@ -120,7 +74,7 @@ def test_what_is_no_drawing_is_refused(sent: object) -> None:
 
 
 def test_a_preview_is_planned_in_another_process() -> None:
-    previewer = Previewer(PathLimits())
+    previewer = Previewer(LIMB, PathLimits(), Load())
     turn = np.linspace(0, 2 * np.pi, 40)
     ring = ARCS.tip([0.9, 0.9]) + 0.03 * np.column_stack([np.cos(turn), np.sin(turn)])
     try:
@@ -148,10 +102,10 @@ def test_a_drawing_that_cannot_be_planned_says_why() -> None:
     "name", ["../up", "a/b", "..", ".hidden", "/etc/passwd", "star\x00", "x.csv"]
 )
 def test_a_name_stays_in_its_folder(tmp_path: Path, name: str) -> None:
-    drawings = Drawings(tmp_path / "kept")
+    drawings = DrawingFolder(tmp_path / "kept")
     points = np.array([[0.1, 0.2], [0.12, 0.21]])
     try:
-        kept = drawings.save(name, points)
+        kept = drawings.save(name, points).stem
     except DrawingError:
         assert name == ".."
         return
@@ -163,9 +117,9 @@ def test_a_name_stays_in_its_folder(tmp_path: Path, name: str) -> None:
 
 
 def test_names_of_any_language_and_files_put_there_by_hand_are_found(tmp_path: Path) -> None:
-    drawings = Drawings(tmp_path)
+    drawings = DrawingFolder(tmp_path)
     points = np.array([[0.1, 0.2], [0.12, 0.21]])
-    assert drawings.save("Über 円", points) == "Über_円"
+    assert drawings.save("Über 円", points).stem == "Über_円"
     (tmp_path / "by hand.csv").write_text("x [cm], y [cm]\n10, 20\n12, 21\n")
     assert drawings.names() == ["by hand", "Über_円"]
     for name in drawings.names():
@@ -174,4 +128,4 @@ def test_names_of_any_language_and_files_put_there_by_hand_are_found(tmp_path: P
 
 def test_a_missing_drawing_is_named(tmp_path: Path) -> None:
     with pytest.raises(DrawingError, match="no drawing 'none'"):
-        Drawings(tmp_path).load("none")
+        DrawingFolder(tmp_path).load("none")

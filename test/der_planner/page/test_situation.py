@@ -12,17 +12,12 @@ import sys
 import time
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Point
 
-from der_planner.page.situation import (
-    DEAD,
-    FRESH,
-    LATE,
-    DriverState,
-    LimbView,
-    NodeStatus,
-    PlanView,
-    Situation,
-)
+from der_msgs.msg import LimbState, PressurePlan, PressureState
+from der_planner.page.situation import DEAD, FRESH, LATE, Situation
+from limb_interfaces.stamps import stamp_from_nanoseconds
 
 
 class Clock:
@@ -42,13 +37,23 @@ def situation(clock: Clock) -> Situation:
     return Situation(clock)
 
 
-def driver(mode: int = 5) -> DriverState:
+def driver(mode: int = 5) -> PressureState:
     nan = float("nan")
-    return DriverState(mode, ("no telemetry",), "p", (12_000.0, 0.0), (nan, 250.0), nan, nan)
+    return PressureState(
+        mode=mode, faults=["no telemetry"], commanded_differential=[12_000.0, 0.0],
+        measured_differential=[nan, 250.0], supply_pressure=nan, telemetry_age=nan,
+    )  # fmt: skip
 
 
-def view(stamp: int, tip: tuple[float, float] = (0.2, 0.05), valid: bool = True) -> LimbView:
-    return LimbView(stamp, valid, "", tip, (math.pi / 4, 0.0), ((0.0, 0.0), tip))
+def view(stamp: int, tip: tuple[float, float] = (0.2, 0.05), valid: bool = True) -> LimbState:
+    message = LimbState(valid=valid, tip=Point(x=tip[0], y=tip[1]), bend_angle=[math.pi / 4, 0.0])
+    message.header.stamp = stamp_from_nanoseconds(stamp)
+    return message
+
+
+def status(name: str, message: str, level: bytes = b"\0", process: str = "") -> DiagnosticStatus:
+    values = [KeyValue(key="process", value=process)]
+    return DiagnosticStatus(name=name, level=level, message=message, values=values)
 
 
 def test_nothing_is_known_before_anything_came(situation: Situation) -> None:
@@ -80,13 +85,13 @@ def test_numbers_come_in_kilopascal_and_unknown_ones_as_null(situation: Situatio
 
 
 def test_nodes_turn_late_and_dead(situation: Situation, clock: Clock) -> None:
-    situation.put_status(NodeStatus("/limb/planner", 1, "refused: too far"))
-    situation.put_status(NodeStatus("/limb/a", 0, "running"))
+    situation.put_status(status("/limb/planner", "refused: too far", b"\1"))
+    situation.put_status(status("/limb/a", "running"))
     first, second = situation.snapshot()["nodes"]
     assert (first["name"], second["name"]) == ("a", "planner")
     assert second["state"] == "warning"
     clock.now += LATE + 0.1
-    situation.put_status(NodeStatus("/limb/a", 0, "running"))
+    situation.put_status(status("/limb/a", "running"))
     first, second = situation.snapshot()["nodes"]
     assert (first["state"], second["state"]) == ("ok", "late")
     clock.now += DEAD
@@ -109,7 +114,7 @@ def test_a_process_that_ends_or_stops_is_dead_at_once(situation: Situation) -> N
             time.sleep(0.01)
 
     try:
-        situation.put_status(NodeStatus("/limb/planner", 0, "idle", {"process": here}))
+        situation.put_status(status("/limb/planner", "idle", process=here))
         becomes(("ok", "idle"))
         process.send_signal(signal.SIGSTOP)
         becomes(("dead", "its process is stopped"))
@@ -122,8 +127,8 @@ def test_a_process_that_ends_or_stops_is_dead_at_once(situation: Situation) -> N
     process.wait()
     assert state() == ("dead", "its process has ended")
     # The node was started again.
-    again = {"process": f"{socket.gethostname()}:{os.getpid()}"}
-    situation.put_status(NodeStatus("/limb/planner", 0, "idle", again))
+    again = f"{socket.gethostname()}:{os.getpid()}"
+    situation.put_status(status("/limb/planner", "idle", process=again))
     assert state() == ("ok", "idle")
 
 
@@ -135,7 +140,7 @@ def test_a_process_that_was_never_seen_here_has_not_ended(
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
     named = identity.format(host=socket.gethostname(), ended=process.pid)
-    situation.put_status(NodeStatus("/limb/planner", 0, "idle", {"process": named}))
+    situation.put_status(status("/limb/planner", "idle", process=named))
     assert situation.snapshot()["nodes"][0]["state"] == "ok"
 
 
@@ -164,11 +169,15 @@ def test_no_reference_is_made_up_across_a_pause(situation: Situation) -> None:
 
 
 def test_a_plan_says_what_it_reckons_with(situation: Situation) -> None:
-    carried = PlanView(
-        "opposite_direction", "der", "optimal", "mine", "hanging", 0.02, 0.12, 0.0031
-    )
-    situation.put_plan(carried)
+    down = [9.81, 0.0, 0.0]
+    plan = PressurePlan(
+        motion="opposite_direction", limb="mine", gravity=down, payload=0.02, payload_at=0.12,
+        predicted_error=0.0031,
+    )  # fmt: skip
+    situation.put_plan(plan)
     said = situation.snapshot()["plan"]
     for part in ("opposite", "'mine'", "hanging", "20 g at 12.0 cm", "0.31 cm"):
         assert part in said
-    assert "carrying" not in str(PlanView("a", "pcc", "paper", "mine", "horizontal", 0.0, 0.0, 0.0))
+    plan.payload = 0.0
+    situation.put_plan(plan)
+    assert "carrying" not in situation.snapshot()["plan"]

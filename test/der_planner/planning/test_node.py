@@ -195,7 +195,7 @@ def test_each_plan_has_the_loads_of_its_time(planner):
 
 
 def test_start_and_stop(planner):
-    from der_planner.experiment.errors import GraphError
+    from der_planner.experiment.processes import GraphError
 
     node = planner(auto_start=False)
     with pytest.raises(GraphError, match="no plan yet"):

@@ -9,7 +9,7 @@ import pyarrow.parquet
 import pytest
 
 from der_planner.commands import study as study_command
-from der_planner.experiment.progress import Progress
+from der_planner.experiment.console import Progress
 from der_planner.studies import cluster
 from der_planner.studies import conduct as conducting
 from der_planner.studies.conduct import Settings, conduct

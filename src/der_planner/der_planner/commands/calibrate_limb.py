@@ -27,18 +27,19 @@ from pathlib import Path
 
 import numpy as np
 
-from der_planner.experiment.errors import GraphError, NodeError, OptionError
-from der_planner.experiment.interrupts import interrupt_once
-from der_planner.experiment.load_options import (
+from der_planner.experiment.console import (
+    OptionError,
+    Progress,
     add_load_options,
     as_loaded,
     check_kilograms,
     check_loads,
+    interrupt_once,
     without_payload,
 )
-from der_planner.experiment.node_specs import Hardware
-from der_planner.experiment.progress import Progress
+from der_planner.experiment.processes import GraphError, Hardware, NodeError
 from der_planner.identification import (
+    GROUPS,
     CalibrationLog,
     ColumnMap,
     Excitation,
@@ -46,7 +47,9 @@ from der_planner.identification import (
     LogError,
     calibration_run,
     fit,
+    plot_prediction,
     predict,
+    prepare,
     read_bag,
     read_csv,
     read_excitation,
@@ -54,12 +57,9 @@ from der_planner.identification import (
     within_limits,
     write_excitation,
 )
-from der_planner.identification.logs.prepare import prepare
 from der_planner.identification.offline import AMPLITUDE
-from der_planner.identification.parameters import GROUPS
-from der_planner.identification.plots import plot_prediction
 from der_planner.limb import Limb, LimbError
-from der_planner.planning.loads.rest import nearly_buckling
+from der_planner.planning.loads import nearly_buckling
 from der_planner.results.outputs import OutputError, check_file, check_folder
 from pressure_driver.settings import Settings
 
@@ -284,7 +284,7 @@ def _obtain(prior: Limb, given: argparse.Namespace) -> CalibrationLog:
 def _play_on_graph(prior: Limb, given: argparse.Namespace) -> Path:
     """Play the calibration on the twin's nodes or the hardware; return the bag."""
     # ROS is imported only by who needs it.
-    from der_planner.experiment.calibration import GraphCalibration  # noqa: PLC0415
+    from der_planner.experiment.graph_trials import GraphCalibration  # noqa: PLC0415
 
     interrupt_once()
     progress = Progress()

@@ -20,8 +20,7 @@ import dataclasses
 import sys
 from pathlib import Path
 
-from der_planner.experiment.errors import OptionError
-from der_planner.experiment.load_options import add_load_options, as_loaded, check_loads
+from der_planner.experiment.console import OptionError, add_load_options, as_loaded, check_loads
 from der_planner.identification import (
     CalibrationLog,
     ColumnMap,

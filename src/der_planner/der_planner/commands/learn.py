@@ -16,8 +16,8 @@ from pathlib import Path
 
 from der_planner.commands.recorded_plan import check_same, plan_of
 from der_planner.control import Learner, LearningError
-from der_planner.experiment.errors import GraphError
 from der_planner.experiment.learning import about, add_run
+from der_planner.experiment.processes import GraphError
 from der_planner.limb import LimbError
 from der_planner.planning import PlanningError
 from der_planner.planning.plan_file import read_plan, write_plan

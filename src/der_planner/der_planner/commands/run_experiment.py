@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import sys
 
-from der_planner.experiment.errors import GraphError, NodeError, OptionError
+from der_planner.experiment.console import OptionError, interrupt_once
 from der_planner.experiment.experiment import run
 from der_planner.experiment.options import parse
+from der_planner.experiment.processes import GraphError, NodeError
 from der_planner.results.outputs import OutputError
 
 
@@ -23,9 +24,6 @@ def main() -> int:
     try:
         options = parse(sys.argv[1:])
         if not options.offline:
-            # There are nodes to end in order; without ROS there is nothing to vent.
-            from der_planner.experiment.interrupts import interrupt_once  # noqa: PLC0415
-
             interrupt_once()
         run(options)
     except (OptionError, OutputError) as error:

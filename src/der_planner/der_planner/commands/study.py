@@ -15,8 +15,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from der_planner.experiment.interrupts import interrupt_once
-from der_planner.experiment.progress import Progress
+from der_planner.experiment.console import Progress, interrupt_once
 from der_planner.results.outputs import OutputError, check_folder
 from der_planner.studies.conduct import Settings, conduct
 from der_planner.studies.errors import StudyError

@@ -18,8 +18,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
-from der_planner.experiment.errors import GraphError
-from der_planner.experiment.processes import NodeProcess
+from der_planner.experiment.processes import GraphError, NodeProcess
 from limb_interfaces import qos, topics
 
 READY = (DiagnosticStatus.OK, DiagnosticStatus.WARN)

@@ -10,30 +10,27 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Path as PathMessage
-
-from der_msgs.msg import MotionCommand, PressurePlan, PressureState
+from der_msgs.msg import PressureState
 from der_planner.experiment.client import GraphClient
-from der_planner.experiment.errors import GraphError, NodeError
-from der_planner.experiment.node_specs import STOP_ORDER, Hardware, NodeSpec, node_specs
-from der_planner.experiment.options import Options, Trial
-from der_planner.experiment.processes import NodeProcess
-from der_planner.experiment.progress import Progress
-from der_planner.limb import Limb
-from der_planner.methods import LEARNED
-from der_planner.planning import paths
-from limb_interfaces import qos, stamps, topics
+from der_planner.experiment.console import Progress
+from der_planner.experiment.processes import (
+    PAGE_TOKEN,
+    STOP_ORDER,
+    GraphError,
+    GraphSetup,
+    NodeError,
+    NodeProcess,
+    NodeSpec,
+)
+from limb_interfaces import qos, topics
 
-PLAN_TIMEOUT = 120.0
 DISCOVERY = 1.0
-"""How long the orchestrator listens for another graph before it starts nodes [s]."""
+"""The orchestrator listens for another graph this long [s] before it starts nodes."""
 ARMING = 5.0
-"""For how long the driver may refuse to be armed before the run is given up [s]."""
+"""The driver may refuse to be armed this long [s] before the run is given up."""
 VENTED_PRESSURE = 1000.0
-"""Differential pressure below which a limb counts as vented [Pa]."""
+"""A limb counts as vented below this differential pressure [Pa]."""
 
 
 @dataclass(frozen=True)
@@ -77,22 +74,14 @@ class GraphPlayer(ABC):
     """Plays something on the graph; whatever happens, the limb is vented and every node stopped.
 
     Args:
+        setup: the nodes.
         logs: folder of the nodes' logs.
-        hardware: in place of the twin, or None.
         progress: shows what happens.
     """
 
-    def __init__(self, logs: Path, hardware: Hardware | None, progress: Progress) -> None:
-        self._logs = logs
-        self._hardware = hardware
-        self._remap = hardware.remap if hardware is not None else None
-        self._progress = progress
+    def __init__(self, setup: GraphSetup, logs: Path, progress: Progress) -> None:
+        self._setup, self._logs, self._progress = setup, logs, progress
         self._processes: dict[str, NodeProcess] = {}
-        self._driver_spec: NodeSpec | None = None
-
-    @abstractmethod
-    def _specs(self, port: str) -> list[NodeSpec]:
-        """Return the nodes in the order in which they start."""
 
     @abstractmethod
     def _begin(self, client: GraphClient) -> Playing:
@@ -107,11 +96,11 @@ class GraphPlayer(ABC):
         """
         with tempfile.TemporaryDirectory(prefix="der_limb_") as folder, GraphClient() as client:
             port = str(Path(folder) / "board")
-            specs = self._specs(port)
+            specs = self._setup.nodes(port)
             client.spin(DISCOVERY)
             self._refuse_second_graph(client, specs)
             self._join(client)
-            with self._everything_stops(client):
+            with self._everything_stops(client, specs):
                 self._start(client, specs, port)
                 # A graph that was not seen at once, or that began meanwhile, is known by now.
                 self._refuse_second_graph(client, specs, own=1)
@@ -137,12 +126,7 @@ class GraphPlayer(ABC):
         begin = time.monotonic()
         self._progress.say(f"  starting {', '.join(spec.executable for spec in specs)}")
         for spec in specs:
-            process = NodeProcess(
-                spec.package, spec.executable, spec.parameters, self._logs, self._remap
-            )
-            self._processes[spec.executable] = process
-            if spec.executable == "pressure_driver":
-                self._driver_spec = spec
+            self._begin_process(spec)
             client.watch(self._processes.values())
             if spec.executable == "board_emulator":
                 client.wait_for(lambda: os.path.exists(port), 60.0, "the emulated board's port")
@@ -150,7 +134,20 @@ class GraphPlayer(ABC):
         self._progress.say(f"  ready after {time.monotonic() - begin:.1f} s")
         if "page" in self._processes:
             address = client.diagnostic_values("page").get("url", "unknown")
-            self._progress.say(f"  the operator's page is at {address}")
+            self._progress.say(f"  the operator's page is at {address}?token={PAGE_TOKEN}")
+
+    def _begin_process(self, spec: NodeSpec, name: str = "") -> NodeProcess:
+        hardware = self._setup.hardware
+        process = NodeProcess(
+            spec.package,
+            spec.executable,
+            spec.parameters,
+            self._logs,
+            hardware.remap if hardware is not None else None,
+            name=name,
+        )
+        self._processes[spec.executable] = process
+        return process
 
     def _record(self, client: GraphClient) -> GraphRun:
         bag = Path(client.call("recorder/start"))
@@ -213,28 +210,19 @@ class GraphPlayer(ABC):
 
         client.wait_for(vented, 30.0, "the chambers to vent")
 
-    def _vent_whatever_happened(self, client: GraphClient) -> None:
+    def _vent_whatever_happened(self, client: GraphClient, specs: list[NodeSpec]) -> None:
         """Vent after an error; a dead driver is started again, since boards have no watchdog."""
         driver = self._processes.get("pressure_driver")
-        if driver is None or self._driver_spec is None:
+        if driver is None:
             return
         self._progress.say("  venting the limb")
         client.watch(())
         try:
             if not driver.alive:
-                spec = self._driver_spec
-                client.diagnostics.pop(spec.executable, None)
-                driver = NodeProcess(
-                    spec.package,
-                    spec.executable,
-                    spec.parameters,
-                    self._logs,
-                    self._remap,
-                    name="pressure_driver_restarted",
-                )
-                self._processes["pressure_driver"] = driver
-                client.watch([driver])
-                client.wait_ready([spec.executable])
+                client.diagnostics.pop("pressure_driver", None)
+                (spec,) = (each for each in specs if each.executable == "pressure_driver")
+                client.watch([self._begin_process(spec, "pressure_driver_restarted")])
+                client.wait_ready(["pressure_driver"])
             self._vent(client)
         except (GraphError, NodeError) as error:
             self._progress.say(
@@ -243,12 +231,12 @@ class GraphPlayer(ABC):
         client.watch(())
 
     @contextlib.contextmanager
-    def _everything_stops(self, client: GraphClient) -> Iterator[None]:
+    def _everything_stops(self, client: GraphClient, specs: list[NodeSpec]) -> Iterator[None]:
         """Stop every node at the end; after an error or an interrupt, vent first."""
         try:
             yield
         except BaseException:
-            self._vent_whatever_happened(client)
+            self._vent_whatever_happened(client, specs)
             self._stop_all()
             raise
         client.watch(())
@@ -265,145 +253,3 @@ class GraphPlayer(ABC):
     def _stop_all(self) -> dict[str, int]:
         order = [name for name in STOP_ORDER if name in self._processes]
         return {name: self._processes[name].stop() for name in order}
-
-
-class GraphTrial(GraphPlayer):
-    """Runs one trial of a planned motion; use `play`.
-
-    Args:
-        trial, options: what to play.
-        limb: limb file for the planner, or None for the default limb.
-        robot: the same limb under the loads of the experiment, which the twin gets.
-        metadata: stored in the bag.
-        progress: shows what happens.
-        learned: file of a learned plan, which is played in place of a new one.
-    """
-
-    def __init__(
-        self,
-        trial: Trial,
-        options: Options,
-        limb: Path | None,
-        robot: Limb,
-        metadata: dict[str, Any],
-        progress: Progress,
-        learned: Path | None = None,
-    ) -> None:
-        super().__init__(options.out / "logs" / trial.name, options.hardware, progress)
-        self._trial = trial
-        self._options = options
-        self._limb = limb
-        self._robot = robot
-        self._metadata = metadata
-        self._learned = learned
-
-    def _specs(self, port: str) -> list[NodeSpec]:
-        return node_specs(
-            port,
-            self._options.out / "bags" / self._trial.name,
-            self._metadata,
-            seed=self._trial.seed,
-            run=self._trial.run - 1,
-            limb=self._robot,
-            hardware=self._hardware,
-            planner=self._planner_parameters(),
-            record_images=self._options.record_images,
-            page=self._options.page,
-        )
-
-    def _planner_parameters(self) -> dict[str, Any]:
-        parameters: dict[str, Any] = {
-            "limb_file": str(self._limb) if self._limb else "",
-            "mounting": self._options.mounting,
-            "payload": self._options.payload,
-            "payload_at": self._options.payload_at or 0.0,
-            "feedback": self._trial.feedback,
-        }
-        if self._learned is not None:
-            parameters["learned_plans"] = str(self._learned.parent)
-        elif self._options.path is not None:
-            # A path names no model: it gets the planner's defaults.
-            parameters["default_model"] = self._trial.model
-            parameters["nearest_path"] = self._options.nearest
-            if self._trial.model == "der":
-                parameters["default_method"] = self._trial.method
-        return parameters
-
-    def _join(self, client: GraphClient) -> None:
-        super()._join(client)
-        client.subscribe(PressurePlan, topics.PLAN, qos.LATCHED)
-
-    def _begin(self, client: GraphClient) -> Playing:
-        drawn = self._options.path if self._learned is None else None
-        kind, topic = (PathMessage, topics.PATH) if drawn else (MotionCommand, topics.COMMAND)
-        publisher = client.node.create_publisher(kind, topic, qos.COMMANDS)
-        # The recorder may listen, too.
-        client.wait_for(lambda: self._planner_listens(client, topic), 30.0, "the planner to listen")
-        client.newest.pop(topics.PLAN, None)
-        publisher.publish(self._path(drawn) if drawn else self._command())
-        plan = client.wait_for(lambda: self._plan_or_refusal(client), PLAN_TIMEOUT, "the plan")
-        self._progress.say(
-            f"  planned in {plan.solve_time:.2f} s, "
-            f"predicted error {plan.predicted_error * 100:.2f} cm"
-        )
-        return Playing(
-            stamps.seconds(plan.header.stamp),
-            float(plan.time[-1]),
-            feed=self._warnings_of(client, plan.plan_id),
-            plan_id=plan.plan_id,
-        )
-
-    def _warnings_of(self, client: GraphClient, plan_id: str) -> Callable[[], None]:
-        """Return what shows the warnings of a plan once the planner's diagnostics have them."""
-        shown: list[str] = []
-
-        def show() -> None:
-            said = client.diagnostic_values("planner")
-            played = said.get("plan_id") == plan_id and said.get("state") == "streaming"
-            if played and not shown:
-                shown.append(said.get("reason", ""))
-                if shown[0]:
-                    self._progress.say(f"  warning: {shown[0]}")
-
-        return show
-
-    def _planner_listens(self, client: GraphClient, topic: str) -> bool:
-        found = client.node.get_subscriptions_info_by_topic(client.node.resolve_topic_name(topic))
-        return any(info.node_name == "planner" for info in found)
-
-    def _path(self, file: Path) -> PathMessage:
-        """Return the path in a file; stamps are relative, all zero for a path without times."""
-        time, tip = paths.read_csv(file)
-        message = PathMessage()
-        message.header.frame_id = topics.BASE_FRAME
-        for index, (x, y) in enumerate(tip):
-            pose = PoseStamped()
-            pose.header.frame_id = topics.BASE_FRAME
-            if time is not None:
-                since = round((float(time[index]) - float(time[0])) * stamps.NANOSECONDS)
-                pose.header.stamp = stamps.stamp_from_nanoseconds(since)
-            pose.pose.position.x, pose.pose.position.y = float(x), float(y)
-            message.poses.append(pose)
-        return message
-
-    def _command(self) -> MotionCommand:
-        return MotionCommand(
-            # A learned plan's name stands in place of the motion's.
-            motion=self._trial.motion if self._learned is None else self._learned.stem,
-            model=self._trial.model,
-            method=self._trial.method if self._learned is None else LEARNED,
-            amplitude=self._options.amplitude,
-            period=self._options.period,
-            cycles=self._options.cycles,
-            plan_id=self._trial.name,
-        )
-
-    def _plan_or_refusal(self, client: GraphClient) -> PressurePlan | None:
-        plan = client.newest.get(topics.PLAN)
-        named = self._options.path is None
-        if plan is not None and (plan.plan_id == self._trial.name or not named):
-            return plan
-        said = client.diagnostic_values("planner")
-        if said.get("state") == "refused":
-            raise GraphError(f"the planner refused: {said.get('reason', 'no reason given')}")
-        return None

@@ -10,11 +10,10 @@ import numpy as np
 from der_planner.bags.run import RunSeries
 from der_planner.control import Learner, LearningError
 from der_planner.control.library import carried_over, nearest
-from der_planner.experiment.errors import GraphError
-from der_planner.experiment.options import Options, Trial
-from der_planner.experiment.progress import Progress
-from der_planner.limb import Limb
-from der_planner.planning import Plan, PlanningError, plan
+from der_planner.experiment.console import Progress
+from der_planner.experiment.options import TrialRun
+from der_planner.experiment.processes import GraphError
+from der_planner.planning import PlanningError
 from der_planner.planning.plan_file import read_plan, write_plan
 
 FOLDER = "learned"
@@ -29,28 +28,21 @@ def add_run(learner: Learner, run: RunSeries) -> None:
     """
     given = run.tip_covariance.value
     whole = len(given) == len(run.tip) and bool(np.isfinite(given).any())
-    covariance = given.reshape(-1, 2, 2) if whole else None
-    held = run.measured
-    told = (held.time, held.value) if len(held) else None
+    measured = run.measured
     try:
         learner.add(
             run.tip.time,
             run.tip.value,
-            covariance,
+            given.reshape(-1, 2, 2) if whole else None,
             commands=run.setpoints.value,
-            chambers=told,
+            chambers=(measured.time, measured.value) if len(measured) else None,
         )
     except LearningError as error:
         raise GraphError(f"cannot learn from {run.description.title}: {error}") from error
 
 
 def about(learner: Learner, **more: Any) -> dict[str, Any]:
-    """Return a summary of the runs so far, to be kept with a plan.
-
-    Args:
-        learner: with its history.
-        more: what else is to be kept.
-    """
+    """Return a summary of the runs so far, and what ``more`` is to be kept with a plan."""
     return {
         **more,
         "mean_error_m": [run.mean_error for run in learner.history],
@@ -61,19 +53,11 @@ def about(learner: Learner, **more: Any) -> dict[str, Any]:
     }
 
 
-def _fresh(trial: Trial, options: Options, robot: Limb) -> Plan:
-    motion = options.motion(trial.motion)
-    return plan(robot, motion, model=trial.model, method=trial.method)
+def _file(run: TrialRun, name: str) -> Path:
+    return run.options.out / FOLDER / f"{name}.yaml"
 
 
-def _file_of_first(trial: Trial, options: Options) -> Path:
-    """Return where the plan of a trial's first run is, if it begins from a library."""
-    return options.out / FOLDER / f"{trial.name}.yaml"
-
-
-def begin_from_library(
-    trial: Trial, options: Options, robot: Limb, progress: Progress
-) -> Path | None:
+def begin_from_library(run: TrialRun, progress: Progress) -> Path | None:
     """Write the plan of a first run that begins from a near learned one, and return its file.
 
     None: no learned plan in the library is near.
@@ -81,19 +65,20 @@ def begin_from_library(
     Raises:
         GraphError: the motion cannot be planned.
     """
-    if options.library is None:
+    library = run.options.library
+    if library is None:
         return None
     try:
-        fresh = _fresh(trial, options, robot)
-        found = nearest(options.library, fresh)
+        fresh = run.plan()
+        found = nearest(library, fresh)
         if found is None:
-            progress.say(f"  no learned plan in {options.library} is near this motion")
+            progress.say(f"  no learned plan in {library} is near this motion")
             return None
         file, learned = found
         begun = carried_over(fresh, learned)
     except PlanningError as error:
-        raise GraphError(f"{trial.name} cannot be planned: {error}") from error
-    path = _file_of_first(trial, options)
+        raise GraphError(f"{run.trial.name} cannot be planned: {error}") from error
+    path = _file(run, run.trial.name)
     write_plan(begun, path, {"begun_from": str(file)})
     progress.say(f"  begins from what was learned in {file}")
     return path
@@ -103,30 +88,27 @@ class TrialLearning:
     """The learner of one trial's motion.
 
     Args:
-        trial: the first run.
-        options: of the experiment.
-        robot: limb that the trial was planned with, under its loads.
+        run: the first one of the trial.
         progress: shows what was learned.
 
     Raises:
         GraphError: the motion cannot be planned, or its model cannot be learned.
     """
 
-    def __init__(self, trial: Trial, options: Options, robot: Limb, progress: Progress) -> None:
-        self._trial, self._options, self._progress = trial, options, progress
-        begun = _file_of_first(trial, options)
+    def __init__(self, run: TrialRun, progress: Progress) -> None:
+        self._run, self._progress = run, progress
+        begun = _file(run, run.trial.name)
         try:
-            first = read_plan(begun) if begun.exists() else _fresh(trial, options, robot)
-            self._learner = Learner(first)
+            self._learner = Learner(read_plan(begun) if begun.exists() else run.plan())
         except (PlanningError, LearningError) as error:
-            raise GraphError(f"{trial.name} cannot be learned: {error}") from error
+            raise GraphError(f"{run.trial.name} cannot be learned: {error}") from error
 
     @property
     def stopped(self) -> str:
         """Why nothing more is learned; empty while it goes on."""
         return self._learner.stopped
 
-    def take(self, run: RunSeries) -> None:
+    def add(self, run: RunSeries) -> None:
         """Learn from a finished run, and print what came of it.
 
         Raises:
@@ -144,16 +126,12 @@ class TrialLearning:
         Raises:
             GraphError: the optimiser found no plan.
         """
+        trial, path = self._run.trial, _file(self._run, name)
         try:
-            following: Plan = self._learner.next()
+            following = self._learner.next()
         except PlanningError as error:
             raise GraphError(f"{name} cannot be planned: {error}") from error
-        path = self._options.out / FOLDER / f"{name}.yaml"
-        write_plan(
-            following,
-            path,
-            about=about(self._learner, seed=self._trial.seed, trial=self._trial.number),
-        )
+        write_plan(following, path, about(self._learner, seed=trial.seed, trial=trial.number))
         return path
 
     def conclude(self) -> None:
@@ -162,7 +140,7 @@ class TrialLearning:
         Raises:
             GraphError: the optimiser found no plan.
         """
-        trial = self._trial
+        trial = self._run.trial
         path = self.next(f"{trial.motion}_{trial.model}_trial{trial.number}")
         self._progress.say(
             f"  {self.stopped or 'learning can go on from here'}; the plan to go on with: {path}"

@@ -1,4 +1,4 @@
-"""One trial in this process: plan, play on the simulated pneumatics and limb, keep the arrays."""
+"""One run in this process: plan, play on the simulated pneumatics and limb, keep the arrays."""
 
 from __future__ import annotations
 
@@ -8,69 +8,50 @@ from typing import Any
 
 import numpy as np
 
-from der_planner.bags.run import method_name
+from der_planner.bags.run import Description, RunSeries, method_name
 from der_planner.control import Feedback, lockstep
 from der_planner.control.lockstep import Played
-from der_planner.experiment.errors import GraphError
-from der_planner.experiment.options import Options, Trial
-from der_planner.experiment.progress import Progress
+from der_planner.experiment.console import Progress
+from der_planner.experiment.options import TrialRun
+from der_planner.experiment.processes import GraphError
 from der_planner.identification.offline import CALIBRATION_RUN
-from der_planner.limb import Limb
-from der_planner.planning import Plan, PlanningError, plan
+from der_planner.planning import Plan, PlanningError
 from der_planner.planning.plan_file import read_plan
-from der_planner.results import Description, RunSeries
 from der_planner.twin.offline import OfflineTwin
 
 _AT_REST = 1.0
-"""The twin is vented for so long before the first setpoint [s]."""
+"""The twin is vented this long [s] before the first setpoint."""
 
 
-def play_offline(
-    trial: Trial,
-    options: Options,
-    robot: Limb,
-    metadata: dict[str, Any],
-    progress: Progress,
-    learned: Path | None = None,
-) -> dict[str, Any]:
-    """Plan, play and keep one trial; the error is against the twin's true tip, not an image's.
+def play_offline(run: TrialRun, progress: Progress) -> dict[str, Any]:
+    """Plan, play and keep one run; the error is against the twin's true tip, not an image's.
 
-    Args:
-        trial: what to play.
-        options: of the experiment.
-        robot: to plan with, under its loads; the twin is mounted as it is and carries its masses.
-        metadata: kept with the arrays.
-        progress: shows the plan's warnings.
-        learned: file of a learned plan, which is played in place of a new one.
+    Returns:
+        What is kept of it beside its arrays.
 
     Raises:
         GraphError: the motion cannot be planned; with the planner's reason.
     """
     try:
-        if learned is not None:
-            planned = read_plan(learned)
-        else:
-            motion = options.motion(trial.motion)
-            planned = plan(robot, motion, model=trial.model, method=trial.method)
+        planned = read_plan(run.learned) if run.learned is not None else run.plan()
     except PlanningError as error:
         raise GraphError(f"the planner refused: {error}") from error
     for warning in planned.warnings:
         progress.say(f"  warning: {warning}")
-    played, about_feedback = _play(planned, trial, robot)
-    payload, place = robot.payload
-    path = options.out / "runs" / f"{trial.name}.npz"
+    played, feedback = _play(planned, run)
+    payload, place = run.limb.payload
+    about = {
+        **run.metadata,
+        "gravity_m_s2": run.limb.gravity,
+        "payload_kg": payload,
+        "payload_at_m": place,
+        **({"feedback": feedback} if feedback else {}),
+    }
+    path = run.options.out / "runs" / f"{run.trial.name}.npz"
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(
         path,
-        metadata=json.dumps(
-            {
-                **metadata,
-                "gravity_m_s2": robot.gravity,
-                "payload_kg": payload,
-                "payload_at_m": place,
-                **({"feedback": about_feedback} if about_feedback else {}),
-            }
-        ),
+        metadata=json.dumps(about),
         time=planned.time,
         tip_reference=planned.tip_reference,
         tip_predicted=planned.tip_predicted,
@@ -82,25 +63,22 @@ def play_offline(
         missing_pressure=played.missing_pressure,
     )
     return {
-        "arrays": str(path.relative_to(options.out)),
+        "arrays": str(path.relative_to(run.options.out)),
         "solve_time_s": planned.solve_time,
         "predicted_error_m": planned.predicted_error,
     }
 
 
-def _run_of_twin(trial: Trial) -> int:
-    """Return which wander of the rest angles the twin has: one of its own for every run."""
-    return 0 if trial.run == 1 else CALIBRATION_RUN + trial.run - 1
-
-
-def _play(planned: Plan, trial: Trial, robot: Limb) -> tuple[Played, dict[str, Any]]:
+def _play(planned: Plan, run: TrialRun) -> tuple[Played, dict[str, Any]]:
     """Play a plan on the twin; return also what feedback did, in numbers."""
+    trial, limb = run.trial, run.limb
     plant = OfflineTwin(
         trial.seed,
-        run=_run_of_twin(trial),
-        segment_count=robot.segment_count,
-        gravity=robot.gravity,
-        masses=robot.masses,
+        # The rest angles wander in every run in a way of their own.
+        run=0 if trial.run == 1 else CALIBRATION_RUN + trial.run - 1,
+        segment_count=limb.segment_count,
+        gravity=limb.gravity,
+        masses=limb.masses,
     )
     plant.rest(_AT_REST)
     feedback = Feedback(planned) if trial.feedback else None

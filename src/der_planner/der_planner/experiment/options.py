@@ -9,14 +9,14 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
-from der_planner.experiment.errors import OptionError
-from der_planner.experiment.load_options import add_load_options, check_loads
-from der_planner.experiment.node_specs import Hardware
+from der_planner.experiment.console import OptionError, add_load_options, check_loads
+from der_planner.experiment.processes import Hardware
 from der_planner.limb import Limb
 from der_planner.methods import LEARNED
 from der_planner.planning import METHODS as METHODS_BY_MODEL
-from der_planner.planning import Motion, PlanningError
+from der_planner.planning import Motion, Plan, PlanningError, plan
 from der_planner.planning.motions import (
     DEFAULT_AMPLITUDE,
     DEFAULT_CYCLES,
@@ -29,6 +29,16 @@ MODELS = tuple(METHODS_BY_MODEL)
 METHODS = METHODS_BY_MODEL["der"]
 DEFAULT_PAGE_PORT = 8080
 DEFAULT_MOTIONS = ("same_direction",)
+RANGES = (
+    ("trials", 1, 1000),
+    ("learn", 0, 100),
+    ("cycles", 1, 1000),
+    ("seed", 0, 2**31 - 1000),
+    ("period", 0.5, 600.0),
+    ("amplitude", 0.01, 2.0),
+    ("page", 1, 65535),
+)
+"""The options that are numbers, each with its smallest and its largest value."""
 
 
 @dataclass(frozen=True)
@@ -134,6 +144,34 @@ class Options:
             for model in self.models
             for feedback in ((False, True) if self.feedback and model == "der" else (False,))
         ]
+
+
+class TrialRun(NamedTuple):
+    """One run that is to be played, on the graph or offline.
+
+    Attributes:
+        trial, options: what to play.
+        limb_file: to plan with; None for the default limb.
+        limb: the same under the loads of the experiment; the twin is mounted and loaded as it is.
+        metadata: kept with what the run leaves.
+        learned: file of a learned plan, which is played in place of a new one.
+    """
+
+    trial: Trial
+    options: Options
+    limb_file: Path | None
+    limb: Limb
+    metadata: dict[str, Any] = {}  # noqa: RUF012 - never changed
+    learned: Path | None = None
+
+    def plan(self) -> Plan:
+        """Plan the motion without anything learned.
+
+        Raises:
+            PlanningError: it cannot be planned.
+        """
+        motion = self.options.motion(self.trial.motion)
+        return plan(self.limb, motion, model=self.trial.model, method=self.trial.method)
 
 
 class _Help(argparse.ArgumentDefaultsHelpFormatter):
@@ -276,44 +314,59 @@ def parse(arguments: Sequence[str]) -> Options:
         _check_names("motion", motions, (*MOTIONS, "all"))
     _check_names("model", models, MODELS)
     _check_names("method", (given.method,), METHODS)
-    _check_ranges(given)
+    for name, least, most in RANGES:
+        value = getattr(given, name)
+        if value is not None and not least <= value <= most:
+            raise OptionError(f"--{name} is {value}: choose {least} to {most}")
     check_loads(given)
-    _check_path_and_page(given)
     hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
-    if hardware is not None and given.offline:
-        raise OptionError("--offline simulates everything: it does not go with --hardware")
-    if given.feedback and "der" not in models:
-        raise OptionError("--feedback corrects plans of the rod: choose --models der")
     limb = given.limb or (Path(hardware.limb) if hardware and hardware.limb else None)
-    if hardware is not None and limb is None:
-        raise OptionError("--hardware needs a limb file: --limb FILE (scripts/calibrate_limb.py)")
+    for wrong, said in (
+        (given.nearest and given.path is None, "--nearest is about a path: give --path FILE.csv"),
+        (
+            given.page is not None and given.offline,
+            "--page shows a running graph: it does not go with --offline",
+        ),
+        (
+            hardware is not None and given.offline,
+            "--offline simulates everything: it does not go with --hardware",
+        ),
+        (
+            hardware is not None and limb is None,
+            "--hardware needs a limb file: --limb FILE (scripts/calibrate_limb.py)",
+        ),
+        (
+            given.feedback and "der" not in models,
+            "--feedback corrects plans of the rod: choose --models der",
+        ),
+        (
+            given.library is not None and not given.library.is_dir(),
+            f"--library {given.library} is no folder: name one of learned plans",
+        ),
+    ):
+        if wrong:
+            raise OptionError(said)
+    out = given.out or Path("experiments") / time.strftime("%Y-%m-%d_%H-%M-%S")
+    as_given = {
+        field.name: getattr(given, field.name)
+        for field in dataclasses.fields(Options)
+        if hasattr(given, field.name)
+    }
+    if given.path is not None:
+        # A path has neither amplitude nor period: the plan says so in the same way.
+        as_given |= {"amplitude": 0.0, "period": 0.0, "cycles": 1, "path": given.path.resolve()}
     return Options(
-        motions=motions,
-        models=models,
-        method=given.method,
-        trials=given.trials,
-        # A path has neither: the plan says so in the same way.
-        amplitude=given.amplitude if given.path is None else 0.0,
-        period=given.period if given.path is None else 0.0,
-        cycles=given.cycles if given.path is None else 1,
-        limb=limb,
-        calibrate=limb is None and not given.no_calibration,
-        seed=given.seed,
-        out=(given.out or _timestamped()).resolve(),
-        hardware=hardware,
-        offline=given.offline,
-        dry_run=given.dry_run,
-        record_images=given.record_images,
-        report=not given.no_report,
-        learn=given.learn,
-        library=_library(given.library),
-        path=given.path.resolve() if given.path is not None else None,
-        nearest=given.nearest,
-        page=given.page,
-        feedback=given.feedback,
-        mounting=given.mounting,
-        payload=given.payload,
-        payload_at=given.payload_at,
+        **as_given
+        | {
+            "motions": motions,
+            "models": models,
+            "limb": limb,
+            "calibrate": limb is None and not given.no_calibration,
+            "hardware": hardware,
+            "out": out.resolve(),
+            "report": not given.no_report,
+            "library": given.library.resolve() if given.library is not None else None,
+        }
     )
 
 
@@ -333,54 +386,6 @@ def _motions(given: argparse.Namespace) -> tuple[str, ...]:
     except PlanningError as error:
         raise OptionError(f"--path: {error}") from error
     return (re.sub(r"[^A-Za-z0-9-]+", "_", given.path.stem).strip("_") or "path",)
-
-
-def _check_ranges(given: argparse.Namespace) -> None:
-    """Refuse numbers that make no sense.
-
-    Raises:
-        OptionError: names the option and what it may be.
-    """
-    for name, least, most in (
-        ("trials", 1, 1000),
-        ("learn", 0, 100),
-        ("cycles", 1, 1000),
-        ("seed", 0, 2**31 - 1000),
-        ("period", 0.5, 600.0),
-        ("amplitude", 0.01, 2.0),
-    ):
-        value = getattr(given, name)
-        if not least <= value <= most:
-            raise OptionError(f"--{name} is {value}: choose {least} to {most}")
-
-
-def _check_path_and_page(given: argparse.Namespace) -> None:
-    """Refuse --nearest without a path, a port that is none, and a page without a graph.
-
-    Raises:
-        OptionError: names the option.
-    """
-    if given.nearest and given.path is None:
-        raise OptionError("--nearest is about a path: give --path FILE.csv, too")
-    if given.page is not None and not 1 <= given.page <= 65535:
-        raise OptionError(f"--page is {given.page}: choose a port of 1 to 65535")
-    if given.page is not None and given.offline:
-        raise OptionError("--page shows a running graph: it does not go with --offline")
-
-
-def _library(folder: Path | None) -> Path | None:
-    """Return the folder of learned plans.
-
-    Raises:
-        OptionError: there is none.
-    """
-    if folder is not None and not folder.is_dir():
-        raise OptionError(f"--library {folder} is no folder: name one of learned plans")
-    return folder.resolve() if folder is not None else None
-
-
-def _timestamped() -> Path:
-    return Path("experiments") / time.strftime("%Y-%m-%d_%H-%M-%S")
 
 
 def _check_names(kind: str, names: Sequence[str], known: Sequence[str]) -> None:

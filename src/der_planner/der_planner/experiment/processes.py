@@ -1,23 +1,182 @@
-"""Nodes as child processes: started, watched, stopped, and never left behind."""
+"""The nodes of a run: which ones with which parameters, started, watched and stopped."""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
+import dataclasses
+import json
 import os
+import secrets
 import signal
 import subprocess
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from der_planner.experiment.errors import NodeError
+from der_planner.experiment.console import OptionError
+from der_planner.limb import Limb
 
+STOP_ORDER = (
+    "planner",
+    "apriltag_tracker",
+    "synthetic_camera",
+    "limb_twin",
+    "recorder",
+    "pressure_driver",
+    "page",
+    "board_emulator",
+)
+PAGE_TOKEN = secrets.token_urlsafe()
+"""Opens the page of each run's graph, so that a window that is open stays let in."""
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)
+
+
+class NodeError(RuntimeError):
+    """A node did not start or died; the message names it and shows its last words."""
+
+
+class GraphError(RuntimeError):
+    """The graph did not do what was asked; the message says what and why."""
+
+
+# Which nodes -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Hardware:
+    """What stands in place of the twin: parameters of the nodes that touch the hardware.
+
+    Attributes:
+        driver, tracker, planner, recorder: parameters by name for each node.
+        remap: new names of topics by their old ones, for all nodes.
+        limb: the limb file, or None for the one on the command line.
+    """
+
+    driver: dict[str, Any] = field(default_factory=dict)
+    tracker: dict[str, Any] = field(default_factory=dict)
+    planner: dict[str, Any] = field(default_factory=dict)
+    recorder: dict[str, Any] = field(default_factory=dict)
+    remap: dict[str, str] = field(default_factory=dict)
+    limb: str | None = None
+
+    @classmethod
+    def from_yaml(cls, path: Path) -> Hardware:
+        """Read a hardware file (see scripts/hardware_example.yaml).
+
+        Raises:
+            OptionError: the file cannot be read, has unknown keys or no serial port.
+        """
+        try:
+            content = yaml.safe_load(path.read_text())
+        except (OSError, yaml.YAMLError) as error:
+            raise OptionError(f"cannot read hardware file {path}: {error}") from error
+        known = [item.name for item in dataclasses.fields(cls)]
+        if not isinstance(content, dict):
+            raise OptionError(f"hardware file {path}: expected the keys {', '.join(known)}")
+        for key in content:
+            if key not in known:
+                raise OptionError(f"hardware file {path}: unknown key '{key}'; known: {known}")
+        hardware = cls(**{key: value for key, value in content.items() if value is not None})
+        port = hardware.driver.get("port")
+        if not port:
+            raise OptionError(
+                f"hardware file {path}: driver.port is missing; `ls /dev/serial/by-id` shows ports"
+            )
+        if not Path(port).exists():
+            raise OptionError(
+                f"hardware file {path}: no serial device {port}; is the valve board plugged in? "
+                "`ls /dev/serial/by-id` shows what is there"
+            )
+        return hardware
+
+
+@dataclass(frozen=True)
+class NodeSpec:
+    """What is needed to start one node."""
+
+    package: str
+    executable: str
+    parameters: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class GraphSetup:
+    """What a graph consists of.
+
+    Attributes:
+        bag: folder that the recorder makes.
+        metadata: stored in the bag.
+        seed: of the twin.
+        run: of the same twin: its rest angles wander in each in a way of their own.
+        limb: whose gravity and masses the twin gets; None: no loads.
+        hardware: in place of the twin.
+        planner: parameters of the planner; None for a graph without one.
+        record_images: whether the bag holds the raw images, too.
+        page: port of the operator's page; None for a graph without one.
+    """
+
+    bag: Path
+    metadata: dict[str, Any]
+    seed: int = 0
+    run: int = 0
+    limb: Limb | None = None
+    hardware: Hardware | None = None
+    planner: dict[str, Any] | None = None
+    record_images: bool = False
+    page: int | None = None
+
+    def nodes(self, port: str) -> list[NodeSpec]:
+        """Return the nodes in the order in which they start; the emulated board is at ``port``."""
+        rig = self.hardware or Hardware()
+        board = {"port_link": port, "seed": self.seed}
+        twin = {"seed": self.seed, "run": self.run, **_twin_loads(self.limb)}
+        driver = {"port": port, "protocol": "ezloop", **rig.driver}
+        recorder = {
+            "output": str(self.bag),
+            "metadata": json.dumps(self.metadata),
+            "record_images": self.record_images,
+            **rig.recorder,
+        }
+        specs = [NodeSpec("pressure_driver", "pressure_driver", driver)]
+        if self.hardware is None:
+            specs.insert(0, NodeSpec("pressure_driver", "board_emulator", board))
+            specs.append(NodeSpec("der_planner", "limb_twin", twin))
+            specs.append(NodeSpec("apriltag_tracker", "synthetic_camera", {"seed": self.seed}))
+        specs.append(NodeSpec("apriltag_tracker", "apriltag_tracker", dict(rig.tracker)))
+        planner = {**(self.planner or {}), **rig.planner}
+        if self.planner is not None:
+            specs.append(NodeSpec("der_planner", "planner", planner))
+        specs.append(NodeSpec("der_planner", "recorder", recorder))
+        if self.page is not None:
+            # The page draws with the planner's limb on the tracker's tags.
+            shared = (
+                "limb_file", "mounting", "payload", "payload_at", "path_speed", "path_acceleration",
+            )  # fmt: skip
+            page = {name: planner[name] for name in shared if name in planner}
+            page |= {name: value for name, value in rig.tracker.items() if name == "tag_map"}
+            page |= {"port": self.page, "token": PAGE_TOKEN}
+            specs.append(NodeSpec("der_planner", "page", page))
+        return specs
+
+
+def _twin_loads(limb: Limb | None) -> dict[str, Any]:
+    """Return the parameters by which the twin's node is mounted and loaded as a limb."""
+    if limb is None:
+        return {}
+    parameters: dict[str, Any] = {"gravity": list(limb.gravity)}
+    if limb.masses:
+        parameters["masses"] = [item.mass for item in limb.masses]
+        parameters["masses_at"] = [item.arc_length for item in limb.masses]
+    return parameters
+
+
+# Processes ---------------------------------------------------------------------------------------
 
 
 def find_executable(package: str, executable: str) -> Path:

@@ -1,25 +1,39 @@
-"""Who may reach the page: addresses, names, origins, passwords and sessions."""
+"""Who may reach the page: addresses, names, origins and the token; and who commands the limb."""
 
 from __future__ import annotations
 
-import hashlib
 import hmac
 import ipaddress
-import math
 import secrets
 import socket
-import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from urllib.parse import urlsplit
 
-SHORTEST_PASSWORD = 12
-"""Characters: a limb is not defended by a word from a dictionary."""
-SESSION_LIFE = 12 * 3600.0
-"""[s] without a sign of a browser after which the password is asked for again. A window that is
-open says something all the time: its vent must not be refused because a shift was long."""
-LOOPBACK_NAMES = ("127.0.0.1", "localhost", "[::1]")
+from starlette.requests import HTTPConnection
+from starlette.responses import PlainTextResponse, RedirectResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocket
+
+SHORTEST_TOKEN = 12
+"""A token that somebody sets has at least this many characters."""
+LOOPBACK_NAMES = ("127.0.0.1", "localhost", "::1")
+SAFE_METHODS = ("GET", "HEAD")
+HEADERS = (
+    (b"x-frame-options", b"DENY"),
+    (b"x-content-type-options", b"nosniff"),
+    (b"referrer-policy", b"same-origin"),
+    (b"cross-origin-resource-policy", b"same-origin"),
+    (b"cross-origin-opener-policy", b"same-origin"),
+    # The page's framework compiles its templates in the browser, hence 'unsafe-eval'. Nothing may
+    # be loaded from, or sent to, another machine, and no other page may show this one in a frame.
+    (
+        b"content-security-policy",
+        b"default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; "
+        b"style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
+        b"connect-src 'self'; frame-ancestors 'none'; form-action 'self'; base-uri 'self'",
+    ),
+)
 
 
 class AccessError(ValueError):
@@ -28,210 +42,223 @@ class AccessError(ValueError):
 
 @dataclass(frozen=True)
 class Binding:
-    """Where the page listens, and what protects it there.
+    """Where the page listens, and the secret that opens it.
 
     Attributes:
         address: IP address to listen on.
         port: TCP port; 0 lets the system choose one.
-        password: asked for by the page; empty: none, which only a loopback address may have.
-        certificate: PEM file of the TLS certificate; empty: plain HTTP.
-        private_key: PEM file of its key.
+        token: what a browser must know; drawn at random unless it is given.
         host_names: further names by which browsers reach the page.
+
+    Raises:
+        AccessError: the address is no IP address, or the token is too short.
     """
 
     address: str = "127.0.0.1"
     port: int = 8080
-    password: str = ""
-    certificate: str = ""
-    private_key: str = ""
+    token: str = field(default_factory=secrets.token_urlsafe)
     host_names: tuple[str, ...] = ()
 
-    @property
-    def scheme(self) -> str:
-        """`https` with a certificate, else `http`."""
-        return "https" if self.certificate else "http"
+    def __post_init__(self) -> None:
+        try:
+            ipaddress.ip_address(self.address)
+        except ValueError as error:
+            raise AccessError(
+                f"parameter 'address' is '{self.address}', which is no IP address: give one of "
+                "this machine's, or 127.0.0.1"
+            ) from error
+        if len(self.token) < SHORTEST_TOKEN:
+            raise AccessError(
+                f"parameter 'token' has {len(self.token)} characters: give it {SHORTEST_TOKEN} or "
+                "more, or leave it empty for one that is drawn at random"
+            )
 
     @property
     def loopback(self) -> bool:
         """Whether only this machine can reach the address."""
         return ipaddress.ip_address(self.address).is_loopback
 
-    def check(self) -> None:
-        """Refuse a binding that lets strangers command a limb.
+    def url(self, port: int) -> str:
+        """Return the address of the page, without its token, at the port that is listened on."""
+        host = f"[{self.address}]" if ":" in self.address else self.address
+        return f"http://{host}:{port}/"
 
-        Raises:
-            AccessError: no IP address; an address that others reach without password or without
-                TLS; a password that is too short; a certificate without its key, or a file missing.
-        """
-        try:
-            loopback = self.loopback
-        except ValueError as error:
-            raise AccessError(
-                f"parameter 'address' is '{self.address}', which is no IP address: give one of "
-                "this machine's, or 127.0.0.1"
-            ) from error
-        if bool(self.certificate) != bool(self.private_key):
-            raise AccessError(
-                "parameters 'certificate' and 'private_key' belong together: set both"
-            )
-        for name, file in (("certificate", self.certificate), ("private_key", self.private_key)):
-            if file and not Path(file).is_file():
-                raise AccessError(f"parameter '{name}' names {file}, which is not there")
-        if self.password and len(self.password) < SHORTEST_PASSWORD:
-            raise AccessError(
-                f"the password in 'password_file' has {len(self.password)} characters: "
-                f"{SHORTEST_PASSWORD} or more are needed"
-            )
-        if loopback:
-            return
-        if not self.password:
-            raise AccessError(
-                f"parameter 'address' is {self.address}, which other machines reach: set "
-                "'password_file' to a file with a password, and 'certificate' and 'private_key' "
-                "for TLS, or leave the address at 127.0.0.1"
-            )
-        if not self.certificate:
-            raise AccessError(
-                f"parameter 'address' is {self.address}, which other machines reach: without TLS "
-                "the password travels in the clear: set 'certificate' and 'private_key' (PEM)"
-            )
-
-    def hosts(self, port: int) -> frozenset[str]:
-        """Return the values of the Host header that are answered.
+    def names(self) -> frozenset[str]:
+        """Return the names under which the page answers.
 
         A page elsewhere whose name is pointed at this machine (DNS rebinding) still sends its own
-        name in Host, so that only names that are listed may pass.
-
-        Args:
-            port: that is really listened on.
+        name in the Host header, so that only names that are listed may pass.
         """
-        names = set(self.host_names)
+        names = {name.lower() for name in self.host_names}
         address = ipaddress.ip_address(self.address)
         if address.is_loopback or address.is_unspecified:
             names.update(LOOPBACK_NAMES)
         if address.is_unspecified:
-            names.update(own_addresses())
+            names.update(_own_addresses())
         else:
-            names.add(bracketed(self.address))
-        default = 443 if self.certificate else 80
-        hosts = {f"{name.lower()}:{port}" for name in names}
-        if port == default:
-            hosts.update(name.lower() for name in names)
-        return frozenset(hosts)
+            names.add(self.address)
+        return frozenset(names)
+
+    def listen(self) -> socket.socket:
+        """Return a bound socket, so that a taken port is known before anything starts.
+
+        Raises:
+            AccessError: the address is not this machine's, or the port is taken.
+        """
+        family = socket.AF_INET6 if ":" in self.address else socket.AF_INET
+        listener = socket.socket(family, socket.SOCK_STREAM)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listener.bind((self.address, self.port))
+        except OSError as error:
+            listener.close()
+            raise AccessError(
+                f"cannot listen on {self.address}, port {self.port} ({error.strerror}): set the "
+                "parameter 'port' to a free one, 'address' to one of this machine's"
+            ) from error
+        return listener
 
 
-def bracketed(address: str) -> str:
-    """Return an IP address as it stands in an address line: IPv6 in brackets."""
-    return f"[{address}]" if ":" in address else address
-
-
-def own_addresses() -> set[str]:
+def _own_addresses() -> set[str]:
     """Return this machine's name and the IP addresses that the name has."""
     name = socket.gethostname()
     try:
-        found = {str(entry[4][0]) for entry in socket.getaddrinfo(name, None)}
+        found = {str(entry[4][0]).split("%")[0] for entry in socket.getaddrinfo(name, None)}
     except OSError:
         found = set()
-    return {name.lower(), *(bracketed(address.split("%")[0]) for address in found)}
+    return {name.lower(), *found}
 
 
-def read_password(path: str) -> str:
-    """Return the first line of a password file, an empty string without a file.
+class AccessFilter:
+    """An ASGI layer around the page that refuses requests of others than the page itself.
 
-    Raises:
-        AccessError: the file cannot be read, is empty, or others may read it.
+    Every request and websocket must name a known host, must not come from another page, and must
+    carry the token: in the address at first, and then in a cookie that the answer has set.
+
+    Args:
+        app: the page.
+        binding: names and token.
+        port: that is listened on; it names the cookie, since a machine's pages share cookies.
     """
-    if not path:
+
+    def __init__(self, app: ASGIApp, binding: Binding, port: int) -> None:
+        self._app = app
+        self._names = binding.names()
+        self._token = binding.token
+        self._cookie = f"limb_token_{port}"
+        self.refused = 0
+        """Requests that were refused."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on, or refuse it, or exchange the address's token for the cookie."""
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                message = {**message, "headers": [*message["headers"], *HEADERS]}
+            await send(message)
+
+        request = HTTPConnection(scope)
+        changes = scope["type"] == "websocket" or scope["method"] not in SAFE_METHODS
+        objection = self._objection(request, changes)
+        answer: ASGIApp = self._app
+        if objection:
+            answer = self._refusal(scope, 403, objection)
+        elif not changes and self._is_token(request.query_params.get("token", "")):
+            answer = self._exchange_token(request)
+        elif not self._is_token(request.cookies.get(self._cookie, "")):
+            text = "this page needs its token: open the address that it printed when it started"
+            answer = self._refusal(scope, 401, text)
+        await answer(scope, receive, send_with_headers)
+
+    def _is_token(self, given: str) -> bool:
+        return hmac.compare_digest(given.encode(), self._token.encode())
+
+    def _objection(self, request: HTTPConnection, changes: bool) -> str:
+        """Return why a request is refused whatever its token; empty if it is not."""
+        hosts, origins = request.headers.getlist("host"), request.headers.getlist("origin")
+        if len(hosts) != 1 or _host_name(hosts[0]) not in self._names:
+            return (
+                f"this page does not answer to the name '{', '.join(hosts)}': open it by its "
+                "address, or add the name to the parameter 'host_names'"
+            )
+        own = (f"http://{hosts[0]}".lower(), f"https://{hosts[0]}".lower())
+        site = request.headers.get("sec-fetch-site", "none")
+        follows_link = request.headers.get("sec-fetch-mode") == "navigate"
+        foreign = site not in ("same-origin", "none") and not follows_link
+        if foreign or any(origin.lower() not in own for origin in origins):
+            return "requests from other pages are refused: only the page itself may ask"
+        if changes and len(origins) != 1:
+            return "a command or a websocket must say its origin: use the page in a browser"
         return ""
-    file = Path(path)
+
+    def _exchange_token(self, request: HTTPConnection) -> Response:
+        """Lead a browser to the address without the token, which it keeps in a cookie instead."""
+        answer = RedirectResponse(str(request.url.remove_query_params("token")), status_code=303)
+        answer.set_cookie(self._cookie, self._token, httponly=True, samesite="lax")
+        return answer
+
+    def _refusal(self, scope: Scope, status: int, text: str) -> ASGIApp:
+        self.refused += 1
+        if scope["type"] == "http":
+            return PlainTextResponse(text, status)
+
+        async def close(scope: Scope, receive: Receive, send: Send) -> None:
+            await WebSocket(scope, receive, send).close(1008, text[:100])
+
+        return close
+
+
+def _host_name(host: str) -> str | None:
+    """Return the name in a Host header without its port; None if it holds none."""
     try:
-        readable_by_others = file.stat().st_mode & 0o077
-        lines = file.read_text().splitlines()
-    except OSError as error:
-        raise AccessError(f"parameter 'password_file': {path}: {error.strerror}") from error
-    if readable_by_others:
-        raise AccessError(f"others may read the password: chmod 600 {path}")
-    if not lines or not lines[0]:
-        raise AccessError(f"parameter 'password_file': the first line of {path} is empty")
-    return lines[0]
+        return urlsplit(f"//{host}").hostname
+    except ValueError:
+        return None
 
 
-def same_origin(origin: str, host: str, scheme: str) -> bool:
-    """Tell whether a request's Origin is the page itself.
+class Desk:
+    """The place of the one window that commands the limb; all others watch.
+
+    A window takes the desk if it is free, and loses it when it leaves or its connection stays away.
+    A window that is loaded anew in its tab of the browser gets another name and keeps the desk.
 
     Args:
-        origin: header of the request.
-        host: header of the request, checked already.
-        scheme: http or https, as served.
-    """
-    parts = urlsplit(origin)
-    return parts.scheme == scheme and parts.netloc.lower() == host.lower()
-
-
-class Sessions:
-    """Who has given the password.
-
-    Args:
-        password: empty: nobody is asked.
-        clock: steady [s].
+        lost: called when the operator's connection is lost.
     """
 
-    def __init__(self, password: str, clock: Callable[[], float] = time.monotonic) -> None:
-        self._password = password
-        self._clock = clock
-        self._until: dict[bytes, float] = {}
+    def __init__(self, lost: Callable[[], None]) -> None:
+        self._lost = lost
+        self._tabs: dict[str, str] = {}
+        self.operator: str | None = None
+        """Name of the window that commands; None: nobody does."""
 
-    @property
-    def needed(self) -> bool:
-        """Whether a password is asked for."""
-        return bool(self._password)
+    def take(self, window: str) -> bool:
+        """Take the desk if it is free; tell whether the window now has it."""
+        if self.operator is None:
+            self.operator = window
+        return self.operator == window
 
-    def open(self, password: str) -> str | None:
-        """Return the token of a new session, None for a wrong password."""
-        if not hmac.compare_digest(_digest(password), _digest(self._password)):
-            return None
-        now = self._clock()
-        self._until = {key: until for key, until in self._until.items() if until > now}
-        token = secrets.token_urlsafe(32)
-        self._until[_digest(token)] = now + SESSION_LIFE
-        return token
+    def connected(self, window: str, tab: str) -> None:
+        """Note the browser's tab of a window, which replaces an earlier window there."""
+        if self.operator is not None and self._tabs.get(self.operator) == tab:
+            self.operator = window
+        self._tabs[window] = tab
 
-    def holds(self, token: str) -> bool:
-        """Tell whether a token belongs to a session that is still open; use keeps it open."""
-        if not self.needed:
-            return True
-        key, now = _digest(token), self._clock()
-        if self._until.get(key, -math.inf) <= now:
-            return False
-        self._until[key] = now + SESSION_LIFE
-        return True
+    def leave(self, window: str) -> None:
+        """Give the desk up on purpose: nothing is lost."""
+        if self.operator == window:
+            self.operator = None
 
+    def disconnected(self, window: str) -> None:
+        """Note that a window has gone without leaving, which frees the desk if it had it."""
+        self._tabs.pop(window, None)
+        if self.operator == window:
+            self.operator = None
+            self._lost()
 
-def _digest(text: str) -> bytes:
-    return hashlib.sha256(text.encode()).digest()
-
-
-def listen(binding: Binding) -> socket.socket:
-    """Return a socket that is bound, so that a taken port is known before anything starts.
-
-    Raises:
-        AccessError: the address is not this machine's, or the port is taken.
-    """
-    family = socket.AF_INET6 if ":" in binding.address else socket.AF_INET
-    listener = socket.socket(family, socket.SOCK_STREAM)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listener.bind((binding.address, binding.port))
-    except OSError as error:
-        listener.close()
-        raise AccessError(
-            f"cannot listen on {binding.address}, port {binding.port} ({error.strerror}): set "
-            "the parameter 'port' to a free one, 'address' to one of this machine's"
-        ) from error
-    return listener
-
-
-def tokens_of(cookies: Sequence[str], name: str) -> list[str]:
-    """Return the values of one cookie in Cookie headers."""
-    pairs = [part.strip().partition("=") for line in cookies for part in line.split(";")]
-    return [value for key, _, value in pairs if key == name]
+    def may_command(self, window: str) -> bool:
+        """Tell whether a window has the desk."""
+        return self.operator == window

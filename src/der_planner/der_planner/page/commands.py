@@ -1,32 +1,43 @@
-"""What the page can ask of the graph; `node` does it by ROS services and topics."""
+"""What the page's buttons do to the graph: the services and topics that a terminal would use."""
 
 from __future__ import annotations
 
 import asyncio
+import json
+import time
+import uuid
 from concurrent.futures import Future
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from rclpy.node import Node
+from std_srvs.srv import Trigger
 
-Service = Literal["vent", "arm", "start", "stop", "record_start", "record_stop"]
+from der_msgs.msg import MotionCommand, PressureSetpoint
+from der_planner.page.situation import NANOSECONDS, Situation
+from der_planner.planning.plan_file import learned_names
+from limb_interfaces import qos, topics
+from limb_interfaces.stamps import stamp_from_nanoseconds
 
-PATIENCE = 3.0
-"""[s] to wait for a service's answer."""
-
-FILLING = 3.0
-"""[s] for which a chamber is filled alone; then the driver holds and lets it down by itself."""
-
-OWNERS: dict[Service, str] = {
-    "vent": "pressure_driver",
-    "arm": "pressure_driver",
-    "start": "planner",
-    "stop": "planner",
-    "record_start": "recorder",
-    "record_stop": "recorder",
+SERVICES = {
+    "vent": "pressure_driver/vent",
+    "arm": "pressure_driver/arm",
+    "start": "planner/start",
+    "stop": "planner/stop",
+    "record_start": "recorder/start",
+    "record_stop": "recorder/stop",
 }
-"""The node that serves each."""
+"""Services by what the page calls them, each with the node that serves it."""
+PATIENCE = 3.0
+"""A service's answer is waited for during this time [s]."""
+FILLING = 3.0
+"""One chamber alone is filled for this time [s]; then the driver lets it down by itself."""
+TICK = NANOSECONDS // 20
+"""Time [ns] between two setpoints."""
+TICKS_AHEAD = 4
+"""The first setpoint of a filling takes effect this many ticks after now."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +48,7 @@ class Answer:
     message: str
 
 
-@dataclass(frozen=True)
-class Load:
+class Load(NamedTuple):
     """How the limb is mounted and what it carries, as a motion command says it.
 
     Attributes:
@@ -52,79 +62,115 @@ class Load:
     mounting: str = ""
 
 
-@dataclass(frozen=True)
-class Conditions:
-    """What a motion or a drawing is planned with.
+class Commands:
+    """The graph as the page commands it; every method returns at once, from any thread.
 
-    Attributes:
-        model: `der` or `pcc`.
-        method: of the planner; empty: the best for the model.
-        load: mounting and payload.
-        feedback: correct the setpoints while the limb moves.
+    Args:
+        node: of the page.
+        situation: what the nodes have said of themselves.
+        segments: of the limb.
     """
 
-    model: str = "der"
-    method: str = ""
-    load: Load = Load()
-    feedback: bool = False
+    def __init__(self, node: Node, situation: Situation, segments: int) -> None:
+        self._node = node
+        self._situation = situation
+        self._segments = segments
+        self._service_clients = {
+            service: node.create_client(Trigger, path) for service, path in SERVICES.items()
+        }
+        self._recorder_parameters = node.create_client(SetParameters, "recorder/set_parameters")
+        self._setpoints = node.create_publisher(
+            PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS
+        )
+        self._motions = node.create_publisher(MotionCommand, topics.COMMAND, qos.COMMANDS)
 
+    def call(self, service: str) -> Future[Answer]:
+        """Call one of `SERVICES`."""
+        answer: Future[Answer] = Future()
+        client = self._service_clients[service]
+        if not client.service_is_ready():
+            text = f"{_owner(service)} does not run or cannot be reached"
+            if service == "vent":
+                text += ": NOT VENTED; close the supply and open the valves by hand"
+            answer.set_result(Answer(False, text))
+            return answer
 
-@dataclass(frozen=True)
-class MotionRequest:
-    """A named motion to play, or a learned plan, whose name is the motion's and method `learned`.
+        def finish(pending: Any) -> None:
+            if not answer.cancelled():
+                result = pending.result()
+                answer.set_result(Answer(bool(result.success), result.message))
 
-    Attributes:
-        motion: its name.
-        amplitude: [rad].
-        period: [s] of one cycle.
-        cycles: how many.
-        conditions: what it is planned with.
-    """
+        client.call_async(Trigger.Request()).add_done_callback(finish)
+        return answer
 
-    motion: str
-    amplitude: float
-    period: float
-    cycles: int
-    conditions: Conditions
+    def record(self, note: str) -> Future[Answer]:
+        """Start the recorder with a note in the bag's metadata."""
+        answer: Future[Answer] = Future()
+        if not self._recorder_parameters.service_is_ready():
+            answer.set_result(Answer(False, "recorder does not run or cannot be reached"))
+            return answer
 
+        def start(pending: Any) -> None:
+            result = pending.result().results[0]
+            if not result.successful:
+                answer.set_result(Answer(False, result.reason))
+                return
+            started = self.call("record_start")
+            started.add_done_callback(lambda done: answer.set_result(done.result()))
 
-class Commands(Protocol):
-    """The graph as the page commands it; every method returns at once, from any thread."""
+        metadata = ParameterValue(
+            type=ParameterType.PARAMETER_STRING, string_value=json.dumps({"note": note})
+        )
+        request = SetParameters.Request(parameters=[Parameter(name="metadata", value=metadata)])
+        self._recorder_parameters.call_async(request).add_done_callback(start)
+        return answer
 
-    def call(self, service: Service) -> Future[Answer]:
-        """Call a service; the future fails only if the page itself is at fault."""
-        ...
-
-    def play(self, request: MotionRequest) -> Answer:
-        """Ask the planner to plan and play a motion."""
-        ...
+    def play(self, command: MotionCommand) -> Answer:
+        """Publish a motion command; the planner's answer is seen in its diagnostics."""
+        listeners = self._node.get_subscriptions_info_by_topic(self._motions.topic_name)
+        # The recorder listens to commands without following them.
+        if all(listener.node_name == "recorder" for listener in listeners):
+            return Answer(False, "no planner listens: start it")
+        self._motions.publish(command)
+        what = command.motion or f"a path of {len(command.path)} points"
+        return Answer(True, f"asked the planner for {what} with {command.model}")
 
     def fill(self, segment: int, side: int, pressure: float) -> Answer:
-        """Fill one chamber alone for `FILLING`.
+        """Fill one chamber alone for `FILLING`, if the driver is armed and nothing is played.
 
         Args:
             segment: its number, 0 at the clamp.
             side: 1 for the left chamber, which bends counter-clockwise, -1 for the right one.
             pressure: differential pressure [Pa], above zero.
         """
-        ...
-
-    def play_path(self, tip: NDArray[np.float64], conditions: Conditions) -> Answer:
-        """Ask the planner to play the nearest path to points (P, 2) [m] that it can."""
-        ...
+        mode = self._situation.driver_mode
+        if mode != "armed":
+            text = f"the driver is {mode or 'not heard'}: it must be armed and at rest"
+            return Answer(False, text)
+        first = (time.time_ns() // TICK + TICKS_AHEAD) * TICK
+        plan_id, values = f"fill_{uuid.uuid4().hex[:8]}", [0.0] * self._segments
+        values[segment] = side * pressure
+        for index in range(round(FILLING * NANOSECONDS / TICK)):
+            message = PressureSetpoint(plan_id=plan_id, index=index, differential_pressure=values)
+            message.header.stamp = stamp_from_nanoseconds(first + index * TICK)
+            self._setpoints.publish(message)
+        which = f"segment {segment}, {'left' if side > 0 else 'right'}"
+        return Answer(True, f"{which}: {pressure / 1000:.1f} kPa for {FILLING:.0f} s")
 
     def learned_plans(self) -> list[str]:
-        """Return the names of the learned plans that the planner can play."""
-        ...
-
-    def record(self, note: str) -> Future[Answer]:
-        """Start recording, with a note in the bag."""
-        ...
+        """Return the names of the learned plans in the folder that the planner says it has."""
+        folder = self._situation.value_of("planner", "learned_plans")
+        return learned_names(folder) if folder else []
 
 
-async def answer_of(service: Service, pending: Future[Answer]) -> Answer:
+def _owner(service: str) -> str:
+    """Return the node that serves a service."""
+    return SERVICES[service].partition("/")[0]
+
+
+async def answer_of(service: str, pending: Future[Answer]) -> Answer:
     """Wait for a service's answer, and say so if none comes."""
-    owner = OWNERS[service]
+    owner = _owner(service)
     try:
         return await asyncio.wait_for(asyncio.wrap_future(pending), PATIENCE)
     except asyncio.TimeoutError:

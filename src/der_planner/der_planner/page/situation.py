@@ -1,17 +1,22 @@
-"""What the page knows of the graph, and how old each part of it is."""
+"""What the page knows of the graph, in the units that it shows, and how old each part is."""
 
 from __future__ import annotations
 
 import math
+import socket
 import threading
 import time
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from typing import Any
 
-from der_planner.page.processes import Processes
+import psutil
+from diagnostic_msgs.msg import DiagnosticStatus
+
+from der_msgs.msg import LimbEstimate, LimbState, PressurePlan, PressureState
+from der_planner.limb import mounting_of
+from limb_interfaces.stamps import nanoseconds
 
 PASCAL_PER_KILOPASCAL = 1000.0
 CENTIMETRES = 100.0
@@ -19,134 +24,23 @@ GRAMS = 1000.0
 PERCENT = 100.0
 NANOSECONDS = 1_000_000_000
 FRESH = {"driver": 0.5, "tracker": 0.5, "camera": 0.7, "estimate": 0.5}
-"""[s] that the newest message of a source may be old before the page greys it."""
-LATE, DEAD = 1.6, 5.0
-"""[s] without diagnostics, which every node sends once a second; a process that has ended on this
-computer is dead at once."""
+"""The newest message of a source may be this old [s] before the page greys it."""
+LATE = 1.6
+"""A node counts as late after this time [s] without diagnostics, which it sends once a second."""
+DEAD = 5.0
+"""A node counts as dead after this time [s] without diagnostics."""
+ENDED, STOPPED = "its process has ended", "its process is stopped"
 MODES = ("disarmed", "armed", "tracking", "holding", "venting", "fault")
 LEVELS = ("ok", "warning", "error", "stale")
 REFERENCES_KEPT = 200
 GAP = NANOSECONDS // 5
-"""[ns] between two references across which none is interpolated: four setpoints of 20 Hz."""
-
-
-def centimetres(metres: float) -> str:
-    """Return a small length [m] for people."""
-    length = metres * CENTIMETRES
-    return "below 0.01 cm" if length < 0.01 else f"{length:.2f} cm"
-
-
-@dataclass(frozen=True)
-class DriverState:
-    """What the driver says at a tick; pressures in Pa, NaN where unknown.
-
-    Attributes:
-        mode: number of its mode, an index of `MODES`.
-        faults: reasons, worst first.
-        plan_id: of the setpoint in force.
-        commanded: (M,) differential pressures sent to the board.
-        measured: (M,) differential pressures measured.
-        supply: absolute pressure of the reservoir.
-        telemetry_age: [s] since the board's last telemetry.
-    """
-
-    mode: int
-    faults: tuple[str, ...]
-    plan_id: str
-    commanded: tuple[float, ...]
-    measured: tuple[float, ...]
-    supply: float
-    telemetry_age: float
-
-
-@dataclass(frozen=True)
-class LimbView:
-    """What the tracker says of one image.
-
-    Attributes:
-        stamp: of the image [ns].
-        valid: whether the numbers mean anything.
-        reason: why not, or what was bridged.
-        tip: (2,) [m].
-        bend: (M,) bend angles [rad].
-        curve: (N, 2) centreline [m], base to tip.
-    """
-
-    stamp: int
-    valid: bool
-    reason: str
-    tip: tuple[float, float]
-    bend: tuple[float, ...]
-    curve: tuple[tuple[float, float], ...]
-
-
-@dataclass(frozen=True)
-class PlanView:
-    """The newest plan, as the planner published it.
-
-    Attributes:
-        motion, model, method, limb: names.
-        mounting: in words.
-        payload: [kg] that it reckons with beside the limb's own masses.
-        payload_at: [m] where, from the clamp; 0: the tip.
-        predicted_error: mean of the tip [m].
-    """
-
-    motion: str
-    model: str
-    method: str
-    limb: str
-    mounting: str
-    payload: float
-    payload_at: float
-    predicted_error: float
-
-    def __str__(self) -> str:
-        """Return it as a line for people."""
-        carried = ""
-        if self.payload:
-            place = f"{self.payload_at * CENTIMETRES:.1f} cm from the clamp"
-            carried = f", carrying {self.payload * GRAMS:.3g} g at "
-            carried += place if self.payload_at else "the tip"
-        return (
-            f"{self.motion}, {self.model} {self.method}, for the limb '{self.limb}', "
-            f"{self.mounting}{carried}; predicted error {centimetres(self.predicted_error)}"
-        )
-
-
-@dataclass(frozen=True)
-class EstimateView:
-    """What feedback knows beside the shape, one number a segment.
-
-    Attributes:
-        missing: effective pressure that the model lacks [Pa].
-        missing_sigma: its standard deviation [Pa].
-        gain_error: relative error of the model's effective pressure.
-        correction: what was added to the newest setpoint [Pa].
-        share: 0 to 1 of the correction that acts.
-        reason: why feedback is out or going out; empty while it acts.
-    """
-
-    missing: tuple[float, ...]
-    missing_sigma: tuple[float, ...]
-    gain_error: tuple[float, ...]
-    correction: tuple[float, ...]
-    share: float
-    reason: str
-
-
-@dataclass(frozen=True)
-class NodeStatus:
-    """The newest diagnostics of a node, an index of `LEVELS` as its level."""
-
-    name: str
-    level: int
-    message: str
-    values: Mapping[str, str] = field(default_factory=dict)
+"""No reference is interpolated between two that are further apart than this [ns]."""
 
 
 class Situation:
     """The newest of everything, with the instant it came at; safe to use from several threads.
+
+    Messages are read when they come, so that one that makes no sense is refused then.
 
     Args:
         clock: steady [s].
@@ -156,30 +50,72 @@ class Situation:
         self._clock = clock
         self._lock = threading.Lock()
         self._heard: dict[str, float] = {}
-        self._driver: DriverState | None = None
-        self._limb: LimbView | None = None
-        self._plan: PlanView | None = None
-        self._estimate: EstimateView | None = None
-        self._nodes: dict[str, tuple[NodeStatus, float]] = {}
-        self._processes = Processes()
+        self._values: dict[str, dict[str, Any]] = {}
+        self._plan = ""
+        self._tip: tuple[int, tuple[float, float]] | None = None
+        self._nodes: dict[str, tuple[dict[str, Any], float]] = {}
+        self._processes: dict[str, tuple[str, psutil.Process | None]] = {}
         self._references: deque[tuple[int, float, float]] = deque(maxlen=REFERENCES_KEPT)
 
-    def hear(self, source: str) -> None:
-        """Note that a source has sent something now."""
+    # What comes in -------------------------------------------------------------------------
+
+    def hear(self, source: str, values: dict[str, Any] | None = None) -> None:
+        """Note that a source has sent something now, and what it said."""
         with self._lock:
             self._heard[source] = self._clock()
+            if values is not None:
+                self._values[source] = values
 
-    def put_driver(self, state: DriverState) -> None:
-        """Take the driver's newest state."""
-        with self._lock:
-            self._driver = state
-            self._heard["driver"] = self._clock()
+    def put_driver(self, message: PressureState) -> None:
+        """Take the driver's state."""
+        known = 0 <= message.mode < len(MODES)
+        values = {
+            "mode": MODES[message.mode] if known else f"unknown mode {message.mode}",
+            "faults": list(message.faults),
+            "plan_id": message.plan_id,
+            "commanded_kpa": _kilopascal(message.commanded_differential),
+            "measured_kpa": _kilopascal(message.measured_differential),
+            "supply_kpa": _number(message.supply_pressure / PASCAL_PER_KILOPASCAL, 1),
+            "telemetry_age": _number(message.telemetry_age, 2),
+        }
+        self.hear("driver", values)
 
-    def put_limb(self, view: LimbView) -> None:
-        """Take the tracker's newest view of the limb."""
-        with self._lock:
-            self._limb = view
-            self._heard["tracker"] = self._clock()
+    def put_limb(self, message: LimbState) -> None:
+        """Take what the tracker says of one image."""
+        values = {
+            "valid": message.valid,
+            "reason": message.reason,
+            "tip_cm": [_number(value * CENTIMETRES, 2) for value in (message.tip.x, message.tip.y)],
+            "bend_deg": [_number(math.degrees(value), 2) for value in message.bend_angle],
+        }
+        self.hear("tracker", values)
+        tip = nanoseconds(message.header.stamp), (message.tip.x, message.tip.y)
+        self._tip = tip if message.valid else None
+
+    def put_estimate(self, message: LimbEstimate) -> None:
+        """Take what feedback knows beside the shape."""
+        values = {
+            "missing_kpa": _kilopascal(message.missing_pressure),
+            "missing_sigma_kpa": _kilopascal(message.missing_pressure_sigma),
+            "gain_error_percent": [_number(error * PERCENT, 1) for error in message.gain_error],
+            "correction_kpa": _kilopascal(message.correction),
+            "share_percent": _number(message.share * PERCENT, 0),
+            "reason": message.reason,
+        }
+        self.hear("estimate", values)
+
+    def put_plan(self, message: PressurePlan) -> None:
+        """Take the newest plan; it is shown as a line for people."""
+        carried = ""
+        if message.payload:
+            place = f"{message.payload_at * CENTIMETRES:.1f} cm from the clamp"
+            carried = f", carrying {message.payload * GRAMS:.3g} g at "
+            carried += place if message.payload_at else "the tip"
+        self._plan = (
+            f"{message.motion}, {message.model} {message.method}, for the limb '{message.limb}', "
+            f"{mounting_of(message.gravity)}{carried}; "
+            f"predicted error {centimetres(message.predicted_error)}"
+        )
 
     def put_reference(self, stamp: int, x: float, y: float) -> None:
         """Take where the tip should be [m] at an instant [ns], which may lie ahead."""
@@ -188,37 +124,36 @@ class Situation:
                 self._references.clear()  # a newer plan took over
             self._references.append((stamp, x, y))
 
-    def put_plan(self, plan: PlanView) -> None:
-        """Take the newest plan."""
-        with self._lock:
-            self._plan = plan
-
-    def put_estimate(self, estimate: EstimateView) -> None:
-        """Take what feedback knows now."""
-        with self._lock:
-            self._estimate = estimate
-            self._heard["estimate"] = self._clock()
-
-    def put_status(self, status: NodeStatus) -> None:
+    def put_status(self, status: DiagnosticStatus) -> None:
         """Take a node's diagnostics."""
+        level = int.from_bytes(status.level, "little")
+        values = {entry.key: entry.value for entry in status.values}
+        node = {
+            "name": status.name.rsplit("/", 1)[-1],
+            "state": LEVELS[level] if level < len(LEVELS) else "error",
+            "message": status.message,
+            "values": values,
+        }
+        process = values.get("process", "")
         with self._lock:
-            self._nodes[status.name] = (status, self._clock())
-            self._processes.note(status.name, status.values.get("process", ""))
+            self._nodes[status.name] = node, self._clock()
+            if self._processes.get(status.name, (None, None))[0] != process:
+                self._processes[status.name] = process, _process(process)
+
+    # What is known -------------------------------------------------------------------------
 
     @property
     def driver_mode(self) -> str:
         """Name of the driver's mode; empty if it has not been heard lately."""
         with self._lock:
             age = self._clock() - self._heard.get("driver", -math.inf)
-            if self._driver is None or age > FRESH["driver"]:
-                return ""
-            return _mode(self._driver)
+            return str(self._values["driver"]["mode"]) if age <= FRESH["driver"] else ""
 
     def value_of(self, node: str, key: str) -> str:
         """Return what a node's newest diagnostics say under a key; empty where they do not."""
         with self._lock:
-            found = [status for status, _ in self._nodes.values() if _short(status.name) == node]
-        return found[0].values.get(key, "") if found else ""
+            found = [entry["values"] for entry, _ in self._nodes.values() if entry["name"] == node]
+        return str(found[0].get(key, "")) if found else ""
 
     def reference_at(self, stamp: int) -> tuple[float, float] | None:
         """Return where the tip should be [m] at an instant [ns]; None where no plan says it."""
@@ -242,50 +177,42 @@ class Situation:
         """Return everything as JSON can carry it: kPa, cm and degrees, None where unknown."""
         with self._lock:
             now = self._clock()
-            heard, nodes = dict(self._heard), list(self._nodes.values())
-            driver, limb = self._driver, self._limb
-            plan, estimate = self._plan, self._estimate
-            troubles = {status.name: self._processes.trouble(status.name) for status, _ in nodes}
+            heard, values = dict(self._heard), dict(self._values)
+            nodes = [
+                _with_age(node, now - at, _trouble(self._processes[name][1]))
+                for name, (node, at) in sorted(self._nodes.items())
+            ]
         ages = {
-            name: {
-                "age": _number(now - heard[name], 2) if name in heard else None,
+            source: {
+                "age": _number(now - heard[source], 2) if source in heard else None,
                 "limit": limit,
-                "fresh": name in heard and now - heard[name] <= limit,
+                "fresh": source in heard and now - heard[source] <= limit,
             }
-            for name, limit in FRESH.items()
+            for source, limit in FRESH.items()
         }
+        limb = values.get("tracker")
         return {
             "sources": ages,
-            "driver": None if driver is None else _driver_values(driver),
-            "limb": None if limb is None else self._limb_values(limb),
-            "plan": "" if plan is None else str(plan),
-            "estimate": None if estimate is None else _estimate_values(estimate),
-            "nodes": [
-                _node_values(status, now - at, troubles[status.name])
-                for status, at in sorted(nodes, key=_name)
-            ],
+            "driver": values.get("driver"),
+            "limb": limb and {**limb, "error_cm": self._tip_error()},
+            "plan": self._plan,
+            "estimate": values.get("estimate"),
+            "nodes": nodes,
         }
 
-    def _limb_values(self, limb: LimbView) -> dict[str, Any]:
-        reference = self.reference_at(limb.stamp) if limb.valid else None
-        error = None
-        if reference is not None:
-            error = _number(math.dist(reference, limb.tip) * CENTIMETRES, 3)
-        return {
-            "valid": limb.valid,
-            "reason": limb.reason,
-            "tip_cm": [_number(value * CENTIMETRES, 2) for value in limb.tip],
-            "bend_deg": [_number(math.degrees(value), 2) for value in limb.bend],
-            "error_cm": error,
-        }
+    def _tip_error(self) -> float | None:
+        """Return the newest tip's distance from its reference [cm]; None where one is missing."""
+        if self._tip is None:
+            return None
+        stamp, tip = self._tip
+        reference = self.reference_at(stamp)
+        return None if reference is None else _number(math.dist(reference, tip) * CENTIMETRES, 3)
 
 
-def _short(name: str) -> str:
-    return name.rsplit("/", 1)[-1]
-
-
-def _name(entry: tuple[NodeStatus, float]) -> str:
-    return entry[0].name
+def centimetres(metres: float) -> str:
+    """Return a small length [m] for people."""
+    length = metres * CENTIMETRES
+    return "below 0.01 cm" if length < 0.01 else f"{length:.2f} cm"
 
 
 def _number(value: float, digits: int) -> float | None:
@@ -296,42 +223,45 @@ def _kilopascal(values: Sequence[float]) -> list[float | None]:
     return [_number(value / PASCAL_PER_KILOPASCAL, 3) for value in values]
 
 
-def _mode(driver: DriverState) -> str:
-    known = 0 <= driver.mode < len(MODES)
-    return MODES[driver.mode] if known else f"unknown mode {driver.mode}"
-
-
-def _driver_values(driver: DriverState) -> dict[str, Any]:
-    return {
-        "mode": _mode(driver),
-        "faults": list(driver.faults),
-        "plan_id": driver.plan_id,
-        "commanded_kpa": _kilopascal(driver.commanded),
-        "measured_kpa": _kilopascal(driver.measured),
-        "supply_kpa": _number(driver.supply / PASCAL_PER_KILOPASCAL, 1),
-        "telemetry_age": _number(driver.telemetry_age, 2),
-    }
-
-
-def _estimate_values(estimate: EstimateView) -> dict[str, Any]:
-    return {
-        "missing_kpa": _kilopascal(estimate.missing),
-        "missing_sigma_kpa": _kilopascal(estimate.missing_sigma),
-        "gain_error_percent": [_number(error * PERCENT, 1) for error in estimate.gain_error],
-        "correction_kpa": _kilopascal(estimate.correction),
-        "share_percent": _number(estimate.share * PERCENT, 0),
-        "reason": estimate.reason,
-    }
-
-
-def _node_values(status: NodeStatus, age: float, trouble: str) -> dict[str, Any]:
-    level = LEVELS[status.level] if 0 <= status.level < len(LEVELS) else "error"
+def _with_age(node: dict[str, Any], age: float, trouble: str) -> dict[str, Any]:
+    """Return what is shown of a node that spoke some seconds ago."""
+    shown = {**node, "age": round(age, 1)}
     if trouble or age > LATE:
-        level = "dead" if trouble or age > DEAD else "late"
-    return {
-        "name": _short(status.name),
-        "state": level,
-        "message": trouble or status.message,
-        "age": round(age, 1),
-        "values": dict(status.values),
-    }
+        shown["state"] = "dead" if trouble or age > DEAD else "late"
+        shown["message"] = trouble or node["message"]
+    return shown
+
+
+def _process(identity: str) -> psutil.Process | None:
+    """Return the process that a node names as ``HOST:NUMBER``, if it runs on this computer.
+
+    A process that is not seen here, as on another computer or in another container, is never said
+    to have ended.
+    """
+    host, _, number = identity.rpartition(":")
+    if host != socket.gethostname() or not number.isdigit():
+        return None
+    try:
+        return psutil.Process(int(number))
+    except psutil.Error:
+        return None
+
+
+def _trouble(process: psutil.Process | None) -> str:
+    """Return `ENDED`, `STOPPED`, or an empty text: it runs, or nothing is known of it.
+
+    Diagnostics come once a second, so that their silence tells of a dead node only after more than
+    that; the operating system knows at once.
+    """
+    if process is None:
+        return ""
+    try:
+        # Another process may have got the number since: then this one is not running any more.
+        status = process.status() if process.is_running() else psutil.STATUS_DEAD
+    except psutil.NoSuchProcess:
+        return ENDED
+    except psutil.Error:
+        return ""
+    if status in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD):
+        return ENDED
+    return STOPPED if status == psutil.STATUS_STOPPED else ""

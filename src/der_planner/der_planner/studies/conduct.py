@@ -15,7 +15,7 @@ from typing import Any
 from distributed import Client, Future
 from distributed.scheduler import KilledWorker
 
-from der_planner.experiment.progress import Progress
+from der_planner.experiment.console import Progress
 from der_planner.studies import cluster, identity, work
 from der_planner.studies.cluster import NoSchedulerError, SchedulerLostError, WorkersLostError
 from der_planner.studies.errors import StudyError

@@ -1,0 +1,206 @@
+"""The operator's page in a real browser: how fast a vent is, and what the page costs."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import socket
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from der_msgs.msg import ChamberPressures, MotionCommand, PressureSetpoint, PressureState
+from der_planner.experiment.client import GraphClient
+from der_planner.experiment.processes import PAGE_TOKEN, GraphError, GraphSetup, NodeProcess
+from limb_interfaces import qos, topics
+from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
+
+DOMAIN = "95"
+PATIENCE = 120.0
+"""A node or a browser may take this time [s] to start on a loaded machine."""
+PERIOD = 50_000_000
+"""Time [ns] between two setpoints."""
+PRESSURE = 2000.0
+"""Both segments hold this differential pressure [Pa] when vent is pressed."""
+FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-sync",
+         "--disable-background-networking", "--window-size=1280,800")  # fmt: skip
+LISTEN = """
+window.presses = [];
+const send = window.fetch;
+window.fetch = (...all) => {
+  if (all[0] === "/vent") window.presses.push(performance.timeOrigin + window.event.timeStamp);
+  return send(...all);
+};
+"""
+"""Notes the instant of each press, by the browser's own stamp of the event [ms]."""
+COUNTS = "return [page.pictures, page.received, performance.now()];"
+
+
+class PageGraph:
+    """Board, driver, twin, camera, tracker, planner, recorder and the page, until it is closed.
+
+    Args:
+        folder: of logs and profiles.
+        stack: ends nodes and browsers.
+    """
+
+    def __init__(self, folder: Path, stack: contextlib.ExitStack) -> None:
+        self._folder, self._stack = folder, stack
+        self._processes: dict[str, NodeProcess] = {}
+        self._windows = 0
+        self.client = stack.enter_context(GraphClient("benchmark"))
+        self.commands: list[ChamberPressures] = []
+        self.states: list[PressureState] = []
+        subscribe = self.client.subscribe
+        subscribe(ChamberPressures, topics.TWIN_BOARD_COMMANDS, qos.SETPOINTS, self.commands.append)
+        subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES, self.states.append)
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            page_port = free.getsockname()[1]
+        self.url = f"http://127.0.0.1:{page_port}/?token={PAGE_TOKEN}"
+        board = str(folder / "board")
+        setup = GraphSetup(bag=folder / "bag", metadata={}, planner={}, page=page_port)
+        for spec in setup.nodes(board):
+            process = NodeProcess(spec.package, spec.executable, spec.parameters, folder)
+            self._processes[spec.executable] = process
+            stack.callback(process.stop)
+            self.client.watch(self._processes.values())
+            if spec.executable == "board_emulator":
+                self.wait(lambda: os.path.lexists(board), "the board's port")
+        self.client.wait_ready(self._processes)
+
+    def open_window(self) -> Any:
+        """Open the page in a browser of its own, and wait until it shows pictures."""
+        from selenium import webdriver  # noqa: PLC0415 - only tests and this need it
+
+        options = webdriver.ChromeOptions()
+        options.binary_location = shutil.which("chromium")
+        self._windows += 1
+        for flag in (*FLAGS, f"--user-data-dir={self._folder / f'profile{self._windows}'}"):
+            options.add_argument(flag)
+        service = webdriver.ChromeService(shutil.which("chromedriver"))
+        window = webdriver.Chrome(options=options, service=service)
+        self._stack.callback(window.quit)
+        window.get(self.url)
+        shown = "return !!page.data && page.pictures > 0"
+        self.wait(lambda: window.execute_script(shown), "the picture in the window")
+        return window
+
+    def wait(self, condition: Callable[[], Any], what: str) -> Any:
+        """Return what a condition returns once it holds."""
+        return self.client.wait_for(condition, PATIENCE, what)
+
+    def wait_mode(self, mode: int) -> None:
+        """Wait until the driver says that it is in a mode."""
+        del self.states[:]
+        self.wait(lambda: self.states and self.states[-1].mode == mode, f"mode {mode}")
+
+    def arm(self) -> None:
+        """Arm the driver as soon as it lets itself be armed: chambers take a while to vent."""
+        while self.states[-1].mode != PressureState.ARMED:
+            with contextlib.suppress(GraphError):
+                self.client.call("pressure_driver/arm", 20.0)
+            self.client.spin(0.2)
+
+    def measure_cpu(self, seconds: float) -> float:
+        """Return the share of a core [%] that the page's process uses during some seconds."""
+        before, begin = self._processes["page"].measure_cpu(), time.monotonic()
+        self.client.spin(seconds)
+        used = self._processes["page"].measure_cpu() - before
+        return 100.0 * used / (time.monotonic() - begin)
+
+
+@contextlib.contextmanager
+def page_graph() -> Iterator[PageGraph]:
+    """Run the whole graph with the page in a folder of its own."""
+    os.environ.setdefault("ROS_DOMAIN_ID", DOMAIN)
+    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
+        yield PageGraph(Path(folder), stack)
+
+
+def send_pressure(publisher: Any, plan_id: str) -> None:
+    """Send setpoints of one pressure in both segments, which last beyond the next press."""
+    start = (time.time_ns() // PERIOD + 4) * PERIOD
+    for index in range(24):
+        message = PressureSetpoint(plan_id=plan_id, index=index)
+        message.differential_pressure = [PRESSURE, PRESSURE]
+        message.header.stamp = stamp_from_nanoseconds(start + index * PERIOD)
+        publisher.publish(message)
+
+
+def first_vent(commands: list[ChamberPressures]) -> ChamberPressures | None:
+    """Return the first command to the board that leaves no pressure in a chamber."""
+    return next((each for each in commands if np.ptp(each.pressure) < 0.5 * PRESSURE), None)
+
+
+def measure_vent(graph: PageGraph, window: Any, count: int) -> list[float]:
+    """Press vent, by mouse and by space bar in turn; return the times to the board [s]."""
+    window.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": LISTEN})
+    window.refresh()
+    graph.wait(lambda: window.execute_script("return !!page.data"), "live data")
+    publisher = graph.client.node.create_publisher(
+        PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS
+    )
+    graph.wait(publisher.get_subscription_count, "the driver to listen")
+    random = np.random.default_rng(1)
+    taken = []
+    for number in range(count):
+        graph.wait_mode(PressureState.DISARMED)
+        graph.arm()
+        send_pressure(publisher, f"vent{number}")
+        graph.wait(lambda: graph.states[-1].commanded_differential[0] == PRESSURE, "the pressure")
+        del graph.commands[:]
+        graph.client.spin(float(random.uniform(0.0, 0.1)))  # any place between two ticks
+        if number % 2:
+            window.find_element("tag name", "body").send_keys(" ")
+        else:
+            window.find_element("id", "vent").click()
+        pressed = float(window.execute_script("return window.presses.at(-1);")) / 1000.0
+
+        vent = graph.wait(lambda: first_vent(graph.commands), "the vent at the board")
+        taken.append(nanoseconds(vent.header.stamp) * 1e-9 - pressed)
+    return taken
+
+
+def measure_windows(graph: PageGraph, windows: list[Any], seconds: float) -> dict[str, float]:
+    """Count pictures drawn and live data received by windows, and the page's CPU time."""
+    before = [window.execute_script(COUNTS) for window in windows]
+    cpu = graph.measure_cpu(seconds)
+    rates = []
+    for first, window in zip(before, windows, strict=True):
+        pictures, received, at = np.subtract(window.execute_script(COUNTS), first)
+        rates.append((1000.0 * pictures / at, 1000.0 * received / at))
+    return {
+        f"windows_{len(windows)}_pictures_per_s_least": min(rate[0] for rate in rates),
+        f"windows_{len(windows)}_live_data_per_s_least": min(rate[1] for rate in rates),
+        f"windows_{len(windows)}_page_cpu_percent": cpu,
+    }
+
+
+def run(quick: bool) -> dict[str, float]:
+    """Measure vent, rates and CPU; ``quick`` presses ten times."""
+    if not (shutil.which("chromium") and shutil.which("chromedriver")):
+        print("page: not measured: sudo apt-get install chromium chromium-driver")
+        return {}
+    seconds, presses = (10.0, 10) if quick else (30.0, 100)
+    with page_graph() as graph:
+        window = graph.open_window()
+        taken = 1000.0 * np.array(measure_vent(graph, window, presses))
+        figures = {f"vent_press_to_first_byte_p{p}_ms": float(np.percentile(taken, p))
+                   for p in (50, 99, 100)}  # fmt: skip
+        graph.wait_mode(PressureState.DISARMED)
+        graph.arm()
+        motions = graph.client.node.create_publisher(MotionCommand, topics.COMMAND, qos.COMMANDS)
+        graph.wait(motions.get_subscription_count, "the planner to listen")
+        motions.publish(MotionCommand(motion="same_direction", model="der", cycles=5))
+        graph.wait_mode(PressureState.TRACKING)
+        figures |= measure_windows(graph, [window], seconds)
+        figures |= measure_windows(graph, [window, graph.open_window()], seconds)
+    for key, value in figures.items():
+        print(f"  {key.replace('_', ' '):52s} {value:10.3f}", flush=True)
+    return figures

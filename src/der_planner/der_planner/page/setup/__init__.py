@@ -1,1 +1,0 @@
-"""The guide through the first power-up."""

@@ -1,0 +1,264 @@
+"""The set-up guide: a checklist for the first power-up, each line judged from what is heard now."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from nicegui import Client, ui
+
+from der_planner.limb import Limb
+from der_planner.page.commands import FILLING, Answer, answer_of
+from der_planner.page.server import STATIC, Parts
+from der_planner.page.situation import PASCAL_PER_KILOPASCAL
+
+ADDRESS = "/setup"
+INTERVAL = 0.5
+"""The steps are judged at this interval [s]."""
+DRIVEN = 3.0
+"""A segment counts as driven to one side from this differential pressure [kPa] on."""
+FILLED = 5.0
+"""The page's buttons fill a chamber to this pressure [kPa], or less where the limb bears less."""
+VENTED = 1.0
+"""A segment counts as vented below this differential pressure [kPa]."""
+BOARD_SILENT = 0.5
+"""A valve board counts as silent after this time [s] without telemetry."""
+CALIBRATION = "calibration-"
+"""The plans of `calibrate_limb.py` have names that begin so."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One line of the checklist.
+
+    Attributes:
+        title: what should be so.
+        done: whether it is, as far as is known now.
+        seen: what is known.
+        advice: what to do if it is not.
+    """
+
+    title: str
+    done: bool
+    seen: str
+    advice: str
+
+
+class SetupGuide:
+    """Judges the steps; remembers which chambers have been driven alone, and a calibration.
+
+    Args:
+        segments: of the limb.
+        default: name of the limb that comes with the package, which is nobody's own.
+    """
+
+    def __init__(self, segments: int, default: str) -> None:
+        self._default = default
+        self._chambers = [(segment, side) for segment in range(segments) for side in (1, -1)]
+        self._driven: set[tuple[int, int]] = set()
+        self._calibrating = self._calibrated = False
+
+    def steps(self, data: dict[str, Any], camera_problem: str, calibrated: bool) -> list[Step]:
+        """Return all steps.
+
+        Args:
+            data: `Situation.snapshot` of now.
+            camera_problem: why the camera's pose is not known; empty if it is.
+            calibrated: whether the camera has sent a calibration.
+        """
+        sources = data["sources"]
+        driver = data["driver"] if sources["driver"]["fresh"] else None
+        limb = data["limb"] if sources["tracker"]["fresh"] else None
+        planned = _planned_limb(data["nodes"])
+        self._watch(driver)
+        return [
+            _board(driver),
+            _zero_pressure(driver),
+            self._each_chamber(),
+            _camera(bool(sources["camera"]["fresh"]), calibrated),
+            Step(
+                "The camera's pose is known from the fixed tags",
+                calibrated and not camera_problem,
+                camera_problem or "the fixed tags fit together",
+                "Print tags with scripts/make_tags.py, enter their places in the tag map.",
+            ),
+            Step(
+                "The limb's tags are seen",
+                bool(limb and limb["valid"]),
+                "no fresh picture of the limb"
+                if limb is None
+                else limb["reason"] or "tip at ({:.1f}, {:.1f}) cm".format(*limb["tip_cm"]),
+                "Light it evenly; tags should be 25 px wide or more.",
+            ),
+            self._calibration(planned),
+            Step(
+                "The planner has this limb's own file",
+                planned not in ("", self._default),
+                f"it plans for '{planned}'" if planned else "no planner is heard",
+                "scripts/calibrate_limb.py makes it from a calibration run; start the planner with "
+                "limb_file:=FILE.",
+            ),
+        ]
+
+    def _watch(self, driver: dict[str, Any] | None) -> None:
+        """Remember what the driver does now."""
+        plan = "" if driver is None else driver["plan_id"]
+        self._calibrating = plan.startswith(CALIBRATION)
+        self._calibrated = self._calibrated or self._calibrating
+        pressures = [] if driver is None else [value or 0.0 for value in driver["measured_kpa"]]
+        for index, value in enumerate(pressures):
+            others = [abs(p) for k, p in enumerate(pressures) if k != index]
+            if abs(value) >= DRIVEN and max(others, default=0.0) < VENTED:
+                self._driven.add((index, 1 if value > 0 else -1))
+
+    def _each_chamber(self) -> Step:
+        left = [chamber(*place) for place in self._chambers if place not in self._driven]
+        return Step(
+            "Each chamber has been filled alone",
+            not left,
+            f"not yet: {', '.join(left)}" if left else "all of them, since this page was opened",
+            "Arm and fill each with the buttons below; look whether the limb bends to the side "
+            "that is said.",
+        )
+
+    def _calibration(self, planned: str) -> Step:
+        own = planned not in ("", self._default)
+        seen = "none has been played since this page was opened"
+        if self._calibrated:
+            seen = "one is being played" if self._calibrating else "one has been played"
+        elif own:
+            seen = "there is a limb file"
+        return Step(
+            "A calibration run has been played",
+            own or (self._calibrated and not self._calibrating),
+            seen,
+            "`python3 scripts/calibrate_limb.py --graph --hardware RIG.yaml --out LIMB.yaml` plays "
+            "and records one with nodes of its own: end all nodes but this page first.",
+        )
+
+
+def chamber(segment: int, side: int) -> str:
+    """Return the name of a chamber: side 1 is the left one."""
+    return f"segment {segment} {'left (bends counter-clockwise)' if side > 0 else 'right'}"
+
+
+def _board(driver: dict[str, Any] | None) -> Step:
+    age = None if driver is None else driver["telemetry_age"]
+    seen = "no driver is heard" if driver is None else "the board has never been heard"
+    if age is not None:
+        seen = f"heard {age:.2f} s ago"
+    return Step(
+        "The valve board answers",
+        age is not None and age < BOARD_SILENT,
+        seen,
+        "Plug it in, start pressure_driver with the port that `ls /dev/serial/by-id` shows.",
+    )
+
+
+def _zero_pressure(driver: dict[str, Any] | None) -> Step:
+    measured: Sequence[float | None] = [] if driver is None else driver["measured_kpa"]
+    known = [abs(value) for value in measured if value is not None]
+    vented = driver is not None and driver["mode"] == "disarmed"
+    zero = bool(known) and len(known) == len(measured) and max(known) < VENTED
+    seen = f"largest differential pressure {max(known):.2f} kPa" if known else "nothing measured"
+    if driver is not None and not vented:
+        seen += f", the driver is {driver['mode']}"
+    return Step(
+        "Vented, the pressures are zero",
+        zero and vented,
+        seen,
+        "Vent. What remains is the sensors' offset, or a chamber that does not vent.",
+    )
+
+
+def _camera(live: bool, calibrated: bool) -> Step:
+    said = "pictures come" if live else "no fresh picture (they are only asked for while looked at)"
+    return Step(
+        "The camera is calibrated",
+        calibrated,
+        f"{said}; {'its calibration is known' if calibrated else 'it has sent no calibration'}",
+        "scripts/calibrate_camera.py writes the camera_info file.",
+    )
+
+
+def _planned_limb(nodes: Sequence[dict[str, Any]]) -> str:
+    """Return the name of the limb that the planner plans for; empty if it is not heard."""
+    planner = next((node for node in nodes if node["name"] == "planner"), None)
+    if planner is None or planner["state"] in ("late", "dead"):
+        return ""
+    return str(planner["values"].get("limb", ""))
+
+
+def show_answer(client: Client, answer: Answer) -> None:
+    """Show in a window what came of a request."""
+    with client:
+        ui.notify(answer.message, type="positive" if answer.success else "negative", timeout=6000)
+
+
+def add_setup_guide(parts: Parts) -> None:
+    """Add the page at `ADDRESS`."""
+
+    @ui.page(ADDRESS, title="Limb: set-up", favicon="🦑")
+    def show_guide(client: Client) -> None:
+        ui.add_head_html('<link rel="stylesheet" href="/static/page.css">')
+        ui.add_body_html((STATIC / "frame.html").read_text())
+        guide = SetupGuide(parts.previewer.limb.segment_count, Limb.default().name)
+        with ui.element("main").props('id="setup"'):
+            ui.html("<h2>First power-up</h2>", sanitize=False)
+            ui.label("From top to bottom; every line is checked twice a second.")
+            lines = ui.column().classes("fill")
+            _add_buttons(client, parts)
+        client.on_delete(lambda: parts.desk.disconnected(client.id))
+
+        def judge() -> None:
+            calibrated, problem = parts.overlay.camera_problem()
+            steps = guide.steps(parts.situation.snapshot(), problem, calibrated)
+            lines.clear()
+            with lines:
+                for number, step in enumerate(steps, 1):
+                    with ui.element("div").classes("step done" if step.done else "step"):
+                        ui.label(f"{'✔' if step.done else '○'} {number}. {step.title}")
+                        ui.label(step.seen if step.done else f"{step.seen}. {step.advice}")
+
+        judge()
+        ui.timer(INTERVAL, judge)
+
+
+def _add_buttons(client: Client, parts: Parts) -> None:
+    """Add the buttons that arm and fill one chamber; each commands only as long as it acts."""
+    limit = parts.previewer.limb.pneumatics.pressure_limit
+    pressure = min(FILLED * PASCAL_PER_KILOPASCAL, limit)
+
+    def may_command() -> bool:
+        if parts.desk.take(client.id):
+            return True
+        show_answer(client, Answer(False, "another window commands: give up control there first"))
+        return False
+
+    async def arm() -> None:
+        if may_command():
+            try:
+                show_answer(client, await answer_of("arm", parts.commands.call("arm")))
+            finally:
+                parts.desk.leave(client.id)
+
+    async def fill(segment: int, side: int) -> None:
+        if may_command():
+            try:
+                show_answer(client, parts.commands.fill(segment, side, pressure))
+                await asyncio.sleep(FILLING)
+            finally:
+                parts.desk.leave(client.id)
+
+    ui.label(f"One chamber alone, {pressure / PASCAL_PER_KILOPASCAL:.0f} kPa for {FILLING:.0f} s:")
+    with ui.row().classes("line"):
+        ui.button("Arm", on_click=arm, color="positive").props('id="arm"')
+        for segment in range(parts.previewer.limb.segment_count):
+            for side in (1, -1):
+                press = functools.partial(fill, segment, side)
+                name = f"fill-{segment}-{'left' if side > 0 else 'right'}"
+                text = chamber(segment, side).partition(" (")[0]
+                ui.button(f"Fill {text}", on_click=press).props(f'id="{name}"')

@@ -1,0 +1,377 @@
+"""The nearest path that a limb can follow, for a drawn path that leaves its reach.
+
+Two segments reach a thin crescent: most lines that a hand draws leave it. Instead of points, bend
+angles are sought: any smooth course of them within the pressure limit is one that the limb follows.
+
+1. The drawn line is smoothed in the plane: waves shorter than `DRAWN_WAVE` (or faster than
+   `TIMED_WAVE`, if it has times) are a trembling hand's.
+2. Dynamic programming over a coarse grid of bend angles finds the course that is nearest to it on
+   the whole, so that it neither depends on a first guess nor jumps from one side of the fold to the
+   other because a single point is nearer there.
+3. A projected Gauss-Newton iteration brings it to the minimum of
+   Σ |tip(θ) − r|² + λ Σ |θ''|² within the limits of the bend angles and of the static pressures.
+4. It keeps its times, or takes longer where bend angles would change faster than pressures can.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
+from scipy.linalg import solveh_banded
+
+from der_planner.model.series import interpolate
+from der_planner.planning.inverse import BRANCHES
+from der_planner.planning.pace import retimed
+from der_planner.planning.paths import PathLimits, TipPath
+from der_planner.planning.workspace import Workspace
+
+Array = NDArray[np.float64]
+
+DRAWN_WAVE = 0.01
+"""Waves of a line without times that are shorter than this [m] are smoothed to less than half."""
+TIMED_WAVE = 0.25
+"""Waves of a path with times that are shorter than this [s] are smoothed to less than half."""
+PACE = 0.03
+"""A line without times is sampled as if the tip went along it at this speed [m/s]."""
+RESERVE = 0.03
+"""Share of the pressure limit that the nearest path leaves: models differ by about this much."""
+NOTABLE = 1e-3
+"""From this distance on [m] the drawn line counts as left."""
+_PLACE = 1e-6
+"""A drawing smaller than this [m] is one place."""
+_STILL = 15
+"""Instants of rest before and after a path that begins and ends at rest, 20 ms each."""
+_SAMPLE = 0.05
+_MOST_SAMPLES = 20_000
+_MOST_AVERAGED = 50
+_WAYPOINTS = 200
+_STATES = 2500
+_TRAVEL = 1e-5
+"""Weight of (rad/s)² against m² in the coarse search: it keeps the course from jumping."""
+_PRESSURE = 1e-4
+"""Weight of (pressure over its limit)² [m²] that decides between equally near courses."""
+_WEAKEST = 0.08
+"""Tip over angle, as a share of the limb's length, where smoothing takes over from following."""
+_EXCESS = 1.0
+"""Weight of what is beyond a limit, relative to it [m]."""
+_ITERATIONS = 60
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """How far the nearest path is from the drawn one, point by point.
+
+    Attributes:
+        largest: distance [m].
+        mean: distance over the drawn path's time, or over its length if it has no times [m].
+        time: when the nearest path is farthest, after its first point [s].
+        point: (x, y) of the drawn path there [m].
+        spans: (begin, end) after its first point [s], between which it is `NOTABLE` away or more.
+        share: of the drawn path that lies in these spans, 0 … 1.
+        slowed: duration over the drawn path's; 1 if it kept its times, NaN if it had none.
+    """
+
+    largest: float
+    mean: float
+    time: float
+    point: tuple[float, float]
+    spans: tuple[tuple[float, float], ...]
+    share: float
+    slowed: float
+
+    def __str__(self) -> str:
+        """Return a sentence for people; empty if the drawn path is followed as it is."""
+        parts = []
+        if self.largest >= NOTABLE:
+            parts.append(
+                f"the nearest path leaves {self.share * 100:.0f} % of the drawn one: it is "
+                f"{self.mean * 1000:.1f} mm away on average and {self.largest * 1000:.1f} mm at "
+                f"most, near ({self.point[0]:.4f}, "
+                f"{self.point[1]:.4f}) m, {self.time:.1f} s after its first point"
+            )
+        if self.slowed > 1.001:
+            parts.append(
+                f"the path takes {self.slowed:.2f} times as long as drawn, since pressures cannot "
+                "change faster"
+            )
+        return "; ".join(parts)
+
+
+@dataclass(frozen=True)
+class NearestPath:
+    """A course of bend angles that a limb can follow.
+
+    Attributes:
+        time: (K,) from 0 [s].
+        bend_angles: (K, M) of arcs [rad].
+        deviation: from the drawn path.
+    """
+
+    time: Array
+    bend_angles: Array
+    deviation: Deviation
+
+
+def nearest_path(
+    workspace: Workspace,
+    path: TipPath,
+    offset: Array,
+    limits: PathLimits | None = None,
+    branch: str = "",
+    rest: bool = False,
+) -> NearestPath:
+    """Return the nearest path that the limb can follow.
+
+    Args:
+        workspace: of the limb.
+        path: drawn; its times are kept where the slew limit lets them.
+        offset: (2,) of the limb's tip from that of the arcs, where loads make it [m].
+        limits: speed and acceleration of the tip, for a path whose times mean nothing (`line`).
+        branch: see `inverse.BRANCHES`; empty: whichever comes nearest.
+        rest: begin and end a path with times at rest, too.
+    """
+    samples = int(np.clip(math.ceil(path.duration / _SAMPLE), 16, _MOST_SAMPLES)) + 1
+    time, drawn = _sampled(path, samples)
+    step = float(time[1])
+    wave = TIMED_WAVE if limits is None else DRAWN_WAVE / PACE
+    target = _smoothed(drawn.mean(axis=1) - offset, step, wave)
+    angles = _Search(workspace, target, step, branch).run()
+    # Without overshoot where the course hurries along a limit; what is left of corners goes after.
+    course = PchipInterpolator(time, angles)
+    clock, along = retimed(workspace, course, path.duration, limits, rest)
+    if limits is not None or rest:
+        still = np.zeros(_STILL)
+        along = np.concatenate([still, along, still + path.duration])
+        clock = np.arange(len(along)) * clock[1]
+    followed = _smoothed(course(along), float(clock[1]), TIMED_WAVE)
+    slowed = math.nan if limits is not None else float(clock[-1] / path.duration)
+    deviation = _deviation(
+        drawn.mean(axis=1),
+        workspace.arcs.tip(angles) + offset,
+        np.interp(time, along, clock),
+        slowed,
+    )
+    return NearestPath(clock, followed, deviation)
+
+
+def line(tip: Array) -> TipPath:
+    """Return points (P, 2) [m] without times as a path at a steady pace; one place: rest for 1 s.
+
+    Its length is measured with a ruler of a quarter of `DRAWN_WAVE`, less for a small drawing: the
+    steps of a trembling hand would make it many times as long.
+    """
+    extent = float(np.linalg.norm(np.ptp(tip, axis=0)))
+    if extent < _PLACE:
+        return TipPath(np.array([0.0, 1.0]), np.repeat(tip[:1], 2, axis=0))
+    ruler = min(DRAWN_WAVE / 4, extent / 20)
+    kept = [0]
+    for k in range(1, len(tip)):
+        if math.dist(tip[k], tip[kept[-1]]) >= ruler:
+            kept.append(k)
+    if kept[-1] != len(tip) - 1:
+        kept.append(len(tip) - 1)
+    steps = np.maximum(np.linalg.norm(np.diff(tip[kept], axis=0), axis=1), ruler / 10)
+    arc = np.concatenate([[0.0], np.cumsum(steps)])
+    return TipPath(np.interp(np.arange(len(tip)), kept, arc) / PACE, tip)
+
+
+def _sampled(path: TipPath, samples: int) -> tuple[Array, Array]:
+    """Return evenly spaced instants (K,) and the drawn points around each of them (K, A, 2)."""
+    time = np.linspace(0.0, path.duration, samples)
+    each = int(np.clip(math.ceil(len(path.time) / samples), 1, _MOST_AVERAGED))
+    offsets = ((np.arange(each) + 0.5) / each - 0.5) * time[1]
+    fine = np.clip(time[:, None] + offsets, 0.0, path.duration)
+    if path.exact or len(path.time) < 3:
+        return time, interpolate(fine.ravel(), path.time, path.tip).reshape(samples, each, 2)
+    # Without overshoot, whatever the points' spacing.
+    drawn: Array = PchipInterpolator(path.time, path.tip)(fine)
+    return time, drawn
+
+
+def _smoothed(points: Array, step: float, wave: float) -> Array:
+    """Return points (K, 2), `step` apart, with waves of length `wave` at half of their height."""
+    weight = (wave / (2 * np.pi * step)) ** 4
+    band = _second_differences(len(points)) * weight
+    band[0] += 1.0
+    smooth: Array = solveh_banded(band, points, lower=True)
+    return smooth
+
+
+def _second_differences(count: int) -> Array:
+    """Return DᵀD (3, K) of the second differences D, in lower banded form."""
+    band = np.zeros((3, count))
+    for offset, first in ((0, 1.0), (1, -2.0), (2, 1.0)):
+        for other, second in ((0, 1.0), (1, -2.0), (2, 1.0)):
+            if other >= offset:
+                band[other - offset, offset : count - 2 + offset] += first * second
+    return band
+
+
+class _Search:
+    """Finds the bend angles (K, M) whose tips are nearest to (K, 2) targets, `step` [s] apart."""
+
+    def __init__(self, workspace: Workspace, target: Array, step: float, branch: str) -> None:
+        self._workspace, self._kinematics = workspace, workspace.arcs
+        self._target, self._step, self._branch = target, step, branch
+        self._count, self._length = workspace.limb.segment_count, workspace.limb.length
+        middle = (workspace.low + workspace.high) / 2
+        half = (workspace.high - workspace.low) / 2 * (1 - RESERVE)
+        self._low, self._high = middle - half, middle + half
+        self._limit = workspace.pressure_limit * (1 - RESERVE)
+        self._smooth = (_WEAKEST * self._length) ** 2 * (TIMED_WAVE / (2 * np.pi * step)) ** 4
+
+    def run(self) -> Array:
+        """Search coarsely, then finely."""
+        where = np.linspace(0, len(self._target) - 1, min(_WAYPOINTS, len(self._target))).round()
+        chosen = where.astype(int)
+        coarse = self._coarse(self._target[chosen], float(where[1]) * self._step)
+        return self._fine(interpolate(np.arange(len(self._target)), where, coarse))
+
+    def _coarse(self, target: Array, step: float) -> Array:
+        """Return the states of a grid (K, M) [rad] that follow the target best on the whole."""
+        count = self._count
+        size = max(3, round(_STATES ** (1 / count)) if count > 1 else 200)
+        axes = [np.linspace(a, b, size) for a, b in zip(self._low, self._high, strict=True)]
+        states = np.stack([part.ravel() for part in np.meshgrid(*axes, indexing="ij")], axis=-1)
+        tips, own = self._kinematics.tip(states), self._price(states)
+        travel = [_TRAVEL / step * (axis[:, None] - axis) ** 2 for axis in axes]
+        shape = (size,) * count
+        total = (step * (((tips - target[0]) ** 2).sum(-1) + own)).reshape(shape)
+        origins = np.empty((len(target), len(states)), dtype=np.int32)
+        for k in range(1, len(target)):
+            origin = np.arange(len(states)).reshape(shape)
+            for axis in range(count):
+                total, origin = _cheapest(total, origin, travel[axis], axis)
+            origins[k] = origin.ravel()
+            total = total + (step * (((tips - target[k]) ** 2).sum(-1) + own)).reshape(shape)
+        course = np.empty(len(target), dtype=int)
+        course[-1] = int(np.argmin(total))
+        for k in range(len(target) - 1, 0, -1):
+            course[k - 1] = origins[k, course[k]]
+        chosen: Array = states[course]
+        return chosen
+
+    def _price(self, states: Array) -> Array:
+        """Return what a state (G, M) costs wherever the tip should be [m²]."""
+        share = np.abs(self._workspace.static_pressure(states)) / self._limit
+        price: Array = _PRESSURE * _WEAKEST**2 * (share**2).sum(-1)
+        price = price + np.where((share > 1).any(-1), 1.0, 0.0)
+        if self._branch and self._count == 2:
+            price = price + np.where(self._beyond_fold(states) > 0, 1.0, 0.0)
+        return price
+
+    def _beyond_fold(self, angles: Array) -> Array:
+        """Return how far poses (K, 2) are on the other branch than the named one; 0 on it [1]."""
+        side = np.linalg.det(self._kinematics.tip_jacobians(angles)) / self._length**2
+        wrong: Array = np.maximum(-side if self._branch == BRANCHES[0] else side, 0.0)
+        return wrong
+
+    def _fine(self, angles: Array) -> Array:
+        """Return the angles (K, M) at the minimum that lies nearest to the given ones."""
+        damping = 1e-6
+        present = self._cost(angles)
+        for _ in range(_ITERATIONS):
+            band, slope = self._normal_equations(angles)
+            tied = ((angles <= self._low) & (slope > 0)) | ((angles >= self._high) & (slope < 0))
+            while damping < 1e3:
+                step = _free_step(band, slope, tied, damping)
+                moved = np.clip(angles + step, self._low, self._high)
+                cost = self._cost(moved)
+                if cost <= present:
+                    break
+                damping *= 10
+            else:
+                break
+            gain, change = present - cost, np.abs(moved - angles).max()
+            angles, present, damping = moved, cost, max(damping / 10, 1e-9)
+            if change < 1e-6 or gain <= 1e-7 * present:
+                break
+        return angles
+
+    def _excess(self, angles: Array) -> Array:
+        """Return what poses (K, M) have beyond the pressure limit and the fold, (K, …) [m]."""
+        pressure = self._workspace.static_pressure(angles) / self._limit
+        beyond: Array = np.sign(pressure) * np.maximum(np.abs(pressure) - 1, 0.0)
+        if self._branch and self._count == 2:
+            beyond = np.column_stack([beyond, self._beyond_fold(angles)])
+        return beyond * _EXCESS
+
+    def _cost(self, angles: Array) -> float:
+        missed = self._kinematics.tip(angles) - self._target
+        bend = np.diff(angles, n=2, axis=0)
+        beyond = self._excess(angles)
+        return float((missed**2).sum() + self._smooth * (bend**2).sum() + (beyond**2).sum())
+
+    def _normal_equations(self, angles: Array) -> tuple[Array, Array]:
+        """Return JᵀJ in lower banded form (2M + 1, K·M) and half the gradient (K, M)."""
+        count, inputs = angles.shape
+        jacobian = self._kinematics.tip_jacobians(angles)
+        missed = self._kinematics.tip(angles) - self._target
+        block = np.einsum("kai,kaj->kij", jacobian, jacobian)
+        slope = np.einsum("kai,ka->ki", jacobian, missed)
+        beyond = self._excess(angles)
+        if beyond.any():
+            nudge = 1e-6 * np.eye(inputs)
+            columns = [(self._excess(angles + part) - beyond) / 1e-6 for part in nudge]
+            change = np.stack(columns, axis=-1)
+            block += np.einsum("kai,kaj->kij", change, change)
+            slope += np.einsum("kai,ka->ki", change, beyond)
+        smooth = _second_differences(count) * self._smooth
+        band = np.zeros((2 * inputs + 1, count * inputs))
+        for below in range(inputs):
+            for column in range(inputs - below):
+                band[below, column::inputs] = block[:, column + below, column]
+        for apart in range(3):
+            band[apart * inputs] += np.repeat(smooth[apart], inputs)
+        bend = np.diff(angles, n=2, axis=0) * self._smooth
+        slope[:-2] += bend
+        slope[1:-1] -= 2 * bend
+        slope[2:] += bend
+        return band, slope
+
+
+def _cheapest(total: Array, origin: Array, travel: Array, axis: int) -> tuple[Array, Array]:
+    """Return the least cost to come to each state along one axis of the grid, and from where."""
+    costs, sources = np.moveaxis(total, axis, -1), np.moveaxis(origin, axis, -1)
+    ways = costs[..., None, :] + travel
+    best = ways.argmin(axis=-1)
+    least = np.take_along_axis(ways, best[..., None], axis=-1)[..., 0]
+    return (
+        np.moveaxis(least, -1, axis),
+        np.moveaxis(np.take_along_axis(sources, best, axis=-1), -1, axis),
+    )
+
+
+def _free_step(band: Array, slope: Array, tied: NDArray[np.bool_], damping: float) -> Array:
+    """Return the Gauss-Newton step (K, M) of the angles that no limit holds."""
+    matrix, still = band.copy(), tied.ravel()
+    matrix[0] += damping * max(float(band[0].max()), 1e-12)
+    for below in range(1, len(matrix)):
+        either = still[: -below or None] | still[below:]
+        matrix[below, : len(either)][either] = 0.0
+    matrix[0][still] = 1.0
+    right = np.where(still, 0.0, -slope.ravel())
+    step: Array = solveh_banded(matrix, right, lower=True).reshape(slope.shape)
+    return step
+
+
+def _deviation(drawn: Array, tip: Array, when: Array, slowed: float) -> Deviation:
+    """Compare tips (K, 2) with the drawn path, both evenly spaced along it."""
+    distance = np.linalg.norm(drawn - tip, axis=-1)
+    farthest = int(distance.argmax())
+    away = distance >= NOTABLE
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], away, [False]]).astype(int)))
+    place = drawn[farthest]
+    return Deviation(
+        largest=float(distance[farthest]),
+        mean=float(distance.mean()),
+        time=float(when[farthest]),
+        point=(float(place[0]), float(place[1])),
+        spans=tuple((float(when[a]), float(when[b - 1])) for a, b in edges.reshape(-1, 2)),
+        share=float(away.mean()),
+        slowed=slowed,
+    )

@@ -1,0 +1,93 @@
+"""The set-up guide judges each step from what is heard now, never from what was heard once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+
+from der_msgs.msg import LimbState, PressureState
+from der_planner.page.setup_guide import SetupGuide, Step
+from der_planner.page.situation import Situation
+
+VENTED = (12.0, -40.0)
+"""Differential pressures [Pa] of a limb that is vented, as its sensors have it."""
+
+
+class GuidedSetup:
+    """What the page hears, and the guide's steps."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.situation = Situation(lambda: self.now)
+        self.guide = SetupGuide(2, "shipped")
+
+    def drive(self, pressures: tuple[float, ...], telemetry_age: float = 0.05, **what: Any) -> None:
+        """Let the driver say what it does and measures [Pa]."""
+        message = PressureState(measured_differential=pressures, telemetry_age=telemetry_age)
+        for name, value in what.items():
+            setattr(message, name, value)
+        self.situation.put_driver(message)
+
+    def plan_for(self, limb: str) -> None:
+        """Let the planner say for which limb it plans."""
+        values = [KeyValue(key="limb", value=limb)]
+        self.situation.put_status(DiagnosticStatus(name="/limb/planner", values=values))
+
+    def steps(self, problem: str = "", calibrated: bool = True) -> list[Step]:
+        return self.guide.steps(self.situation.snapshot(), problem, calibrated)
+
+    def done(self) -> list[bool]:
+        return [step.done for step in self.steps()]
+
+
+def test_nothing_is_done_before_anything_is_heard() -> None:
+    steps = GuidedSetup().steps("no calibration yet", calibrated=False)
+    assert not any(step.done for step in steps)
+    assert all(step.seen and step.advice for step in steps)
+
+
+def test_a_running_rig_passes_until_it_falls_silent() -> None:
+    rig = GuidedSetup()
+    rig.drive(VENTED)
+    rig.situation.put_limb(LimbState(valid=True))
+    rig.plan_for("ours")
+    assert rig.done() == [True, True, False, True, True, True, True, True]
+    rig.now = 6.0
+    assert rig.done() == [False, False, False, True, True, False, False, False]
+
+
+def test_each_chamber_counts_only_if_it_is_driven_alone() -> None:
+    rig = GuidedSetup()
+    for measured in ((5e3, 5e3), (2e3, 0.0), (float("nan"), 5e3)):
+        rig.drive(measured, mode=2)
+        rig.steps()
+    assert "segment 0 left" in rig.steps()[2].seen
+    assert "segment 1 left" not in rig.steps()[2].seen
+    for measured in ((5e3, 0.0), (-5e3, 200.0), (0.0, -4e3)):
+        rig.drive(measured, mode=2)
+        rig.steps()
+    assert rig.steps()[2].done
+
+
+def test_pressure_that_stays_and_the_shipped_limb_are_no_success() -> None:
+    rig = GuidedSetup()
+    rig.drive((1500.0, 0.0))
+    rig.plan_for("shipped")
+    steps = rig.steps()
+    assert not steps[1].done
+    assert "1.50 kPa" in steps[1].seen
+    assert not steps[6].done
+    assert not steps[7].done
+    rig.drive(VENTED, mode=1)
+    assert not rig.steps()[1].done
+    rig.drive(VENTED, telemetry_age=float("nan"))
+    assert "never been heard" in rig.steps()[0].seen
+
+
+def test_a_calibration_run_is_seen_while_and_after_it_is_played() -> None:
+    rig = GuidedSetup()
+    rig.drive(VENTED, mode=2, plan_id="calibration-12ab34cd")
+    assert (rig.steps()[6].done, rig.steps()[6].seen) == (False, "one is being played")
+    rig.drive(VENTED)
+    assert rig.steps()[6].done
