@@ -26,8 +26,7 @@ from der_msgs.msg import (
     PressureState,
 )
 from der_planner.experiment.client import GraphClient
-from der_planner.experiment.errors import GraphError
-from der_planner.experiment.processes import NodeProcess
+from der_planner.experiment.processes import GraphError, NodeProcess
 from limb_interfaces import qos, topics
 from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
 
