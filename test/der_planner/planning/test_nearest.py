@@ -124,20 +124,6 @@ def test_the_plan_says_how_far_it_is_from_the_drawing(model):
     assert planned.predicted_error < 2e-3
 
 
-@pytest.mark.parametrize(
-    ("time", "tip", "message"),
-    [
-        (None, [(0.2, 0.1), (np.nan, 0.1)], "point 1 of the tip path is not finite"),
-        ([0.0, np.nan], [(0.2, 0.1), (0.2, 0.2)], "times of a tip path must increase"),
-        (None, [(0.2, 0.1)], "two or more points"),
-        (None, np.zeros((3, 3)), r"got shape \(3, 3\)"),
-    ],
-)
-def test_nonsense_is_refused(time, tip, message):
-    with pytest.raises(PlanningError, match=message):
-        Motion.from_tip_path(time, tip, nearest=True)
-
-
 def test_an_unknown_branch_is_refused():
     with pytest.raises(PlanningError, match="branch 'left' is unknown"):
         Motion.from_tip_path(None, CENTRE + 0.02 * RING, branch="left", nearest=True)
