@@ -22,8 +22,8 @@ from der_planner.planning import (
     Plan,
     Workspace,
     configuration,
-    inverse,
     plan,
+    workspace,
 )
 from der_planner.planning.configuration import REFERENCE_PRIOR, configure
 
@@ -90,8 +90,8 @@ def kinematics_and_gains() -> Figures:
     reference = Motion.named("asynchronous").reference(Workspace(RodModel(joined)))
     figures: Figures = {"tip_arcs_to_polyline_at_45_and_-45_degrees_mm": float(gap) * 1e3}
     print(f"\nArcs and polyline at 45/-45 degrees: tips {gap * 1e3:.1f} mm apart")
-    for name, pull in (("exact", inverse.PRIOR_WEIGHT), ("smooth", REFERENCE_PRIOR)):
-        angles, miss = inverse.solve(
+    for name, pull in (("exact", workspace.PRIOR_WEIGHT), ("smooth", REFERENCE_PRIOR)):
+        angles, miss = workspace.solve(
             kinematics, reference.tip, reference.bend_angles, prior_weight=pull
         )
         twirl = np.abs(np.diff(angles, 2, axis=0)).max() / CONTROL_PERIOD**2

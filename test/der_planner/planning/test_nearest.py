@@ -8,7 +8,7 @@ import pytest
 from der_planner.limb import Limb
 from der_planner.model import ArcModel, RodModel
 from der_planner.planning import Motion, PlanningError, Workspace, plan
-from der_planner.planning.inverse import BRANCHES
+from der_planner.planning.workspace import BRANCHES
 
 LIMB = Limb.default()
 ARCS = ArcModel(LIMB)

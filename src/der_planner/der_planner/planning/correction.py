@@ -16,9 +16,9 @@ from der_planner.model import CONTROL_PERIOD, Model, simulate
 from der_planner.model.simulation import Bend
 from der_planner.planning.configuration import configure
 from der_planner.planning.errors import PlanningError
-from der_planner.planning.inverse import solve
 from der_planner.planning.optimal import Optimiser, OptimiserSettings, Optimum
 from der_planner.planning.plan_file import Plan
+from der_planner.planning.workspace import solve
 from der_planner.rod import ConvergenceError
 
 Array = NDArray[np.float64]
