@@ -6,7 +6,6 @@ import contextlib
 import os
 import shutil
 import socket
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -17,19 +16,17 @@ import numpy as np
 
 from der_msgs.msg import ChamberPressures, MotionCommand, PressureSetpoint, PressureState
 from der_planner.experiment.client import GraphClient
-from der_planner.experiment.processes import GraphError, NodeProcess
+from der_planner.experiment.processes import PAGE_TOKEN, GraphError, GraphSetup, NodeProcess
 from limb_interfaces import qos, topics
 from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
 
-DOMAIN = int(os.environ.get("ROS_DOMAIN_ID") or 95)
-TOKEN = "token-of-the-benchmark"
+DOMAIN = "95"
 PATIENCE = 120.0
 """A node or a browser may take this time [s] to start on a loaded machine."""
 PERIOD = 50_000_000
 """Time [ns] between two setpoints."""
 PRESSURE = 2000.0
 """Both segments hold this differential pressure [Pa] when vent is pressed."""
-SETPOINTS_AHEAD = 24
 FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-sync",
          "--disable-background-networking", "--window-size=1280,800")  # fmt: skip
 LISTEN = """
@@ -56,7 +53,7 @@ class PageGraph:
         self._folder, self._stack = folder, stack
         self._processes: dict[str, NodeProcess] = {}
         self._windows = 0
-        self.client = stack.enter_context(GraphClient("benchmark", DOMAIN))
+        self.client = stack.enter_context(GraphClient("benchmark"))
         self.commands: list[ChamberPressures] = []
         self.states: list[PressureState] = []
         subscribe = self.client.subscribe
@@ -65,25 +62,17 @@ class PageGraph:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             page_port = free.getsockname()[1]
-        self.url = f"http://127.0.0.1:{page_port}/?token={TOKEN}"
+        self.url = f"http://127.0.0.1:{page_port}/?token={PAGE_TOKEN}"
         board = str(folder / "board")
-        self._start("pressure_driver", "board_emulator", {"port_link": board})
-        self.client.wait_for(lambda: os.path.lexists(board), PATIENCE, "the board's port")
-        self._start("pressure_driver", "pressure_driver", {"port": board})
-        self._start("der_planner", "limb_twin", {})
-        self._start("apriltag_tracker", "synthetic_camera", {})
-        self._start("apriltag_tracker", "apriltag_tracker", {})
-        self._start("der_planner", "planner", {})
-        self._start("der_planner", "recorder", {"output": str(folder / "bag")})
-        self._start("der_planner", "page", {"port": page_port, "token": TOKEN})
+        setup = GraphSetup(bag=folder / "bag", metadata={}, planner={}, page=page_port)
+        for spec in setup.nodes(board):
+            process = NodeProcess(spec.package, spec.executable, spec.parameters, folder)
+            self._processes[spec.executable] = process
+            stack.callback(process.stop)
+            self.client.watch(self._processes.values())
+            if spec.executable == "board_emulator":
+                self.wait(lambda: os.path.lexists(board), "the board's port")
         self.client.wait_ready(self._processes)
-
-    def _start(self, package: str, executable: str, parameters: dict[str, object]) -> None:
-        environment = {**os.environ, "ROS_DOMAIN_ID": str(DOMAIN)}
-        process = NodeProcess(package, executable, parameters, self._folder, None, environment)
-        self._processes[executable] = process
-        self._stack.callback(process.stop)
-        self.client.watch(self._processes.values())
 
     def open_window(self) -> Any:
         """Open the page in a browser of its own, and wait until it shows pictures."""
@@ -113,16 +102,10 @@ class PageGraph:
 
     def arm(self) -> None:
         """Arm the driver as soon as it lets itself be armed: chambers take a while to vent."""
-
-        def armed() -> bool:
+        while self.states[-1].mode != PressureState.ARMED:
             with contextlib.suppress(GraphError):
                 self.client.call("pressure_driver/arm", 20.0)
-                return True
             self.client.spin(0.2)
-            return False
-
-        self.wait(armed, "the driver to be armed")
-        self.wait_mode(PressureState.ARMED)
 
     def measure_cpu(self, seconds: float) -> float:
         """Return the share of a core [%] that the page's process uses during some seconds."""
@@ -135,14 +118,24 @@ class PageGraph:
 @contextlib.contextmanager
 def page_graph() -> Iterator[PageGraph]:
     """Run the whole graph with the page in a folder of its own."""
+    os.environ.setdefault("ROS_DOMAIN_ID", DOMAIN)
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
         yield PageGraph(Path(folder), stack)
 
 
-def largest_difference(command: ChamberPressures) -> float:
-    """Return the largest differential pressure of a command [Pa]."""
-    chambers = np.array(command.pressure)
-    return float(np.abs(chambers[0::2] - chambers[1::2]).max())
+def send_pressure(publisher: Any, plan_id: str) -> None:
+    """Send setpoints of one pressure in both segments, which last beyond the next press."""
+    start = (time.time_ns() // PERIOD + 4) * PERIOD
+    for index in range(24):
+        message = PressureSetpoint(plan_id=plan_id, index=index)
+        message.differential_pressure = [PRESSURE, PRESSURE]
+        message.header.stamp = stamp_from_nanoseconds(start + index * PERIOD)
+        publisher.publish(message)
+
+
+def first_vent(commands: list[ChamberPressures]) -> ChamberPressures | None:
+    """Return the first command to the board that leaves no pressure in a chamber."""
+    return next((each for each in commands if np.ptp(each.pressure) < 0.5 * PRESSURE), None)
 
 
 def measure_vent(graph: PageGraph, window: Any, count: int) -> list[float]:
@@ -159,17 +152,9 @@ def measure_vent(graph: PageGraph, window: Any, count: int) -> list[float]:
     for number in range(count):
         graph.wait_mode(PressureState.DISARMED)
         graph.arm()
-        start = (time.time_ns() // PERIOD + 4) * PERIOD
-        for index in range(SETPOINTS_AHEAD):
-            message = PressureSetpoint(plan_id=f"vent{number}", index=index)
-            message.differential_pressure = [PRESSURE, PRESSURE]
-            message.header.stamp = stamp_from_nanoseconds(start + index * PERIOD)
-            publisher.publish(message)
+        send_pressure(publisher, f"vent{number}")
+        graph.wait(lambda: graph.states[-1].commanded_differential[0] == PRESSURE, "the pressure")
         del graph.commands[:]
-        graph.wait(
-            lambda: graph.commands and largest_difference(graph.commands[-1]) > 0.9 * PRESSURE,
-            "the pressure",
-        )
         graph.client.spin(float(random.uniform(0.0, 0.1)))  # any place between two ticks
         if number % 2:
             window.find_element("tag name", "body").send_keys(" ")
@@ -177,14 +162,8 @@ def measure_vent(graph: PageGraph, window: Any, count: int) -> list[float]:
             window.find_element("id", "vent").click()
         pressed = float(window.execute_script("return window.presses.at(-1);")) / 1000.0
 
-        def vented(pressed: float = pressed) -> float | None:
-            for command in graph.commands:
-                came = nanoseconds(command.header.stamp) * 1e-9
-                if came >= pressed and largest_difference(command) < 0.5 * PRESSURE:
-                    return came - pressed
-            return None
-
-        taken.append(float(graph.wait(vented, "the vent at the board")))
+        vent = graph.wait(lambda: first_vent(graph.commands), "the vent at the board")
+        taken.append(nanoseconds(vent.header.stamp) * 1e-9 - pressed)
     return taken
 
 
@@ -211,7 +190,6 @@ def run(quick: bool) -> dict[str, float]:
     seconds, presses = (10.0, 10) if quick else (30.0, 100)
     with page_graph() as graph:
         window = graph.open_window()
-        print(f"page: vent, load {os.getloadavg()[0]:.1f} …", file=sys.stderr, flush=True)
         taken = 1000.0 * np.array(measure_vent(graph, window, presses))
         figures = {f"vent_press_to_first_byte_p{p}_ms": float(np.percentile(taken, p))
                    for p in (50, 99, 100)}  # fmt: skip

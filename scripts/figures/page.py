@@ -25,8 +25,7 @@ SETTLING = 1.5
 CENTRE = """
 const box = document.getElementById('drawing').getBoundingClientRect();
 const [width, height] = page.pictureSize;
-const outline = page.drawing.region[0];
-const top = outline.reduce((best, point) => (point[1] < best[1] ? point : best));
+const top = page.drawing.region[0].reduce((best, point) => (point[1] < best[1] ? point : best));
 return [box.left + top[0] * box.width / width, box.top + top[1] * box.height / height];
 """
 """Where the reachable region is highest, in the window."""

@@ -16,8 +16,7 @@ from matplotlib.axes import Axes
 
 from der_planner.limb import Limb
 from der_planner.model import ArcModel
-from der_planner.planning import METHODS, Motion, Plan, plan
-from der_planner.planning.inverse import angle_limits, solutions
+from der_planner.planning import Motion, Plan, Workspace, plan
 from der_planner.results.outputs import folder_argument
 from workspace_setup.basics import ROOT
 
@@ -35,13 +34,9 @@ COLORS = {
 
 
 def every_plan(limb: Limb, case: str, period: float) -> dict[tuple[str, str], Plan]:
-    """Return the plans of all models and methods."""
+    """Return the plan of each model and method that has a colour."""
     motion = Motion.named(case, period=period, cycles=1)
-    return {
-        (model, method): plan(limb, motion, model, method)
-        for model, methods in METHODS.items()
-        for method in methods
-    }
+    return {which: plan(limb, motion, *which) for which in COLORS}
 
 
 def draw_methods(path: Path) -> None:
@@ -71,7 +66,8 @@ def draw_branches(path: Path) -> None:
     """The tip's reach, its fold, and the two ways to one point."""
     limb = Limb.default()
     kinematics = ArcModel(limb)
-    low, high = angle_limits(limb)
+    space = Workspace(kinematics)
+    low, high = space.low, space.high
     figure, axes = plt.subplots(figsize=(5, 4.5), layout="constrained")
     grid = np.stack(
         np.meshgrid(*(np.linspace(a, b, 161) for a, b in zip(low, high, strict=True))), -1
@@ -85,7 +81,7 @@ def draw_branches(path: Path) -> None:
         axes.plot(*tips[sign].T, ".", ms=1, color=color, alpha=0.15)
         axes.plot([], [], "o", color=color, label=name)
     point = kinematics.tip(np.radians([35.0, 20.0]))
-    for found in solutions(limb, kinematics, point):
+    for found in space.solutions(point):
         color = "tab:blue" if found.branch == "counter_clockwise" else "tab:red"
         axes.plot(*(kinematics.curve(found.bend_angles).T * 100), color=color, lw=3)
     axes.plot(*(point * 100), "k*", ms=10)

@@ -12,12 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from apriltag_tracker.detection import Detector
 from apriltag_tracker.pipeline import LimbTracker
 from apriltag_tracker.synthetic.camera import CameraModel, SyntheticCamera
 from apriltag_tracker.synthetic.shapes import constant_curvature
 from apriltag_tracker.tag_map import TagMap
-from benchmarks.tracker.renderer import Scene, render
 from der_planner.identification.parameters import start_values
 from der_planner.identification.rod_angles import RodAngles
 from der_planner.limb import Limb
@@ -37,12 +35,9 @@ def _track() -> None:
     straight = constant_curvature(tags.segment_lengths, [0.0] * len(tags.segment_lengths))
     picture = SyntheticCamera(model, tags).frame(straight).image
     tracker = LimbTracker(tags, model.intrinsics)
-    # The first image is searched in full, the next by regions.
+    # The first image is searched in full, in the next tags are where they were.
     for stamp in (0.0, 0.03):
         tracker.observe(picture, stamp)
-    # Tags that something covers, or that motion smears, are looked for in ways of their own.
-    for scene in (Scene("covered", corner=0.25), Scene("smeared", smear=6.0)):
-        Detector().detect(render(scene, seed=40, size=(320, 240))[0])
 
 
 def _fitted(limb: Limb) -> Limb:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from apriltag_tracker.camera import Intrinsics, lens
-from apriltag_tracker.detection import Detector, decoding, edges
+from apriltag_tracker.detection import Detector, codes, edges
 from apriltag_tracker.pipeline import LimbTracker, TrackerOptions, Uncertainty, warm_up
 from apriltag_tracker.pose import plane
 from apriltag_tracker.synthetic.camera import Errors, Optics, SyntheticCamera
@@ -74,47 +74,6 @@ def test_set_up_errors_stay_within_the_systematic_part(straight_tags, model, swi
         spread = observations[-1].estimate.tip_systematic
         normalised.append(error[-1] @ np.linalg.solve(spread, error[-1]))
     assert 0.4 < np.mean(normalised) < 5.0
-
-
-def test_a_limb_at_two_metres_a_second_keeps_its_tags(straight_tags, model, swing):
-    exposure, hurry = 0.003, 6.2
-    camera = SyntheticCamera(model, straight_tags, Optics(exposure=exposure), seed=8)
-    tracker = LimbTracker(straight_tags, model.intrinsics)
-    asked, found, errors, smears = 0, 0, [], []
-    for k in range(24):
-        moment = 0.9 + hurry * k * PERIOD
-        shape, slow = swing.shape(moment), swing.velocity(moment)
-        velocity = dataclasses.replace(
-            slow, points=hurry * slow.points, heading=hurry * slow.heading
-        )
-        frame = camera.frame(shape, velocity)
-        observation = tracker.observe(frame.image, k * PERIOD)
-        if k < 3:
-            continue
-        inside = {tag.id for tag in straight_tags.limb} & frame.corners.keys()
-        seen = {placed.tag.id: placed.tag for placed in observation.tags if placed.on_limb}
-        asked, found = asked + len(inside), found + len(inside & seen.keys())
-        assert all(np.abs(seen[tag].corners - frame.corners[tag]).max() < 0.5 for tag in seen)
-        errors.append(observation.estimate.tip - shape.points[-1])
-        smears.append(exposure * np.hypot(*velocity.points[-1]))
-    assert max(smears) > 0.006
-    assert found >= 0.97 * asked
-    assert np.sqrt(np.mean(np.sum(np.square(errors), axis=1))) < 4e-4
-
-
-def test_a_covered_tag_is_not_found_where_it_is_expected(straight_tags, model, camera, swing):
-    tracker = LimbTracker(straight_tags, model.intrinsics)
-    run(tracker, camera, swing, 4)
-    for k, time in enumerate(np.arange(4, 12) * PERIOD):
-        frame = camera.frame(swing.shape(time))
-        middle = frame.corners[4].mean(axis=0)
-        # Something as dark as the border, of the size of the tag, soft as if it moved.
-        picture = frame.image.astype(np.float64)
-        y, x = np.mgrid[0 : picture.shape[0], 0 : picture.shape[1]]
-        away = np.hypot(x - middle[0], y - middle[1]) / (16.0 + k)
-        picture = 30.0 + (picture - 30.0) * (1.0 - np.exp(-(away**6)))
-        observation = tracker.observe(np.round(picture).astype(np.uint8), time)
-        assert 4 not in {placed.tag.id for placed in observation.tags}
 
 
 def test_gaps_are_bridged_marked_and_then_given_up(straight_tags, model, camera, swing):
@@ -201,9 +160,7 @@ def test_warming_up_leaves_no_kernel_for_the_first_image(detector):
     warm_up(detector)
     kernels = [
         edges.refine_quads,
-        edges.corner_covariances,
-        decoding.distances,
-        decoding.identify,
+        codes.read_codes,
         lens.undistort_pixels,
         lens.distort_to_pixels,
         plane._locate,

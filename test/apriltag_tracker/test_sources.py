@@ -7,12 +7,14 @@ import cv2
 import numpy as np
 import pytest
 
-from apriltag_tracker.camera.encodings import ImageError, ImageReader, to_grey
-from apriltag_tracker.camera.sources import (
+from apriltag_tracker.camera.images import (
     DeviceSource,
+    ImageError,
+    ImageReader,
     SourceError,
     VideoSource,
     open_source,
+    to_grey,
 )
 
 

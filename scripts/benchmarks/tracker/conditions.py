@@ -105,7 +105,6 @@ def c_library(decimate: float) -> Callable[[NDArray[np.uint8]], dict[int, NDArra
 def our_search() -> Callable[[NDArray[np.uint8]], dict[int, NDArray[np.float64]]]:
     """Return our full search as a function of an image."""
     detector = Detector(smallest=12.0)
-    detector.warm_up()
     return lambda image: {tag.id: tag.corners for tag in detector.detect(image)}
 
 
@@ -164,10 +163,7 @@ def measure_sequence(frames: int, scale: float, name: str) -> dict[str, float]:
     """Track a swinging limb and search every picture with the C library."""
     tags, model, pictures, tips = swinging_limb(frames, scale)
     detector = Detector(smallest=14.0)
-    detector.warm_up()
-    lens, still = model.intrinsics, [tag.id for tag in tags.world]
-    detector = detector.through((lens.matrix, lens.distortion))
-    tracker = TagTracker(tags.ids, detector, still=still)
+    tracker = TagTracker(tags.ids, detector)
     tracked, full = Score([], []), Score([], [])
     times, kinds = [], []
     for k, frame in enumerate(pictures):

@@ -42,9 +42,8 @@ class Family:
         first_code: bits of the printed tag 0, row by row from its upper left, as published.
         correct_bits: wrong cells of a code that are forgiven in a search, if nothing else is said.
         most_corrected: the same at most: with more, pictures without a tag show some.
-        explained: share of the pixels' variance above which a pattern is a tag's. A pattern with so
-            many other cells that it is not forgiven explains less, however sharp the picture is.
-        needs_pattern: the code alone is too weak: the whole pattern must explain the picture, too.
+        largest_misfit: RMS distance of the cells from plain black and white above which a code is
+            not believed [half contrasts]; the shorter a code, the smaller it is.
         dictionary_id: OpenCV's number of the family, None if it has none.
     """
 
@@ -55,8 +54,7 @@ class Family:
     first_code: int
     correct_bits: int
     most_corrected: int
-    explained: float
-    needs_pattern: bool
+    largest_misfit: float
     dictionary_id: int | None
 
     @property
@@ -195,13 +193,15 @@ def _codes(family: Family) -> NDArray[np.uint8]:
     return table
 
 
+_STRONG, _CLEAR = 0.6, 0.35
+
 _ALL = (
-    Family("tag36h11", 6, 587, 11, 0xD5D628584, 1, 2, 0.93, False, cv2.aruco.DICT_APRILTAG_36h11),
-    Family("tag36h10", 6, 2320, 10, 0x1CA92A687, 1, 1, 0.93, False, cv2.aruco.DICT_APRILTAG_36h10),
-    Family("tag25h9", 5, 35, 9, 0x155CBF1, 0, 1, 0.955, True, cv2.aruco.DICT_APRILTAG_25h9),
-    Family("tag16h5", 4, 30, 5, 0x231B, 0, 0, 0.95, True, cv2.aruco.DICT_APRILTAG_16h5),
-    Family("tagStandard41h12", 3, 2115, 12, 0x1BC2788B1A4, 2, 2, 0.93, False, None),
-    Family("tagStandard52h13", 4, 48714, 13, 0x406B98AB8AA9A, 3, 4, 0.93, False, None),
+    Family("tag36h11", 6, 587, 11, 0xD5D628584, 1, 2, _STRONG, cv2.aruco.DICT_APRILTAG_36h11),
+    Family("tag36h10", 6, 2320, 10, 0x1CA92A687, 1, 1, _STRONG, cv2.aruco.DICT_APRILTAG_36h10),
+    Family("tag25h9", 5, 35, 9, 0x155CBF1, 0, 1, _CLEAR, cv2.aruco.DICT_APRILTAG_25h9),
+    Family("tag16h5", 4, 30, 5, 0x231B, 0, 0, _CLEAR, cv2.aruco.DICT_APRILTAG_16h5),
+    Family("tagStandard41h12", 3, 2115, 12, 0x1BC2788B1A4, 2, 2, _STRONG, None),
+    Family("tagStandard52h13", 4, 48714, 13, 0x406B98AB8AA9A, 3, 4, _STRONG, None),
 )
 
 FAMILIES = {family.name: family for family in _ALL}

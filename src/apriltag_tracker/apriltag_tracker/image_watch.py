@@ -138,8 +138,7 @@ class ImageWatch:
             counts, world = tracker.tracker.counts, tracker.world
             values.update(
                 tags_tracked=counts.tracked,
-                tags_by_region=counts.by_region,
-                tags_by_full_search=counts.by_full,
+                tags_by_full_search=counts.by_full_search,
                 full_searches=counts.full_searches,
                 duplicates_rejected=counts.duplicates,
                 unknown_tags=dict(counts.unknown),

@@ -19,10 +19,8 @@ from sensor_msgs.msg import CameraInfo, Image
 from visualization_msgs.msg import MarkerArray
 
 from apriltag_tracker.camera import CameraError, Intrinsics
-from apriltag_tracker.camera.encodings import ImageReader
-from apriltag_tracker.camera.sources import Grabbed, Source, SourceError, open_source
+from apriltag_tracker.camera.images import Grabbed, ImageReader, Source, SourceError, open_source
 from apriltag_tracker.detection import Detector
-from apriltag_tracker.detection.tracking import TrackingOptions
 from apriltag_tracker.image_watch import NO_CALIBRATION, ImageWatch
 from apriltag_tracker.node_messages import limb_markers, tag_message
 from apriltag_tracker.overlay import draw_observation
@@ -170,13 +168,11 @@ class TrackerNode(Node):
                     1.0,
                 ),
             ),
-            tracking=TrackingOptions(
-                full_search_period=number(
-                    "full_search_period",
-                    TrackingOptions.full_search_period,
-                    "s between searches of the whole image; 0 searches every image in full",
-                    60.0,
-                )
+            full_search_period=number(
+                "full_search_period",
+                TrackerOptions.full_search_period,
+                "s between searches of the whole image; 0 searches every image in full",
+                60.0,
             ),
         )
 

@@ -10,10 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apriltag_tracker.camera import CameraPose, Intrinsics
-from apriltag_tracker.detection import Detector
-from apriltag_tracker.detection.tag import ExpectedTag, Tag
-from apriltag_tracker.detection.tracking import TagTracker, TrackingOptions
-from apriltag_tracker.pose.expected import TagPredictor
+from apriltag_tracker.detection import Detector, Tag
+from apriltag_tracker.detection.tracking import FULL_SEARCH_PERIOD, TagTracker
 from apriltag_tracker.pose.plane import centreline_pose, locate, pose_moves
 from apriltag_tracker.pose.shape import LimbEstimate, PlanarTag, ShapeFitter, ShapePrior
 from apriltag_tracker.pose.world import WorldPose
@@ -50,7 +48,8 @@ class TrackerOptions:
         largest_tip_sigma: standard deviation of the tip, noise and systematic together, above which
             it is not told [m].
         prior: how the limb may differ from ideal.
-        tracking: when to search how.
+        full_search_period: s between searches of the whole image while all tags are tracked; 0
+            searches every image in full.
     """
 
     bridge_frames: int = 5
@@ -59,7 +58,7 @@ class TrackerOptions:
     largest_tip_sigma: float = 0.01
     uncertainty: Uncertainty = field(default_factory=Uncertainty)
     prior: ShapePrior = field(default_factory=ShapePrior)
-    tracking: TrackingOptions = field(default_factory=TrackingOptions)
+    full_search_period: float = FULL_SEARCH_PERIOD
 
 
 @dataclass(frozen=True)
@@ -119,9 +118,7 @@ class LimbTracker:
                 f"the detector reads {detector.family.name} but the tag map is of "
                 f"{tags.family.name}: make it by Detector(family=tag_map.family)"
             )
-        detector = detector.through((intrinsics.matrix, intrinsics.distortion))
-        still = [tag.id for tag in tags.world]
-        self.tracker = TagTracker(self._flat, detector, self.options.tracking, still)
+        self.tracker = TagTracker(self._flat, detector, self.options.full_search_period)
         self.world = WorldPose(tags, intrinsics)
         uncertainty = self.options.uncertainty
         self.fitter = ShapeFitter(
@@ -131,7 +128,6 @@ class LimbTracker:
             uncertainty.mounting,
             uncertainty.mounting_angle,
         )
-        self._predictor = TagPredictor(tags, intrinsics, self.fitter)
         self._history: list[tuple[float, LimbEstimate]] = []
         self._bridged = 0
         self.misplaced = 0
@@ -156,9 +152,7 @@ class LimbTracker:
                 f"the image has {gray.shape[1]} x {gray.shape[0]} px but the calibration is for "
                 f"{size.width} x {size.height}: calibrate at the resolution that is used"
             )
-        found = self.tracker.track(
-            gray, stamp, lambda tags: self._expect(tags, stamp), search_later
-        )
+        found = self.tracker.track(gray, stamp, search_later)
         pose = self.world.update(found)
         placed, planar, common, shared_noise = self._place(found, pose)
         if pose is None:
@@ -166,7 +160,6 @@ class LimbTracker:
         estimate = self.fitter.fit(planar, common, shared_noise) if planar else None
         if estimate is None:
             return self._bridge(placed, stamp, bool(planar))
-        self._predictor.remember(stamp, self.fitter.parameters)
         self.misplaced += len(estimate.rejected)
         sigma = estimate.tip_sigma
         if sigma > self.options.largest_tip_sigma:
@@ -182,11 +175,6 @@ class LimbTracker:
     def search_again(self, gray: NDArray[np.uint8]) -> None:
         """Look for duplicates and unknown tags in the last image, if that was left for later."""
         self.tracker.search_again(gray)
-
-    def _expect(self, found: Sequence[Tag], stamp: float) -> list[ExpectedTag]:
-        """Return where the limb's other tags are, if the camera's pose is known."""
-        pose = self.world.pose
-        return [] if pose is None else self._predictor.predict(found, pose, stamp)
 
     def _place(
         self, found: Sequence[Tag], pose: CameraPose | None
@@ -302,7 +290,6 @@ class LimbTracker:
 
 def warm_up(detector: Detector) -> None:
     """Follow a tiny still limb through two images, so that no kernel is compiled in a run."""
-    detector.warm_up()
     family, f = detector.family, 500.0
     side = 5 * family.border_cells
     # 125 mm above the plane, a pixel is a quarter of a millimetre.

@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 
 from der_planner.limb import VENT_REFERENCE, Limb, LimbError
-from der_planner.model import STEPS, Material, RodModel, commands
+from der_planner.model import Model, RodModel, commands
 from der_planner.model.air import Air
-from der_planner.model.commands import slow_venting
-from der_planner.model.series import CONTROL_PERIOD
-from der_planner.planning import METHODS, Motion, plan, planner
+from der_planner.planning import METHODS, Motion, Workspace, plan, planner
+from der_planner.planning.configuration import configure
 from der_planner.planning.optimal import Optimiser
-from der_planner.planning.rod_model import PlanningRod
 
 LIMB = Limb.default()
 EVERY = [(model, method) for model, methods in METHODS.items() for method in methods]
@@ -124,17 +122,11 @@ def test_commands_invert_slow_venting():
     limb = slow(slew_limit=1e6, delay=0.03)
     fine = np.arange(401) * 0.025
     wanted = np.column_stack([5e3 * (1 - np.cos(1.3 * fine)), 6e3 * np.sin(1.1 * fine)])
-    command = commands.commands(RodModel(limb), fine, wanted, np.zeros_like(wanted), 0.05)
+    command = commands.commands(Air(limb.pneumatics), fine, wanted, 0.05)
     middle = (np.arange(len(command)) + 0.5) * 0.05
     exact = np.column_stack([np.interp(middle, fine, column) for column in wanted.T])
     ignorant = dataclasses.replace(limb.pneumatics, vent_rate=0.0)
-    unaware = commands.commands(
-        RodModel(dataclasses.replace(limb, pneumatics=ignorant)),
-        fine,
-        wanted,
-        np.zeros_like(wanted),
-        0.05,
-    )
+    unaware = commands.commands(Air(ignorant), fine, wanted, 0.05)
     known, unknown = (
         np.sqrt(((chambers.mean(axis=1) - exact)[20:] ** 2).mean())
         for chambers in (
@@ -151,11 +143,8 @@ def test_a_plan_faster_than_the_chambers_vent_warns_and_a_slow_one_does_not(mode
     said = [w for w in fast.warnings if "its chamber is vented by" in w]
     assert len(said) == 1
     assert "a longer period or a smaller amplitude" in said[0]
-    time, effective, bend = planner.balance(
-        *_physics(fast), method if method != "optimal" else "projected"
-    )
-    wanted = Material(slow()).differential_pressure(time, effective, bend)
-    numbers = slow_venting(Air(slow().pneumatics), time, wanted)
+    which = method if method != "optimal" else "projected"
+    _, numbers = planner.balance(_configuration(fast), fast.reference, which)
     assert numbers is not None
     assert numbers.wanted > 1.2 * numbers.possible
     assert f"fall by {numbers.wanted:.0f} Pa/s" in said[0]
@@ -163,9 +152,8 @@ def test_a_plan_faster_than_the_chambers_vent_warns_and_a_slow_one_does_not(mode
     assert calm.warnings == ()
 
 
-def _physics(result):
-    physics = planner.models.build(result.limb, result.model, planner.NODES)
-    return physics, physics.configuration(result.reference), result.reference
+def _configuration(result):
+    return configure(Model.of(result.limb, result.model), result.reference)
 
 
 @pytest.mark.parametrize("name", ["asynchronous", "same_direction", "opposite_direction"])
@@ -173,8 +161,7 @@ def test_optimal_makes_more_of_slow_chambers_than_a_balance(name):
     motion = Motion.named(name, period=6.0, cycles=1)
     best, balance = (plan(slow(), motion, "der", method) for method in ("optimal", "projected"))
     ignorant = plan(slow(vent_rate=0.0), motion, "der", "optimal")
-    physics, spline, _ = _physics(best)
-    tip = planner.tip_under(physics, spline, ignorant.differential_pressure)
+    tip = planner.tip_under(_configuration(best), ignorant.differential_pressure)
     unknown = np.linalg.norm(tip - best.tip_reference, axis=1).mean()
     assert best.predicted_error < 0.7 * balance.predicted_error
     assert balance.predicted_error < 0.75 * unknown
@@ -189,13 +176,11 @@ def test_at_twenty_seconds_slow_chambers_cost_next_to_nothing():
 
 def test_gauss_newton_agrees_with_finite_differences_where_chambers_are_limited():
     limb = slow()
-    model = PlanningRod(limb)
-    reference = Motion.named("asynchronous", period=6.0, cycles=1).reference(limb)
-    spline = model.configuration(reference)
-    warm = commands.commands(
-        model, *planner.balance(model, spline, reference, "projected"), CONTROL_PERIOD
-    )
-    solver = Optimiser(model, model.rest, spline, reference, warm, STEPS)
+    model = RodModel(limb)
+    motion = Motion.named("asynchronous", period=6.0, cycles=1)
+    configuration = configure(model, motion.reference(Workspace(model)))
+    warm, _ = planner.balance(configuration, motion.reference(Workspace(model)), "projected")
+    solver = Optimiser(configuration, motion.reference(Workspace(model)), warm)
     quadratic = solver._linearise(solver.drive.window(warm[:100]), solver.start, 0.0)
     time = np.arange(100) * 0.05
     for direction in (np.column_stack([np.sin(time), np.cos(2 * time)]), np.ones((100, 2))):

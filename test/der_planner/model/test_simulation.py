@@ -14,8 +14,7 @@ from der_planner.model import STEPS, Initial, Material, Model, RodModel, simulat
 from der_planner.model.bending import bend_angles
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import Motion, plan
-from der_planner.planning.rod_model import PlanningRod
-from der_planner.planning.ways import sample_spline
+from der_planner.planning.configuration import configure
 
 
 def everything() -> Limb:
@@ -115,15 +114,13 @@ def test_commands_become_pressures_and_shape_by_the_laws():
 
 def test_the_optimal_planner_expects_what_the_laws_say():
     result = plan(LIMB, Motion.named("asynchronous", 0.5, 6.0, 1), "der", "optimal")
-    model = PlanningRod(LIMB)
-    spline = model.configuration(result.reference)
+    configuration = configure(RodModel(LIMB), result.reference)
     middle = (np.arange(len(result.time) * STEPS) + 0.5) * 0.01
     chambers = simulate(LIMB, result.time, commands=result.differential_pressure)
     differential = chambers.differential_pressure.reshape(-1, 2)
-    effective = felt(differential, middle, sample_spline(spline, middle)[0])
-    state = model.begin(spline, result.reference.start)
-    moved = model.rod.simulate(
-        state, effective.reshape(-1, STEPS, 2), CONTROL_PERIOD, substeps=STEPS
+    effective = felt(differential, middle, configuration.bend_at(middle))
+    moved = configuration.model.rod.simulate(
+        configuration.begin, effective.reshape(-1, STEPS, 2), CONTROL_PERIOD, substeps=STEPS
     )
     np.testing.assert_allclose(result.tip_predicted, moved.tip[:-1, :2], atol=1e-8)
 

@@ -21,17 +21,16 @@ from der_planner.page.drawing import (
     reachable_region,
 )
 from der_planner.page.drawing_panel import summary
-from der_planner.planning import PathLimits
-from der_planner.planning.inverse import angle_limits, distance_to_reach
+from der_planner.planning import PathLimits, Workspace
 
 LIMB = Limb.default()
 ARCS = ArcModel(LIMB)
+SPACE = Workspace(ARCS)
 
 
 def test_the_region_holds_what_the_tip_reaches_and_nothing_else() -> None:
     outlines = reachable_region(LIMB)
-    low, high = angle_limits(LIMB)
-    poses = np.random.default_rng(2).uniform(low, high, (300, 2))
+    poses = np.random.default_rng(2).uniform(SPACE.low, SPACE.high, (300, 2))
 
     def inside(point: np.ndarray, margin: float) -> bool:
         scaled = [np.float32(outline) for outline in outlines]
@@ -43,7 +42,7 @@ def test_the_region_holds_what_the_tip_reaches_and_nothing_else() -> None:
     assert all(inside(tip, 1.5e-3) for tip in ARCS.tip(poses))
     for point in np.random.default_rng(3).uniform((-0.1, -0.3), (0.3, 0.3), (60, 2)):
         if inside(point, 0.0):
-            assert distance_to_reach(LIMB, ARCS, point, [0.3, 0.3]) < 1.5e-3
+            assert SPACE.distance_to_reach(point, [0.3, 0.3]) < 1.5e-3
 
 
 def test_a_load_decides_what_is_reached_and_what_draws() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from apriltag_tracker.camera import CameraPose, Intrinsics
 from apriltag_tracker.camera.pinhole import project
-from apriltag_tracker.detection.tag import Tag
+from apriltag_tracker.detection import Tag
 from apriltag_tracker.tag_map import TagMap
 from der_planner.page.picture import LOOKING, Overlay, PictureFeed
 
@@ -60,7 +60,7 @@ def test_pixels_become_metres_where_they_are_drawn() -> None:
     )
     pose = CameraPose.looking_down((0.12, 0.0, 0.8), turn=0.2, tilt=(0.05, -0.03))
     seen = [
-        Tag(entry.id, project(camera, pose, entry.corners()), np.eye(8) * 1e-4, 0.01, 40.0, 1.0)
+        Tag(entry.id, project(camera, pose, entry.corners()), np.eye(8) * 1e-4, 0.01)
         for entry in tags.world
     ]  # fmt: skip
     overlay.put_camera(camera)

@@ -14,7 +14,7 @@ VENTED = (12.0, -40.0)
 """Differential pressures [Pa] of a limb that is vented, as its sensors have it."""
 
 
-class Rig:
+class GuidedSetup:
     """What the page hears, and the guide's steps."""
 
     def __init__(self) -> None:
@@ -42,13 +42,13 @@ class Rig:
 
 
 def test_nothing_is_done_before_anything_is_heard() -> None:
-    steps = Rig().steps("no calibration yet", calibrated=False)
+    steps = GuidedSetup().steps("no calibration yet", calibrated=False)
     assert not any(step.done for step in steps)
     assert all(step.seen and step.advice for step in steps)
 
 
 def test_a_running_rig_passes_until_it_falls_silent() -> None:
-    rig = Rig()
+    rig = GuidedSetup()
     rig.drive(VENTED)
     rig.situation.put_limb(LimbState(valid=True))
     rig.plan_for("ours")
@@ -58,7 +58,7 @@ def test_a_running_rig_passes_until_it_falls_silent() -> None:
 
 
 def test_each_chamber_counts_only_if_it_is_driven_alone() -> None:
-    rig = Rig()
+    rig = GuidedSetup()
     for measured in ((5e3, 5e3), (2e3, 0.0), (float("nan"), 5e3)):
         rig.drive(measured, mode=2)
         rig.steps()
@@ -71,7 +71,7 @@ def test_each_chamber_counts_only_if_it_is_driven_alone() -> None:
 
 
 def test_pressure_that_stays_and_the_shipped_limb_are_no_success() -> None:
-    rig = Rig()
+    rig = GuidedSetup()
     rig.drive((1500.0, 0.0))
     rig.plan_for("shipped")
     steps = rig.steps()
@@ -86,7 +86,7 @@ def test_pressure_that_stays_and_the_shipped_limb_are_no_success() -> None:
 
 
 def test_a_calibration_run_is_seen_while_and_after_it_is_played() -> None:
-    rig = Rig()
+    rig = GuidedSetup()
     rig.drive(VENTED, mode=2, plan_id="calibration-12ab34cd")
     assert (rig.steps()[6].done, rig.steps()[6].seen) == (False, "one is being played")
     rig.drive(VENTED)

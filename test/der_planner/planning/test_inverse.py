@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from der_planner.limb import Limb
-from der_planner.model import ArcModel
+from der_planner.model import ArcModel, RodModel
 from der_planner.model.bending import PolylineKinematics, bend_angles
-from der_planner.planning import inverse
-from der_planner.planning.rod_model import PlanningRod
+from der_planner.planning import Workspace, inverse
 from der_planner.rod import Rod
 
 LIMB = Limb.default()
 ARCS = ArcModel(LIMB)
-CHAIN = PlanningRod(LIMB).kinematics
+SPACE = Workspace(ARCS)
+CHAIN = RodModel(LIMB).kinematics
 
 
 def polyline(count):
@@ -47,7 +47,7 @@ def test_an_evenly_bent_chain_has_these_bend_angles_and_tangents(angles):
 
 def test_a_stiff_base_moves_the_limb_along_x():
     based = replace(LIMB, base_length=7e-3)
-    model, rod = PlanningRod(based), Rod.from_limb(based, 21)
+    model, rod = RodModel(based), Rod.from_limb(based, 21)
     angles = [0.9, -0.4]
     q = PolylineKinematics.of_rod(rod).configuration(angles)
     np.testing.assert_allclose(model.kinematics.nodes(angles), rod.positions(q)[:, :2], atol=1e-14)
@@ -93,7 +93,7 @@ def test_inverse_of_forward_is_the_identity(kinematics):
 
 def test_both_branches_are_found_and_named():
     point = ARCS.tip(np.radians([35.0, 20.0]))
-    found = inverse.solutions(LIMB, ARCS, point)
+    found = SPACE.solutions(point)
     assert {item.branch for item in found} == set(inverse.BRANCHES)
     assert len(found) == 2
     for item in found:
@@ -109,7 +109,7 @@ def test_a_path_stays_on_the_branch_it_was_given(branch):
     turn = np.linspace(0, 2 * np.pi, 50)
     centre = ARCS.tip(np.radians([35.0, 20.0]))
     tip = centre + 0.003 * np.column_stack([np.cos(turn), np.sin(turn)])
-    angles = inverse.follow(LIMB, ARCS, turn, tip, branch)
+    angles = SPACE.follow(turn, tip, branch)
     assert {inverse.branch_of(ARCS, q) for q in angles} == {branch}
     np.testing.assert_allclose(ARCS.tip(angles), tip, atol=1e-8)
     assert np.abs(np.diff(angles, axis=0)).max() < 0.1
@@ -143,20 +143,20 @@ def test_more_than_two_segments_stay_near_the_first_guess(count):
 
 
 def test_distance_to_reach_agrees_with_a_search():
-    low, high = inverse.angle_limits(LIMB)
+    low, high = SPACE.low, SPACE.high
     grid = np.stack(
         np.meshgrid(*(np.linspace(a, b, 301) for a, b in zip(low, high, strict=True))), -1
     )
     tips = ARCS.tip(grid).reshape(-1, 2)
     for point in ([0.26, 0.10], [0.10, 0.02], [0.0, 0.0]):
         searched = np.linalg.norm(tips - point, axis=1).min()
-        found = inverse.distance_to_reach(LIMB, ARCS, point, np.array([0.1, 0.1]))
+        found = SPACE.distance_to_reach(point, np.array([0.1, 0.1]))
         assert found <= searched + 1e-9
         assert found == pytest.approx(searched, abs=1e-3)
 
 
 def test_static_pressure_inverts_the_angle_limits():
-    low, high = inverse.angle_limits(LIMB)
+    low, high = SPACE.low, SPACE.high
     np.testing.assert_allclose(
-        inverse.static_pressure(LIMB, [low, high]), [[-24e3] * 2, [24e3] * 2], rtol=1e-9
+        SPACE.static_pressure([low, high]), [[-24e3] * 2, [24e3] * 2], rtol=1e-9
     )

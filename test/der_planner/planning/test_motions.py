@@ -6,17 +6,25 @@ import numpy as np
 import pytest
 
 from der_planner.limb import Limb
-from der_planner.model import ArcModel
-from der_planner.planning import NAMES, Motion, PathLimits, PlanningError, UnreachableError
+from der_planner.model import ArcModel, RodModel
+from der_planner.planning import (
+    NAMES,
+    Motion,
+    PathLimits,
+    PlanningError,
+    UnreachableError,
+    Workspace,
+)
 from der_planner.planning.motions import JOINT_MOTIONS
 from der_planner.planning.paths import TipPath
 
 LIMB = Limb.default()
+SPACE = Workspace(RodModel(LIMB))
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_motion_starts_and_ends_at_rest_in_the_straight_pose(name):
-    reference = Motion.named(name, amplitude=0.6, period=6.0, cycles=1).reference(LIMB)
+    reference = Motion.named(name, amplitude=0.6, period=6.0, cycles=1).reference(SPACE)
     ends = np.array([0.0, reference.duration])
     angles, rates, accelerations = reference.sample(ends)
     np.testing.assert_allclose(angles, 0.0, atol=1e-8)
@@ -28,7 +36,7 @@ def test_every_motion_starts_and_ends_at_rest_in_the_straight_pose(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_rates_and_accelerations_are_derivatives(name):
-    reference = Motion.named(name, amplitude=0.6, period=4.0, cycles=1).reference(LIMB)
+    reference = Motion.named(name, amplitude=0.6, period=4.0, cycles=1).reference(SPACE)
     time = np.linspace(0.2, reference.duration - 0.2, 57)
     h = 1e-4
     _, rates, accelerations = reference.sample(time)
@@ -47,7 +55,7 @@ def test_rates_and_accelerations_are_derivatives(name):
     ],
 )
 def test_named_motions_follow_the_papers_formulas_after_the_fade(name, second):
-    reference = Motion.named(name, amplitude=0.7, period=8.0, cycles=2).reference(LIMB)
+    reference = Motion.named(name, amplitude=0.7, period=8.0, cycles=2).reference(SPACE)
     time = np.linspace(2.0, 16.0, 200)
     angles, _, _ = reference.sample(time)
     np.testing.assert_allclose(
@@ -58,7 +66,7 @@ def test_named_motions_follow_the_papers_formulas_after_the_fade(name, second):
 
 def test_reference_is_the_tip_of_the_arcs():
     for name in NAMES:
-        reference = Motion.named(name, amplitude=0.6, period=5.0).reference(LIMB)
+        reference = Motion.named(name, amplitude=0.6, period=5.0).reference(SPACE)
         tip = ArcModel(LIMB).tip(reference.bend_angles)
         np.testing.assert_allclose(reference.tip, tip, atol=1e-12)
 
@@ -68,16 +76,18 @@ def test_motions_work_for_any_number_of_segments(name):
     content = LIMB.segments[0]
     for count in (1, 3, 4):
         limb = Limb("many", (content,) * count, LIMB.pneumatics)
-        reference = Motion.named(name, amplitude=0.5, period=4.0, cycles=1).reference(limb)
+        reference = Motion.named(name, amplitude=0.5, period=4.0, cycles=1).reference(
+            Workspace(RodModel(limb))
+        )
         assert reference.bend_angles.shape == (len(reference.time), count)
         assert np.abs(reference.bend_angles).max() == pytest.approx(0.5, rel=0.02)
 
 
 def test_a_tip_path_is_followed_in_its_own_time():
-    start = Motion.named("circle", amplitude=0.7, period=8.0, cycles=1).reference(LIMB)
+    start = Motion.named("circle", amplitude=0.7, period=8.0, cycles=1).reference(SPACE)
     middle = slice(60, 160)
     time, tip = start.time[middle] + 5.0, start.tip[middle]
-    reference = Motion.from_tip_path(time, tip).reference(LIMB)
+    reference = Motion.from_tip_path(time, tip).reference(SPACE)
     lead = np.argmin(np.linalg.norm(reference.tip - tip[0], axis=1))
     followed = reference.tip[lead : lead + len(tip)]
     assert np.linalg.norm(followed - tip, axis=1).max() < 2e-5
@@ -85,7 +95,7 @@ def test_a_tip_path_is_followed_in_its_own_time():
 
 def test_a_path_without_times_keeps_the_limits():
     turn = np.linspace(0, 2 * np.pi, 60)
-    centre = Motion.named("circle").reference(LIMB).tip.mean(axis=0)
+    centre = Motion.named("circle").reference(SPACE).tip.mean(axis=0)
     points = centre + 0.008 * np.column_stack([np.cos(turn), np.sin(turn)])
     limits = PathLimits(speed=0.02, acceleration=0.03)
     path = TipPath.build(None, points, limits)
@@ -103,10 +113,10 @@ def test_csv_paths(tmp_path):
     file.write_text("time, x, y\n0, 0.20, 0.10\n1, 0.195, 0.11\n2, 0.19, 0.12\n")
     motion = Motion.from_csv(file)
     assert motion.name == "spot"
-    reference = motion.reference(LIMB)
+    reference = motion.reference(SPACE)
     assert np.linalg.norm(reference.tip - [0.195, 0.11], axis=1).min() < 1e-4
     file.write_text("x,y\n0.20,0.10\n0.19,0.12\n")
-    assert Motion.from_csv(file).reference(LIMB).duration > 2.0
+    assert Motion.from_csv(file).reference(SPACE).duration > 2.0
     for header in ("t_ms, x [cm], y [mm]", "time [ms], x (cm), y_mm, remark"):
         file.write_text(f"{header}\n0, 20, 100, start\n1000, 19.5, 110,\n\n2000, 19, 120, end\n")
         path = Motion.from_csv(file).path
@@ -162,7 +172,7 @@ def test_an_unreachable_path_names_time_point_and_distance():
     time = np.linspace(0, 4, 41)
     tip = np.column_stack([np.linspace(0.20, 0.26, 41), np.full(41, 0.10)])
     with pytest.raises(UnreachableError) as caught:
-        Motion.from_tip_path(time, tip).reference(LIMB)
+        Motion.from_tip_path(time, tip).reference(SPACE)
     error = caught.value
     assert 0.5 < error.time < 2.0
     assert error.point[1] == pytest.approx(0.10)
@@ -175,5 +185,5 @@ def test_a_pose_beyond_the_pressure_limit_says_what_it_would_need():
     weak = Limb("weak", LIMB.segments, type(LIMB.pneumatics)(10e3, 9e3, 9e3, 0.15))
     tip = ArcModel(weak).tip(np.radians([[45.0, 45.0], [46.0, 46.0]]))
     with pytest.raises(UnreachableError, match=r"it would need 1\d\.\d kPa") as caught:
-        Motion.from_tip_path([0.0, 1.0], tip).reference(weak)
+        Motion.from_tip_path([0.0, 1.0], tip).reference(Workspace(RodModel(weak)))
     assert caught.value.required_pressure == pytest.approx(12.4e3, rel=0.01)

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from der_planner.limb import Limb
-from der_planner.model import ArcModel
-from der_planner.planning import Motion, PlanningError, plan
-from der_planner.planning.inverse import BRANCHES, angle_limits, distance_to_reach
+from der_planner.model import ArcModel, RodModel
+from der_planner.planning import Motion, PlanningError, Workspace, plan
+from der_planner.planning.inverse import BRANCHES
 
 LIMB = Limb.default()
 ARCS = ArcModel(LIMB)
+SPACE = Workspace(RodModel(LIMB))
 CENTRE = ARCS.tip([0.9, 0.9])
 TURN = np.linspace(0.0, 2 * np.pi, 90)
 RING = np.column_stack([np.cos(TURN), np.sin(TURN)])
@@ -38,8 +39,8 @@ FOREIGN = {
 
 @pytest.mark.parametrize("drawn", FOREIGN)
 def test_what_comes_out_can_be_followed(drawn):
-    reference = Motion.from_tip_path(*FOREIGN[drawn], nearest=True).reference(LIMB)
-    low, high = angle_limits(LIMB)
+    reference = Motion.from_tip_path(*FOREIGN[drawn], nearest=True).reference(SPACE)
+    low, high = SPACE.low, SPACE.high
     assert np.all(reference.bend_angles >= low)
     assert np.all(reference.bend_angles <= high)
     steps = np.abs(np.diff(reference.bend_angles, axis=0)).max() / 0.05
@@ -49,11 +50,11 @@ def test_what_comes_out_can_be_followed(drawn):
 
 
 def test_a_path_within_reach_stays_as_it_is():
-    named = Motion.named("circle", amplitude=0.7, period=8.0, cycles=1).reference(LIMB)
+    named = Motion.named("circle", amplitude=0.7, period=8.0, cycles=1).reference(SPACE)
     inner = slice(60, 160)
     time, tip = named.time[inner], named.tip[inner]
-    plain = Motion.from_tip_path(time, tip).reference(LIMB)
-    nearest = Motion.from_tip_path(time, tip, nearest=True).reference(LIMB)
+    plain = Motion.from_tip_path(time, tip).reference(SPACE)
+    nearest = Motion.from_tip_path(time, tip, nearest=True).reference(SPACE)
     assert nearest.deviation.largest < 2e-4
     assert nearest.deviation.slowed == 1.0
     assert str(nearest.deviation) == ""
@@ -65,8 +66,8 @@ def test_a_path_within_reach_stays_as_it_is():
 
 def test_the_deviation_is_that_of_the_nearest_points():
     time, tip = FOREIGN["one place out of reach, for a while"]
-    deviation = Motion.from_tip_path(time, tip, nearest=True).reference(LIMB).deviation
-    truth = distance_to_reach(LIMB, ARCS, tip[0], [1.0, 1.0])
+    deviation = Motion.from_tip_path(time, tip, nearest=True).reference(SPACE).deviation
+    truth = SPACE.distance_to_reach(tip[0], [1.0, 1.0])
     assert deviation.mean == pytest.approx(truth, rel=0.01)
     assert deviation.share == 1.0
 
@@ -74,7 +75,7 @@ def test_the_deviation_is_that_of_the_nearest_points():
 def test_where_the_path_is_left_is_said():
     line = np.linspace(CENTRE - [0.004, 0.0], CENTRE + np.array([0.06, 0.0]), 40)
     motion = Motion.from_tip_path(np.linspace(0, 10, 40), line, nearest=True)
-    deviation = motion.reference(LIMB).deviation
+    deviation = motion.reference(SPACE).deviation
     assert deviation.point == pytest.approx(line[-1], abs=1e-3)
     assert len(deviation.spans) == 1
     begin, end = deviation.spans[0]
@@ -85,7 +86,7 @@ def test_where_the_path_is_left_is_said():
 def test_a_trembling_hand_is_smoothed():
     radius = np.linalg.norm(TREMBLING - CENTRE, axis=1).std()
     small = CENTRE + 0.4 * (TREMBLING - NOISE - CENTRE) + NOISE
-    reference = Motion.from_tip_path(None, small, nearest=True).reference(LIMB)
+    reference = Motion.from_tip_path(None, small, nearest=True).reference(SPACE)
     on_circle = np.linalg.norm(reference.tip - CENTRE, axis=1)
     inner = slice(len(on_circle) // 3, 2 * len(on_circle) // 3)
     assert on_circle[inner].std() < 0.3 * radius
@@ -96,7 +97,7 @@ def test_a_trembling_hand_is_smoothed():
 def test_a_branch_that_was_named_is_kept():
     for branch in BRANCHES:
         motion = Motion.from_tip_path(None, CENTRE + 0.02 * RING, branch=branch, nearest=True)
-        path = motion.reference(LIMB)
+        path = motion.reference(SPACE)
         inner = path.bend_angles[len(path.time) // 4 : 3 * len(path.time) // 4]
         sides = np.linalg.det(ARCS.tip_jacobians(inner)) * (1 if branch == BRANCHES[0] else -1)
         assert sides.min() > -3e-4  # m²/rad²: it may lean on the fold
@@ -107,7 +108,9 @@ def test_a_branch_that_was_named_is_kept():
 def test_other_numbers_of_segments(segments):
     limb = replace(LIMB, segments=(LIMB.segments[0],) * segments)
     centre = ArcModel(limb).tip(np.full(segments, 0.6))
-    reference = Motion.from_tip_path(None, centre + 0.02 * RING, nearest=True).reference(limb)
+    reference = Motion.from_tip_path(None, centre + 0.02 * RING, nearest=True).reference(
+        Workspace(RodModel(limb))
+    )
     assert reference.bend_angles.shape == (len(reference.time), segments)
     assert reference.deviation.mean < 0.015
 

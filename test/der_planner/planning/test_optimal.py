@@ -5,25 +5,22 @@ import pytest
 from scipy.optimize import minimize
 
 from der_planner.limb import Limb
-from der_planner.model import STEPS, commands
+from der_planner.model import RodModel
 from der_planner.model.series import CONTROL_PERIOD
-from der_planner.planning import Motion, plan, planner
-from der_planner.planning.optimal import Optimiser, Settings
+from der_planner.planning import Motion, Workspace, plan, planner
+from der_planner.planning.configuration import configure
+from der_planner.planning.optimal import Optimiser, OptimiserSettings
 from der_planner.planning.quadratic import Band, solve_limited
-from der_planner.planning.rod_model import PlanningRod
 
 LIMB = Limb.default()
 
 
 def solver_for(limb, motion, **settings):
-    model = PlanningRod(limb)
-    reference = motion.reference(limb)
-    spline = model.configuration(reference)
-    warm = commands.commands(
-        model, *planner.balance(model, spline, reference, "projected"), CONTROL_PERIOD
-    )
-    begin = model.begin(spline, reference.start)
-    return Optimiser(model, begin, spline, reference, warm, STEPS, Settings(**settings))
+    model = RodModel(limb)
+    reference = motion.reference(Workspace(model))
+    configuration = configure(model, reference)
+    warm, _ = planner.balance(configuration, reference, "projected")
+    return Optimiser(configuration, reference, warm, OptimiserSettings(**settings))
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +70,7 @@ def test_windows_agree_with_one_window():
     motion = Motion.named("opposite_direction", period=6.0, cycles=1)
     whole = solver_for(LIMB, motion, window=1000, settled=1000).run()
     windows = solver_for(LIMB, motion).run()
-    assert len(windows.commands) > 1.2 * Settings().window
+    assert len(windows.commands) > 1.2 * OptimiserSettings().window
     assert np.abs(whole.tip - windows.tip).max() < 5e-5
     assert np.abs(whole.commands - windows.commands).max() < 60.0
 
@@ -81,9 +78,8 @@ def test_windows_agree_with_one_window():
 def test_predicted_tip_is_the_one_the_rod_gives_again():
     motion = Motion.named("asynchronous", period=5.0, cycles=2)
     result = plan(LIMB, motion, "der", "optimal")
-    model = PlanningRod(LIMB)
-    spline = model.configuration(result.reference)
-    again = planner.tip_under(model, spline, result.differential_pressure)
+    configuration = configure(RodModel(LIMB), result.reference)
+    again = planner.tip_under(configuration, result.differential_pressure)
     np.testing.assert_allclose(result.tip_predicted, again, atol=1e-10)
 
 

@@ -15,13 +15,14 @@ from der_planner.planning import (
     PlanningError,
     Start,
     UnreachableError,
+    Workspace,
     plan,
 )
-from der_planner.planning.inverse import static_pressure
-from der_planner.planning.rod_model import PlanningRod
-from der_planner.planning.ways import resting_spline
+from der_planner.planning.configuration import RodConfiguration
+from der_planner.planning.transitions import resting_spline
 
 LIMB = Limb.default()
+SPACE = Workspace(RodModel(LIMB))
 CASES = ("asynchronous", "same_direction", "opposite_direction")
 EVERY = [(model, method) for model, methods in METHODS.items() for method in methods]
 
@@ -59,7 +60,7 @@ FREE = changed(LIMB, {"slew_limit": 1e6, "pressure_limit": 1e5})
 
 @pytest.fixture(scope="module")
 def model():
-    return PlanningRod(UNEVEN)
+    return RodModel(UNEVEN)
 
 
 def curvatures(rod, nodes):
@@ -146,10 +147,10 @@ def test_at_rest_every_method_is_the_static_inversion(method, model):
 
 @pytest.mark.parametrize("name", CASES)
 def test_paper_becomes_the_static_inversion_as_speed_goes_to_zero(name):
-    model = PlanningRod(LIMB)
+    model = RodModel(LIMB)
     gaps = []
     for period in (10.0, 20.0, 40.0):
-        reference = Motion.named(name, period=period, cycles=1).reference(LIMB)
+        reference = Motion.named(name, period=period, cycles=1).reference(SPACE)
         q, v, a = reference.sample(reference.time)
         moving = model.balance.paper(q, v, a)
         resting = model.balance.paper(q, 0 * v, 0 * a)
@@ -159,7 +160,7 @@ def test_paper_becomes_the_static_inversion_as_speed_goes_to_zero(name):
 
 
 def test_the_papers_gains_add_nothing_without_an_error_and_little_with_one():
-    model = PlanningRod(LIMB)
+    model = RodModel(LIMB)
     q = np.tile([0.3, 0.2], (40, 1))
     zero = np.zeros_like(q)
     balance = model.balance.paper(q[:1], zero[:1], zero[:1])[0]
@@ -167,10 +168,10 @@ def test_the_papers_gains_add_nothing_without_an_error_and_little_with_one():
     # the couples, so that a distributed error hardly comes back.
     time = 0.025 * np.arange(40)
     still = resting_spline(time, q)
-    away = model.pressures("paper", still, time)
+    away = RodConfiguration(model, still, None).pressures("paper", time)
     assert 1e-5 < np.abs(away[0] / balance - 1).max() < 1e-2
     model.rest = model.rod.equilibrium(balance)
-    settled = model.pressures("paper", still, time)
+    settled = RodConfiguration(model, still, None).pressures("paper", time)
     np.testing.assert_allclose(settled, np.tile(balance, (40, 1)), rtol=1e-6)
 
 
@@ -243,7 +244,7 @@ def test_a_plan_begins_and_ends_vented():
 def test_a_plan_takes_over_from_a_moving_limb(model_name, method):
     first = Motion.named("asynchronous", amplitude=0.5, period=8.0, cycles=1)
     before = plan(LIMB, first, model_name, method)
-    reference = first.reference(LIMB)
+    reference = first.reference(SPACE)
     k = 70
     angles, rates, accelerations = reference.sample(reference.time[k])
     start = Start(angles, rates, accelerations, before.differential_pressure[k - 1])
@@ -345,8 +346,7 @@ def test_commands_invert_hold_lag_and_delay():
     limb = changed(LIMB, {"delay": 0.03})
     fine = np.arange(401) * 0.025
     wanted = np.column_stack([4e3 * (1 - np.cos(fine)), 2e3 * np.sin(0.7 * fine) ** 2])
-    bend = np.zeros_like(wanted)
-    command = commands.commands(RodModel(limb), fine, wanted, bend, 0.05)
+    command = commands.commands(Air(limb.pneumatics), fine, wanted, 0.05)
     chambers = Air(limb.pneumatics).follow(command, 0.05, 5).differential
     middle = (np.arange(len(command) * 5) + 0.5) * 0.01
     exact = np.column_stack([np.interp(middle, fine, column) for column in wanted.T])
@@ -364,6 +364,6 @@ def test_the_optimum_is_found_in_few_steps_whatever_the_dead_time(name, period):
 
 def test_static_pressure_holds_the_angles_of_the_rod():
     angles = np.array([0.5, -0.6])
-    rod = PlanningRod(LIMB).rod
-    resting = rod.equilibrium(static_pressure(LIMB, angles))
+    rod = RodModel(LIMB).rod
+    resting = rod.equilibrium(SPACE.static_pressure(angles))
     np.testing.assert_allclose(bend_angles(rod, resting.q), angles, rtol=2e-3)

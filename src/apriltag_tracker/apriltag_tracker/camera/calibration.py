@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from apriltag_tracker.camera.images import check_grey
 from apriltag_tracker.camera.pinhole import Intrinsics
-from apriltag_tracker.detection.detector import Detector
-from apriltag_tracker.detection.picture import grey
+from apriltag_tracker.detection import Detector
 from apriltag_tracker.pipeline import LimbTracker
 from apriltag_tracker.sheets import BoardLayout
 from apriltag_tracker.tag_map import LimbTag, TagMap
@@ -73,7 +73,7 @@ class BoardFinder:
 
     def find(self, image: NDArray[np.uint8], name: str) -> BoardView | None:
         """Return the corners of the board, None if fewer than twelve are seen."""
-        gray = grey(image)
+        gray = check_grey(image)
         corners, ids, _, _ = self._detector.detectBoard(gray)
         if ids is None or len(ids) < _LEAST_CORNERS:
             return None
@@ -231,7 +231,7 @@ def calibrate_mounting(
     seen: dict[int, list[NDArray[np.float64]]] = {tag.id: [] for tag in tags.limb}
     count = 0
     for count, image in enumerate(images, 1):
-        observation = tracker.observe(grey(image), float(count))
+        observation = tracker.observe(check_grey(image), float(count))
         for placed in observation.tags:
             if placed.on_limb and placed.pose is not None:
                 seen[placed.tag.id].append(placed.pose)

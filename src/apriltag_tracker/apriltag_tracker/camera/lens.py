@@ -13,11 +13,8 @@ from numpy.typing import NDArray
 
 COEFFICIENTS = 8
 
-_BEND_STEP = 10.0
-"""Of differences, about the reach of a tag [px]."""
 
-
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def distort(x: float, y: float, d: NDArray[np.float64]) -> tuple[float, float]:
     """Return where the lens puts a normalised point."""
     r2 = x * x + y * y
@@ -29,7 +26,7 @@ def distort(x: float, y: float, d: NDArray[np.float64]) -> tuple[float, float]:
     return xd, yd
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def undistort(xd: float, yd: float, d: NDArray[np.float64]) -> tuple[float, float]:
     """Return the normalised point that the lens puts at (xd, yd): Newton with numeric slopes."""
     x, y = xd, yd
@@ -51,7 +48,7 @@ def undistort(xd: float, yd: float, d: NDArray[np.float64]) -> tuple[float, floa
     return x, y
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def undistort_pixels(
     pixels: NDArray[np.float64], matrix: NDArray[np.float64], d: NDArray[np.float64]
 ) -> NDArray[np.float64]:
@@ -64,7 +61,7 @@ def undistort_pixels(
     return out
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def distort_to_pixels(
     normalised: NDArray[np.float64], matrix: NDArray[np.float64], d: NDArray[np.float64]
 ) -> NDArray[np.float64]:
@@ -77,34 +74,7 @@ def distort_to_pixels(
     return out
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def local_bend(
-    corners: NDArray[np.float64], matrix: NDArray[np.float64], d: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return how the lens bends straight lines around a tag, to second order, (6,) 1/px.
-
-    With x, y from the mean of the corners (4, 2) px, x + b0 x² + b1 x y + b2 y² and y + b3 x² +
-    b4 x y + b5 y² are an affine map of where a lens without distortion would have the point.
-    """
-    places = np.empty((9, 2))
-    for k in range(9):
-        places[k, 0] = corners[:, 0].mean() + _BEND_STEP * (k % 3 - 1)
-        places[k, 1] = corners[:, 1].mean() + _BEND_STEP * (k // 3 - 1)
-    u = undistort_pixels(places, matrix, d)
-    by_x, by_y = 0.5 * (u[5] - u[3]) / _BEND_STEP, 0.5 * (u[7] - u[1]) / _BEND_STEP
-    second = np.empty((3, 2))
-    second[0] = 0.5 * (u[5] - 2.0 * u[4] + u[3]) / _BEND_STEP**2
-    second[1] = 0.25 * (u[8] - u[6] - u[2] + u[0]) / _BEND_STEP**2
-    second[2] = 0.5 * (u[7] - 2.0 * u[4] + u[1]) / _BEND_STEP**2
-    determinant = by_x[0] * by_y[1] - by_y[0] * by_x[1]
-    bend = np.empty(6)
-    for k in range(3):
-        bend[k] = (by_y[1] * second[k, 0] - by_y[0] * second[k, 1]) / determinant
-        bend[3 + k] = (by_x[0] * second[k, 1] - by_x[1] * second[k, 0]) / determinant
-    return bend
-
-
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def ray_map(
     width: int, height: int, matrix: NDArray[np.float64], d: NDArray[np.float64]
 ) -> NDArray[np.float32]:

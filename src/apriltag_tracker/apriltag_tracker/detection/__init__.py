@@ -1,7 +1,5 @@
 """Finds tags in an image: candidates, their corners, their codes, and following them over time."""
 
-from apriltag_tracker.detection.detector import Detector
-from apriltag_tracker.detection.picture import grey
-from apriltag_tracker.detection.quads import check_orientation
+from apriltag_tracker.detection.detector import Detector, Tag
 
-__all__ = ["Detector", "check_orientation", "grey"]
+__all__ = ["Detector", "Tag"]

@@ -5,6 +5,8 @@ profile's slope lies under a Gaussian window: this does not depend on the levels
 nor on light that changes slowly, and a symmetric blur does not move it. A line goes through the
 crossings of a side, outliers are taken out, and neighbouring lines are intersected. Passes are
 repeated from the corners of the one before until these stay.
+
+The covariance of the corners is that of the crossings about their lines.
 """
 
 from __future__ import annotations
@@ -15,23 +17,38 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-MAX_SAMPLES = 96
-EDGE_VALUES = 6
-"""Per side: angle, offset variance, angle variance, residual RMS, used fraction, contrast."""
+SIDE_VALUES = 7
+"""A fitted side has its middle x and y [px], its direction x and y, the variances of its offset
+[px²] and of its angle [rad²], and the RMS residual of its crossings [px]."""
+
+_MAX_SAMPLES = 96
+"""A side is crossed by at most this many profiles."""
 
 _PROFILE = 9
+"""A profile has this many samples."""
+
 _GAUSSIAN = 0.9
-"""Standard deviation of the window in which slopes count [px]."""
+"""The Gaussian window in which slopes count has this standard deviation [px]."""
 
 _USUAL_BLUR = 0.7
-"""Of edges: lens and pixel together [px]."""
+"""Edges of a sharp picture have this standard deviation, lens and pixel together [px]."""
 
 _COARSE_PASSES, _FINE_PASSES = 3, 8
-_NEAR, _SETTLED = 0.5, 0.02
-"""Passes end when no corner moves further than this, coarse and fine [px]."""
+
+_NEAR = 0.5
+"""Coarse passes end when no corner moves further than this [px]."""
+
+_SETTLED = 0.02
+"""Fine passes end when no corner moves further than this [px]."""
+
+_LEAST_CONTRAST = 8.0
+"""A side whose white is not brighter than its black by this is no side [grey levels]."""
+
+_MODEL_ERROR = 0.004
+"""Crossings scatter by this at least, whatever the noise [px]."""
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def sample(image: NDArray[np.uint8], x: float, y: float) -> float:
     """Return the bilinear intensity at a point well inside of the image."""
     column, row = np.uintp(x), np.uintp(y)
@@ -42,13 +59,13 @@ def sample(image: NDArray[np.uint8], x: float, y: float) -> float:
     return float(top * (1.0 - b) + low * b)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def inside(image: NDArray[np.uint8], x: float, y: float) -> bool:
     """Tell whether a point can be sampled."""
     return bool(0.0 <= x < image.shape[1] - 1.001 and 0.0 <= y < image.shape[0] - 1.001)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _coarse_crossing(profile: NDArray[np.float64], window: float) -> tuple[float, float]:
     """Return offset of the edge from the middle of a profile [px] and its contrast.
 
@@ -66,7 +83,7 @@ def _coarse_crossing(profile: NDArray[np.float64], window: float) -> tuple[float
     return (moment / weight if weight > 0.0 else 0.0), contrast
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _fine_crossings(
     profiles: NDArray[np.float64],
     usable: NDArray[np.bool_],
@@ -80,9 +97,8 @@ def _fine_crossings(
     which the gain undoes for a usual blur and the next pass for any.
     """
     step = 2.0 * window / (_PROFILE - 1)
-    weights = np.empty(_PROFILE - 1)
-    for k in range(_PROFILE - 1):
-        weights[k] = math.exp(-0.5 * ((-window + (k + 0.5) * step) / _GAUSSIAN) ** 2)
+    places = -window + (np.arange(_PROFILE - 1) + 0.5) * step
+    weights = np.exp(-0.5 * (places / _GAUSSIAN) ** 2)
     total, count = 0.0, 0
     for i in range(profiles.shape[0]):
         if not usable[i]:
@@ -90,7 +106,7 @@ def _fine_crossings(
         moment = 0.0
         for k in range(_PROFILE - 1):
             slope = weights[k] * (profiles[i, k + 1] - profiles[i, k])
-            moment += slope * (-window + (k + 0.5) * step)
+            moment += slope * places[k]
             total += slope
         across[i] = moment
         count += 1
@@ -102,7 +118,7 @@ def _fine_crossings(
             across[i] *= gain * count / total
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _fit_line(
     along: NDArray[np.float64],
     across: NDArray[np.float64],
@@ -144,7 +160,7 @@ def _fit_line(
     return True
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _fit_side(
     image: NDArray[np.uint8],
     start: NDArray[np.float64],
@@ -152,10 +168,9 @@ def _fit_side(
     turn: float,
     window: float,
     coarse: bool,
-    line: NDArray[np.float64],
-    stats: NDArray[np.float64],
+    fitted: NDArray[np.float64],
 ) -> bool:
-    """Fit the line of one side; `line` becomes (middle x, y, direction x, y)."""
+    """Fit the line of one side and write it, see `SIDE_VALUES`; False if there is no side."""
     length = math.hypot(end[0] - start[0], end[1] - start[1])
     if length < 4.0:
         return False
@@ -163,7 +178,7 @@ def _fit_side(
     nx, ny = turn * ty, -turn * tx
     middle_x, middle_y = 0.5 * (start[0] + end[0]), 0.5 * (start[1] + end[1])
     inset = min(max(1.5, 0.05 * length), 0.25 * length)
-    count = min(max(int(length - 2.0 * inset), 6), MAX_SAMPLES)
+    count = min(max(int(length - 2.0 * inset), 6), _MAX_SAMPLES)
     spacing = (length - 2.0 * inset) / (count - 1)
     along, across, contrasts = np.empty(count), np.zeros(count), np.zeros(count)
     profiles = np.zeros((count, _PROFILE))
@@ -181,7 +196,7 @@ def _fit_side(
         else:
             contrasts[i] = profiles[i, _PROFILE - 1] - profiles[i, 0]
     typical = np.median(contrasts)
-    if typical < 8.0:
+    if typical < _LEAST_CONTRAST:
         return False
     usable = contrasts > 0.6 * typical
     if not coarse:
@@ -191,42 +206,37 @@ def _fit_side(
     if not _fit_line(along, across, usable.astype(np.float64), fit):
         return False
     middle, slope, mean, spread, rms, used = fit
-    line[0], line[1] = middle_x + middle * nx, middle_y + middle * ny
     dx, dy = tx + slope * nx, ty + slope * ny
     norm = math.hypot(dx, dy)
-    line[2], line[3] = dx / norm, dy / norm
     # Neighbouring profiles share pixels, which makes about two of them worth one.
-    variance = 2.0 * max(rms, 0.004) ** 2
-    stats[0] = math.atan2(dy, dx)
-    stats[1] = variance / used + variance * mean**2 / spread
-    stats[2] = variance / spread
-    stats[3] = rms
-    stats[4] = used / count
-    stats[5] = typical
+    variance = 2.0 * max(rms, _MODEL_ERROR) ** 2
+    fitted[0], fitted[1] = middle_x + middle * nx, middle_y + middle * ny
+    fitted[2], fitted[3] = dx / norm, dy / norm
+    fitted[4] = variance / used + variance * mean**2 / spread
+    fitted[5] = variance / spread
+    fitted[6] = rms
     return True
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _refine_once(
     image: NDArray[np.uint8],
     corners: NDArray[np.float64],
     window: float,
     coarse: bool,
-    stats: NDArray[np.float64],
+    sides: NDArray[np.float64],
 ) -> bool:
+    """Fit the four sides (4, 7) and move the corners to where they meet."""
     area = 0.0
     for i in range(4):
         j = (i + 1) % 4
         area += corners[i, 0] * corners[j, 1] - corners[j, 0] * corners[i, 1]
     turn = 1.0 if area > 0.0 else -1.0
-    lines = np.empty((4, 4))
     for i in range(4):
-        j = (i + 1) % 4
-        if not _fit_side(image, corners[i], corners[j], turn, window, coarse, lines[i], stats[i]):
+        if not _fit_side(image, corners[i], corners[(i + 1) % 4], turn, window, coarse, sides[i]):
             return False
     for i in range(4):
-        before = lines[(i + 3) % 4]
-        after = lines[i]
+        before, after = sides[(i + 3) % 4], sides[i]
         determinant = before[2] * after[3] - before[3] * after[2]
         if abs(determinant) < 0.2:
             return False
@@ -237,96 +247,93 @@ def _refine_once(
     return True
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _refine_until(
     image: NDArray[np.uint8],
     corners: NDArray[np.float64],
     window: float,
     coarse: bool,
-    stats: NDArray[np.float64],
+    sides: NDArray[np.float64],
 ) -> bool:
     """Repeat passes until the corners stay where they are."""
     for _ in range(_COARSE_PASSES if coarse else _FINE_PASSES):
         before = corners.copy()
-        if not _refine_once(image, corners, window, coarse, stats):
+        if not _refine_once(image, corners, window, coarse, sides):
             return False
         if np.abs(corners - before).max() < (_NEAR if coarse else _SETTLED):
             break
     return True
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def refine_quads(
-    image: NDArray[np.uint8],
-    quads: NDArray[np.float64],
-    search: float,
-    corners: NDArray[np.float64],
-    stats: NDArray[np.float64],
-    found: NDArray[np.bool_],
-) -> None:
+    image: NDArray[np.uint8], quads: NDArray[np.float64], search: float
+) -> tuple[
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.bool_],
+]:
     """Refine the corners of black quadrilaterals on white.
 
     Args:
         image: grey image.
         quads: (n, 4, 2) px, corners to start from, in either sense of rotation.
         search: largest distance of a side from where it starts [px]; cut to the width of a cell.
-        corners: (n, 4, 2) px, output.
-        stats: (n, 4, 6), output per side: direction [rad], variance of its offset in the middle
-            [px²], variance of its direction [rad²], RMS residual [px], share of profiles used,
-            contrast.
-        found: (n,), output: whether all four sides were there.
+
+    Returns:
+        Corners (n, 4, 2) px; their covariances (n, 8, 8) px², of x0 y0 x1 …; the RMS distance (n,)
+        of the border's crossings from the four lines [px]; and whether all four sides were there.
     """
-    for i in range(quads.shape[0]):
+    count = quads.shape[0]
+    corners, covariances = quads.copy(), np.zeros((count, 8, 8))
+    residuals, found = np.zeros(count), np.zeros(count, dtype=np.bool_)
+    sides = np.empty((4, SIDE_VALUES))
+    for i in range(count):
         shortest = 1e9
         for k in range(4):
             j = (k + 1) % 4
             side = math.hypot(quads[i, j, 0] - quads[i, k, 0], quads[i, j, 1] - quads[i, k, 1])
             shortest = min(shortest, side)
-            corners[i, k, 0] = quads[i, k, 0]
-            corners[i, k, 1] = quads[i, k, 1]
         cell = shortest / 8.0
         wide = min(max(search, 1.0), 0.9 * cell + 0.4)
         fine = min(max(0.55 * cell, 1.1), 2.5)
-        found[i] = _refine_until(image, corners[i], wide, True, stats[i]) and _refine_until(
-            image, corners[i], fine, False, stats[i]
-        )
+        # A loop, since numba would compile a constant True and a constant False one by one.
+        for coarse in (True, False):
+            found[i] = _refine_until(image, corners[i], wide if coarse else fine, coarse, sides)
+            if not found[i]:
+                break
+        if found[i]:
+            residuals[i] = math.sqrt(np.mean(sides[:, 6] ** 2))
+            _write_covariance(corners[i], sides, covariances[i])
+    return corners, covariances, residuals, found
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def corner_covariances(
-    corners: NDArray[np.float64], stats: NDArray[np.float64], spread: NDArray[np.float64]
+@njit(cache=True)
+def _write_covariance(
+    corners: NDArray[np.float64], sides: NDArray[np.float64], covariance: NDArray[np.float64]
 ) -> None:
-    """Propagate the variances of four lines to the corners they meet in.
+    """Propagate the variances of four lines (4, 7) to the corners they meet in, (8, 8) px².
 
     A line of normal n that moves by δ moves a corner, where it meets a line of direction t, by
     t δ / (t·n).
-
-    Args:
-        corners: (n, 4, 2) px.
-        stats: (n, 4, 6) per side, from `refine_quads`.
-        spread: (n, 8, 8) px², output.
     """
     moves = np.empty((4, 2))
-    for i in range(corners.shape[0]):
-        spread[i] = 0.0
-        for side in range(4):
-            end = (side + 1) % 4
-            half = 0.5 * math.hypot(
-                corners[i, end, 0] - corners[i, side, 0], corners[i, end, 1] - corners[i, side, 1]
-            )
-            angle = stats[i, side, 0]
-            for place in range(2):
-                other = (side + 3) % 4 if place == 0 else end
-                tx, ty = math.cos(stats[i, other, 0]), math.sin(stats[i, other, 0])
-                across = -tx * math.sin(angle) + ty * math.cos(angle)
-                lever = -half if place == 0 else half
-                moves[2 * place, 0], moves[2 * place, 1] = tx / across, tx / across * lever
-                moves[2 * place + 1, 0], moves[2 * place + 1, 1] = ty / across, ty / across * lever
-            for a in range(4):
-                row = (2 * side + a) % 8
-                for b in range(4):
-                    column = (2 * side + b) % 8
-                    spread[i, row, column] += (
-                        moves[a, 0] * moves[b, 0] * stats[i, side, 1]
-                        + moves[a, 1] * moves[b, 1] * stats[i, side, 2]
-                    )
+    for side in range(4):
+        end = (side + 1) % 4
+        half = 0.5 * math.hypot(
+            corners[end, 0] - corners[side, 0], corners[end, 1] - corners[side, 1]
+        )
+        for place in range(2):
+            other = (side + 3) % 4 if place == 0 else end
+            tx, ty = sides[other, 2], sides[other, 3]
+            across = ty * sides[side, 2] - tx * sides[side, 3]
+            lever = -half if place == 0 else half
+            moves[2 * place, 0], moves[2 * place, 1] = tx / across, tx / across * lever
+            moves[2 * place + 1, 0], moves[2 * place + 1, 1] = ty / across, ty / across * lever
+        for a in range(4):
+            for b in range(4):
+                covariance[(2 * side + a) % 8, (2 * side + b) % 8] += (
+                    moves[a, 0] * moves[b, 0] * sides[side, 4]
+                    + moves[a, 1] * moves[b, 1] * sides[side, 5]
+                )

@@ -81,13 +81,13 @@ class Curve:
         return points, table
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def wrap(angle: float) -> float:
     """Return an angle between −π and π."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def write_places(
     parameters: NDArray[np.float64],
     integral: NDArray[np.float64],

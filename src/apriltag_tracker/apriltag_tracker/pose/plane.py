@@ -13,7 +13,7 @@ from apriltag_tracker.camera.lens import undistort_pixels
 from apriltag_tracker.tag_map import LimbTag
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def planar_pose(
     corners: NDArray[np.float64], size: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
@@ -54,7 +54,7 @@ def planar_pose(
     return np.array([x, y, math.atan2(sine, cosine)]), jacobian, math.sqrt(misfit / 4.0)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _locate(
     corners: NDArray[np.float64],
     covariances: NDArray[np.float64],
@@ -132,7 +132,7 @@ def locate(
     return places, spreads, misfits
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _moves_of_a_point(
     point: NDArray[np.float64],
     rotation: NDArray[np.float64],
@@ -157,7 +157,7 @@ def _moves_of_a_point(
             moves[row, k] = ray[row] * turned[2] / ray[2] - turned[row]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _pose_moves(
     places: NDArray[np.float64],
     heights: NDArray[np.float64],

@@ -161,11 +161,6 @@ class ShapeFitter:
         self._evaluations: dict[tuple[int, tuple[float, ...]], Evaluation] = {}
         self._last = np.zeros(self._smooth.size)
 
-    @property
-    def parameters(self) -> NDArray[np.float64]:
-        """Parameters of the last smooth fit."""
-        return self._last
-
     def reset(self) -> None:
         """Forget the last shape, from which the next fit would start."""
         self._last = np.zeros(self._smooth.size)
@@ -198,33 +193,6 @@ class ShapeFitter:
             for moves in (common, shared_noise)
         )
         return self._estimate(fit, arcs, kept, rejected, shared[0], shared[1])
-
-    def elsewhere(
-        self,
-        tags: Sequence[PlanarTag],
-        arc_lengths: Sequence[float],
-        usual: NDArray[np.float64] | None = None,
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return where other points of the limb are on the smooth fit of some tags.
-
-        Args:
-            tags: of the limb, one at least.
-            arc_lengths: (n,) m.
-            usual: parameters of the shape to which what the tags leave open is near; a straight
-                limb if it is None.
-
-        Returns:
-            x, y [m] and heading [rad] of the centreline, (n, 3), and their derivatives by the
-            curvature of each segment, (n, 3, M).
-        """
-        fit = self._solve(self._smooth, tags, self._last, usual)
-        evaluation = self._evaluation(self._smooth, tuple(arc_lengths))
-        places, slopes = evaluation.places(fit.parameters)
-        return places, slopes[:, :, 4 : 4 + self._smooth.segments]
-
-    def bends(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the mean curvatures (M,) among the parameters of a shape."""
-        return parameters[4 : 4 + self._smooth.segments]
 
     def _consistent(
         self, tags: list[PlanarTag]
@@ -290,7 +258,6 @@ class ShapeFitter:
         curve: Curve,
         tags: Sequence[PlanarTag],
         start: NDArray[np.float64],
-        usual: NDArray[np.float64] | None = None,
     ) -> _Fit:
         """Find the most probable parameters and the gain (size, n, 3) from measurements to them."""
         evaluation = self._evaluation(curve, tuple(tag.arc_length for tag in tags))
@@ -309,7 +276,6 @@ class ShapeFitter:
             np.array([tag.covariance for tag in tags]),
             np.array([slack[0], slack[0], slack[1]]) ** 2,
             1.0 / self._prior_sigma(curve),
-            np.zeros(size) if usual is None else usual[:size],
             evaluation.integral,
             evaluation.inner,
             evaluation.outer,

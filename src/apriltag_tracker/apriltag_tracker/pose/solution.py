@@ -13,7 +13,7 @@ _SETTLED = 1e-9
 """Steps end when heading [rad] and base [m] change by less."""
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _whitening(covariances: NDArray[np.float64], slack: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the matrices (n, 3, 3) that make the measurements' errors independent and of one."""
     whiten = np.empty_like(covariances)
@@ -22,7 +22,7 @@ def _whitening(covariances: NDArray[np.float64], slack: NDArray[np.float64]) -> 
     return whiten
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _write_gains(
     inverse: NDArray[np.float64],
     by: NDArray[np.float64],
@@ -39,13 +39,12 @@ def _write_gains(
         left_open -= share @ slopes[i]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def solve_shape(
     measured: NDArray[np.float64],
     covariances: NDArray[np.float64],
     slack: NDArray[np.float64],
     weak: NDArray[np.float64],
-    usual: NDArray[np.float64],
     integral: NDArray[np.float64],
     inner: NDArray[np.float64],
     outer: NDArray[np.float64],
@@ -60,8 +59,7 @@ def solve_shape(
         measured: (n, 3) x, y [m] and heading [rad].
         covariances: (n, 3, 3) of their noise.
         slack: (3,) variances of what they may be off besides.
-        weak: (size,) one over the prior's standard deviations.
-        usual: (size,) the prior's mean.
+        weak: (size,) one over the prior's standard deviations; its mean is zero.
         integral: table of `curve.write_places`, as are the next two.
         inner: (points, size).
         outer: (n, size).
@@ -80,7 +78,7 @@ def solve_shape(
     for _ in range(_PASSES):
         write_places(parameters, integral, inner, outer, places, slopes)
         normal[:] = np.diag(weak**2)
-        right = weak**2 * (usual - parameters)
+        right = -(weak**2) * parameters
         for i in range(count):
             gap[i] = measured[i] - places[i]
             gap[i, 2] = wrap(gap[i, 2])

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apriltag_tracker.camera import CameraError, CameraPose, Intrinsics, solve_pose
-from apriltag_tracker.detection.tag import Tag
+from apriltag_tracker.detection import Tag
 from apriltag_tracker.tag_map import TagMap, WorldTag
 
 
 @dataclass
 class _Seen:
-    """Mean of one fixed tag's corners over the pictures in which it was fitted.
+    """Mean of one fixed tag's corners over the pictures in which it was found.
 
     Attributes:
         corners: (4, 2) px.
@@ -35,14 +35,11 @@ class _Seen:
         self.noise = (1.0 - share) ** 2 * self.noise + share**2 * tag.covariance
 
 
-_LASTING = 0.002
-"""Error of a corner that stays from frame to frame, so that averaging does not remove it [px].
+LASTING_ERROR = 0.012
+"""A corner has this error in every picture alike, so that averaging does not remove it [px].
 
-Pixels are rounded to whole grey levels, and the fit's model of lens and print is not quite theirs.
+A lens bends the sides of a tag, and pixels are rounded to whole grey levels.
 """
-
-_LEAST_MEMORY = 40
-"""Pictures of one tag that are averaged at least."""
 
 
 class WorldPose:
@@ -51,8 +48,7 @@ class WorldPose:
     Args:
         tags: the tag map.
         intrinsics: of the camera.
-        memory: pictures over which corners are averaged; at least `_LEAST_MEMORY` of each tag where
-            not all are fitted in every picture.
+        memory: pictures over which corners are averaged.
         solve_every: frames between two solutions once the pose has settled.
         bump: shift of the fixed tags, all together, that means that the camera was moved [px].
         bump_frames: frames in a row that must show it.
@@ -96,14 +92,12 @@ class WorldPose:
             self.bumps += 1
             self._seen.clear()
             self._frames = 0
-        fitted = [tag for tag, _ in known if tag.measured]
-        memory = max(self._memory * len(fitted) // max(len(known), 1), _LEAST_MEMORY)
-        for tag in fitted:
+        for tag, _ in known:
             seen = self._seen.get(tag.id)
             if seen is None:
                 self._seen[tag.id] = _Seen(tag.corners.copy(), tag.covariance.copy())
             else:
-                seen.add(tag, memory)
+                seen.add(tag, self._memory)
         if known and (self._frames < 10 or self._frames % self._solve_every == 0):
             self._solve()
         if known:
@@ -181,7 +175,7 @@ class WorldPose:
         result = np.zeros((6, 6))
         for k, tag in enumerate(ids):
             known = self._seen[tag]
-            spread = known.noise + _LASTING**2 * np.eye(8)
+            spread = known.noise + LASTING_ERROR**2 * np.eye(8)
             part = gain[:, 8 * k : 8 * k + 8]
             result += part @ spread @ part.T
         return result

@@ -59,7 +59,7 @@ class Exposure(NamedTuple):
         return cls(0.5 * time, scale, instants, shares)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def place_at(
     arc_length: NDArray[np.float64],
     points: NDArray[np.float64],
@@ -87,7 +87,7 @@ def place_at(
     return x, y, heading[k] + t * turned
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _write_placement(
     mounts: Mounts, tag: int, x: float, y: float, angle: float, placement: NDArray[np.float64]
 ) -> None:
@@ -100,7 +100,7 @@ def _write_placement(
     placement[4] = mounts.size[tag]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def place_tags(
     mounts: Mounts,
     exposure: Exposure,

@@ -71,7 +71,7 @@ def cumulative_table() -> NDArray[np.float64]:
     return np.array([0.5 * (1.0 + math.erf(x / math.sqrt(2.0))) for x in grid])
 
 
-@njit(cache=True, fastmath=True, error_model="numpy", inline="always")  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True, error_model="numpy", inline="always")
 def _cumulative(place: float, table: NDArray[np.float64]) -> float:
     """Look up the Gaussian's distribution at a place of the table, in its steps."""
     place = min(max(place, 0.0), _TABLE_STEPS - 1e-9)
@@ -80,7 +80,7 @@ def _cumulative(place: float, table: NDArray[np.float64]) -> float:
     return float(table[k] + (table[k + np.uintp(1)] - table[k]) * (place - whole))
 
 
-@njit(cache=True, fastmath=True, error_model="numpy", inline="always")  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True, error_model="numpy", inline="always")
 def _shares(
     place: float,
     spread: float,
@@ -115,7 +115,7 @@ def _shares(
     return first, end, last - begin
 
 
-@njit(cache=True, fastmath=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _draw_box(
     canvas: NDArray[np.uint8],
     eye: Eye,
@@ -171,7 +171,7 @@ def _draw_box(
             canvas[row, column] = int(min(max(value + 0.5, 0.0), 255.0))
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _write_corners(eye: Eye, placement: NDArray[np.float64], corners: NDArray[np.float64]) -> None:
     """Write the pixels (4, 2) of a placed tag's corners, from the printed lower left."""
     cosine, sine = math.cos(placement[3]), math.sin(placement[3])
@@ -189,7 +189,7 @@ def _write_corners(eye: Eye, placement: NDArray[np.float64], corners: NDArray[np
         corners[k, 1] = eye.matrix[1, 1] * y + eye.matrix[1, 2]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _write_map(
     eye: Eye, placement: NDArray[np.float64], prints: Prints, result: NDArray[np.float64]
 ) -> None:
@@ -207,7 +207,7 @@ def _write_map(
     result[6:9] = np.cross(right, down)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _box_of(
     both: NDArray[np.float64], grown: float, blur: float, rows: int, columns: int
 ) -> tuple[int, int, int, int]:
@@ -234,7 +234,7 @@ def _box_of(
     )
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def draw_tags(
     canvas: NDArray[np.uint8],
     eye: Eye,

@@ -59,7 +59,7 @@ from der_planner.identification.offline import AMPLITUDE
 from der_planner.identification.parameters import GROUPS
 from der_planner.identification.plots import plot_prediction
 from der_planner.limb import Limb, LimbError
-from der_planner.planning.loads.rest import nearly_buckling
+from der_planner.planning.loads import nearly_buckling
 from der_planner.results.outputs import OutputError, check_file, check_folder
 from pressure_driver.schedule import ScheduleLimits
 

@@ -23,7 +23,7 @@ from der_planner.control.knowledge import Estimate
 from der_planner.control.nominal import Nominal
 from der_planner.control.supervision import Limits, Supervisor, Warned
 from der_planner.model.series import CONTROL_PERIOD
-from der_planner.planning.result import Plan
+from der_planner.planning.plan_file import Plan
 
 Array = NDArray[np.float64]
 

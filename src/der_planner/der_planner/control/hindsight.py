@@ -17,7 +17,7 @@ from der_planner.control.knowledge import EstimatorSettings
 from der_planner.control.nominal import STEP, Nominal
 from der_planner.model import STEPS
 from der_planner.model.series import CONTROL_PERIOD
-from der_planner.planning.result import Plan
+from der_planner.planning.plan_file import Plan
 
 Array = NDArray[np.float64]
 

@@ -33,8 +33,8 @@ from der_planner.model import STEPS
 from der_planner.model.air import Chambers
 from der_planner.model.commands import within_limits
 from der_planner.model.series import CONTROL_PERIOD
+from der_planner.planning.plan_file import Plan
 from der_planner.planning.quadratic import UnsolvedError, minimise
-from der_planner.planning.result import Plan
 
 Array = NDArray[np.float64]
 

@@ -36,7 +36,7 @@ from der_planner.control.disturbance import (
 from der_planner.control.repeatability import Played, Runs
 from der_planner.planning.correction import Correction
 from der_planner.planning.errors import PlanningError
-from der_planner.planning.result import Plan
+from der_planner.planning.plan_file import Plan
 
 Array = NDArray[np.float64]
 

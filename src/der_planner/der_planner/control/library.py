@@ -16,8 +16,7 @@ from der_planner.control.learning import PULL
 from der_planner.methods import LEARNED
 from der_planner.planning.correction import Correction
 from der_planner.planning.errors import PlanningError
-from der_planner.planning.plan_file import SUFFIX, difference, read_plan
-from der_planner.planning.result import Plan
+from der_planner.planning.plan_file import SUFFIX, Plan, difference, read_plan
 
 NEAR = math.log(1.35)
 """Largest logarithm of the ratio of two periods and amplitudes that are near each other."""

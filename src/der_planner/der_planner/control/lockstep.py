@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from der_planner.control.feedback import Feedback
 from der_planner.model.series import CONTROL_PERIOD
-from der_planner.planning.result import Plan
+from der_planner.planning.plan_file import Plan
 
 Array = NDArray[np.float64]
 

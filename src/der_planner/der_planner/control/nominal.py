@@ -22,8 +22,8 @@ from scipy.linalg import expm
 from der_planner.methods import LEARNED
 from der_planner.model import STEPS, Initial, RodModel, simulate
 from der_planner.model.series import CONTROL_PERIOD, interpolate, step_middles
-from der_planner.planning.result import Plan
-from der_planner.planning.ways import resting_spline, sample_spline
+from der_planner.planning.plan_file import Plan
+from der_planner.planning.transitions import resting_spline, sample_spline
 
 Array = NDArray[np.float64]
 Whole = NDArray[np.signedinteger[Any]]

@@ -199,7 +199,7 @@ def _limb_file(trial: Trial, options: Options, progress: Progress) -> Path | Non
     if path.exists():
         return path
     from der_planner.identification import calibrate_twin  # noqa: PLC0415
-    from der_planner.planning.loads.rest import nearly_buckling  # noqa: PLC0415
+    from der_planner.planning.loads import nearly_buckling  # noqa: PLC0415
 
     prior = options.mounted(Limb.default())
     if said := nearly_buckling(prior):

@@ -32,7 +32,7 @@ from der_planner.identification.rod_angles import NODES
 from der_planner.limb import CalibratedRange, Limb
 from der_planner.model import RodModel
 from der_planner.model.series import CONTROL_PERIOD
-from der_planner.planning.loads.rest import nearly_buckling
+from der_planner.planning.loads import nearly_buckling
 
 Array = NDArray[np.float64]
 

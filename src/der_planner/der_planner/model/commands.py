@@ -1,4 +1,4 @@
-"""Commands within their limits for wanted effective pressures: the inverse of air and material."""
+"""Commands within their limits for wanted pressures in the chambers: the inverse of the air."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from der_planner.limb import VENT_REFERENCE
 from der_planner.model.air import Air, AirLaw, fallen
-from der_planner.model.model import Model
 from der_planner.model.series import interpolate
 
 Array = NDArray[np.float64]
@@ -19,8 +18,8 @@ _SHARES_BEFORE = (0.0, 0.2, 0.4, 0.6, 0.8)
 """Shares of a ramp that may come before the jump that it replaces."""
 
 
-def commands(model: Model, time: Array, effective: Array, bend: Array, period: float) -> Array:
-    """Return the commands (K, M) [Pa] under which the limb feels effective pressures.
+def commands(air: Air, time: Array, pressure: Array, period: float) -> Array:
+    """Return the commands (K, M) [Pa] under which the chambers hold wanted pressures.
 
     The pressure that is wanted in the middle of a command's period, a dead time later, is led by
     the lag. Where a wanted pressure changes its sign, one chamber is nearly empty and the other not
@@ -28,14 +27,12 @@ def commands(model: Model, time: Array, effective: Array, bend: Array, period: f
     slew limit, part of it ahead of the jump.
 
     Args:
-        model: of the limb.
+        air: of the limb.
         time: (F,) fine grid [s] from 0 that reaches past the last command by period and dead time.
-        effective: (F, M) [Pa].
-        bend: (F, M) bend angles along the motion [rad].
+        pressure: (F, M) wanted differential pressures [Pa].
         period: of the commands [s].
     """
-    air, delay = model.air, model.air.pneumatics.delay
-    pressure = model.material.differential_pressure(time, effective, bend)
+    delay = air.pneumatics.delay
     led = leading_commands(air, time, pressure)
     last = time[-1] - period - delay
     instants = np.arange(round(last / period) + 1) * period + period / 2 + delay

@@ -25,8 +25,7 @@ from der_planner.methods import LEARNED
 from der_planner.planning import METHODS, Motion, PathLimits, choose_method
 from der_planner.planning.inverse import BRANCHES
 from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD
-from der_planner.planning.plan_file import learned_plan
-from der_planner.planning.result import Plan
+from der_planner.planning.plan_file import Plan, learned_plan
 from der_planner.planning.streaming import GRID, Schedule
 from limb_interfaces import topics
 from limb_interfaces.parameters import declare

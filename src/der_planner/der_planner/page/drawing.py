@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from der_planner.limb import Limb
 from der_planner.model import ArcModel
 from der_planner.page.commands import Load
-from der_planner.planning import Motion, PathLimits, PlanningError, plan
-from der_planner.planning.inverse import angle_limits, static_pressure
+from der_planner.planning import Motion, PathLimits, PlanningError, Workspace, plan
 from der_planner.planning.paths import read_csv
 
 Array = NDArray[np.float64]
@@ -248,13 +247,13 @@ def reachable_region(limb: Limb) -> list[Array]:
         limb: for its arcs and pressure limit.
     """
     count = limb.segment_count
-    low, high = angle_limits(limb)
+    space = Workspace(ArcModel(limb))
     size = max(4, round(_POSES ** (1 / max(count, 2))))
-    axes = [np.linspace(a, b, size) for a, b in zip(low, high, strict=True)]
+    axes = [np.linspace(a, b, size) for a, b in zip(space.low, space.high, strict=True)]
     poses = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    tips = ArcModel(limb).tip(poses)
+    tips = space.arcs.tip(poses)
     limit = limb.pneumatics.pressure_limit * (1 + 1e-9)
-    allowed: NDArray[np.bool_] = np.all(np.abs(static_pressure(limb, poses)) <= limit, axis=-1)
+    allowed: NDArray[np.bool_] = np.all(np.abs(space.static_pressure(poses)) <= limit, axis=-1)
     if not allowed.any():
         return []
     corner = tips[allowed].min(axis=0)

@@ -23,8 +23,8 @@ from sensor_msgs.msg import CameraInfo, Image
 from visualization_msgs.msg import MarkerArray
 
 from apriltag_tracker.camera import CameraError, Intrinsics
-from apriltag_tracker.camera.encodings import ImageError, to_grey
-from apriltag_tracker.detection.tag import Tag
+from apriltag_tracker.camera.images import ImageError, to_grey
+from apriltag_tracker.detection import Tag
 from apriltag_tracker.tag_map import TagMap
 from der_msgs.msg import LimbEstimate, LimbState, PressurePlan, PressureState, TagDetectionArray
 from der_planner.limb import Limb
@@ -164,7 +164,7 @@ class PageNode(Node):
 
     def _on_tags(self, message: TagDetectionArray) -> None:
         tags = [
-            Tag(tag.id, np.array(tag.corners).reshape(4, 2), np.zeros((8, 8)), 0.0, 1.0, 1.0)
+            Tag(tag.id, np.array(tag.corners).reshape(4, 2), np.zeros((8, 8)), 0.0)
             for tag in message.detections
         ]  # fmt: skip
         self._overlay.put_tags(nanoseconds(message.header.stamp), tags)

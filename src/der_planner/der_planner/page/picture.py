@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apriltag_tracker.camera import CameraPose, Intrinsics, project
-from apriltag_tracker.detection.tag import Tag
+from apriltag_tracker.detection import Tag
 from apriltag_tracker.pose.world import WorldPose
 from apriltag_tracker.tag_map import TagMap
 from der_planner.page.situation import NANOSECONDS

@@ -3,19 +3,20 @@
 `plan(limb, motion)` is the way in; `Motion.named` and `Motion.from_tip_path` make motions.
 """
 
-from der_planner.model.series import CONTROL_PERIOD
+from der_planner.model import CONTROL_PERIOD
+from der_planner.planning.configuration import METHODS
 from der_planner.planning.errors import (
     BucklingError,
     OverloadError,
     PlanningError,
     UnreachableError,
 )
-from der_planner.planning.models import METHODS
 from der_planner.planning.motions import NAMES, Motion, Reference
 from der_planner.planning.paths import PathLimits
+from der_planner.planning.plan_file import Plan
 from der_planner.planning.planner import DEFAULT_METHOD, choose_method, plan
-from der_planner.planning.result import Plan
-from der_planner.planning.ways import Start
+from der_planner.planning.transitions import Start
+from der_planner.planning.workspace import Workspace
 
 __all__ = [
     "CONTROL_PERIOD",
@@ -31,6 +32,7 @@ __all__ = [
     "Reference",
     "Start",
     "UnreachableError",
+    "Workspace",
     "choose_method",
     "plan",
 ]

@@ -12,29 +12,26 @@ from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
 from der_planner.limb import Limb
-from der_planner.model import NODES, Initial, simulate
-from der_planner.model.series import CONTROL_PERIOD
-from der_planner.model.simulation import STEPS, Bend
-from der_planner.planning import models
+from der_planner.model import CONTROL_PERIOD, Model, simulate
+from der_planner.model.simulation import Bend
+from der_planner.planning.configuration import configure
 from der_planner.planning.errors import PlanningError
 from der_planner.planning.inverse import solve
-from der_planner.planning.optimal import Optimiser, Outcome, Settings
-from der_planner.planning.result import Plan
-from der_planner.planning.ways import sample_spline
+from der_planner.planning.optimal import Optimiser, OptimiserSettings, Optimum
+from der_planner.planning.plan_file import Plan
 from der_planner.rod import ConvergenceError
 
 Array = NDArray[np.float64]
 _THREADS = ThreadpoolController()
 
 _WINDOWS = (100, 150, 150)
-"""Setpoints that are solved together in each round over the motion. Only the first is needed but
-where limits bind: they are felt from further ahead than a plan's first window reaches, …"""
+"""Setpoints that are solved together, for each try; a longer window feels limits further ahead."""
 _NOTABLE_ERROR = 5e-4
-"""… and where they leave more than this of mean tip error [m]."""
+"""Mean tip error that limits may leave without another try with a longer window [m]."""
 _ROUNDS = 2
-"""With friction along the bend of the last round's commands; each leaves a fifth of its change …"""
+"""Rounds of friction along the bend of the last commands; each leaves a fifth of its change."""
 _SETTLED = 2e-5
-"""… and a smaller mean change of the tip is not worth another [m]."""
+"""Mean change of the tip by friction below which no further round is worth its time [m]."""
 _PRIOR = 3e-4
 """Pull toward the plan's bend angles where the tip hardly tells them [m/rad]."""
 
@@ -62,11 +59,8 @@ class Correction:
     """
 
     def __init__(self, plan: Plan) -> None:
-        physics = models.build(plan.limb, plan.model, NODES)
-        self._physics = physics
-        self._spline = physics.configuration(plan.reference)
         self._plan = plan
-        self._limb = plan.limb
+        self._configuration = configure(Model.of(plan.limb, plan.model), plan.reference)
 
     def of(self, limb: Limb) -> Correction:
         """Return the same with another limb's model; its plans still name the plan's own limb.
@@ -75,44 +69,44 @@ class Correction:
             limb: with as many segments.
         """
         other = copy.copy(self)
-        other._limb, other._physics = limb, models.build(limb, self._plan.model, NODES)
+        other._configuration = self._configuration.on(self.model.another(limb))
         return other
+
+    @property
+    def model(self) -> Model:
+        """Of the limb."""
+        return self._configuration.model
 
     @property
     def limb(self) -> Limb:
         """The limb whose model it is."""
-        return self._limb
+        return self.model.limb
 
     @property
     def tip_per_pressure(self) -> float:
         """Largest movement of the tip per differential pressure of a segment at rest [m/Pa]."""
-        limb = self._limb
+        limb = self.model.limb
         ahead = np.cumsum([s.length for s in limb.segments][::-1])[::-1]
         return float(np.max(limb.static_gain * ahead))
 
-    def expected(self, commands: Array) -> Expected:
+    def expected(self, commands: Array, bend: Bend | None = None) -> Expected:
         """Return what the model expects under commands (K, M) [Pa].
 
-        Friction and creep act along the bend that these commands lead to.
+        Args:
+            commands: (K, M) [Pa].
+            bend: along which friction and creep act; None: along the bend that these commands lead
+                to.
 
         Raises:
             PlanningError: the model cannot be rolled forward under them.
         """
-        return self._simulated(commands, None)
-
-    def _simulated(self, commands: Array, bend: Bend | None) -> Expected:
-        """Return what the model expects, with friction along this bend or its own (None)."""
-        start = self._plan.reference.start
         try:
             response = simulate(
-                self._physics,
+                self.model,
                 np.arange(len(commands)) * CONTROL_PERIOD,
                 commands=commands,
                 bend=bend,
-                initial=Initial(
-                    self._physics.begin(self._spline, start),
-                    None if start is None else start.pressure,
-                ),
+                initial=self._configuration.initial,
             )
         except ConvergenceError as error:
             raise _not_followed(error) from error
@@ -138,8 +132,8 @@ class Correction:
         begin = clock.perf_counter()
         wanted = self._reachable(self._plan.tip_reference - disturbance)
         tip = self.expected(commands).tip
-        rubbed = tip - self._simulated(commands, self._own_bend).tip
-        best: Outcome | None = None
+        rubbed = tip - self.expected(commands, self._configuration.bend_at).tip
+        best: Optimum | None = None
         steps = 0
         try:
             # Matrices of a few hundred rows: more threads only get into other processes' way.
@@ -164,13 +158,9 @@ class Correction:
             details={"steps": steps, "limited_windows": best.limited},
         )
 
-    def _own_bend(self, time: Array) -> Array:
-        """Return the bend of the plan's reference (n, M) [rad] at instants (n,) [s]."""
-        return sample_spline(self._spline, time)[0]
-
     def _solve(
-        self, commands: Array, wanted: Array, pull: float, begin: Outcome | None
-    ) -> tuple[Outcome, int]:
+        self, commands: Array, wanted: Array, pull: float, begin: Optimum | None
+    ) -> tuple[Optimum, int]:
         """Return the best commands for wanted tips (K, 2) [m], and the steps of all windows.
 
         Args:
@@ -181,17 +171,10 @@ class Correction:
         """
         best, missed, steps = begin, np.inf, 0
         for window in _WINDOWS:
-            settings = Settings(nearness=pull, nearness_vented=pull, window=window)
+            settings = OptimiserSettings(nearness=pull, nearness_vented=pull, window=window)
             offset = self._plan.tip_reference - wanted
             solver = Optimiser(
-                self._physics,
-                self._physics.begin(self._spline, self._plan.reference.start),
-                self._spline,
-                self._plan.reference,
-                commands,
-                STEPS,
-                settings,
-                offset=offset,
+                self._configuration, self._plan.reference, commands, settings, offset
             )
             outcome = solver.run(begin=None if best is None else best.commands)
             left = float(np.linalg.norm(outcome.tip - wanted, axis=1).mean())
@@ -209,8 +192,8 @@ class Correction:
 
         A straight limb reaches no further, and bends to no avail where more is wanted of it.
         """
-        angles, _ = solve(self._physics.kinematics, wanted, self._plan.bend_angles, _PRIOR)
-        reached: Array = self._physics.kinematics.tip(angles)
+        angles, _ = solve(self.model.kinematics, wanted, self._plan.bend_angles, _PRIOR)
+        reached: Array = self.model.kinematics.tip(angles)
         return reached
 
 

@@ -27,16 +27,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BSpline
 
-from der_planner.limb import Limb
-from der_planner.model import ArcModel
-from der_planner.model.series import CONTROL_PERIOD
-from der_planner.planning import paths, shapes
+from der_planner.model import CONTROL_PERIOD
+from der_planner.planning import paths
 from der_planner.planning.errors import PlanningError
-from der_planner.planning.inverse import angle_limits, check_branch, follow
-from der_planner.planning.loads.rest import Rest, rest_of
-from der_planner.planning.loads.sagged import sagged_tips
+from der_planner.planning.inverse import check_branch
 from der_planner.planning.nearest import Deviation, line, nearest_path
-from der_planner.planning.ways import (
+from der_planner.planning.transitions import (
     FINE_PERIOD,
     Start,
     fine_grid,
@@ -46,19 +42,22 @@ from der_planner.planning.ways import (
     resting_spline,
     sample_spline,
     smooth_step,
-    with_ways,
+    with_transitions,
 )
+from der_planner.planning.workspace import Workspace
 
 Array = NDArray[np.float64]
 
 JOINT_MOTIONS = ("asynchronous", "same_direction", "opposite_direction")
-NAMES = (*JOINT_MOTIONS, *shapes.NAMES)
+NAMES = (*JOINT_MOTIONS, *paths.SHAPES)
 DEFAULT_AMPLITUDE = math.pi / 4
+"""Largest bend of a segment where none is given [rad]."""
 DEFAULT_PERIOD = 20.0
+"""Period of a cycle where none is given [s]."""
 DEFAULT_CYCLES = 2
-LONGEST = 3600.0
+"""Number of cycles where none is given."""
 _SAG_ROUNDS = 3
-"""Each leaves some per cent of what the sag's change along a path took."""
+"""Corrections of a path for the limb's sag, each of which leaves some per cent of the last."""
 
 
 @dataclass(frozen=True)
@@ -157,9 +156,9 @@ class Motion:
             raise PlanningError(f"cycles must be a whole number of 1 or more, got {cycles}")
         if period < 4 * CONTROL_PERIOD:
             raise PlanningError(f"period is {period} s: the shortest is {4 * CONTROL_PERIOD} s")
-        if period * cycles > LONGEST:
+        if period * cycles > paths.LONGEST:
             raise PlanningError(
-                f"{cycles} cycles of {period} s are longer than {LONGEST:.0f} s: plan fewer"
+                f"{cycles} cycles of {period} s are longer than {paths.LONGEST:.0f} s: plan fewer"
             )
         return cls(name, float(amplitude), float(period), int(cycles), branch=branch)
 
@@ -215,11 +214,11 @@ class Motion:
         time, tip = paths.read_csv(path)
         return cls.from_tip_path(time, tip, Path(path).stem, branch, limits, nearest)
 
-    def reference(self, limb: Limb, start: Start | None = None) -> Reference:
+    def reference(self, workspace: Workspace, start: Start | None = None) -> Reference:
         """Return q̄(t) and r̄(t) for a limb.
 
         Args:
-            limb: the robot.
+            workspace: of the limb.
             start: where the limb is if another motion is left; None: where it rests, vented.
 
         Raises:
@@ -227,28 +226,28 @@ class Motion:
             BucklingError: the vented limb does not stay where it rests.
             PlanningError: the path cannot be followed.
         """
-        deviation = None
-        rest = rest_of(limb)
+        deviation, rest, fastest = None, workspace.rest, workspace.fastest
         if self.name in JOINT_MOTIONS and self.path is None:
-            time, angles = self._joint_motion(limb.segment_count, rest)
+            time, angles = self._joint_motion(workspace)
             if start is None and np.any(angles[0] != rest.bend_angles):
                 zero = np.zeros_like(rest.bend_angles)
-                time, angles = led_in(limb, (rest.bend_angles, zero, zero), time, angles)
+                time, angles = led_in(fastest, (rest.bend_angles, zero, zero), time, angles)
         else:
-            time, angles, deviation = self._tip_motion(limb, rest)
+            time, angles, deviation = self._tip_motion(workspace)
         if start is not None:
             state = (start.bend_angles, start.rate, start.acceleration)
-            time, angles = led_in(limb, state, time, angles)
+            time, angles = led_in(fastest, state, time, angles)
         spline = resting_spline(time, angles, start)
         count = round(time[-1] / CONTROL_PERIOD) + 1
         instants = np.arange(count) * CONTROL_PERIOD
         sampled = sample_spline(spline, instants)[0]
-        tip = ArcModel(limb).tip(sampled) + rest.offset
-        if limb.gravity[2]:
-            tip = sagged_tips(limb, instants, sampled, rest.bend_angles)
+        tip = workspace.arcs.tip(sampled) + rest.offset
+        if workspace.sags:
+            tip = workspace.sagging_tips(instants, sampled)
         return Reference(instants, tip, sampled, spline, rest.bend_angles, start, deviation)
 
-    def _joint_motion(self, segments: int, rest: Rest) -> tuple[Array, Array]:
+    def _joint_motion(self, workspace: Workspace) -> tuple[Array, Array]:
+        rest, segments = workspace.rest, workspace.limb.segment_count
         total = self.cycles * self.period
         time = fine_grid(total)
         place = np.arange(segments)
@@ -269,42 +268,37 @@ class Motion:
         back = quintic(closing, *state, rest.bend_angles, zero, zero)
         return np.append(time, total + closing[1:]), np.concatenate([angles, back[1:]])
 
-    def _tip_motion(self, limb: Limb, rest: Rest) -> tuple[Array, Array, Deviation | None]:
-        kinematics = ArcModel(limb)
-        path = self.path
+    def _tip_motion(self, workspace: Workspace) -> tuple[Array, Array, Deviation | None]:
+        rest, path = workspace.rest, self.path
         if path is None:
-            path = shapes.draw(
-                self.name, kinematics, self.amplitude, self.period, self.cycles, rest.sag
+            path = paths.draw_shape(
+                self.name, workspace.arcs, self.amplitude, self.period, self.cycles, rest.sag
             )
         if self.nearest:
-            return self._nearest_motion(limb, rest, path)
+            return self._nearest_motion(workspace, path)
         time, tip = path.resample(FINE_PERIOD * 2)
-        angles = follow(limb, kinematics, time, tip - rest.offset, self.branch)
-        if limb.gravity[2]:
+        angles = workspace.follow(time, tip - rest.offset, self.branch)
+        if workspace.sags:
             # Arcs reach farther than a limb that sags out of the plane does at the same bend.
             for _ in range(_SAG_ROUNDS):
-                short = kinematics.tip(angles) - sagged_tips(limb, time, angles, rest.bend_angles)
-                angles = follow(limb, kinematics, time, tip + short, self.branch)
-        return (*with_ways(limb, time, angles, rest.bend_angles), None)
+                short = workspace.arcs.tip(angles) - workspace.sagging_tips(time, angles)
+                angles = workspace.follow(time, tip + short, self.branch)
+        return (*with_transitions(workspace.fastest, time, angles, rest.bend_angles), None)
 
     def _nearest_motion(
-        self, limb: Limb, rest: Rest, path: paths.TipPath
+        self, workspace: Workspace, path: paths.TipPath
     ) -> tuple[Array, Array, Deviation]:
-        kinematics = ArcModel(limb)
-        offset = rest.offset
-        found = nearest_path(limb, kinematics, path, offset, self.limits, self.branch)
-        if limb.gravity[2]:
+        rest, offset = workspace.rest, workspace.rest.offset
+        found = nearest_path(workspace, path, offset, self.limits, self.branch)
+        if workspace.sags:
             # On average: the arcs' reach is longer than that of a limb which sags out of the plane.
-            time, angles = found.time, found.bend_angles
-            sagged = sagged_tips(limb, time, angles, rest.bend_angles)
-            offset = (sagged - kinematics.tip(angles)).mean(axis=0)
-            found = nearest_path(limb, kinematics, path, offset, self.limits, self.branch)
-        ways = with_ways(limb, found.time, found.bend_angles, rest.bend_angles)
-        low, high = angle_limits(limb)
-        if np.any(ways[1] < low) or np.any(ways[1] > high):
-            # A way that begins or ends in full motion near a limit would swing beyond it.
-            found = nearest_path(
-                limb, kinematics, path, offset, self.limits, self.branch, rest=True
-            )
-            ways = with_ways(limb, found.time, found.bend_angles, rest.bend_angles)
-        return (*ways, found.deviation)
+            tips = workspace.sagging_tips(found.time, found.bend_angles)
+            offset = (tips - workspace.arcs.tip(found.bend_angles)).mean(axis=0)
+            found = nearest_path(workspace, path, offset, self.limits, self.branch)
+        fastest, home = workspace.fastest, rest.bend_angles
+        time, angles = with_transitions(fastest, found.time, found.bend_angles, home)
+        if np.any(angles < workspace.low) or np.any(angles > workspace.high):
+            # A transition that begins or ends in full motion near a limit would swing beyond it.
+            found = nearest_path(workspace, path, offset, self.limits, self.branch, rest=True)
+            time, angles = with_transitions(fastest, found.time, found.bend_angles, home)
+        return time, angles, found.deviation

@@ -25,23 +25,21 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline
 from scipy.linalg import cho_factor, cho_solve
 
-from der_planner.model import Initial, Model, State
+from der_planner.model import CONTROL_PERIOD, STEPS, Initial, State
 from der_planner.model.commands import within_limits
-from der_planner.model.series import CONTROL_PERIOD
 from der_planner.model.simulation import Drive, Window
+from der_planner.planning.configuration import Configuration
 from der_planner.planning.motions import Reference
 from der_planner.planning.quadratic import Band, solve_limited
-from der_planner.planning.ways import sample_spline
 from der_planner.rod import ConvergenceError
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Settings:
+class OptimiserSettings:
     """What the optimisation weighs and when it is content.
 
     Attributes:
@@ -90,7 +88,7 @@ class Quadratic:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class Optimum:
     """What the optimisation found.
 
     Attributes:
@@ -110,13 +108,10 @@ class Optimiser:
     """Solves window after window; see the module.
 
     Args:
-        model: rod or arcs.
-        begin: its state where the motion starts.
-        spline: bend angles along the motion.
-        reference: r̄, and the command before the motion.
+        configuration: of the model along the motion.
+        reference: r̄.
         warm: (K, M) commands where the search starts and toward which they are pulled: those of a
             balance, before limits, or the last ones played [Pa].
-        substeps: integrator steps a command.
         settings: weights and sizes.
         offset: (K, 2) what is added to the model's tip at the setpoints before it is compared with
             r̄, e.g. what a run showed beyond the model [m]; None: nothing.
@@ -124,41 +119,32 @@ class Optimiser:
 
     def __init__(
         self,
-        model: Model,
-        begin: State,
-        spline: BSpline,
+        configuration: Configuration,
         reference: Reference,
         warm: Array,
-        substeps: int,
-        settings: Settings | None = None,
+        settings: OptimiserSettings | None = None,
         offset: Array | None = None,
     ) -> None:
-        self.model = model
-        self.settings = settings or Settings()
+        self.model = model = configuration.model
+        self.settings = settings or OptimiserSettings()
         vented = model.air.vents_slowly
         self.nearness = self.settings.nearness_vented if vented else self.settings.nearness
         wanted = reference.tip if offset is None else reference.tip - offset
         self.target = np.concatenate([wanted[1:], wanted[-1:]])
         self.warm = warm
         count, inputs = warm.shape
-        start = reference.start
+        self.start, start = configuration.begin, configuration.start
         self.before = np.zeros(inputs) if start is None else start.pressure
-        self.start = begin
-        self.drive = Drive(
-            model,
-            lambda time: sample_spline(spline, time)[0],
-            count,
-            substeps,
-            Initial(before=self.before),
-        )
-        pulse = model.air.even_pulse(CONTROL_PERIOD, substeps)
+        initial = Initial(before=self.before)
+        self.drive = Drive(model, configuration.bend_at, count, STEPS, initial)
+        pulse = model.air.even_pulse(CONTROL_PERIOD, STEPS)
         self._pulse = np.tile(pulse[:, None], (1, inputs))
 
     def run(
         self,
         progress: Callable[[float], None] = lambda _share: None,
         begin: Array | None = None,
-    ) -> Outcome:
+    ) -> Optimum:
         """Solve all windows, one after the other.
 
         Args:
@@ -188,7 +174,7 @@ class Optimiser:
             tip[first:keep] = motion.tip[:-1]
             state, first, before = motion.final, keep, command[keep - 1]
             progress(first / count)
-        return Outcome(command, tip, steps, limited)
+        return Optimum(command, tip, steps, limited)
 
     def improve(self, command: Array, state: State, first: int, last: int) -> tuple[int, bool]:
         """Improve ``command[first:last]`` in place; return the steps and if a limit was met."""

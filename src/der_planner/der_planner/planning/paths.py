@@ -1,4 +1,4 @@
-"""Paths of the tip: read, checked, timed within stated limits, and resampled."""
+"""Paths of the tip: read, checked, timed within stated limits, resampled; shapes that it draws."""
 
 from __future__ import annotations
 
@@ -12,12 +12,22 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import PchipInterpolator, make_interp_spline
 
+from der_planner.model.bending import Kinematics
 from der_planner.model.series import interpolate
 from der_planner.planning.errors import PlanningError
 
 Array = NDArray[np.float64]
 
 LONGEST = 3600.0
+"""Longest duration of a motion [s]."""
+SHAPES = ("circle", "figure_eight", "line", "star")
+"""Shapes that the tip can draw."""
+SHAPE_SIZE = 0.04
+"""Radius (half length) of a shape over the limb's length, at an amplitude of 45 degrees."""
+_SHAPE_POINTS = 50
+"""A quarter of the points of a shape in one cycle."""
+_GRID = 0.02
+"""Time between two samples of a path that gets its timing from limits [s]."""
 _SOFTNESS = 0.2
 """Half width of the mean that rounds the corners of a speed profile [s]."""
 
@@ -151,24 +161,45 @@ def time_path(points: Array, limits: PathLimits) -> TipPath:
     speed = np.minimum(limits.speed, np.sqrt(limits.acceleration / np.maximum(bend, 1e-9)))
     steps = np.linalg.norm(np.diff(curve, axis=0), axis=1)
     speed[0] = speed[-1] = 0.0
-    for k in range(count - 1):
-        reach = math.sqrt(speed[k] ** 2 + 2 * limits.acceleration * steps[k])
-        speed[k + 1] = min(speed[k + 1], reach)
-    for k in range(count - 2, -1, -1):
-        reach = math.sqrt(speed[k + 1] ** 2 + 2 * limits.acceleration * steps[k])
-        speed[k] = min(speed[k], reach)
+    keep_acceleration(speed, 2 * limits.acceleration * steps)
     durations = 2 * steps / np.maximum(speed[1:] + speed[:-1], 1e-9)
+    instants, along = evenly_in_time(durations, s)
+    return TipPath(instants, spline(along))
+
+
+def keep_acceleration(speed: Array, gain: Array) -> None:
+    """Lower the speeds (K,) until none changes faster than it may, forward and backward.
+
+    Args:
+        speed: largest ones, changed in place.
+        gain: (K − 1,) largest change of the squared speed from one place to the next.
+    """
+    for k in range(len(gain)):
+        speed[k + 1] = min(speed[k + 1], math.sqrt(speed[k] ** 2 + gain[k]))
+    for k in range(len(gain) - 1, -1, -1):
+        speed[k] = min(speed[k], math.sqrt(speed[k + 1] ** 2 + gain[k]))
+
+
+def evenly_in_time(durations: Array, place: Array) -> tuple[Array, Array]:
+    """Return evenly spaced instants from 0 on [s], and the places then, with rounded corners.
+
+    Args:
+        durations: (K − 1,) times from one place to the next [s].
+        place: (K,) along a course.
+
+    Raises:
+        PlanningError: it would last too long.
+    """
     time = np.concatenate([[0.0], np.cumsum(durations)])
     if time[-1] > LONGEST:
         raise PlanningError(
-            f"at {limits.speed} m/s the tip path lasts {time[-1]:.0f} s, "
-            f"the longest is {LONGEST:.0f} s"
+            f"the path would last {time[-1]:.0f} s, the longest is {LONGEST:.0f} s: draw less, or "
+            "allow a higher speed"
         )
-    grid = np.linspace(0.0, time[-1], max(20, round(time[-1] / 0.02) + 1))
+    grid = np.linspace(0.0, time[-1], max(20, round(time[-1] / _GRID) + 1))
     step = float(grid[1])
-    along = running_mean(PchipInterpolator(time, s)(grid), window=max(1, round(_SOFTNESS / step)))
-    instants = np.arange(len(along), dtype=np.float64) * step
-    return TipPath(instants, spline(along))
+    along = _running_mean(PchipInterpolator(time, place)(grid), max(1, round(_SOFTNESS / step)))
+    return np.arange(len(along), dtype=np.float64) * step, along
 
 
 def polygon(corners: Array, period: float) -> TipPath:
@@ -190,13 +221,81 @@ def polygon(corners: Array, period: float) -> TipPath:
     return TipPath(np.concatenate(times), np.concatenate(points), exact=True)
 
 
-def running_mean(values: Array, window: int) -> Array:
+def _running_mean(values: Array, window: int) -> Array:
     """Return a running mean over 2 window + 1 samples, longer by as much: from rest to rest."""
     width = 2 * window + 1
     padded = np.concatenate([np.full(width - 1, values[0]), values, np.full(width - 1, values[-1])])
     total = np.concatenate([[0.0], np.cumsum(padded)])
     mean: Array = (total[width:] - total[:-width]) / width
     return mean
+
+
+def draw_shape(
+    name: str,
+    kinematics: Kinematics,
+    amplitude: float,
+    period: float,
+    cycles: int,
+    sag: Array | None = None,
+) -> TipPath:
+    """Return a shape as a timed path around the tip of a limb bent by 1.2 times the amplitude.
+
+    Curves start and end at rest by a fade of their phase over the first and last quarter of a
+    period; polygons rest at each corner.
+
+    Args:
+        name: one of `SHAPES`.
+        kinematics: of the arcs.
+        amplitude: bend angle that sets place and size [rad].
+        period: of one cycle [s].
+        cycles: how many.
+        sag: (M,) bend angles from which the amplitude counts [rad]; None: straight.
+    """
+    bend = np.full(kinematics.segment_count, 1.2 * amplitude)
+    if sag is not None:
+        bend = bend + sag
+    centre = kinematics.tip(bend)
+    length = float(kinematics.tip(np.zeros(kinematics.segment_count))[0])
+    radius = SHAPE_SIZE * length * amplitude / (np.pi / 4)
+    heading = float(bend.sum()) / 2
+    along = np.array([np.cos(heading), np.sin(heading)])
+    across = np.array([-along[1], along[0]])
+    if name in ("line", "star"):
+        corners = np.array(_corners(name))
+        points = centre + radius * (corners[:, :1] * along + corners[:, 1:] * across)
+        loop = np.concatenate([points] + [points[1:]] * (cycles - 1))
+        return polygon(loop, period * cycles)
+    total = period * cycles
+    time = np.linspace(0.0, total + period / 4, _SHAPE_POINTS * 4 * cycles + 1)
+    phase = 2 * np.pi * _faded_phase(time / period, cycles)
+    if name == "circle":
+        local = np.column_stack([np.cos(phase), np.sin(phase)])
+    else:
+        local = np.column_stack([np.sin(2 * phase) / 2, np.sin(phase)])
+    points = centre + radius * (local[:, :1] * along + local[:, 1:] * across)
+    return TipPath(time, points)
+
+
+def _faded_phase(turns: Array, cycles: int) -> Array:
+    """Return the phase in turns: rate from 0 to 1 over a quarter turn, and back to 0 at the end."""
+    fade = 0.25
+    total = cycles + fade
+
+    def ramp(x: Array) -> Array:
+        t = np.clip(x / fade, 0.0, 1.0)
+        area: Array = fade * (2.5 * t**4 - 3 * t**5 + t**6)
+        return area
+
+    start = np.where(turns < fade, ramp(turns), fade / 2 + (turns - fade))
+    end = fade / 2 + (total - fade - fade) + fade / 2 - ramp(total - turns)
+    return np.where(turns > total - fade, end, start)
+
+
+def _corners(name: str) -> list[tuple[float, float]]:
+    if name == "line":
+        return [(0.0, -1.0), (0.0, 1.0), (0.0, -1.0)]
+    turns = np.arange(6) * 2 / 5
+    return [(float(np.cos(2 * np.pi * t)), float(np.sin(2 * np.pi * t))) for t in turns]
 
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "s": 1.0, "ms": 0.001}

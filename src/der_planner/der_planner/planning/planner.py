@@ -8,22 +8,20 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline
 from threadpoolctl import ThreadpoolController
 
 from der_planner.limb import Limb
-from der_planner.model import NODES, STEPS, Initial, simulate
+from der_planner.model import CONTROL_PERIOD, NODES, Model, RodModel, simulate
 from der_planner.model.commands import SlowVenting, slow_venting, within_limits
 from der_planner.model.commands import commands as commands_for
-from der_planner.model.series import CONTROL_PERIOD
-from der_planner.planning import models
+from der_planner.planning.configuration import METHODS, Configuration, configure
 from der_planner.planning.errors import PlanningError
-from der_planner.planning.loads.rest import nearly_buckling
-from der_planner.planning.models import METHODS, PlanningModel
+from der_planner.planning.loads import nearly_buckling
 from der_planner.planning.motions import Motion, Reference
 from der_planner.planning.optimal import Optimiser
-from der_planner.planning.result import Plan
-from der_planner.planning.ways import Start, sample_spline
+from der_planner.planning.plan_file import Plan
+from der_planner.planning.transitions import Start
+from der_planner.planning.workspace import Workspace
 from der_planner.rod import ConvergenceError
 
 Array = NDArray[np.float64]
@@ -77,16 +75,15 @@ def plan(
     report = progress or (lambda _share: None)
     # Its matrices are small: more threads only get into other processes' way.
     with _THREADS.limit(limits=1, user_api="blas"):
-        physics = models.build(limb, model, nodes)
-        reference = motion.reference(limb, start)
-        spline = _configuration(physics, reference, model)
+        rod = RodModel(limb, nodes)
+        body = rod if model == "der" else Model.of(limb, model)
+        reference = motion.reference(Workspace(rod), start)
+        configuration = _configured(body, reference)
         report(0.3)
-        solved = _followed(physics, spline, reference, method, report)
-    bend = sample_spline(spline, reference.time)[0]
-    left = [
-        str(reference.deviation or ""), limb.other_mounting, nearly_buckling(physics.limb)
-    ]  # fmt: skip
-    warnings = filter(None, left + solved.warnings + _calibration_warnings(physics.limb, bend))
+        solved = _solve(configuration, reference, method, report)
+    bend, seen = configuration.bend_at(reference.time), body.limb
+    own = [str(reference.deviation or ""), limb.other_mounting, nearly_buckling(seen)]
+    warnings = filter(None, own + solved.warnings + _calibration_warnings(seen, bend))
     return Plan(
         time=reference.time,
         differential_pressure=solved.commands,
@@ -99,20 +96,20 @@ def plan(
         amplitude=motion.amplitude,
         period=motion.period,
         cycles=motion.cycles,
-        limb=physics.limb,
-        kinematics=physics.kinematics,
+        limb=seen,
+        kinematics=body.kinematics,
         solve_time=clock.perf_counter() - begin,
         warnings=tuple(warnings),
         details=solved.details,
     )
 
 
-def _configuration(physics: PlanningModel, reference: Reference, model: str) -> BSpline:
-    """Return q̄(t) of a model; a refusal of arcs that sag out of their plane advises the rod."""
+def _configured(model: Model, reference: Reference) -> Configuration:
+    """Return the configuration; a refusal of arcs that sag out of their plane advises the rod."""
     try:
-        return physics.configuration(reference)
+        return configure(model, reference)
     except PlanningError as error:
-        if model == "pcc" and physics.limb.gravity[2]:
+        if model.name == "pcc" and model.limb.gravity[2]:
             error.args = (
                 f"{error}. Arcs know nothing of the sag out of their plane that this gravity "
                 "brings: plan with the rod (der)",
@@ -128,20 +125,21 @@ class _Solved:
     details: dict[str, float]
 
 
-def _followed(
-    physics: PlanningModel,
-    spline: BSpline,
+def _solve(
+    configuration: Configuration,
     reference: Reference,
     method: str,
     report: Callable[[float], None],
 ) -> _Solved:
-    """Call `_solve`; a rod that does not converge becomes a refusal with the remedy.
+    """Return commands that keep the limits, and what the model expects of them.
 
     Raises:
-        PlanningError: the rod cannot be simulated along the motion.
+        PlanningError: the rod cannot be simulated along the motion; names the remedy.
     """
     try:
-        return _solve(physics, spline, reference, method, report)
+        if method == "optimal":
+            return _optimal(configuration, reference, report)
+        return _balanced(configuration, reference, method)
     except ConvergenceError as error:
         raise PlanningError(
             f"the rod cannot be rolled forward along this motion ({error}): take a longer "
@@ -149,42 +147,35 @@ def _followed(
         ) from error
 
 
-def _solve(
-    physics: PlanningModel,
-    spline: BSpline,
-    reference: Reference,
-    method: str,
-    report: Callable[[float], None],
+def _optimal(
+    configuration: Configuration, reference: Reference, report: Callable[[float], None]
 ) -> _Solved:
-    """Return commands that keep the limits, and what the model expects of them."""
-    optimal = method == "optimal"
-    time, effective, bend = balance(physics, spline, reference, "projected" if optimal else method)
-    wanted = commands_for(physics, time, effective, bend, CONTROL_PERIOD)
-    if optimal:
-        begin = physics.begin(spline, reference.start)
-        solver = Optimiser(physics, begin, spline, reference, wanted, STEPS)
-        outcome = solver.run(lambda share: report(0.4 + 0.6 * share))
-        commands, tip, said = outcome.commands, outcome.tip, ""
-        missed = _mean_distance(tip, reference)
-        elsewhere = _begins_elsewhere(tip, reference) and not _excessive(physics.limb, wanted)
-        if outcome.limited and missed > _NOTABLE_ERROR and not elsewhere:
-            said = f"the limits leave a mean error of {missed * 1000:.1f} mm on the model itself"
-        details: dict[str, float] = {"steps": outcome.steps, "limited_windows": outcome.limited}
-    else:
-        before = None if reference.start is None else reference.start.pressure
-        commands, cut = within_limits(wanted, physics.air, CONTROL_PERIOD, before)
-        tip = tip_under(physics, spline, commands, reference.start)
-        said = (
-            f"limits cut the wanted pressures by up to {cut:.0f} Pa" if cut > _NOTABLE_CUT else ""
-        )
-        details = {}
-    pressure = physics.material.differential_pressure(time, effective, bend)
-    slow = slow_venting(physics.air, time, pressure)
+    wanted, slow = balance(configuration, reference, "projected")
+    solver = Optimiser(configuration, reference, wanted)
+    found = solver.run(lambda share: report(0.4 + 0.6 * share))
+    missed = _mean_distance(found.tip, reference)
+    warnings = _vent_warnings(slow, missed)
+    model = configuration.model
+    elsewhere = _begins_elsewhere(found.tip, reference) and not _excessive(model, wanted)
+    if found.limited and missed > _NOTABLE_ERROR and not elsewhere and not warnings:
+        said = f"the limits leave a mean error of {missed * 1000:.1f} mm on the model itself"
+        warnings.insert(0, f"{said}: {_excess(model, wanted)}")
+    warnings += _error_warnings(found.tip, reference, "optimal")
+    details: dict[str, float] = {"steps": found.steps, "limited_windows": found.limited}
+    return _Solved(found.commands, found.tip, warnings, details)
+
+
+def _balanced(configuration: Configuration, reference: Reference, method: str) -> _Solved:
+    wanted, slow = balance(configuration, reference, method)
+    model, before = configuration.model, configuration.initial.before
+    commands, cut = within_limits(wanted, model.air, CONTROL_PERIOD, before)
+    tip = tip_under(configuration, commands)
     warnings = _vent_warnings(slow, _mean_distance(tip, reference))
-    if said and not (optimal and warnings):
-        warnings.insert(0, f"{said}: {_excess(physics.limb, wanted)}")
+    if cut > _NOTABLE_CUT:
+        said = f"limits cut the wanted pressures by up to {cut:.0f} Pa"
+        warnings.insert(0, f"{said}: {_excess(model, wanted)}")
     warnings += _error_warnings(tip, reference, method)
-    return _Solved(commands, tip, warnings, details)
+    return _Solved(commands, tip, warnings, {})
 
 
 def choose_method(model: str, method: str) -> str:
@@ -204,34 +195,30 @@ def choose_method(model: str, method: str) -> str:
 
 
 def balance(
-    physics: PlanningModel, spline: BSpline, reference: Reference, method: str
-) -> tuple[Array, Array, Array]:
-    """Return instants (F,) [s], wanted effective pressures (F, M) [Pa] and bend angles (F, M)."""
-    ahead = CONTROL_PERIOD + physics.limb.pneumatics.delay
-    count = int(np.ceil((reference.duration + ahead) / CONTROL_PERIOD * _FINE - 1e-6)) + 1
-    fine = np.arange(count, dtype=np.float64) * (CONTROL_PERIOD / _FINE)
-    fine[-1] = reference.duration + ahead
-    effective = physics.pressures(method, spline, fine, reference.start)
-    return fine, effective, sample_spline(spline, fine)[0]
+    configuration: Configuration, reference: Reference, method: str
+) -> tuple[Array, SlowVenting | None]:
+    """Return the commands (K, M) [Pa] that a balance wants, before limits.
 
-
-def tip_under(
-    physics: PlanningModel, spline: BSpline, commands: Array, start: Start | None = None
-) -> Array:
-    """Return the tip (K, 2) [m] of a model at the instants of commands (K, M) [Pa].
-
-    Args:
-        physics: model of the limb.
-        spline: bend angles of the motion, along which friction and creep act [rad].
-        commands: (K, M) [Pa].
-        start: where the motion begins; None: at rest.
+    Also where it wants a chamber to fall faster than it is vented.
     """
+    air, material = configuration.model.air, configuration.model.material
+    end = reference.duration + CONTROL_PERIOD + air.pneumatics.delay
+    count = int(np.ceil(end / CONTROL_PERIOD * _FINE - 1e-6)) + 1
+    fine = np.arange(count, dtype=np.float64) * (CONTROL_PERIOD / _FINE)
+    fine[-1] = end
+    effective = configuration.pressures(method, fine)
+    pressure = material.differential_pressure(fine, effective, configuration.bend_at(fine))
+    return commands_for(air, fine, pressure, CONTROL_PERIOD), slow_venting(air, fine, pressure)
+
+
+def tip_under(configuration: Configuration, commands: Array) -> Array:
+    """Return the tip (K, 2) [m] of a model at the instants of commands (K, M) [Pa]."""
     response = simulate(
-        physics,
+        configuration.model,
         np.arange(len(commands)) * CONTROL_PERIOD,
         commands=commands,
-        bend=lambda time: sample_spline(spline, time)[0],
-        initial=Initial(physics.begin(spline, start), None if start is None else start.pressure),
+        bend=configuration.bend_at,
+        initial=configuration.initial,
     )
     return response.tip[:-1]
 
@@ -293,13 +280,14 @@ def _wants(wanted: Array) -> tuple[float, float]:
     return float(np.abs(wanted).max()), float(fastest)
 
 
-def _excessive(limb: Limb, wanted: Array) -> bool:
+def _excessive(model: Model, wanted: Array) -> bool:
+    air = model.air.pneumatics
     largest, fastest = _wants(wanted)
-    return largest > limb.pneumatics.pressure_limit or fastest > limb.pneumatics.slew_limit
+    return largest > air.pressure_limit or fastest > air.slew_limit
 
 
-def _excess(limb: Limb, wanted: Array) -> str:
-    air = limb.pneumatics
+def _excess(model: Model, wanted: Array) -> str:
+    air = model.air.pneumatics
     largest, fastest = _wants(wanted)
     return (
         f"the motion wants {largest:.0f} Pa and {fastest:.0f} Pa/s, allowed are "

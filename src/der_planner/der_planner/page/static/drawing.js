@@ -3,8 +3,10 @@
 page.drawing = (() => {
   const INSIDE = "#ffffff", OUTSIDE = "#ff4040";
   const REGION_INTERVAL = 1000; // ms: the reachable region moves in the picture only with the camera
-  let load = "", region = null, on = false, clean = true, points = [], preview = null, begun = 0, pointer = null;
-  const canvas = () => document.getElementById("drawing");
+  const { find, seconds, drawLine } = page;
+  let on = false, clean = true, points = [], pointer = null;
+  let load = "", region = null, preview = null, begun = 0;
+  const canvas = () => find("drawing");
 
   function pathOf(outlines) {
     const path = new Path2D();
@@ -15,43 +17,32 @@ page.drawing = (() => {
     return path;
   }
 
-  function line(context, list, colour, width, dash = []) {
-    if (list.length < 2) return;
-    context.beginPath();
-    list.forEach(([x, y], index) => (index ? context.lineTo(x, y) : context.moveTo(x, y)));
-    context.setLineDash(dash);
-    context.strokeStyle = colour;
-    context.lineWidth = width;
-    context.lineJoin = context.lineCap = "round";
-    context.stroke();
-    context.setLineDash([]);
-  }
-
   function draw() {
     const target = canvas(), [width, height] = page.pictureSize || [1280, 720];
     if (!target || (!on && clean)) return; // what is drawn anew is composed anew, also where nothing is seen
     if (target.width !== width || target.height !== height) { target.width = width; target.height = height; }
     const context = target.getContext("2d");
-    context.clearRect(0, 0, target.width, target.height);
+    context.clearRect(0, 0, width, height);
     clean = !on;
     if (!on) return;
-    const reachable = region ? pathOf(region) : null;
+    const reachable = region && pathOf(region);
     if (reachable) { context.fillStyle = "rgba(60, 200, 255, .28)"; context.fill(reachable); }
     // Each piece in the colour of where it lies.
     for (let k = 1; k < points.length; k += 1) {
-      const inside = !reachable || context.isPointInPath(reachable, points[k][0], points[k][1]);
-      line(context, [points[k - 1], points[k]], inside ? INSIDE : OUTSIDE, 4);
+      const inside = !reachable || context.isPointInPath(reachable, ...points[k]);
+      drawLine(context, [points[k - 1], points[k]], { colour: inside ? INSIDE : OUTSIDE, width: 4 });
     }
     if (!preview || !preview.path.length) return;
-    line(context, preview.path, "#ffe14a", 3, [9, 6]);
-    const share = ((performance.now() - begun) / 1000 / Math.max(preview.duration, 1)) % 1;
+    drawLine(context, preview.path, { colour: "#ffe14a", width: 3, dash: [9, 6] });
+    const share = ((seconds() - begun) / Math.max(preview.duration, 1)) % 1;
     const pose = preview.poses[Math.floor(share * preview.poses.length)];
-    if (pose) line(context, pose, "rgba(255, 255, 255, .75)", 10);
+    if (pose) drawLine(context, pose, { colour: "rgba(255, 255, 255, .75)", width: 10 });
   }
 
-  function at(event) {
+  function pixel(event) {
     const target = canvas(), box = target.getBoundingClientRect();
-    return [((event.clientX - box.left) / box.width) * target.width, ((event.clientY - box.top) / box.height) * target.height];
+    const x = (event.clientX - box.left) / box.width, y = (event.clientY - box.top) / box.height;
+    return [x * target.width, y * target.height];
   }
 
   function begin(event) {
@@ -59,29 +50,24 @@ page.drawing = (() => {
     event.preventDefault();
     pointer = event.pointerId;
     event.target.setPointerCapture(pointer);
-    points = [at(event)];
+    points = [pixel(event)];
     preview = null;
   }
 
   function go(event) {
     if (event.pointerId !== pointer) return;
     const all = event.getCoalescedEvents?.() || [];
-    for (const part of all.length ? all : [event]) points.push(at(part));
+    for (const part of all.length ? all : [event]) points.push(pixel(part));
   }
 
   function end(event) {
     if (event.pointerId !== pointer) return;
     pointer = null;
-    // Whole pixels of the camera's picture over ten are finer than any hand.
-    if (event.type === "pointerup") emitEvent("drawn", { points: points.map(([x, y]) => [Math.round(x * 10) / 10, Math.round(y * 10) / 10]) });
-    else points = [];
+    if (event.type !== "pointerup") { points = []; return; }
+    // Tenths of a pixel of the camera's picture are finer than any hand.
+    const rounded = points.map((point) => point.map((value) => Math.round(value * 10) / 10));
+    emitEvent("drawn", { points: rounded });
   }
-
-  document.addEventListener("pointerdown", begin);
-  document.addEventListener("pointermove", go);
-  document.addEventListener("pointerup", end);
-  document.addEventListener("pointercancel", end);
-  setInterval(() => { if (!document.hidden) draw(); }, 60);
 
   async function askForRegion() {
     if (!on || document.hidden) return;
@@ -90,6 +76,11 @@ page.drawing = (() => {
     if (answer.ok && asked === load) region = await answer.json();
   }
 
+  document.addEventListener("pointerdown", begin);
+  document.addEventListener("pointermove", go);
+  document.addEventListener("pointerup", end);
+  document.addEventListener("pointercancel", end);
+  setInterval(() => { if (!document.hidden) draw(); }, 60);
   (async () => {
     for (;;) {
       try { await askForRegion(); } catch (error) { /* the banner says that the server is away */ }
@@ -101,12 +92,23 @@ page.drawing = (() => {
     get on() { return on; },
     get load() { return load; },
     get region() { return region; },
-    // What is reachable depends on the load: it is asked for anew, and not shown as if it held meanwhile.
-    setLoad(wanted) { const next = new URLSearchParams(wanted).toString(); if (next !== load) { load = next; region = null; } },
-    get points() { return points; },
     get preview() { return preview; },
-    turn(wanted) { on = wanted; canvas()?.classList.toggle("on", on); document.getElementById("draw-legend")?.toggleAttribute("hidden", !on); if (!on) { points = []; preview = null; } },
     clear() { points = []; preview = null; },
-    show(found) { preview = found; begun = performance.now(); if (!points.length || pointer === null) points = found.drawn; },
+    turn(wanted) {
+      on = wanted;
+      canvas()?.classList.toggle("on", on);
+      find("draw-legend")?.toggleAttribute("hidden", !on);
+      if (!on) this.clear();
+    },
+    // What is reachable depends on the load: it is asked for anew, and not shown as if it held meanwhile.
+    setLoad(wanted) {
+      const next = new URLSearchParams(wanted).toString();
+      if (next !== load) { load = next; region = null; }
+    },
+    show(found) {
+      preview = found;
+      begun = seconds();
+      if (!points.length || pointer === null) points = found.drawn;
+    },
   };
 })();

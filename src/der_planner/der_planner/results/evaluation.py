@@ -9,24 +9,38 @@ window from the first to the last setpoint of the plan: E is the mean over the v
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from der_planner.bags.run import Array, RunSeries
-from der_planner.bags.series import load_run
+from der_planner.bags.reader import BagError
+from der_planner.bags.record import read_record
+from der_planner.bags.run import Array, EvaluationError, RunSeries
+from der_planner.bags.series import load_run, run_of
 from der_planner.limb import mounting_of
-from der_planner.results.alignment import Settings, error_series, split_error, window
-from der_planner.results.selfcheck import check_board, check_tracker, interpolate
+from der_planner.results.errors import (
+    EvaluationSettings,
+    check_board,
+    check_tracker,
+    error_series,
+    interpolate,
+    split_error,
+    window,
+)
 
 GAP = 0.5
 """Longest time without a valid image [s] that leaves a run fit for comparison."""
 LEAST_VALID = 0.9
 """Least share of valid images of such a run."""
 REFERENCE_POINTS = 25
+WORTH_WHILE = 64 << 20
+"""Bags of fewer bytes in total are read by one process."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +50,7 @@ class RunResult:
     ``valid_fraction`` is the share of the images in the window whose limb state is valid;
     ``dropped_frames`` is estimated from the gaps between stamps. ``problems`` says in words what
     makes the run unfit for a comparison; ``reference_points_m`` is r̄ at 25 evenly spaced instants
-    of the window. ``checks`` holds figures of the instruments (`selfcheck`).
+    of the window. ``checks`` holds figures of the instruments (`errors`).
     """
 
     motion: str
@@ -118,7 +132,7 @@ def _python_value(value: Any) -> Any:
     return float("nan") if value is None else value
 
 
-def evaluate_bag(path: str | Path, settings: Settings | None = None) -> RunResult:
+def evaluate_bag(path: str | Path, settings: EvaluationSettings | None = None) -> RunResult:
     """Evaluate one bag; see `evaluate_run`.
 
     Raises:
@@ -128,7 +142,7 @@ def evaluate_bag(path: str | Path, settings: Settings | None = None) -> RunResul
     return evaluate_run(load_run(path), settings)
 
 
-def evaluate_run(run: RunSeries, settings: Settings | None = None) -> RunResult:
+def evaluate_run(run: RunSeries, settings: EvaluationSettings | None = None) -> RunResult:
     """Compute every figure of a run.
 
     Args:
@@ -138,7 +152,7 @@ def evaluate_run(run: RunSeries, settings: Settings | None = None) -> RunResult:
     Raises:
         EvaluationError: there is no valid image in the window.
     """
-    settings = settings or Settings()
+    settings = settings or EvaluationSettings()
     series = error_series(run, settings)
     first, last = window(run, settings)
     images = run.tip.time[(run.tip.time >= first) & (run.tip.time <= last)]
@@ -185,7 +199,7 @@ def evaluate_run(run: RunSeries, settings: Settings | None = None) -> RunResult:
         removed_lag_s=split.lag if settings.remove_lag else 0.0,
         problems=_problems(run, valid, longest),
         reference_points_m=_reference_points(run, first, last),
-        checks=_checks(run, first, last),
+        checks=check_tracker(run.tip, run.truth, first, last) | check_board(run.board),
         extra=dict(about.extra),
     )
 
@@ -237,25 +251,74 @@ def _problems(run: RunSeries, valid: float, longest: float) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _checks(run: RunSeries, first: float, last: float) -> dict[str, float]:
-    figures: dict[str, float] = {}
-    tracker = check_tracker(run.tip, run.truth, first, last)
-    if tracker is not None:
-        figures |= {
-            "tracker_rms_m": tracker.rms,
-            "tracker_max_m": tracker.maximum,
-            "tracker_samples": tracker.samples,
-        }
-    board = check_board(run.board)
-    if board is not None:
-        figures |= {
-            "board_setpoints": board.setpoints,
-            "board_received": board.received,
-            "board_lost": board.lost,
-            "board_out_of_order": board.out_of_order,
-            "board_lateness_p50_s": board.lateness_p50,
-            "board_lateness_p99_s": board.lateness_p99,
-            "board_lateness_max_s": board.lateness_max,
-            "board_value_error_pa": board.value_error,
-        }
-    return figures
+@dataclass(frozen=True)
+class Evaluated:
+    """One limb of one bag: its run and result, or the reason why there is none."""
+
+    path: Path
+    run: RunSeries | None = None
+    result: RunResult | None = None
+    error: str = ""
+
+
+def evaluate_bags(
+    paths: Sequence[Path],
+    settings: EvaluationSettings | None = None,
+    *,
+    workers: int = 0,
+    progress: Callable[[int, int, Path], None] | None = None,
+) -> list[Evaluated]:
+    """Evaluate bags in parallel; one that fails does not stop the others.
+
+    Args:
+        paths: bag folders or files.
+        settings: for all of them.
+        workers: processes; 0 = as many as there are cores, but only this one for so few bytes that
+            starting others would take longer; 1 = this process.
+        progress: called with the number done, the number of bags and the last one's path.
+
+    Returns:
+        One entry per limb that has a plan, in the order of the paths; one with the reason for a
+        bag without any.
+    """
+    chosen = settings or EvaluationSettings()
+    workers = min(workers or _worth_while(paths), len(paths))
+    if workers <= 1:
+        found = []
+        for count, path in enumerate(paths, start=1):
+            found += _evaluate(path, chosen)
+            if progress is not None:
+                progress(count, len(paths), path)
+        return found
+    done: dict[Path, list[Evaluated]] = {}
+    # Forking a process that already runs threads (ROS, BLAS) can deadlock.
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        waiting = {pool.submit(_evaluate, path, chosen): path for path in paths}
+        for count, future in enumerate(as_completed(waiting), start=1):
+            path = waiting[future]
+            done[path] = future.result()
+            if progress is not None:
+                progress(count, len(paths), path)
+    return [entry for path in paths for entry in done[path]]
+
+
+def _worth_while(paths: Sequence[Path]) -> int:
+    """Return how many processes pay for their start of a few seconds."""
+    files = [file for path in paths for file in (path.glob("*") if path.is_dir() else [path])]
+    size = sum(file.stat().st_size for file in files if file.is_file())
+    return os.cpu_count() or 1 if size > WORTH_WHILE else 1
+
+
+def _evaluate(path: Path, settings: EvaluationSettings) -> list[Evaluated]:
+    try:
+        record = read_record(path)
+    except (BagError, OSError) as error:
+        return [Evaluated(path, error=str(error))]
+    found = []
+    for namespace in sorted(record.played or record.limbs) or [""]:
+        try:
+            run = run_of(record, namespace)
+            found.append(Evaluated(path, run, evaluate_run(run, settings)))
+        except (BagError, EvaluationError, OSError) as error:
+            found.append(Evaluated(path, error=str(error)))
+    return found

@@ -23,12 +23,11 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.linalg import solveh_banded
 
-from der_planner.limb import Limb
-from der_planner.model.bending import Kinematics
 from der_planner.model.series import interpolate
-from der_planner.planning.inverse import BRANCHES, angle_limits, static_pressure
-from der_planner.planning.nearest.pace import retimed
+from der_planner.planning.inverse import BRANCHES
+from der_planner.planning.pace import retimed
 from der_planner.planning.paths import PathLimits, TipPath
+from der_planner.planning.workspace import Workspace
 
 Array = NDArray[np.float64]
 
@@ -118,8 +117,7 @@ class NearestPath:
 
 
 def nearest_path(
-    limb: Limb,
-    kinematics: Kinematics,
+    workspace: Workspace,
     path: TipPath,
     offset: Array,
     limits: PathLimits | None = None,
@@ -129,8 +127,7 @@ def nearest_path(
     """Return the nearest path that the limb can follow.
 
     Args:
-        limb: for its pressure and slew limits.
-        kinematics: of arcs.
+        workspace: of the limb.
         path: drawn; its times are kept where the slew limit lets them.
         offset: (2,) of the limb's tip from that of the arcs, where loads make it [m].
         limits: speed and acceleration of the tip, for a path whose times mean nothing (`line`).
@@ -142,10 +139,10 @@ def nearest_path(
     step = float(time[1])
     wave = TIMED_WAVE if limits is None else DRAWN_WAVE / PACE
     target = _smoothed(drawn.mean(axis=1) - offset, step, wave)
-    angles = _Search(limb, kinematics, target, step, branch).run()
+    angles = _Search(workspace, target, step, branch).run()
     # Without overshoot where the course hurries along a limit; what is left of corners goes after.
     course = PchipInterpolator(time, angles)
-    clock, along = retimed(limb, kinematics, course, path.duration, limits, rest)
+    clock, along = retimed(workspace, course, path.duration, limits, rest)
     if limits is not None or rest:
         still = np.zeros(_STILL)
         along = np.concatenate([still, along, still + path.duration])
@@ -153,7 +150,10 @@ def nearest_path(
     followed = _smoothed(course(along), float(clock[1]), TIMED_WAVE)
     slowed = math.nan if limits is not None else float(clock[-1] / path.duration)
     deviation = _deviation(
-        drawn.mean(axis=1), kinematics.tip(angles) + offset, np.interp(time, along, clock), slowed
+        drawn.mean(axis=1),
+        workspace.arcs.tip(angles) + offset,
+        np.interp(time, along, clock),
+        slowed,
     )
     return NearestPath(clock, followed, deviation)
 
@@ -211,23 +211,18 @@ def _second_differences(count: int) -> Array:
     return band
 
 
-def _bounds(limb: Limb) -> tuple[Array, Array]:
-    low, high = angle_limits(limb)
-    middle, half = (low + high) / 2, (high - low) / 2 * (1 - RESERVE)
-    return middle - half, middle + half
-
-
 class _Search:
     """Finds the bend angles (K, M) whose tips are nearest to (K, 2) targets, `step` [s] apart."""
 
-    def __init__(
-        self, limb: Limb, kinematics: Kinematics, target: Array, step: float, branch: str
-    ) -> None:
-        self._limb, self._kinematics = limb, kinematics
+    def __init__(self, workspace: Workspace, target: Array, step: float, branch: str) -> None:
+        self._workspace, self._kinematics = workspace, workspace.arcs
         self._target, self._step, self._branch = target, step, branch
-        self._low, self._high = _bounds(limb)
-        self._limit = limb.pneumatics.pressure_limit * (1 - RESERVE)
-        self._smooth = (_WEAKEST * limb.length) ** 2 * (TIMED_WAVE / (2 * np.pi * step)) ** 4
+        self._count, self._length = workspace.limb.segment_count, workspace.limb.length
+        middle = (workspace.low + workspace.high) / 2
+        half = (workspace.high - workspace.low) / 2 * (1 - RESERVE)
+        self._low, self._high = middle - half, middle + half
+        self._limit = workspace.pressure_limit * (1 - RESERVE)
+        self._smooth = (_WEAKEST * self._length) ** 2 * (TIMED_WAVE / (2 * np.pi * step)) ** 4
 
     def run(self) -> Array:
         """Search coarsely, then finely."""
@@ -238,7 +233,7 @@ class _Search:
 
     def _coarse(self, target: Array, step: float) -> Array:
         """Return the states of a grid (K, M) [rad] that follow the target best on the whole."""
-        count = self._limb.segment_count
+        count = self._count
         size = max(3, round(_STATES ** (1 / count)) if count > 1 else 200)
         axes = [np.linspace(a, b, size) for a, b in zip(self._low, self._high, strict=True)]
         states = np.stack([part.ravel() for part in np.meshgrid(*axes, indexing="ij")], axis=-1)
@@ -262,16 +257,16 @@ class _Search:
 
     def _price(self, states: Array) -> Array:
         """Return what a state (G, M) costs wherever the tip should be [m²]."""
-        share = np.abs(static_pressure(self._limb, states)) / self._limit
+        share = np.abs(self._workspace.static_pressure(states)) / self._limit
         price: Array = _PRESSURE * _WEAKEST**2 * (share**2).sum(-1)
         price = price + np.where((share > 1).any(-1), 1.0, 0.0)
-        if self._branch and self._limb.segment_count == 2:
+        if self._branch and self._count == 2:
             price = price + np.where(self._beyond_fold(states) > 0, 1.0, 0.0)
         return price
 
     def _beyond_fold(self, angles: Array) -> Array:
         """Return how far poses (K, 2) are on the other branch than the named one; 0 on it [1]."""
-        side = np.linalg.det(self._kinematics.tip_jacobians(angles)) / self._limb.length**2
+        side = np.linalg.det(self._kinematics.tip_jacobians(angles)) / self._length**2
         wrong: Array = np.maximum(-side if self._branch == BRANCHES[0] else side, 0.0)
         return wrong
 
@@ -281,9 +276,9 @@ class _Search:
         present = self._cost(angles)
         for _ in range(_ITERATIONS):
             band, slope = self._normal_equations(angles)
-            held = ((angles <= self._low) & (slope > 0)) | ((angles >= self._high) & (slope < 0))
+            tied = ((angles <= self._low) & (slope > 0)) | ((angles >= self._high) & (slope < 0))
             while damping < 1e3:
-                step = _free_step(band, slope, held, damping)
+                step = _free_step(band, slope, tied, damping)
                 moved = np.clip(angles + step, self._low, self._high)
                 cost = self._cost(moved)
                 if cost <= present:
@@ -299,9 +294,9 @@ class _Search:
 
     def _excess(self, angles: Array) -> Array:
         """Return what poses (K, M) have beyond the pressure limit and the fold, (K, …) [m]."""
-        pressure = static_pressure(self._limb, angles) / self._limit
+        pressure = self._workspace.static_pressure(angles) / self._limit
         beyond: Array = np.sign(pressure) * np.maximum(np.abs(pressure) - 1, 0.0)
-        if self._branch and self._limb.segment_count == 2:
+        if self._branch and self._count == 2:
             beyond = np.column_stack([beyond, self._beyond_fold(angles)])
         return beyond * _EXCESS
 
@@ -351,13 +346,13 @@ def _cheapest(total: Array, origin: Array, travel: Array, axis: int) -> tuple[Ar
     )
 
 
-def _free_step(band: Array, slope: Array, held: NDArray[np.bool_], damping: float) -> Array:
+def _free_step(band: Array, slope: Array, tied: NDArray[np.bool_], damping: float) -> Array:
     """Return the Gauss-Newton step (K, M) of the angles that no limit holds."""
-    matrix, still = band.copy(), held.ravel()
+    matrix, still = band.copy(), tied.ravel()
     matrix[0] += damping * max(float(band[0].max()), 1e-12)
     for below in range(1, len(matrix)):
-        tied = still[: -below or None] | still[below:]
-        matrix[below, : len(tied)][tied] = 0.0
+        either = still[: -below or None] | still[below:]
+        matrix[below, : len(either)][either] = 0.0
     matrix[0][still] = 1.0
     right = np.where(still, 0.0, -slope.ravel())
     step: Array = solveh_banded(matrix, right, lower=True).reshape(slope.shape)

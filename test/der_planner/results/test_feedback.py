@@ -1,13 +1,15 @@
-"""What feedback did in a run: how soon the board knew, and the manners of playing side by side."""
+"""What feedback did in a run: how soon the board knew, and ways of playing side by side."""
 
 from dataclasses import replace
 
 import numpy as np
 from runs import FRAMES, reference, series
 
-from der_planner.bags.corrections import Revisions, described, latencies
+from der_planner.bags.record import Revisions
+from der_planner.bags.series import described, latencies
 from der_planner.results import evaluate_run
-from der_planner.results.manners import manner, manners_table, side_by_side
+from der_planner.results.report import side_by_side_table
+from der_planner.results.statistics import control_of, side_by_side
 
 MS = 1_000_000
 
@@ -42,11 +44,11 @@ def test_every_latency_is_in_the_histogram():
     assert about["latency_median_s"] == np.median(taken)
 
 
-def test_manners_stand_side_by_side():
-    assert manner("optimal") == "open_loop"
-    assert manner("optimal + feedback") == "feedback"
-    assert manner("learned 2") == "learned"
-    assert manner("learned 2 + feedback") == "learned_feedback"
+def test_ways_of_playing_stand_side_by_side():
+    assert control_of("optimal") == "open_loop"
+    assert control_of("optimal + feedback") == "feedback"
+    assert control_of("learned 2") == "learned"
+    assert control_of("learned 2 + feedback") == "learned_feedback"
     methods = {
         "optimal": 0.004,
         "optimal + feedback": 0.002,
@@ -61,5 +63,5 @@ def test_manners_stand_side_by_side():
     assert row["learned_m"] == 0.001
     assert row["feedback_m"] == 0.002
     assert row["learned_feedback_m"] is None
-    assert "0.100" in manners_table(results)
-    assert manners_table(results[:1]) == ""
+    assert "0.100" in side_by_side_table(results).text()
+    assert not side_by_side_table(results[:1]).rows

@@ -1,4 +1,4 @@
-"""Ways between poses: quintics from rest to a motion, from one motion to another, and back to rest.
+"""Transitions between poses: quintics from rest to a motion, from one to another, back to rest.
 
 All are sequences of bend angles (K, M) [rad] on a fine grid of instants; `resting_spline` turns
 the whole of them into a function that can be differentiated twice.
@@ -14,13 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BSpline, make_interp_spline
 
-from der_planner.limb import Limb
 from der_planner.model.series import CONTROL_PERIOD
 
 Array = NDArray[np.float64]
 
 FINE_PERIOD = 0.01
-"""Between the samples of a way, about [s]."""
+"""Time between two samples of a transition, about [s]."""
 
 
 @dataclass(frozen=True)
@@ -63,13 +62,22 @@ def resting_spline(time: ArrayLike, values: ArrayLike, start: Start | None = Non
     return make_interp_spline(np.asarray(time), samples, k=5, bc_type=ends)
 
 
-def with_ways(limb: Limb, time: Array, angles: Array, home: Array) -> tuple[Array, Array]:
-    """Return times and angles with the ways from home to their first and from their last pose."""
+def with_transitions(
+    fastest: Array, time: Array, angles: Array, home: Array
+) -> tuple[Array, Array]:
+    """Return times and angles that begin and end at rest at home.
+
+    Args:
+        fastest: (M,) rates of the bend angles at the slew limit [rad/s].
+        time: (K,) [s].
+        angles: (K, M) of the motion [rad].
+        home: (M,) where the limb rests [rad].
+    """
     inner = make_interp_spline(time, angles, k=5)
     ends = [(inner(t), inner(t, 1), inner(t, 2)) for t in (time[0], time[-1])]
-    zero = np.zeros(limb.segment_count)
-    lead = _travel_time(limb, ends[0], home)
-    tail = _travel_time(limb, ends[1], home)
+    zero = np.zeros_like(home)
+    lead = _travel_time(fastest, ends[0], home)
+    tail = _travel_time(fastest, ends[1], home)
     approach = quintic(fine_grid(lead), home, zero, zero, *ends[0])
     back = quintic(fine_grid(tail), *ends[1], home, zero, zero)
     between = fine_grid(on_grid(time[-1] - time[0]))
@@ -106,16 +114,17 @@ def quintic(time: Array, x0: Array, v0: Array, a0: Array, x1: Array, v1: Array, 
 
 
 def led_in(
-    limb: Limb, state: tuple[Array, Array, Array], time: Array, angles: Array
+    fastest: Array, state: tuple[Array, Array, Array], time: Array, angles: Array
 ) -> tuple[Array, Array]:
-    """Return time and angles with the way from a state to their first pose, at rest, before them.
+    """Return time and angles with the transition from a state to their first pose before them.
 
-    The state is angle [rad], rate [rad/s] and acceleration [rad/s²], each (M,).
+    The state is angle [rad], rate [rad/s] and acceleration [rad/s²], each (M,); the first pose is
+    at rest. The other arguments are those of `with_transitions`.
     """
-    zero = np.zeros(limb.segment_count)
-    lead = fine_grid(_travel_time(limb, state, angles[0]))
-    way = quintic(lead, *state, angles[0], zero, zero)
-    return np.append(lead, lead[-1] + time[1:]), np.concatenate([way, angles[1:]])
+    zero = np.zeros_like(fastest)
+    lead = fine_grid(_travel_time(fastest, state, angles[0]))
+    approach = quintic(lead, *state, angles[0], zero, zero)
+    return np.append(lead, lead[-1] + time[1:]), np.concatenate([approach, angles[1:]])
 
 
 def on_grid(span: float) -> float:
@@ -128,14 +137,14 @@ def fine_grid(span: float) -> Array:
     return np.linspace(0.0, span, max(2, round(span / FINE_PERIOD) + 1))
 
 
-def _travel_time(limb: Limb, state: tuple[Array, Array, Array], home: Array) -> float:
+def _travel_time(fastest: Array, state: tuple[Array, Array, Array], home: Array) -> float:
     """Return how long the limb takes between rest at home and a state, at half of its slew limit.
 
     Angles (M,) in rad, the result in s.
     """
-    fastest = 0.5 * limb.pneumatics.slew_limit * limb.static_gain
+    half = 0.5 * fastest
     angle, rate, acceleration = (np.abs(p) for p in (state[0] - home, state[1], state[2]))
-    by_angle = np.max(1.875 * angle / fastest)
-    by_rate = np.max(2 * rate / fastest)
-    by_acceleration = np.max(np.sqrt(acceleration / fastest))
+    by_angle = np.max(1.875 * angle / half)
+    by_rate = np.max(2 * rate / half)
+    by_acceleration = np.max(np.sqrt(acceleration / half))
     return on_grid(max(1.0, by_angle, by_rate, by_acceleration))

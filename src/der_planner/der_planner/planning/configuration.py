@@ -1,0 +1,401 @@
+"""The configurations of a model along a reference, and the pressures that move it through them.
+
+Arcs take q̄(t) itself. A rod without gravity bends evenly, by angles that bring its own tip to r̄(t).
+
+Under gravity the shape of a rod at given bend angles is not even, and a balance of forces along
+even shapes is wrong by far. So r̄(t) is followed through resting poses q̄(t) of the rod itself, every
+0.1 s, with quintic splines between them. On these,
+
+    B(q̄) Λ w = M q̄̈ + D q̄̇ − F_int − F_ext
+
+is solved for w by the paper's pseudo-inverse, or projected on the tangent ∂q̄/∂w of the poses
+(virtual work); where the motion is slow both are the pressures at which the poses rest.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from abc import ABC, abstractmethod
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline, make_interp_spline
+
+from der_planner.limb import Limb
+from der_planner.model import ArcModel, Initial, Model, RodModel, State
+from der_planner.model.poses import PoseFinder, Poses
+from der_planner.planning.errors import (
+    BucklingError,
+    OverloadError,
+    PlanningError,
+    UnreachableError,
+)
+from der_planner.planning.inverse import solve
+from der_planner.planning.loads import check_load, check_stays, stable_rest
+from der_planner.planning.motions import Reference
+from der_planner.planning.transitions import Start, resting_spline, sample_spline
+from der_planner.planning.workspace import (
+    NEAREST_TOLERANCE,
+    TOLERANCE,
+    Workspace,
+    static_pressure,
+)
+from der_planner.rod import ConvergenceError, Rod, RodState
+
+Array = NDArray[np.float64]
+
+METHODS = {"der": ("paper", "projected", "optimal"), "pcc": ("paper", "projected", "optimal")}
+"""The methods of each model. Arcs have one unknown a pressure: their two balances are the same."""
+POSITION_GAIN = 20.0
+"""K_p of the method ``paper`` [1/s²]."""
+VELOCITY_GAIN = 8.0
+"""K_d of the method ``paper`` [1/s]: with K_p a damped return at 0.7 Hz."""
+REFERENCE_PRIOR = 2e-3
+"""Pull of the rod's bend angles toward the arcs' [m/rad]. The rod's polyline reaches a little less
+far than the arcs: the pull keeps its angles smooth where the reference touches its fold, and costs
+0.03 mm."""
+_FALLEN = 1.0
+"""Arcs that rest this far from the rod have buckled [rad]."""
+_POSE_PERIOD = 0.1
+"""Time between two poses of a loaded rod [s]."""
+_POSE_TOLERANCE = 0.01
+"""Share of the length by which a pose may miss: near its fold a loaded limb reaches less far than
+the arcs of a named motion."""
+_SPARSE = 5
+"""Every so many poses one is taken to find what the limb could carry."""
+
+
+class Configuration(ABC):
+    """A model's bend angles along a reference, and the pressures that they need.
+
+    Args:
+        model: of the limb.
+        bend: bend angles (M,) [rad] over time.
+        start: where the motion begins; None: at rest.
+    """
+
+    def __init__(self, model: Model, bend: BSpline, start: Start | None) -> None:
+        self.model, self.bend, self.start = model, bend, start
+
+    def bend_at(self, time: Array) -> Array:
+        """Return the bend angles (…, M) [rad] at instants (…,) [s]."""
+        return sample_spline(self.bend, time)[0]
+
+    def on(self, model: Model) -> Self:
+        """Return the same motion for the model of another limb with as many segments."""
+        other = copy.copy(self)
+        other.model = model
+        return other
+
+    @property
+    def initial(self) -> Initial:
+        """State and command with which the motion begins."""
+        return Initial(self.begin, None if self.start is None else self.start.pressure)
+
+    @property
+    def begin(self) -> State:
+        """State in which the motion begins: at rest, or where another motion is left."""
+        if self.start is None:
+            return self.model.rest
+        return self.model.state(self.bend(0.0), self.bend(0.0, 1))
+
+    @abstractmethod
+    def pressures(self, method: str, time: Array) -> Array:
+        """Return effective pressures (K, M) [Pa] by ``paper`` or ``projected``.
+
+        Args:
+            method: of the two.
+            time: (K,) evenly spaced instants from 0 on [s].
+        """
+
+
+def configure(model: Model, reference: Reference) -> Configuration:
+    """Return the configuration of a model that follows r̄(t).
+
+    Raises:
+        UnreachableError: a point is out of reach of the model, or beyond the pressure limit.
+        OverloadError: gravity's load takes more than the pressure limit.
+        BucklingError: the model does not stay at a pose on the way, or does not rest.
+    """
+    if isinstance(model, ArcModel):
+        return _arcs_along(model, reference)
+    if not isinstance(model, RodModel):
+        raise TypeError(f"expected a rod or arcs, got {type(model).__name__}")
+    return _poses_along(model, reference) if model.is_loaded else _evenly_along(model, reference)
+
+
+# Arcs ------------------------------------------------------------------------------------------
+
+
+class ArcConfiguration(Configuration):
+    """Arcs along a reference."""
+
+    model: ArcModel
+
+    def pressures(self, method: str, time: Array) -> Array:  # noqa: ARG002 - both are the same
+        """Return u = Λ† (M q̈ + (C + D) q̇ + K q − Q_gravity) at instants (K,) [s]."""
+        return self.model.inverse_dynamics(*sample_spline(self.bend, time))
+
+
+def _arcs_along(model: ArcModel, reference: Reference) -> ArcConfiguration:
+    """Return q̄(t) itself: the reference is made of arcs.
+
+    Under gravity the arcs rest elsewhere than the rod whose rest the reference begins with: there
+    they follow r̄(t) from their own rest.
+    """
+    time, tip, angles = reference.time, reference.tip, reference.bend_angles
+    if not model.is_loaded:
+        Workspace(model).check_reach(time, tip, angles, np.zeros(len(time)))
+        return ArcConfiguration(model, reference.spline, reference.start)
+    home = model.rest.angles
+    if np.abs(home - reference.rest).max() > _FALLEN:
+        raise BucklingError(
+            "the arcs fall over under their load where the rod stands: make the limb lighter "
+            "or stiffer, or mount it otherwise"
+        )
+    near = angles + (home - reference.rest)
+    # Points that the rod reaches and the arcs miss are no refusal: the plan's error shows them.
+    own = solve(model, tip, near, REFERENCE_PRIOR)[0]
+
+    def needed(limb: Limb) -> Array:
+        lighter = model if limb is model.limb else model.another(limb)
+        pressure = static_pressure(lighter, own)
+        return lighter.material.differential_pressure(time, pressure, own)
+
+    stiffness = np.array([model.smallest_stiffness(pose) for pose in own])
+    check_stays(stiffness, time, tip, "arcs")
+    check_load(model.limb, time, tip, needed(model.limb), needed)
+    return ArcConfiguration(model, resting_spline(time, own, reference.start), reference.start)
+
+
+# Rods ------------------------------------------------------------------------------------------
+
+
+class RodConfiguration(Configuration):
+    """A rod without gravity along a reference: its segments bend evenly."""
+
+    model: RodModel
+
+    def pressures(self, method: str, time: Array) -> Array:
+        """Return effective pressures (K, M) [Pa], see `Configuration.pressures`."""
+        q, v, a = sample_spline(self.bend, time)
+        balance, nodes = self.model.balance, self.model.rod.nodes
+        if method != "paper":
+            return balance.projected(q, v, a)
+        # (B Λ)† (M q̄̈ + D q̄̇ − F_int − F_ext)
+        placed, moving, _ = self.model.kinematics.motion(q, v, a)
+        columns = np.array([4 * node + axis for node in range(nodes) for axis in (0, 1)])
+        position, velocity = (np.zeros((len(q), 4 * nodes - 1)) for _ in range(2))
+        position[:, columns] = placed.reshape(len(q), -1)
+        velocity[:, columns] = moving.reshape(len(q), -1)
+        inverse, pressures = balance.inverse_inputs(q), balance.paper(q, v, a)
+        return self._beside_the_model(pressures, inverse, position, velocity, time)
+
+    def _beside_the_model(
+        self, pressures: Array, inverse: Array, position: Array, velocity: Array, time: Array
+    ) -> Array:
+        """Return the pressures (K, M) with (B Λ)† M (K_d ė + K_p e) added.
+
+        The rod is simulated beside the equation, under the pressures that it has given so far; e
+        is its distance from the reference.
+
+        Args:
+            pressures: (K, M) of the equation without e [Pa].
+            inverse: (K, M, F) (B Λ)† on the free rows.
+            position: (K, 4N-1) of the reference.
+            velocity: (K, 4N-1) of the reference.
+            time: (K,) [s].
+        """
+        rod, result = self.model.rod, pressures.copy()
+        mass, step = rod.mass_diagonal[rod.free], float(time[1] - time[0])
+        state = self.begin
+        if not isinstance(state, RodState):
+            raise TypeError("a rod begins in a state of the rod")
+        for k in range(len(result)):
+            gap, rate = (position[k] - state.q)[rod.free], (velocity[k] - state.v)[rod.free]
+            result[k] += inverse[k] @ (mass * (VELOCITY_GAIN * rate + POSITION_GAIN * gap))
+            state = rod.simulate(state, result[k, None], step, substeps=2).final
+        return result
+
+
+def _evenly_along(model: RodModel, reference: Reference) -> RodConfiguration:
+    time, tip, guess = reference.time, reference.tip, reference.bend_angles
+    if model.inputs == 1:
+        # One angle cannot follow two coordinates: the rod bends as the arc does.
+        bend = resting_spline(time, guess, reference.start)
+        return RodConfiguration(model, bend, reference.start)
+    angles, misses = solve(model.kinematics, tip, guess, REFERENCE_PRIOR)
+    tolerance = TOLERANCE if reference.deviation is None else NEAREST_TOLERANCE
+    Workspace(model).check_reach(time, tip, angles, misses, tolerance, model.kinematics)
+    return RodConfiguration(model, resting_spline(time, angles, reference.start), reference.start)
+
+
+class LoadedConfiguration(RodConfiguration):
+    """A rod under gravity along a reference: a row of its own resting poses.
+
+    Args:
+        model: of the limb.
+        time: (K,) of the poses [s].
+        poses: at these instants.
+        start: where the motion begins; None: at rest.
+    """
+
+    def __init__(self, model: RodModel, time: Array, poses: Poses, start: Start | None) -> None:
+        super().__init__(model, _through(time, poses.bend_angles, start), start)
+        self._time, self._poses = time, poses
+        q = np.array([state.q for state in poses.states])[:, model.rod.free]
+        self._shape = _through(time, q, start)
+
+    @property
+    def begin(self) -> RodState:
+        """State in which the motion begins."""
+        if self.start is None:
+            return self.model.rest
+        q, v, _ = self._sample(np.array(0.0))
+        return self.model.rod.state(q, v, like=self._poses.states[0])
+
+    def _sample(self, time: Array) -> tuple[Array, Array, Array]:
+        """Return q, its rate and acceleration (…, 4N-1) at instants [s]."""
+        rod = self.model.rod
+        straight, result = rod.straight_state().q, []
+        for order, part in enumerate(sample_spline(self._shape, time)):
+            full = np.zeros((*part.shape[:-1], len(straight)))
+            if order == 0:
+                full[...] = straight
+            full[..., rod.free] = part
+            result.append(full)
+        return result[0], result[1], result[2]
+
+    @cached_property
+    def _forces(self) -> tuple[Array, Array]:
+        """M q̄̈ + D q̄̇ − F_int − F_ext (K, F) [N] and B Λ (K, F, M) [N/Pa] at the poses.
+
+        A pose rests under its own pressures: −F_int − F_ext is B Λ times these.
+        """
+        rod, free = self.model.rod, self.model.rod.free
+        q, v, a = self._sample(self._time)
+        forces, inputs = [], []
+        for k, state in enumerate(self._poses.states):
+            inputs.append(rod.input_matrix(state)[free])
+            moved = rod.mass_diagonal * a[k] + rod.damping_diagonal * v[k]
+            moved += _viscous_force(rod, q[k], v[k])
+            forces.append(inputs[-1] @ self._poses.pressures[k] + moved[free])
+        return np.array(forces), np.array(inputs)
+
+    def pressures(self, method: str, time: Array) -> Array:
+        """Return effective pressures (K, M) [Pa] along the poses, see the module."""
+        forces, inputs = self._forces
+        if method != "paper":
+            work = np.einsum("kfm,kf->km", self._poses.tangents, forces)
+            by_pressure = np.einsum("kfm,kfn->kmn", self._poses.tangents, inputs)
+            found = np.linalg.solve(by_pressure, work[..., None])[..., 0]
+            return interpolate_smoothly(time, self._time, found)
+        inverse = np.asarray(np.linalg.pinv(inputs), dtype=np.float64)
+        found = (inverse @ forces[..., None])[..., 0]
+        pressures = interpolate_smoothly(time, self._time, found)
+        nearest = np.rint(np.interp(time, self._time, np.arange(len(self._time)))).astype(int)
+        position, velocity, _ = self._sample(time)
+        return self._beside_the_model(pressures, inverse[nearest], position, velocity, time)
+
+
+def _viscous_force(rod: Rod, q: Array, v: Array) -> Array:
+    """Return what Kelvin-Voigt damping of bending in the xy plane takes (4N-1,) [N]."""
+    mesh = rod.mesh
+    if not mesh.viscous.any():
+        return np.zeros_like(q)
+    dx, dy = np.diff(q[0::4]), np.diff(q[1::4])
+    edges = np.arange(len(dx))
+    # ∂(heading of an edge)/∂q, and by it that of the curvature κ = 2 tan(turn / 2) of each node.
+    heading = np.zeros((len(dx), len(q)))
+    for end, sign in ((0, 1.0), (1, -1.0)):
+        heading[edges, 4 * (edges + end)] = sign * dy / (dx**2 + dy**2)
+        heading[edges, 4 * (edges + end) + 1] = -sign * dx / (dx**2 + dy**2)
+    turn = np.diff(np.unwrap(np.arctan2(dy, dx)), prepend=0.0)
+    growth = 1.0 + np.tan(0.5 * turn) ** 2
+    curving = growth[:, None] * np.diff(heading, axis=0, prepend=0.0)
+    force: Array = curving.T @ (mesh.viscous[:-1] * (curving @ v))
+    return force
+
+
+def interpolate_smoothly(time: Array, instants: Array, values: Array) -> Array:
+    """Return values (K, M) at instants (K,) as (…, M) at others, by a spline."""
+    return sample_spline(resting_spline(instants, values), time)[0]
+
+
+def _through(time: Array, values: Array, start: Start | None) -> BSpline:
+    """Return the spline through (K, n) values; one that another motion precedes begins moving."""
+    if start is None:
+        return resting_spline(time, values)
+    passing = make_interp_spline(time, values, k=5)
+    begin = dataclasses.replace(start, rate=passing(0.0, 1), acceleration=passing(0.0, 2))
+    return resting_spline(time, values, begin)
+
+
+def _poses_along(model: RodModel, reference: Reference) -> LoadedConfiguration:
+    """Return the poses of a loaded rod along a reference."""
+    limb = model.limb
+    count = max(8, int(np.ceil(reference.duration / _POSE_PERIOD)) + 1)
+    time = np.linspace(0.0, reference.duration, count)
+    tip = interpolate_smoothly(time, reference.time, reference.tip)
+    # The rod's own bend angles where it rests: there the poses begin and end without pressure.
+    home = model.bend_of(stable_rest(model))
+    guess = reference.sample(time)[0] + (home - reference.rest)
+    poses = _find_poses(model, time, tip, guess)
+    pressure = _needed(model, time, poses)
+    worst = int(np.abs(pressure).max(axis=1).argmax())
+    some = np.unique(np.append(np.arange(0, count, _SPARSE), [0, worst, count - 1]))
+
+    def needed(lighter: Limb) -> Array:
+        other = model.another(lighter)
+        fewer = _find_poses(other, time[some], tip[some], guess[some])
+        left = _unreached(lighter, time[some], tip[some], fewer)
+        if left is not None:
+            raise left
+        return _needed(other, time[some], fewer)
+
+    unreached = _unreached(limb, time, tip, poses)
+    try:
+        if unreached is None or limb.masses:
+            check_load(limb, time, tip, pressure, needed)
+    except OverloadError as error:
+        # What keeps the limb from a point is its load only if it would be there with less of it.
+        if unreached is None or error.possible_mass is not None:
+            raise
+    if unreached is not None:
+        raise unreached
+    return LoadedConfiguration(model, time, poses, reference.start)
+
+
+def _unreached(limb: Limb, time: Array, tip: Array, poses: Poses) -> UnreachableError | None:
+    """Return the error of poses that miss their points (K, 2) [m]; None where none does."""
+    missed = poses.misses > _POSE_TOLERANCE * limb.length
+    if not missed.any() or limb.segment_count == 1:
+        return None
+    k = int(np.argmax(missed))
+    point = float(tip[k, 0]), float(tip[k, 1])
+    carried = sum(item.mass for item in limb.masses)
+    return UnreachableError(float(time[k]), point, float(poses.misses[k]), float("nan"), carried)
+
+
+def _find_poses(model: RodModel, time: Array, tip: Array, guess: Array) -> Poses:
+    try:
+        poses = PoseFinder(model, REFERENCE_PRIOR).along(stable_rest(model), tip, guess)
+    except ConvergenceError as error:
+        raise BucklingError(
+            f"no pose of the limb leads on to its tip at ({tip[error.step, 0]:.4f}, "
+            f"{tip[error.step, 1]:.4f}) m at t = {time[error.step]:.2f} s: it would buckle or snap "
+            "through under its load. Shrink or move the motion, or mount the limb otherwise"
+        ) from error
+    check_stays(poses.smallest_stiffness, time, tip, "limb")
+    return poses
+
+
+def _needed(model: RodModel, time: Array, poses: Poses) -> Array:
+    """Return the differential pressures (K, M) [Pa] at which poses rest."""
+    try:
+        return model.material.differential_pressure(time, poses.pressures, poses.bend_angles)
+    except ValueError as error:
+        raise PlanningError(str(error)) from error

@@ -1,0 +1,265 @@
+"""A limb under its loads: where it rests and stays, how it sags, and what pressures can hold.
+
+A level limb that is free to sag under gravity along −z comes less far out than arcs of its length
+say. Its reference is therefore the tip of the rod in space, held by pressures so that its segments
+bend by the motion's angles, as seen along z (`sagging_tips`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
+
+from der_planner.limb import PAYLOAD, Limb
+from der_planner.model import ArcModel, RodModel
+from der_planner.model.poses import PoseFinder
+from der_planner.model.series import interpolate
+from der_planner.planning.errors import BucklingError, OverloadError, PlanningError
+from der_planner.planning.inverse import solve
+from der_planner.rod import ConvergenceError, Rod, RodState
+
+Array = NDArray[np.float64]
+
+NEAR = 1.1
+"""A standing limb that would buckle under less than this multiple of its load is near that [-]."""
+_STRAIGHT = 1e-3
+"""A limb that rests within this bend of straight starts there [rad]."""
+_APART = 1e-3
+"""Two resting shapes that are this far apart are two [m]."""
+_POSE_PERIOD = 0.1
+"""Time between two poses of a limb that sags [s]."""
+_HALVINGS = 8
+"""Steps of the bisection for the mass that could be carried."""
+
+
+@dataclass(frozen=True)
+class Rest:
+    """The pose in which a vented limb rests, as bend angles of arcs with the rod's tip.
+
+    Attributes:
+        bend_angles: (M,) under the loads [rad].
+        sag: (M,) what the loads alone add to the bend without loads [rad].
+        offset: (2,) of the rod's tip from that of these arcs [m]: stretch, and what arcs cannot do.
+    """
+
+    bend_angles: Array
+    sag: Array
+    offset: Array
+
+
+def rest_of(arcs: ArcModel, rod: Callable[[], RodModel]) -> Rest:
+    """Return where a vented limb rests.
+
+    Args:
+        arcs: of the limb.
+        rod: gives the rod of the same limb, if it is needed.
+
+    Without gravity that is its rest curvature. With gravity it is the rod's equilibrium, and the
+    arcs that have its tip.
+
+    Raises:
+        BucklingError: the limb does not stay where it rests.
+    """
+    own = arcs.free_angles
+    if np.abs(own).max() < _STRAIGHT:
+        own = np.zeros_like(own)
+    if not arcs.is_loaded:
+        return Rest(own, np.zeros_like(own), np.zeros(2))
+    state = stable_rest(rod())
+    angles = solve(arcs, state.q[None, -3:-1], rod().bend_of(state))[0][0]
+    if np.abs(angles).max() < _STRAIGHT:
+        angles = np.zeros_like(angles)
+    return Rest(angles, angles - own, state.q[-3:-1] - arcs.tip(angles))
+
+
+def stable_rest(model: RodModel) -> RodState:
+    """Return the rod's resting state without pressure.
+
+    Raises:
+        BucklingError: the rod does not stay there, or it may as well rest in its mirror image.
+    """
+    rod, vented = model.rod, np.zeros(model.limb.segment_count)
+    try:
+        state = model.rest
+    except ConvergenceError as error:
+        raise BucklingError(_said(model, "finds no rest under its loads")) from error
+    if rod.smallest_stiffness(state, vented) <= 0:
+        raise BucklingError(_said(model, "does not stay upright under its loads"))
+    if model.limb.gravity[0] < 0 and _has_a_mirror_image(rod, state):
+        raise BucklingError(_said(model, "may fall to either side under its loads"))
+    return state
+
+
+def _has_a_mirror_image(rod: Rod, state: RodState) -> bool:
+    mirrored = state.q.copy()
+    for axis in (1, 2):
+        mirrored[axis::4] *= -1
+    try:
+        other = rod.equilibrium(np.zeros(rod.segment_count), start=rod.state(mirrored, like=state))
+    except ConvergenceError:
+        return False
+    apart = np.abs(other.positions - state.positions).max() > _APART
+    return bool(apart) and rod.smallest_stiffness(other, np.zeros(rod.segment_count)) > 0
+
+
+def _said(model: RodModel, what: str) -> str:
+    limb, share = model.limb, critical_share(model.limb)
+    if share >= 1:
+        return f"the limb '{limb.name}' {what}: mount it otherwise, or let it carry less"
+    mass = float(model.rod.mesh.node_mass.sum())
+    return (
+        f"the limb '{limb.name}' {what}: straight it buckles under {share * mass:.3f} kg spread as "
+        f"its {mass:.3f} kg are ({share:.2f} of them). A bending stiffness {1 / share:.2f} times "
+        "as large, less mass, a shorter limb or another mounting keeps it upright"
+    )
+
+
+def nearly_buckling(limb: Limb) -> str:
+    """Return a sentence where a standing limb is near the load at which it buckles; else empty."""
+    x, y, z = limb.gravity
+    if x >= 0:
+        return ""
+    share = critical_share(dataclasses.replace(limb, gravity=(NEAR * x, y, z)))
+    if share >= 1:
+        return ""
+    return (
+        f"the limb stands under {100 / (NEAR * share):.0f} % of the load under which it would "
+        "buckle if it were straight: there a few per cent of stiffness or mass, and friction, move "
+        "its tip by centimetres, which neither rod nor arcs predict. Hang it, or make it stiffer "
+        "or lighter"
+    )
+
+
+def critical_share(limb: Limb) -> float:
+    """Return the share of its gravity under which a straight limb buckles, by bisection; ≤ 1."""
+    straight = tuple(dataclasses.replace(s, rest_curvature=0.0) for s in limb.segments)
+    along = dataclasses.replace(limb, segments=straight, pcc_segments=())
+    low, high = 0.0, 1.0
+    for _ in range(12):
+        share = 0.5 * (low + high)
+        gravity = (share * limb.gravity[0], 0.0, 0.0)
+        rod = Rod.from_limb(dataclasses.replace(along, gravity=gravity))
+        vented = np.zeros(limb.segment_count)
+        if rod.smallest_stiffness(rod.equilibrium(vented), vented) > 0:
+            low = share
+        else:
+            high = share
+    return high
+
+
+def sagging_tips(model: RodModel, time: Array, angles: Array, rest: Array) -> Array:
+    """Return the tips (K, 2) [m] of the rod in space that bends by angles (K, M) [rad].
+
+    Args:
+        model: rod of a limb whose gravity leaves the plane.
+        time: (K,) for messages [s].
+        angles: of the motion; where they are ``rest`` the rod rests.
+        rest: (M,) bend angles of the arcs at rest [rad].
+
+    Raises:
+        BucklingError: the rod does not stay on the way.
+    """
+    state = stable_rest(model)
+    home = model.bend_of(state)
+    count = max(8, math.ceil((time[-1] - time[0]) / _POSE_PERIOD) + 1)
+    instants = np.linspace(time[0], time[-1], count)
+    wanted = interpolate(instants, time, angles) + (home - rest)
+    holder = PoseFinder(model, prior=1.0, tip_weight=0.0)
+    try:
+        poses = holder.along(state, np.tile(state.q[-3:-1], (count, 1)), wanted)
+    except ConvergenceError as error:
+        raise BucklingError(
+            f"the limb cannot be held at t = {instants[error.step]:.2f} s: under its load it would "
+            "snap through. Shrink the motion, or mount the limb otherwise"
+        ) from error
+    tips = np.array([state.q[-3:-1] for state in poses.states])
+    smooth: Array = make_interp_spline(instants, tips, k=5)(time)
+    return smooth
+
+
+def check_load(
+    limb: Limb, time: Array, tip: Array, pressure: Array, needed: Callable[[Limb], Array]
+) -> None:
+    """Refuse a motion along which resting takes more pressure than the limb may have.
+
+    Args:
+        limb: as the model sees it.
+        time: (K,) [s].
+        tip: (K, 2) of the motion [m].
+        pressure: (K, M) differential pressures that hold the limb at rest at these instants [Pa].
+        needed: returns the same for a limb that carries less.
+
+    Raises:
+        OverloadError: with what is needed, when and where, and what could be carried.
+    """
+    limit = limb.pneumatics.pressure_limit
+    if np.abs(pressure).max() <= limit:
+        return
+    k, segment = np.unravel_index(int(np.abs(pressure).argmax()), pressure.shape)
+    carried, possible = 0.0, None
+    if limb.masses:
+        named = [mass.mass for mass in limb.masses if mass.name == PAYLOAD]
+        carried = sum(named) if named else sum(mass.mass for mass in limb.masses)
+        share = _possible_share(limb, needed)
+        possible = None if share is None else share * carried
+    raise OverloadError(
+        float(time[k]), (float(tip[k, 0]), float(tip[k, 1])), int(segment),
+        float(np.abs(pressure[k, segment])), limit, carried, possible,
+    )  # fmt: skip
+
+
+def check_stays(stiffness: Array, time: Array, tip: Array, what: str) -> None:
+    """Refuse a motion with a pose from which the limb would snap through.
+
+    Args:
+        stiffness: (K,) smallest eigenvalue of the static stiffness at each pose.
+        time: (K,) [s].
+        tip: (K, 2) of the poses [m].
+        what: "limb" or "arcs", for the message.
+
+    Raises:
+        BucklingError: names the first such pose.
+    """
+    falls = stiffness <= 0
+    if falls.any():
+        k = int(np.argmax(falls))
+        raise BucklingError(
+            f"the {what} would snap through under the load at t = {time[k]:.2f} s, tip at "
+            f"({tip[k, 0]:.4f}, {tip[k, 1]:.4f}) m. Shrink or move the motion, or mount the limb "
+            "otherwise"
+        )
+
+
+def _possible_share(limb: Limb, needed: Callable[[Limb], Array]) -> float | None:
+    """Return the share of its masses that the limb can hold; None: not even its own weight."""
+
+    def holds(share: float) -> bool:
+        try:
+            pressure = needed(_with_share(limb, share))
+        except (ConvergenceError, PlanningError, ValueError):
+            return False
+        return bool(np.abs(pressure).max() <= limb.pneumatics.pressure_limit)
+
+    if not holds(0.0):
+        return None
+    low, high = 0.0, 1.0
+    for _ in range(_HALVINGS):
+        share = 0.5 * (low + high)
+        low, high = (share, high) if holds(share) else (low, share)
+    return low
+
+
+def _with_share(limb: Limb, share: float) -> Limb:
+    """Return the limb with a share of its payload; without a payload: of all that it carries."""
+    every = all(mass.name != PAYLOAD for mass in limb.masses)
+    masses = tuple(
+        dataclasses.replace(mass, mass=share * mass.mass) if every or mass.name == PAYLOAD else mass
+        for mass in limb.masses
+    )
+    return dataclasses.replace(limb, masses=masses)

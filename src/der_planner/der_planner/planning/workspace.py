@@ -1,0 +1,299 @@
+"""What a limb reaches within its pressure limit, and where it rests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import least_squares
+
+from der_planner.model import NODES, ArcModel, Model, RodModel
+from der_planner.model.bending import Kinematics
+from der_planner.model.series import interpolate
+from der_planner.planning.errors import PlanningError, UnreachableError
+from der_planner.planning.inverse import branch_of, check_branch, solve
+from der_planner.planning.loads import Rest, rest_of, sagging_tips
+
+Array = NDArray[np.float64]
+
+TOLERANCE = 1e-3
+"""Points missed by less than this [m] count as reached (the models' reach differs by less)."""
+NEAREST_TOLERANCE = 5e-3
+"""The same [m] for a nearest path: along the edge of what arcs reach, a rod's polyline stays behind
+by 1 to 2 mm."""
+_LARGEST_STRIDE = 0.15
+"""Change of a bend angle between anchors of a path up to which what lies between is safe [rad]."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """One way to reach a point.
+
+    Attributes:
+        bend_angles: (M,) [rad].
+        branch: ``counter_clockwise`` or ``clockwise``; empty for M other than 2.
+        distance: that remains [m].
+        pressure: largest |static differential pressure|, with the weight on arcs [Pa].
+    """
+
+    bend_angles: Array
+    branch: str
+    distance: float
+    pressure: float
+
+
+class Workspace:
+    """What one limb reaches as arcs.
+
+    Args:
+        model: of the limb.
+
+    Attributes:
+        limb: of the model.
+        arcs: constant-curvature arcs of its segments.
+        is_loaded: whether gravity bends it.
+        sags: whether it sags out of its plane of motion.
+        pressure_limit: largest |differential pressure| [Pa].
+        fastest: (M,) rates of the bend angles at the slew limit [rad/s].
+        low, high: (M,) least and largest bend angles that the pressure limit holds at rest [rad].
+            Under gravity they are bounds: as if the whole weight beyond a segment pulled across it.
+    """
+
+    def __init__(self, model: Model) -> None:
+        limb = model.limb
+        self._model, self.limb, self.is_loaded = model, limb, model.is_loaded
+        self.arcs = model if isinstance(model, ArcModel) else ArcModel(limb)
+        self.sags = limb.gravity[2] != 0
+        self.pressure_limit = limb.pneumatics.pressure_limit
+        self.fastest = limb.pneumatics.slew_limit * limb.static_gain
+        self.low, self.high = self._angle_limits()
+
+    @cached_property
+    def rod(self) -> RodModel:
+        """The limb's rod with the usual number of nodes."""
+        if isinstance(self._model, RodModel) and self._model.nodes == NODES:
+            return self._model
+        return RodModel(self.limb)
+
+    @cached_property
+    def rest(self) -> Rest:
+        """Where the vented limb rests.
+
+        Raises:
+            BucklingError: it does not stay there.
+        """
+        return rest_of(self.arcs, lambda: self.rod)
+
+    def sagging_tips(self, time: Array, angles: Array) -> Array:
+        """Return the tips (K, 2) [m] of the rod in space that bends by angles (K, M) [rad].
+
+        Raises:
+            BucklingError: the rod does not stay on the way.
+        """
+        return sagging_tips(self.rod, time, angles, self.rest.bend_angles)
+
+    def static_pressure(self, bend_angles: ArrayLike) -> Array:
+        """Return differential pressures (..., M) [Pa] that hold bend angles (..., M) [rad] at rest.
+
+        The limb's weight acts on arcs.
+        """
+        return static_pressure(self.arcs, bend_angles)
+
+    def _angle_limits(self) -> tuple[Array, Array]:
+        bounds = []
+        for segment, weight in zip(self.limb.segments, self._weight_moments(), strict=True):
+            moment = segment.moment_gain * self.pressure_limit + weight
+            roots = np.roots([segment.cubic_stiffness, 0.0, segment.bending_stiffness, -moment])
+            real = roots[np.abs(roots.imag) < 1e-6 * np.abs(roots).max()].real
+            positive = real[real > 0]
+            curvature = positive.min() if positive.size else moment / segment.bending_stiffness
+            around = segment.rest_curvature + np.array([-curvature, curvature])
+            bounds.append(around * segment.length)
+        low, high = np.array(bounds).T
+        if self.is_loaded:
+            return np.maximum(low, -np.pi), np.minimum(high, np.pi)
+        return low, high
+
+    def _weight_moments(self) -> Array:
+        """Return the largest moments (M,) of gravity about where each segment starts [N·m]."""
+        limb, arcs = self.limb, self.arcs
+        pull = float(np.hypot(*limb.gravity[:2]))
+        if pull == 0:
+            return np.zeros(limb.segment_count)
+        starts = np.cumsum(arcs.lengths + arcs.connector) - arcs.lengths - arcs.connector
+        places = [item.arc_length - limb.base_length for item in limb.masses]
+        where = np.append(starts + arcs.lengths / 2, places)
+        mass = np.append(arcs.masses, [item.mass for item in limb.masses])
+        arms = np.maximum(where - starts[:, None], 0.0)
+        moments: Array = pull * arms @ mass
+        return moments
+
+    def check_reach(
+        self,
+        time: Array,
+        tip: Array,
+        angles: Array,
+        misses: Array,
+        tolerance: float = TOLERANCE,
+        kinematics: Kinematics | None = None,
+    ) -> None:
+        """Refuse a path whose points are missed or need more pressure than the limb may have.
+
+        Under gravity only what is missed counts here: what pressures have to hold is for
+        `der_planner.planning.loads`.
+
+        Args:
+            time: (K,) [s].
+            tip: (K, 2) [m].
+            angles: (K, M) from `inverse.solve` [rad].
+            misses: (K,) distances from `inverse.solve` [m].
+            tolerance: largest distance that still counts as reached [m].
+            kinematics: that solved the path; None: the arcs.
+
+        Raises:
+            UnreachableError: for the first point that fails.
+        """
+        pressures = np.abs(self.static_pressure(angles)).max(axis=-1)
+        failed = misses > tolerance
+        if not self.is_loaded:
+            failed |= pressures > self.pressure_limit
+        if not failed.any():
+            return
+        k = int(np.argmax(failed))
+        reached = misses[k] <= tolerance
+        raise UnreachableError(
+            float(time[k]),
+            (float(tip[k, 0]), float(tip[k, 1])),
+            self.distance_to_reach(tip[k], angles[k], kinematics),
+            float(pressures[k]) if reached else float("nan"),
+        )
+
+    def distance_to_reach(
+        self, point: ArrayLike, guess: ArrayLike, kinematics: Kinematics | None = None
+    ) -> float:
+        """Return the distance [m] from a point to the nearest tip within the pressure limit.
+
+        Bounded least squares from several starts, so that the nearest of the folds' sides counts.
+        """
+        shape = kinematics or self.arcs
+        target, low, high = np.asarray(point, dtype=float), self.low, self.high
+
+        def miss(theta: Array) -> Array:
+            difference: Array = shape.tip(theta) - target
+            return difference
+
+        corners = self._grid(np.array([0.25, 0.75]), 4)
+        best = np.inf
+        for start in [np.clip(np.asarray(guess, dtype=float), low, high), *corners]:
+            result = least_squares(
+                miss,
+                np.clip(start, low + 1e-9, high - 1e-9),
+                jac=shape.tip_jacobians,
+                bounds=(low, high),
+            )
+            best = min(best, float(np.linalg.norm(result.fun)))
+        return best
+
+    def _grid(self, shares: Array, most: int) -> Array:
+        """Return bend angles (P, M) [rad] at shares of the limits, of limbs with few segments all.
+
+        With more than ``most`` segments all segments have the same share.
+        """
+        count = len(self.low)
+        table = np.tile(shares[:, None], (1, count))
+        if count <= most:
+            mesh = np.meshgrid(*([shares] * count))
+            table = np.stack([part.ravel() for part in mesh], axis=-1)
+        angles: Array = self.low + (self.high - self.low) * table
+        return angles
+
+    def solutions(self, point: ArrayLike) -> list[Solution]:
+        """Return every way found to reach one point within the limit, least pressure first.
+
+        If there is none under gravity, ways beyond the limit are returned: what it takes to hold
+        them is for `der_planner.planning.loads`.
+
+        Args:
+            point: (2,) [m].
+        """
+        starts = self._grid(np.array([0.1, 0.35, 0.5, 0.65, 0.9]), 3)
+        target = np.tile(np.asarray(point, dtype=float), (len(starts), 1))
+        found: list[Solution] = []
+        for theta, distance in zip(*solve(self.arcs, target, starts), strict=True):
+            inside = np.all(theta >= self.low - 1e-9) and np.all(theta <= self.high + 1e-9)
+            if distance > 1e-6 or not inside:
+                continue
+            known = (np.linalg.norm(theta - item.bend_angles) < 1e-3 for item in found)
+            if len(theta) <= 2 and any(known):
+                continue
+            pressure = float(np.abs(self.static_pressure(theta)).max())
+            branch = branch_of(self.arcs, theta)
+            found.append(Solution(theta, branch, float(distance), pressure))
+        limit = self.pressure_limit * (1 + 1e-6)
+        possible = [item for item in found if item.pressure <= limit]
+        return sorted(possible or found, key=lambda item: item.pressure)
+
+    def follow(self, time: Array, tip: Array, branch: str = "") -> Array:
+        """Return bend angles (K, M) [rad] of arcs along a path, on one branch, by continuity.
+
+        Args:
+            time: (K,) of the points, for messages [s].
+            tip: (K, 2) [m].
+            branch: at the first point, see `inverse.BRANCHES`; empty takes the one with the least
+                pressure.
+
+        Raises:
+            UnreachableError: a point is out of reach or beyond the pressure limit.
+            PlanningError: unknown branch, or the first point has no solution on it.
+        """
+        start = self._begin(time, tip, branch)
+        # One by one over every eighth point, all others at once from between them. Where the path
+        # is too fast for that, one by one over all.
+        for stride in (8, 1):
+            anchors = np.unique(np.append(np.arange(0, len(tip), stride), len(tip) - 1))
+            coarse = self._continue(tip[anchors], start)
+            if stride == 1 or np.abs(np.diff(coarse, axis=0)).max(initial=0.0) < _LARGEST_STRIDE:
+                break
+        guesses = interpolate(np.arange(len(tip)), anchors, coarse)
+        angles, misses = solve(self.arcs, tip, guesses)
+        self.check_reach(time, tip, angles, misses)
+        return angles
+
+    def _begin(self, time: Array, tip: Array, branch: str) -> Array:
+        """Return the bend angles (M,) [rad] at the first point of a path, see `follow`."""
+        check_branch(branch)
+        found = self.solutions(tip[0])
+        if not found:
+            middle = (self.low + self.high) / 2 + 0.1
+            angles, miss = solve(self.arcs, tip[:1], middle[None])
+            self.check_reach(time[:1], tip[:1], angles, miss, tolerance=1e-6)
+            first: Array = angles[0]
+            return first
+        chosen = [item for item in found if not branch or item.branch == branch]
+        if not chosen:
+            raise PlanningError(
+                f"the first point ({tip[0, 0]:.4f}, {tip[0, 1]:.4f}) m has no solution "
+                f"on the branch '{branch}' within the pressure limit, only on '{found[0].branch}'"
+            )
+        return chosen[0].bend_angles
+
+    def _continue(self, points: Array, start: Array) -> Array:
+        """Return bend angles (K, M) along points (K, 2), each from where the last two lead."""
+        angles = np.zeros((len(points), len(start)))
+        guess = start
+        for k, point in enumerate(points):
+            angles[k] = solve(self.arcs, point[None], guess[None])[0][0]
+            guess = 2 * angles[k] - angles[k - 1] if k else angles[k]
+        return angles
+
+
+def static_pressure(arcs: ArcModel, bend_angles: ArrayLike) -> Array:
+    """Return the pressures (..., M) [Pa] that hold arcs at bend angles (..., M) [rad] at rest."""
+    angles = np.asarray(bend_angles, dtype=float)
+    if not arcs.is_loaded:
+        pressure: Array = arcs.elastic_torque(angles) / arcs.gain
+        return pressure
+    flat = angles.reshape(-1, angles.shape[-1])
+    return arcs.inverse_dynamics(flat, 0 * flat, 0 * flat).reshape(angles.shape)
