@@ -8,7 +8,7 @@ import numpy as np
 
 from der_planner.identification.excitation import Excitation, calibration_run
 from der_planner.identification.fit import fit
-from der_planner.identification.logs.log import CalibrationLog
+from der_planner.identification.log import CalibrationLog
 from der_planner.identification.report import FitReport
 from der_planner.limb import Limb
 

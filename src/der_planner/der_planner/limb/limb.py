@@ -156,6 +156,11 @@ class Limb:
         return own + self.connector_length * sum(0.5 * (a + b) for a, b in pairwise(densities))
 
     @property
+    def weighs_in_plane(self) -> bool:
+        """Whether gravity pulls in the plane of motion."""
+        return any(self.gravity[:2])
+
+    @property
     def static_gain(self) -> NDArray[np.float64]:
         """(M,) `Segment.static_gain` [rad/Pa]."""
         return np.array([segment.static_gain for segment in self.segments])

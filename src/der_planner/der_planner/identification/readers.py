@@ -1,8 +1,11 @@
-"""Logs as CSV tables of any lab, read through a map of columns."""
+"""Logs of runs from recorded bags, and from tables of any program through a map of columns."""
 
 from __future__ import annotations
 
+import codecs
+import csv
 import math
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -12,11 +15,19 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from der_planner.identification.logs.log import CalibrationLog, LogError
-from der_planner.identification.logs.text import read_table
+from der_planner.bags.reader import BagError
+from der_planner.bags.record import PRESSURE_TYPE, STATE_TYPE, BagRecord, LimbRecord, read_record
+from der_planner.bags.run import Stream
+from der_planner.bags.series import stream
+from der_planner.identification.log import CalibrationLog, LogError, on_grid
+from der_planner.model.series import CONTROL_PERIOD
 
 Array = NDArray[np.float64]
 
+LONGEST_GAP = 0.25
+"""Time between two messages of a bag that a straight line may bridge [s]."""
+LEAST_MESSAGES = 10
+"""Messages of pressures, and of valid limb states, that a bag must hold."""
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 PRESSURE_UNITS = {
     "Pa": 1.0,
@@ -29,9 +40,73 @@ PRESSURE_UNITS = {
 ANGLE_UNITS = {"rad": 1.0, "deg": np.pi / 180.0}
 LENGTH_UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
 REST_SHARE = 0.02
-"""Commands below this share of the log's largest one count as rest."""
+"""Share of a table's largest command below which commands count as rest."""
 VENTING_TIME = 5.0
-"""Time [s] that chambers need to be at rest after they were filled."""
+"""Time that chambers need to be at rest after they were filled [s]."""
+SEPARATORS = "\t;,"
+"""Separators of columns; a table has the first of these that its header holds."""
+
+
+def read_bag(path: str | Path, namespace: str = "") -> CalibrationLog:
+    """Read the log of a run. The twin's ground truth is never looked at.
+
+    Args:
+        path: bag folder or file.
+        namespace: of the limb, e.g. ``/limb``; needed only where a bag holds several.
+
+    Raises:
+        LogError: the bag cannot be read, holds several limbs and none is named, or lacks pressures
+            or limb states; the message says which.
+    """
+    try:
+        record = read_record(path)
+    except BagError as error:
+        raise LogError(str(error)) from error
+    limb = _choose_limb(record, namespace)
+    if len(limb.measured) < LEAST_MESSAGES:
+        raise LogError(
+            f"the bag {path} holds no pressures ({PRESSURE_TYPE}): was the driver running?"
+        )
+    if np.isfinite(limb.tip.values(2)).all(axis=1).sum() < LEAST_MESSAGES:
+        raise LogError(
+            f"the bag {path} holds no valid limb state ({STATE_TYPE}): was the limb seen?"
+        )
+    count, origin = limb.angles.width, int(limb.measured.stamps().min())
+    measured, angles = stream(limb.measured, count, origin), stream(limb.angles, count, origin)
+    seen = angles.time[np.isfinite(angles.value).all(axis=1)]
+    start, end = max(measured.time[0], seen[0]), min(measured.time[-1], seen[-1])
+    if end - start < 1.0:
+        raise LogError(f"in {path} pressures and limb states do not overlap: check the clocks")
+    grid = np.arange(start, end, CONTROL_PERIOD)
+    commanded, tip = stream(limb.commanded, count, origin), stream(limb.tip, 2, origin)
+
+    def table(one: Stream) -> Array:
+        columns = [on_grid(one.time, column, grid, LONGEST_GAP) for column in one.value.T]
+        return np.stack(columns, axis=1)
+
+    return CalibrationLog(
+        grid - start,
+        table(commanded),
+        table(measured),
+        table(angles),
+        table(tip),
+        Path(path).name,
+    )
+
+
+def _choose_limb(record: BagRecord, namespace: str) -> LimbRecord:
+    if namespace:
+        if namespace not in record.limbs:
+            known = ", ".join(sorted(record.limbs)) or "none"
+            raise LogError(f"the bag {record.path} has no limb {namespace}, only {known}")
+        return record.limbs[namespace]
+    driven = [name for name, limb in record.limbs.items() if len(limb.measured)]
+    if len(driven) > 1:
+        raise LogError(
+            f"the bag {record.path} holds several limbs, {', '.join(sorted(driven))}: name one "
+            "with --namespace"
+        )
+    return record.limbs[driven[0]] if driven else LimbRecord()
 
 
 @dataclass(frozen=True)
@@ -250,3 +325,75 @@ def _unit(name: str, known: Mapping[str, float], key: str) -> float:
     if name not in known:
         raise LogError(f"{key} is '{name}': choose {', '.join(known)}")
     return known[name]
+
+
+def read_table(path: Path) -> dict[str, Array]:
+    """Return the columns (K,) of a table by the names in its header; missing numbers are NaN.
+
+    Lines before the header that begin with ``#`` and empty lines are skipped, and a last row that
+    ends early, as that of a program that was killed, is left out. Numbers may have a decimal comma
+    where columns are separated by something else, or in quotes.
+
+    Raises:
+        LogError: the file cannot be read, names a column twice, has fewer than two rows or another
+            number of columns in a row, or holds something that is no number; names line and column.
+    """
+    lines = _lines(path)
+    if not lines:
+        raise LogError(f"the log {path} is empty")
+    separator = next((mark for mark in SEPARATORS if mark in lines[0][1]), ",")
+    rows = list(csv.reader((text for _, text in lines), delimiter=separator))
+    header = [name.strip() for name in rows[0]]
+    twice = [name for name, count in Counter(header).items() if name and count > 1]
+    if twice:
+        raise LogError(f"the log {path} has two columns '{twice[0]}': name them differently")
+    if len(rows) > 1 and len(rows[-1]) < len(header):
+        rows.pop()
+    if len(rows) < 3:
+        raise LogError(f"the log {path} has fewer than two rows below its header")
+    values = np.empty((len(rows) - 1, len(header)))
+    for index, row in enumerate(rows[1:]):
+        number = lines[index + 1][0]
+        if len(row) != len(header):
+            raise LogError(
+                f"line {number} of {path} has {len(row)} columns, its header has {len(header)}"
+            )
+        for place, cell in enumerate(row):
+            values[index, place] = _number(
+                cell, f"line {number}, column '{header[place]}' of {path}"
+            )
+    return {name: values[:, index] for index, name in enumerate(header)}
+
+
+def _lines(path: Path) -> list[tuple[int, str]]:
+    """Return the lines that hold something, with their numbers from 1; the first is the header."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise LogError(f"cannot read the log {path}: {error.strerror}") from error
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        text = content.decode("utf-16", errors="replace")
+    else:
+        try:
+            text = content.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            # Names of columns may hold a degree sign of an older program.
+            text = content.decode("cp1252", errors="replace")
+    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
+    while lines and lines[0][1].lstrip().startswith("#"):
+        lines.pop(0)
+    return lines
+
+
+def _number(cell: str, where: str) -> float:
+    text = cell.strip()
+    if not text:
+        return math.nan
+    try:
+        value = float(text if "," not in text else text.replace(",", "."))
+    except ValueError as error:
+        raise LogError(
+            f"{where} is '{text}', which is no number: leave cells without a value empty, or write "
+            "NaN"
+        ) from error
+    return value if math.isfinite(value) else math.nan
