@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.identification import (
+    GROUPS,
     CalibrationLog,
     Excitation,
     FitReport,
@@ -21,7 +22,6 @@ from der_planner.identification import (
     record_twin,
 )
 from der_planner.identification.excitation import PERIOD
-from der_planner.identification.parameters import GROUPS
 from der_planner.limb import Limb
 
 Figures = dict[str, float | str]

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-import tempfile
 import time
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.limb import Limb
 from der_planner.rod import Rod
 
 LENGTH, RADIUS, YOUNG, DENSITY, GRAVITY = 0.25, 0.015, 1.5e6, 1240.0, -9.81
@@ -20,19 +15,9 @@ AREA = np.pi * RADIUS**2
 INERTIA = 0.25 * np.pi * RADIUS**4
 SHEAR = YOUNG / 3.0
 
-_FIRST_USE = """
-import time
-start = time.perf_counter()
-from der_planner.rod import Rod
-from der_planner.limb import Limb
-rod = Rod.from_limb(Limb.default(), plane={plane!r})
-rod.warm_up()
-print(time.perf_counter() - start, time.process_time())
-"""
-
 
 @dataclass(frozen=True)
-class Run:
+class TimedRun:
     """One timed simulation.
 
     Attributes:
@@ -60,7 +45,7 @@ def cantilever(nodes: int, *, plane: str | None, clamp: str = "ghost") -> Rod:
     )  # fmt: skip
 
 
-def run_rod(rod: Rod, dt: float, method: str, simulated: float, repetitions: int = 1) -> Run:
+def run_rod(rod: Rod, dt: float, method: str, simulated: float, repetitions: int = 1) -> TimedRun:
     """Release the cantilever; the best wall time of several repetitions."""
     start = rod.straight_state()
     still = np.zeros((round(simulated / dt), rod.segment_count))
@@ -69,12 +54,14 @@ def run_rod(rod: Rod, dt: float, method: str, simulated: float, repetitions: int
         begin = time.perf_counter()
         motion = rod.simulate(start, still, dt, method=method)
         best = min(best, time.perf_counter() - begin)
-    return Run(
+    return TimedRun(
         motion.tip[-1] - motion.tip[0], best, simulated, len(still), motion.newton_iterations
     )
 
 
-def run_elastica(elements: int, dt: float, simulated: float, *, shear_factor: float = 1.0) -> Run:
+def run_elastica(
+    elements: int, dt: float, simulated: float, *, shear_factor: float = 1.0
+) -> TimedRun:
     """Release the same cantilever in PyElastica, its shear stiffness times `shear_factor`."""
     import elastica as ea  # noqa: PLC0415 - heavy, and only this peer needs it
 
@@ -101,7 +88,7 @@ def run_elastica(elements: int, dt: float, simulated: float, *, shear_factor: fl
         for _ in range(steps):
             now = stepper.step(simulator, now, dt)
     seconds = time.perf_counter() - begin
-    return Run(rod.position_collection[:, -1] - [LENGTH, 0, 0], seconds, simulated, steps)
+    return TimedRun(rod.position_collection[:, -1] - [LENGTH, 0, 0], seconds, simulated, steps)
 
 
 def largest_stable_step(elements: int) -> float:
@@ -114,33 +101,9 @@ def largest_stable_step(elements: int) -> float:
     raise RuntimeError(f"PyElastica with {elements} elements was stable at no step tried")
 
 
-def first_use(plane: str | None, cache: str) -> tuple[float, float]:
-    """Return wall and processor seconds from import to the end of `warm_up` in a new process."""
-    result = subprocess.run(
-        [sys.executable, "-c", _FIRST_USE.format(plane=plane)],
-        env={**os.environ, "NUMBA_CACHE_DIR": cache},
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    wall, processor = map(float, result.stdout.split())
-    return wall, processor
-
-
 def exponent(sizes: list[int], seconds: list[float]) -> float:
     """Return the growth exponent of wall time with N, by least squares in the logarithms."""
     return float(np.polyfit(np.log(sizes), np.log(seconds), 1)[0])
-
-
-def _starts(figures: dict[str, float | str]) -> None:
-    print("first use of a process: import, construction, warm_up")
-    for name, plane in (("planar", "xy"), ("3d", None)):
-        with tempfile.TemporaryDirectory() as cache:
-            cold, warm = first_use(plane, cache), first_use(plane, cache)
-        figures[f"{name}_cold_start_s"], figures[f"{name}_cold_start_cpu_s"] = cold
-        figures[f"{name}_cached_start_s"], figures[f"{name}_cached_start_cpu_s"] = warm
-        print(
-            f"  {name:7s} cold {cold[0]:6.2f} s (processor {cold[1]:5.2f} s)   "
-            f"cached {warm[0]:5.2f} s (processor {warm[1]:5.2f} s)"
-        )
 
 
 def _scaling(figures: dict[str, float | str], sizes: list[int], repetitions: int) -> None:
@@ -211,42 +174,11 @@ def _limit(tips: list[NDArray[np.float64]], order: int) -> NDArray[np.float64]:
     return (factor * tips[1] - tips[0]) / (factor - 1.0)
 
 
-def _sensitivities(figures: dict[str, float | str]) -> None:
-    rod = Rod.from_limb(Limb.default())
-    time_grid = np.arange(800)[:, None] * 0.05
-    pressures = 12e3 * np.sin(2 * np.pi * time_grid / 10.0 + [0.0, 1.0])
-    print("default limb, 40 s, 800 setpoints of 2 pressures: simulation and tip sensitivity")
-    for substeps in (1, 2, 4):
-        begin = time.perf_counter()
-        rod.simulate(rod.straight_state(), pressures, 0.05, substeps=substeps)
-        plain = time.perf_counter()
-        run = rod.simulate(rod.straight_state(), pressures, 0.05, substeps=substeps, linearise=True)
-        linear = time.perf_counter()
-        assert run.linearisation is not None
-        run.linearisation.tangent(pressures)
-        tangent = time.perf_counter()
-        run.linearisation.adjoint(np.ones((801, 2)))
-        adjoint = time.perf_counter()
-        run.linearisation.sensitivity()
-        dense = time.perf_counter()
-        values = {
-            "simulate": plain - begin, "simulate_linearised": linear - plain,
-            "tangent": tangent - linear, "adjoint": adjoint - tangent,
-            "dense_1602x1600": dense - adjoint,
-        }  # fmt: skip
-        for name, value in values.items():
-            figures[f"limb_substeps{substeps}_{name}_ms"] = value * 1e3
-        text = "   ".join(f"{name} {value * 1e3:.1f} ms" for name, value in values.items())
-        print(f"  {substeps} steps an interval: {text}")
-
-
 def run(quick: bool) -> dict[str, float | str]:
     """Measure and print; return every figure with its unit in the key."""
     figures: dict[str, float | str] = {}
     sizes = [11, 21, 41] if quick else [11, 21, 41, 81, 161]
     repetitions = 10 if quick else 60
-    _starts(figures)
     _scaling(figures, sizes, repetitions)
     _peer(figures, sizes, repetitions)
-    _sensitivities(figures)
     return figures

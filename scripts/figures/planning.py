@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 
 from der_planner.limb import Limb
 from der_planner.model import ArcModel
-from der_planner.planning import METHODS, Motion, Plan, Workspace, plan
+from der_planner.planning import Motion, Plan, Workspace, plan
 from der_planner.results.outputs import folder_argument
 from workspace_setup.basics import ROOT
 
@@ -34,13 +34,9 @@ COLORS = {
 
 
 def every_plan(limb: Limb, case: str, period: float) -> dict[tuple[str, str], Plan]:
-    """Return the plans of all models and methods."""
+    """Return the plan of each model and method that has a colour."""
     motion = Motion.named(case, period=period, cycles=1)
-    return {
-        (model, method): plan(limb, motion, model, method)
-        for model, methods in METHODS.items()
-        for method in methods
-    }
+    return {which: plan(limb, motion, *which) for which in COLORS}
 
 
 def draw_methods(path: Path) -> None:

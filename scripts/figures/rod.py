@@ -14,9 +14,8 @@ import numpy as np
 
 from benchmarks.rod import cantilever, run_elastica
 from der_planner.limb import Limb
-from der_planner.model.bending import PolylineKinematics
 from der_planner.results.outputs import folder_argument
-from der_planner.rod import Rod, RodState
+from der_planner.rod import Rod
 from workspace_setup.basics import ROOT
 
 matplotlib.use("Agg")
@@ -34,8 +33,8 @@ def save(figure: plt.Figure, folder: Path, name: str) -> None:
 
 
 def statics(folder: Path) -> None:
-    """Elastica, circle, helix."""
-    figure, axes = plt.subplots(1, 4, figsize=(14, 3.4))
+    """Elastica and circle."""
+    figure, axes = plt.subplots(1, 3, figsize=(11, 3.4))
     rod = cantilever(21, plane="xz")
     shape = rod.positions(rod.equilibrium([])) * 1e3
     axes[0].plot(shape[:, 0], shape[:, 2], ".-")
@@ -66,38 +65,7 @@ def statics(folder: Path) -> None:
     axes[2].set(title="end moment: turns to a circle", xlabel="x [mm]", ylabel="y [mm]")
     axes[2].set_aspect("equal")
     axes[2].legend()
-    axes[3].remove()
-    space = figure.add_subplot(1, 4, 4, projection="3d")
-    state: RodState | None = None
-    for part in np.linspace(0.1, 1, 10):
-        helix = Rod.uniform(
-            length=0.5, nodes=81, EI=0.02, EA=1e3, GJ=0.02, mass_per_length=1.0,
-            rest_curvature=(0.0, 20 * part), rest_twist=12 * part,
-        )  # fmt: skip
-        state = helix.equilibrium([], start=state)
-    assert state is not None
-    space.plot(*(state.positions.T * 1e3))
-    space.set(title="curved and twisted at rest: a helix", xlabel="x [mm]")
     save(figure, folder, "statics")
-
-
-def theorem(folder: Path) -> None:
-    """Bending forces of an even bend, and what uneven edges make of them."""
-    limb = Limb.default()
-    rod = Rod.from_limb(limb)
-    q = PolylineKinematics.of_rod(rod).configuration(np.radians([45.0, -60.0]))
-    force = rod.internal_force(q)
-    forces = np.stack([force[0::4], force[1::4]], axis=1)
-    x = rod.positions(q) * 1e3
-    figure, axes = plt.subplots(1, 2, figsize=(11, 3.8))
-    axes[0].plot(x[:, 0], x[:, 1], "k.-", lw=1)
-    axes[0].quiver(x[:, 0], x[:, 1], forces[:, 0], forces[:, 1], color="C3", width=0.004)
-    axes[0].set(title="−∇E of two even bends: a couple at each end", xlabel="x [mm]")
-    axes[0].set_ylabel("y [mm]")
-    axes[0].set_aspect("equal")
-    axes[1].semilogy(np.linalg.norm(forces, axis=1) + 1e-17, "o-")
-    axes[1].set(title="its size at each node", xlabel="node", ylabel="|F| [N]")
-    save(figure, folder, "theorem")
 
 
 def dynamics(folder: Path) -> None:
@@ -171,6 +139,6 @@ def main() -> int:
     parser.add_argument("folder", nargs="?", type=folder_argument, default=FOLDER)
     folder = parser.parse_args().folder
     folder.mkdir(parents=True, exist_ok=True)
-    for draw in (statics, theorem, dynamics, stability):
+    for draw in (statics, dynamics, stability):
         draw(folder)
     return 0

@@ -16,10 +16,12 @@ from apriltag_tracker.pipeline import LimbTracker
 from apriltag_tracker.synthetic.camera import CameraModel, SyntheticCamera
 from apriltag_tracker.synthetic.shapes import constant_curvature
 from apriltag_tracker.tag_map import TagMap
-from der_planner.identification.parameters import start_values
-from der_planner.identification.rod_angles import RodAngles
+from der_planner.identification import CalibrationLog
+from der_planner.identification.bends import NODES, predicted
+from der_planner.identification.log import Prepared
+from der_planner.identification.terms import FreeTerms
 from der_planner.limb import Limb
-from der_planner.model import simulate
+from der_planner.model import RodModel, simulate
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import METHODS, Motion, plan
 from der_planner.rod import Rod
@@ -63,7 +65,10 @@ def _fit() -> None:
     found = simulate(limb, time, commands=pressure, linearise=True)
     assert found.derivative is not None
     found.derivative.tangent(pressure)
-    RodAngles(limb, time, pressure).derivatives(start_values(limb), [(0, 0), (1, 0)])
+    log = CalibrationLog(time, pressure, pressure, 0 * pressure, 0 * pressure)
+    free = FreeTerms.of(limb, {"gain"})
+    prepared = Prepared(log, pressure, log.bend_angles, np.ones(4, dtype=bool), ())
+    predicted(free, RodModel(limb, NODES), prepared, free.unknowns.prior)
 
 
 def _in_plane() -> None:

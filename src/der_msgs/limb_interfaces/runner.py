@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
@@ -16,7 +15,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from limb_interfaces import transport
-from limb_interfaces.entry import END_SIGNALS
+from limb_interfaces.entry import on_end_signals
 
 
 class ClosableNode(Protocol):
@@ -51,8 +50,7 @@ def run_node(
     stop = threading.Event()
     transport.use_large_messages()
     transport.keep_buffers()
-    for number in END_SIGNALS:
-        signal.signal(number, lambda *_: stop.set())
+    on_end_signals(lambda *_: stop.set())
     try:
         rclpy.init(
             args=list(arguments) if arguments is not None else None,

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from der_planner.identification import CalibrationLog, LogError, check, fit, predict
+from der_planner.identification.bends import NODES, follow, predicted
 from der_planner.identification.excitation import calibration_run, steps, sweep, waves
-from der_planner.identification.geometry import fit_geometry, with_geometry
-from der_planner.identification.parameters import TERMS, exists, put, start_values
-from der_planner.identification.rod_angles import RodAngles
+from der_planner.identification.lengths import fit_geometry, with_lengths
+from der_planner.identification.log import Prepared
+from der_planner.identification.terms import COLUMN, TERMS, FreeTerms, values_of
 from der_planner.limb import Limb
-from der_planner.model.bending import PolylineKinematics
-from der_planner.rod import Rod
+from der_planner.model import RodModel
 
 pytestmark = pytest.mark.slow
 
@@ -76,36 +76,35 @@ def fitted(log):
 
 
 def test_derivatives_agree_with_differences(log):
-    rows = slice(0, 300)
-    pressure = log.measured_differential[rows]
-    prediction = RodAngles(Limb.default(), log.time[rows], pressure)
-    values = start_values(hidden_limb())
-    wanted = [(i, k) for i in range(2) for k in range(len(TERMS)) if exists(i, k, 2)]
-    exact = prediction.derivatives(values, wanted).angles_by
-    for place, (segment, term) in enumerate(wanted):
-        if TERMS[term].name == "material_damping":
-            continue  # zero is its lower bound
-        step = 1e-4 * TERMS[term].scale
-        ends = []
-        for sign in (1, -1):
-            moved = values.copy()
-            put(moved, segment, term, values[segment, term] + sign * step)
-            ends.append(prediction.angles(moved))
-        difference = (ends[0] - ends[1]) / (2 * step)
+    log = log.between(0.0, 15.0)
+    prepared = Prepared(
+        log, log.measured_differential, log.bend_angles, np.ones(len(log.time), bool), ()
+    )
+    names = {term.name for term in TERMS} - {"material_damping"}  # zero is its lower bound
+    free = FreeTerms.of(hidden_limb(), names)
+    values = free.unknowns.prior
+    exact = predicted(free, RodModel(free.limb, NODES), prepared, values).angles_by
+    for place, term in enumerate(free.terms):
+        step = 1e-4 * term.scale * np.eye(len(values))[place]
+        ends = [
+            follow(RodModel(free.limb_with(values + sign * step), NODES), prepared).bend_angles
+            for sign in (1, -1)
+        ]
+        difference = (ends[0] - ends[1]) / (2 * step[place])
         scale = np.abs(difference).max()
         # What is no pressure goes through a coarse difference, and a rest angle bends the start
         # too; a cubic term acts where the rod bends, its derivative evenly over the segment.
-        tolerance = {"dynamics": 0.2, "mass": 0.2, "cubic": 0.05}.get(TERMS[term].group, 0.02)
-        assert np.abs(exact[:, :, place] - difference).max() < tolerance * scale, TERMS[term].name
+        tolerance = {"dynamics": 0.2, "mass": 0.2, "cubic": 0.05}.get(term.group, 0.02)
+        assert np.abs(exact[:, :, place] - difference).max() < tolerance * scale, term.name
 
 
 def test_known_parameters_are_recovered_within_their_uncertainty(fitted):
     _, report = fitted
-    truth = start_values(hidden_limb())
+    truth = values_of(hidden_limb())
     for segment in range(2):
         for name in STATIC + (("coupling_after",), ("coupling_before",))[segment]:
             item = report.value(f"{name}[{segment}]")
-            true = truth[segment, [term.name for term in TERMS].index(name)]
+            true = truth[segment, COLUMN[name]]
             spread = max(item.deviation, 1e-3 * abs(true))
             assert abs(item.value - true) < 4 * spread, (name, item, true)
     assert np.degrees(report.residual).max() < 0.25
@@ -141,11 +140,10 @@ def test_a_limb_that_fits_passes_the_check_and_a_changed_one_does_not(fitted):
 
 
 def test_lengths_are_recovered_from_tips():
-    limb = with_geometry(Limb.default(), np.array([0.1195, 0.1235]), 6e-3, 5e-3)
-    rod = Rod.from_limb(limb, 21)
+    limb = with_lengths(Limb.default(), np.array([0.1195, 0.1235, 5e-3, 6e-3]))
     generator = np.random.default_rng(2)
     angles = generator.uniform(-0.8, 0.8, (400, 2))
-    tip = PolylineKinematics.of_rod(rod).tip(angles)
+    tip = RodModel(limb).kinematics.tip(angles)
     tip += 2e-4 * generator.standard_normal(tip.shape)
     time, none = 0.05 * np.arange(400), np.zeros((400, 2))
     found = fit_geometry(Limb.default(), CalibrationLog(time, none, none, angles, tip))

@@ -8,16 +8,11 @@ from chain_calibration import prior
 from link_chain import LinkChain
 
 from der_planner.identification import CalibrationLog, LogError, fit, predict
+from der_planner.identification.bends import NODES, predicted
 from der_planner.identification.excitation import sweep, waves
-from der_planner.identification.geometry import (
-    UnevenTips,
-    check_that_it_holds,
-    unevenness,
-    with_geometry,
-)
-from der_planner.identification.logs.prepare import prepare
-from der_planner.identification.parameters import column, start_values
-from der_planner.identification.rod_angles import NODES, RodAngles
+from der_planner.identification.lengths import UnevenTips, uneven_tip, unevenness, with_lengths
+from der_planner.identification.log import Prepared, prepare
+from der_planner.identification.terms import FreeTerms
 from der_planner.limb import Limb, gravity_of
 from der_planner.model import RodModel, simulate
 from der_planner.planning import Motion, plan
@@ -34,6 +29,12 @@ def chain_log(
     time = 0.05 * np.arange(len(pressure))
     played = LinkChain(seed, gravity, masses).play(time, pressure, 20.0, run=1, swing=swing)
     return played.log()
+
+
+def logged(time, pressure, bend_angles, tip) -> Prepared:
+    """Return a log without gaps as `prepare` gives it."""
+    log = CalibrationLog(time, pressure, pressure, bend_angles, tip)
+    return Prepared(log, pressure, bend_angles, np.ones(len(time), bool), ())
 
 
 def test_a_hanging_chain_that_swings_and_carries_a_mass_is_fitted():
@@ -93,30 +94,29 @@ def test_lengths_that_are_far_off_are_named_in_place_of_a_traceback():
 
 
 def test_tips_tell_how_much_of_a_bend_is_the_weights():
-    limb = with_geometry(Limb.default().mounted("sideways"), np.array([0.12, 0.12]), 4e-3, 1e-3)
+    limb = with_lengths(Limb.default().mounted("sideways"), np.array([0.12, 0.12, 1e-3, 4e-3]))
     pressure = waves(16_800.0, 2, 15.0)
     time = 0.05 * np.arange(len(pressure))
     model, fine = RodModel(limb, NODES), RodModel(limb)
     seen = simulate(fine, time, pressures=pressure)
-    log = CalibrationLog(time, pressure, pressure, seen.bend_angles, seen.tip)
+    log = logged(time, pressure, seen.bend_angles, seen.tip)
     coarse = simulate(model, time, pressures=pressure)
     finer = seen.tip - fine.kinematics.tip(seen.bend_angles)
     finer -= coarse.tip - model.kinematics.tip(coarse.bend_angles)
     # Lengths that are wrong by some millimetres are no reason to find another stiffness.
-    other = with_geometry(limb, np.array([0.117, 0.125]), 0.004, 0.003)
-    tips = UnevenTips(limb, other, log, np.ones(len(time), bool), RodModel(other, NODES), finer)
-    values, term = start_values(other), column("log_stiffness")
+    other = RodModel(with_lengths(limb, np.array([0.117, 0.125, 0.003, 0.004])), NODES)
+    tips = UnevenTips(limb, other, log, finer)
+    both = FreeTerms.of(other.limb, {"log_stiffness"})
+    stiffness = replace(both, places=both.places[1:])
 
-    def residual(change: float) -> np.ndarray:
-        moved = values.copy()
-        moved[1, term] += change
-        return tips.residual(RodAngles(other, time, pressure).derivatives(moved, []))
+    def rows(change: float) -> tuple[np.ndarray, np.ndarray]:
+        return tips.rows(predicted(stiffness, other, log, np.array([change])))
 
-    own = np.linalg.norm(residual(0.0))
-    assert np.linalg.norm(residual(-0.3)) > 2.5 * own
-    assert np.linalg.norm(residual(0.3)) > 2.5 * own
-    slope = tips.jacobian(RodAngles(other, time, pressure).derivatives(values, [(1, term)]))[:, 0]
-    difference = (residual(0.02) - residual(-0.02)) / 0.04
+    own = np.linalg.norm(rows(0.0)[0])
+    assert np.linalg.norm(rows(-0.3)[0]) > 2.5 * own
+    assert np.linalg.norm(rows(0.3)[0]) > 2.5 * own
+    slope = rows(0.0)[1][:, 0]
+    difference = (rows(0.02)[0] - rows(-0.02)[0]) / 0.04
     assert np.abs(slope - difference).max() < 0.05 * np.abs(difference).max()
 
 
@@ -129,18 +129,20 @@ def test_a_limb_that_gives_way_in_the_rod_of_more_nodes_is_told_by_the_other_one
         changes = {"bending_stiffness": 0.0183, "cubic_stiffness": growth, "damping": 0.7}
         return replace(known, segments=tuple(replace(s, **changes) for s in known.segments))
 
-    whole, lacking, holds = unevenness(softening(-1.0e-5), time, pressure, NODES)
+    none = np.zeros_like(pressure)
+    log = logged(time, pressure, none, none)
+    whole, lacking, holds = unevenness(softening(-1.0e-5), log, NODES)
     assert holds
     assert 0.0 < np.abs(lacking).max() < 0.2 * np.abs(whole).max()
-    check_that_it_holds(softening(-1.0e-5), time, pressure)
-    whole, lacking, holds = unevenness(softening(-1.6e-5), time, pressure, NODES)
+    uneven_tip(softening(-1.0e-5), log)
+    whole, lacking, holds = unevenness(softening(-1.6e-5), log, NODES)
     assert not holds
     assert np.isfinite(whole).all()
     assert not lacking.any()
     with pytest.raises(LogError, match=r"gives way .* \(--terms without 'cubic'\)"):
-        check_that_it_holds(softening(-1.6e-5), time, pressure)
+        uneven_tip(softening(-1.6e-5), log)
     with pytest.raises(LogError, match="gives way"):
-        unevenness(softening(-1.6e-5), time, 1.6 * pressure, NODES)
+        unevenness(softening(-1.6e-5), logged(time, 1.6 * pressure, none, none), NODES)
 
 
 def test_mass_is_told_where_stiffness_is_given():

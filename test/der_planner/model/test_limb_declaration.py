@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from der_planner.commands.write_limb_page import PAGE, page
-from der_planner.identification.parameters import TERMS, column, start_values, to_limb
+from der_planner.identification.terms import COLUMN, TERMS, to_limb, values_of
 from der_planner.limb import (
     DEFAULT_LIMB_FILE,
     CalibratedRange,
@@ -114,17 +114,17 @@ def test_the_fit_has_an_unknown_for_each_declaration_and_finds_its_value_again()
     rng = np.random.default_rng(3)
     low, high = (np.array([getattr(term, end) for term in TERMS]) for end in ("low", "high"))
     values = rng.uniform(0.6 * low + 0.4 * high, high, (2, len(TERMS)))
-    values[:, [column(term.name) for term in TERMS if term.relative]] = 0.0
-    np.testing.assert_allclose(start_values(to_limb(LIMB, values)), values, rtol=1e-12)
+    values[:, [COLUMN[term.name] for term in TERMS if term.relative]] = 0.0
+    np.testing.assert_allclose(values_of(to_limb(LIMB, values)), values, rtol=1e-12)
 
 
 def test_units_of_the_fit_are_those_of_its_quantities():
     """Closed forms on the default limb: what an unknown is in terms of the segment's numbers."""
-    values = start_values(LIMB)
-    values[:, column("cubic")] = 0.1
-    values[:, column("friction_pressure")] = 300.0
-    values[:, column("creep_pressure")] = 500.0
-    values[:, column("log_stiffness")] = 0.2
+    values = values_of(LIMB, starts=True)
+    values[:, COLUMN["cubic"]] = 0.1
+    values[:, COLUMN["friction_pressure"]] = 300.0
+    values[:, COLUMN["creep_pressure"]] = 500.0
+    values[:, COLUMN["log_stiffness"]] = 0.2
     old, new = LIMB.segments[0], to_limb(LIMB, values).segments[0]
     stiffness = old.bending_stiffness * math.exp(0.2)
     assert new.bending_stiffness == pytest.approx(stiffness)

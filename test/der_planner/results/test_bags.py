@@ -13,13 +13,12 @@ from der_planner.identification import LogError, read_bag
 from der_planner.results import (
     EvaluationError,
     csv_table,
+    error_table,
     evaluate_bag,
     evaluate_bags,
     evaluate_run,
     format_table,
-    latex_table,
     load_run,
-    markdown_table,
     summarise,
 )
 
@@ -198,7 +197,12 @@ def test_two_limbs_in_one_bag_are_evaluated_apart(tmp_path: Path):
     assert checks["/lab2"] == pytest.approx(0.008, abs=5e-5)
     rows = summarise([entry.result for entry in found])
     assert [row.trials for row in rows] == [1, 1]
-    for text in (format_table(rows), markdown_table(rows), csv_table(rows), latex_table(rows)):
+    for text in (
+        format_table(rows),
+        error_table(rows).markdown(),
+        csv_table(rows),
+        error_table(rows).latex(),
+    ):
         assert "/limb" in text
         assert "/lab2" in text.replace("\\_", "_")
 

@@ -7,9 +7,9 @@ from runs import CYCLES, FRAMES, PERIOD, TIMES, reference, series
 from der_planner.results import (
     Description,
     EvaluationError,
+    EvaluationSettings,
     RunResult,
     RunSeries,
-    Settings,
     error_series,
     evaluate_run,
     split_error,
@@ -52,13 +52,13 @@ def test_cycles_window_leaves_out_fade_in_and_closing_move():
     tip = reference(FRAMES).copy()
     tip[FRAMES < PERIOD / 4] += 0.5
     tip[FRAMES > PERIOD * CYCLES] += 0.5
-    settings = Settings(window="cycles")
+    settings = EvaluationSettings(window="cycles")
     assert evaluate_run(series(tip), settings).max_error_m < 5e-5
     assert evaluate_run(series(tip)).max_error_m > 0.5
     with pytest.raises(EvaluationError, match="0 cycles"):
         evaluate_run(series(tip, cycles=0), settings)
     with pytest.raises(EvaluationError, match="window 'ramp' is unknown"):
-        Settings(window="ramp")
+        EvaluationSettings(window="ramp")
 
 
 @pytest.mark.parametrize("lag", [-0.2, 0.013, 0.35])
@@ -79,7 +79,7 @@ def test_lag_gain_and_bias_are_told_apart(lag: float):
 def test_nothing_is_shifted_unless_asked():
     tip = reference(FRAMES - 0.3)
     plain = evaluate_run(series(tip))
-    shifted = evaluate_run(series(tip), Settings(remove_lag=True))
+    shifted = evaluate_run(series(tip), EvaluationSettings(remove_lag=True))
     assert plain.removed_lag_s == 0.0
     assert plain.mean_error_m > 0.01
     assert shifted.removed_lag_s == pytest.approx(0.3, abs=1e-3)

@@ -14,7 +14,7 @@ import pytest
 from filmed import FilmedRun, pixels
 from runs import FRAMES, TIMES, BagOfRun, reference, series
 
-from der_planner.bags.images import gray
+from der_planner.bags.images import RunImages, gray
 from der_planner.results import (
     EvaluationError,
     compare,
@@ -24,7 +24,6 @@ from der_planner.results import (
     write_report,
 )
 from der_planner.results.overlay import plot_shapes, write_video
-from der_planner.results.snapshots import fit_projection, take_snapshots
 
 
 @pytest.fixture(scope="module")
@@ -46,19 +45,19 @@ def bag(tmp_path_factory) -> Path:
 
 
 def test_projection_is_found_from_the_tags_alone(bag: Path):
-    project = fit_projection(load_run(bag))
+    with RunImages(load_run(bag)) as images:
+        project = images.projection()
     points = np.random.default_rng(3).uniform([0.0, -0.1], [0.24, 0.1], (50, 2))
-    assert project.residual < 0.02
     assert np.abs(project(points) - pixels(points)).max() < 0.05
     assert project(np.empty((0, 2))).shape == (0, 2)
 
 
 def test_snapshot_is_the_nearest_frame(bag: Path):
     frames = FRAMES[FRAMES >= 0]
-    asked = float(frames[40]) + 0.02
-    (shot,) = take_snapshots(load_run(bag), [asked])
-    assert shot.frame.shape == (240, 320)
-    assert np.all(shot.frame == 40)
+    with RunImages(load_run(bag)) as images:
+        shot = images.snapshot(float(frames[40]) + 0.02)
+    assert shot.picture.shape == (240, 320)
+    assert np.all(shot.picture == 40)
     assert shot.planned.shape == (0, 2)
 
 
@@ -154,7 +153,6 @@ def test_bag_without_images_has_shapes_but_no_film(tmp_path: Path):
     run.setpoint(len(TIMES) - 1, [0.0, 0.0])
     run.bag.close()
     loaded = load_run(tmp_path / "plain")
-    assert fit_projection(loaded) is None
     assert len(plot_shapes([loaded], tmp_path)) == 2
     with pytest.raises(EvaluationError, match="no camera calibration"):
         write_video(loaded, tmp_path / "film.mp4")

@@ -12,15 +12,14 @@ from der_planner.bags.run import BoardLog
 from der_planner.results import (
     compare,
     csv_table,
+    error_table,
     evaluate_run,
     format_table,
-    latex_table,
-    markdown_table,
     read_results,
     summarise,
     write_results,
 )
-from der_planner.results.selfcheck import check_board
+from der_planner.results.errors import check_board
 
 
 def result(error: float, model="der", trial=0, **changes):
@@ -126,7 +125,7 @@ def test_other_loads_are_not_mixed():
     text = format_table(rows, [level, loaded])
     assert "same_direction (hanging, 20 g): der" in text
     assert "loads" not in format_table(summarise(DER))
-    for table in (markdown_table(rows), csv_table(rows), latex_table(rows)):
+    for table in (error_table(rows).markdown(), csv_table(rows), error_table(rows).latex()):
         assert "hanging, 20 g" in table
 
 
@@ -151,8 +150,8 @@ def test_tables_hold_the_same_numbers():
     rows = summarise([*DER, *PCC])
     text, markdown, latex, csv = (
         format_table(rows),
-        markdown_table(rows),
-        latex_table(rows),
+        error_table(rows).markdown(),
+        error_table(rows).latex(),
         csv_table(rows),
     )
     assert "1.20 ± 0.20" in text
@@ -180,27 +179,27 @@ def board(count=50, **changes) -> BoardLog:
 
 def test_board_receives_all_in_time():
     found = check_board(board())
-    assert (found.received, found.lost, found.out_of_order) == (50, 0, 0)
-    assert found.lateness_p99 == pytest.approx(0.003)
-    assert found.value_error <= 50.0
+    assert (found["board_received"], found["board_lost"], found["board_out_of_order"]) == (50, 0, 0)
+    assert found["board_lateness_p99_s"] == pytest.approx(0.003)
+    assert found["board_value_error_pa"] <= 50.0
 
 
 def test_lost_late_and_swapped_commands_are_told_apart():
     whole = board()
     keep = np.arange(50) != 20
     lost = check_board(board(command_time=whole.command_time[keep], command=whole.command[keep]))
-    assert (lost.received, lost.lost) == (49, 1)
-    assert lost.lateness_max == pytest.approx(0.003)
+    assert (lost["board_received"], lost["board_lost"]) == (49, 1)
+    assert lost["board_lateness_max_s"] == pytest.approx(0.003)
 
     time = whole.command_time.copy()
     time[20] += 0.12
     order = np.argsort(time, kind="stable")
     late = check_board(board(command_time=time[order], command=whole.command[order]))
-    assert late.lost == 0
-    assert late.out_of_order == 1
-    assert late.lateness_max == pytest.approx(0.123)
+    assert late["board_lost"] == 0
+    assert late["board_out_of_order"] == 1
+    assert late["board_lateness_max_s"] == pytest.approx(0.123)
 
     values = whole.command.copy()
     values[20] += 3000.0
     wrong = check_board(board(command=values))
-    assert wrong.lost == 1
+    assert wrong["board_lost"] == 1

@@ -6,16 +6,15 @@ Everything of one limb lies in one namespace; a plan is never paired with the st
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.bags.columns import Columns
-from der_planner.bags.corrections import Revisions
 from der_planner.bags.reader import BagError, BagReader
 from der_planner.bags.run import Array
 
@@ -29,6 +28,88 @@ TRUTH_SUFFIX = "twin/ground_truth"
 BOARD_SUFFIX = "twin/board_commands"
 FAULT_MODE = 5
 MOST_FAULTS = 1000
+_SAME = 1e-6
+"""Pressures that differ by less are the same number, written twice [Pa]."""
+_LOOK_BACK = 40
+"""An estimate belongs to one of so many revisions before it."""
+
+
+class Columns:
+    """Rows of a stamp [ns] and some numbers, appended one by one: 8 bytes a number.
+
+    The first row that is not empty fixes the width; a row of another width becomes NaN (a board
+    that has not measured yet, a limb that was not seen).
+    """
+
+    def __init__(self, width: int = 0) -> None:
+        self._stamps = array("q")
+        self._values = array("d")
+        self._width = width
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    @property
+    def width(self) -> int:
+        """Numbers in a row; 0 before the first row that is not empty."""
+        return self._width
+
+    def append(self, stamp: int, values: Sequence[float] | Array) -> None:
+        """Add a row."""
+        if self._width == 0 and len(values):
+            self._width = len(values)
+            self._values.extend([float("nan")] * (self._width * len(self._stamps)))
+        self._stamps.append(stamp)
+        if len(values) == self._width:
+            self._values.extend(float(value) for value in values)
+        else:
+            self._values.extend([float("nan")] * self._width)
+
+    def stamps(self) -> NDArray[np.int64]:
+        """Return (N,) stamps [ns]."""
+        return np.array(self._stamps, dtype=np.int64)
+
+    def values(self, width: int) -> Array:
+        """Return (N, width) numbers; NaN throughout where rows had another width."""
+        if self._width != width:
+            return np.full((len(self), width), np.nan)
+        return np.array(self._values, dtype=float).reshape(-1, width)
+
+
+@dataclass
+class Revisions:
+    """The revised setpoints of a plan, and the estimates that they rest on, as they were logged.
+
+    Attributes:
+        stamps: instants at which the revised setpoints take effect [ns].
+        added: (M,) of each: the setpoint less the plan's [Pa].
+        pictures: of each revision, the newest picture that it knows of [ns]; None: not told.
+    """
+
+    stamps: list[int] = field(default_factory=list)
+    added: list[Array] = field(default_factory=list)
+    pictures: list[int | None] = field(default_factory=list)
+
+    def revised(self, stamp: int, added: Array) -> None:
+        """Add a revised setpoint."""
+        self.stamps.append(stamp)
+        self.added.append(added)
+        self.pictures.append(None)
+
+    def estimated(self, picture: int, correction: Array) -> None:
+        """Find the revision that was published with an estimate, by what both say was added.
+
+        Args:
+            picture: the newest picture that the estimate knows of [ns].
+            correction: (M,) that it says was added [Pa].
+        """
+        if not np.any(correction):
+            return
+        for place in range(len(self.stamps) - 1, max(-1, len(self.stamps) - _LOOK_BACK), -1):
+            same = len(self.added[place]) == len(correction)
+            if same and np.abs(self.added[place] - correction).max() < _SAME:
+                self.pictures[place] = picture
+                return
 
 
 @dataclass
@@ -72,6 +153,56 @@ class LimbRecord:
         """Return the stamps (K,) of the pictures on which the tip was seen [ns]."""
         seen: NDArray[np.int64] = self.tip.stamps()[np.isfinite(self.tip.values(2)).all(axis=1)]
         return seen
+
+    def add_plan(self, message: Any) -> None:
+        """Add a `PressurePlan`."""
+        self.plans[message.plan_id] = (header_stamp(message), message)
+
+    def add_setpoint(self, message: Any) -> None:
+        """Add a `PressureSetpoint`."""
+        name, stamp = message.plan_id, header_stamp(message)
+        self.setpoints.setdefault(name, Columns()).append(stamp, message.differential_pressure)
+        self.setpoint_indices.setdefault(name, array("q")).append(int(message.index))
+        if message.revision:
+            self.revised.add(name)
+            _, plan = self.plans.get(name, (0, None))
+            planned = () if plan is None else planned_commands(plan)
+            if message.index < len(planned):
+                added = np.asarray(message.differential_pressure) - planned[message.index]
+                self.revisions.setdefault(name, Revisions()).revised(stamp, added)
+
+    def add_estimate(self, message: Any) -> None:
+        """Add a `LimbEstimate`."""
+        picture = header_stamp(message) - round(message.age * NANOSECONDS)
+        revisions = self.revisions.get(message.plan_id)
+        if revisions is not None:
+            revisions.estimated(picture, np.asarray(message.correction))
+
+    def add_state(self, message: Any) -> None:
+        """Add a `LimbState` of the tracker."""
+        stamp, valid = header_stamp(message), bool(message.valid)
+        self.tip.append(stamp, (message.tip.x, message.tip.y) if valid else ())
+        self.angles.append(stamp, message.bend_angle if valid else ())
+        self.covariance.append(stamp, message.tip_covariance if valid else ())
+
+    def add_truth(self, message: Any) -> None:
+        """Add a `LimbState` of the twin itself."""
+        if message.valid:
+            self.truth.append(header_stamp(message), (message.tip.x, message.tip.y))
+
+    def add_pressure(self, message: Any) -> None:
+        """Add a `PressureState`."""
+        stamp = header_stamp(message)
+        self.commanded.append(stamp, message.commanded_differential)
+        self.measured.append(stamp, message.measured_differential)
+        if message.mode == FAULT_MODE:
+            new = [(stamp, reason) for reason in message.faults or ["fault"]]
+            self.faults += [entry for entry in new if len(self.faults) < MOST_FAULTS]
+
+    def add_board(self, message: Any) -> None:
+        """Add the `ChamberPressures` of a command that the twin's board received."""
+        chambers = np.asarray(message.pressure)
+        self.board.append(header_stamp(message), chambers[0::2] - chambers[1::2])
 
 
 @dataclass(frozen=True)
@@ -131,86 +262,33 @@ def header_stamp(message: Any) -> int:
 def _collect(bag: BagReader, progress: Callable[[float], None] | None) -> dict[str, LimbRecord]:
     """Return what the bag holds of each limb; every topic counts for its own namespace only."""
     limbs: dict[str, LimbRecord] = {}
-    handlers: dict[str, tuple[LimbRecord, Callable[[LimbRecord, Any], None]]] = {}
+    receivers: dict[str, Callable[[Any], None]] = {}
     for name, topic in bag.topics.items():
-        take = _taker(name, topic.type_name)
-        if take is not None:
+        method = _method(name, topic.type_name)
+        if method is not None:
             limb = limbs.setdefault(namespace_of(name), LimbRecord())
-            handlers[name] = (limb, take)
+            receivers[name] = partial(method, limb)
     begin, length = bag.start, max(1, bag.end - bag.start)
-    for count, (name, log_time, message) in enumerate(bag.messages(list(handlers))):
-        limb, take = handlers[name]
-        take(limb, message)
+    for count, (name, log_time, message) in enumerate(bag.messages(list(receivers))):
+        receivers[name](message)
         if progress is not None and count % 1000 == 0:
             progress((log_time - begin) / length)
     return limbs
 
 
-def _taker(topic: str, type_name: str) -> Callable[[LimbRecord, Any], None] | None:
-    """Return what takes the messages of a topic; None for a topic that becomes no array."""
+def _method(topic: str, type_name: str) -> Callable[[LimbRecord, Any], None] | None:
+    """Return what adds the messages of a topic; None for a topic that becomes no array."""
     if topic.endswith(TRUTH_SUFFIX):
-        return _take_truth
+        return LimbRecord.add_truth
     if topic.endswith(BOARD_SUFFIX):
-        return _take_board
+        return LimbRecord.add_board
     return {
-        PLAN_TYPE: _take_plan,
-        SETPOINT_TYPE: _take_setpoint,
-        PRESSURE_TYPE: _take_pressure,
-        STATE_TYPE: _take_state,
-        ESTIMATE_TYPE: _take_estimate,
+        PLAN_TYPE: LimbRecord.add_plan,
+        SETPOINT_TYPE: LimbRecord.add_setpoint,
+        PRESSURE_TYPE: LimbRecord.add_pressure,
+        STATE_TYPE: LimbRecord.add_state,
+        ESTIMATE_TYPE: LimbRecord.add_estimate,
     }.get(type_name)
-
-
-def _take_plan(limb: LimbRecord, message: Any) -> None:
-    limb.plans[message.plan_id] = (header_stamp(message), message)
-
-
-def _take_setpoint(limb: LimbRecord, message: Any) -> None:
-    of_plan = limb.setpoints.setdefault(message.plan_id, Columns())
-    of_plan.append(header_stamp(message), message.differential_pressure)
-    limb.setpoint_indices.setdefault(message.plan_id, array("q")).append(int(message.index))
-    if message.revision:
-        limb.revised.add(message.plan_id)
-        _, plan = limb.plans.get(message.plan_id, (0, None))
-        planned = () if plan is None else planned_commands(plan)
-        if message.index < len(planned):
-            added = np.asarray(message.differential_pressure) - planned[message.index]
-            limb.revisions.setdefault(message.plan_id, Revisions()).revised(
-                header_stamp(message), added
-            )
-
-
-def _take_estimate(limb: LimbRecord, message: Any) -> None:
-    picture = header_stamp(message) - round(message.age * NANOSECONDS)
-    revisions = limb.revisions.get(message.plan_id)
-    if revisions is not None:
-        revisions.estimated(picture, np.asarray(message.correction))
-
-
-def _take_state(limb: LimbRecord, message: Any) -> None:
-    stamp, valid = header_stamp(message), bool(message.valid)
-    limb.tip.append(stamp, (message.tip.x, message.tip.y) if valid else ())
-    limb.angles.append(stamp, message.bend_angle if valid else ())
-    limb.covariance.append(stamp, message.tip_covariance if valid else ())
-
-
-def _take_truth(limb: LimbRecord, message: Any) -> None:
-    if message.valid:
-        limb.truth.append(header_stamp(message), (message.tip.x, message.tip.y))
-
-
-def _take_pressure(limb: LimbRecord, message: Any) -> None:
-    stamp = header_stamp(message)
-    limb.commanded.append(stamp, message.commanded_differential)
-    limb.measured.append(stamp, message.measured_differential)
-    if message.mode == FAULT_MODE:
-        new = [(stamp, reason) for reason in message.faults or ["fault"]]
-        limb.faults += [entry for entry in new if len(limb.faults) < MOST_FAULTS]
-
-
-def _take_board(limb: LimbRecord, message: Any) -> None:
-    chambers = np.asarray(message.pressure)
-    limb.board.append(header_stamp(message), chambers[0::2] - chambers[1::2])
 
 
 def planned_commands(plan: Any) -> Array:

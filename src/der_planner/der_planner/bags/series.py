@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.bags.columns import Columns
-from der_planner.bags.corrections import Revisions, described, latencies
 from der_planner.bags.record import (
     NANOSECONDS,
     PLAN_TYPE,
     BagRecord,
+    Columns,
     LimbRecord,
+    Revisions,
     planned_commands,
     read_record,
 )
@@ -33,6 +33,11 @@ from der_planner.bags.run import (
     Stream,
     method_name,
 )
+
+BIN = 0.01
+"""Width of a bin of the histogram of latencies [s]."""
+_LONGEST = 0.5
+"""Latencies above this are no latencies of a picture that was waited for [s]."""
 
 
 def load_run(
@@ -263,3 +268,53 @@ def _describe(
         **_loads(plan),
         extra={**{key: value for key, value in run.items() if key not in known}, **feedback},
     )
+
+
+def latencies(revisions: Revisions, pictures: NDArray[np.int64]) -> Array:
+    """Return the times (n,) [s] from pictures to the first setpoints that know of them.
+
+    A setpoint goes to the board at its stamp. Pictures that no later revision knows of are left
+    out, as are those between which feedback was out.
+
+    Args:
+        revisions: of the plan.
+        pictures: (K,) stamps of the pictures on which the limb was seen [ns].
+    """
+    known = [
+        (picture, stamp)
+        for stamp, picture in zip(revisions.stamps, revisions.pictures, strict=True)
+        if picture is not None
+    ]
+    if not known:
+        return np.empty(0)
+    newest, stamp = np.array(known, dtype=np.int64).T
+    order = np.argsort(newest, kind="stable")
+    newest, stamp = newest[order], stamp[order]
+    # The first setpoint among those that know of this picture or of a later one.
+    first = np.minimum.accumulate(stamp[::-1])[::-1]
+    inside = np.unique(pictures[(pictures >= newest[0]) & (pictures <= newest[-1])])
+    taken: Array = (first[np.searchsorted(newest, inside)] - inside) * 1e-9
+    return taken[(taken > 0) & (taken < _LONGEST)]
+
+
+def described(added: Array, taken: Array) -> dict[str, Any]:
+    """Return what feedback did, in numbers to be kept with a run.
+
+    Args:
+        added: (K, M) the setpoints that were played less the plan's [Pa].
+        taken: (n,) from pictures to the setpoints that know of them [s].
+    """
+    about: dict[str, Any] = {
+        "correction_rms_pa": np.sqrt(np.mean(added**2, axis=0)).tolist(),
+        "correction_max_pa": np.abs(added).max(axis=0).tolist(),
+    }
+    if len(taken):
+        median, late = np.quantile(taken, [0.5, 0.99])
+        counts, _ = np.histogram(taken, bins=np.arange(0.0, _LONGEST + BIN / 2, BIN))
+        about |= {
+            "latency_median_s": float(median),
+            "latency_p99_s": float(late),
+            "latency_counts": counts.tolist(),
+            "latency_bin_s": BIN,
+        }
+    return about

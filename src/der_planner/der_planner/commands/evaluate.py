@@ -16,7 +16,7 @@ from pathlib import Path
 from der_planner.results import (
     BagError,
     EvaluationError,
-    Settings,
+    EvaluationSettings,
     compare,
     evaluate_bags,
     format_table,
@@ -24,7 +24,7 @@ from der_planner.results import (
     write_report,
     write_results,
 )
-from der_planner.results.alignment import WINDOWS
+from der_planner.results.errors import WINDOWS
 from der_planner.results.outputs import OutputError, check_file, check_folder
 from der_planner.results.overlay import write_video
 
@@ -100,7 +100,7 @@ def main() -> int:
     except OutputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    settings = Settings(window=options.window, remove_lag=options.remove_lag)
+    settings = EvaluationSettings(window=options.window, remove_lag=options.remove_lag)
     bags = expand(options.bags)
     found = evaluate_bags(bags, settings, workers=options.workers, progress=_show)
     for entry in found:

@@ -12,7 +12,7 @@ Guards: plans are judged by the error that all runs together say they leave. A p
 than the best one is left, and the next step from the best one is half as long (the share α of the
 error that is asked to go) and pulled harder. Learning stops when only noise is left, when runs
 bring nothing more, or when no smaller step helps. Where the first run is far from what the model
-expects, gains and rest angles of the model are taken from it (`der_planner.control.adaptation`).
+expects, gains and rest angles of the model are taken from it (`der_planner.identification.update`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from der_planner.control.adaptation import adapted
 from der_planner.control.disturbance import (
     LearningError,
     Measured,
@@ -34,6 +33,8 @@ from der_planner.control.disturbance import (
     stays_behind,
 )
 from der_planner.control.repeatability import Played, Runs
+from der_planner.identification.update import adapted
+from der_planner.limb import Limb, LimbError
 from der_planner.planning.correction import Correction
 from der_planner.planning.errors import PlanningError
 from der_planner.planning.plan_file import Plan
@@ -282,10 +283,17 @@ class Learner:
     def _adapt(self, first: Played) -> tuple[Played, str]:
         """Bring the model near a first run that is far from it; return the run as it sees it."""
         tip = first.expected.tip + first.shown.value
-        nearer = adapted(self._of_file, first.commands, tip)
+
+        def tip_of(limb: Limb) -> Array | None:
+            try:
+                return self._of_file.of(limb).expected(first.commands).tip
+            except (PlanningError, LimbError):
+                return None
+
+        nearer = adapted(self._of_file.limb, tip_of, tip)
         if nearer is None:
             return self._seen_by_model(first), ""
-        self._correction = nearer
+        self._correction = self._of_file.of(nearer)
         return self._seen_by_model(first), _ADAPTED
 
     def _seen_by_model(self, run: Played) -> Played:

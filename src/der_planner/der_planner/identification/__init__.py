@@ -1,6 +1,6 @@
 """From logs to a limb file: excitation, fits, reports, and checks of later runs."""
 
-from der_planner.identification.check import Check, check
+from der_planner.identification.check import Check, Prediction, check, plot_prediction, predict
 from der_planner.identification.excitation import (
     Excitation,
     calibration_run,
@@ -9,15 +9,15 @@ from der_planner.identification.excitation import (
     write_excitation,
 )
 from der_planner.identification.fit import fit
-from der_planner.identification.logs.bag import read_bag
-from der_planner.identification.logs.log import CalibrationLog, LogError
-from der_planner.identification.logs.table import ColumnMap, read_csv
+from der_planner.identification.log import CalibrationLog, LogError, prepare
 from der_planner.identification.offline import calibrate_twin, record_twin
-from der_planner.identification.predict import Prediction, predict
-from der_planner.identification.report import Change, FitReport, Unknown, Update
-from der_planner.identification.update import update
+from der_planner.identification.readers import ColumnMap, read_bag, read_csv
+from der_planner.identification.report import FitReport, Unknown
+from der_planner.identification.terms import GROUPS
+from der_planner.identification.update import Change, Update, update
 
 __all__ = [
+    "GROUPS",
     "CalibrationLog",
     "Change",
     "Check",
@@ -32,7 +32,9 @@ __all__ = [
     "calibration_run",
     "check",
     "fit",
+    "plot_prediction",
     "predict",
+    "prepare",
     "read_bag",
     "read_csv",
     "read_excitation",

@@ -2,44 +2,59 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
-from der_planner.identification.logs.log import CalibrationLog, LogError
+from der_planner.identification.least_squares import (
+    LeastSquares,
+    Rows,
+    Unknowns,
+    with_differences,
+)
+from der_planner.identification.log import CalibrationLog, LogError
 from der_planner.limb import Limb, Pneumatics
 from der_planner.model.air import Air
 
 Array = NDArray[np.float64]
 
 SMOOTH_RATE = 6000.0
-"""Commands that rise faster than this [Pa/s] are steps: their flow is choked, not a lag."""
+"""Rate from which on a change of a command is a step [Pa/s]: its flow is choked, not a lag."""
 STEP_MEMORY = 3.0
 """Time after such a step that nothing is fitted to [s]."""
-SHOWN = (0.25, 0.15)
+SHOWN = {"vent_rate": 0.25, "vent_exponent": 0.15}
 """Standard deviations up to which a log is said to show how fast chambers are vented: of the rate,
 relative, and of the exponent."""
 BETTER = 0.7
 """Share of the residual of lags alone that slow venting may leave to be believed."""
 VALVE_BETTER = 0.85
 """Share of the residual of one lag that a lag which changes with the pressure may leave."""
-_LAGS, _VENTING = 3, 5
-"""How many of the numbers below are fitted with lags alone, and with slow venting."""
-_LOWEST = (0.005, 0.005, 0.0, 300.0, 0.3, 0.0)
-_HIGHEST = (1.5, 1.5, 1.9, 60e3, 1.0, 1.0)
-_NAMES = (
-    "time_constant",
-    "vent_time_constant",
-    "delay",
-    "vent_rate",
-    "vent_exponent",
-    "vent_lag_exponent",
-)
-_START = (0.2, 0.2, 0.05, 5000.0, 0.7, 0.5)
-_STEP = (2e-3, 2e-3, 2e-3, 20.0, 2e-3, 2e-3)
-_SCALE = (0.1, 0.1, 0.1, 1000.0, 0.1, 0.1)
+SOFTNESS = 50.0
+"""Errors beyond this count less than their square [Pa]."""
+
+
+class _Number(NamedTuple):
+    start: float
+    low: float
+    high: float
+    scale: float
+    nudge: float
+
+
+_NUMBERS = {
+    "time_constant": _Number(0.2, 0.005, 1.5, 0.1, 2e-3),
+    "vent_time_constant": _Number(0.2, 0.005, 1.5, 0.1, 2e-3),
+    "delay": _Number(0.05, 0.0, 1.9, 0.1, 2e-3),
+    "vent_rate": _Number(5000.0, 300.0, 60e3, 1000.0, 20.0),
+    "vent_exponent": _Number(0.7, 0.3, 1.0, 0.1, 2e-3),
+    "vent_lag_exponent": _Number(0.5, 0.0, 1.0, 0.1, 2e-3),
+}
+"""Numbers of `Pneumatics` that are fitted: start, bounds, scale and change for a slope. Lags are
+the first three, slow venting adds two, a valve that opens in proportion to its error the last."""
+_LAGS, _VENTING, _VALVE = (tuple(_NUMBERS)[:count] for count in (3, 5, 6))
 
 
 @dataclass(frozen=True)
@@ -47,32 +62,23 @@ class AirFit:
     """How chambers follow commands.
 
     Attributes:
-        fill_lag, vent_lag: first-order time constants while |pressure| rises and falls [s].
-        delay: dead time [s].
+        numbers: of `Pneumatics` by name; without those of venting where the log does not show it.
+        deviations: standard deviations of the numbers that were fitted, by name.
         fill_rate: largest rate of a filling chamber [Pa/s]; NaN without a step.
         offset: (M,) measured less commanded pressure at rest [Pa].
         residual: root mean square of measured less predicted along smooth commands and, where
             venting is shown, after steps down [Pa].
-        uncertainty: (3,) standard deviations of the two lags and the dead time [s].
-        vent_rate: rate at which a chamber at 10 kPa falls at the most [Pa/s]; NaN where the log
-            does not show it.
-        vent_exponent: its growth with the pressure [-]; NaN where the log does not show it.
-        vent_uncertainty: (2,) standard deviations of the two.
-        vent_lag_exponent: with which power of the pressure `vent_lag`, which is that at 10 kPa,
-            falls [-]; 0 where one lag explains the log as well.
     """
 
-    fill_lag: float
-    vent_lag: float
-    delay: float
+    numbers: Mapping[str, float]
+    deviations: Mapping[str, float]
     fill_rate: float
     offset: Array
     residual: float
-    uncertainty: Array
-    vent_rate: float = float("nan")
-    vent_exponent: float = float("nan")
-    vent_uncertainty: Array = field(default_factory=lambda: np.full(2, np.nan))
-    vent_lag_exponent: float = 0.0
+
+    def law(self, prior: Pneumatics) -> Pneumatics:
+        """Return a law of the air with the fitted numbers in place of the prior's."""
+        return replace(prior, **self.numbers)
 
 
 def fit_air(log: CalibrationLog, period: float) -> AirFit:
@@ -98,92 +104,70 @@ def fit_air(log: CalibrationLog, period: float) -> AirFit:
             "record the calibration run, or a plan"
         )
     falling = known & _after_no_step(np.abs(command), period, rising=True)
-    found = _solve(command, measured - offset, falling, period, _START[:_VENTING])
-    lags = _solve(command, measured - offset, smooth, period, _START[:_LAGS])
-    without = (Air(_air(lags.x)).pressures_at_commands(command, period) + offset - measured)[
-        falling
-    ]
-    venting = _shown(found) and found.spread < BETTER * float(np.sqrt(np.mean(without**2)))
-    found = found if venting else lags
-    valve = None
-    if venting:
-        start = (*found.x, _START[-1])
-        valve = _solve(command, measured - offset, falling, period, start)
-        valve = valve if _shown(valve) and valve.spread < VALVE_BETTER * found.spread else None
-    found = valve or found
-    return AirFit(
-        fill_lag=float(found.x[0]),
-        vent_lag=float(found.x[1]),
-        delay=float(found.x[2]),
-        fill_rate=_fill_rate(command, measured, period),
-        offset=offset,
-        residual=found.spread,
-        uncertainty=found.deviation[:3],
-        vent_rate=float(found.x[3]) if venting else float("nan"),
-        vent_exponent=float(found.x[4]) if venting else float("nan"),
-        vent_uncertainty=found.deviation[_LAGS:_VENTING] if venting else np.full(2, np.nan),
-        vent_lag_exponent=float(valve.x[-1]) if valve else 0.0,
-    )
+    lags = _Chambers(command, measured - offset, smooth, period)
+    venting = replace(lags, rows=falling)
+    found, slow = lags.fit(_LAGS), venting.fit(_VENTING)
+    alone = float(np.sqrt(np.mean(venting.residual(found.numbers) ** 2)))
+    if _shown(slow) and slow.residual < BETTER * alone:
+        valve = venting.fit(_VALVE, slow.numbers)
+        by_degrees = _shown(valve) and valve.residual < VALVE_BETTER * slow.residual
+        found = valve if by_degrees else slow
+        found = found._replace(numbers={"vent_lag_exponent": 0.0, **found.numbers})
+    fill_rate = _fill_rate(command, measured, period)
+    return AirFit(found.numbers, found.deviations, fill_rate, offset, found.residual)
+
+
+class _Found(NamedTuple):
+    numbers: Mapping[str, float]
+    deviations: Mapping[str, float]
+    residual: float
 
 
 @dataclass(frozen=True)
-class _Solution:
-    x: Array
-    deviation: Array
-    spread: float
+class _Chambers:
+    """Commands and measured pressures (K, M) [Pa], rows (K, M) to fit to, and their period [s]."""
+
+    command: Array
+    measured: Array
+    rows: NDArray[np.bool_]
+    period: float
+
+    def residual(self, numbers: Mapping[str, float]) -> Array:
+        """Return predicted less measured pressures of the rows [Pa]."""
+        law = replace(Limb.default().pneumatics, **{"vent_rate": 0.0, **numbers})
+        predicted = Air(law).pressures_at_commands(self.command, self.period)
+        return np.asarray((predicted - self.measured)[self.rows])
+
+    def fit(self, names: tuple[str, ...], start: Mapping[str, float] | None = None) -> _Found:
+        """Fit the numbers of these names, from other starts where they are given."""
+        fitted = [_NUMBERS[name] for name in names]
+        begin, low, high, scale, nudge = np.array(fitted).T
+        begin = np.array([(start or {}).get(n, v) for n, v in zip(names, begin, strict=True)])
+
+        def of(values: Array) -> dict[str, float]:
+            return dict(zip(names, map(float, values), strict=True))
+
+        def rows(values: Array) -> Rows:
+            # Of a size of their own: a relative change of a dead time near zero would be none.
+            steps = np.where(values + nudge <= high, nudge, -nudge)
+            return with_differences(lambda v: self.residual(of(v)) / SOFTNESS, values, steps)
+
+        nothing = np.full(len(names), np.inf)
+        search = LeastSquares(
+            Unknowns(begin, nothing, low, high, scale), rows, softness=1.0, cheap=True
+        )
+        values = search.solve()
+        left = float(np.sqrt(np.mean(self.residual(of(values)) ** 2)))
+        covariance = search.covariance(values, (left / SOFTNESS) ** 2 / self.period)
+        return _Found(of(values), of(np.sqrt(np.diag(covariance))), left)
 
 
-def _solve(
-    command: Array,
-    measured: Array,
-    rows: NDArray[np.bool_],
-    period: float,
-    start: tuple[float, ...],
-) -> _Solution:
-    """Fit as many of the numbers `_NAMES` as ``start`` has to rows of a log."""
-    count = len(start)
-
-    def residual(x: Array) -> Array:
-        difference: Array = (Air(_air(x)).pressures_at_commands(command, period) - measured)[rows]
-        return difference
-
-    def jacobian(x: Array) -> Array:
-        # Steps of their own size: a dead time of nearly zero would get none from a relative one.
-        ahead = x + np.asarray(_STEP[:count]) <= np.asarray(_HIGHEST[:count])
-        steps = np.where(ahead, 1.0, -1.0) * _STEP[:count]
-        base = residual(x)
-        moved = [residual(x + step) for step in np.diag(steps)]
-        slopes: Array = (np.stack(moved, axis=1) - base[:, None]) / steps
-        return slopes
-
-    solution = least_squares(
-        residual,
-        start,
-        jac=jacobian,
-        bounds=(_LOWEST[:count], _HIGHEST[:count]),
-        loss="soft_l1",
-        f_scale=50.0,
-        x_scale=_SCALE[:count],
-    )
-    spread = float(np.sqrt(np.mean(residual(solution.x) ** 2)))
-    scale = np.asarray(_SCALE[:count])
-    # In units of their own: the pseudo-inverse would take seconds beside pascals for nothing.
-    slopes = jacobian(solution.x) * scale
-    covariance = np.linalg.pinv(slopes.T @ slopes, hermitian=True) * spread**2 / period
-    return _Solution(np.asarray(solution.x), np.sqrt(np.diag(covariance)) * scale, spread)
-
-
-def _air(x: Array) -> Pneumatics:
-    """Return the law for the numbers `_NAMES`, as many as there are."""
-    values = dict(zip(_NAMES, (float(value) for value in x), strict=False))
-    return replace(Limb.default().pneumatics, **{"vent_rate": 0.0, **values})
-
-
-def _shown(solution: _Solution) -> bool:
+def _shown(found: _Found) -> bool:
     """Tell whether rate and exponent of venting are known well, the rate inside its bounds."""
-    rate, of_rate, of_exponent = solution.x[_LAGS], *solution.deviation[_LAGS:_VENTING]
-    known = 0.0 < of_rate < SHOWN[0] * rate and 0.0 < of_exponent < SHOWN[1]
-    return bool(known and _LOWEST[3] < 0.9 * rate < 0.8 * _HIGHEST[3])
+    rate, number = found.numbers["vent_rate"], _NUMBERS["vent_rate"]
+    of_rate, of_exponent = (found.deviations[name] for name in SHOWN)
+    known = 0.0 < of_rate < SHOWN["vent_rate"] * rate and 0.0 < of_exponent < SHOWN["vent_exponent"]
+    return known and number.low < 0.9 * rate < 0.8 * number.high
 
 
 def _after_no_step(command: Array, period: float, rising: bool = False) -> NDArray[np.bool_]:

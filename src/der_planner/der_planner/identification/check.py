@@ -1,17 +1,20 @@
-"""Does a limb file still fit? Open-loop prediction of a later run against its measured bend."""
+"""Open-loop prediction of a run against what was measured: numbers, a figure, and a verdict.
+
+The verdict says whether a limb file still fits a later run.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.identification.logs.log import CalibrationLog
-from der_planner.identification.logs.prepare import bridge, prepare
-from der_planner.identification.predict import predict
+from der_planner.identification.log import CalibrationLog, LogError, bridge, prepare
 from der_planner.limb import Limb
+from der_planner.model import CONTROL_PERIOD, Model, simulate
 
 Array = NDArray[np.float64]
 
@@ -24,6 +27,50 @@ ERROR_GROWTH = 2.5
 LEAST_ERROR = math.radians(0.4)
 LEAST_MOTION = math.radians(3.0)
 """Predicted range of motion above which the gain is checked [rad]."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """An open-loop prediction.
+
+    Attributes:
+        bend_angles: (K, M) [rad].
+        tip: (K, 2) [m].
+    """
+
+    bend_angles: Array
+    tip: Array
+
+
+def predict(
+    limb: Limb,
+    time: Array,
+    differential_pressure: Array,
+    model: str = "der",
+) -> Prediction:
+    """Predict the bend of a limb from the pressures in its chambers.
+
+    Args:
+        limb: calibrated limb.
+        time: (K,) regular [s].
+        differential_pressure: (K, M) measured [Pa], without gaps.
+        model: ``der`` or ``pcc``.
+
+    Returns:
+        Bend angles and tips at ``time``, from the equilibrium of the first pressures on. Measured
+        angles are not used.
+
+    Raises:
+        LogError: the model cannot follow the pressures, or does not come to rest.
+    """
+    try:
+        response = simulate(Model.of(limb, model), time, pressures=differential_pressure)
+    except RuntimeError as error:
+        raise LogError(
+            f"the {model} model of the limb '{limb.name}' cannot follow this log ({error}): check "
+            "that the limb file is that of this limb, with its mounting and what it carries"
+        ) from error
+    return Prediction(response.bend_angles, response.tip)
 
 
 @dataclass(frozen=True)
@@ -92,9 +139,7 @@ def check(limb: Limb, log: CalibrationLog) -> Check:
     tip_error = float(np.nanmean(distance)) if np.isfinite(distance).any() else math.nan
     findings = [*prepared.warnings, *_drift(limb, error, gains, rests)]
     drifted = len(findings) > len(prepared.warnings)
-    findings += still + _range(
-        limb, prepared.pressure[rows], np.stack([bridge(c) for c in measured.T], 1)
-    )
+    findings += still + _range(limb, prepared.pressure[rows], bridge(measured))
     return Check(not drifted, tuple(findings), error, tip_error, gains, rests)
 
 
@@ -135,3 +180,40 @@ def _range(limb: Limb, pressure: Array, bend: Array) -> list[str]:
                     f"were {factor * limit:.0f} {unit}"
                 )
     return found
+
+
+def plot_prediction(
+    limb: Limb, log: CalibrationLog, path: str | Path, held_out: CalibrationLog | None = None
+) -> None:
+    """Write a figure of bend angles, measured and predicted open loop, with the errors below.
+
+    Args:
+        limb: identified.
+        log: that it was fitted to.
+        path: of the PNG.
+        held_out: a log that the fit has not seen.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    logs = [("fitted", log)] + ([("not seen by the fit", held_out)] if held_out else [])
+    figure = Figure(figsize=(5.2 * len(logs), 4.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(2, len(logs), sharex="col", squeeze=False, height_ratios=(2, 1))
+    for column, (title, one) in enumerate(logs):
+        grid = one.resampled(CONTROL_PERIOD)
+        predicted = predict(limb, grid.time, bridge(grid.measured_differential)).bend_angles
+        top, bottom = axes[0, column], axes[1, column]
+        for index in range(limb.segment_count):
+            colour = f"C{index}"
+            measured = np.degrees(grid.bend_angles[:, index])
+            model = np.degrees(predicted[:, index])
+            top.plot(grid.time, measured, colour, lw=1.2, label=f"segment {index}, measured")
+            top.plot(grid.time, model, "k--", lw=0.8, label="predicted" if index == 0 else None)
+            bottom.plot(grid.time, measured - model, colour, lw=0.8)
+        top.set_title(title)
+        top.legend(fontsize=7)
+        bottom.set_xlabel("time [s]")
+    axes[0, 0].set_ylabel("bend angle [deg]")
+    axes[1, 0].set_ylabel("error [deg]")
+    figure.savefig(path, dpi=80)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.identification.logs.log import LogError
+from der_planner.identification.log import LogError
 from der_planner.model.series import CONTROL_PERIOD as PERIOD
 
 Array = NDArray[np.float64]

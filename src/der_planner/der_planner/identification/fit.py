@@ -1,10 +1,10 @@
-"""From a log to a limb: air, lengths, statics, then everything at once on the rod's dynamics."""
+"""From a log to a limb: air, lengths, statics, then everything at once on the model's dynamics."""
 
 from __future__ import annotations
 
 import datetime
 import time as clock
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -12,37 +12,62 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.identification.air import AirFit, fit_air
-from der_planner.identification.geometry import (
+from der_planner.identification.bends import NODES, BendFit
+from der_planner.identification.lengths import (
     GeometryFit,
     Unevenness,
     UnevenTips,
-    check_that_it_holds,
     fit_geometry,
     lengths_at_their_end,
+    lengths_of,
+    uneven_tip,
     unevenness,
-    with_geometry,
 )
-from der_planner.identification.logs.log import CalibrationLog, LogError
-from der_planner.identification.logs.prepare import LONGEST_GAP, Prepared, prepare
-from der_planner.identification.parameters import GROUPS, OPTIONAL, to_limb
-from der_planner.identification.pcc_fit import fit_pcc
-from der_planner.identification.problem import Problem
-from der_planner.identification.report import FitReport, LoadsFit, Unknown, loads_of
-from der_planner.identification.rod_angles import NODES
+from der_planner.identification.log import (
+    LEAST_EXCITATION,
+    LONGEST_GAP,
+    CalibrationLog,
+    LogError,
+    Prepared,
+    prepare,
+)
+from der_planner.identification.report import FitReport, Unknown, loads_of
+from der_planner.identification.terms import (
+    COLUMN,
+    GROUPS,
+    OPTIONAL,
+    TERMS,
+    FreeTerms,
+    values_of,
+    without,
+)
 from der_planner.limb import CalibratedRange, Limb
-from der_planner.model import RodModel
-from der_planner.model.series import CONTROL_PERIOD
+from der_planner.model import CONTROL_PERIOD, ArcModel, Material, RodModel
 from der_planner.planning.loads import nearly_buckling
 
 Array = NDArray[np.float64]
 
+UNTOLD = 0.8
+"""Share of its prior spread above which the deviation of an unknown means that the log does not
+tell it."""
 STRONG = 0.9
 """|correlation| above which two unknowns are reported as a pair that the log cannot tell apart."""
 MOST_PASSES = 4
 """Largest number of times that lengths and bend angles are fitted in turn, for a limb that its
 weight bends unevenly."""
 SAME_LENGTH = 5e-4
-"""A pass that changes no length by more than this is the last one [m]."""
+"""Change of a length up to which a pass is the last one [m]."""
+LEAST_ROWS = 3
+"""Rows that a log needs for the start in closed form."""
+COMPLIANCE_SPREAD = 0.3
+"""Relative standard deviation of the prior's compliance in the start in closed form."""
+EVEN_ERROR = np.deg2rad(5.0)
+"""Error of the bend angle of an evenly bent segment in the start in closed form [rad]."""
+LARGEST_CHANGE = 0.6
+"""Largest change of the logarithm of the stiffness in the start in closed form."""
+STIFFER_STARTS = (0.0, 0.25, 0.5, 0.9)
+"""Added to the logarithm of the stiffness, or taken off that of the mass, until the rod can follow
+the log from there."""
 
 
 def fit(
@@ -51,7 +76,6 @@ def fit(
     *,
     terms: Iterable[str] = GROUPS,
     geometry: bool = True,
-    nodes: int = NODES,
     longest_gap: float = LONGEST_GAP,
 ) -> tuple[Limb, FitReport]:
     """Identify a limb from a calibration run.
@@ -63,7 +87,6 @@ def fit(
             `OPTIONAL`) the mass of each segment is fitted and its stiffness is the prior's. A log
             shows the mass only under gravity or in fast motion.
         geometry: fit the lengths to the tips as well.
-        nodes: of the rod in the fit.
         longest_gap: between two rows of the log that a straight line may bridge [s].
 
     Returns:
@@ -77,53 +100,65 @@ def fit(
     if not groups <= {*GROUPS, *OPTIONAL}:
         known = (*GROUPS, *OPTIONAL)
         raise LogError(f"unknown model term {sorted(groups - set(known))}: choose {known}")
-    prepared = prepare(log, limb, longest_gap=longest_gap)
-    warnings = list(prepared.warnings)
-    air = _try_air(prepared, warnings)
-    offset = np.zeros(limb.segment_count) if air is None else air.offset
-    fitted = _fit_bends_and_lengths(limb, prepared, offset, groups, nodes, geometry)
+    recorded = prepare(log, limb, longest_gap)
+    warnings = list(recorded.warnings)
+    air = _try_air(recorded, warnings)
+    offset = 0.0 if air is None else air.offset
+    prepared = replace(recorded, pressure=recorded.pressure - offset)
+    fitted = _fit_bends_and_lengths(limb, prepared, groups, geometry)
     if fitted.lengths is not None:
         warnings += filter(None, [lengths_at_their_end(limb, fitted.lengths.lengths)])
-    unknowns, correlation = fitted.problem.uncertainties(fitted.values, fitted.jacobian)
+    unknowns, correlation = _told(fitted)
     if "dynamics" in groups and _all_untold(unknowns):
         warnings.append(
             "the log is too slow to tell the stiffness apart from the gain: stiffness and damping "
             "keep their old values; steps or a sweep would tell them"
         )
-        slow = Problem(fitted.limb, prepared, offset, groups - {"dynamics"}, nodes)
-        fitted = _Fitted(fitted.limb, fitted.lengths, slow, *slow.solve())
-        unknowns, correlation = slow.uncertainties(fitted.values, fitted.jacobian)
-    remaining = fitted.problem.remaining(fitted.values)
-    found = _finish(limb, to_limb(fitted.limb, fitted.values), air, prepared, remaining)
+        groups -= {"dynamics"}
+        fitted = _fit_bends(fitted.known, prepared, groups, fitted.lengths)
+        unknowns, correlation = _told(fitted)
+    found = _calibrated(fitted, limb, air, recorded)
     warnings += filter(None, [nearly_buckling(found)])
     pcc_residual = np.full(limb.segment_count, np.nan)
-    if "dynamics" in fitted.problem.groups or any(limb.gravity[:2]):
-        found, pcc_residual = _with_arcs(found, prepared, offset, warnings)
-    report = _report(
-        log, prepared, unknowns, correlation, remaining, air=air, geometry=fitted.lengths,
-        pcc_residual=pcc_residual, evaluations=fitted.problem.evaluations,
-        fit_time=clock.perf_counter() - begin, warnings=tuple(warnings), loads=loads_of(found),
-    )  # fmt: skip
-    return found, report
+    if "dynamics" in groups or limb.weighs_in_plane:
+        found, pcc_residual = _with_arcs(found, prepared, warnings)
+    return found, FitReport(
+        source=log.source,
+        unknowns=unknowns,
+        correlation=correlation,
+        strongly_correlated=_pairs(unknowns, correlation),
+        air=air,
+        geometry=fitted.lengths,
+        residual=np.sqrt(np.nanmean(fitted.remaining**2, axis=0)),
+        largest=np.nanmax(np.abs(fitted.remaining), axis=0),
+        pcc_residual=pcc_residual,
+        span=np.ptp(prepared.bend[prepared.usable], axis=0),
+        duration=float(prepared.time[-1] - prepared.time[0]),
+        rows=int(prepared.usable.sum()),
+        evaluations=fitted.problem.search.evaluations,
+        fit_time=clock.perf_counter() - begin,
+        warnings=tuple(warnings),
+        loads=loads_of(found),
+    )
 
 
 class _Fitted(NamedTuple):
-    """A limb with its lengths, and the problem that was solved on it with its solution."""
+    """A limb with its lengths, the problem that was solved on it, its solution and what it left."""
 
-    limb: Limb
+    known: Limb
     lengths: GeometryFit | None
-    problem: Problem
+    problem: BendFit
     values: Array
-    jacobian: Array
+    remaining: Array
+
+    @property
+    def limb(self) -> Limb:
+        """The limb that was found."""
+        return self.problem.free.limb_with(self.values)
 
 
 def _fit_bends_and_lengths(
-    limb: Limb,
-    prepared: Prepared,
-    offset: Array,
-    groups: frozenset[str],
-    nodes: int,
-    geometry: bool,
+    prior: Limb, prepared: Prepared, groups: Collection[str], geometry: bool
 ) -> _Fitted:
     """Fit the lengths first, or in turn with the bend angles where weight bends the limb unevenly.
 
@@ -131,37 +166,136 @@ def _fit_bends_and_lengths(
     bends; that follows from a fitted limb, whose weight depends on its lengths. So both are fitted
     in turn until the lengths stay the same. How unevenly it bends also tells the stiffness.
     """
-    loaded = any(limb.gravity[:2])
-    prior = limb
-    lengths = fit_geometry(limb, prepared.log) if geometry and not loaded else None
-    if lengths is not None:
-        limb = with_geometry(prior, lengths.lengths, lengths.connector, lengths.base)
-    problem = Problem(limb, prepared, offset, groups, nodes)
-    fitted = _Fitted(limb, lengths, problem, *problem.solve())
+    loaded = prior.weighs_in_plane
+    lengths = fit_geometry(prior, prepared.log) if geometry and not loaded else None
+    fitted = _fit_bends(lengths.limb if lengths else prior, prepared, groups, lengths)
     bent: Unevenness | None = None
     for _ in range(MOST_PASSES if geometry and loaded else 0):
-        found = to_limb(fitted.limb, fitted.values)
-        bent = unevenness(found, prepared.log.time, prepared.pressure - offset, nodes)
+        bent = unevenness(fitted.limb, prepared, NODES)
         lengths = fit_geometry(prior, prepared.log, uneven=bent.tip)
         if lengths is None:
             break
-        limb = with_geometry(prior, lengths.lengths, lengths.connector, lengths.base)
-        tips = UnevenTips(
-            prior, limb, prepared.log, prepared.usable, RodModel(limb, nodes), bent.lacking
-        )
-        problem = Problem(limb, prepared, offset, groups, nodes, fitted.values, tips)
-        moved = np.abs(np.subtract(_lengths(limb), _lengths(fitted.limb))).max()
-        fitted = _Fitted(limb, lengths, problem, *problem.solve())
-        if moved < SAME_LENGTH:
+        tips = UnevenTips(prior, RodModel(lengths.limb, NODES), prepared, bent.lacking)
+        change = np.abs(lengths_of(lengths.limb) - lengths_of(fitted.known))
+        fitted = _fit_bends(lengths.limb, prepared, groups, lengths, fitted.values, tips)
+        if change[: prior.segment_count + 1].max() < SAME_LENGTH:
             break
     if bent is not None and not bent.holds:
-        found = to_limb(fitted.limb, fitted.values)
-        check_that_it_holds(found, prepared.log.time, prepared.pressure - offset)
+        uneven_tip(fitted.limb, prepared)
     return fitted
 
 
-def _lengths(limb: Limb) -> list[float]:
-    return [limb.base_length, *(segment.length for segment in limb.segments)]
+def _fit_bends(
+    known: Limb,
+    prepared: Prepared,
+    groups: Collection[str],
+    lengths: GeometryFit | None,
+    start: Array | None = None,
+    tips: UnevenTips | None = None,
+) -> _Fitted:
+    """Fit the rod to the bend angles.
+
+    Args:
+        known: the limb before, with the lengths that were fitted.
+        prepared: the log.
+        groups: of terms to fit.
+        lengths: of the limb.
+        start: (P,) of the free terms; None: in closed form from the log's statics.
+        tips: fit to them, too; None: to the bend angles alone.
+    """
+    names = {term.name for term in TERMS if term.group in ("linear", *groups)}
+    if "mass" in groups:
+        names.discard("log_stiffness")
+    if "mass" in groups or not known.weighs_in_plane:
+        # Without weight, or with an unknown mass, it is one scale with the stiffness.
+        names.discard("log_inertia")
+    free = FreeTerms.of(known, names, without(values_of(known, starts=True), groups))
+    problem = BendFit(free, RodModel(known, NODES), [prepared], tips.rows if tips else None)
+    if start is None:
+        start = free.at_places(_static_start(free, prepared))
+    values = problem.search.solve(_followed(problem, free, start))
+    return _Fitted(known, lengths, problem, values, problem.remaining(values))
+
+
+def _static_start(free: FreeTerms, prepared: Prepared) -> Array:
+    """Return values (M, T) by fitting bend = gain · pressure + compliance · torque + rest.
+
+    The torque is that of the weight of evenly bent segments at the measured bend angles. Without
+    gravity it is zero, and the compliance stays the prior's.
+
+    Raises:
+        LogError: too few rows, or an input that was not excited.
+    """
+    rows = prepared.usable
+    pressure, bend = prepared.pressure[rows], prepared.bend[rows]
+    if len(pressure) < LEAST_ROWS:
+        raise LogError(f"only {len(pressure)} rows of the log can be used: record a whole run")
+    values, weight = free.values.copy(), Material(free.limb).weight_torques(bend)
+    doubt = EVEN_ERROR / COMPLIANCE_SPREAD * np.sqrt(len(bend))
+    for index, segment in enumerate(free.limb.segments):
+        spread = float(np.std(pressure[:, index]))
+        if spread < LEAST_EXCITATION:
+            raise LogError(
+                f"input {index} was not excited (standard deviation {spread:.0f} Pa): its gain "
+                "cannot be told"
+            )
+        known = segment.length / segment.bending_stiffness
+        design = np.stack(
+            [pressure[:, index] / spread, known * weight[:, index], np.ones(len(pressure))], axis=1
+        )
+        # The last row is what is known of the compliance, as one more measurement.
+        design = np.concatenate([design, [[0.0, doubt, 0.0]]])
+        seen = np.append(bend[:, index], doubt)
+        gain, compliance, rest = np.linalg.lstsq(design, seen, rcond=None)[0]
+        stiffer = np.clip(-np.log(max(compliance, 1e-3)), -LARGEST_CHANGE, LARGEST_CHANGE)
+        for term, value in (
+            ("gain", gain / spread),
+            ("rest_angle", rest),
+            ("log_stiffness", stiffer),
+        ):
+            values[index, COLUMN[term]] = value
+    return values
+
+
+def _followed(problem: BendFit, free: FreeTerms, start: Array) -> Array:
+    """Return a start that the rod can follow: stiffer, or lighter, if it must be.
+
+    Raises:
+        LogError: the rod cannot follow the log from any start.
+    """
+    names = [term.name for term in free.terms]
+    more = np.array([(n == "log_stiffness") - 1.0 * (n == "log_mass") for n in names])
+    for share in STIFFER_STARTS if more.any() else STIFFER_STARTS[:1]:
+        if problem.search.follows(start + share * more):
+            return start + share * more
+    raise LogError(
+        "the rod cannot follow this log, neither with the prior's stiffness nor with more: "
+        "check the prior's gravity, mass, masses and lengths, and that x points along the "
+        "straight limb"
+    )
+
+
+def _told(fitted: _Fitted) -> tuple[tuple[Unknown, ...], Array]:
+    """Return the unknowns with standard deviations, and their correlation (P, P)."""
+    problem, free = fitted.problem, fitted.problem.free
+    assert isinstance(free, FreeTerms)
+    covariance = problem.search.covariance(fitted.values, problem.excess(fitted.remaining))
+    deviation = np.sqrt(np.diag(covariance))
+    at_bound = free.unknowns.at_bound(fitted.values)
+    unknowns = tuple(
+        Unknown(
+            name=term.name if term.shared else f"{term.name}[{segment}]",
+            unit=term.unit,
+            value=float(value),
+            deviation=float(sigma),
+            untold=bool(sigma > UNTOLD * term.spread),
+            at_bound=bool(edge),
+        )
+        for term, (segment, _), value, sigma, edge in zip(
+            free.terms, free.places, fitted.values, deviation, at_bound, strict=True
+        )
+    )
+    return unknowns, covariance / np.outer(deviation, deviation)
 
 
 def _all_untold(unknowns: tuple[Unknown, ...]) -> bool:
@@ -169,55 +303,28 @@ def _all_untold(unknowns: tuple[Unknown, ...]) -> bool:
     return bool(stiffness) and all(stiffness)
 
 
-def _with_arcs(
-    found: Limb, prepared: Prepared, offset: Array, warnings: list[str]
-) -> tuple[Limb, Array]:
-    """Return the limb with the PCC model's numbers, and that model's errors (M,) [rad]."""
-    segments, residual = fit_pcc(found, prepared, offset)
-    if np.all(np.isfinite(residual)):
-        return replace(found, pcc_segments=segments), residual
-    warnings.append(
-        "arcs of constant curvature cannot follow this log under its loads: the PCC model has the "
-        "rod's numbers"
-    )
-    return found, residual
+def _with_arcs(found: Limb, prepared: Prepared, warnings: list[str]) -> tuple[Limb, Array]:
+    """Return the limb with the PCC model's numbers, and that model's errors (M,) [rad].
 
-
-def _report(
-    log: CalibrationLog,
-    prepared: Prepared,
-    unknowns: tuple[Unknown, ...],
-    correlation: Array,
-    remaining: Array,
-    *,
-    air: AirFit | None,
-    geometry: GeometryFit | None,
-    pcc_residual: Array,
-    evaluations: int,
-    fit_time: float,
-    warnings: tuple[str, ...],
-    loads: LoadsFit | None,
-) -> FitReport:
-    """Return what the data say; ``remaining`` (K, M) is measured less predicted [rad]."""
-    return FitReport(
-        source=log.source,
-        unknowns=unknowns,
-        correlation=correlation,
-        strongly_correlated=_pairs(unknowns, correlation),
-        untold=tuple(u.name for u in unknowns if u.untold),
-        air=air,
-        geometry=geometry,
-        residual=np.sqrt(np.nanmean(remaining**2, axis=0)),
-        largest=np.nanmax(np.abs(remaining), axis=0),
-        pcc_residual=pcc_residual,
-        span=np.ptp(prepared.bend[prepared.usable], axis=0),
-        duration=float(prepared.log.time[-1] - prepared.log.time[0]),
-        rows=int(prepared.usable.sum()),
-        evaluations=evaluations,
-        fit_time=fit_time,
-        warnings=warnings,
-        loads=loads,
-    )
+    Without gravity both models have the same statics, segment by segment, so gain, rest angle,
+    unequal chambers, stiffening, friction and creep are shared, and only stiffness and damping are
+    fitted to each: an arc is stiffer than a rod that may bend unevenly. Under gravity their statics
+    differ as well, and the arcs get gains and rest angles of their own from the same log.
+    """
+    names = {"log_stiffness", "material_damping", "log_damping"}
+    if found.weighs_in_plane:
+        names |= {"gain", "rest_angle"}
+    free = FreeTerms.of(found, names)
+    problem = BendFit(free, ArcModel(found), [prepared])
+    if not problem.search.follows(free.unknowns.prior):
+        warnings.append(
+            "arcs of constant curvature cannot follow this log under its loads: the PCC model has "
+            "the rod's numbers"
+        )
+        return found, np.full(found.segment_count, np.nan)
+    values = problem.search.solve()
+    residual = np.sqrt(np.nanmean(problem.remaining(values) ** 2, axis=0))
+    return replace(found, pcc_segments=free.limb_with(values).segments), residual
 
 
 def _try_air(prepared: Prepared, warnings: list[str]) -> AirFit | None:
@@ -229,50 +336,26 @@ def _try_air(prepared: Prepared, warnings: list[str]) -> AirFit | None:
 
 
 def _pairs(unknowns: tuple[Unknown, ...], correlation: Array) -> tuple[tuple[str, str, float], ...]:
-    count = len(unknowns)
-    return tuple(
-        (unknowns[i].name, unknowns[j].name, float(correlation[i, j]))
-        for i in range(count)
-        for j in range(i)
-        if abs(correlation[i, j]) > STRONG
-    )
+    strong = np.argwhere(np.tril(np.abs(correlation) > STRONG, -1))
+    return tuple((unknowns[i].name, unknowns[j].name, float(correlation[i, j])) for i, j in strong)
 
 
-def _finish(
-    prior: Limb, found: Limb, air: AirFit | None, prepared: Prepared, remaining: Array
-) -> Limb:
-    pneumatics = prior.pneumatics
-    if air is not None:
-        pneumatics = replace(
-            pneumatics,
-            time_constant=air.fill_lag,
-            vent_time_constant=air.vent_lag,
-            delay=air.delay,
-        )
-        if np.isfinite(air.vent_rate):
-            pneumatics = replace(
-                pneumatics,
-                vent_rate=air.vent_rate,
-                vent_exponent=air.vent_exponent,
-                vent_lag_exponent=air.vent_lag_exponent,
-            )
-    rows = prepared.usable
-    error = np.degrees(np.sqrt(np.nanmean(remaining**2, axis=0)))
+def _calibrated(fitted: _Fitted, prior: Limb, air: AirFit | None, recorded: Prepared) -> Limb:
+    """Return the limb that was found, with its air, what the log covered and where it is from."""
+    rows, error = recorded.usable, np.sqrt(np.nanmean(fitted.remaining**2, axis=0))
     return replace(
-        found,
-        pneumatics=pneumatics,
+        fitted.limb,
+        pcc_segments=(),
+        pneumatics=air.law(prior.pneumatics) if air else prior.pneumatics,
         calibrated=CalibratedRange(
-            tuple(float(v) for v in np.abs(prepared.pressure[rows]).max(axis=0)),
-            tuple(float(v) for v in np.abs(prepared.bend[rows]).max(axis=0)),
+            tuple(float(v) for v in np.abs(recorded.pressure[rows]).max(axis=0)),
+            tuple(float(v) for v in np.abs(recorded.bend[rows]).max(axis=0)),
         ),
         provenance={
-            "source": prepared.log.source,
+            "source": recorded.log.source,
             "date": datetime.datetime.now(datetime.timezone.utc).date().isoformat(),
             "fitted_by": "der_planner.identification",
-            "residual_deg": [round(float(v), 3) for v in error],
+            "residual_deg": [round(float(v), 3) for v in np.degrees(error)],
             "prior": prior.name,
         },
     )
-
-
-__all__ = ["AirFit", "FitReport", "GeometryFit", "fit"]

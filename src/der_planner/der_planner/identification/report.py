@@ -1,4 +1,4 @@
-"""Results of a fit or an update: values, uncertainties, residuals, what a log cannot separate."""
+"""Results of a calibration: values, uncertainties, residuals, what a log cannot separate."""
 
 from __future__ import annotations
 
@@ -9,15 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.identification.air import AirFit
-from der_planner.identification.geometry import GeometryFit
+from der_planner.identification.lengths import GeometryFit
 from der_planner.limb import Limb
 from der_planner.limb.parameters import REST_SPREAD
 from der_planner.model.resting import weight_of
 
 Array = NDArray[np.float64]
-
-CALIBRATE_AGAIN = math.radians(3.0)
-"""Root mean square error that a limb file should not leave [rad]."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +57,7 @@ class LoadsFit:
 
 def loads_of(limb: Limb) -> LoadsFit | None:
     """Return mass, first moment and stiffness of a limb; None without gravity in its plane."""
-    if not any(limb.gravity[:2]):
+    if not limb.weighs_in_plane:
         return None
     straight = replace(limb, gravity=(0.0, 1.0, 0.0))
     weight = weight_of(straight)
@@ -83,7 +80,6 @@ class FitReport:
         unknowns: (P,) with standard deviations.
         correlation: (P, P) of the unknowns.
         strongly_correlated: pairs that the log cannot tell apart.
-        untold: names of unknowns whose spread is the prior's still.
         air: fit of the chambers; None if the log has no smooth commands.
         geometry: fit of the lengths; None if the log has no tips.
         residual, largest: (M,) root mean square and largest bend angle error of the rod [rad].
@@ -102,7 +98,6 @@ class FitReport:
     unknowns: tuple[Unknown, ...]
     correlation: Array
     strongly_correlated: tuple[tuple[str, str, float], ...]
-    untold: tuple[str, ...]
     air: AirFit | None
     geometry: GeometryFit | None
     residual: Array
@@ -162,22 +157,23 @@ class FitReport:
         if self.air is None:
             return []
         air = self.air
+        number, deviation = air.numbers, air.deviations
         # A run without fast steps never shows how fast a chamber fills.
         seen = np.isfinite(air.fill_rate)
         rate = f"{air.fill_rate:.0f} Pa/s" if seen else "not shown by this run"
         venting = "how slowly chambers are venting: not shown by this run, kept"
-        if math.isfinite(air.vent_rate):
-            speed, exponent = air.vent_uncertainty
+        if "vent_rate" in number:
             venting = (
-                f"a vented chamber falls by at most {air.vent_rate:.0f} ± {speed:.0f} Pa/s at "
-                f"10 kPa, with the pressure to the power {air.vent_exponent:.2f} ± {exponent:.2f}"
+                f"a vented chamber falls by at most {number['vent_rate']:.0f} ± "
+                f"{deviation['vent_rate']:.0f} Pa/s at 10 kPa, with the pressure to the power "
+                f"{number['vent_exponent']:.2f} ± {deviation['vent_exponent']:.2f}"
             )
-        lag = f"{air.vent_lag:.3f} s venting"
-        if air.vent_lag_exponent > 0:
-            lag += f" at 10 kPa · (10 kPa / pressure)^{air.vent_lag_exponent:.2f}"
+        lag = f"{number['vent_time_constant']:.3f} s venting"
+        if number.get("vent_lag_exponent"):
+            lag += f" at 10 kPa · (10 kPa / pressure)^{number['vent_lag_exponent']:.2f}"
         return [
-            f"air: lag {air.fill_lag:.3f} s filling, {lag}, dead time "
-            f"{air.delay:.3f} s, fill rate {rate}, residual {air.residual:.0f} Pa",
+            f"air: lag {number['time_constant']:.3f} s filling, {lag}, dead time "
+            f"{number['delay']:.3f} s, fill rate {rate}, residual {air.residual:.0f} Pa",
             f"air: {venting}",
         ]
 
@@ -262,82 +258,3 @@ def _readable(item: Unknown) -> tuple[float, float, str]:
         "Pa/rad": (0.01 * math.radians(45.0), "hPa at 45 deg"),
     }.get(item.unit, (1.0, item.unit))
     return item.value * factor, item.deviation * factor, unit
-
-
-@dataclass(frozen=True)
-class Change:
-    """One number of a limb file before and after an update.
-
-    Attributes:
-        segment: from 0.
-        name: ``gain`` [rad/Pa], ``rest angle`` [rad] or ``friction`` [N·m].
-        before, after: values.
-        spread: standard deviation before, that of days.
-        deviation: standard deviation after.
-        told: the runs tell it; if not, it keeps its value.
-    """
-
-    segment: int
-    name: str
-    before: float
-    after: float
-    spread: float
-    deviation: float
-    told: bool
-
-    def text(self) -> str:
-        """Return the line for people."""
-        factor, unit = {
-            "gain": (math.degrees(100.0), "°/hPa"),
-            "rest angle": (math.degrees(1.0), "°"),
-            "friction": (1e3, "mN·m"),
-        }[self.name]
-        before, after, spread, deviation = (
-            factor * value for value in (self.before, self.after, self.spread, self.deviation)
-        )
-        line = f"segment {self.segment}, {self.name}: {before:.3g} ± {spread:.2g} {unit}"
-        if not self.told:
-            return f"{line} stays: not told by these runs"
-        line += f" -> {after:.3g} ± {deviation:.2g} {unit}"
-        if self.name == "gain":
-            return f"{line} ({100 * (after / before - 1):+.1f} %)"
-        return f"{line} ({after - before:+.2g} {unit})"
-
-
-@dataclass(frozen=True)
-class Update:
-    """What ordinary runs said of a limb file.
-
-    Attributes:
-        changes: three a segment, in the order gain, rest angle, friction.
-        error_before, error_after: (M,) root mean square open-loop error of the bend angles [rad].
-        duration: of all runs [s].
-        warnings: sentences.
-    """
-
-    changes: tuple[Change, ...]
-    error_before: Array
-    error_after: Array
-    duration: float
-    warnings: tuple[str, ...]
-
-    @property
-    def told(self) -> bool:
-        """Whether the runs told anything."""
-        return any(change.told for change in self.changes)
-
-    @property
-    def enough(self) -> bool:
-        """Whether the updated limb file predicts the runs; if not, the limb must be calibrated."""
-        return bool(np.all(self.error_after < CALIBRATE_AGAIN))
-
-    def text(self) -> str:
-        """Return the result for people."""
-        lines = [change.text() for change in self.changes]
-        pairs = zip(self.error_before, self.error_after, strict=True)
-        lines += [
-            f"segment {index}: open-loop error rms {math.degrees(before):.2f}° -> "
-            f"{math.degrees(after):.2f}°"
-            for index, (before, after) in enumerate(pairs)
-        ]
-        return "\n".join([*lines, *(f"finding: {text}" for text in self.warnings)])

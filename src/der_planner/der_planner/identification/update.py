@@ -1,73 +1,232 @@
-"""Gain, rest angle and friction of a limb file, brought up to date from ordinary runs.
+"""What changes from day to day, gain, rest angle and friction, brought up to date from runs.
 
 A calibration moves every chamber on purpose. An ordinary run tells less, so that only what changes
-from day to day is asked of it, and what is known of it before, the limb file with the spread of
-days around it, is weighed against the run:
-
-    minimise  Σ (measured − predicted bend)² / (e² ℓ)  +  Σ x²
-
-with x an unknown's distance from the limb file in spreads of a day (`GAIN_SPREAD` …), e the error
-that remains and ℓ the number of rows over which it stays alike, both taken from the fit before (at
-least 0.3° and 1 s: what a model of this kind leaves anyhow). The prediction is open loop from the
-measured pressures. An unknown whose standard deviation stays that of the days was not told by the
-run, and keeps its value.
+from day to day is asked of it, and the limb file with the spread of days around it is weighed
+against the run. The errors are weighed by what the fit before left (at least 0.3° and 1 s: what a
+model of this kind leaves anyhow). The prediction is open loop from the measured pressures. An
+unknown whose standard deviation stays that of the days was not told by the run and keeps its value.
 """
 
 from __future__ import annotations
 
 import datetime
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
+from der_planner.identification.bends import CORRELATION, NODES, BendFit
 from der_planner.identification.check import LEAST_MOTION
-from der_planner.identification.logs.log import CalibrationLog, LogError
-from der_planner.identification.logs.prepare import Prepared, prepare
-from der_planner.identification.problem import (
-    ANGLE_ERROR,
-    CORRELATION,
-    NOT_FOLLOWED,
-    UNTOLD,
-    correlation_length,
+from der_planner.identification.fit import UNTOLD
+from der_planner.identification.least_squares import (
+    LeastSquares,
+    Rows,
+    Unknowns,
+    with_differences,
 )
-from der_planner.identification.report import CALIBRATE_AGAIN, Change, Update
-from der_planner.identification.rod_angles import NODES
+from der_planner.identification.log import CalibrationLog, LogError, Prepared, prepare
 from der_planner.limb import Limb, Segment
-from der_planner.limb.days import GAIN_SPREAD, LARGEST_CHANGES, REST_SPREAD, on_another_day
-from der_planner.model import RodModel, simulate
+from der_planner.limb.parameters import REST_SPREAD
+from der_planner.model import RodModel
 from der_planner.rod import ConvergenceError
 
 Array = NDArray[np.float64]
 
+GAIN_SPREAD = 0.35
+"""Share of a gain by which it changes from day to day: a real limb's changed by up to a half."""
+LARGEST_GAIN_CHANGE = 4.0
+"""Largest factor by which a fit may change a gain."""
+LARGEST_REST_CHANGE = math.radians(35.0)
+"""Largest change of a rest angle in a fit [rad]."""
 FRICTION_SPREAD = 0.5
-"""Of friction, as a share of it …"""
+"""Share of a friction by which it changes from day to day."""
 LEAST_FRICTION_SPREAD = 100.0
-"""… and at least this, as a pressure [Pa]."""
+"""Least change of a friction from day to day, as a pressure [Pa]."""
+LARGEST_FRICTION_CHANGE = 20.0
+"""Largest change of a friction in a fit, in spreads of a day."""
 FRICTION_ANGLE = 0.1
 """Bend over which friction turns round, for a limb file without friction [rad]."""
 WRONG_WAY = -0.5
 """Correlation of predicted and measured bend below which pressure and bend have other signs."""
 LEAST_DURATION = 5.0
-"""Of all runs together [s]."""
-_LARGEST_FRICTION_CHANGE = 20.0
-"""In spreads of a day."""
-_PASSES = 3
-_STEP = 1e-3
-"""Of an unknown in its spread, for a difference of two predictions."""
-_CHECK_LIMB = (
-    "check that they are of this limb, that no tubes, signs or columns are swapped, and that what "
-    "it carries is named"
-)
-_NOT_FOLLOWED = (
-    "the rod of the limb '{name}' cannot follow these runs: check that they are of this limb, with "
-    "its mounting and what it carries"
-)
-_NAMES = ("gain", "rest angle", "friction")
-_GAIN, _REST, _FRICTION = range(3)
+"""Least duration of all runs together [s]."""
+CALIBRATE_AGAIN = math.radians(3.0)
+"""Root mean square error that a limb file should not leave [rad]."""
+MOST_PASSES = 3
+"""Largest number of fits, each with the weights and without the untold unknowns of the last."""
+
+FAR = 3e-3
+"""Mean distance of measured and expected tip beyond which a model is adapted [m]."""
+TIP_ERROR = 2e-3
+"""Error of the tip that a model leaves anyhow [m]."""
+BETTER = 0.7
+"""Share of the distance that an adapted model may leave to be used."""
+_NUDGE = 1e-3
+"""Change of an unknown in its spread, for a difference of two simulations."""
+
+
+@dataclass(frozen=True)
+class DayNumbers:
+    """Gain [rad/Pa], rest angle [rad] and friction [N·m] of each segment of a limb, in this order.
+
+    Attributes:
+        limb: with the numbers of its file.
+        names: of the numbers.
+        free: (P,) which of the numbers of all segments may change.
+    """
+
+    limb: Limb
+    names: tuple[str, ...] = ("gain", "rest angle", "friction")
+    free: tuple[int, ...] | None = None
+
+    @property
+    def places(self) -> list[int]:
+        """(P,) places of the free numbers in (M, len(names)) of all."""
+        count = self.limb.segment_count * len(self.names)
+        return list(range(count)) if self.free is None else list(self.free)
+
+    @property
+    def unknowns(self) -> Unknowns:
+        """What is known of the free numbers: those of the file, with the spread of days."""
+        rows = []
+        for segment in self.limb.segments:
+            rows += _day(segment)[: len(self.names)]
+        prior, spread, low, high = np.array(rows)[self.places].T
+        return Unknowns(prior, spread, low, high, scale=spread)
+
+    def limb_with(self, values: Array) -> Limb:
+        """Return the limb with the free numbers (P,) put in place, its arcs changed alike."""
+        known = {place: float(value) for place, value in zip(self.places, values, strict=True)}
+        size = len(self.names)
+        segments = tuple(
+            _changed(s, [known.get(size * m + n) for n in range(size)])
+            for m, s in enumerate(self.limb.segments)
+        )
+        pairs = zip(self.limb.pcc_segments, self.limb.segments, segments, strict=False)
+        return replace(self.limb, segments=segments, pcc_segments=tuple(_alike(*p) for p in pairs))
+
+
+def _day(segment: Segment) -> list[tuple[float, float, float, float]]:
+    """Return prior, spread, least and largest value of a segment's three numbers."""
+    gain, friction = segment.static_gain, segment.friction_moment
+    rest = segment.rest_curvature * segment.length
+    rubs = max(FRICTION_SPREAD * friction, LEAST_FRICTION_SPREAD * segment.moment_gain)
+    return [
+        (gain, GAIN_SPREAD * gain, gain / LARGEST_GAIN_CHANGE, gain * LARGEST_GAIN_CHANGE),
+        (rest, REST_SPREAD, rest - LARGEST_REST_CHANGE, rest + LARGEST_REST_CHANGE),
+        (friction, rubs, 0.0, friction + LARGEST_FRICTION_CHANGE * rubs),
+    ]
+
+
+def _changed(segment: Segment, numbers: Sequence[float | None]) -> Segment:
+    """Return a segment with gain, rest angle and friction, as far as they are not None."""
+    gain, rest, friction = [*numbers, None][:3]
+    changes = {}
+    if gain is not None:
+        changes["moment_gain"] = gain * segment.bending_stiffness / segment.length
+    if rest is not None:
+        changes["rest_curvature"] = rest / segment.length
+    if friction is not None:
+        changes["friction_moment"] = friction
+        if not segment.friction_curvature:
+            changes["friction_curvature"] = FRICTION_ANGLE / segment.length
+    return replace(segment, **changes)
+
+
+def _alike(arc: Segment, before: Segment, after: Segment) -> Segment:
+    """Return an arc changed as its segment was: gain and friction by factors, rest by a shift."""
+    gain = arc.moment_gain * after.moment_gain / before.moment_gain
+    friction = after.friction_moment
+    if before.friction_moment:
+        friction *= arc.friction_moment / before.friction_moment
+    return replace(
+        arc,
+        moment_gain=gain,
+        rest_curvature=arc.rest_curvature + after.rest_curvature - before.rest_curvature,
+        friction_moment=friction,
+        friction_curvature=arc.friction_curvature or after.friction_curvature,
+    )
+
+
+@dataclass(frozen=True)
+class Change:
+    """One number of a limb file before and after an update.
+
+    Attributes:
+        segment: from 0.
+        name: ``gain`` [rad/Pa], ``rest angle`` [rad] or ``friction`` [N·m].
+        before, after: values.
+        spread: standard deviation before, that of days.
+        deviation: standard deviation after.
+        told: the runs tell it; if not, it keeps its value.
+    """
+
+    segment: int
+    name: str
+    before: float
+    after: float
+    spread: float
+    deviation: float
+    told: bool
+
+    def text(self) -> str:
+        """Return the line for people."""
+        factor, unit = {
+            "gain": (math.degrees(100.0), "°/hPa"),
+            "rest angle": (math.degrees(1.0), "°"),
+            "friction": (1e3, "mN·m"),
+        }[self.name]
+        before, after, spread, deviation = (
+            factor * value for value in (self.before, self.after, self.spread, self.deviation)
+        )
+        line = f"segment {self.segment}, {self.name}: {before:.3g} ± {spread:.2g} {unit}"
+        if not self.told:
+            return f"{line} stays: not told by these runs"
+        line += f" -> {after:.3g} ± {deviation:.2g} {unit}"
+        if self.name == "gain":
+            return f"{line} ({100 * (after / before - 1):+.1f} %)"
+        return f"{line} ({after - before:+.2g} {unit})"
+
+
+@dataclass(frozen=True)
+class Update:
+    """What ordinary runs said of a limb file.
+
+    Attributes:
+        changes: three a segment, in the order gain, rest angle, friction.
+        error_before, error_after: (M,) root mean square open-loop error of the bend angles [rad].
+        duration: of all runs [s].
+        warnings: sentences.
+    """
+
+    changes: tuple[Change, ...]
+    error_before: Array
+    error_after: Array
+    duration: float
+    warnings: tuple[str, ...]
+
+    @property
+    def told(self) -> bool:
+        """Whether the runs told anything."""
+        return any(change.told for change in self.changes)
+
+    @property
+    def enough(self) -> bool:
+        """Whether the updated limb file predicts the runs; if not, the limb must be calibrated."""
+        return bool(np.all(self.error_after < CALIBRATE_AGAIN))
+
+    def text(self) -> str:
+        """Return the result for people."""
+        lines = [change.text() for change in self.changes]
+        pairs = zip(self.error_before, self.error_after, strict=True)
+        lines += [
+            f"segment {index}: open-loop error rms {math.degrees(before):.2f}° -> "
+            f"{math.degrees(after):.2f}°"
+            for index, (before, after) in enumerate(pairs)
+        ]
+        return "\n".join([*lines, *(f"finding: {text}" for text in self.warnings)])
 
 
 def update(limb: Limb, logs: CalibrationLog | Sequence[CalibrationLog]) -> tuple[Limb, Update]:
@@ -87,251 +246,143 @@ def update(limb: Limb, logs: CalibrationLog | Sequence[CalibrationLog]) -> tuple
     """
     given = [logs] if isinstance(logs, CalibrationLog) else list(logs)
     runs = [prepare(log, limb, to_fit=False) for log in given]
-    duration = sum(float(run.log.time[-1] - run.log.time[0]) for run in runs)
+    duration = sum(float(run.time[-1] - run.time[0]) for run in runs)
     if duration < LEAST_DURATION:
         raise LogError(
             f"the runs last {duration:.1f} s altogether: an update needs {LEAST_DURATION:.0f} s, "
             "and half a minute in which all segments move to tell all of it"
         )
-    days = _Days(limb, runs)
-    days.refuse_wrong_way()
-    x, deviation, told = days.solve()
-    before, after = days.error(np.zeros_like(x)), days.error(x)
+    every = DayNumbers(limb)
+    known = every.unknowns.prior
+    try:
+        remaining = BendFit(every, RodModel(limb, NODES), runs).remaining(known)
+    except ConvergenceError as error:
+        raise LogError(
+            f"the rod of the limb '{limb.name}' cannot follow these runs: check that they are of "
+            "this limb, with its mounting and what it carries"
+        ) from error
+    _refuse_wrong_way(runs, remaining)
+    values, deviations = _solve(every, runs)
+    told = replace(every, free=tuple(deviations))
+    found = told.limb_with(values[told.places])
+    before, after = (
+        np.sqrt(np.nanmean(left**2, axis=0))
+        for left in (remaining, BendFit(every, RodModel(limb, NODES), runs).remaining(values))
+    )
     warnings = [warning for run in runs for warning in run.warnings]
     if not np.all(after < CALIBRATE_AGAIN):
         warnings.append(
             f"gain, rest angle and friction leave {math.degrees(after.max()):.1f}°: something else "
             "changed, calibrate again"
         )
+    spread = every.unknowns.spread
     changes = tuple(
-        change for m in range(limb.segment_count) for change in days.changes(m, x, deviation, told)
+        Change(
+            segment=place // len(every.names),
+            name=every.names[place % len(every.names)],
+            before=float(known[place]),
+            after=float(values[place]),
+            spread=float(spread[place]),
+            deviation=deviations.get(place, float(spread[place])),
+            told=place in deviations,
+        )
+        for place in every.places
     )
-    found = _with_provenance(days.limb(x), limb, changes, after, given)
+    found = _with_provenance(found, limb, changes, after, given)
     return found, Update(changes, before, after, duration, tuple(warnings))
 
 
-class _Days:
-    """The unknowns of a limb file that change from day to day, in spreads of a day.
+def _solve(every: DayNumbers, runs: Sequence[Prepared]) -> tuple[Array, dict[int, float]]:
+    """Return the best numbers (3 M,), and by place the deviations of those that the runs tell."""
+    numbers, factor, deviations = every, 1.0, dict[int, float]()
+    values = every.unknowns.prior
+    for _ in range(MOST_PASSES):
+        problem = BendFit(numbers, RodModel(every.limb, NODES), runs)
+        free = problem.search.solve(values[numbers.places], factor)
+        values = every.unknowns.prior.copy()
+        values[numbers.places] = free
+        factor = max(1.0, problem.excess(problem.remaining(free)))
+        deviation = np.sqrt(np.diag(problem.search.covariance(free, factor)))
+        told = deviation <= UNTOLD * numbers.unknowns.spread
+        deviations = {
+            p: float(d) for p, d, t in zip(numbers.places, deviation, told, strict=True) if t
+        }
+        if not deviations:
+            return every.unknowns.prior, {}
+        numbers = replace(numbers, free=tuple(deviations))
+    return values, deviations
+
+
+def _refuse_wrong_way(runs: Sequence[Prepared], remaining: Array) -> None:
+    """Refuse runs in which a segment bends against its pressure.
 
     Args:
-        limb: as its file says.
-        runs: prepared logs.
+        runs: prepared.
+        remaining: (K, M) measured less predicted bend of all runs [rad].
+
+    Raises:
+        LogError: a segment does.
     """
+    measured = np.concatenate([run.log.bend_angles for run in runs])
+    expected = measured - remaining
+    ends = np.cumsum([len(run.time) for run in runs])[:-1]
+    usable = np.concatenate([run.usable for run in runs])
 
-    def __init__(self, limb: Limb, runs: list[Prepared]) -> None:
-        self._limb, self._runs = limb, runs
-        self._size = 3 * limb.segment_count
-        self._weight = 1.0 / (ANGLE_ERROR * math.sqrt(CORRELATION))
-        self._last: tuple[bytes, list[Array] | None] | None = None
-        largest = [*LARGEST_CHANGES, _LARGEST_FRICTION_CHANGE]
-        self._high = np.tile(largest, limb.segment_count)
-        self._low = -self._high
-        # Friction is never negative.
-        for m, segment in enumerate(limb.segments):
-            self._low[3 * m + _FRICTION] = -segment.friction_moment / _friction_spread(segment)
+    def about_means(table: Array) -> Array:
+        parts = [part - np.nanmean(part, axis=0) for part in np.split(table, ends)]
+        return np.asarray(np.concatenate(parts)[usable].T)
 
-    def limb(self, x: Array) -> Limb:
-        """Return the limb with the unknowns (3 M,)."""
-        arcs = self._limb.pcc_segments
-        return replace(
-            self._limb,
-            segments=tuple(_moved(s, row) for s, row in self._rows(self._limb.segments, x)),
-            pcc_segments=tuple(_moved(s, row) for s, row in self._rows(arcs, x)) if arcs else (),
-        )
-
-    def _rows(self, segments: Sequence[Segment], x: Array) -> list[tuple[Segment, Array]]:
-        return list(zip(segments, x.reshape(-1, 3), strict=True))
-
-    def refuse_wrong_way(self) -> None:
-        """Refuse runs in which a segment bends against its pressure.
-
-        Raises:
-            LogError: it does, or the rod cannot follow the runs.
-        """
-        expected, seen = np.zeros((0, self._limb.segment_count)), []
-        predicted = self._followed(np.zeros(self._size))
-        for run, part in zip(self._runs, predicted, strict=True):
-            rows = run.usable
-            expected = np.concatenate([expected, part[rows] - part[rows].mean(axis=0)])
-            seen.append(run.log.bend_angles[rows] - run.log.bend_angles[rows].mean(axis=0))
-        measured = np.concatenate(seen)
-        for m in range(self._limb.segment_count):
-            if np.ptp(expected[:, m]) < LEAST_MOTION or np.ptp(measured[:, m]) < LEAST_MOTION:
-                continue
-            if np.corrcoef(expected[:, m], measured[:, m])[0, 1] < WRONG_WAY:
-                raise LogError(
-                    f"segment {m} bends the wrong way in these runs: {_CHECK_LIMB}; else "
-                    "calibrate again"
-                )
-
-    def solve(self) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Return the unknowns, their standard deviations and which the runs tell, (3 M,) each.
-
-        Raises:
-            LogError: the rod cannot follow the runs.
-        """
-        told = np.ones(self._size, dtype=bool)
-        x, deviation = np.zeros(self._size), np.ones(self._size)
-        self._followed(x)
-        for _ in range(_PASSES):
-            x = self._fit(x, told)
-            self._believe_remaining(x)
-            deviation = self._deviation(x, told)
-            if np.any(deviation[told] > UNTOLD):
-                told &= deviation <= UNTOLD
-                x = self._fit(np.where(told, x, 0.0), told)
-        return np.where(told, x, 0.0), np.where(told, deviation, 1.0), told
-
-    def _fit(self, x: Array, told: NDArray[np.bool_]) -> Array:
-        if not told.any():
-            return x
-        rows = sum(run.log.bend_angles.size for run in self._runs)
-
-        def full(part: Array) -> Array:
-            whole = np.zeros(self._size)
-            whole[told] = part
-            return whole
-
-        def residual(part: Array) -> Array:
-            remaining = self._remaining(full(part))
-            if remaining is None:
-                remaining = np.full(rows, NOT_FOLLOWED)
-            return np.concatenate([self._weight * remaining, part])
-
-        def jacobian(part: Array) -> Array:
-            slopes = self._slopes(full(part), told)
-            return np.concatenate([self._weight * slopes, np.eye(len(part))])
-
-        low, high = self._low[told] - 1e-9, self._high[told] + 1e-9
-        found = least_squares(
-            residual, x[told], jac=jacobian, bounds=(low, high), xtol=1e-3, ftol=1e-4, max_nfev=20
-        )
-        return full(np.clip(found.x, self._low[told], self._high[told]))
-
-    def _believe_remaining(self, x: Array) -> None:
-        """Weigh the rows by the error that remains, and by how long it stays alike."""
-        length, remaining = CORRELATION, []
-        for run, part in zip(self._runs, self._followed(x), strict=True):
-            error = np.where(run.usable[:, None], run.log.bend_angles - part, np.nan)
-            length = max(length, correlation_length(error))
-            remaining.append(error)
-        error_rms = float(np.sqrt(np.nanmean(np.concatenate(remaining) ** 2)))
-        self._weight = 1.0 / (max(error_rms, ANGLE_ERROR) * math.sqrt(length))
-
-    def _deviation(self, x: Array, told: NDArray[np.bool_]) -> Array:
-        slopes = self._weight * self._slopes(x, told)
-        information = slopes.T @ slopes + np.eye(int(told.sum()))
-        deviation = np.ones(self._size)
-        deviation[told] = np.sqrt(np.diag(np.linalg.inv(information)))
-        return deviation
-
-    def error(self, x: Array) -> Array:
-        """Return the root mean square error of the bend angles (M,) [rad]."""
-        squares = [
-            (run.log.bend_angles - part)[run.usable] ** 2
-            for run, part in zip(self._runs, self._followed(x), strict=True)
-        ]
-        error: Array = np.sqrt(np.nanmean(np.concatenate(squares), axis=0))
-        return error
-
-    def _remaining(self, x: Array) -> Array | None:
-        """Return predicted less measured angles of all runs, 0 where unseen; None: not followed."""
-        angles = self._angles(x)
-        if angles is None:
-            return None
-        parts = [
-            np.where(run.usable[:, None], part - run.log.bend_angles, 0.0).ravel()
-            for run, part in zip(self._runs, angles, strict=True)
-        ]
-        return np.concatenate(parts)
-
-    def _slopes(self, x: Array, told: NDArray[np.bool_]) -> Array:
-        """Return ∂(remaining)/∂(unknowns that are told), by differences."""
-        here = self._remaining(x)
-        rows = sum(run.log.bend_angles.size for run in self._runs)
-        columns = []
-        for place in np.flatnonzero(told):
-            step = _STEP if x[place] + _STEP < self._high[place] else -_STEP
-            moved = x.copy()
-            moved[place] += step
-            there = self._remaining(moved)
-            if here is None or there is None:
-                columns.append(np.zeros(rows))
-            else:
-                columns.append((there - here) / step)
-        return np.stack(columns, axis=1) if columns else np.zeros((rows, 0))
-
-    def _angles(self, x: Array) -> list[Array] | None:
-        """Return the predicted bend angles (K, M) [rad] of each run; None: not followed.
-
-        The last ones are kept: errors and slopes are asked for at the same unknowns.
-        """
-        key = x.tobytes()
-        if self._last is None or self._last[0] != key:
-            self._last = (key, self._predicted(x))
-        return self._last[1]
-
-    def _predicted(self, x: Array) -> list[Array] | None:
-        model = RodModel(self.limb(x), NODES)
-        try:
-            angles = [
-                simulate(model, run.log.time, pressures=run.pressure, steps=1).bend_angles
-                for run in self._runs
-            ]
-        except ConvergenceError:
-            return None
-        return angles if all(np.isfinite(part).all() for part in angles) else None
-
-    def _followed(self, x: Array) -> list[Array]:
-        """Return the angles where the rod was seen to follow.
-
-        Raises:
-            LogError: it does not.
-        """
-        angles = self._angles(x)
-        if angles is None:
-            raise LogError(_NOT_FOLLOWED.format(name=self._limb.name))
-        return angles
-
-    def changes(
-        self, m: int, x: Array, deviation: Array, told: NDArray[np.bool_]
-    ) -> tuple[Change, ...]:
-        """Return the changes of a segment's three numbers."""
-        old = self._limb.segments[m]
-        new = _moved(old, x[3 * m : 3 * m + 3])
-        spreads = (GAIN_SPREAD * old.static_gain, REST_SPREAD, _friction_spread(old))
-        # That of a gain is a share of the gain, which is another one now.
-        units = (GAIN_SPREAD * new.static_gain, *spreads[1:])
-        columns = (_NAMES, _day(old), _day(new), spreads, units)
-        return tuple(
-            Change(
-                m, name, before, after, spread,
-                unit * float(deviation[3 * m + n]), bool(told[3 * m + n]),
+    pairs = zip(about_means(measured), about_means(expected), strict=True)
+    for m, (seen, told) in enumerate(pairs):
+        if min(np.ptp(seen), np.ptp(told)) < LEAST_MOTION:
+            continue
+        if np.corrcoef(seen, told)[0, 1] < WRONG_WAY:
+            raise LogError(
+                f"segment {m} bends the wrong way in these runs: check that they are of this limb, "
+                "that no tubes, signs or columns are swapped, and that what it carries is named; "
+                "else calibrate again"
             )
-            for n, (name, before, after, spread, unit) in enumerate(zip(*columns, strict=True))
-        )  # fmt: skip
 
 
-def _day(segment: Segment) -> tuple[float, float, float]:
-    """Return gain [rad/Pa], rest angle [rad] and friction [N·m]."""
-    return segment.static_gain, segment.rest_curvature * segment.length, segment.friction_moment
+def adapted(limb: Limb, tip_of: Callable[[Limb], Array | None], tip: Array) -> Limb | None:
+    """Return a limb with gains and rest angles under which its tip comes nearest to a run's.
 
+    Learning plans with the model's answer to a change of commands. Where a limb is far from its
+    file, of another day or another limb altogether, that answer is wrong as well, and a step by it
+    may make things worse. So what the tip tells of the day is put into the model first; `update`
+    takes it from bend angles and measured pressures, which tell more.
 
-def _friction_spread(segment: Segment) -> float:
-    """Return the spread of a segment's friction from day to day [N·m]."""
-    least = LEAST_FRICTION_SPREAD * segment.moment_gain
-    return max(FRICTION_SPREAD * segment.friction_moment, least)
+    Args:
+        limb: of the plan.
+        tip_of: gives the tip (K, 2) [m] of such a limb in the run; None where it has none.
+        tip: (K, 2) measured, NaN where it was not seen [m].
 
+    Returns:
+        None where the limb is near the run already, or nothing much is gained.
+    """
+    seen = np.isfinite(tip).all(axis=1)
+    numbers = DayNumbers(limb, ("gain", "rest angle"))
+    unknowns = numbers.unknowns
 
-def _moved(segment: Segment, row: Array) -> Segment:
-    """Return a segment with its three unknowns put in place; what does not move stays as it is."""
-    changed = {}
-    if row[_FRICTION]:
-        moment = segment.friction_moment + _friction_spread(segment) * row[_FRICTION]
-        changed["friction_moment"] = max(0.0, float(moment))
-        if not segment.friction_curvature:
-            changed["friction_curvature"] = FRICTION_ANGLE / segment.length
-    return replace(on_another_day(segment, row[_GAIN], row[_REST]), **changed)
+    def missed(values: Array) -> Array:
+        found = tip_of(numbers.limb_with(values))
+        return np.full((int(seen.sum()), 2), np.nan) if found is None else (found - tip)[seen]
+
+    def rows(values: Array) -> Rows:
+        weight = 1.0 / (TIP_ERROR * math.sqrt(CORRELATION))
+        residual, slopes = with_differences(
+            lambda v: weight * missed(v).ravel(), values, _NUDGE * unknowns.spread
+        )
+        return residual, np.nan_to_num(slopes)
+
+    def far(values: Array) -> float:
+        return float(np.linalg.norm(missed(values), axis=1).mean())
+
+    before = far(unknowns.prior)
+    if not before >= FAR:
+        return None
+    found = LeastSquares(unknowns, rows).solve()
+    return numbers.limb_with(found) if far(found) < BETTER * before else None
 
 
 def _with_provenance(

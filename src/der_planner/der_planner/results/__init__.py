@@ -1,4 +1,4 @@
-"""Evaluation: from bags, or arrays of a run without one, to errors, tables and figures.
+"""Results: from bags, or arrays of a run without one, to errors, tables and figures.
 
 Example::
 
@@ -13,52 +13,38 @@ Example::
 from der_planner.bags.reader import BagError
 from der_planner.bags.run import Description, EvaluationError, RunSeries, Stream
 from der_planner.bags.series import load_run
-from der_planner.results.alignment import Settings, Split, error_series, split_error
-from der_planner.results.batch import Evaluated, evaluate_bags
-from der_planner.results.figures import plot_error, plot_pressures, plot_tip
-from der_planner.results.learning import plot_learning
-from der_planner.results.metrics import RunResult, evaluate_bag, evaluate_run
-from der_planner.results.report import Report, write_report
-from der_planner.results.results import read_results, results_document, write_results
+from der_planner.results.errors import EvaluationSettings, error_series, split_error
+from der_planner.results.evaluation import RunResult, evaluate_bag, evaluate_bags, evaluate_run
+from der_planner.results.figures import plot_error, plot_learning, plot_pressures, plot_tip
+from der_planner.results.report import read_results, write_report, write_results
 from der_planner.results.statistics import Comparison, Summary, compare, summarise
-from der_planner.results.table import (
-    csv_table,
-    format_comparison,
-    format_table,
-    latex_table,
-    markdown_table,
-)
+from der_planner.results.tables import csv_table, error_table, format_comparison, format_table
 
 __all__ = [
     "BagError",
     "Comparison",
     "Description",
-    "Evaluated",
     "EvaluationError",
-    "Report",
+    "EvaluationSettings",
     "RunResult",
     "RunSeries",
-    "Settings",
-    "Split",
     "Stream",
     "Summary",
     "compare",
     "csv_table",
     "error_series",
+    "error_table",
     "evaluate_bag",
     "evaluate_bags",
     "evaluate_run",
     "format_comparison",
     "format_table",
-    "latex_table",
     "load_run",
-    "markdown_table",
     "plot_error",
     "plot_learning",
     "plot_pressures",
     "plot_tip",
     "read_results",
-    "results_document",
     "split_error",
     "summarise",
     "write_report",

@@ -1,23 +1,80 @@
-"""Figures of runs. Drawn without a display and without pyplot's global state."""
+"""Figures of runs in one  Drawn without a display and without pyplot's global state.
+
+The style is that of a two-column paper; its colours are told apart by colour-blind readers.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from der_planner.bags.run import Array, RunSeries, Stream
-from der_planner.results import style
-from der_planner.results.alignment import error_series
-from der_planner.results.table import CASE
+from der_planner.results.errors import error_series
+from der_planner.results.evaluation import RunResult
+from der_planner.results.statistics import learning_curves
+from der_planner.results.tables import CASE
 
 FORMATS = ("png", "pdf")
 CM = 100.0
+COLUMN = 3.5
+"""Width of a column of a two-column paper [inch]."""
+PAGE = 7.16
+"""Width of both columns [inch]."""
+# Okabe and Ito's palette (2008).
+REFERENCE = "#000000"
+COLOURS = {"der": "#0072B2", "pcc": "#D55E00"}
+OTHER = ("#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+DASHES = {"der": "-", "pcc": "--"}
+
+
+def colour(model: str, index: int = 0) -> str:
+    """Return the colour of a model, or the index-th of the rest for an unknown one."""
+    return COLOURS.get(model, OTHER[index % len(OTHER)])
+
+
+@contextmanager
+def paper_style() -> Iterator[None]:
+    """Set font sizes and line widths of a two-column paper, without touching the caller's."""
+    settings: dict[str, Any] = {
+        "font.size": 8,
+        "axes.titlesize": 8,
+        "axes.labelsize": 8,
+        "legend.fontsize": 7,
+        "xtick.labelsize": 7,
+        "ytick.labelsize": 7,
+        "lines.linewidth": 1.2,
+        "axes.linewidth": 0.6,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "legend.frameon": False,
+        "pdf.fonttype": 42,
+        "svg.fonttype": "none",
+        "savefig.dpi": 160,
+        "figure.constrained_layout.use": True,
+    }
+    with mpl.rc_context(settings):
+        yield
+
+
+def save(figure: Figure, folder: Path, name: str, formats: tuple[str, ...]) -> list[Path]:
+    """Write a figure in every format and return the paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for suffix in formats:
+        path = folder / f"{name}.{suffix}"
+        # Without a date in it, the same runs give the same file.
+        stripped = {"CreationDate": None} if suffix == "pdf" else None
+        figure.savefig(path, metadata=stripped)
+        paths.append(path)
+    return paths
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -25,6 +82,16 @@ def new_figure(width: float, height: float) -> Figure:
     figure = Figure(figsize=(width, height))
     FigureCanvasAgg(figure)
     return figure
+
+
+def shared_legend(figure: Figure, axes: Iterable[Axes]) -> None:
+    """Put one legend above all axes, in which each label stands once."""
+    handles = {
+        label: handle
+        for axis in axes
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=4)
 
 
 def by_motion(runs: Sequence[RunSeries]) -> dict[str, list[RunSeries]]:
@@ -54,15 +121,13 @@ def plot_tip(
         The written files.
     """
     motions = by_motion(runs)
-    with style.paper_style():
-        figure = new_figure(style.PAGE, 2.1 * len(motions))
+    with paper_style():
+        figure = new_figure(PAGE, 2.1 * len(motions))
         axes = figure.subplots(len(motions), 3, squeeze=False)
         for row, (title, members) in zip(axes, motions.items(), strict=True):
             _draw_tip_row(row, title, members)
-        handles, labels = axes[0][0].get_legend_handles_labels()
-        unique = dict(zip(labels, handles, strict=True))
-        figure.legend(unique.values(), unique.keys(), loc="outside upper center", ncols=4)
-        return style.save(figure, folder, "tip", formats)
+        shared_legend(figure, [axes[0][0]])
+        return save(figure, folder, "tip", formats)
 
 
 def _draw_tip_row(row: Sequence[Axes], title: str, runs: Sequence[RunSeries]) -> None:
@@ -70,10 +135,10 @@ def _draw_tip_row(row: Sequence[Axes], title: str, runs: Sequence[RunSeries]) ->
     for index, run in enumerate(runs):
         model = run.description.model
         look: dict[str, Any] = {
-            "color": style.colour(model, index),
+            "color": colour(model, index),
             "alpha": 0.9 if len(runs) <= 4 else 0.5,
             "lw": 1.0,
-            "ls": style.DASHES.get(model, "-."),
+            "ls": DASHES.get(model, "-."),
         }
         inside = (run.tip.time >= 0) & (run.tip.time <= run.reference.time[-1])
         time, tip = run.tip.time[inside], run.tip.value[inside] * CM
@@ -81,7 +146,7 @@ def _draw_tip_row(row: Sequence[Axes], title: str, runs: Sequence[RunSeries]) ->
         over_x.plot(time, tip[:, 0], **look)
         over_y.plot(time, tip[:, 1], **look)
     reference = runs[0].reference
-    black: dict[str, Any] = {"color": style.REFERENCE, "lw": 0.9, "ls": ":"}
+    black: dict[str, Any] = {"color": REFERENCE, "lw": 0.9, "ls": ":"}
     value = reference.value * CM
     plane.plot(value[:, 0], value[:, 1], label="reference", **black)
     over_x.plot(reference.time, value[:, 0], **black)
@@ -103,18 +168,16 @@ def plot_error(
         formats: file name endings.
     """
     motions = by_motion(runs)
-    with style.paper_style():
-        wide = style.PAGE if len(motions) > 1 else style.COLUMN
+    with paper_style():
+        wide = PAGE if len(motions) > 1 else COLUMN
         figure = new_figure(wide, 2.2)
         axes = figure.subplots(1, len(motions), squeeze=False, sharey=True)[0]
         for axis, (title, members) in zip(axes, motions.items(), strict=True):
             for index, (label, same) in enumerate(_by_model(members).items()):
                 time, mean, deviation = mean_error(same)
                 model = same[0].description.model
-                look = style.colour(model, index)
-                axis.plot(
-                    time, mean * CM, color=look, ls=style.DASHES.get(model, "-."), label=label
-                )
+                look = colour(model, index)
+                axis.plot(time, mean * CM, color=look, ls=DASHES.get(model, "-."), label=label)
                 low = np.maximum(mean - deviation, 0.0)
                 axis.fill_between(
                     time, low * CM, (mean + deviation) * CM, color=look, alpha=0.2, lw=0
@@ -122,13 +185,8 @@ def plot_error(
             axis.set(xlabel="time [s]", title=title)
             axis.set_ylim(bottom=0.0)
         axes[0].set_ylabel("tip error [cm]")
-        handles = {
-            label: handle
-            for axis in axes
-            for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
-        }
-        figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=4)
-        return style.save(figure, folder, "error", formats)
+        shared_legend(figure, axes)
+        return save(figure, folder, "error", formats)
 
 
 def _by_model(runs: Sequence[RunSeries]) -> dict[str, list[RunSeries]]:
@@ -179,18 +237,17 @@ def plot_pressures(
         return []
     motions = by_motion(runs)
     segments = runs[0].commanded.value.shape[1]
-    with style.paper_style():
-        figure = new_figure(style.PAGE, 1.9 * len(motions))
+    with paper_style():
+        figure = new_figure(PAGE, 1.9 * len(motions))
         axes = figure.subplots(len(motions), segments, squeeze=False, sharex="row")
         for row, (title, members) in zip(axes, motions.items(), strict=True):
             for index, (label, same) in enumerate(_by_model(members).items()):
-                _draw_pressures(row, same[0], label, style.colour(same[0].description.model, index))
+                _draw_pressures(row, same[0], label, colour(same[0].description.model, index))
             for segment, axis in enumerate(row):
                 axis.set(xlabel="time [s]", ylabel=f"Δp, segment {segment + 1} [kPa]")
             row[0].set_title(title)
-        handles, labels = axes[0][0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=4)
-        return style.save(figure, folder, "pressures", formats)
+        shared_legend(figure, [axes[0][0]])
+        return save(figure, folder, "pressures", formats)
 
 
 def _draw_pressures(row: Sequence[Axes], run: RunSeries, label: str, look: str) -> None:
@@ -200,22 +257,62 @@ def _draw_pressures(row: Sequence[Axes], run: RunSeries, label: str, look: str) 
         inside = (stream.time >= 0) & (stream.time <= last)
         return Stream(stream.time[inside], stream.value[inside] / 1000.0)
 
-    commanded = cut(run.commanded)
-    measured = cut(run.measured)
-    for segment, axis in enumerate(row):
-        axis.plot(
-            commanded.time,
-            commanded.value[:, segment],
-            color=look,
-            ls=":",
-            lw=0.9,
-            label=f"{label}, commanded",
-        )
-        if len(measured):
-            axis.plot(
-                measured.time,
-                measured.value[:, segment],
-                color=look,
-                ls=style.DASHES.get(run.description.model, "-."),
-                label=f"{label}, measured",
-            )
+    looks: dict[str, dict[str, Any]] = {
+        "commanded": {"ls": ":", "lw": 0.9},
+        "measured": {"ls": DASHES.get(run.description.model, "-.")},
+    }
+    for name, dash in looks.items():
+        stream = cut(getattr(run, name))
+        for segment, axis in enumerate(row if len(stream) else ()):
+            value = stream.value[:, segment]
+            axis.plot(stream.time, value, color=look, label=f"{label}, {name}", **dash)
+
+
+def plot_learning(
+    results: Sequence[RunResult], folder: Path, formats: tuple[str, ...] = FORMATS
+) -> list[Path]:
+    """Draw the learning curves, a line a trial and a column a motion; nothing where there is none.
+
+    Args:
+        results: of an experiment.
+        folder: where ``learning.png`` and ``learning.pdf`` go.
+        formats: file name endings.
+    """
+    curves = learning_curves(results)
+    if not curves:
+        return []
+    with paper_style():
+        figure: Any = new_figure(PAGE if len(curves) > 1 else COLUMN, 2.2)
+        axes = figure.subplots(1, len(curves), squeeze=False, sharey=True)[0]
+        for axis, (motion, trials) in zip(axes, curves.items(), strict=True):
+            for errors in trials:
+                axis.semilogy(np.arange(len(errors)), np.array(errors) * CM, "o-", ms=3)
+            axis.set(xlabel="runs learned from", title=motion.replace("_", " "))
+            axis.xaxis.get_major_locator().set_params(integer=True)
+        axes[0].set_ylabel("mean tip error [cm]")
+        return save(figure, folder, "learning", formats)
+
+
+def plot_latency(
+    results: Sequence[RunResult], folder: Path, formats: tuple[str, ...] = FORMATS
+) -> list[Path]:
+    """Draw the time from a picture to the first setpoint corrected by it, where it is known.
+
+    Args:
+        results: of an experiment; all runs with feedback are counted together.
+        folder: where ``latency.png`` and ``latency.pdf`` go.
+        formats: file name endings.
+    """
+    told = [run.extra.get("feedback", {}) for run in results]
+    counted = [about for about in told if about.get("latency_counts")]
+    if not counted:
+        return []
+    counts = np.sum([about["latency_counts"] for about in counted], axis=0)
+    width = float(counted[0]["latency_bin_s"]) * 1e3
+    with paper_style():
+        figure: Any = new_figure(COLUMN, 2.0)
+        axis = figure.subplots()
+        last = int(np.nonzero(counts)[0][-1]) + 2
+        axis.bar(np.arange(len(counts))[:last] * width, counts[:last], width, align="edge")
+        axis.set(xlabel="from picture to board [ms]", ylabel="pictures")
+        return save(figure, folder, "latency", formats)

@@ -8,22 +8,22 @@ from pathlib import Path
 import cv2
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
-from der_planner.bags.images import (
-    IMAGE_TYPE,
-    Projection,
-    curve_points,
-    gray,
-    stamp_of,
-    topics_of,
-)
-from der_planner.bags.reader import BagReader
-from der_planner.bags.record import NANOSECONDS, STATE_TYPE
+from der_planner.bags.images import Picture, Projection, RunImages, Snapshot
 from der_planner.bags.run import Array, EvaluationError, RunSeries
-from der_planner.results import style
-from der_planner.results.figures import CM, FORMATS, by_motion, new_figure
-from der_planner.results.snapshots import Snapshot, fit_projection, take_snapshots
+from der_planner.results.figures import (
+    CM,
+    DASHES,
+    FORMATS,
+    PAGE,
+    REFERENCE,
+    by_motion,
+    colour,
+    new_figure,
+    paper_style,
+    save,
+    shared_legend,
+)
 
 INSTANTS = 5
 
@@ -47,19 +47,14 @@ def plot_shapes(
     motions = by_motion([run for run in runs if run.origin])
     if not motions:
         return []
-    with style.paper_style():
-        figure = new_figure(style.PAGE, 0.4 + 1.6 * len(motions))
+    with paper_style():
+        figure = new_figure(PAGE, 0.4 + 1.6 * len(motions))
         axes = figure.subplots(len(motions), INSTANTS, squeeze=False)
         for row, (title, members) in zip(axes, motions.items(), strict=True):
             _draw_row(row, members)
             row[0].set_ylabel(title)
-        handles = {
-            label: handle
-            for axis in axes.flat
-            for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
-        }
-        figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=4)
-        return style.save(figure, folder, "shapes", formats)
+        shared_legend(figure, axes.flat)
+        return save(figure, folder, "shapes", formats)
 
 
 def _draw_row(row: Sequence[Axes], runs: Sequence[RunSeries]) -> None:
@@ -69,15 +64,17 @@ def _draw_row(row: Sequence[Axes], runs: Sequence[RunSeries]) -> None:
     chosen = list(first.values())
     last = min(float(run.reference.time[-1]) for run in chosen)
     times = np.linspace(0.1, 0.9, INSTANTS) * last
-    shots = {run.description.model: take_snapshots(run, times.tolist()) for run in chosen}
-    background = next(
-        (run for run in chosen if shots[run.description.model][0].frame is not None), None
-    )
-    project = fit_projection(background) if background is not None else None
+    shots: dict[str, list[Snapshot]] = {}
+    background, project = None, None
+    for run in chosen:
+        with RunImages(run) as images:
+            shots[run.description.model] = [images.snapshot(time) for time in times]
+            if background is None and shots[run.description.model][0].picture is not None:
+                background, project = run.description.model, images.projection()
     for index, axis in enumerate(row):
         under = None
         if background is not None and project is not None:
-            under = shots[background.description.model][index].frame
+            under = shots[background][index].picture
         _draw_shot(axis, {model: shot[index] for model, shot in shots.items()}, under, project)
         axis.set_title(f"{times[index]:.1f} s")
     _zoom(row)
@@ -101,7 +98,7 @@ def _zoom(row: Sequence[Axes]) -> None:
 def _draw_shot(
     axis: Axes,
     shots: dict[str, Snapshot],
-    frame: NDArray[np.uint8] | None,
+    frame: Picture | None,
     project: Projection | None,
 ) -> None:
     place: Callable[[Array], Array] = lambda points: points * CM  # noqa: E731
@@ -113,11 +110,11 @@ def _draw_shot(
         line = place(planned)
         if frame is not None:
             axis.plot(line[:, 0], line[:, 1], color="white", lw=1.8)
-        axis.plot(line[:, 0], line[:, 1], color=style.REFERENCE, ls=":", lw=1.0, label="planned")
+        axis.plot(line[:, 0], line[:, 1], color=REFERENCE, ls=":", lw=1.0, label="planned")
     for index, (model, shot) in enumerate(shots.items()):
         if len(shot.measured):
             line = place(shot.measured)
-            look, dash = style.colour(model, index), style.DASHES.get(model, "-.")
+            look, dash = colour(model, index), DASHES.get(model, "-.")
             axis.plot(line[:, 0], line[:, 1], color=look, ls=dash, lw=1.0, label=model.upper())
     axis.set_aspect("equal")
     axis.set(xticks=[], yticks=[])
@@ -138,43 +135,26 @@ def write_video(
     Raises:
         EvaluationError: the bag has no images, calibration or tags, or the film cannot be written.
     """
-    project = fit_projection(run)
-    if project is None:
-        raise EvaluationError(f"{run.description.bag}: no camera calibration or too few limb tags")
-    with BagReader(run.description.bag) as bag:
-        space = run.description.namespace
-        images, states = (
-            topics_of(bag, IMAGE_TYPE, space)[:1],
-            topics_of(bag, STATE_TYPE, space)[:1],
-        )
-        if not images:
-            raise EvaluationError(
-                f"{run.description.bag}: holds no images; record them with record_images:=true"
-            )
-        curves = {
-            stamp_of(message): curve_points(message.curve)
-            for _, _, message in bag.messages(states)
-            if message.valid
-        }
-        film: cv2.VideoWriter | None = None
-        for _, _, message in bag.messages(images):
-            frame = gray(message)
-            stamp = stamp_of(message)
-            if frame is None or stamp is None:
-                continue
-            if film is None:
-                film = _open_film(path, run, frame)
-            time = (stamp - run.origin) / NANOSECONDS
-            film.write(_film_frame(frame, time, curves.get(stamp), run, project))
+    bag = run.description.bag
+    film: cv2.VideoWriter | None = None
+    with RunImages(run) as images:
+        project = images.projection()
+        if project is None:
+            raise EvaluationError(f"{bag}: no camera calibration or too few limb tags")
+        for time, picture, curve in images.pictures():
+            film = film or _open_film(path, run, picture)
+            film.write(_film_frame(picture, time, curve, run, project))
             if progress is not None:
                 progress(min(1.0, max(0.0, time / float(run.reference.time[-1]))))
     if film is None:
-        raise EvaluationError(f"{run.description.bag}: no image has a known encoding")
+        raise EvaluationError(
+            f"{bag}: holds no images of a known encoding; record them with record_images:=true"
+        )
     film.release()
     return path
 
 
-def _open_film(path: Path, run: RunSeries, frame: NDArray[np.uint8]) -> cv2.VideoWriter:
+def _open_film(path: Path, run: RunSeries, frame: Picture) -> cv2.VideoWriter:
     rate = 1.0 / float(np.median(np.diff(run.tip.time)))
     height, width = frame.shape
     code = cv2.VideoWriter.fourcc(*"mp4v")
@@ -185,21 +165,21 @@ def _open_film(path: Path, run: RunSeries, frame: NDArray[np.uint8]) -> cv2.Vide
 
 
 def _film_frame(
-    frame: NDArray[np.uint8],
+    frame: Picture,
     time: float,
-    curve: Array | None,
+    curve: Array,
     run: RunSeries,
     project: Projection,
-) -> NDArray[np.uint8]:
+) -> Picture:
     picture = np.asarray(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
-    red, green, blue = (int(style.colour(run.description.model)[i : i + 2], 16) for i in (1, 3, 5))
-    colour = (blue, green, red)
+    red, green, blue = (int(colour(run.description.model)[i : i + 2], 16) for i in (1, 3, 5))
+    paint = (blue, green, red)
     path = np.rint(project(run.reference.value)).astype(np.int32)
     cv2.polylines(picture, [path], False, (255, 255, 255), 1, cv2.LINE_AA)
-    if curve is not None and len(curve):
+    if len(curve):
         line = np.rint(project(curve)).astype(np.int32)
-        cv2.polylines(picture, [line], False, colour, 3, cv2.LINE_AA)
-        cv2.circle(picture, line[-1].tolist(), 7, colour, -1, cv2.LINE_AA)
+        cv2.polylines(picture, [line], False, paint, 3, cv2.LINE_AA)
+        cv2.circle(picture, line[-1].tolist(), 7, paint, -1, cv2.LINE_AA)
     if 0.0 <= time <= run.reference.time[-1]:
         asked = [[np.interp(time, run.reference.time, column) for column in run.reference.value.T]]
         centre = np.rint(project(np.array(asked)))[0].astype(int).tolist()

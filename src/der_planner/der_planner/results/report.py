@@ -1,51 +1,72 @@
-"""A page of the results that opens from disk, and the table and figures for a paper beside it."""
+"""What is written of results: results.json, and a page with the table and figures for a paper."""
 
 from __future__ import annotations
 
+import base64
 import html
-import math
+import json
+import os
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from der_planner.bags.run import RunSeries
-from der_planner.results.figures import plot_error, plot_pressures, plot_tip
-from der_planner.results.html import document, figure, table
-from der_planner.results.learning import plot_learning
-from der_planner.results.manners import manners_table, plot_latency
-from der_planner.results.metrics import RunResult
+from der_planner.results.evaluation import RunResult
+from der_planner.results.figures import (
+    plot_error,
+    plot_latency,
+    plot_learning,
+    plot_pressures,
+    plot_tip,
+)
 from der_planner.results.overlay import plot_shapes
-from der_planner.results.results import write_results
-from der_planner.results.statistics import Comparison, Summary, compare, summarise
-from der_planner.results.table import (
+from der_planner.results.statistics import CONTROLS, compare, side_by_side, summarise
+from der_planner.results.tables import (
     CASE,
+    CM,
+    Table,
     csv_table,
+    error_table,
     format_comparison,
-    format_value,
-    latex_table,
-    markdown_table,
-    shows_loads,
-    shows_namespace,
+    number,
+    numbers,
+    several_limbs,
+    share,
 )
 
+FORMAT = 1
 _CAPTIONS = {
-    "latency": "From the instant of a picture to the first command at the board that knows of it.",
-    "learning": "Mean tip error over the runs that a plan was learned from, a line a trial.",
     "error": "Tip error over time: mean over trials, shaded one standard deviation.",
     "tip": "Measured tip against the reference: path in the plane, x and y over time.",
     "shapes": "Planned and measured limb, over the camera's frames where these were recorded.",
     "pressures": "Differential pressures, commanded and measured; first trial of each model.",
+    "learning": "Mean tip error over the runs that a plan was learned from, a line a trial.",
+    "latency": "From the instant of a picture to the first command at the board that knows of it.",
 }
-
 _DEFINITIONS = """
 <p>r̄ is the tip reference of the plan, interpolated linearly at the stamp of each image; r is the
 tip that the tracker measured in that image. E is the mean of |r − r̄| over the valid images of the
-window, E<sub>x</sub> and E<sub>y</sub> are the means of |x − x̄| and |y − ȳ|. The table shows mean ±
-sample standard deviation of these over trials, and the largest |r − r̄| of any trial. Times come
+window, E_x and E_y are the means of |x − x̄| and |y − ȳ|. The table shows mean ± sample standard
+deviation of these over trials, and the largest |r − r̄| of any trial. Times come
 from stamps; nothing is shifted. The split fits r(t) ≈ g r̄(t − τ) + b: lag τ, gains g, bias b, and
 the RMS error that is left when lag, then bias, then gain are taken out. Models are compared under
 the same loads; where a comparison says that methods differ, too, it is not one of models alone.</p>
+"""
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem;
+       color: #1a1a1a; background: #fff; }
+h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2rem; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 0.87rem; }
+th, td { padding: 0.25rem 0.7rem; text-align: right; border-bottom: 1px solid #ddd;
+         white-space: nowrap; }
+th { border-bottom: 1.5px solid #333; } .name { text-align: left; }
+.long { white-space: normal; text-align: left; min-width: 20rem; }
+img { max-width: 100%; height: auto; } figure { margin: 1rem 0; }
+figcaption, .small { font-size: 0.85rem; color: #555; }
 """
 
 
@@ -57,6 +78,35 @@ class Report:
     files: tuple[Path, ...]
 
 
+def results_document(results: Sequence[RunResult]) -> dict[str, Any]:
+    """Return the content of ``results.json``: runs, summary over trials, comparisons."""
+    return {
+        "format": FORMAT,
+        "runs": [result.to_dict() for result in results],
+        "summary": [row.to_dict() for row in summarise(results)],
+        "comparisons": [entry.to_dict() for entry in compare(results)],
+        "side_by_side": side_by_side(results),
+    }
+
+
+def write_results(results: Sequence[RunResult], folder: Path) -> Path:
+    """Write ``results.json`` into a folder, whole or not at all, and return its path."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "results.json"
+    unfinished = folder / ".results.json.part"
+    text = json.dumps(results_document(results), indent=1, allow_nan=False)
+    unfinished.write_text(text + "\n", encoding="utf-8")
+    os.replace(unfinished, path)
+    return path
+
+
+def read_results(path: Path) -> list[RunResult]:
+    """Return the runs of a ``results.json``."""
+    document = json.loads(Path(path).read_text(encoding="utf-8"))
+    return [RunResult.from_dict(entry) for entry in document["runs"]]
+
+
 def write_report(
     runs: Sequence[RunSeries],
     results: Sequence[RunResult],
@@ -64,7 +114,7 @@ def write_report(
     *,
     title: str = "Tracking errors",
     drawn: Sequence[Path] = (),
-    progress: Callable[[str], None] | None = None,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> Report:
     """Write page, tables and figures into a folder.
 
@@ -83,211 +133,166 @@ def write_report(
     Raises:
         BagError: a bag cannot be read again for its frames.
     """
-    say = progress or (lambda _: None)
     folder = Path(folder)
     files = [write_results(results, folder)]
-    rows, comparisons = summarise(results), compare(results)
+    rows = summarise(results)
     for name, text in (
-        ("table.md", markdown_table(rows)),
+        ("table.md", error_table(rows).markdown()),
         ("table.csv", csv_table(rows)),
-        ("table.tex", latex_table(rows)),
+        ("table.tex", error_table(rows).latex()),
     ):
         files.append(folder / name)
         files[-1].write_text(text, encoding="utf-8")
-    figures: dict[str, Path] = {}
-    for name, plot in (
-        ("error", plot_error),
-        ("tip", plot_tip),
-        ("shapes", plot_shapes),
-        ("pressures", plot_pressures),
-        ("learning", lambda _, place: plot_learning(results, place)),
-        ("latency", lambda _, place: plot_latency(results, place)),
-    ):
-        ready = [path for path in drawn if path.stem == name]
-        if ready:
-            written = [Path(shutil.copy(path, folder)) for path in ready]
-        else:
-            say(f"figure {name}")
-            written = plot(runs, folder)
+    figures: list[str] = []
+    plots: dict[str, Callable[[], list[Path]]] = {
+        "error": lambda: plot_error(runs, folder),
+        "tip": lambda: plot_tip(runs, folder),
+        "shapes": lambda: plot_shapes(runs, folder),
+        "pressures": lambda: plot_pressures(runs, folder),
+        "learning": lambda: plot_learning(results, folder),
+        "latency": lambda: plot_latency(results, folder),
+    }
+    for name, plot in plots.items():
+        written = [Path(shutil.copy(path, folder)) for path in drawn if path.stem == name]
+        if not written:
+            progress(f"figure {name}")
+            written = plot()
         files += written
-        pictures = [path for path in written if path.suffix == ".png"]
-        if pictures:
-            figures[name] = pictures[0]
+        figures += [figure(_CAPTIONS[name], path) for path in written if path.suffix == ".png"]
     page = folder / "report.html"
-    page.write_text(_page(title, results, rows, comparisons, figures), encoding="utf-8")
+    page.write_text(document(title, _sections(results, figures)), encoding="utf-8")
     return Report(page, (*files, page))
 
 
-def _page(
-    title: str,
-    results: Sequence[RunResult],
-    rows: Sequence[Summary],
-    comparisons: Sequence[Comparison],
-    figures: dict[str, Path],
-) -> str:
-    sections = [
-        f"<h1>{html.escape(title)}</h1>",
-        _summary_table(rows),
-        "".join(f"<p>{html.escape(format_comparison(entry))}</p>" for entry in comparisons),
-        manners_table(results),
-        *(figure(_CAPTIONS[name], path) for name, path in figures.items()),
-        "<h2>Every run</h2>",
-        _run_table(results),
-        _feedback_table(results),
-        _checks_table(results),
+def document(title: str, sections: Sequence[str]) -> str:
+    """Return a page, one file that opens from disk, of sections, which are HTML already."""
+    name, body = html.escape(title), "\n".join(filter(None, sections))
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{name}</title><style>{_STYLE}</style></head>\n"
+        f"<body>\n<h1>{name}</h1>\n{body}\n</body></html>\n"
+    )
+
+
+def figure(caption: str, path: Path) -> str:
+    """Return a PNG within the page."""
+    data = base64.b64encode(path.read_bytes()).decode("ascii")
+    return (
+        f'<figure><img alt="{html.escape(caption)}" src="data:image/png;base64,{data}">'
+        f"<figcaption>{html.escape(caption)}</figcaption></figure>"
+    )
+
+
+def section(title: str, table: Table) -> str:
+    """Return a table with its title; nothing for a table without rows."""
+    return f"<h2>{html.escape(title)}</h2>{table.html()}" if table.rows else ""
+
+
+def _sections(results: Sequence[RunResult], figures: Sequence[str]) -> list[str]:
+    return [
+        error_table(summarise(results)).html(),
+        *(f"<p>{html.escape(format_comparison(entry))}</p>" for entry in compare(results)),
+        section("Open loop, feedback, learning", side_by_side_table(results)),
+        *figures,
+        section("Every run", _run_table(results)),
+        section("What feedback added", _feedback_table(results)),
+        section("Instruments", _instrument_table(results)),
         "<h2>Definitions</h2>",
         _DEFINITIONS,
-        "<h2>Where the numbers come from</h2>",
-        _provenance(results),
+        section("Where the numbers come from", _provenance(results)),
     ]
-    return document(title, sections)
 
 
-def _summary_table(rows: Sequence[Summary]) -> str:
-    several, loaded = shows_namespace(rows), shows_loads(rows)
-    lines = [
-        [
-            *([html.escape(row.namespace)] if several else []),
-            *([html.escape(row.loads or "horizontal")] if loaded else []),
-            html.escape(CASE.get(row.motion, row.motion)),
-            html.escape(row.model.upper()),
-            html.escape(row.method),
-            str(row.trials),
-            format_value(row.mean_error_m, row.std_error_m),
-            format_value(row.mean_error_x_m, row.std_error_x_m),
-            format_value(row.mean_error_y_m, row.std_error_y_m),
-            f"{row.max_error_m * 100:.2f}",
-            _number(row.predicted_error_m, 100),
-        ]
-        for row in rows
-    ]
-    header = [
-        *(["limb"] if several else []),
-        *(["loads"] if loaded else []),
-        *("case", "model", "method", "trials", "E [cm]", "E<sub>x</sub> [cm]"),
-        *("E<sub>y</sub> [cm]", "max [cm]", "predicted E [cm]"),
-    ]
-    return table(header, lines, names=3 + several + loaded)
+def side_by_side_table(results: Sequence[RunResult]) -> Table:
+    """Return the table of `side_by_side` in cm; without rows where nothing stands beside."""
+    columns: dict[str, Callable[[dict[str, Any]], str]] = {
+        "case": lambda row: CASE.get(row["motion"], row["motion"]),
+        "model": lambda row: row["model"].upper(),
+    }
+    for name in CONTROLS:
+        head = name.replace("open_loop", "open loop").replace("_", " + ")
+        columns[f"{head}, E [cm]"] = partial(_error_of, f"{name}_m")
+    return Table.of(side_by_side(results), columns, names=2)
 
 
-def _number(value: float, scale: float = 1.0, digits: int = 2) -> str:
-    return "–" if math.isnan(value) else f"{value * scale:.{digits}f}"
+def _error_of(key: str, row: dict[str, Any]) -> str:
+    return number(row[key], CM, 3)
 
 
-def _run_name(run: RunResult, several: bool, method: str = "") -> str:
-    return f"{run.namespace if several else ''} {run.motion} {run.model} {method}".strip()
+Columns = dict[str, Callable[[RunResult], str]]
 
 
-def _run_table(results: Sequence[RunResult]) -> str:
-    lines = []
-    several = shows_namespace(results)
-    for run in results:
-        problems = "; ".join(run.problems)
-        lines.append(
-            [
-                html.escape(_run_name(run, several, run.method)),
-                str(run.trial),
-                str(run.seed),
-                _number(run.mean_error_m, 100),
-                _number(run.max_error_m, 100),
-                f"{math.floor(run.valid_fraction * 1000) / 10:.1f} %",
-                str(run.dropped_frames),
-                _number(run.lag_s, 1, 3),
-                f"{_number(run.gain_x)}, {_number(run.gain_y)}",
-                f"{_number(run.bias_x_m, 100)}, {_number(run.bias_y_m, 100)}",
-                " → ".join(
-                    _number(value, 100)
-                    for value in (
-                        run.rms_error_m,
-                        run.rms_without_lag_m,
-                        run.rms_without_bias_m,
-                        run.rms_without_gain_m,
-                    )
-                ),
-                ", ".join(_number(value, 1e-3) for value in run.pressure_rms_error_pa) or "–",
-                f'<span class="problem">{html.escape(problems)}</span>' if problems else "",
-            ]
-        )
-    header = [
-        *("run", "trial", "seed", "E [cm]", "max [cm]", "valid", "images missing", "lag [s]"),
-        *("gain x, y", "bias x, y [cm]", "RMS [cm] without lag, bias, gain"),
-        *("pressure RMS [kPa]", "problems"),
-    ]
-    return table(header, lines, names=1)
+def _first_columns(results: Sequence[RunResult]) -> Columns:
+    several = several_limbs(results)
+    return {
+        "run": lambda run: (
+            f"{run.namespace if several else ''} {run.motion} {run.model} {run.method}".strip()
+        ),
+        "trial": lambda run: str(run.trial),
+    }
 
 
-def _feedback_table(results: Sequence[RunResult]) -> str:
+def _run_table(results: Sequence[RunResult]) -> Table:
+    columns: Columns = {
+        "seed": lambda run: str(run.seed),
+        "E [cm]": lambda run: number(run.mean_error_m, CM),
+        "predicted E [cm]": lambda run: number(run.predicted_error_m, CM),
+        "max [cm]": lambda run: number(run.max_error_m, CM),
+        "valid": lambda run: share(run.valid_fraction),
+        "images missing": lambda run: str(run.dropped_frames),
+        "lag [s]": lambda run: number(run.lag_s, 1, 3),
+        "gain x, y": lambda run: numbers((run.gain_x, run.gain_y)),
+        "bias x, y [cm]": lambda run: numbers((run.bias_x_m, run.bias_y_m), CM),
+        "RMS [cm]": lambda run: number(run.rms_error_m, CM),
+        "without lag, bias, gain": lambda run: numbers(
+            (run.rms_without_lag_m, run.rms_without_bias_m, run.rms_without_gain_m), CM
+        ),
+        "pressure RMS [kPa]": lambda run: numbers(run.pressure_rms_error_pa, 1e-3),
+        "problems": lambda run: "; ".join(run.problems),
+    }
+    return Table.of(results, _first_columns(results) | columns)
+
+
+def _feedback_table(results: Sequence[RunResult]) -> Table:
     """List what feedback added to the commands of each run that had it."""
+
+    def told(run: RunResult, key: str) -> Any:
+        return run.extra["feedback"].get(key)
+
+    columns: Columns = {
+        "added, RMS [kPa]": lambda run: numbers(told(run, "correction_rms_pa") or (), 1e-3),
+        "largest [kPa]": lambda run: numbers(told(run, "correction_max_pa") or (), 1e-3),
+        "estimate RMS [mm]": lambda run: number(told(run, "estimate_rms_m"), 1e3),
+        "picture to board, median [ms]": lambda run: number(told(run, "latency_median_s"), 1e3, 0),
+        "p99 [ms]": lambda run: number(told(run, "latency_p99_s"), 1e3, 0),
+        "warnings": lambda run: "; ".join(told(run, "warnings") or ()) or "none",
+    }
     corrected = [run for run in results if run.extra.get("feedback")]
-    if not corrected:
-        return ""
-    several, lines = shows_namespace(results), []
-    for run in corrected:
-        about = run.extra["feedback"]
-        lines.append(
-            [
-                html.escape(_run_name(run, several, run.method)),
-                str(run.trial),
-                *(
-                    ", ".join(_number(value, 1e-3) for value in about.get(key, ()))
-                    for key in ("correction_rms_pa", "correction_max_pa")
-                ),
-                _number(about.get("estimate_rms_m", math.nan), 1000),
-                *(
-                    _number(about.get(key, math.nan), 1000, 0)
-                    for key in ("latency_median_s", "latency_p99_s")
-                ),
-                html.escape("; ".join(about.get("warnings", ())) or "none"),
-            ]
-        )
-    header = [
-        *("run", "trial", "added, RMS [kPa]", "largest [kPa]", "estimate RMS [mm]"),
-        *("picture to board, median [ms]", "p99 [ms]", "warnings"),
-    ]
-    return "<h2>What feedback added</h2>" + table(header, lines, names=1)
+    return Table.of(corrected, _first_columns(results) | columns)
 
 
-def _checks_table(results: Sequence[RunResult]) -> str:
-    checked = [run for run in results if run.checks]
-    if not checked:
-        return ""
-    several = shows_namespace(results)
-    lines = [
-        [
-            html.escape(_run_name(run, several)),
-            str(run.trial),
-            _number(run.checks.get("tracker_rms_m", math.nan), 1000, 3),
-            _count(run, "board_setpoints"),
-            _count(run, "board_lost"),
-            _count(run, "board_out_of_order"),
-            _number(run.checks.get("board_lateness_p50_s", math.nan), 1000),
-            _number(run.checks.get("board_lateness_p99_s", math.nan), 1000),
-            _number(run.checks.get("board_lateness_max_s", math.nan), 1000),
-        ]
-        for run in checked
-    ]
-    header = [
-        *("run", "trial", "tracker RMS [mm]", "setpoints", "lost", "out of order"),
-        *("late p50 [ms]", "p99 [ms]", "max [ms]"),
-    ]
-    return "<h2>Instruments</h2>" + table(header, lines, names=1)
+def _instrument_table(results: Sequence[RunResult]) -> Table:
+    def show(key: str, scale: float = 1.0, digits: int = 0) -> Callable[[RunResult], str]:
+        return lambda run: number(run.checks.get(key), scale, digits)
+
+    columns: Columns = {
+        "tracker RMS [mm]": show("tracker_rms_m", 1e3, 3),
+        "setpoints": show("board_setpoints"),
+        "lost": show("board_lost"),
+        "out of order": show("board_out_of_order"),
+        "late p50 [ms]": show("board_lateness_p50_s", 1e3, 2),
+        "p99 [ms]": show("board_lateness_p99_s", 1e3, 2),
+        "max [ms]": show("board_lateness_max_s", 1e3, 2),
+    }
+    return Table.of([run for run in results if run.checks], _first_columns(results) | columns)
 
 
-def _count(run: RunResult, name: str) -> str:
-    value = run.checks.get(name)
-    return "–" if value is None else f"{value:.0f}"
-
-
-def _provenance(results: Sequence[RunResult]) -> str:
+def _provenance(results: Sequence[RunResult]) -> Table:
     """List what the runs say of themselves: one line where all agree, else every value."""
-    keys = sorted({key for run in results for key in run.extra} - {"feedback"})
-    lines = []
-    for key in keys:
-        values = list(dict.fromkeys(str(run.extra.get(key, "–")) for run in results))
-        lines.append([html.escape(key), html.escape(", ".join(values))])
-    for run in results:
-        if run.bag:
-            lines.append(
-                [f"bag of {html.escape(f'{run.model} {run.trial}')}", html.escape(run.bag)]
-            )
-    return table(["", ""], lines, names=2)
+    rows = []
+    for key in sorted({key for run in results for key in run.extra} - {"feedback"}):
+        values = dict.fromkeys(str(run.extra.get(key, "–")) for run in results)
+        rows.append([key, ", ".join(values)])
+    rows += [[f"bag of {run.model} {run.trial}", run.bag] for run in results if run.bag]
+    return Table(["what", "value"], rows, names=2)

@@ -12,13 +12,18 @@ from typing import Any
 import numpy as np
 
 from der_planner.bags.run import Array
-from der_planner.results.metrics import RunResult, json_value
+from der_planner.methods import LEARNED
+from der_planner.results.evaluation import RunResult, json_value
 
 RESAMPLES = 10_000
 CONFIDENCE = 0.95
 SEED = 20260
 SAME_REFERENCE = 1e-4
 """References nearer than that [m] are the same."""
+FEEDBACK = "feedback"
+"""What stands behind the + in the method of a plan that was corrected."""
+CONTROLS = ("open_loop", "feedback", "learned", "learned_feedback")
+"""Ways of playing a motion that `side_by_side` compares."""
 
 
 @dataclass(frozen=True)
@@ -279,3 +284,59 @@ def _mean(sample: Array, axis: int = -1) -> Array:
 
 def _difference_of_means(one: Array, two: Array, axis: int = -1) -> Array:
     return np.asarray(np.mean(two, axis=axis) - np.mean(one, axis=axis))
+
+
+def learned_from(method: str) -> int:
+    """Return how many runs a method's plan was learned from: 0 for a first plan."""
+    name, count, *_ = [*method.split(), "", ""]
+    return int(count) if name == LEARNED and count.isdigit() else 0
+
+
+def learning_curves(results: Sequence[RunResult]) -> dict[str, list[list[float]]]:
+    """Return by motion the mean errors [m] of each trial's runs, in the order of learning.
+
+    Trials that were not learned from are left out.
+    """
+    trials: dict[tuple[str, str, int, str], dict[int, float]] = {}
+    for result in results:
+        # "learned 2 + feedback": what was played beside the plan makes a curve of its own.
+        beside = result.method.partition("+")[2]
+        key = (result.motion, result.model, result.trial, beside)
+        trials.setdefault(key, {})[learned_from(result.method)] = result.mean_error_m
+    curves: dict[str, list[list[float]]] = {}
+    for (motion, *_), errors in trials.items():
+        if max(errors) > 0 and 0 in errors:
+            curves.setdefault(motion, []).append([errors[k] for k in sorted(errors)])
+    return curves
+
+
+def control_of(method: str) -> str:
+    """Return which of `CONTROLS` a run's method belongs to."""
+    learned = "learned" if learned_from(method) else ""
+    corrected = method.partition("+")[2].strip() == FEEDBACK
+    return "_".join([learned] * bool(learned) + [FEEDBACK] * corrected) or "open_loop"
+
+
+def side_by_side(results: Sequence[RunResult]) -> list[dict[str, Any]]:
+    """Return by limb, motion and model the mean error [m] of each of `CONTROLS`; None: not played.
+
+    Of learned runs those count whose plan was learned from the most runs.
+    """
+    rows: dict[tuple[str, str, str], dict[str, dict[int, list[float]]]] = {}
+    for run in results:
+        row = rows.setdefault((run.namespace, run.motion, run.model), {})
+        by_count = row.setdefault(control_of(run.method), {})
+        by_count.setdefault(learned_from(run.method), []).append(run.mean_error_m)
+    return [
+        {
+            "namespace": namespace,
+            "motion": motion,
+            "model": model,
+            **{
+                f"{name}_m": float(np.mean(row[name][max(row[name])])) if name in row else None
+                for name in CONTROLS
+            },
+        }
+        for (namespace, motion, model), row in rows.items()
+        if len(row) > 1
+    ]

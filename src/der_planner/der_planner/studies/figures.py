@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from der_planner.results import style
+from der_planner.results import figures as style
 from der_planner.results.figures import FORMATS, new_figure
 from der_planner.studies.indices import Index, sobol_indices
 from der_planner.studies.store import Kept

@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from der_planner.results.html import document, figure, table
-from der_planner.studies import identity
-from der_planner.studies.errors import StudyError
+from der_planner.results.report import document, figure, section
+from der_planner.results.tables import Table
+from der_planner.studies import cache
+from der_planner.studies.factors import StudyError
 from der_planner.studies.figures import draw, quantity
 from der_planner.studies.indices import sobol_indices
 from der_planner.studies.store import Kept, Store
@@ -53,12 +54,7 @@ def summarise(study: Study, kept: Mapping[str, Kept], store: Store) -> Path:
 def text_table(study: Study, kept: Mapping[str, Kept]) -> str:
     """Return the groups of rows as a table for the terminal."""
     header, lines = _groups(study, kept)
-    columns = [header, *lines]
-    widths = [max(len(line[i]) for line in columns) for i in range(len(header))]
-    rows = [
-        "  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)) for line in columns
-    ]
-    return "\n".join([rows[0].rstrip(), "  ".join("-" * w for w in widths), *rows[1:]])
+    return Table(header, lines).text()
 
 
 def _groups(study: Study, kept: Mapping[str, Kept]) -> tuple[list[str], list[list[str]]]:
@@ -110,26 +106,21 @@ def _page(study: Study, kept: Mapping[str, Kept], drawn: Mapping[str, Sequence[P
     return document(
         f"Study {study.name}",
         [
-            f"<h1>Study {html.escape(study.name)}</h1>",
             f"<p>{html.escape(study.about)}</p>" if study.about else "",
             f"<p>{len(kept)} of {len(study.rows)} rows are done, {len(failed)} of them failed. "
             f"Each row: {html.escape(study.task.text)}.</p>",
             *pictures,
             "<h2>Means</h2><p class='small'>Mean ± sample standard deviation over the seeds and "
             "every other factor that is not in the table.</p>",
-            table(header, [[html.escape(cell) for cell in line] for line in lines], names),
+            Table(header, lines, names).html(),
             _index_table(study, kept),
             _failures(failed, study),
-            "<h2>Factors</h2>",
-            _factor_table(study),
-            "<h2>Columns</h2>",
-            table(
-                ["column", "what"],
-                [[html.escape(c), html.escape(study.task.columns[c])] for c in study.keep],
-                2,
+            section("Factors", _factor_table(study)),
+            section(
+                "Columns",
+                Table(["column", "what"], [[c, study.task.columns[c]] for c in study.keep], 2),
             ),
-            "<h2>Where the numbers come from</h2>",
-            _provenance(study, kept),
+            section("Where the numbers come from", _provenance(study, kept)),
         ],
     )
 
@@ -147,7 +138,7 @@ def _index_table(study: Study, kept: Mapping[str, Kept]) -> str:
         indices = sobol_indices(study, kept, plot["of"]) if plot["kind"] == "indices" else ()
         lines = [
             [
-                html.escape(each.factor),
+                each.factor,
                 f"{each.first:.3f}",
                 f"{each.first_range[0]:.3f} to {each.first_range[1]:.3f}",
                 f"{each.total:.3f}",
@@ -155,9 +146,9 @@ def _index_table(study: Study, kept: Mapping[str, Kept]) -> str:
             ]
             for each in sorted(indices, key=lambda each: -each.total)
         ]
+        header = ["factor", "alone", "95 %", "total", "95 %"]
         if lines:
-            parts.append(f"<h2>Sobol indices of {html.escape(plot['of'])}</h2>")
-            parts.append(table(["factor", "alone", "95 %", "total", "95 %"], lines, 1))
+            parts.append(section(f"Sobol indices of {plot['of']}", Table(header, lines)))
     return "".join(parts)
 
 
@@ -166,16 +157,16 @@ def _failures(failed: Sequence[Kept], study: Study) -> str:
         return ""
     lines = [
         [
-            html.escape(", ".join(f"{name} {row[name]}" for name in study.factors)),
-            f'<span class="problem">{html.escape(row["error"])}</span>',
+            ", ".join(f"{name} {row[name]}" for name in study.factors),
+            row["error"],
         ]
         for row in failed[:_MOST_ERRORS]
     ]
     more = f"<p>… and {len(failed) - len(lines)} more.</p>" if len(failed) > len(lines) else ""
-    return f"<h2>Failed rows</h2>{table(['row', 'error'], lines, 1)}{more}"
+    return section("Failed rows", Table(["row", "error"], lines)) + more
 
 
-def _factor_table(study: Study) -> str:
+def _factor_table(study: Study) -> Table:
     lines = []
     for name, each in study.factors.items():
         if name in study.grid:
@@ -184,18 +175,18 @@ def _factor_table(study: Study) -> str:
         else:
             spread = study.spreads[name]
             text = f"{spread.scale}, {spread.low:g} … {spread.high:g}"
-        lines.append([html.escape(name), each.unit, html.escape(text), html.escape(each.text)])
-    return table(["factor", "unit", "values", "what"], lines, 4)
+        lines.append([name, each.unit, text, each.text])
+    return Table(["factor", "unit", "values", "what"], lines, 4)
 
 
-def _provenance(study: Study, kept: Mapping[str, Kept]) -> str:
+def _provenance(study: Study, kept: Mapping[str, Kept]) -> Table:
     sources = sorted({str(row["sources"]) for row in kept.values()})
     drawn = f"{study.draw.method}, {study.draw.count}, seed {study.draw.seed}"
     lines = [
         ["task", study.task.name],
         ["drawn", drawn if study.spreads else "nothing"],
-        ["digest of sources and libraries", ", ".join(sources) or identity.digest()],
+        ["digest of sources and libraries", ", ".join(sources) or cache.digest()],
         ["python", platform.python_version()],
         ["machine of this page", f"{platform.node()}, {platform.machine()}"],
     ]
-    return table(["", ""], [[html.escape(cell) for cell in line] for line in lines], 2)
+    return Table(["what", "value"], lines, 2)

@@ -1,0 +1,203 @@
+"""Bend angles and tips along the pressures of a log, predicted open loop, by the unknowns of a fit.
+
+Friction and creep act along the bend at rest that the pressures give, never along the measured one.
+So a fit minimises the same open-loop error with which the limb is predicted afterwards; with the
+measured bend inside the model, an error of friction would partly cancel itself in the residual.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from der_planner.identification.least_squares import (
+    LeastSquares,
+    Rows,
+    Unknowns,
+    correlation_length,
+)
+from der_planner.identification.log import Prepared
+from der_planner.limb import Limb
+from der_planner.model import Material, Model, Response, simulate
+
+Array = NDArray[np.float64]
+
+NODES = 13
+"""Nodes of the rod in a fit. Its statics do not depend on them, its first two natural frequencies
+change by 2 %."""
+ANGLE_ERROR = np.deg2rad(0.3)
+"""Error of a predicted bend angle that is taken for granted before its residual is known [rad]."""
+CORRELATION = 20.0
+"""Rows over which an error of the model stays the same (1 s)."""
+SOFTNESS = 3.0
+"""Errors beyond this multiple of `ANGLE_ERROR` count less than their square."""
+_STEPS = {"der": 1, "pcc": 2}
+"""Integrator steps in each row of 50 ms; the page of the identification shows the convergence."""
+_NUDGE = 1e-3
+"""Change of an unknown, in units of its scale, for the slope of the effective pressure."""
+_STEP = 0.1
+"""Change of an unknown, in units of its scale, for the difference of two simulations."""
+_OF_THE_BODY = (
+    *("length", "bending_stiffness", "mass_per_length"),
+    *("damping", "material_damping", "swing_inertia"),
+)
+"""Parameters of a segment that change the body which moves, not only what drives it."""
+
+
+class FreeNumbers(Protocol):
+    """Numbers of a limb that a fit may change."""
+
+    @property
+    def unknowns(self) -> Unknowns:
+        """What is known of them."""
+
+    def limb_with(self, values: Array) -> Limb:
+        """Return the limb with values (P,) put in place."""
+
+
+class Predicted(NamedTuple):
+    """What a limb does along a log of K rows, and the derivatives by P unknowns.
+
+    Attributes:
+        angles: (K, M) bend angles [rad].
+        tip: (K, 2) [m].
+        angles_by: (K, M, P).
+        tip_by: (K, 2, P).
+    """
+
+    angles: Array
+    tip: Array
+    angles_by: Array
+    tip_by: Array
+
+
+def follow(model: Model, log: Prepared, *, linearise: bool = False) -> Response:
+    """Return what a model does under the pressures of a log.
+
+    Raises:
+        RuntimeError: it cannot follow, or does not come to rest.
+    """
+    steps = _STEPS[model.name]
+    return simulate(model, log.time, pressures=log.pressure, steps=steps, linearise=linearise)
+
+
+def predicted(free: FreeNumbers, model: Model, log: Prepared, values: Array) -> Predicted:
+    """Return bend angles and tips along a log with their derivatives by P unknowns.
+
+    What drives the limb goes through the model's exact tangent; stiffness, damping and mass, which
+    change what bends, are differences of two simulations.
+
+    Args:
+        free: the unknowns.
+        model: of any limb; says what bends.
+        log: prepared.
+        values: (P,) of the unknowns.
+
+    Raises:
+        RuntimeError: the model cannot follow.
+    """
+    limb, scale = free.limb_with(values), free.unknowns.scale
+    response = follow(model.another(limb), log, linearise=True)
+    assert response.derivative is not None
+    angles, tip = response.bend_angles, response.tip
+    moments, gain = _moments(limb, log, angles), _gain(limb)
+    angles_by, tip_by = (np.empty((*part.shape, len(values))) for part in (angles, tip))
+    for place, unit in enumerate(np.diag(scale)):
+        nudged = free.limb_with(values + _NUDGE * unit)
+        if _same_body(limb, nudged):
+            change = (_moments(nudged, log, angles) - moments) / gain / (_NUDGE * scale[place])
+            tip_by[:, :, place], angles_by[:, :, place] = response.derivative.by_effective(change)
+            continue
+        moved = follow(model.another(free.limb_with(values + _STEP * unit)), log)
+        tip_by[:, :, place] = (moved.tip - tip) / (_STEP * scale[place])
+        angles_by[:, :, place] = (moved.bend_angles - angles) / (_STEP * scale[place])
+    return Predicted(angles, tip, angles_by, tip_by)
+
+
+def _gain(limb: Limb) -> Array:
+    return np.array([segment.moment_gain for segment in limb.segments])
+
+
+def _same_body(limb: Limb, other: Limb) -> bool:
+    pairs = zip(limb.segments, other.segments, strict=True)
+    return all(getattr(a, key) == getattr(b, key) for a, b in pairs for key in _OF_THE_BODY)
+
+
+def _moments(limb: Limb, log: Prepared, angles: Array) -> Array:
+    """Return the moments (K, M) that drive the limb, less the elastic ones of its bend [N·m]."""
+    driving = _gain(limb) * Material(limb).slow_effective_pressure(log.time, log.pressure)
+    lengths = np.array([segment.length for segment in limb.segments])
+    rest, linear, cubic = np.array(
+        [[s.rest_curvature, s.bending_stiffness, s.cubic_stiffness] for s in limb.segments]
+    ).T
+    curvature = angles / lengths - rest
+    moments: Array = driving - linear * curvature - cubic * curvature**3
+    return moments
+
+
+class BendFit:
+    """A fit of a limb's unknowns to the bend angles of logs, by any model.
+
+    Args:
+        free: the unknowns.
+        model: of any limb; says what bends.
+        logs: prepared; one or more of the same limb.
+        more_rows: further weighted rows of what is predicted along the first log, with their
+            derivatives; None: the bend angles alone.
+    """
+
+    def __init__(
+        self,
+        free: FreeNumbers,
+        model: Model,
+        logs: Sequence[Prepared],
+        more_rows: Callable[[Predicted], Rows] | None = None,
+    ) -> None:
+        self.free, self._model, self._logs, self._more_rows = free, model, logs, more_rows
+        self.search = LeastSquares(free.unknowns, self._rows, SOFTNESS / np.sqrt(CORRELATION))
+
+    def _rows(self, values: Array) -> Rows | None:
+        weight = 1.0 / (ANGLE_ERROR * np.sqrt(CORRELATION))
+        errors, slopes = [], []
+        try:
+            found = [predicted(self.free, self._model, log, values) for log in self._logs]
+        except RuntimeError:  # also where arcs that buckle under their load do not come to rest
+            return None
+        for log, part in zip(self._logs, found, strict=True):
+            rows = log.usable
+            errors.append(weight * (part.angles[rows] - log.log.bend_angles[rows]).ravel())
+            slopes.append(weight * part.angles_by[rows].reshape(-1, len(values)))
+        if self._more_rows is not None:
+            more = self._more_rows(found[0])
+            errors.append(more[0])
+            slopes.append(more[1])
+        return np.concatenate(errors), np.concatenate(slopes)
+
+    def remaining(self, values: Array) -> Array:
+        """Return measured less predicted bend angles (K, M) of all logs [rad], NaN where unused.
+
+        Raises:
+            RuntimeError: the model cannot follow the logs.
+        """
+        model = self._model.another(self.free.limb_with(values))
+        errors = [log.log.bend_angles - follow(model, log).bend_angles for log in self._logs]
+        for error, log in zip(errors, self._logs, strict=True):
+            error[~log.usable] = np.nan
+        return np.concatenate(errors)
+
+    def excess(self, remaining: Array) -> float:
+        """Return by how much the data's variance exceeds that of `ANGLE_ERROR` and `CORRELATION`.
+
+        Args:
+            remaining: (K, M) of the values that were found [rad].
+        """
+        error = float(np.sqrt(np.nanmean(remaining**2)))
+        # Errors of neighbouring rows are correlated: rows / correlation length are independent.
+        length = correlation_length(remaining)
+        independent = np.count_nonzero(np.isfinite(remaining)) / length
+        # Each fitted unknown uses up one of them (degrees of freedom).
+        left = max(independent - len(self.free.unknowns.prior), 0.2 * independent)
+        return float((error / ANGLE_ERROR) ** 2 * length / CORRELATION * independent / left)

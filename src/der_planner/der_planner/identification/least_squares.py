@@ -1,0 +1,199 @@
+"""Nonlinear least squares with priors, bounds and standard deviations: every fit of this package.
+
+    minimise  Σ ρ(r(p)²)  +  Σ ρ(((p − p₀) / s)²)      within bounds
+
+with r the weighted residuals of the data, p₀ and s what is known of the unknowns before any data,
+and ρ the square itself or, with ``softness``, a loss that grows like a straight line beyond it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+Array = NDArray[np.float64]
+Rows = tuple[Array, Array]
+"""Weighted residuals (R,) and their derivatives by the unknowns (R, P)."""
+
+NOT_FOLLOWED = 100.0
+"""Weighted residual of every row where the data function has no answer, which drives the search
+back to a shorter step."""
+TOLERANCE = 1e-4
+"""Relative change of the sum of squares at which a search ends: its unknowns then change by less
+than their uncertainty."""
+MOST_EVALUATIONS = 25
+"""Largest number of evaluations of a search that is not cheap."""
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """P numbers that a fit may change.
+
+    Attributes:
+        prior: (P,) most likely values before any data.
+        spread: (P,) their standard deviations; infinite where nothing is known.
+        low, high: (P,) bounds.
+        scale: (P,) typical sizes, in multiples of which the search works.
+    """
+
+    prior: Array
+    spread: Array
+    low: Array
+    high: Array
+    scale: Array
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """(P,) whether anything is known before the data."""
+        return np.isfinite(self.spread)
+
+    def inside(self, values: Array) -> Array:
+        """Return the values (P,), those at a bound moved a little inside."""
+        margin = 1e-6 * (self.high - self.low)
+        return np.clip(values, self.low + margin, self.high - margin)
+
+    def at_bound(self, values: Array) -> NDArray[np.bool_]:
+        """Return (P,) which values sit at a bound of their range."""
+        near = np.minimum(values - self.low, self.high - values)
+        return np.asarray(near < 1e-3 * (self.high - self.low))
+
+
+class LeastSquares:
+    """One fit.
+
+    Args:
+        unknowns: what is free, and what is known of it.
+        rows: gives the data's weighted residuals and their derivatives; None for values that the
+            model cannot follow.
+        softness: weighted residual from which on errors count less than their square; None: never.
+        cheap: the rows take no time, so that the search goes on to the last digit, in steps as
+            large as the unknowns' scales say, not their derivatives.
+    """
+
+    def __init__(
+        self,
+        unknowns: Unknowns,
+        rows: Callable[[Array], Rows | None],
+        softness: float | None = None,
+        *,
+        cheap: bool = False,
+    ) -> None:
+        self.unknowns, self.evaluations = unknowns, 0
+        self._cheap = cheap
+        self._tolerance = 1e-4 * TOLERANCE if cheap else TOLERANCE
+        self._most = 10 * MOST_EVALUATIONS if cheap else MOST_EVALUATIONS
+        self._rows, self._softness = rows, softness
+        self._last: tuple[bytes, Rows | None] = (b"", None)
+
+    def follows(self, values: Array) -> bool:
+        """Return whether the model follows with values (P,)."""
+        return self._evaluate(self.unknowns.inside(values)) is not None
+
+    def solve(self, start: Array | None = None, factor: float = 1.0) -> Array:
+        """Return the best values (P,).
+
+        Args:
+            start: (P,) that the model follows; None: the prior's values.
+            factor: by which the data's variance is larger than their weights say.
+
+        Raises:
+            ValueError: the model cannot be followed at the start.
+        """
+        unknowns = self.unknowns
+        begin = unknowns.inside(unknowns.prior if start is None else start)
+        found = self._evaluate(begin)
+        if found is None:
+            raise ValueError("a fit must begin where its model can be followed")
+        lost = np.full(len(found[0]), NOT_FOLLOWED)
+        inflated = np.sqrt(factor)
+        known, tightness = unknowns.known, unknowns.scale / unknowns.spread
+
+        def residual(x: Array) -> Array:
+            found = self._evaluate(x * unknowns.scale)
+            prior = ((x - unknowns.prior / unknowns.scale) * tightness)[known]
+            return np.concatenate([lost if found is None else found[0] / inflated, prior])
+
+        def jacobian(x: Array) -> Array:
+            found = self._evaluate(x * unknowns.scale)
+            assert found is not None  # the search never stays where the model is not followed
+            return np.concatenate([found[1] * unknowns.scale / inflated, np.diag(tightness)[known]])
+
+        solution = least_squares(
+            residual,
+            begin / unknowns.scale,
+            jac=jacobian,
+            bounds=(unknowns.low / unknowns.scale, unknowns.high / unknowns.scale),
+            loss="linear" if self._softness is None else "soft_l1",
+            f_scale=self._softness or 1.0,
+            x_scale=1.0 if self._cheap else "jac",
+            xtol=10.0 * self._tolerance,
+            ftol=self._tolerance,
+            max_nfev=self._most,
+        )
+        return np.asarray(solution.x * unknowns.scale)
+
+    def covariance(self, values: Array, factor: float = 1.0) -> Array:
+        """Return the covariance (P, P) of values that were found.
+
+        Args:
+            values: (P,) as found.
+            factor: by which the data's variance is larger than their weights say.
+        """
+        unknowns = self.unknowns
+        found = self._evaluate(values)
+        assert found is not None
+        slopes = found[1] * unknowns.scale
+        prior = np.where(unknowns.known, unknowns.scale / unknowns.spread, 0.0)
+        information = slopes.T @ slopes / max(factor, 1e-6) + np.diag(prior**2)
+        covariance = np.linalg.pinv(information, hermitian=True)
+        return np.asarray(covariance * np.outer(unknowns.scale, unknowns.scale))
+
+    def _evaluate(self, values: Array) -> Rows | None:
+        """Return the rows at values (P,), or None; the last ones are kept."""
+        key = values.tobytes()
+        if self._last[0] != key:
+            self.evaluations += 1
+            found = self._rows(values)
+            followed = found is not None and bool(np.all(np.isfinite(found[0])))
+            self._last = (key, found if followed else None)
+        return self._last[1]
+
+
+def with_differences(residual: Callable[[Array], Array], values: Array, steps: Array) -> Rows:
+    """Return residuals (R,) at values (P,) and their derivatives by forward differences.
+
+    Args:
+        residual: to evaluate.
+        values: where.
+        steps: (P,) changes of the values, negative for one that must not grow.
+    """
+    here = residual(values)
+    moved = [residual(values + step) for step in np.diag(steps)]
+    return here, np.stack([there - here for there in moved], axis=1) / steps
+
+
+def correlation_length(remaining: Array) -> float:
+    """Return over how many rows the errors (K, M) of a prediction stay alike, 1 or more.
+
+    One plus twice the sum of the autocorrelation up to its first zero, at most a third of the log;
+    the larger of the columns.
+    """
+    lengths, longest = [1.0], len(remaining) // 3
+    for error in remaining.T:
+        known = error[np.isfinite(error)]
+        known = known - known.mean()
+        power = float(known @ known)
+        if power == 0 or known.size < 2:
+            continue
+        total = 1.0
+        for lag in range(1, min(longest, known.size - 1)):
+            value = float(known[lag:] @ known[:-lag]) / power
+            if value <= 0:
+                break
+            total += 2.0 * value
+        lengths.append(total)
+    return max(lengths)

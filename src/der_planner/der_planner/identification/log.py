@@ -1,0 +1,367 @@
+"""The log of a calibration or of any run: as recorded, and checked on a grid that a fit can use."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from der_planner.limb import Limb
+from der_planner.model.series import CONTROL_PERIOD
+
+Array = NDArray[np.float64]
+
+SMOOTHING = 11
+"""Rows of the filter that takes the tags' noise off the bend (0.5 s)."""
+LONGEST_GAP = 1.0
+"""Gap in the tags that a straight line may bridge [s]; rows in longer ones are not fitted to."""
+LEAST_EXCITATION = 1000.0
+"""Standard deviation of an input below which nothing can be told of its segment [Pa]."""
+LEAST_VALID = 0.5
+"""Share of a log to fit to in which the tags must be seen."""
+LEAST_SEEN = 0.05
+"""Share of a log to predict in which the tags must be seen."""
+SWING = np.deg2rad(0.5)
+"""Amplitude below which a swing need not be waited for [rad]."""
+LONGEST_SWING = 12.0
+"""Longest time at the beginning of a log that is waited for a swing to end [s]."""
+
+WRONG_WAY = (
+    "segment {index} bends the wrong way: positive differential pressure must bend toward +y; "
+    "swap the two chambers or the sign in the column map"
+)
+
+
+class LogError(ValueError):
+    """A log cannot be used; the message names what is missing and the remedy."""
+
+
+@dataclass(frozen=True)
+class CalibrationLog:
+    """One run on one time axis. Missing numbers are NaN.
+
+    Attributes:
+        time: (K,) rising [s].
+        commanded_differential: (K, M) [Pa].
+        measured_differential: (K, M) [Pa].
+        bend_angles: (K, M) [rad], as the tracker measures them.
+        tip: (K, 2) [m]; all NaN where a log has no scale.
+        source: where it came from, for provenance.
+    """
+
+    time: Array
+    commanded_differential: Array
+    measured_differential: Array
+    bend_angles: Array
+    tip: Array
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        rows = self.time.shape
+        if self.time.ndim != 1 or self.time.size < 2:
+            raise LogError(f"a log needs two instants or more, time has shape {rows}")
+        if not np.all(np.diff(self.time) > 0):
+            raise LogError("the time of a log must rise from row to row")
+        inputs = self.commanded_differential.shape
+        for name in ("commanded_differential", "measured_differential", "bend_angles"):
+            if getattr(self, name).shape != inputs:
+                raise LogError(f"{name} has shape {getattr(self, name).shape}, expected {inputs}")
+        if len(inputs) != 2 or inputs[0] != rows[0] or self.tip.shape != (rows[0], 2):
+            raise LogError(f"pressures {inputs} and tip {self.tip.shape} do not fit time {rows}")
+
+    @property
+    def segment_count(self) -> int:
+        """M."""
+        return int(self.bend_angles.shape[1])
+
+    def resampled(self, period: float, longest_gap: float = 1.0) -> CalibrationLog:
+        """Return the log on a regular grid, NaN in gaps longer than ``longest_gap`` [s].
+
+        Args:
+            period: of the grid [s].
+            longest_gap: between two valid rows of a column that a straight line may bridge [s].
+        """
+        grid = np.arange(self.time[0], self.time[-1] + 1e-9, period)
+
+        def table(values: Array) -> Array:
+            columns = [on_grid(self.time, column, grid, longest_gap) for column in values.T]
+            return np.stack(columns, axis=1)
+
+        return CalibrationLog(
+            grid,
+            table(self.commanded_differential),
+            table(self.measured_differential),
+            table(self.bend_angles),
+            table(self.tip),
+            self.source,
+        )
+
+    def between(self, first: float, last: float) -> CalibrationLog:
+        """Return the rows from ``first`` to ``last`` [s]."""
+        rows = (self.time >= first) & (self.time <= last)
+        return CalibrationLog(
+            self.time[rows],
+            self.commanded_differential[rows],
+            self.measured_differential[rows],
+            self.bend_angles[rows],
+            self.tip[rows],
+            self.source,
+        )
+
+
+def on_grid(time: Array, column: Array, grid: Array, longest_gap: float) -> Array:
+    """Return a column (G,) on a regular grid, by straight lines between its known rows.
+
+    Args:
+        time: (K,) rising [s].
+        column: (K,), NaN where nothing is known.
+        grid: (G,) regular instants [s].
+        longest_gap: between two known rows that a line may bridge [s]; a row of the grid in a
+            longer one is NaN, unless it is nearer to a known row than the grid's period.
+    """
+    known = np.isfinite(column)
+    if not known.any():
+        return np.full(grid.size, np.nan)
+    period = grid[1] - grid[0] if grid.size > 1 else 0.0
+    instants = time[known]
+    result: Array = np.interp(grid, instants, column[known])
+    after = instants[np.clip(np.searchsorted(instants, grid, "left"), 0, len(instants) - 1)]
+    before = instants[np.clip(np.searchsorted(instants, grid, "right") - 1, 0, None)]
+    edge = np.minimum(np.abs(after - grid), np.abs(before - grid))
+    result[(after - before > longest_gap) & (edge > period)] = np.nan
+    result[(grid < instants[0] - period) | (grid > instants[-1] + period)] = np.nan
+    return result
+
+
+def bridge(table: Array) -> Array:
+    """Return a table (K, N) whose missing rows are straight lines between the known ones."""
+    index = np.arange(len(table))
+    known = np.isfinite(table)
+    return np.stack(
+        [np.interp(index, index[k], c[k]) for c, k in zip(table.T, known.T, strict=True)], axis=1
+    )
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A log on a regular grid.
+
+    Attributes:
+        log: on the grid, NaN where nothing was measured.
+        pressure: (K, M) measured, without gaps [Pa].
+        bend: (K, M) smoothed bend angles without gaps [rad].
+        usable: (K,) rows to fit to.
+        warnings: sentences for the report.
+    """
+
+    log: CalibrationLog
+    pressure: Array
+    bend: Array
+    usable: NDArray[np.bool_]
+    warnings: tuple[str, ...]
+
+    @property
+    def time(self) -> Array:
+        """(K,) [s]."""
+        return self.log.time
+
+
+def prepare(
+    log: CalibrationLog, limb: Limb, longest_gap: float = LONGEST_GAP, *, to_fit: bool = True
+) -> Prepared:
+    """Resample a log to the control period and check it.
+
+    Args:
+        log: as recorded.
+        limb: that it should belong to.
+        longest_gap: between two rows that a straight line may bridge [s].
+        to_fit: the log must tell every parameter; a run that is only predicted need not move every
+            segment.
+
+    Raises:
+        LogError: another number of segments, too few tags or no pressures; with ``to_fit`` an input
+            without excitation as well, or pressures that contradict the commands or the bends (a
+            wrong column map).
+    """
+    if log.segment_count != limb.segment_count:
+        raise LogError(
+            f"the log has {log.segment_count} segments, the limb '{limb.name}' "
+            f"{limb.segment_count}: this limb file belongs to another limb"
+        )
+    grid = log.resampled(CONTROL_PERIOD, longest_gap)
+    warnings: list[str] = []
+    valid = np.all(np.isfinite(grid.bend_angles), axis=1)
+    least = LEAST_VALID if to_fit else LEAST_SEEN
+    if valid.mean() < least:
+        raise LogError(
+            f"the tags were seen in {100 * valid.mean():.0f} % of the log only, "
+            f"{100 * least:.0f} % are needed: check light, focus and the tag map"
+        )
+    if valid.mean() < 0.98:
+        warnings.append(f"tags lost in {100 * (1 - valid.mean()):.1f} % of the log")
+    for index, share in enumerate(np.isfinite(grid.measured_differential).mean(axis=0)):
+        if share < least:
+            raise LogError(
+                f"pressure {index} was measured in {100 * share:.0f} % of the log only: the fit "
+                "needs the board's telemetry"
+            )
+    pressure, bend = bridge(grid.measured_differential), bridge(grid.bend_angles)
+    if to_fit:
+        _check_units(pressure, limb)
+        _check_tips(grid, limb)
+        _check_commands(grid, warnings)
+        _check_excitation(pressure, warnings)
+        _check_saturation(pressure, limb, warnings)
+        _check_match(pressure, bend, warnings)
+    swinging = _still_swinging(grid.time, pressure, bend, limb)
+    if swinging.any():
+        unseen = swinging[:, None]
+        grid = replace(
+            grid,
+            bend_angles=np.where(unseen, np.nan, grid.bend_angles),
+            tip=np.where(unseen, np.nan, grid.tip),
+        )
+        warnings.append(
+            "the log begins while the limb swings: its first "
+            f"{CONTROL_PERIOD * swinging.sum():.1f} s are not used, since no pressure tells that "
+            "motion"
+        )
+    return Prepared(grid, pressure, _smoothed(bend), valid & ~swinging, tuple(warnings))
+
+
+def _smoothed(bend: Array) -> Array:
+    """Return bend angles (K, M) without the tags' noise."""
+    # It takes half a second to import: only who has a log pays for it.
+    from scipy.signal import savgol_filter  # noqa: PLC0415
+
+    count = min(SMOOTHING, len(bend) - (len(bend) + 1) % 2)
+    return np.asarray(savgol_filter(bend, count, 2, axis=0))
+
+
+def _still_swinging(time: Array, pressure: Array, bend: Array, limb: Limb) -> NDArray[np.bool_]:
+    """Return the rows (K,) in which the limb swings from before the log, at most a fifth of all.
+
+    In the first second, motion beyond what the pressures explain is taken for a swing, which then
+    decays with the prior's damping.
+    """
+    elapsed = time - time[0]
+    first = elapsed < 1.0
+    driven = limb.static_gain * np.ptp(pressure[first], axis=0)
+    amplitude = 0.5 * float(np.max(np.ptp(bend[first], axis=0) - 2.0 * driven))
+    if amplitude < 2.0 * SWING:
+        return np.zeros(len(elapsed), dtype=bool)
+    decay = 0.5 * max(float(np.mean([s.damping for s in limb.segments])), 0.2)
+    swing = min(float(np.log(amplitude / SWING)) / decay, LONGEST_SWING, 0.2 * elapsed[-1])
+    return np.asarray(elapsed < swing)
+
+
+def _check_units(pressure: Array, limb: Limb) -> None:
+    largest = np.nanmax(np.abs(pressure))
+    if largest > 20.0 * limb.pneumatics.pressure_limit or largest < 100.0:
+        raise LogError(
+            f"the largest measured differential pressure is {largest:.3g} Pa, the limb's limit "
+            f"{limb.pneumatics.pressure_limit:.0f} Pa: check the units of the log"
+        )
+
+
+def _check_tips(log: CalibrationLog, limb: Limb) -> None:
+    """Refuse tips that are nowhere near the limb: another unit, or another origin."""
+    away = np.linalg.norm(log.tip, axis=1)
+    if not np.isfinite(away).any():
+        return
+    far = float(np.nanpercentile(away, 90))
+    if not 0.5 * limb.length < far < 1.5 * limb.length:
+        raise LogError(
+            f"the tips are {far:.3g} m from the clamp, the limb '{limb.name}' is "
+            f"{limb.length:.3g} m long: check the tips' unit (length_unit) and origin, which is "
+            "the clamp, or give the limb's lengths in the limb file of --prior"
+        )
+
+
+def _check_commands(log: CalibrationLog, warnings: list[str]) -> None:
+    measured = log.measured_differential
+    for index, (command, column) in enumerate(
+        zip(log.commanded_differential.T, measured.T, strict=True)
+    ):
+        both = np.isfinite(command) & np.isfinite(column)
+        if both.sum() < 10 or np.std(command[both]) < LEAST_EXCITATION:
+            continue
+        agreement = _correlation(command[both], column[both])
+        if agreement < 0.3:
+            raise LogError(
+                f"measured pressure {index} does not follow its command (correlation "
+                f"{agreement:.2f}): check the column map and the tubes"
+            )
+        if agreement < 0.8:
+            warnings.append(
+                f"measured pressure {index} follows its command loosely ({agreement:.2f})"
+            )
+
+
+def _check_excitation(pressure: Array, warnings: list[str]) -> None:
+    spread = np.std(pressure, axis=0)
+    for index, value in enumerate(spread):
+        if value < LEAST_EXCITATION:
+            raise LogError(
+                f"input {index} was not excited (standard deviation {value:.0f} Pa, "
+                f"{LEAST_EXCITATION:.0f} Pa needed): nothing can be told of segment {index}; "
+                "run the calibration motion, or check the unit of the pressures"
+            )
+    if pressure.shape[1] > 1:
+        together = np.asarray(np.corrcoef(pressure.T))
+        for i in range(len(together)):
+            for j in range(i):
+                if abs(together[i, j]) > 0.98:
+                    warnings.append(
+                        f"inputs {j} and {i} always move together (correlation "
+                        f"{together[i, j]:+.2f}): "
+                        "swapped columns and coupling between segments cannot be told"
+                    )
+
+
+def _check_saturation(pressure: Array, limb: Limb, warnings: list[str]) -> None:
+    limit = limb.pneumatics.pressure_limit
+    for index, column in enumerate(pressure.T):
+        share = float(np.mean(np.abs(column) > 0.98 * limit))
+        if share > 0.5:
+            raise LogError(
+                f"input {index} is saturated in {100 * share:.0f} % of the log: lower the amplitude"
+            )
+        if share > 0.02:
+            warnings.append(f"input {index} is at its limit in {100 * share:.0f} % of the log")
+
+
+def _check_match(pressure: Array, bend: Array, warnings: list[str]) -> None:
+    """Each segment must follow its own pressure, not its neighbour's, and with the right sign."""
+    count = pressure.shape[1]
+    if count > 1 and np.abs(np.corrcoef(pressure.T) - np.eye(count)).max() > 0.98:
+        # Which input bends a segment cannot be told: only the sign can.
+        for index in range(count):
+            if np.polyfit(pressure[:, index], bend[:, index], 1)[0] < 0:
+                raise LogError(WRONG_WAY.format(index=index))
+        return
+    design = np.concatenate([pressure, np.ones((len(pressure), 1))], axis=1)
+    solution = np.linalg.lstsq(design, bend, rcond=None)[0][:count]
+    for index in range(count):
+        own = solution[index, index]
+        others = np.abs(np.delete(solution[:, index], index))
+        if others.size and others.max() > 1.5 * abs(own):
+            raise LogError(
+                f"segment {index} bends with input "
+                f"{int(np.argmax(np.abs(solution[:, index])))}, not "
+                f"with input {index}: columns or tubes are swapped"
+            )
+        if own < 0:
+            raise LogError(WRONG_WAY.format(index=index))
+        if others.size and others.max() > 0.2 * own:
+            warnings.append(
+                f"segment {index} answers to another segment's pressure with "
+                f"{100 * others.max() / own:.0f} % of its own gain"
+            )
+
+
+def _correlation(a: Array, b: Array) -> float:
+    if np.std(a) == 0 or np.std(b) == 0:
+        return 0.0
+    return float(np.corrcoef(a, b)[0, 1])

@@ -1,1 +1,0 @@
-"""Logs of calibration runs: from bags and tables to rows that a fit can use."""

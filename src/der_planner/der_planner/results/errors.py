@@ -1,0 +1,294 @@
+"""Errors over time: of the tip, what explains them, and of the instruments themselves.
+
+Measured and asked-for tip are compared at the same instants. Times come from stamps; nothing is
+shifted unless the settings ask for it. In a bag of the twin the tracker's tip is compared with the
+simulated one, and the board's log of commands with the setpoints.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from der_planner.bags.run import Array, BoardLog, EvaluationError, RunSeries, Stream
+
+LARGEST_LAG = 1.0
+"""Bound of the estimated lag [s]."""
+STANDSTILL = 1e-6
+"""A reference that moves less [m] stands still."""
+WINDOWS = ("plan", "cycles")
+ROUNDING = 160.0
+"""Largest difference [Pa] of a setpoint and its command: both chambers are rounded to 1 hPa."""
+ON_TIME = 0.025
+"""Half the period of the setpoints [s]: a command nearer than that belongs to the setpoint."""
+LATEST = 0.5
+"""A setpoint that reached the board later than this [s] is lost."""
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """How a run is evaluated.
+
+    Attributes:
+        window: ``plan``: from the first to the last setpoint, so with the fade-in and the closing
+            move to rest; ``cycles``: without the first quarter of a period, in which the motion is
+            faded in, and up to the end of the last whole cycle.
+        remove_lag: shift the measured tip by the estimated lag before E is computed; the result
+            says by how much.
+    """
+
+    window: str = "plan"
+    remove_lag: bool = False
+
+    def __post_init__(self) -> None:
+        if self.window not in WINDOWS:
+            raise EvaluationError(f"window '{self.window}' is unknown: choose {', '.join(WINDOWS)}")
+
+
+@dataclass(frozen=True)
+class Split:
+    """The measured tip as a late, scaled and shifted copy of the reference, and what is left.
+
+    r(t) ≈ g r̄(t − τ) + b per axis, fitted by least squares over the window; τ is common.
+
+    Attributes:
+        lag: τ [s], positive when the limb is late.
+        gain_x, gain_y: g.
+        bias_x, bias_y: mean of r − r̄ over the window after the lag is taken out [m].
+        rms: of |r − r̄| [m].
+        rms_without_lag: after the lag is taken out.
+        rms_without_bias: after the mean is taken out, too.
+        rms_without_gain: after the gains are fitted, too: neither lag, bias nor gain explains it.
+    """
+
+    lag: float
+    gain_x: float
+    gain_y: float
+    bias_x: float
+    bias_y: float
+    rms: float
+    rms_without_lag: float
+    rms_without_bias: float
+    rms_without_gain: float
+
+
+@dataclass(frozen=True)
+class ErrorSeries:
+    """Error over time of one run: time (F,) [s], error (F, 2) measured minus reference [m]."""
+
+    time: Array
+    error: Array
+    measured: Array
+    reference: Array
+
+    @property
+    def distance(self) -> Array:
+        """|r − r̄| (F,) [m]."""
+        return np.asarray(np.linalg.norm(self.error, axis=1))
+
+
+def error_series(run: RunSeries, settings: EvaluationSettings | None = None) -> ErrorSeries:
+    """Return the error at every valid image of the window.
+
+    Raises:
+        EvaluationError: there is no valid image in the window.
+    """
+    settings = settings or EvaluationSettings()
+    lag = split_error(run, settings).lag if settings.remove_lag else 0.0
+    first, last = window(run, settings)
+    time = run.tip.time - lag
+    inside = (time >= first) & (time <= last) & np.isfinite(run.tip.value).all(axis=1)
+    if not inside.any():
+        raise EvaluationError(
+            f"{run.description.title}: no valid limb state between the first and the last setpoint"
+        )
+    reference = interpolate(run.reference, time[inside])
+    measured = run.tip.value[inside]
+    return ErrorSeries(time[inside], measured - reference, measured, reference)
+
+
+def window(run: RunSeries, settings: EvaluationSettings) -> tuple[float, float]:
+    """Return the first and last instant that count [s].
+
+    Raises:
+        EvaluationError: the run has no cycles, or its plan ends before them.
+    """
+    first, last = float(run.reference.time[0]), float(run.reference.time[-1])
+    if settings.window == "plan":
+        return first, last
+    about = run.description
+    begin, end = 0.25 * about.period, about.period * about.cycles
+    if not first <= begin < end <= last + 1e-9:
+        raise EvaluationError(
+            f"{about.title}: has no window 'cycles': {about.cycles} cycles of {about.period:g} s "
+            f"in a plan of {last:.1f} s. Use the window 'plan'"
+        )
+    return begin, min(end, last)
+
+
+def split_error(run: RunSeries, settings: EvaluationSettings | None = None) -> Split:
+    """Fit lag, gain and bias of the measured against the reference tip.
+
+    The lag minimises what gains and mean leave of the squared distance of r(t) and r̄(t − τ), |τ| up
+    to 1 s and a tenth of the window; a reference that stands still has none, and gets 0.
+
+    Args:
+        run: with at least a few valid images.
+        settings: window.
+
+    Raises:
+        EvaluationError: there is no valid image in the window.
+    """
+    first, last = window(run, settings or EvaluationSettings())
+    # The same samples for every lag, so that residuals compare.
+    margin = min(LARGEST_LAG, 0.1 * (last - first))
+    valid = np.isfinite(run.tip.value).all(axis=1)
+    inside = valid & (run.tip.time >= first + margin) & (run.tip.time <= last - margin)
+    if inside.sum() < 3:
+        inside = valid & (run.tip.time >= first) & (run.tip.time <= last)
+    if not inside.any():
+        raise EvaluationError(
+            f"{run.description.title}: no valid limb state between the first and the last setpoint"
+        )
+    time, measured = run.tip.time[inside], run.tip.value[inside]
+    lag = _best_lag(run.reference, time, measured, margin)
+    present = interpolate(run.reference, time)
+    late = interpolate(run.reference, time - lag)
+    offset = (measured - late).mean(axis=0)
+    gains, fitted = _fit_gains(late, measured)
+    return Split(
+        lag=lag,
+        gain_x=float(gains[0]),
+        gain_y=float(gains[1]),
+        bias_x=float(offset[0]),
+        bias_y=float(offset[1]),
+        rms=_rms(measured - present),
+        rms_without_lag=_rms(measured - late),
+        rms_without_bias=_rms(measured - late - offset),
+        rms_without_gain=_rms(measured - fitted),
+    )
+
+
+def _rms(difference: Array) -> float:
+    return float(np.sqrt(np.mean(np.sum(difference**2, axis=1))))
+
+
+def _best_lag(reference: Stream, time: Array, measured: Array, margin: float) -> float:
+    def cost(lag: float) -> float:
+        _, fitted = _fit_gains(interpolate(reference, time - lag), measured)
+        return _rms(measured - fitted)
+
+    if np.ptp(reference.value, axis=0).max() < STANDSTILL:
+        return 0.0
+    grid = np.linspace(-margin, margin, 41)
+    best = grid[int(np.argmin([cost(lag) for lag in grid]))]
+    step = grid[1] - grid[0]
+    found = minimize_scalar(
+        cost,
+        bounds=(max(-margin, best - step), min(margin, best + step)),
+        method="bounded",
+        options={"xatol": 1e-5},
+    )
+    return float(found.x)
+
+
+def _fit_gains(reference: Array, measured: Array) -> tuple[Array, Array]:
+    gains, fitted = np.ones(2), np.empty_like(measured)
+    for axis in range(2):
+        centred = reference[:, axis] - reference[:, axis].mean()
+        power = float(centred @ centred)
+        if power > 1e-12 * len(centred):
+            gains[axis] = float(centred @ measured[:, axis]) / power
+        fitted[:, axis] = measured[:, axis].mean() + gains[axis] * centred
+    return gains, fitted
+
+
+def interpolate(stream: Stream, time: Array) -> Array:
+    """Return the stream's columns at other times, linear between its samples."""
+    columns = [np.interp(time, stream.time, column) for column in stream.value.T]
+    return np.column_stack(columns)
+
+
+def check_tracker(tip: Stream, truth: Stream | None, first: float, last: float) -> dict[str, float]:
+    """Compare tracked and simulated tip at the images' stamps between two times.
+
+    Args:
+        tip: (F, 2) tracked, NaN where invalid.
+        truth: (T, 2) simulated.
+        first: start of the window [s].
+        last: its end [s].
+
+    Returns:
+        Their distance, ``tracker_rms_m`` and ``tracker_max_m``, and ``tracker_samples``; nothing
+        where the bag has no ground truth in the window.
+    """
+    if truth is None or len(truth) < 2:
+        return {}
+    inside = (
+        (tip.time >= max(first, truth.time[0]))
+        & (tip.time <= min(last, truth.time[-1]))
+        & np.isfinite(tip.value).all(axis=1)
+    )
+    if not inside.any():
+        return {}
+    simulated = interpolate(truth, tip.time[inside])
+    distance = np.linalg.norm(tip.value[inside] - simulated, axis=1)
+    return {
+        "tracker_rms_m": float(np.sqrt(np.mean(distance**2))),
+        "tracker_max_m": float(distance.max()),
+        "tracker_samples": int(inside.sum()),
+    }
+
+
+def check_board(log: BoardLog | None) -> dict[str, float]:
+    """Match every setpoint with the command that carried it.
+
+    The command nearest in time is the setpoint's own if its value is the setpoint's within the
+    wire's rounding. A setpoint without such a command is looked for among the later ones that
+    belong to no other setpoint, up to `LATEST` after its stamp.
+
+    Returns:
+        ``board_setpoints`` sent, ``board_received`` of them, ``board_lost`` (not found),
+        ``board_out_of_order`` (received before an earlier one), ``board_lateness_…_s`` after the
+        stamp (NaN without any), ``board_value_error_pa`` (up to 100 is the wire's rounding);
+        nothing where there is no log.
+    """
+    if log is None or not len(log.setpoint_time):
+        return {}
+    order = np.argsort(log.command_time, kind="stable")
+    arrival = log.command_time[order]
+    matched: dict[int, int] = {}
+    taken: set[int] = set()
+
+    def difference(setpoint: int, command: int) -> float:
+        return float(np.max(np.abs(log.setpoint[setpoint] - log.command[command])))
+
+    def match(setpoint: int, places: NDArray[np.int64]) -> None:
+        for command in order[places]:
+            if command not in taken and difference(setpoint, command) <= ROUNDING:
+                taken.add(int(command))
+                matched[setpoint] = int(command)
+                return
+
+    for index, stamp in enumerate(log.setpoint_time):
+        near = np.arange(*np.searchsorted(arrival, [stamp - ON_TIME, stamp + ON_TIME]))
+        match(index, near[np.argsort(np.abs(arrival[near] - stamp))][:1])
+    for index, stamp in enumerate(log.setpoint_time):
+        if index not in matched:
+            match(index, np.arange(*np.searchsorted(arrival, [stamp - ON_TIME, stamp + LATEST])))
+    late = np.array([log.command_time[c] - log.setpoint_time[s] for s, c in matched.items()])
+    median, high = np.quantile(late, [0.5, 0.99]) if len(late) else (np.nan, np.nan)
+    wrong = [difference(*pair) for pair in matched.items()]
+    return {
+        "board_setpoints": len(log.setpoint_time),
+        "board_received": len(matched),
+        "board_lost": len(log.setpoint_time) - len(matched),
+        "board_out_of_order": int(np.sum(np.diff([matched[s] for s in sorted(matched)]) < 0)),
+        "board_lateness_p50_s": float(median),
+        "board_lateness_p99_s": float(high),
+        "board_lateness_max_s": float(late.max()) if len(late) else float("nan"),
+        "board_value_error_pa": max(wrong, default=np.nan),
+    }

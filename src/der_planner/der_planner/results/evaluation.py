@@ -1,0 +1,324 @@
+"""The error of one run, as the paper's Table I reads it, and where it comes from.
+
+With r̄ the tip reference of the plan, interpolated linearly at the stamp of each image (the plan's
+setpoints are 50 ms apart, which costs under 0.01 mm at 20 s a cycle), r the measured tip, and the
+window from the first to the last setpoint of the plan: E is the mean over the valid images of
+|r − r̄|, its components the means of |x − x̄| and |y − ȳ|.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from der_planner.bags.reader import BagError
+from der_planner.bags.record import read_record
+from der_planner.bags.run import Array, EvaluationError, RunSeries
+from der_planner.bags.series import load_run, run_of
+from der_planner.limb import mounting_of
+from der_planner.results.errors import (
+    EvaluationSettings,
+    check_board,
+    check_tracker,
+    error_series,
+    interpolate,
+    split_error,
+    window,
+)
+
+GAP = 0.5
+"""Longest time without a valid image [s] that leaves a run fit for comparison."""
+LEAST_VALID = 0.9
+"""Least share of valid images of such a run."""
+REFERENCE_POINTS = 25
+WORTH_WHILE = 64 << 20
+"""Bags of fewer bytes in total are read by one process."""
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """The figures of one run; field names carry their units, as in ``results.json``.
+
+    ``valid_fraction`` is the share of the images in the window whose limb state is valid;
+    ``dropped_frames`` is estimated from the gaps between stamps. ``problems`` says in words what
+    makes the run unfit for a comparison; ``reference_points_m`` is r̄ at 25 evenly spaced instants
+    of the window. ``checks`` holds figures of the instruments (`errors`).
+    """
+
+    motion: str
+    model: str
+    method: str
+    trial: int
+    seed: int
+    mean_error_m: float
+    mean_error_x_m: float
+    mean_error_y_m: float
+    max_error_m: float
+    valid_fraction: float
+    bag: str
+    rms_error_m: float = float("nan")
+    predicted_error_m: float = float("nan")
+    frames: int = 0
+    dropped_frames: int = 0
+    longest_gap_s: float = float("nan")
+    window_s: tuple[float, float] = (0.0, 0.0)
+    amplitude_rad: float = 0.0
+    period_s: float = 0.0
+    cycles: int = 0
+    limb: str = ""
+    namespace: str = ""
+    mounting: str = "horizontal"
+    gravity_m_s2: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    payload_kg: float = 0.0
+    payload_at_m: float = 0.0
+    lag_s: float = float("nan")
+    gain_x: float = float("nan")
+    gain_y: float = float("nan")
+    bias_x_m: float = float("nan")
+    bias_y_m: float = float("nan")
+    rms_without_lag_m: float = float("nan")
+    rms_without_bias_m: float = float("nan")
+    rms_without_gain_m: float = float("nan")
+    pressure_rms_error_pa: tuple[float, ...] = ()
+    removed_lag_s: float = 0.0
+    problems: tuple[str, ...] = ()
+    reference_points_m: tuple[tuple[float, float], ...] = ()
+    checks: Mapping[str, float] = field(default_factory=dict)
+    extra: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def loads(self) -> str:
+        """Mounting and payload in words; empty for a horizontal limb without payload."""
+        if not self.payload_kg:
+            return "" if self.mounting == "horizontal" else self.mounting
+        place = f" at {self.payload_at_m * 100:.1f} cm" if self.payload_at_m else ""
+        return f"{self.mounting}, {self.payload_kg * 1000:.4g} g{place}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what ``results.json`` holds; NaN becomes None, which JSON can say."""
+        return {key: json_value(value) for key, value in dataclasses.asdict(self).items()}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> RunResult:
+        """Return a result that `to_dict` wrote; unknown keys are kept in ``extra``."""
+        names = {entry.name for entry in dataclasses.fields(cls)}
+        given = {key: _python_value(value) for key, value in data.items() if key in names}
+        for key in ("checks", "extra"):
+            given[key] = dict(data.get(key) or {})
+        given["extra"] |= {key: value for key, value in data.items() if key not in names}
+        return cls(**given)
+
+
+def json_value(value: Any) -> Any:
+    """Return a value as JSON can say it: tuples as lists, NaN and infinity as None."""
+    if isinstance(value, dict):
+        return {key: json_value(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [json_value(entry) for entry in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _python_value(value: Any) -> Any:
+    if isinstance(value, list):
+        return tuple(_python_value(entry) for entry in value)
+    return float("nan") if value is None else value
+
+
+def evaluate_bag(path: str | Path, settings: EvaluationSettings | None = None) -> RunResult:
+    """Evaluate one bag; see `evaluate_run`.
+
+    Raises:
+        EvaluationError: it holds no plan or no limb states.
+        BagError: it cannot be read.
+    """
+    return evaluate_run(load_run(path), settings)
+
+
+def evaluate_run(run: RunSeries, settings: EvaluationSettings | None = None) -> RunResult:
+    """Compute every figure of a run.
+
+    Args:
+        run: from `load_run` or `RunSeries.from_arrays`.
+        settings: window and lag.
+
+    Raises:
+        EvaluationError: there is no valid image in the window.
+    """
+    settings = settings or EvaluationSettings()
+    series = error_series(run, settings)
+    first, last = window(run, settings)
+    images = run.tip.time[(run.tip.time >= first) & (run.tip.time <= last)]
+    dropped, longest = _gaps(images, series.time, first, last)
+    split = split_error(run, settings)
+    about = run.description
+    valid = len(series.time) / max(1, len(images))
+    return RunResult(
+        motion=about.motion,
+        model=about.model,
+        method=about.method,
+        trial=about.trial,
+        seed=about.seed,
+        mean_error_m=float(series.distance.mean()),
+        mean_error_x_m=float(np.abs(series.error[:, 0]).mean()),
+        mean_error_y_m=float(np.abs(series.error[:, 1]).mean()),
+        max_error_m=float(series.distance.max()),
+        valid_fraction=min(1.0, valid),
+        bag=about.bag,
+        rms_error_m=float(np.sqrt(np.mean(series.distance**2))),
+        predicted_error_m=_predicted_error(run),
+        frames=len(images),
+        dropped_frames=dropped,
+        longest_gap_s=longest,
+        window_s=(first, last),
+        amplitude_rad=about.amplitude,
+        period_s=about.period,
+        cycles=about.cycles,
+        limb=about.limb,
+        namespace=about.namespace,
+        mounting=mounting_of(about.gravity),
+        gravity_m_s2=about.gravity,
+        payload_kg=about.payload,
+        payload_at_m=about.payload_at,
+        lag_s=split.lag,
+        gain_x=split.gain_x,
+        gain_y=split.gain_y,
+        bias_x_m=split.bias_x,
+        bias_y_m=split.bias_y,
+        rms_without_lag_m=split.rms_without_lag,
+        rms_without_bias_m=split.rms_without_bias,
+        rms_without_gain_m=split.rms_without_gain,
+        pressure_rms_error_pa=_pressure_errors(run, first, last),
+        removed_lag_s=split.lag if settings.remove_lag else 0.0,
+        problems=_problems(run, valid, longest),
+        reference_points_m=_reference_points(run, first, last),
+        checks=check_tracker(run.tip, run.truth, first, last) | check_board(run.board),
+        extra=dict(about.extra),
+    )
+
+
+def _gaps(stamps: Array, valid: Array, first: float, last: float) -> tuple[int, float]:
+    """Return the images missing between stamps, and the longest time without a valid one [s]."""
+    steps = np.diff(stamps)
+    dropped = 0
+    if len(steps):
+        dropped = int(np.sum(np.maximum(0, np.rint(steps / np.median(steps)) - 1)))
+    edges = np.concatenate([[first], valid, [last]])
+    return dropped, float(np.diff(edges).max())
+
+
+def _reference_points(run: RunSeries, first: float, last: float) -> tuple[tuple[float, float], ...]:
+    """Return r̄ at evenly spaced instants of the window: enough to tell two references apart."""
+    points = interpolate(run.reference, np.linspace(first, last, REFERENCE_POINTS))
+    return tuple((round(float(x), 6), round(float(y), 6)) for x, y in points)
+
+
+def _predicted_error(run: RunSeries) -> float:
+    if not len(run.predicted):
+        return float("nan")
+    distance = np.linalg.norm(run.predicted.value - run.reference.value, axis=1)
+    return float(distance.mean())
+
+
+def _pressure_errors(run: RunSeries, first: float, last: float) -> tuple[float, ...]:
+    """RMS of measured minus commanded differential pressure, one a segment [Pa]."""
+    if not len(run.measured) or not len(run.commanded):
+        return ()
+    inside = (run.measured.time >= first) & (run.measured.time <= last)
+    difference = run.measured.value[inside] - run.commanded.value[inside]
+    known = np.isfinite(difference)
+    if not known.any(axis=0).all():
+        return ()
+    squares = np.where(known, difference, 0.0) ** 2
+    return tuple(float(v) for v in np.sqrt(squares.sum(axis=0) / known.sum(axis=0)))
+
+
+def _problems(run: RunSeries, valid: float, longest: float) -> tuple[str, ...]:
+    found = [f"the driver reported a fault: {text}" for text in run.faults]
+    if not run.finished:
+        found.append("the motion was not played or not recorded to its end")
+    if valid < LEAST_VALID:
+        found.append(f"only {valid:.0%} of the images have a valid limb state")
+    if longest > GAP:
+        found.append(f"{longest:.1f} s without a valid limb state")
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """One limb of one bag: its run and result, or the reason why there is none."""
+
+    path: Path
+    run: RunSeries | None = None
+    result: RunResult | None = None
+    error: str = ""
+
+
+def evaluate_bags(
+    paths: Sequence[Path],
+    settings: EvaluationSettings | None = None,
+    *,
+    workers: int = 0,
+    progress: Callable[[int, int, Path], None] | None = None,
+) -> list[Evaluated]:
+    """Evaluate bags in parallel; one that fails does not stop the others.
+
+    Args:
+        paths: bag folders or files.
+        settings: for all of them.
+        workers: processes; 0 = as many as there are cores, but only this one for so few bytes that
+            starting others would take longer; 1 = this process.
+        progress: called with the number done, the number of bags and the last one's path.
+
+    Returns:
+        One entry per limb that has a plan, in the order of the paths; one with the reason for a
+        bag without any.
+    """
+    chosen = settings or EvaluationSettings()
+    workers = min(workers or _worth_while(paths), len(paths))
+    if workers <= 1:
+        found = []
+        for count, path in enumerate(paths, start=1):
+            found += _evaluate(path, chosen)
+            if progress is not None:
+                progress(count, len(paths), path)
+        return found
+    done: dict[Path, list[Evaluated]] = {}
+    # Forking a process that already runs threads (ROS, BLAS) can deadlock.
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        waiting = {pool.submit(_evaluate, path, chosen): path for path in paths}
+        for count, future in enumerate(as_completed(waiting), start=1):
+            path = waiting[future]
+            done[path] = future.result()
+            if progress is not None:
+                progress(count, len(paths), path)
+    return [entry for path in paths for entry in done[path]]
+
+
+def _worth_while(paths: Sequence[Path]) -> int:
+    """Return how many processes pay for their start of a few seconds."""
+    files = [file for path in paths for file in (path.glob("*") if path.is_dir() else [path])]
+    size = sum(file.stat().st_size for file in files if file.is_file())
+    return os.cpu_count() or 1 if size > WORTH_WHILE else 1
+
+
+def _evaluate(path: Path, settings: EvaluationSettings) -> list[Evaluated]:
+    try:
+        record = read_record(path)
+    except (BagError, OSError) as error:
+        return [Evaluated(path, error=str(error))]
+    found = []
+    for namespace in sorted(record.played or record.limbs) or [""]:
+        try:
+            run = run_of(record, namespace)
+            found.append(Evaluated(path, run, evaluate_run(run, settings)))
+        except (BagError, EvaluationError, OSError) as error:
+            found.append(Evaluated(path, error=str(error)))
+    return found
