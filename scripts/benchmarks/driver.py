@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import os
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -14,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from std_srvs.srv import Trigger
 
 from der_msgs.msg import (
     ChamberPressures,
@@ -23,6 +26,7 @@ from der_msgs.msg import (
     PressureState,
 )
 from der_planner.experiment.client import GraphClient
+from der_planner.experiment.errors import GraphError
 from der_planner.experiment.processes import NodeProcess
 from limb_interfaces import qos, topics
 from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
@@ -30,11 +34,8 @@ from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
 PERIOD = 50_000_000
 LATE = 10e-3
 """[s] after its stamp, a setpoint that reaches the board counts as late."""
-GUARDED = ("quiet", "alone")
-"""The case with the guardian, and the same without."""
-TURNS = 6
-"""Starts of each of these two. When the board reports, relative to the driver's ticks, is drawn at
-each start, and a report that comes just before a tick delays it."""
+PRESSES = 200
+"""Of `vent` in the storm."""
 
 
 @dataclass
@@ -52,8 +53,6 @@ Setpoints = dict[int, tuple[float, ...]]
 def _nodes(case: str, port: str, folder: Path) -> list[tuple[str, str, dict[str, object]]]:
     board = ("pressure_driver", "board_emulator", {"port_link": port})
     options: dict[str, object] = {"real_time_priority": 0} if case == "ordinary" else {}
-    if case in GUARDED:
-        options["guardian"] = "always" if case == GUARDED[0] else "never"
     driver = ("pressure_driver", "pressure_driver", {"port": port, **options})
     if case != "graph":
         return [board, driver]
@@ -78,6 +77,76 @@ def _burners(count: int) -> Iterator[None]:
         for process in running:
             process.kill()
             process.wait()
+
+
+NODE = """
+import time, rclpy
+rclpy.init()
+node = rclpy.create_node(f"passer_by_{time.time_ns()}")
+time.sleep(3.0)
+"""
+
+
+@contextlib.contextmanager
+def _passers_by() -> Iterator[None]:
+    """Have a node a second appear, stay for three seconds and go."""
+    end, running = threading.Event(), []
+
+    def appear() -> None:
+        while not end.wait(1.0):
+            running.append(subprocess.Popen([sys.executable, "-c", NODE]))
+
+    thread = threading.Thread(target=appear)
+    thread.start()
+    try:
+        yield
+    finally:
+        end.set()
+        thread.join()
+        for process in running:
+            process.kill()
+            process.wait()
+
+
+def _arm(client: GraphClient) -> bool:
+    with contextlib.suppress(GraphError):
+        client.call("pressure_driver/arm", 20.0)
+        return True
+    return False
+
+
+def _press(client: GraphClient, seen: Seen, count: int) -> list[float]:
+    """Press `vent` under a small command; return the times [s] until it is on the wire."""
+    publisher = client.node.create_publisher(
+        PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS
+    )
+    vent = client.node.create_client(Trigger, "pressure_driver/vent")
+    client.wait_for(vent.service_is_ready, 20.0, "the service")
+
+    def pressed(since: int) -> float | None:
+        for command in seen.commands[since:]:
+            if abs(command.pressure[0] - command.pressure[1]) < 1.0:
+                return nanoseconds(command.header.stamp) / 1e9
+        return None
+
+    def commanded() -> bool:
+        message = PressureSetpoint(plan_id=plan, differential_pressure=[300.0, 0.0])
+        publisher.publish(message)
+        client.spin(0.03)
+        newest = seen.commands[-1].pressure
+        return bool(newest[0] - newest[1] > 200.0)
+
+    times = []
+    for press in range(count):
+        plan = f"press {press}"
+        client.wait_for(lambda: _arm(client), 60.0, "arming")
+        client.wait_for(commanded, 60.0, "the command on the wire")
+        since = len(seen.commands)
+        begin = time.time()
+        vent.call_async(Trigger.Request())
+        client.wait_for(lambda since=since: pressed(since), 20.0, "the vent on the wire")
+        times.append((pressed(since) or 0.0) - begin)
+    return times
 
 
 def _stream(client: GraphClient, seconds: float) -> Setpoints:
@@ -140,14 +209,10 @@ class Samples:
     ticks: dict[str, float] = field(default_factory=dict)
     """Percentiles [ms] of the driver's own ticks, on its own clock."""
     real_time_priority: str = ""
-
-    def first_byte(self, share: str) -> float:
-        """Return p50 or p99 [ms] of the latency on the board's clock."""
-        return float(1000.0 * np.percentile(self.latency, int(share[1:])))
-
-    def write(self, share: str) -> float:
-        """Return p50 or p99 [ms] from a tick to the end of its write, on the driver's clock."""
-        return self.ticks[f"tick_to_write_{share}_ms"]
+    presses: list[float] = field(default_factory=list)
+    """From a press of `vent` to its first byte at the board [s]."""
+    lost: int = 0
+    """1 if the run ended or was vented."""
 
 
 def _compare(wanted: Setpoints, seen: Seen) -> Samples:
@@ -182,6 +247,10 @@ def _figures(case: str, played: list[Samples]) -> dict[str, float | str]:
     }
     figures |= _percentiles(f"{case}_stamp_to_first_byte", latency)
     figures |= _percentiles(f"{case}_tick_jitter", jitter)
+    figures[f"{case}_runs_ended_or_vented"] = float(sum(each.lost for each in played))
+    if presses := [value for each in played for value in each.presses]:
+        figures[f"{case}_vent_presses"] = float(len(presses))
+        figures |= _percentiles(f"{case}_vent_press_to_first_byte", np.array(presses))
     for name in played[0].processor:
         mean = float(np.mean([each.processor[name] for each in played]))
         figures[f"{case}_cpu_{name}_percent"] = mean
@@ -205,25 +274,7 @@ def _percentiles(name: str, values: NDArray[np.float64]) -> dict[str, float | st
     }
 
 
-def _guardian_cost(turns: dict[str, list[Samples]]) -> dict[str, float | str]:
-    """Return what the guardian adds from a setpoint's stamp to the driver's write and to the wire.
-
-    Differences of the medians over all starts. The board's clock is read by a program that shares
-    the cores, which shows in its last per cent; the driver's own clock does not see that.
-    """
-    medians = {
-        case: {
-            f"{name}_{share}": float(np.median([getattr(each, name)(share) for each in played]))
-            for name in ("first_byte", "write")
-            for share in ("p50", "p99")
-        }
-        for case, played in turns.items()
-    }
-    guarded, alone = (medians[case] for case in GUARDED)
-    return {f"guardian_adds_to_{key}_ms": guarded[key] - alone[key] for key in guarded}
-
-
-def _measure(case: str, seconds: float) -> Samples:
+def _measure(case: str, seconds: float, presses: int = 0) -> Samples:
     """Start the nodes of a case, play, and return what was seen."""
     play: Callable[[GraphClient, float], Setpoints] = play_plan if case == "graph" else _stream
     with contextlib.ExitStack() as stack:
@@ -245,8 +296,10 @@ def _measure(case: str, seconds: float) -> Samples:
                 client.wait_for(lambda: os.path.lexists(port), 60.0, "the emulated port")
         client.wait_ready(processes)
         client.call("pressure_driver/arm", 20.0)
-        if case in ("busy", "ordinary"):
+        if case in ("busy", "ordinary", "storm"):
             stack.enter_context(_burners(os.cpu_count() or 1))
+        if case == "storm":
+            stack.enter_context(_passers_by())
         before = {name: process.measure_cpu() for name, process in processes.items()}
         begin = time.monotonic()
         wanted = play(client, seconds)
@@ -258,42 +311,49 @@ def _measure(case: str, seconds: float) -> Samples:
         told = client.diagnostic_values("pressure_driver")
         samples.ticks = {k: float(v) for k, v in told.items() if k.startswith("tick_to_")}
         samples.real_time_priority = told.get("real_time_priority", "unknown")
+        bad = (PressureState.FAULT, PressureState.DISARMED)
+        armed = [s.mode for s in seen.states if s.setpoints_accepted]
+        samples.lost = int(any(mode in bad for mode in armed))
+        if case == "storm" and presses:
+            client.call("pressure_driver/vent", 20.0)
+            samples.presses = _press(client, seen, presses)
         return samples
 
 
-def run(quick: bool) -> dict[str, float | str]:
-    """Measure all cases; ``quick`` takes 10 s each instead of 60.
+CASES = {
+    "quiet": "driver and board",
+    "busy": "driver and board, every core busy with another process",
+    "ordinary": "the same without real-time priority for the driver",
+    "storm": "every core busy, and a node a second appearing",
+    "graph": "driver, board and planner, twin, camera, tracker, recorder",
+}
 
-    With and without the guardian take turns, so that what else the machine does in some seconds
-    counts for both.
-    """
-    seconds = 10.0 if quick else 60.0
-    titles = {
-        "quiet": "driver, guardian and board",
-        "alone": "the same without the guardian",
-        "busy": "driver and board, every core busy with another process",
-        "ordinary": "the same without real-time priority for the driver",
-        "graph": "driver, board and planner, twin, camera, tracker, recorder",
-    }
-    print(f"driver: with and without the guardian, {seconds:.0f} s each …", file=sys.stderr)
-    turns: dict[str, list[Samples]] = {case: [] for case in GUARDED}
-    count = 2 if quick else TURNS
-    for _ in range(count):
-        for case in GUARDED:
-            turns[case].append(_measure(case, seconds / count))
-    figures: dict[str, float | str] = {}
-    for case, title in titles.items():
-        if case in GUARDED:
-            found = _figures(case, turns[case])
-        else:
-            print(f"driver: {title}, {seconds:.0f} s …", file=sys.stderr, flush=True)
-            found = _figures(case, [_measure(case, seconds)])
-        figures |= found
-        if case == GUARDED[-1]:
-            found |= _guardian_cost(turns)
-        figures |= found
-        print(f"\n{title}")
-        for key, value in found.items():
-            shown = f"{value:10.3f}" if isinstance(value, float) else f"{value:>10}"
-            print(f"  {key.removeprefix(case + '_').replace('_', ' '):45s} {shown}")
+
+def measure(case: str, runs: int, seconds: float, presses: int) -> dict[str, float | str]:
+    """Measure one case, print its figures and return them."""
+    print(f"driver: {CASES[case]}, {runs} x {seconds:.0f} s …", file=sys.stderr, flush=True)
+    played = [_measure(case, seconds, presses // runs) for _ in range(runs)]
+    figures = _figures(case, played)
+    print(f"\n{CASES[case]}")
+    for key, value in figures.items():
+        shown = f"{value:10.3f}" if isinstance(value, float) else f"{value:>10}"
+        print(f"  {key.removeprefix(case + '_').replace('_', ' '):45s} {shown}")
     return figures
+
+
+def run(quick: bool) -> dict[str, float | str]:
+    """Measure all cases; ``quick`` takes 10 s each instead of 60."""
+    figures: dict[str, float | str] = {}
+    for case in CASES:
+        figures |= measure(case, 1, 10.0 if quick else 60.0, 20 if quick else PRESSES)
+    return figures
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("case", choices=CASES)
+    parser.add_argument("--runs", type=int, default=6)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--presses", type=int, default=PRESSES)
+    given = parser.parse_args()
+    measure(given.case, given.runs, given.seconds, given.presses)

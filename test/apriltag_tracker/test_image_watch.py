@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from apriltag_tracker.camera import project
-from apriltag_tracker.image_watch import ImageWatch
-from apriltag_tracker.overlay import draw_observation
 from apriltag_tracker.pipeline import LimbObservation, LimbTracker
+from apriltag_tracker.reports import ImageWatch, draw_observation
 
 
 class Clock:

@@ -5,10 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from apriltag_tracker.camera import Intrinsics, lens
+from apriltag_tracker.camera import Intrinsics, pinhole
 from apriltag_tracker.detection import Detector, codes, edges
 from apriltag_tracker.pipeline import LimbTracker, TrackerOptions, Uncertainty, warm_up
-from apriltag_tracker.pose import plane
 from apriltag_tracker.synthetic.camera import Errors, Optics, SyntheticCamera
 
 PERIOD = 1.0 / 30.0
@@ -161,9 +160,8 @@ def test_warming_up_leaves_no_kernel_for_the_first_image(detector):
     kernels = [
         edges.refine_quads,
         codes.read_codes,
-        lens.undistort_pixels,
-        lens.distort_to_pixels,
-        plane._locate,
+        pinhole.undistort_pixels,
+        pinhole.distort_to_pixels,
     ]
     before = [len(kernel.signatures) for kernel in kernels]
     assert min(before) == 1

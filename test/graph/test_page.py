@@ -50,8 +50,7 @@ class WatchedPage:
         self.client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES, self.states.append)
         graph.start("pressure_driver", "board_emulator", port_link=link)
         self.client.wait_ready(["board_emulator"])
-        # A guardian would end a driver that is stopped for longer than a moment.
-        self.driver = graph.start("pressure_driver", "pressure_driver", port=link, guardian="never")
+        self.driver = graph.start("pressure_driver", "pressure_driver", port=link)
         self.page, self.url = start_page(graph, on_lost_operator=on_lost_operator)
         self.client.wait_ready(["pressure_driver", "page"])
 

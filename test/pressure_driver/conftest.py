@@ -1,17 +1,15 @@
 """A driver and an emulated board in simulated time, without ports, threads or ROS."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from pressure_driver.core import CoreSettings, DriverCore
-from pressure_driver.emulator.board import EmulatedBoard
-from pressure_driver.emulator.faults import Faults
+from pressure_driver.core import DriverCore
+from pressure_driver.emulator.board import EmulatedBoard, Faults
 from pressure_driver.emulator.pneumatics import BoardPneumatics
 from pressure_driver.protocols import board_protocol, host_protocol
 from pressure_driver.safety import Mode
 from pressure_driver.schedule import Setpoint, Verdict
+from pressure_driver.settings import Settings
 
 PERIOD = 50_000_000
 START = 1_700_000_000_000_000_000
@@ -29,7 +27,7 @@ class Simulation:
     def __init__(self, protocol="ezloop", seed=0, **settings):
         self.time = 0
         self.clock_error = 0
-        self.settings = replace(CoreSettings(), **settings)
+        self.settings = Settings(protocol=protocol, **settings)
         self.core = DriverCore(host_protocol(protocol), self.settings, steady=lambda: self.steady)
         self.board = EmulatedBoard(board_protocol(protocol), BoardPneumatics(2, seed), seed)
         self.plugged = True
@@ -49,11 +47,11 @@ class Simulation:
 
     @property
     def mode(self):
-        return self.core.snapshot().mode
+        return self.core.mode
 
     @property
     def faults(self):
-        return self.core.snapshot().faults
+        return tuple(self.core.faults)
 
     @property
     def gauge(self):
@@ -89,7 +87,7 @@ class Simulation:
         data = self.core.tick(self.wall)
         self.sent.append(data)
         self._receive(data)
-        self.core.sent(self.wall)
+        self.core.sent()
         self.board.step(PERIOD / 1e9)
         report = self.board.telemetry()
         if report and self.plugged:

@@ -1,15 +1,15 @@
 """What is written down agrees with the code: parameter files, and the native page's vectors."""
 
+import argparse
 import re
 from pathlib import Path
 
 import pytest
 import yaml
 
-from pressure_driver.core import CoreSettings
+from pressure_driver import settings
 from pressure_driver.protocols.base import Telemetry
-from pressure_driver.protocols.framing import crc16, unstuff
-from pressure_driver.protocols.native import NativeBoard, NativeHost
+from pressure_driver.protocols.native import NativeBoard, NativeHost, crc16, unstuff
 
 PACKAGE = Path(__file__).resolve().parents[2] / "src" / "pressure_driver"
 README = (PACKAGE / "README.md").read_text(encoding="utf-8")
@@ -17,29 +17,23 @@ PROTOCOL = (PACKAGE / "doc" / "native_protocol.md").read_text(encoding="utf-8")
 VECTOR = re.compile(r"^\| (\w+) \|.*\| `([0-9a-f ]+)` \|$", re.MULTILINE)
 
 
-def parameters(name):
-    document = yaml.safe_load((PACKAGE / "config" / f"{name}.yaml").read_text())
-    return document[f"/**/{name}"]["ros__parameters"]
+@pytest.mark.parametrize("name", settings.NODES)
+def test_the_parameter_file_is_what_the_declaration_says(name):
+    written = (PACKAGE / "config" / f"{name}.yaml").read_text(encoding="utf-8")
+    assert written == settings.parameter_file(name)
+    values = yaml.safe_load(written)[f"/**/{name}"]["ros__parameters"]
+    assert settings.NODES[name](**values) == settings.NODES[name]()
 
 
-def test_the_parameter_file_holds_the_defaults():
-    values = parameters("pressure_driver")
-    settings = CoreSettings()
-    for group in (settings.schedule, settings.monitor, settings.safety):
-        for name, default in vars(group).items():
-            if name not in ("capacity", "rest_time", "rest_spread", "rest_drift"):
-                assert values.pop(name) == default, name
-    assert values.pop("rate") == 1e9 / settings.period
-    assert values.pop("command_validity") == settings.command_validity
-    assert values.pop("atmosphere") == settings.atmosphere
+def test_the_table_of_parameters_is_what_the_declaration_says():
+    assert settings.with_table(README) == README
 
 
-@pytest.mark.parametrize("name", ["pressure_driver", "board_emulator"])
-def test_the_parameter_file_names_every_parameter_of_the_node(name):
-    source = "node_parameters.py" if name == "pressure_driver" else "emulator/node.py"
-    text = (PACKAGE / "pressure_driver" / source).read_text()
-    declared = set(re.findall(r"(?:declare\(\s*(?:node|self),|number\()\s*\"(\w+)\"", text))
-    assert declared == set(parameters(name))
+def test_options_of_the_command_give_the_settings_back():
+    given = settings.Settings(port="/dev/x", supply_required=False, vent_rate=5_000.0)
+    parser = argparse.ArgumentParser()
+    settings.add_options(parser)
+    assert settings.from_options(parser.parse_args(settings.to_options(given))) == given
 
 
 def vectors():

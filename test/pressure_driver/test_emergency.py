@@ -10,6 +10,7 @@ import time
 import tty
 
 import pytest
+from driver_bench import PERIOD, difference
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -18,6 +19,7 @@ from std_srvs.srv import Trigger
 from der_msgs.msg import PressureSetpoint, PressureState
 from der_planner.experiment.processes import find_executable
 from limb_interfaces import qos, topics
+from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
 
 pytestmark = pytest.mark.graph
 
@@ -49,14 +51,14 @@ class FloodingBoard:
         self._thread.start()
 
     def _run(self):
-        report = b"[MPR]: 1013.31 1013.02 1013.55 1013.90\r\n[RPR]: 1401.22\r\n"
+        report = b"[MPR]: 1013.3%d 1013.02 1013.55 1013.90\r\n[RPR]: 1401.22\r\n"
         last = report_at = time.monotonic()
         while not self._end.wait(0.005):
             now = time.monotonic()
             with contextlib.suppress(BlockingIOError):
                 self.received.append((now, os.read(self.master, 4096)))
             if now >= report_at:
-                self._say(report)
+                self._say(report % (10.0 * now % 10))  # readings of a sensor tremble
                 report_at = now + 0.05
             if self.flooding:
                 self.flood_bytes += self._say(b"a\n" * round((now - last) * BYTES_A_SECOND / 2))
@@ -136,6 +138,7 @@ class Driver:
 
 
 def test_text_from_the_board_holds_up_neither_vent_nor_the_end(graph, board):
+    started = time.monotonic()
     driver = Driver(graph, board)
     driver.pressurise()
     board.flooding = True
@@ -166,7 +169,7 @@ def test_text_from_the_board_holds_up_neither_vent_nor_the_end(graph, board):
         lambda: board.asked(asked_at)[-3:] == [0.0] * 3, PROMPT, "the last commands"
     )
     log = driver.process.log.read_text()
-    assert log.count("board: a") < 200
+    assert log.count("board: a") < 20 * (time.monotonic() - started)
     assert "faster than it is logged" in log
 
 
@@ -269,22 +272,94 @@ def test_a_log_that_cannot_be_written_stops_nothing(logging_to):
     driver.client.wait_for(lambda: driver.board.asked(0.0)[-3:] == [0.0] * 3, PROMPT, "the vents")
 
 
-def test_a_log_that_nobody_reads_counts_as_a_blocked_executor(logging_to):
+def test_a_log_that_nobody_reads_has_the_limb_let_down_and_the_run_goes_on_later(logging_to):
     reader, writer = os.pipe()
     driver = logging_to(writer)
     driver.pressurise()
     os.set_blocking(writer, False)
     with contextlib.suppress(BlockingIOError):
         while True:
-            os.write(writer, b"x")
+            os.write(writer, b"x" * 512)
     os.set_blocking(writer, True)
-    end = time.monotonic() + 30.0
-    while driver.process.poll() is None and time.monotonic() < end:
-        driver.publisher.publish(PressureSetpoint(differential_pressure=[float("nan"), 0.0]))
+
+    def let_down():
+        for value in (float("nan"), 3000.0):  # the first is refused, which is logged
+            driver.publisher.publish(PressureSetpoint(differential_pressure=[value, 0.0]))
         driver.client.spin(0.04)
-    assert driver.process.poll() == -signal.SIGKILL
-    driver.client.wait_for(
-        lambda: driver.board.asked(time.monotonic() - 0.5)[-1:] == [0.0], PROMPT, "the vent"
-    )
+        return driver.board.asked(time.monotonic() - 0.3)[-1:] == [0.0]
+
+    driver.client.wait_for(let_down, 30.0, "the ramp down")
+    draining = threading.Thread(target=lambda: [*iter(lambda: os.read(reader, 4096), b"")])
+    draining.start()
+    driver.pressurise()
+    driver.process.send_signal(signal.SIGINT)
+    assert driver.process.wait(30.0) == 0
     os.close(writer)
+    draining.join(30.0)
     os.close(reader)
+
+
+HANGING = """
+import ctypes
+from pressure_driver.node import PressureDriver
+from limb_interfaces.runner import run_node
+
+class Hanging(PressureDriver):
+    def _on_setpoint(self, message, info):
+        super()._on_setpoint(message, info)
+        if message.plan_id == "hang":
+            ctypes.PyDLL(None).usleep(900_000)  # it holds Python's lock
+
+raise SystemExit(run_node(Hanging))
+"""
+"""A node that hangs as it does in a publication that waits for a lock of the middleware."""
+
+
+@pytest.mark.parametrize("protocol", ["ezloop", "ctrlp", "native"])
+def test_a_node_that_hangs_in_a_publication_delays_no_setpoint_that_has_arrived(bench, protocol):
+    run = bench(protocol)
+    with run.other_driver(HANGING) as process:
+        run.pressurise()
+        start = (time.time_ns() // PERIOD + 8) * PERIOD
+        for index in range(14):
+            message = PressureSetpoint(
+                plan_id="ahead" if index < 13 else "hang",
+                index=index,
+                differential_pressure=[3500.0, -2000.0 - 100.0 * index],
+            )
+            message.header.stamp = stamp_from_nanoseconds(start + index * PERIOD)
+            run.publisher.publish(message)
+
+        def played():
+            asked = [round(difference(command)[1], -2) for command in run.commands]
+            return asked and asked.count(-3200.0) and asked
+
+        asked = run.wait(played, "the last setpoint that had arrived")
+        assert [-2000.0 - 100.0 * k for k in range(13) if -2000.0 - 100.0 * k not in asked] == []
+        seen = {round(difference(c)[1], -2): nanoseconds(c.header.stamp) for c in run.commands}
+        begin = len(run.states)
+        run.play(20, lambda _: (3500.0, -2000.0))
+        modes = [state.mode for state in run.states[begin:]]
+        assert PressureState.TRACKING in modes
+        assert PressureState.FAULT not in modes
+        # On a busy machine the hand-over may come late; a node that holds it up adds 0.9 s.
+        late = sorted(seen[-2100.0 - 100.0 * k] - start - (k + 1) * PERIOD for k in range(12))
+        assert late[6] < 200_000_000
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60.0) == 0
+
+
+def test_a_machine_that_stands_still_for_a_moment_ends_no_run(bench):
+    run = bench()
+    run.pressurise()
+    told = run.client.diagnostic_values("pressure_driver")
+    processes = [run.driver.pid, int(told["port_process"])]
+    for process in processes:
+        os.kill(process, signal.SIGSTOP)
+    run.client.spin(0.4)
+    for process in processes:
+        os.kill(process, signal.SIGCONT)
+    run.play(20, lambda _: (3500.0, -2000.0))
+    run.wait_mode(PressureState.HOLDING)
+    assert PressureState.FAULT not in [state.mode for state in run.states]
+    assert run.driver.alive

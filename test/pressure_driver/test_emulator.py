@@ -7,8 +7,7 @@ import select
 import numpy as np
 import pytest
 
-from pressure_driver.emulator.board import EmulatedBoard
-from pressure_driver.emulator.faults import FaultError, Faults
+from pressure_driver.emulator.board import EmulatedBoard, FaultError, Faults
 from pressure_driver.emulator.pneumatics import BoardPneumatics
 from pressure_driver.emulator.port import EmulatedPort
 from pressure_driver.protocols import board_protocol, host_protocol

@@ -4,8 +4,6 @@ import contextlib
 import os
 import pty
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -31,30 +29,12 @@ def test_every_exit_vents(bench):
         run.start_driver()
 
 
-@pytest.mark.parametrize("guardian", ["auto", "never"])
-def test_a_killed_driver_leaves_boards_without_a_watchdog_vented_if_it_has_a_guardian(
-    bench, guardian
-):
-    # A busy machine may take seconds from the last setpoint to the kill: until then it holds.
-    run = bench(guardian=guardian, hold_time=20.0)
+@pytest.mark.parametrize("protocol", ["ezloop", "native"])
+def test_a_killed_node_leaves_the_board_vented(bench, protocol):
+    run = bench(protocol, hold_time=20.0)
     run.pressurise()
     run.client.watch([run.board])
     run.driver.signal(signal.SIGKILL)
-    run.wait(lambda: not run.driver.alive, "the end of the driver")
-    if guardian == "never":
-        run.client.spin(1.0)
-        assert not run.vented()
-        run.start_driver(ready=False)
-    run.wait(run.vented, "vented chambers")
-
-
-def test_a_stopped_driver_is_ended_and_the_board_vented(bench):
-    run = bench()
-    run.pressurise()
-    run.client.watch([run.board])
-    run.driver.signal(signal.SIGSTOP)
-    run.wait(lambda: not run.driver.alive, "the end of the driver")
-    assert run.driver.exit_code == -signal.SIGKILL
     run.wait(run.vented, "vented chambers")
 
 
@@ -68,15 +48,6 @@ def test_an_end_without_the_board_says_so(bench):
     assert "cannot be reached" in run.driver.last_words()
     assert "close the air supply" in run.driver.last_words()
     assert "vented and closed" not in run.driver.log.read_text()
-
-
-def test_a_killed_driver_leaves_native_boards_vented(bench):
-    run = bench("native")
-    run.pressurise()
-    run.client.watch([run.board])
-    run.driver.signal(signal.SIGKILL)
-    run.wait(lambda: not run.driver.alive, "the end of the driver")
-    run.wait(run.vented, "vented chambers")
 
 
 CRASHING = """
@@ -94,28 +65,15 @@ raise SystemExit(run_node(Crashing))
 """
 
 
-def test_an_exception_vents(bench, tmp_path):
+def test_an_exception_vents(bench):
     run = bench()
-    run.driver.stop()
-    run.client.watch([run.board])
-    arguments = ["--ros-args", "-p", f"port:={run.link}"]
-    environment = {**os.environ, "ROS_DOMAIN_ID": str(run.graph.domain_id)}
-    process = subprocess.Popen(
-        [sys.executable, "-c", CRASHING, *arguments], env=environment, stderr=subprocess.PIPE
-    )
-    try:
-        run.states.clear()
-        run.wait(lambda: run.states, "the driver")
-        run.wait(run.publisher.get_subscription_count, "the driver's subscription")
+    with run.other_driver(CRASHING) as process:
         run.pressurise()
         run.publisher.publish(PressureSetpoint(plan_id="crash"))
         run.wait(lambda: process.poll() is not None, "the end of the driver")
         assert process.returncode == 1
         assert b"a callback failed" in process.stderr.read()
         run.wait(run.vented, "vented chambers")
-    finally:
-        process.kill()
-        process.wait()
 
 
 def start_on_terminal(run):
@@ -134,7 +92,7 @@ def start_on_terminal(run):
 
 def test_a_closed_terminal_vents(bench):
     """The kernel sends SIGHUP to the driver, and everything that it writes from then on fails."""
-    run = bench(guardian="never")
+    run = bench()
     assert run.driver.stop() == 0
     run.client.watch([run.board])
     run.states.clear()

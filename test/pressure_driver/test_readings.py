@@ -5,8 +5,6 @@ import pytest
 
 from pressure_driver.protocols import NAMES
 from pressure_driver.safety import MOST_FAULTS, Mode
-from pressure_driver.watch.limits import MonitorLimits
-from pressure_driver.watch.texts import LogAllowance
 
 # ---------------------------------------------------------------------------------- supply
 
@@ -38,7 +36,7 @@ def test_arming_wants_a_reading_of_the_supply_where_the_protocol_tells_it(simula
 
 
 def test_a_board_without_a_sensor_of_the_supply_needs_a_parameter(simulate):
-    sim = simulate(monitor=MonitorLimits(supply_required=False))
+    sim = simulate(supply_required=False)
     without(sim, b"[RPR]")
     sim.arm()
     sim.run(3.0)
@@ -214,7 +212,7 @@ def test_faults_are_bounded(simulate):
     assert len(sim.faults) == MOST_FAULTS
 
 
-def test_text_of_the_board_is_logged_at_a_limited_rate(simulate):
+def test_text_of_the_board_is_logged_once_a_tick(simulate):
     sim = simulate()
     logged = []
     sim.core._log = lambda text, _: logged.append(text)
@@ -224,17 +222,10 @@ def test_text_of_the_board_is_logged_at_a_limited_rate(simulate):
         sim.core.received(b"a\n" * 243)  # 9.7 kB/s
         sim.tick()
     texts = [text for text in logged if text == "board: a"]
-    assert 30 <= len(texts) <= 30 + 3 * 10 + 1
+    assert len(texts) == 200
     assert len(logged) == len(texts) + 1
-    assert sim.core.unlogged_texts == 200 * 243 - len(texts)
+    assert sim.core.unlogged_texts == 200 * 243 - len(texts) - len(sim.core._texts)
     assert sim.mode is Mode.ARMED
-
-
-def test_the_allowance_for_texts_comes_back():
-    allowance = LogAllowance(burst=3, rate=1.0)
-    assert [allowance.allows(0.0) for _ in range(5)] == [True, True, True, False, False]
-    assert [allowance.allows(2.0) for _ in range(3)] == [True, True, False]
-    assert allowance.withheld == 3
 
 
 def test_reports_of_another_language_are_said_to_be_so(simulate):

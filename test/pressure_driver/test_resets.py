@@ -182,7 +182,7 @@ def test_a_native_board_that_has_vented_while_it_is_commanded_is_a_fault(simulat
     ]
     assert len(reports) == 1
     assert reports[0].fatal
-    sim.core._take(reports[0], sim.steady)
+    sim.core._serve(reports[0], sim.steady)
     assert sim.mode is Mode.FAULT
 
 

@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pressure_driver.core import CoreSettings
+from pressure_driver.board_watch import BoardWatch
 from pressure_driver.protocols import NAMES
 from pressure_driver.protocols.base import BoardReport
 from pressure_driver.safety import Mode
-from pressure_driver.schedule import ScheduleLimits, Verdict
-from pressure_driver.watch.board import BoardWatch
-from pressure_driver.watch.limits import MonitorLimits
+from pressure_driver.schedule import Verdict
+from pressure_driver.settings import Settings
 
 # --------------------------------------------------------------------------------- refusals
 
@@ -46,7 +45,7 @@ def test_nothing_but_vent_is_sent_until_armed(simulate):
         assert sim.offer((1_000.0, 0.0), index=index) is Verdict.REFUSED
         sim.tick()
     assert all(sim.is_vent(data) for data in sim.sent)
-    assert sim.core.snapshot().counters.refused == 40
+    assert sim.core.counters.refused == 40
 
 
 # ------------------------------------------------------------------------------------ faults
@@ -176,7 +175,7 @@ def test_a_board_with_other_chambers_or_less_range_cannot_be_armed(simulate):
     success, text = sim.core.arm()
     assert not success
     assert "reaches 20000 Pa" in text
-    other = BoardWatch(sim.core.protocol, 24_000.0, 500.0)
+    other = BoardWatch(sim.core.protocol, Settings())
     other.check_identity(replace(sim.core.identity, chamber_count=6, largest_pressure=3e4))
     assert "6 chambers" in other.obstacle(sim.steady)
 
@@ -195,7 +194,7 @@ def test_a_slow_native_board_is_asked_again(simulate):
 def test_a_report_of_the_board_is_a_fault(simulate):
     sim = simulate("native")
     sim.arm()
-    sim.core._take(BoardReport("sensor: channel 3", fatal=True), sim.steady)
+    sim.core._serve(BoardReport("sensor: channel 3", fatal=True), sim.steady)
     assert sim.mode is Mode.FAULT
     sim.tick()
     assert sim.is_vent(sim.sent[-1])
@@ -205,7 +204,7 @@ def test_a_report_of_the_board_is_a_fault(simulate):
 @pytest.mark.parametrize("protocol", NAMES)
 def test_no_false_alarm_on_full_steps_and_fast_swings(simulate, protocol, seed):
     """Steps over the whole range and a 3 s swing, on limbs whose valves differ."""
-    limits = ScheduleLimits(slew_limit=1e6)
+    limits = Settings(slew_limit=1e6)
     sim = simulate(protocol, seed=seed, schedule=limits)
     sim.arm()
     step = 20_000.0
@@ -229,7 +228,7 @@ def test_corrupt_lines_do_not_end_a_run(simulate):
 
 @pytest.mark.parametrize("step", [-3600, -2, 2, 3600])
 def test_a_wall_clock_that_is_set_drops_the_schedule_and_ends_vented(simulate, step):
-    sim = simulate(schedule=ScheduleLimits(horizon=60.0))
+    sim = simulate(horizon=60.0)
     sim.track()
     held = sim.core.snapshot().commanded_differential
     for index in range(100):
@@ -270,9 +269,9 @@ def test_the_round_trip_is_measured_where_there_are_echoes(simulate):
 
 
 def test_the_monitor_bounds_are_those_of_the_settings(simulate):
-    settings = CoreSettings()
+    settings = Settings()
     assert settings.monitor.over_pressure > settings.schedule.pressure_limit
-    sim = simulate(monitor=MonitorLimits(follow_time=0.5))
+    sim = simulate(follow_time=0.5)
     sim.track()
     sim.have("stick:0")
     begin = sim.steady

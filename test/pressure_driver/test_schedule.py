@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from pressure_driver.grid import TickGrid
-from pressure_driver.schedule import ScheduleLimits, Setpoint, SetpointSchedule, Verdict
+from pressure_driver import schedule as schedule_module
+from pressure_driver.schedule import Setpoint, SetpointSchedule, TickGrid, Verdict
+from pressure_driver.settings import Settings
 
 PERIOD = 50_000_000
 NOW = 1_700_000_000 * 1_000_000_000
@@ -20,7 +21,7 @@ def offer(schedule, item, now=NOW):
 
 
 def test_a_setpoint_waits_for_its_stamp_and_is_then_held():
-    schedule = SetpointSchedule(ScheduleLimits())
+    schedule = SetpointSchedule(Settings())
     assert offer(schedule, setpoint(3)) is Verdict.ACCEPTED
     assert [schedule.sample(NOW + k * PERIOD) for k in (1, 2)] == [None, None]
     first = schedule.sample(NOW + 3 * PERIOD)
@@ -33,7 +34,7 @@ def test_a_setpoint_waits_for_its_stamp_and_is_then_held():
 
 
 def test_order_of_arrival_does_not_matter():
-    schedule = SetpointSchedule(ScheduleLimits())
+    schedule = SetpointSchedule(Settings())
     for k in (5, 3, 4):
         assert offer(schedule, setpoint(k, 1000.0 + k, index=k)) is Verdict.ACCEPTED
     values = [schedule.sample(NOW + k * PERIOD).differential[0] for k in (3, 4, 5)]
@@ -41,14 +42,14 @@ def test_order_of_arrival_does_not_matter():
 
 
 def test_a_stamp_between_ticks_takes_effect_at_the_next_one():
-    schedule = SetpointSchedule(ScheduleLimits())
+    schedule = SetpointSchedule(Settings())
     offer(schedule, setpoint(2, offset=1))
     assert schedule.sample(NOW + 2 * PERIOD) is None
     assert schedule.sample(NOW + 3 * PERIOD).fresh
 
 
 def test_two_setpoints_within_one_tick_leave_the_later_one():
-    schedule = SetpointSchedule(ScheduleLimits())
+    schedule = SetpointSchedule(Settings())
     offer(schedule, setpoint(2, 1000.0, offset=-2 * 10**7))
     offer(schedule, setpoint(2, 2000.0, index=1))
     assert schedule.sample(NOW + 2 * PERIOD).differential[0] == 2000.0
@@ -56,7 +57,7 @@ def test_two_setpoints_within_one_tick_leave_the_later_one():
 
 
 def test_linear_interpolation_moves_between_stamps():
-    schedule = SetpointSchedule(ScheduleLimits(), interpolate=True)
+    schedule = SetpointSchedule(Settings(interpolation="linear"))
     offer(schedule, setpoint(2, 0.0))
     offer(schedule, setpoint(6, 4000.0, index=1))
     samples = [schedule.sample(NOW + k * PERIOD) for k in range(2, 8)]
@@ -65,7 +66,7 @@ def test_linear_interpolation_moves_between_stamps():
 
 
 def test_stamp_zero_is_the_next_tick():
-    schedule = SetpointSchedule(ScheduleLimits())
+    schedule = SetpointSchedule(Settings())
     schedule.sample(NOW)
     item = Setpoint(0, (500.0, 0.0))
     assert offer(schedule, item, NOW + 10**6) is Verdict.ACCEPTED
@@ -77,7 +78,7 @@ def test_stamp_zero_is_the_next_tick():
 
 
 def test_of_two_untimed_commands_within_a_tick_the_newer_one_counts():
-    schedule = SetpointSchedule(ScheduleLimits())
+    schedule = SetpointSchedule(Settings())
     schedule.sample(NOW)
     for value in (500.0, 700.0):
         assert offer(schedule, Setpoint(0, (value, 0.0)), NOW + 10**6) is Verdict.ACCEPTED
@@ -86,7 +87,7 @@ def test_of_two_untimed_commands_within_a_tick_the_newer_one_counts():
 
 
 def test_late_ones_are_counted_and_refused():
-    schedule = SetpointSchedule(ScheduleLimits())
+    schedule = SetpointSchedule(Settings())
     schedule.sample(NOW + 4 * PERIOD)
     assert offer(schedule, setpoint(4), NOW + 4 * PERIOD) is Verdict.LATE
     assert offer(schedule, setpoint(3, offset=1), NOW + 4 * PERIOD) is Verdict.LATE
@@ -96,7 +97,7 @@ def test_late_ones_are_counted_and_refused():
 
 
 def test_duplicates_are_counted_and_refused():
-    schedule = SetpointSchedule(ScheduleLimits())
+    schedule = SetpointSchedule(Settings())
     offer(schedule, setpoint(1, 1000.0))
     assert offer(schedule, setpoint(1, 2000.0)) is Verdict.DUPLICATE
     assert schedule.sample(NOW + PERIOD).differential[0] == 1000.0
@@ -104,7 +105,7 @@ def test_duplicates_are_counted_and_refused():
 
 
 def test_a_new_plan_replaces_the_old_from_its_first_stamp_on():
-    schedule = SetpointSchedule(ScheduleLimits())
+    schedule = SetpointSchedule(Settings())
     for k in range(1, 9):
         offer(schedule, setpoint(k, 100.0 * k, index=k))
     for k in range(5, 8):
@@ -130,7 +131,7 @@ def test_a_new_plan_replaces_the_old_from_its_first_stamp_on():
     ],
 )
 def test_refused_with_the_reason(values, reason):
-    schedule = SetpointSchedule(ScheduleLimits())
+    schedule = SetpointSchedule(Settings())
     item = Setpoint(NOW + PERIOD, values, "plan-7", 3)
     assert offer(schedule, item) is Verdict.REFUSED
     assert reason in schedule.reason
@@ -140,14 +141,14 @@ def test_refused_with_the_reason(values, reason):
 
 
 def test_too_far_ahead_is_refused():
-    schedule = SetpointSchedule(ScheduleLimits(horizon=1.0))
+    schedule = SetpointSchedule(Settings(horizon=1.0))
     assert offer(schedule, setpoint(20)) is Verdict.ACCEPTED
     assert offer(schedule, setpoint(21, index=1)) is Verdict.REFUSED
     assert "1.05 s ahead" in schedule.reason
 
 
 def test_slew_is_taken_between_neighbours_in_time():
-    limits = ScheduleLimits(slew_limit=10_000.0)
+    limits = Settings(slew_limit=10_000.0)
     schedule = SetpointSchedule(limits)
     assert offer(schedule, setpoint(1, 500.0)) is Verdict.ACCEPTED
     assert offer(schedule, setpoint(11, 5500.0)) is Verdict.ACCEPTED
@@ -163,8 +164,9 @@ def test_slew_is_taken_between_neighbours_in_time():
     assert fresh.offer(late, NOW + 99 * PERIOD, (500.0, -500.0)) is Verdict.REFUSED
 
 
-def test_the_buffer_is_bounded():
-    schedule = SetpointSchedule(ScheduleLimits(capacity=10))
+def test_the_buffer_is_bounded(monkeypatch):
+    monkeypatch.setattr(schedule_module, "CAPACITY", 10)
+    schedule = SetpointSchedule(Settings())
     verdicts = [offer(schedule, setpoint(k, 1.0 * k, index=k)) for k in range(1, 13)]
     assert verdicts == [Verdict.ACCEPTED] * 10 + [Verdict.REFUSED] * 2
 
@@ -220,7 +222,7 @@ def test_two_hours_of_setpoints_without_drift():
     """At 20 Hz on clocks that drift by 80 ppm, are slewed, and wake the thread late."""
     generator = np.random.default_rng(14)
     grid = TickGrid(PERIOD)
-    schedule = SetpointSchedule(ScheduleLimits())
+    schedule = SetpointSchedule(Settings())
     count = 2 * 3600 * 20
     lateness = generator.exponential(60_000.0, count + 10).astype(np.int64)
     drift = 80e-6 * np.sin(np.linspace(0.0, 9.0, count + 10))

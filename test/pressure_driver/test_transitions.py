@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pressure_driver.protocols import NAMES
-from pressure_driver.safety import Mode, SafetyLimits
+from pressure_driver.safety import Mode
 from pressure_driver.schedule import Setpoint, Verdict
 
 
@@ -24,7 +24,7 @@ def test_a_whole_life(simulate, protocol):
     assert order == [
         Mode.DISARMED, Mode.ARMED, Mode.TRACKING, Mode.HOLDING, Mode.VENTING, Mode.ARMED,
     ]  # fmt: skip
-    counters = sim.core.snapshot().counters
+    counters = sim.core.counters
     assert counters.accepted == counters.executed == 80
     assert counters.late == counters.refused == counters.duplicate == 0
     assert sim.core.vent()[0]
@@ -56,11 +56,11 @@ def test_holding_goes_on_with_the_next_setpoint(simulate):
     held = sim.core.snapshot().commanded_differential
     assert sim.offer(held, plan_id="next") is Verdict.ACCEPTED
     sim.run_until(lambda: sim.mode is Mode.TRACKING, 0.3)
-    assert sim.core.snapshot().setpoint.plan_id == "next"
+    assert sim.core.setpoint.plan_id == "next"
 
 
 def test_holding_keeps_the_last_pressures_for_the_hold_time(simulate):
-    sim = simulate(safety=SafetyLimits(setpoint_timeout=0.2, hold_time=1.0))
+    sim = simulate(setpoint_timeout=0.2, hold_time=1.0)
     sim.track()
     last = None
     silence = 0
@@ -75,7 +75,7 @@ def test_holding_keeps_the_last_pressures_for_the_hold_time(simulate):
 
 
 def test_the_ramp_down_is_as_fast_as_it_says_and_keeps_the_shape(simulate):
-    sim = simulate(safety=SafetyLimits(vent_rate=8_000.0))
+    sim = simulate(vent_rate=8_000.0)
     sim.track()
     sim.run_until(lambda: sim.mode is Mode.VENTING)
     commanded = [sim.core.snapshot().commanded_differential]
@@ -135,7 +135,7 @@ def test_vent_while_disarmed_or_in_fault_vents_and_changes_nothing(simulate):
 
 
 def test_a_vent_that_does_not_empty_the_chambers_is_a_fault(simulate):
-    sim = simulate(safety=SafetyLimits(vent_timeout=1.0))
+    sim = simulate(vent_timeout=1.0)
     sim.track()
     sim.have("stick:0")
     sim.core.vent()
@@ -176,7 +176,7 @@ def test_rest_pressures_are_the_sensors_own(simulate, seed):
     sim = simulate(seed=seed)
     sim.arm()
     reading = sim.board.pneumatics.pressure + sim.board._offset
-    assert sim.core._monitor.rest_pressure == pytest.approx(reading, abs=8.0)
+    assert sim.core._monitor.rest.pressure == pytest.approx(reading, abs=8.0)
 
 
 def test_rest_pressures_are_not_taken_from_chambers_under_pressure(simulate):

@@ -1,6 +1,9 @@
 """A driver and an emulated board as running nodes, for the tests of both."""
 
 import contextlib
+import os
+import subprocess
+import sys
 import time
 import uuid
 
@@ -60,6 +63,28 @@ class Bench:
             self.client.wait_ready(["pressure_driver"])
             self.wait(self.publisher.get_subscription_count, "the driver's subscription")
             self.wait(lambda: self.air, "the air")
+
+    @contextlib.contextmanager
+    def other_driver(self, code):
+        """Run a driver from Python code in the place of the installed one."""
+        self.driver.stop()
+        self.client.watch([self.board])
+        words = [
+            word for name, value in self.parameters.items() for word in ("-p", f"{name}:={value}")
+        ]
+        process = subprocess.Popen(
+            [sys.executable, "-c", code, "--ros-args", *words],
+            env={**os.environ, "ROS_DOMAIN_ID": str(self.graph.domain_id)},
+            stderr=subprocess.PIPE,
+        )
+        try:
+            self.states.clear()
+            self.wait(lambda: self.states, "the driver")
+            self.wait(self.publisher.get_subscription_count, "the driver's subscription")
+            yield process
+        finally:
+            process.kill()
+            process.wait()
 
     def wait(self, condition, what, limit=60.0):
         return self.client.wait_for(condition, limit, what)

@@ -5,9 +5,18 @@ from __future__ import annotations
 import importlib
 import os
 import signal
+from collections.abc import Callable
+from types import FrameType
 
 END_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 """What ends a node in order: Ctrl-C, a request, a terminal that was closed, and Ctrl-\\."""
+
+
+def on_end_signals(handler: Callable[[int, FrameType | None], None] | signal.Handlers) -> None:
+    """Have `END_SIGNALS` handled; a SIGHUP that `nohup` has switched off stays so."""
+    for number in END_SIGNALS:
+        if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, handler)
 
 
 def run_module(name: str) -> int:
@@ -22,6 +31,8 @@ def run_module(name: str) -> int:
     Returns:
         What ``main`` returns, or 0.
     """
-    for number in END_SIGNALS:
-        signal.signal(number, lambda *_: os._exit(0))
-    return int(importlib.import_module(name).main() or 0)
+    on_end_signals(lambda *_: os._exit(0))
+    exit_code = int(importlib.import_module(name).main() or 0)
+    # A second signal must not change the exit code while Python takes itself down.
+    on_end_signals(signal.SIG_IGN)
+    return exit_code

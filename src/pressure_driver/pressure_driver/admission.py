@@ -1,8 +1,7 @@
-"""Whose setpoints are taken: one publisher at a time, and plans of this arming only.
+"""Whose setpoints are taken: those of one publisher, and of plans of this arming only.
 
 A publisher is told by the numbers that it counts its messages with: the middleware of ROS 2 Jazzy
-hands these to a node, and not the publisher's identity. Publishers that count in step cannot be
-told apart; then none of them is taken.
+hands these to a node, and not the publisher's identity.
 """
 
 from __future__ import annotations
@@ -11,10 +10,7 @@ from collections import OrderedDict
 from typing import NamedTuple
 
 RELEASE_TIME = 1.0
-"""[s] of silence after which another publisher, or hand-typed setpoints again, are taken."""
-IN_STEP = 0.3
-"""[s] since the publisher that is played was heard, after which the next number is not its own if
-another publisher has just sent the one before."""
+"""[s] of silence after which hand-typed setpoints, which have no plan, are taken again."""
 REMEMBERED_PLANS = 1024
 """Plans that were heard before the last arming and are refused since."""
 REMEMBERED_PUBLISHERS = 16
@@ -31,64 +27,47 @@ class Origin(NamedTuple):
     """The topic has no other publisher."""
 
 
-class SourceGate:
-    """Keeps to one publisher until it has been silent for `RELEASE_TIME`."""
+class PublisherGate:
+    """Keeps to the publisher that is heard first after an arming, until the next arming."""
 
     def __init__(self) -> None:
         self.refused = 0
-        """Setpoints of a second publisher."""
-        self._active: Origin | None = None
-        self._heard_at = 0.0
-        self._mixed_at: float | None = None
-        self._others: OrderedDict[tuple[str, int], float] = OrderedDict()
+        """Setpoints of other publishers since the start."""
+        self.release()
 
-    def refuse(self, origin: Origin, now: float) -> str:
-        """Return why a setpoint from there is not taken, or nothing if it is.
+    def release(self) -> None:
+        """Take whoever is heard next: the driver has been armed."""
+        self._owner: Origin | None = None
+        self._in_step = False
+        self._others: OrderedDict[tuple[str, int], None] = OrderedDict()
 
-        Args:
-            origin: of the setpoint.
-            now: [s] steady clock.
-        """
-        reason = self._judge(origin, now)
+    def refuse(self, origin: Origin) -> str:
+        """Return why a setpoint from there is not taken, or nothing if it is."""
+        reason = self._judge(origin)
         if reason:
             self.refused += 1
+        else:
+            self._owner = origin
         return reason
 
-    def _judge(self, origin: Origin, now: float) -> str:
-        mixed = self._mixed_at is not None and now - self._mixed_at < RELEASE_TIME
-        if mixed and not origin.alone:
-            self._mixed_at = now
-            return (
-                "two publishers send setpoints in step and cannot be told apart: stop both for "
-                f"{RELEASE_TIME:g} s, then start one"
-            )
-        self._mixed_at = None
-        active = self._active
-        if active is None or now - self._heard_at >= RELEASE_TIME:
-            self._others.clear()
-            return self._take(origin, now)
+    def _judge(self, origin: Origin) -> str:
+        owner = self._owner
+        if owner is None:
+            return ""
+        counted = origin.number - owner.number if origin.topic == owner.topic else -1
         before = (origin.topic, origin.number - 1)
-        continues = origin.topic == active.topic and origin.number == active.number + 1
-        if continues and not (before in self._others and now - self._heard_at > IN_STEP):
-            if before in self._others:
-                self._active, self._mixed_at = None, now
-                self._others.clear()
-                return "two publishers send setpoints, and which is which cannot be told: stop one"
-            return self._take(origin, now)
-        if origin.alone and origin.topic == active.topic:
-            return self._take(origin, now)  # messages were lost, or the publisher has started anew
+        # A number that two publishers have reached does not tell any more which of them goes on.
+        if counted == 0 or (counted == 1 and before in self._others):
+            self._in_step = True
+        if self._in_step:
+            return "two publishers count in step and cannot be told apart: stop one and arm again"
+        if counted == 1 or (counted > 1 and origin.alone):
+            return ""
         self._others.pop(before, None)
-        self._others[origin.topic, origin.number] = now
-        while len(self._others) > REMEMBERED_PUBLISHERS:
+        self._others[origin.topic, origin.number] = None
+        if len(self._others) > REMEMBERED_PUBLISHERS:
             self._others.popitem(last=False)
-        return (
-            f"another publisher on '{active.topic}' is being played: stop it, and wait "
-            f"{RELEASE_TIME:g} s"
-        )
-
-    def _take(self, origin: Origin, now: float) -> str:
-        self._active, self._heard_at = origin, now
-        return ""
+        return f"another publisher on '{owner.topic}' is being played: stop it and arm again"
 
 
 class SpentPlans:

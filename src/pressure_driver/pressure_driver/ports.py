@@ -16,7 +16,12 @@ from serial.tools import list_ports
 STABLE_NAMES = Path("/dev/serial/by-id")
 """Where the system keeps names of ports that survive re-plugging."""
 RELEASE_TIME = 4.0
-"""[s] in which a guardian that vents after a killed driver has let go of the port."""
+"""[s] in which a process that vents after the end of its driver has let go of the port."""
+VENT_TIME = 2.0
+"""[s] for which `vent_port` repeats the vent command: bytes may be damaged."""
+VENT_PERIOD = 0.05
+"""[s] between two of its vent commands."""
+ADVICE = "close the air supply"
 
 
 class PortError(RuntimeError):
@@ -117,8 +122,66 @@ def release_port(device: serial.Serial, drop: bool = True) -> None:
         with contextlib.suppress(Exception):
             device.reset_output_buffer()
     with contextlib.suppress(Exception):
-        fcntl.ioctl(device.fileno(), termios.TIOCNXCL)
-    with contextlib.suppress(Exception):
-        fcntl.flock(device.fileno(), fcntl.LOCK_UN)
+        release_descriptor(os.dup(device.fileno()))
     with contextlib.suppress(Exception):
         device.close()
+
+
+def vent_port(descriptor: int, command: bytes) -> str:
+    """Send the vent command again and again for `VENT_TIME`, before all that waits to be sent.
+
+    For a process that has lost the other one of the driver: nobody else writes any more.
+
+    Args:
+        descriptor: of the open port; −1 if there is none.
+        command: opens every chamber, complete after any half-sent bytes.
+
+    Returns:
+        What came of it, as a sentence.
+    """
+    if descriptor < 0:
+        return f"the board cannot be reached: {ADVICE}"
+    count, end = 0, time.monotonic() + VENT_TIME
+    with contextlib.suppress(termios.error):
+        termios.tcflush(descriptor, termios.TCOFLUSH)
+    while time.monotonic() < end:
+        try:
+            count += os.write(descriptor, command) == len(command)
+        except BlockingIOError:
+            with contextlib.suppress(termios.error):
+                termios.tcflush(descriptor, termios.TCOFLUSH)
+        except OSError as error:
+            return f"the port is gone ({error}) after {count} vent commands: {ADVICE}"
+        time.sleep(VENT_PERIOD)
+    if not count:
+        return f"the board takes no bytes: {ADVICE}"
+    return f"the vent command was sent {count} times; check that the chambers are down"
+
+
+def release_descriptor(descriptor: int) -> None:
+    """Close a descriptor of a port, if there is one, and take off the locks of the port."""
+    if descriptor < 0:
+        return
+    with contextlib.suppress(OSError):
+        fcntl.ioctl(descriptor, termios.TIOCNXCL)
+    with contextlib.suppress(OSError):
+        fcntl.flock(descriptor, fcntl.LOCK_UN)
+    with contextlib.suppress(OSError):
+        os.close(descriptor)
+
+
+def prefer_thread(priority: int) -> bool:
+    """Give the calling thread real-time priority (SCHED_FIFO): it serves a port.
+
+    Args:
+        priority: 1 … 99, 0 to leave the thread as it is.
+
+    Returns:
+        Whether it was granted; it needs root, CAP_SYS_NICE or an rtprio limit.
+    """
+    if priority <= 0:
+        return False
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        return True
+    return False

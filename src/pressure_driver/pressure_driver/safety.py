@@ -12,18 +12,17 @@
 
     any state --something failed--> FAULT (vented) --arm, once the cause is gone--> ARMED
 
-Everything here is plain Python with the time passed in, and is called under one lock.
+Everything here is plain Python with the time passed in.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import IntEnum
 
-from pressure_driver.admission import Origin, SourceGate, SpentPlans
-from pressure_driver.schedule import NANOSECONDS, Sample, Setpoint, SetpointSchedule, Verdict
-from pressure_driver.watch.monitor import TelemetryMonitor
-from pressure_driver.watch.probe import SteadyProbe
+from pressure_driver.admission import Origin, PublisherGate, SpentPlans
+from pressure_driver.schedule import Sample, Setpoint, SetpointSchedule, Verdict
+from pressure_driver.settings import NANOSECONDS, Settings
+from pressure_driver.telemetry import TelemetryMonitor
 
 
 class Mode(IntEnum):
@@ -37,30 +36,6 @@ class Mode(IntEnum):
     FAULT = 5
 
 
-@dataclass(frozen=True)
-class SafetyLimits:
-    """When the driver gives up on a stream of setpoints, and how it lets the air out."""
-
-    setpoint_timeout: float = 0.2
-    """[s] after a setpoint's stamp without a next one: the stream has stopped."""
-    hold_time: float = 1.0
-    """[s] the last pressures are kept then."""
-    vent_rate: float = 10_000.0
-    """[Pa/s] of the ramp to zero differential."""
-    vent_timeout: float = 10.0
-    """[s] a commanded vent may take before it is a fault."""
-
-
-@dataclass(frozen=True)
-class Action:
-    """What is to be sent at one tick."""
-
-    differential: tuple[float, ...]
-    """(M,) [Pa]."""
-    dump: bool
-    """Send the vent command instead."""
-
-
 MOST_FAULTS = 16
 """Reasons that are kept; more would only be more of the same."""
 LIVE = (Mode.ARMED, Mode.TRACKING, Mode.HOLDING, Mode.VENTING)
@@ -70,23 +45,15 @@ class SafetyMachine:
     """Turns setpoints, telemetry and requests into what the board is told.
 
     Args:
-        schedule: of timed setpoints.
+        settings: limits and times.
         monitor: of the board's telemetry.
-        limits: of the state machine.
-        probe: changes steady commands of boards that do not echo; None for others.
     """
 
-    def __init__(
-        self,
-        schedule: SetpointSchedule,
-        monitor: TelemetryMonitor,
-        limits: SafetyLimits,
-        probe: SteadyProbe | None = None,
-    ) -> None:
-        self.schedule = schedule
+    def __init__(self, settings: Settings, monitor: TelemetryMonitor) -> None:
+        self.schedule = SetpointSchedule(settings)
+        """Of timed setpoints."""
         self.monitor = monitor
-        self.limits = limits
-        self._probe = probe
+        self._settings = settings
         self.mode = Mode.DISARMED
         self.faults: list[str] = []
         """Why the mode is FAULT, worst first."""
@@ -94,10 +61,10 @@ class SafetyMachine:
         """What is wrong with the line; empty while it works."""
         self.board_obstacle: str = ""
         """What is wrong with the board itself; empty if nothing is."""
-        self._zero = (0.0,) * schedule.limits.segment_count
+        self._zero = (0.0,) * settings.segment_count
         self.differential = self._zero
         """(M,) [Pa] commanded at the last tick."""
-        self.sources = SourceGate()
+        self.publishers = PublisherGate()
         self.limited_ticks = 0
         """Ticks at which the output was held back by the slew limit."""
         self._spent = SpentPlans()
@@ -118,6 +85,8 @@ class SafetyMachine:
             Whether the driver is armed, and a sentence.
         """
         if self.mode in LIVE and not self._latched:
+            if self.mode is Mode.ARMED:
+                self.publishers.release()
             return True, f"already armed ({self.mode.name})"
         obstacles = self.obstacles(now)
         if obstacles:
@@ -125,11 +94,10 @@ class SafetyMachine:
         self.faults = []
         self._latched = False
         self.schedule.clear()
-        self.monitor.reset_following(now)
-        if self._probe is not None:
-            self._probe.restart()
+        self.publishers.release()
+        self.monitor.restart_following(now)
         self.command_nothing()
-        self._enter(Mode.ARMED)
+        self.mode = Mode.ARMED
         return True, "armed"
 
     def obstacles(self, now: float) -> list[str]:
@@ -144,7 +112,7 @@ class SafetyMachine:
             return found
         found = monitor.overpressure_faults() + monitor.supply_obstacles(now)
         found += monitor.reading_faults(now)
-        if problem := monitor.rest_problem():
+        if problem := monitor.rest.problem:
             found.append(problem)
         elif not monitor.vented():
             found.append("the chambers are not vented yet: " + monitor.describe_gauge())
@@ -159,7 +127,7 @@ class SafetyMachine:
             return True, "venting; it was not armed"
         self._latched = True
         self._vent_since = now
-        self._enter(Mode.VENTING)
+        self.mode = Mode.VENTING
         return True, "venting; arm to go on"
 
     def offer(
@@ -180,18 +148,12 @@ class SafetyMachine:
             return schedule.refuse(f"setpoints are refused while {self.mode.name}: arm first")
         reason = self._spent.refuse(plan, now)
         if not reason and origin is not None:
-            reason = self.sources.refuse(origin, now)
+            reason = self.publishers.refuse(origin)
         if reason:
             name = f" of '{plan}'" if plan else ""
             return schedule.refuse(f"setpoint {setpoint.index}{name}: {reason}")
         self._spent.hear(plan, now)
         return schedule.offer(setpoint, wall, self.differential)
-
-    def hear(self, now: float) -> None:
-        """Note that the monitor has new chamber pressures (steady clock [s])."""
-        if self._probe is not None:
-            gauge = self.monitor.gauge
-            self._probe.receive(gauge[0::2] - gauge[1::2], now)
 
     def fail(self, reason: str) -> None:
         """Go to FAULT for a reason from outside (the line, the board's own report)."""
@@ -209,22 +171,26 @@ class SafetyMachine:
 
     # ------------------------------------------------------------------------------- ticks
 
-    def tick(self, tick: int, now: float) -> Action:
-        """Advance to one tick and say what the board is to be told.
+    def tick(self, tick: int, now: float) -> bool:
+        """Advance to one tick: `differential` is what to command.
 
         Args:
             tick: [ns] wall time of the tick, on the grid.
             now: [s] steady clock.
+
+        Returns:
+            Whether the board is to be told to vent instead.
         """
         sample = self.schedule.sample(tick, self.differential)
         self._look_for_faults(now)
         if self.mode in (Mode.DISARMED, Mode.FAULT):
             self.command_nothing()
-            return Action(self._zero, dump=True)
-        if self._latched:
-            return self._vent_latched(now)
-        self._follow(sample, now)
-        return Action(self.differential, dump=self.mode is Mode.ARMED)
+        elif self._latched:
+            self._finish_vent(now)
+        else:
+            self._follow(sample, now)
+            return self.mode is Mode.ARMED
+        return True
 
     def _follow(self, sample: Sample | None, now: float) -> None:
         """Move between ARMED, TRACKING, HOLDING and VENTING, and set what is commanded.
@@ -235,72 +201,67 @@ class SafetyMachine:
         if sample is not None and sample.fresh:
             self._target = sample.differential
             self._fresh_at = now
-            self._enter(Mode.TRACKING)
+            self.mode = Mode.TRACKING
         if self.mode is Mode.TRACKING:
-            self._approach_target(now)
+            self._approach_target()
         silence = now - self._fresh_at
-        if self.mode is Mode.TRACKING and silence > self.limits.setpoint_timeout:
-            self._enter(Mode.HOLDING)
+        if self.mode is Mode.TRACKING and silence > self._settings.setpoint_timeout:
+            self.mode = Mode.HOLDING
         if self.mode is Mode.HOLDING and (
-            silence > self.limits.setpoint_timeout + self.limits.hold_time
+            silence > self._settings.setpoint_timeout + self._settings.hold_time
         ):
-            self._enter(Mode.VENTING)
+            self.mode = Mode.VENTING
         if self.mode is Mode.VENTING:
             self._ramp_down()
 
-    def _approach_target(self, now: float) -> None:
+    def _approach_target(self) -> None:
         """Move what is commanded to what is wanted, by no more than the slew limit allows a tick.
 
         The step is taken from what was commanded last, whatever brought it there.
         """
-        target = self._target if self._probe is None else self._probe.change(self._target, now)
-        step = self.schedule.limits.slew_limit * self.schedule.period / NANOSECONDS
-        step *= 1.0 + 1e-9  # a plan at the limit is not beyond it for the sake of rounding
+        step = self._settings.largest_step
         moved = tuple(
             min(max(wanted, last - step), last + step)
-            for wanted, last in zip(target, self.differential, strict=True)
+            for wanted, last in zip(self._target, self.differential, strict=True)
         )
-        if moved != target:
+        if moved != self._target:
             self.limited_ticks += 1
         self.differential = moved
 
     def _ramp_down(self) -> None:
         """One step of the ramp; all segments arrive together, so that the limb keeps its shape."""
         largest = max(abs(value) for value in self.differential)
-        step = self.limits.vent_rate * self.schedule.period / NANOSECONDS
+        step = self._settings.vent_rate * self.schedule.period / NANOSECONDS
         if largest <= step:
             self.command_nothing()
             if not self.schedule.waiting:
                 self.schedule.clear()
-            self._enter(Mode.ARMED)
+            self.mode = Mode.ARMED
         else:
             share = 1.0 - step / largest
             self.differential = tuple(value * share for value in self.differential)
 
-    def _vent_latched(self, now: float) -> Action:
+    def _finish_vent(self, now: float) -> None:
         self.command_nothing()
         if self.monitor.vented():
             self._latched = False
-            self._enter(Mode.DISARMED)
-        elif now - self._vent_since > self.limits.vent_timeout:
+            self.mode = Mode.DISARMED
+        elif now - self._vent_since > self._settings.vent_timeout:
             self._fault(
                 [
-                    f"not vented within {self.limits.vent_timeout:g} s of `vent`: "
+                    f"not vented within {self._settings.vent_timeout:g} s of `vent`: "
                     + self.monitor.describe_gauge()
                 ]
             )
-        return Action(self._zero, dump=True)
 
     def _look_for_faults(self, now: float) -> None:
         monitor = self.monitor
-        found = monitor.overpressure_faults() + monitor.following_faults(now)
+        found = [*monitor.overpressure_faults(), *monitor.following_faults(now)]
         if self.mode in LIVE:
             # Without a port there is no telemetry either: one cause, one reason.
             silent = [self.link_fault] if self.link_fault else monitor.telemetry_faults(now)
             found += silent + monitor.supply_faults(now) + monitor.reading_faults(now)
             found += monitor.below_rest_faults(now)
-            if self._probe is not None and self._probe.fault:
-                found.append(self._probe.fault)
         elif self.mode is Mode.FAULT:
             if self.link_fault:
                 found.append(self.link_fault)
@@ -319,10 +280,7 @@ class SafetyMachine:
                 self.faults = [*self.faults, reason]
         self._latched = False
         self._drop_plans()
-        self._enter(Mode.FAULT)
-
-    def _enter(self, mode: Mode) -> None:
-        self.mode = mode
+        self.mode = Mode.FAULT
 
 
 def _subject(reason: str) -> str:

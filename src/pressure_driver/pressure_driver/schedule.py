@@ -1,4 +1,4 @@
-"""Timed setpoints: which differential pressures are in force at an instant.
+"""Timed setpoints, and the grid of ticks at which they take effect.
 
 The clock is whatever the caller passes in as nanoseconds. A setpoint takes effect at the first tick
 at or after its stamp.
@@ -10,11 +10,14 @@ import bisect
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import NamedTuple
 
-NANOSECONDS = 1_000_000_000
+from pressure_driver.settings import NANOSECONDS, Settings
+
+CAPACITY = 4096
+"""Setpoints that may wait."""
 REMEMBERED_PLANS = 256
 """Plans that have been replaced and are still known as such."""
 
@@ -68,39 +71,19 @@ class Counters:
     """Places of a plan, counted by `index`, that were not there when a later one took effect."""
 
 
-@dataclass(frozen=True)
-class ScheduleLimits:
-    """What a setpoint must keep to."""
-
-    segment_count: int = 2
-    pressure_limit: float = 24_000.0
-    """[Pa] largest differential pressure."""
-    slew_limit: float = 200_000.0
-    """[Pa/s] between one setpoint and the next."""
-    horizon: float = 10.0
-    """[s] a stamp may lie ahead."""
-    capacity: int = 4096
-    """Setpoints that may wait."""
-
-
-@dataclass
 class SetpointSchedule:
     """A buffer of timed setpoints with zero-order hold or linear interpolation.
 
     Args:
-        limits: that every setpoint is checked against.
-        period: [ns] of the ticks.
-        interpolate: move linearly from one setpoint to the next instead of holding.
+        settings: the ticks, and what every setpoint is checked against.
     """
 
-    limits: ScheduleLimits
-    period: int = 50_000_000
-    interpolate: bool = False
-    counters: Counters = field(default_factory=Counters)
-    reason: str = ""
-    """Why the last setpoint that was not accepted was not."""
-
-    def __post_init__(self) -> None:
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.period = settings.period
+        self.counters = Counters()
+        self.reason = ""
+        """Why the last setpoint that was not accepted was not."""
         self._waiting: list[Setpoint] = []
         self._current: Setpoint | None = None
         self._last_tick = -(2**62)
@@ -162,21 +145,23 @@ class SetpointSchedule:
             stamp = max(self._tick_of(now), self._last_tick + self.period)
             setpoint = replace(setpoint, stamp=stamp)
         ahead = (setpoint.stamp - now) / NANOSECONDS
-        if ahead > self.limits.horizon:
-            return Verdict.REFUSED, (f"{ahead:.2f} s ahead, the limit is {self.limits.horizon:g} s")
+        if ahead > self.settings.horizon:
+            return Verdict.REFUSED, (
+                f"{ahead:.2f} s ahead, the limit is {self.settings.horizon:g} s"
+            )
         if self._tick_of(setpoint.stamp) <= self._last_tick:
             return Verdict.LATE, f"came {-ahead * 1000:.1f} ms after its stamp"
         return self._insert(setpoint, held, untimed)
 
     def _value_problem(self, setpoint: Setpoint) -> str:
         values = setpoint.differential
-        if len(values) != self.limits.segment_count:
-            return f"has {len(values)} pressures, expected {self.limits.segment_count}"
+        if len(values) != self.settings.segment_count:
+            return f"has {len(values)} pressures, expected {self.settings.segment_count}"
         if not all(math.isfinite(value) for value in values):
             return f"is not finite: {list(values)}"
         worst = max(values, key=abs)
-        if abs(worst) > self.limits.pressure_limit:
-            return f"asks for {worst:.0f} Pa, the limit is ±{self.limits.pressure_limit:.0f} Pa"
+        if abs(worst) > self.settings.pressure_limit:
+            return f"asks for {worst:.0f} Pa, the limit is ±{self.settings.pressure_limit:.0f} Pa"
         return ""
 
     def _insert(
@@ -196,7 +181,7 @@ class SetpointSchedule:
                 )
         if setpoint.plan_id in self._replaced:
             return Verdict.REFUSED, "this plan has been replaced by a newer one"
-        if len(self._waiting) >= self.limits.capacity and not replaces:
+        if len(self._waiting) >= CAPACITY and not replaces:
             return Verdict.REFUSED, f"{len(self._waiting)} setpoints are waiting already"
         before = self._waiting[place - 1] if place else None
         following = place + 1 if same_stamp else place
@@ -247,8 +232,8 @@ class SetpointSchedule:
         duration = max(gap, self.period) / NANOSECONDS
         slew = max(abs(a - b) for a, b in zip(after.differential, reference, strict=True))
         slew /= duration
-        if slew > self.limits.slew_limit * (1.0 + 1e-9):
-            return f"changes by {slew:.0f} Pa/s, the limit is {self.limits.slew_limit:.0f} Pa/s"
+        if slew > self.settings.slew_limit * (1.0 + 1e-9):
+            return f"changes by {slew:.0f} Pa/s, the limit is {self.settings.slew_limit:.0f} Pa/s"
         return ""
 
     def _tick_of(self, stamp: int) -> int:
@@ -282,7 +267,7 @@ class SetpointSchedule:
         current = self._current
         if current is None:
             return None
-        if not (self.interpolate and self._waiting):
+        if self.settings.interpolation == "hold" or not self._waiting:
             return Sample(current, current.differential, fresh=bool(due))
         if due or not held:
             begin, start = current.stamp, current.differential
@@ -303,3 +288,73 @@ class SetpointSchedule:
     def forget_ticks(self) -> None:
         """Accept earlier stamps again, as after the wall clock was set back."""
         self._last_tick = -(2**62)
+
+
+class TickGrid:
+    """The absolute time grid of the ticks: when the next is due, and for which instant it stands.
+
+    Ticks fall on whole multiples of the period of the wall clock that stamps messages (ROS time),
+    so they cannot drift against the stamps. How far this clock is from the steady one is taken anew
+    at every tick, so that a clock that is slewed or set moves the grid by itself.
+
+    Args:
+        period: [ns] between ticks.
+
+    Raises:
+        ValueError: the period is not positive.
+    """
+
+    def __init__(self, period: int) -> None:
+        if period <= 0:
+            raise ValueError(f"the tick period must be positive, got {period} ns")
+        self.period = period
+        self.missed = 0
+        """Ticks that were skipped since the thread woke more than a period late."""
+        self.clock_steps = 0
+        """Times that the wall clock jumped by more than a period against the steady clock."""
+        self._last: int | None = None
+        self._offset: int | None = None
+
+    def next_tick(self, wall: int) -> int:
+        """Return the wall time [ns] of the next tick, given the wall time now."""
+        following = (wall // self.period + 1) * self.period
+        if self._last is None:
+            return following
+        return max(self._last + self.period, self._floor(wall))
+
+    def delay(self, wall: int) -> float:
+        """Return the time [s] from now to the next tick; zero or less if it is due.
+
+        Never more than a period: a wall clock that was set back must not stop the ticks.
+        """
+        return min(self.next_tick(wall) - wall, self.period) / NANOSECONDS
+
+    def take(self, wall: int, steady: int) -> int | None:
+        """Return the instant [ns] of the tick that is due now, or None if none is.
+
+        Args:
+            wall: [ns] the clock that stamps messages, now.
+            steady: [ns] the steady clock, now.
+        """
+        self._watch_steps(wall, steady)
+        if self._last is None:
+            if self._offset is None:
+                self._offset = wall - steady
+            self._last = self._floor(wall)
+            return None
+        due = self._floor(wall)
+        if due <= self._last:
+            return None
+        self.missed += (due - self._last) // self.period - 1
+        self._last = due
+        return due
+
+    def _floor(self, wall: int) -> int:
+        return wall // self.period * self.period
+
+    def _watch_steps(self, wall: int, steady: int) -> None:
+        offset = wall - steady
+        if self._offset is not None and abs(offset - self._offset) > self.period:
+            self.clock_steps += 1
+            self._last = self._floor(wall)
+        self._offset = offset

@@ -4,8 +4,13 @@ import numpy as np
 import pytest
 
 from apriltag_tracker.camera import CameraPose, project
-from apriltag_tracker.pose.plane import centreline_pose, locate, planar_pose
+from apriltag_tracker.pose.plane import centreline_pose, locate, planar_poses
 from apriltag_tracker.tag_map import UNIT_CORNERS, LimbTag
+
+
+def planar_pose(corners, size):
+    """Return pose, derivatives and misfit of one square."""
+    return [values[0] for values in planar_poses(corners[None], np.array([size]))]
 
 
 def square(place, size):

@@ -4,7 +4,7 @@ import crcmod.predefined
 import numpy as np
 import pytest
 
-from pressure_driver.protocols.framing import FrameSplitter, crc16, seal, stuff, unstuff
+from pressure_driver.protocols.native import FrameSplitter, crc16, seal, stuff, unstuff
 
 
 def samples():

@@ -183,7 +183,7 @@ def test_native_board_refuses_malformed_setpoints(body):
 
 
 def test_frames_of_another_version_or_type_are_rejected():
-    from pressure_driver.protocols.framing import seal
+    from pressure_driver.protocols.native import seal
 
     host = host_protocol("native")
     assert host.decode(seal(bytes([2, FrameType.STATUS, 0, 0]))) == []

@@ -61,7 +61,7 @@ from der_planner.identification.offline import AMPLITUDE
 from der_planner.limb import Limb, LimbError
 from der_planner.planning.loads import nearly_buckling
 from der_planner.results.outputs import OutputError, check_file, check_folder
-from pressure_driver.schedule import ScheduleLimits
+from pressure_driver.settings import Settings
 
 LIGHTEST = 1e-3
 """A limb of less [kg] is a mistake in the unit."""
@@ -290,7 +290,7 @@ def _play_on_graph(prior: Limb, given: argparse.Namespace) -> Path:
     progress = Progress()
     hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
     driver = hardware.driver if hardware else {}
-    defaults = ScheduleLimits()
+    defaults = Settings()
     count = int(driver.get("segment_count", defaults.segment_count))
     if count != prior.segment_count:
         raise OptionError(

@@ -11,17 +11,15 @@ from rclpy.parameter import Parameter
 from der_msgs.msg import ChamberPressures
 from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
-from limb_interfaces.overrides import check_overrides
-from limb_interfaces.parameters import declare
 from limb_interfaces.runner import run_node
 from limb_interfaces.stamps import stamp_from_nanoseconds
-from pressure_driver.emulator.board import EmulatedBoard, ReceivedCommand
-from pressure_driver.emulator.faults import FaultError, Faults
+from pressure_driver.emulator.board import EmulatedBoard, FaultError, Faults, ReceivedCommand
 from pressure_driver.emulator.pneumatics import BoardPneumatics
 from pressure_driver.emulator.port import EmulatedPort
 from pressure_driver.emulator.runner import BoardRunner
-from pressure_driver.protocols import NAMES, board_protocol
-from pressure_driver.realtime import prepare_process
+from pressure_driver.node import read_settings
+from pressure_driver.protocols import board_protocol
+from pressure_driver.settings import EmulatorSettings
 
 
 class BoardEmulator(Node):
@@ -30,14 +28,12 @@ class BoardEmulator(Node):
     def __init__(self) -> None:
         super().__init__("board_emulator", namespace=topics.NAMESPACE)
         self.fatal_error = ""
-        self._declare()
-        check_overrides(self)
-        segment_count, seed = self._value("segment_count"), self._value("seed")
-        pneumatics = BoardPneumatics(segment_count, seed)
-        protocol = board_protocol(self._value("protocol"), 2 * segment_count)
-        self._board = EmulatedBoard(protocol, pneumatics, seed)
-        faults = self._parse(self._value("faults"))  # before the port stands where others see it
-        self._port = EmulatedPort(self._value("port_link"), self._value("baud_rate"))
+        settings = read_settings(self, EmulatorSettings)
+        pneumatics = BoardPneumatics(settings.segment_count, settings.seed)
+        protocol = board_protocol(settings.protocol, 2 * settings.segment_count)
+        self._board = EmulatedBoard(protocol, pneumatics, settings.seed)
+        faults = self._parse(settings.faults)  # before the port stands where others see it
+        self._port = EmulatedPort(settings.port_link, settings.baud_rate)
         self._air: deque[tuple[int, list[float]]] = deque(maxlen=100)
         self._commands: deque[ReceivedCommand] = deque(maxlen=1000)
         self._sequences = [0, 0]
@@ -53,44 +49,15 @@ class BoardEmulator(Node):
             self._port,
             self._on_air,
             self._on_command,
-            self._value("real_time_priority"),
-            self._value("reset_on_open"),
+            settings.real_time_priority,
+            settings.reset_on_open,
         )
         self._runner.set_faults(faults)
         self.add_on_set_parameters_callback(self._on_parameters)
-        prepare_process(self._value("real_time_priority"))
         self._runner.start()
         DiagnosticsPublisher(self, self._report, hardware_id=str(self._port.link))
         self.create_timer(0.2, self._watch)
-        self.get_logger().info(f"{self._value('protocol')} board on {self._port.link}")
-
-    def _declare(self) -> None:
-        declare(self, "port_link", "/tmp/der_limb_board_0", "symbolic link to the pseudo-terminal")
-        declare(self, "protocol", "ezloop", "language of the board", choices=NAMES)
-        declare(
-            self,
-            "baud_rate",
-            115200,
-            "[baud] pace of the bytes, 0: none",
-            at_least=0,
-            at_most=4_000_000,
-        )
-        declare(self, "segment_count", 2, "M, pairs of chambers", at_least=1, at_most=16)
-        declare(self, "seed", 0, "of sensors, valves and the day's atmosphere", at_least=0)
-        declare(self, "reset_on_open", True, "opening the port restarts the board")
-        declare(
-            self, "real_time_priority", 10, "SCHED_FIFO priority, 0: none", at_least=0, at_most=90
-        )
-        declare(
-            self,
-            "faults",
-            "",
-            "comma-separated, e.g. 'stick:1,leak:2'; may be set at run time",
-            read_only=False,
-        )
-
-    def _value(self, name: str) -> object:
-        return self.get_parameter(name).value
+        self.get_logger().info(f"{settings.protocol} board on {self._port.link}")
 
     def _parse(self, text: str) -> Faults:
         return Faults.parse(text.split(","), self._board.pneumatics.chamber_count)

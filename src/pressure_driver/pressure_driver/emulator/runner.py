@@ -11,12 +11,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from pressure_driver.emulator.board import EmulatedBoard, ReceivedCommand
-from pressure_driver.emulator.faults import Faults
+from pressure_driver.emulator.board import EmulatedBoard, Faults, ReceivedCommand
 from pressure_driver.emulator.port import EmulatedPort
-from pressure_driver.realtime import prefer_thread
+from pressure_driver.ports import prefer_thread
+from pressure_driver.settings import NANOSECONDS
 
-NANOSECONDS = 1_000_000_000
 TELEMETRY_PERIOD = 50_000_000
 """[ns] 20 Hz, as boards report."""
 AIR_PERIOD = 20_000_000

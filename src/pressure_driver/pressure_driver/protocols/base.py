@@ -11,6 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
+STANDARD_ATMOSPHERE = 101_325.0
+"""[Pa]"""
+LONGEST_LINE = 512
+"""[bytes] A longer line is garbage: its bytes are dropped up to the next line end."""
+LONGEST_SHOWN = 80
+"""[characters] of a damaged line that are kept to be shown."""
+
 
 @dataclass(frozen=True)
 class Telemetry:
@@ -70,6 +77,77 @@ class BoardIdentity:
 Event = Telemetry | Echo | BoardReport | BoardReset | BoardText | BoardIdentity
 
 
+class StreamCutter:
+    """Collects bytes and returns complete pieces with the place of their first byte.
+
+    Args:
+        end: the byte after each piece.
+        longest: bytes; of a longer piece everything up to its end is dropped.
+    """
+
+    def __init__(self, end: bytes, longest: int) -> None:
+        self._end = end
+        self._longest = longest
+        self._buffer = bytearray()
+        self._position = 0
+        self._overlong = False
+
+    def feed(self, data: bytes) -> list[tuple[int, bytes | None]]:
+        """Return (place of the first byte, piece without its end); None for one too long."""
+        pieces: list[tuple[int, bytes | None]] = []
+        self._buffer += data
+        while (end := self._buffer.find(self._end)) >= 0:
+            too_long = self._overlong or end > self._longest
+            pieces.append((self._position, None if too_long else bytes(self._buffer[:end])))
+            del self._buffer[: end + 1]
+            self._position += end + 1
+            self._overlong = False
+        if len(self._buffer) > self._longest:
+            self._position += len(self._buffer)
+            self._buffer.clear()
+            self._overlong = True
+        return pieces
+
+    def reset(self) -> None:
+        """Forget a half-received piece."""
+        self._position += len(self._buffer)
+        self._buffer.clear()
+        self._overlong = False
+
+
+class LineSplitter:
+    """Collects bytes and returns complete lines with the place of their first byte.
+
+    Lines end with a line feed; carriage returns and blanks at either end are dropped, and so are
+    empty lines. Bytes outside printable ASCII (and tab) make a line damaged.
+    """
+
+    def __init__(self) -> None:
+        self._pieces = StreamCutter(b"\n", LONGEST_LINE)
+        self.damaged = 0
+
+    def feed(self, data: bytes) -> list[tuple[int, str]]:
+        """Return the lines completed by ``data`` as (place of the first byte, text)."""
+        lines: list[tuple[int, str]] = []
+        for start, raw in self._pieces.feed(data):
+            if raw is None:
+                self.damaged += 1
+                continue
+            leading = len(raw) - len(raw.lstrip())
+            text = raw.strip()
+            if not text:
+                continue
+            if any(byte != 9 and not 32 <= byte < 127 for byte in text):
+                self.damaged += 1
+                continue
+            lines.append((start + leading, text.decode("ascii")))
+        return lines
+
+    def reset(self) -> None:
+        """Forget a half-received line."""
+        self._pieces.reset()
+
+
 class HostProtocol(ABC):
     """The driver's end: encodes commands, decodes what the board says.
 
@@ -92,9 +170,11 @@ class HostProtocol(ABC):
     """What makes the board drop or finish whatever was sent by halves."""
     echoes: ClassVar[bool] = False
     """Whether the board repeats every command (`Echo`)."""
+    tells_pascals: ClassVar[bool] = False
+    """Whether pressures are told finely enough that those of a working sensor always tremble."""
     measures_room_at_start: ClassVar[bool] = False
     """Whether the board takes what it reads when it starts for the room's pressure."""
-    assumed_atmosphere: float = 101_325.0
+    assumed_atmosphere: float = STANDARD_ATMOSPHERE
     """[Pa] added to the reports of boards that only know gauge pressures."""
 
     def __init__(self, chamber_count: int = 4) -> None:
@@ -148,6 +228,36 @@ class HostProtocol(ABC):
             raise ValueError(
                 f"expected {self.chamber_count // 2} differences, got {len(differential)}"
             )
+
+
+class LineHost(HostProtocol):
+    """The driver's end of a protocol whose board sends text lines."""
+
+    def __init__(self, chamber_count: int = 4) -> None:
+        super().__init__(chamber_count)
+        self._lines = LineSplitter()
+        self._malformed = 0
+
+    def decode(self, data: bytes) -> list[Event]:
+        """Return what complete lines say; damaged lines are counted in ``rejected``."""
+        events: list[Event] = []
+        for _, line in self._lines.feed(data):
+            event = self._parse(line)
+            if event is None:
+                self._malformed += 1
+                self.last_damaged = line[:LONGEST_SHOWN]
+            else:
+                events.append(event)
+        self.rejected = self._malformed + self._lines.damaged
+        return events
+
+    @abstractmethod
+    def _parse(self, line: str) -> Event | None:
+        """Return what a line says; None: it is damaged."""
+
+    def reset(self) -> None:
+        """Forget a half-received line."""
+        self._lines.reset()
 
 
 @dataclass(frozen=True)

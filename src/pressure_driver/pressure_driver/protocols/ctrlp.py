@@ -38,9 +38,10 @@ from pressure_driver.protocols.base import (
     BoardText,
     Echo,
     Event,
+    LineHost,
+    LineSplitter,
     Telemetry,
 )
-from pressure_driver.protocols.lines import LineHost, LineSplitter
 
 PASCAL_PER_KILOPASCAL = 1000.0
 PASCAL_PER_PSI = 6894.757
@@ -161,7 +162,9 @@ class CtrlpHost(LineHost):
         expected = 1 if kind == "2" else self.chamber_count
         if len(values) != expected or any(abs(value) > LARGEST_GAUGE for value in values):
             return None
-        if kind == "0":
+        # A board whose clock stands still repeats itself.
+        stands_still = len(self._times) == 4 and {int(time), *self._times} == {int(time)}
+        if kind == "0" or (kind == "1" and stands_still):
             return Telemetry()  # sound, and nothing that was measured
         pressure = tuple(
             self.assumed_atmosphere + value * PASCAL_PER_KILOPASCAL for value in values

@@ -29,9 +29,9 @@ from pressure_driver.protocols.base import (
     BoardReset,
     BoardText,
     Event,
+    LineHost,
     Telemetry,
 )
-from pressure_driver.protocols.lines import LineHost
 
 PASCAL_PER_HECTOPASCAL = 100.0
 LARGEST_WIRE_VALUE = 1250.0
@@ -59,6 +59,7 @@ class EzloopHost(LineHost):
         "no checksum: a damaged number can pass for a pressure",
     )
     reports_supply = True
+    tells_pascals = True
     measures_room_at_start = True
 
     def __init__(self, chamber_count: int = 4) -> None:

@@ -1,15 +1,20 @@
 """Our own protocol for new firmware: binary frames with a checksum and a watchdog on the board.
 
+Frames are stuffed (Cheshire and Baker 1999) so that they hold no zero byte, and end with one.
+
 The specification, for authors of firmware and with test vectors, is doc/native_protocol.md.
 """
 
 from __future__ import annotations
 
+import binascii
 import struct
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+
+from cobs import cobs
 
 from pressure_driver.protocols.base import (
     BoardCommand,
@@ -21,9 +26,9 @@ from pressure_driver.protocols.base import (
     Echo,
     Event,
     HostProtocol,
+    StreamCutter,
     Telemetry,
 )
-from pressure_driver.protocols.framing import FrameSplitter, seal
 
 VERSION = 1
 HEADER = struct.Struct("<BBH")
@@ -34,6 +39,73 @@ LARGEST_GAUGE = 1_000_000
 """[Pa] A frame with more is refused."""
 LONGEST_VALIDITY = 60_000
 """[ms] A setpoint may stay valid at most this long."""
+
+
+def crc16(data: bytes) -> int:
+    """Return CRC-16/CCITT-FALSE: polynomial 0x1021, start 0xFFFF, nothing reflected or inverted.
+
+    Check value: ``crc16(b"123456789") == 0x29B1``.
+    """
+    return binascii.crc_hqx(data, 0xFFFF)
+
+
+def stuff(data: bytes) -> bytes:
+    """Return ``data`` coded without zero bytes; on the wire one zero byte ends it."""
+    coded: bytes = cobs.encode(data)
+    return coded
+
+
+def unstuff(coded: bytes) -> bytes | None:
+    """Return the data of a coded frame (without its ending zero), or None if it is damaged."""
+    if not coded:
+        return None
+    try:
+        data: bytes = cobs.decode(coded)
+    except cobs.DecodeError:
+        return None
+    return data
+
+
+class FrameSplitter:
+    """Cuts a byte stream at zero bytes and checks each frame.
+
+    Args:
+        longest: coded bytes; longer frames are dropped as garbage.
+    """
+
+    def __init__(self, longest: int = 256) -> None:
+        self._pieces = StreamCutter(b"\0", longest)
+        self.rejected = 0
+
+    def feed(self, data: bytes) -> list[tuple[int, bytes]]:
+        """Return (place of the first byte, payload without CRC) of every sound frame."""
+        frames: list[tuple[int, bytes]] = []
+        for start, coded in self._pieces.feed(data):
+            if coded == b"":
+                continue
+            payload = None if coded is None else _open(coded)
+            if payload is None:
+                self.rejected += 1
+            else:
+                frames.append((start, payload))
+        return frames
+
+    def reset(self) -> None:
+        """Forget a half-received frame."""
+        self._pieces.reset()
+
+
+def _open(coded: bytes) -> bytes | None:
+    data = unstuff(coded)
+    if data is None or len(data) < 3:
+        return None
+    payload, check = data[:-2], data[-2:]
+    return payload if crc16(payload).to_bytes(2, "little") == check else None
+
+
+def seal(payload: bytes) -> bytes:
+    """Return the wire bytes of a payload: CRC appended (low byte first), stuffed, ended by zero."""
+    return stuff(payload + crc16(payload).to_bytes(2, "little")) + b"\0"
 
 
 class FrameType(IntEnum):
@@ -116,6 +188,7 @@ class NativeHost(HostProtocol):
 
     name = "native"
     reports_supply = True
+    tells_pascals = True
     has_watchdog = True
     introduces_itself = True
     separator = b"\0"

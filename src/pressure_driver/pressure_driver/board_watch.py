@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
-
-import numpy as np
-from numpy.typing import NDArray
+from collections.abc import Sequence
 
 from pressure_driver.protocols.base import BoardIdentity, Echo, HostProtocol
+from pressure_driver.settings import Settings
 
 IDENTITY_RETRY = 1.0
 """[s] after which a board that has not introduced or set itself up is greeted again."""
@@ -20,25 +20,22 @@ class BoardWatch:
 
     Args:
         protocol: the driver's end of the board's language.
-        pressure_limit: [Pa] that the board must reach.
-        vented_tolerance: [Pa] gauge that counts as vented.
+        settings: what the board must reach, and what counts as vented.
     """
 
-    def __init__(
-        self, protocol: HostProtocol, pressure_limit: float, vented_tolerance: float
-    ) -> None:
+    def __init__(self, protocol: HostProtocol, settings: Settings) -> None:
         self.identity: BoardIdentity | None = None
         self.round_trip = float("nan")
         """[s] from the last command that was echoed to its echo."""
         self._protocol = protocol
-        self._pressure_limit = pressure_limit
-        self._vented_tolerance = vented_tolerance
+        self._settings = settings
         self._awaiting_echo: deque[tuple[int | None, float]] = deque(maxlen=64)
         self._echo_awaited_since: float | None = None
         self._asked_at = 0.0
         self._problem = ""
         self._starting = False
-        self._at_start = np.full(protocol.chamber_count, -np.inf)
+        self._unknown = [-math.inf] * protocol.chamber_count
+        self._at_start = self._unknown
 
     def opened(self, now: float) -> None:
         """The port has been opened: nothing is known about the board."""
@@ -55,7 +52,7 @@ class BoardWatch:
 
     # ----------------------------------------------------------------------------- its start
 
-    def has_reset(self, last_reading: NDArray[np.float64], now: float) -> None:
+    def has_reset(self, last_reading: Sequence[float], now: float) -> None:
         """The board has started anew while the port was open.
 
         Args:
@@ -65,7 +62,7 @@ class BoardWatch:
         self._forget_identity(now)
         self.greet_now(now)
         self._starting = True
-        self._at_start = np.nan_to_num(last_reading, nan=-np.inf)
+        self._at_start = [-math.inf if math.isnan(value) else value for value in last_reading]
 
     def greet_now(self, now: float) -> None:
         """Have what the board does not confirm asked at the next tick (steady clock [s])."""
@@ -75,15 +72,15 @@ class BoardWatch:
         """The board sends the words of its start."""
         if not self._starting:
             self._starting = True
-            self._at_start = np.full(self._protocol.chamber_count, -np.inf)
+            self._at_start = self._unknown
 
-    def reports(self, reading: NDArray[np.float64]) -> None:
+    def reports(self, reading: Sequence[float]) -> None:
         """The board reports chamber pressures (2M,) [Pa] absolute: its start is over."""
         if self._starting:
             self._starting = False
-            self._at_start = np.maximum(self._at_start, reading)
+            self._at_start = list(map(max, self._at_start, reading))
 
-    def started_under_pressure(self, rest: NDArray[np.float64]) -> str:
+    def started_under_pressure(self, rest: Sequence[float]) -> str:
         """Return the warning that the board may have taken trapped air for the room's, or nothing.
 
         Whether it has shows when it fills a chamber: see `LeakWatch`.
@@ -93,8 +90,9 @@ class BoardWatch:
         """
         if not self._protocol.measures_room_at_start:
             return ""
-        gauge = float(np.max(self._at_start - rest))  # NaN while the rest is not known
-        if not gauge > self._vented_tolerance:
+        gauge = max(start - known for start, known in zip(self._at_start, rest, strict=True))
+        # NaN while the rest is not known.
+        if not gauge > self._settings.vented_tolerance:
             return ""
         return (
             f"the board started with {gauge:.0f} Pa in its chambers: if it takes that for the "
@@ -152,10 +150,10 @@ class BoardWatch:
                 f"the board has {identity.chamber_count} chambers, the driver expects "
                 f"{expected}: set the parameter 'segment_count'"
             )
-        elif identity.largest_pressure < self._pressure_limit:
+        elif identity.largest_pressure < (wanted := self._settings.pressure_limit):
             problem = (
                 f"the board reaches {identity.largest_pressure:.0f} Pa, less than 'pressure_limit' "
-                f"({self._pressure_limit:.0f} Pa): lower the parameter"
+                f"({wanted:.0f} Pa): lower the parameter"
             )
         self._problem = problem
 

@@ -1,0 +1,430 @@
+"""The process that owns the port of a valve board: it ticks, plays, watches and vents.
+
+The ROS node starts it and talks with it over a socket; it has no ROS, no threads and one `select`
+loop, so that nothing which holds up the node holds up the limb. It can also be started alone, to
+try a board without ROS:
+
+    ros2 run pressure_driver board --port /dev/ttyACM0 --protocol ezloop --hold-time 60
+
+Then it takes lines: ``arm``, ``vent``, or one differential pressure [Pa] for each segment.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import gc
+import os
+import select
+import signal
+import socket
+import sys
+import time
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import serial
+
+from pressure_driver import ports
+from pressure_driver.admission import Origin
+from pressure_driver.channel import Channel, Terminal
+from pressure_driver.core import DriverCore
+from pressure_driver.ports import PortError
+from pressure_driver.protocols import host_protocol
+from pressure_driver.schedule import Setpoint, TickGrid, Verdict
+from pressure_driver.settings import NANOSECONDS, SettingError, Settings, add_options, from_options
+
+FIRST_RETRY = 0.1
+"""[s] after a lost port until it is looked for again."""
+LAST_RETRY = 2.0
+"""[s] between looks after a long absence."""
+LONGEST_WAIT = 0.03
+"""[s] after which the loop turns at the latest: to look for a lost port, to show life."""
+UNREAD_TIME = 1.0
+"""[s] that bytes may wait in the port's output queue until the board counts as not reading."""
+NODE_PATIENCE = 1.0
+"""[s] without a message from the node, after which setpoints that wait are dropped: nobody could
+stop them. The limb is then held and let down as when setpoints stop."""
+DIAGNOSTICS_PERIOD = 0.5
+"""[s] between two messages with the diagnostics."""
+REFUSAL_PERIOD = 1.0
+"""[s] between two lines of the log about refused setpoints."""
+MOST_MESSAGES = 100
+"""Messages that are served before the next look at the clock."""
+VENT_REPEATS = 3
+"""How often the vent command is sent at the end: there may be no checksum, and no second chance."""
+LAST_WORDS_TIME = 0.5
+"""[s] that the operating system may take to send them."""
+EMPTYING_TIME = 3.0
+"""[s] in which pressures must begin to fall at the end: boards take up to 1.7 s to obey."""
+EMPTYING_SHARE = 0.8
+"""Of the pressure at the end, below which it counts as falling."""
+
+
+class BoardProcess:
+    """Plays setpoints on a board until it is told to end.
+
+    Args:
+        settings: the parameters.
+        channel: to the node, or the terminal.
+    """
+
+    def __init__(self, settings: Settings, channel: Channel | Terminal) -> None:
+        protocol = host_protocol(settings.protocol, 2 * settings.segment_count)
+        self.core = DriverCore(protocol, settings, log=self._log)
+        self.grid = TickGrid(settings.period)
+        self.ending = False
+        """Set to end in order."""
+        self._channel = channel
+        self._port = ports.stable_name(settings.port)
+        self._baud_rate = settings.baud_rate or protocol.baud_rate
+        self._device: serial.Serial | None = None
+        self._bytes_waiting: select.epoll | None = None
+        self._bytes_sent = self._bytes_received = self._reconnects = 0
+        self._unsent = b""
+        self._drained_at = 0.0
+        self._was_venting = True
+        self._emergency = b""
+        self._retry_delay, self._retry_at = FIRST_RETRY, 0.0
+        self._name_exists = True
+        self._heard_at = self._said_at = time.monotonic()
+        self._diagnosed_at = self._refused_at = 0.0
+        self._node_is_silent = False
+        self._late_to_wake: deque[float] = deque(maxlen=1200)
+        self._late_to_write: deque[float] = deque(maxlen=1200)
+        self._real_time = ports.prefer_thread(settings.real_time_priority)
+
+    def run(self) -> int:
+        """Serve the port until the end; return the exit code."""
+        try:
+            self._device = ports.open_port_when_free(self._port, self._baud_rate)
+        except PortError as error:
+            self._send("failed", str(error))
+            return 1
+        try:
+            self._opened()
+            gc.collect()
+            gc.freeze()
+            while not self.ending:
+                self._turn()
+            problem = self._empty()
+        except EOFError:
+            return self._replace_node()
+        finally:
+            reached = self._send_last_words()
+            self._release(drop=not reached)
+        if not reached:
+            alone = " (a board with a watchdog vents by itself)"
+            problem = (
+                f"the board on {self._port} cannot be reached and may hold its pressures"
+                f"{alone if self.core.protocol.has_watchdog else ''}: {ports.ADVICE}"
+            )
+        self._send("ended", problem)
+        return 1 if problem else 0
+
+    def _send(self, *message: Any, descriptor: int | None = None) -> None:
+        self._said_at = time.monotonic()
+        self._channel.send(*message, descriptor=descriptor)
+
+    def _log(self, text: str, warning: bool) -> None:
+        self._send("log", text, warning)
+
+    # ------------------------------------------------------------------------------ the loop
+
+    def _turn(self) -> None:
+        """Wait for bytes, a message or the tick, and serve what came."""
+        self._look_for_port()
+        delay = min(max(self.grid.delay(time.time_ns()), 0.0), LONGEST_WAIT)
+        watched: list[Any] = [self._channel]
+        if self._bytes_waiting is not None:
+            watched.append(self._bytes_waiting)
+        readable, _, _ = select.select(watched, [], [], delay)
+        wall = time.time_ns()
+        instant = self.grid.take(wall, time.monotonic_ns())
+        if instant is not None:
+            self._late_to_wake.append((wall - instant) / NANOSECONDS)
+            self._tick(instant)
+        if self._channel in readable:
+            self._serve_messages()
+        if self._bytes_waiting is not None and self._bytes_waiting in readable:
+            self._read()
+        self._show_life()
+
+    def _tick(self, instant: int) -> None:
+        """Write the tick's command; the first vent command overtakes what waits to be sent."""
+        data = self.core.tick(instant)
+        venting = self.core.venting
+        if venting and not self._was_venting:
+            self._drop_unsent()
+            data = self.core.protocol.separator + data
+        self._was_venting = venting
+        self._watch_queue()
+        self._write(data)
+        self._late_to_write.append((time.time_ns() - instant) / NANOSECONDS)
+        self.core.sent()
+        self._send("state", vars(self.core.snapshot()), self._bytes_sent, self._bytes_received)
+        self._renew_emergency()
+        now = time.monotonic()
+        if now - self._diagnosed_at >= DIAGNOSTICS_PERIOD:
+            self._diagnosed_at = now
+            self._diagnose()
+
+    def _diagnose(self) -> None:
+        level, text, values = self.core.diagnostics()
+        values |= {
+            "ticks_missed": self.grid.missed,
+            "clock_steps": self.grid.clock_steps,
+            "reconnects": self._reconnects,
+            "real_time_priority": self._real_time,
+        }
+        for name, times in (("wake", self._late_to_wake), ("write", self._late_to_write)):
+            recent = sorted(times)
+            for label, share in {"p50": 0.5, "p99": 0.99, "max": 1.0}.items():
+                late = recent[round(share * (len(recent) - 1))]
+                values[f"tick_to_{name}_{label}_ms"] = f"{1000.0 * late:.3f}"
+        self._send("diagnostics", level, text, values)
+
+    # ------------------------------------------------------------------------------ the node
+
+    def _serve_messages(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            for _ in range(MOST_MESSAGES):
+                (word, *content), _ = self._channel.receive()
+                self._heard_at = time.monotonic()
+                self._serve(word, content)
+
+    def _serve(self, word: str, content: list[Any]) -> None:
+        if word == "setpoint":
+            stamp, differential, plan_id, index, revision, *origin = content
+            setpoint = Setpoint(stamp, tuple(differential), plan_id, index, revision)
+            self._offer(setpoint, Origin(*origin))
+        elif word == "arm":
+            self._send("answer", *self.core.arm())
+        elif word == "vent":
+            answer = self.core.vent()
+            self._drop_unsent()
+            self._write(self.core.emergency())
+            self._send("answer", *answer)
+        elif word == "end":
+            self.ending = True
+
+    def _offer(self, setpoint: Setpoint, origin: Origin) -> None:
+        verdict = self.core.offer(setpoint, time.time_ns(), origin)
+        now = time.monotonic()
+        if verdict is not Verdict.ACCEPTED and now - self._refused_at >= REFUSAL_PERIOD:
+            self._refused_at = now
+            self._log(f"{verdict.value}: {self.core.last_refusal}", True)
+
+    def _show_life(self) -> None:
+        """Say something at least every `LONGEST_WAIT`, and notice a node that says nothing."""
+        now = time.monotonic()
+        if now - self._said_at >= LONGEST_WAIT:
+            self._send("alive")
+        silent = isinstance(self._channel, Channel) and now - self._heard_at > NODE_PATIENCE
+        if silent:
+            self.core.drop_setpoints()
+            if not self._node_is_silent:
+                self._log(f"the node said nothing for {NODE_PATIENCE:g} s", True)
+        self._node_is_silent = silent
+
+    def _replace_node(self) -> int:
+        """Vent in the place of a node that has ended without a goodbye, and say so."""
+        outcome = ports.vent_port(
+            -1 if self._device is None else self._device.fileno(), self.core.emergency()
+        )
+        if self._device is not None:
+            ports.release_port(self._device, drop=False)
+            self._device = None
+        # Whoever reads the standard error may stand still, and the limb is vented: do not wait.
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.alarm(1)
+        with contextlib.suppress(OSError):
+            os.write(2, f"board: the driver's node has ended: {outcome}\n".encode())
+        return 1
+
+    def _renew_emergency(self) -> None:
+        """Tell the node the vent command again if it has changed: it names the room's pressure."""
+        if self.core.protocol.has_watchdog and self._emergency:
+            return  # it names a number, and any will do
+        if (command := self.core.emergency()) != self._emergency:
+            self._emergency = command
+            self._send("port", command.hex())
+
+    # ------------------------------------------------------------------------------ the port
+
+    def _opened(self) -> None:
+        assert self._device is not None
+        # Edge-triggered: to ask a terminal that has no bytes (as `select` on it does) makes the
+        # kernel finish pending deliveries first, which on busy cores takes milliseconds.
+        self._bytes_waiting = select.epoll()
+        self._bytes_waiting.register(self._device.fileno(), select.EPOLLIN | select.EPOLLET)
+        self._drained_at = time.monotonic()
+        self._write(self.core.opening())
+        if self._device is not None:
+            self._emergency = self.core.emergency()
+            self._send("port", self._emergency.hex(), descriptor=self._device.fileno())
+
+    def _watch_queue(self) -> None:
+        """Lose the port if what has been written stays where it is: the board does not read."""
+        if self._device is None:
+            return
+        now = time.monotonic()
+        waiting = len(self._unsent)
+        with contextlib.suppress(OSError):
+            waiting += self._device.out_waiting
+        if not waiting:
+            self._drained_at = now
+        elif now - self._drained_at > UNREAD_TIME:
+            self._lose(
+                f"the board on {self._port} does not read: {waiting} bytes have been waiting for "
+                f"{UNREAD_TIME:g} s"
+            )
+
+    def _drop_unsent(self) -> None:
+        """Throw away what waits to be sent; a frame may be cut, so a separator must follow."""
+        self._unsent = b""
+        if self._device is not None:
+            with contextlib.suppress(Exception):
+                self._device.reset_output_buffer()
+
+    def _read(self) -> None:
+        """Take the bytes that are there; none means that the device has gone."""
+        assert self._device is not None
+        assert self._bytes_waiting is not None
+        self._bytes_waiting.poll(0)
+        try:
+            data = self._device.read(max(self._device.in_waiting, 1))
+        except (serial.SerialException, OSError) as error:
+            self._lose(f"reading from {self._port} failed: {error}")
+            return
+        if data:
+            self._retry_delay = FIRST_RETRY
+        self._bytes_received += len(data)
+        self.core.received(data)
+
+    def _write(self, data: bytes) -> None:
+        """Hand bytes to the operating system without ever waiting for it.
+
+        What it does not take is sent before the next command; if that is not taken either, the
+        port counts as lost. (pyserial's own `write` waits for the terminal after each write.)
+        """
+        if self._device is None or not data:
+            return
+        left_over = len(self._unsent)
+        pending = self._unsent + data
+        try:
+            count = os.write(self._device.fileno(), pending)
+        except BlockingIOError:
+            count = 0
+        except (serial.SerialException, OSError) as error:
+            self._lose(f"writing to {self._port} failed: {error}")
+            return
+        self._bytes_sent += count
+        self._unsent = pending[count:]
+        if count < left_over:
+            self._lose(f"{self._port} takes no bytes: the board does not read")
+
+    def _lose(self, reason: str) -> None:
+        """Close what is left of the port and arrange for the next attempt."""
+        self._release(drop=True)
+        self._send("lost")
+        self._unsent = b""
+        self._name_exists = os.path.exists(self._port)
+        self._retry_at = time.monotonic() + self._retry_delay
+        self._log(reason, True)
+        self.core.lost(f"serial link lost: {reason}")
+
+    def _release(self, drop: bool) -> None:
+        if self._bytes_waiting is not None:
+            self._bytes_waiting.close()
+        if self._device is not None:
+            ports.release_port(self._device, drop)
+        self._bytes_waiting = self._device = None
+
+    def _look_for_port(self) -> None:
+        """Open the port as soon as its name is there again; if it does not open, later again."""
+        if self._device is not None:
+            return
+        exists = os.path.exists(self._port)
+        if exists and not self._name_exists:
+            self._retry_at, self._retry_delay = 0.0, FIRST_RETRY
+        self._name_exists = exists
+        if not exists or time.monotonic() < self._retry_at:
+            return
+        self._retry_delay = min(self._retry_delay * 1.6, LAST_RETRY)
+        self._retry_at = time.monotonic() + self._retry_delay
+        with contextlib.suppress(PortError):
+            self._device = ports.open_port(self._port, self._baud_rate)
+            self._reconnects += 1
+            self._log(f"{self._port} is back", True)
+            self._opened()
+
+    # ------------------------------------------------------------------------------- the end
+
+    def _empty(self) -> str:
+        """Vent, and go on until the pressures fall; return what to do if they do not."""
+        self.core.vent()
+        self._drop_unsent()
+        self._write(self.core.emergency())
+        before, deadline = self.core.highest_pressure(), time.monotonic() + EMPTYING_TIME
+        while self.core.highest_pressure() > EMPTYING_SHARE * before:
+            if time.monotonic() > deadline:
+                left = self.core.highest_pressure()
+                return f"the chambers on {self._port} keep {left:.0f} Pa: {ports.ADVICE}"
+            self._turn()
+        return ""
+
+    def _send_last_words(self) -> bool:
+        """Return whether the last vent commands have left the operating system in time."""
+        if self._device is None and os.path.exists(self._port):
+            with contextlib.suppress(PortError):
+                self._device = ports.open_port(self._port, self._baud_rate)
+        if self._device is None:
+            return False
+        self._drop_unsent()
+        farewell = self.core.emergency() * VENT_REPEATS
+        deadline = time.monotonic() + LAST_WORDS_TIME
+        with contextlib.suppress(OSError, serial.SerialException):
+            while farewell or self._device.out_waiting:
+                if time.monotonic() > deadline:
+                    return False
+                with contextlib.suppress(BlockingIOError):
+                    farewell = farewell[os.write(self._device.fileno(), farewell) :]
+                time.sleep(0.002)
+            # The last bytes may still be in the port's hardware buffer.
+            time.sleep(64 * 10 / self._baud_rate)
+            return True
+        return False
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the process: started by the node, or by hand in a terminal."""
+    parser = argparse.ArgumentParser(
+        prog="board", description="Drive a valve board: arm, vent, or one pressure [Pa] a segment."
+    )
+    add_options(parser)
+    parser.add_argument("--socket", type=int, help="of the node that starts this process")
+    given = parser.parse_args(arguments)
+    try:
+        settings = from_options(given)
+    except SettingError as error:
+        parser.error(str(error))
+    channel: Channel | Terminal = Terminal()
+    if given.socket is not None:
+        channel = Channel(socket.socket(fileno=given.socket))
+        channel.socket.setblocking(False)
+    process = BoardProcess(settings, channel)
+
+    def end(*_: object) -> None:
+        process.ending = True
+
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
+        # What ends the node must not end the process before it: the node says when.
+        by_hand = given.socket is None or number == signal.SIGTERM
+        signal.signal(number, end if by_hand else signal.SIG_IGN)
+    return process.run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

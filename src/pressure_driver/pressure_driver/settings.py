@@ -1,0 +1,279 @@
+"""The parameters of the driver and of the emulated board, each declared once.
+
+From here come what the nodes declare, the options of the `board` command, the limits of the state
+machine, the files under `config/` and the table in the README. After a change, write the last two:
+
+    python3 -m pressure_driver.settings
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import MISSING, Field, dataclass, field, fields
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+from pressure_driver.protocols import NAMES
+
+NANOSECONDS = 1_000_000_000
+BEGIN, END = "<!-- parameters: begin -->\n", "<!-- parameters: end -->\n"
+"""Around the table in the README."""
+
+
+class SettingError(ValueError):
+    """A parameter has a value that the driver cannot work with; the message names both."""
+
+
+class Declaration(NamedTuple):
+    """What is known of one parameter beside its type and default."""
+
+    text: str
+    """What it means and how to choose it, for `ros2 param describe` and the README."""
+    unit: str = ""
+    range: tuple[float, float] | None = None
+    """Smallest and largest admissible number."""
+    choices: tuple[str, ...] = ()
+    """Admissible texts."""
+    changeable: bool = False
+    """Whether it may be set while the node runs."""
+
+    @property
+    def description(self) -> str:
+        """The meaning with the unit."""
+        return f"[{self.unit}] {self.text}" if self.unit else self.text
+
+
+def _number(default: Any, unit: str, low: float, high: float, text: str) -> Any:
+    return field(default=default, metadata={"declaration": Declaration(text, unit, (low, high))})
+
+
+def _other(default: Any, text: str, choices: tuple[str, ...] = (), changeable: bool = False) -> Any:
+    declaration = Declaration(text, choices=choices, changeable=changeable)
+    return field(default=default, metadata={"declaration": declaration})
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The parameters of the driver.
+
+    Raises:
+        SettingError: a value is out of its range, or two contradict each other.
+    """
+
+    port: str = _other(
+        "/dev/ttyACM0",
+        "serial port of the board; better its name under /dev/serial/by-id, which survives "
+        "re-plugging",
+    )
+    protocol: str = _other("ezloop", "language of the board", NAMES)
+    baud_rate: int = _number(0, "baud", 0, 4_000_000, "0: what the protocol says, 115200")
+    rate: float = _number(20.0, "Hz", 1.0, 100.0, "ticks, on an absolute grid")
+    real_time_priority: int = _number(
+        10, "", 0, 90, "SCHED_FIFO of the port's process; 0: none; ignored without the right to it"
+    )
+    command_validity: float = _number(
+        0.25, "s", 0.06, 10.0, "a `native` board vents by itself after this time without a command"
+    )
+    segment_count: int = _number(2, "", 1, 16, "pairs of chambers")
+    pressure_limit: float = _number(24_000.0, "Pa", 0.0, 1e5, "largest differential pressure")
+    slew_limit: float = _number(
+        200_000.0, "Pa/s", 1.0, 1e7, "of setpoints and of what is commanded: 10 kPa a tick"
+    )
+    atmosphere: float = _number(
+        0.0, "Pa", 0.0, 1.1e5, "absolute, of the room; 0: measured with vented chambers"
+    )
+    interpolation: str = _other("hold", "between setpoints", ("hold", "linear"))
+    horizon: float = _number(10.0, "s", 0.1, 3600.0, "a setpoint's stamp may lie ahead")
+    accept_cmd_u_t: bool = _other(
+        False, "also take std_msgs/Float64MultiArray in hPa on cmd_u_t, in force at once"
+    )
+    setpoint_timeout: float = _number(0.2, "s", 0.05, 60.0, "without a next setpoint until HOLDING")
+    hold_time: float = _number(1.0, "s", 0.0, 600.0, "of HOLDING until the ramp down")
+    vent_rate: float = _number(10_000.0, "Pa/s", 100.0, 1e6, "of the ramp down")
+    vent_timeout: float = _number(10.0, "s", 0.5, 120.0, "a vent may take before it is a fault")
+    telemetry_timeout: float = _number(0.5, "s", 0.06, 60.0, "without chamber pressures")
+    over_pressure: float = _number(30_000.0, "Pa", 1.0, 2e5, "gauge, in any chamber")
+    supply_low: float = _number(115_000.0, "Pa", 0.0, 1e6, "absolute, smallest supply")
+    supply_high: float = _number(200_000.0, "Pa", 0.0, 1e6, "absolute, largest supply")
+    supply_time: float = _number(0.5, "s", 0.0, 60.0, "the supply may be outside of these")
+    supply_required: bool = _other(
+        True, "arm only with a fresh reading of the supply, where the protocol tells it"
+    )
+    follow_tolerance: float = _number(
+        3_000.0, "Pa", 100.0, 1e5, "beyond the slowest and fastest normal response of a chamber"
+    )
+    follow_time: float = _number(2.0, "s", 0.1, 60.0, "a chamber may be outside of it")
+    slowest_fill: float = _number(4_000.0, "Pa/s", 100.0, 1e6, "that a working valve reaches")
+    slowest_vent: float = _number(
+        2.5, "s", 0.05, 60.0, "time constant in which a working valve vents"
+    )
+    leak_time: float = _number(
+        10.0, "s", 2.0, 600.0, "over which slow leaks are looked for; longer than a fill"
+    )
+    leak_tolerance: float = _number(
+        1_000.0,
+        "Pa",
+        50.0,
+        1e5,
+        "a chamber may lie below its command in the mean of leak_time; choose a few times what a "
+        "sound limb shows at steady pressure (20 to 160 Pa on a real one)",
+    )
+    leak_opening: float = _number(
+        0.25,
+        "",
+        0.0,
+        1.0,
+        "mean opening of an inlet at steady pressure that is no leak; choose twice what "
+        "valve_opening shows there; 1: do not look",
+    )
+    vented_tolerance: float = _number(500.0, "Pa", 10.0, 5_000.0, "gauge that counts as vented")
+
+    def __post_init__(self) -> None:
+        for name, declaration, _ in declarations(type(self)):
+            _check(name, getattr(self, name), declaration)
+        if self.supply_low >= self.supply_high:
+            raise SettingError(
+                f"parameters 'supply_low' ({self.supply_low:g} Pa) and 'supply_high' "
+                f"({self.supply_high:g} Pa): the first must be smaller"
+            )
+        if self.over_pressure <= self.pressure_limit:
+            raise SettingError(
+                f"parameters 'over_pressure' ({self.over_pressure:g} Pa) and 'pressure_limit' "
+                f"({self.pressure_limit:g} Pa): the first must be larger, or every full command "
+                "would end in a fault"
+            )
+        if self.command_validity * self.rate <= 1.0:
+            raise SettingError(
+                f"parameters 'command_validity' ({self.command_validity:g} s) and 'rate' "
+                f"({self.rate:g} Hz): a command must stay valid until the next tick"
+            )
+
+    @property
+    def period(self) -> int:
+        """[ns] of the ticks."""
+        return round(NANOSECONDS / self.rate)
+
+    @property
+    def largest_step(self) -> float:
+        """[Pa] by which a command may move in one tick; a plan at the limit is not beyond it."""
+        return self.slew_limit * self.period / NANOSECONDS * (1.0 + 1e-9)
+
+
+@dataclass(frozen=True)
+class EmulatorSettings:
+    """The parameters of the emulated board."""
+
+    port_link: str = _other("/tmp/der_limb_board_0", "symbolic link to the pseudo-terminal")
+    protocol: str = _other("ezloop", "language of the board", NAMES)
+    baud_rate: int = _number(115_200, "baud", 0, 4_000_000, "pace of the bytes; 0: none")
+    segment_count: int = _number(2, "", 1, 16, "pairs of chambers")
+    seed: int = _number(0, "", 0, 2**62, "of sensors, valves and the day's atmosphere")
+    reset_on_open: bool = _other(True, "opening the port restarts the board")
+    real_time_priority: int = _number(10, "", 0, 90, "SCHED_FIFO; 0: none")
+    faults: str = _other("", 'e.g. "stick:1,leak:2"; may be set while it runs', changeable=True)
+
+
+NODES: dict[str, type[Settings] | type[EmulatorSettings]] = {
+    "pressure_driver": Settings,
+    "board_emulator": EmulatorSettings,
+}
+"""The parameters of each node."""
+Declared = TypeVar("Declared", Settings, EmulatorSettings)
+
+
+def declarations(
+    settings: type[Settings] | type[EmulatorSettings],
+) -> Iterator[tuple[str, Declaration, Any]]:
+    """Yield name, declaration and default of each parameter."""
+    each: Field[Any]
+    for each in fields(settings):
+        assert each.default is not MISSING
+        yield each.name, each.metadata["declaration"], each.default
+
+
+def _check(name: str, value: Any, declaration: Declaration) -> None:
+    if declaration.choices and value not in declaration.choices:
+        choices = ", ".join(declaration.choices)
+        raise SettingError(f"parameter '{name}' is '{value}': choose {choices}")
+    if declaration.range is not None:
+        low, high = declaration.range
+        if not low <= value <= high:
+            raise SettingError(
+                f"parameter '{name}' ({declaration.description}) is {value:g}: "
+                f"allowed are {low:g} to {high:g}"
+            )
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Give a command one option for each parameter of the driver: ``--pressure-limit 2000``."""
+    for name, declaration, default in declarations(Settings):
+        kind = (lambda text: text.lower() == "true") if isinstance(default, bool) else type(default)
+        parser.add_argument(
+            f"--{name.replace('_', '-')}",
+            type=kind,
+            default=default,
+            metavar="|".join(declaration.choices) or type(default).__name__.upper(),
+            help=f"{declaration.description} (%(default)s)",
+        )
+
+
+def to_options(settings: Settings) -> list[str]:
+    """Return the options of `add_options` that give these settings."""
+    given = vars(settings).items()
+    return [f"--{name.replace('_', '-')}={value}" for name, value in given]
+
+
+def from_options(given: argparse.Namespace) -> Settings:
+    """Return the settings that the options of `add_options` gave."""
+    return Settings(**{name: getattr(given, name) for name, _, _ in declarations(Settings)})
+
+
+def parameter_file(node: str) -> str:
+    """Return the text of a node's parameter file, which holds the defaults."""
+    lines = [
+        f"# Parameters of {node} with their defaults: written by python3 -m {__name__}",
+        f"# `ros2 param describe /limb/{node} NAME` tells the range of each.",
+        f"/**/{node}:",
+        "  ros__parameters:",
+    ]
+    for name, declaration, default in declarations(NODES[node]):
+        lines.append(f"    # {declaration.description}")
+        lines.append(f"    {name}: {_written(default)}")
+    return "\n".join(lines) + "\n"
+
+
+def table() -> str:
+    """Return the README's table of the driver's parameters."""
+    lines = ["| parameter | default | range | meaning |", "|---|---|---|---|"]
+    for name, declaration, default in declarations(Settings):
+        limits = ", ".join(declaration.choices)
+        if declaration.range is not None:
+            limits = " to ".join(f"{limit:,g}".replace(",", " ") for limit in declaration.range)
+        shown = f"{_written(default)} {declaration.unit}".strip()
+        lines.append(f"| `{name}` | {shown} | {limits} | {declaration.text} |")
+    return "\n".join(lines) + "\n"
+
+
+def with_table(readme: str) -> str:
+    """Return the text of the README with its table as it should be."""
+    before, _, rest = readme.partition(BEGIN)
+    return before + BEGIN + table() + END + rest.partition(END)[2]
+
+
+def _written(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return value or '""' if isinstance(value, str) else str(value)
+
+
+def write(package: Path) -> None:
+    """Write the parameter files and the README's table of the package in a folder."""
+    for node in NODES:
+        (package / "config" / f"{node}.yaml").write_text(parameter_file(node), encoding="utf-8")
+    readme = package / "README.md"
+    readme.write_text(with_table(readme.read_text(encoding="utf-8")), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    write(Path(__file__).resolve().parents[1])

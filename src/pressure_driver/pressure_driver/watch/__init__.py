@@ -1,1 +1,0 @@
-"""What the driver watches: readings, chambers that follow, a board that hears."""

@@ -1,0 +1,439 @@
+"""The process of the port on a pseudo-terminal: what it plays, and who vents when one ends."""
+
+import itertools
+import os
+import re
+import select
+import signal
+import socket
+import subprocess
+import sys
+import termios
+import threading
+import time
+
+import pytest
+
+from pressure_driver import board as board_module
+from pressure_driver import ports
+from pressure_driver.channel import Channel
+from pressure_driver.emulator.board import EmulatedBoard, Faults
+from pressure_driver.emulator.pneumatics import BoardPneumatics
+from pressure_driver.emulator.port import EmulatedPort
+from pressure_driver.emulator.runner import BoardRunner
+from pressure_driver.port_process import PortProcess
+from pressure_driver.ports import PortError, open_port, prefer_thread
+from pressure_driver.protocols import NAMES, board_protocol
+from pressure_driver.safety import Mode
+from pressure_driver.schedule import TickGrid
+from pressure_driver.settings import Settings, to_options
+
+PERIOD = 50_000_000
+
+
+def wait_for(condition, what, limit=60.0):
+    deadline = time.monotonic() + limit
+    while not condition():
+        assert time.monotonic() < deadline, f"waited too long for {what}"
+        time.sleep(0.005)
+
+
+class Rig:
+    """An emulated board in this process, and settings for a driver on its port."""
+
+    def __init__(self, folder, protocol):
+        self.commands = []
+        self.port = EmulatedPort(str(folder / "board"), 115_200)
+        self.board = EmulatedBoard(board_protocol(protocol), BoardPneumatics(2, 1), 1)
+        self.runner = BoardRunner(self.board, self.port, on_command=self.commands.append)
+        self.runner.start()
+        self.settings = Settings(port=str(self.port.link), protocol=protocol, slew_limit=1e6)
+        self.said, self.state, self.driver, self.armings = [], {}, None, 0
+
+    def start(self):
+        """Have the node's end of the driver in this process, and the port's in one of its own."""
+        self.driver = PortProcess(self.settings, self.hear)
+        self.driver.start()
+        return self
+
+    def hear(self):
+        while self.driver.log:
+            self.said.append(self.driver.log.popleft()[0])
+        while self.driver.states:
+            self.state = self.driver.states.popleft()[0]
+
+    def send(self, *message):
+        self.driver.send(*message)
+
+    @property
+    def mode(self):
+        return self.state.get("mode")
+
+    def arm(self):
+        wait_for(lambda: self.ask("arm"), "the driver to be armed")
+        self.armings += 1
+
+    def ask(self, word):
+        self.send("alive")
+        return self.driver.ask(word)[0]
+
+    def offer(self, differential, stamp=0, index=0):
+        plan = f"plan {self.armings}"
+        self.send("setpoint", stamp, list(differential), plan, index, 0, "topic", next(COUNT), True)
+
+    def pressurise(self):
+        """Arm and play until a chamber is full."""
+        self.arm()
+        wait_for(lambda: self.offer((3000.0, -2000.0)) or self.pressurised(), "pressure")
+
+    def pressurised(self):
+        air = self.board.pneumatics
+        return max(air.pressure) > air.atmosphere + 1000.0
+
+    def vents(self, since=0):
+        """Tell for each command since one of them whether it asks for equal pressures."""
+        pairs = [list(c.pressure) for c in list(self.commands)[since:]]
+        return [max(abs(p[0] - p[1]), abs(p[2] - p[3])) < 1.0 for p in pairs]
+
+    def wait_vented(self):
+        wait_for(lambda: not self.pressurised(), "vented chambers")
+        assert self.vents()[-1]
+
+    def have(self, *texts):
+        self.runner.set_faults(Faults.parse(texts, 4))
+
+    def close(self):
+        if self.driver is not None:
+            self.driver.close()
+        self.runner.close()
+
+
+COUNT = itertools.count(1)
+
+
+@pytest.fixture
+def make_rig(tmp_path):
+    made = []
+
+    def make(protocol="ezloop"):
+        made.append(Rig(tmp_path, protocol))
+        return made[-1]
+
+    yield make
+    for rig in made:
+        rig.close()
+
+
+@pytest.fixture
+def rig(make_rig):
+    return make_rig().start()
+
+
+# ------------------------------------------------------------------------------- it plays
+
+
+def test_setpoints_arrive_in_order_not_before_their_stamps(rig):
+    rig.arm()
+    start = (time.time_ns() // PERIOD + 10) * PERIOD
+    wanted = {start + k * PERIOD: 300.0 * (k + 1) for k in range(20)}
+    for index, (stamp, value) in enumerate(wanted.items()):
+        rig.offer((value, 0.0), stamp, index)
+    wait_for(lambda: rig.send("alive") or rig.mode == Mode.TRACKING, "tracking")
+    wait_for(lambda: rig.send("alive") or rig.mode == Mode.ARMED, "the ramp down")
+    first_seen = {}
+    for command in rig.commands:
+        value = round(command.pressure[0] - command.pressure[1], 1)
+        first_seen.setdefault(value, command.stamp)
+    seen = {stamp: first_seen[value] for stamp, value in wanted.items() if value in first_seen}
+    assert len(seen) >= 1
+    assert list(seen.values()) == sorted(seen.values())
+    assert all(at >= stamp for stamp, at in seen.items())
+    assert rig.state["setpoints_accepted"] == len(wanted)
+
+
+def test_a_vent_is_sent_at_once_and_refuses_what_comes(rig):
+    rig.pressurise()
+    assert rig.ask("vent")
+    count = len(rig.commands)
+    rig.offer((3000.0, 0.0))
+    rig.wait_vented()
+    assert all(rig.vents(count + 1))
+
+
+def test_by_hand_it_takes_lines_from_a_terminal(make_rig):
+    rig = make_rig()
+    command = [sys.executable, "-m", "pressure_driver.board", *to_options(rig.settings)]
+    process = subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
+    )
+
+    def armed():
+        process.stdin.write("arm\n")
+        return "True" in (line := process.stdout.readline()) or line == "armed\n"
+
+    wait_for(armed, "an answer")
+    process.stdin.write("3000 -2000\n")
+    wait_for(rig.pressurised, "pressure")
+    process.stdin.close()
+    assert process.wait(30.0) == 0
+    rig.wait_vented()
+
+
+# ---------------------------------------------------------------- one of the two processes ends
+
+
+@pytest.mark.parametrize("protocol", NAMES)
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_the_node_vents_for_a_process_of_the_port_that_dies_or_hangs(make_rig, protocol, number):
+    rig = make_rig(protocol).start()
+    rig.pressurise()
+    os.kill(rig.driver.process_id, number)
+    wait_for(lambda: rig.driver.error, "the node to notice")
+    assert re.search("has ended|no sign of life", rig.driver.error)
+    assert "check that the chambers are down" in rig.driver.error
+    rig.wait_vented()
+    assert not rig.driver.ask("arm")[0]
+    wait_for(lambda: not rig.port.host_present, "a port that nobody holds")
+
+
+def test_a_process_of_the_port_that_dies_without_its_board_is_told_of(rig):
+    rig.pressurise()
+    rig.have("unplug")
+    wait_for(lambda: rig.mode == Mode.FAULT, "the fault")
+    os.kill(rig.driver.process_id, signal.SIGKILL)
+    wait_for(lambda: rig.driver.error, "the node to notice")
+    assert "close the air supply" in rig.driver.error
+
+
+class SilentNode(Rig):
+    """The node's end without the thread that watches: it can be silent, and go."""
+
+    def start(self):
+        near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        words = ["-m", "pressure_driver.board", f"--socket={far.fileno()}"]
+        self.process = subprocess.Popen(
+            [sys.executable, *words, *to_options(self.settings)],
+            pass_fds=(far.fileno(),),
+            stderr=subprocess.PIPE,
+        )
+        far.close()
+        self.channel = Channel(near)
+        near.settimeout(30.0)
+        self.modes = []
+        return self
+
+    def send(self, *message):
+        self.channel.send(*message)
+
+    def ask(self, word):
+        self.send(word)
+        while (content := self.channel.receive()[0])[0] != "answer":
+            self.note(content)
+        return content[1]
+
+    def note(self, content):
+        if content[0] == "state":
+            self.state = content[1]
+            if self.modes[-1:] != [self.mode]:
+                self.modes.append(self.mode)
+
+    def close(self):
+        self.channel.socket.close()
+        self.process.wait(30.0)
+        self.process.stderr.close()
+        self.runner.close()
+
+
+@pytest.fixture
+def silent_node(tmp_path, request):
+    rig = SilentNode(tmp_path, request.param).start()
+    yield rig
+    rig.close()
+
+
+@pytest.mark.parametrize("silent_node", NAMES, indirect=True)
+def test_the_process_of_the_port_vents_for_a_node_that_ends(silent_node):
+    silent_node.pressurise()
+    silent_node.channel.socket.close()
+    assert silent_node.process.wait(30.0) == 1
+    assert b"the driver's node has ended: the vent command was" in silent_node.process.stderr.read()
+    silent_node.wait_vented()
+
+
+@pytest.mark.parametrize("silent_node", NAMES, indirect=True)
+def test_a_node_that_hangs_has_the_limb_let_down_and_may_go_on(silent_node):
+    """Though setpoints for seconds have arrived: nobody could stop them."""
+    rig = silent_node
+    rig.arm()
+    start = (time.time_ns() // PERIOD + 10) * PERIOD
+    for index in range(180):
+        rig.offer((3000.0, -2000.0), start + index * PERIOD, index)
+    while rig.modes[-1:] != [Mode.ARMED] or Mode.VENTING not in rig.modes:
+        rig.note(rig.channel.receive()[0])
+        assert time.time_ns() < start + 178 * PERIOD, "played to the end"
+    assert rig.modes[-4:] == [Mode.TRACKING, Mode.HOLDING, Mode.VENTING, Mode.ARMED]
+    wait_for(lambda: rig.offer((3000.0, -2000.0)) or rig.pressurised(), "pressure again")
+
+
+# ------------------------------------------------------------------------------- the port
+
+
+def test_an_unplug_faults_and_the_return_vents(rig):
+    rig.pressurise()
+    rig.have("unplug:0.5")
+    wait_for(lambda: rig.mode == Mode.FAULT, "the fault")
+    assert "serial link lost" in rig.state["faults"][0]
+    wait_for(lambda: any("is back" in text for text in rig.said), "the port")
+    count = len(rig.commands)
+    wait_for(lambda: len(rig.commands) > count + 5, "commands")
+    assert all(rig.vents(count))
+    assert rig.mode == Mode.FAULT
+    rig.have()
+    rig.pressurise()
+
+
+def test_a_port_that_takes_no_bytes_is_a_fault_and_old_setpoints_are_not_sent_afterwards(rig):
+    """Output is held back by the terminal itself, as by a board whose USB does not fetch bytes."""
+    rig.pressurise()
+    terminal = os.open(os.path.realpath(rig.port.link), os.O_RDWR | os.O_NOCTTY)
+    try:
+        termios.tcflow(terminal, termios.TCOOFF)
+        count = len(rig.commands)
+        wait_for(lambda: rig.offer((3000.0, -2000.0)) or rig.mode == Mode.FAULT, "the fault")
+        assert "does not read" in rig.state["faults"][0]
+        termios.tcflow(terminal, termios.TCOON)
+    finally:
+        os.close(terminal)
+    wait_for(lambda: len(rig.commands) > count + 5, "commands")
+    # What was on its way when the terminal was stopped may still come; nothing from later.
+    assert all(rig.vents(count + 1))
+    rig.wait_vented()
+
+
+@pytest.fixture
+def in_thread(monkeypatch):
+    """Return a function that runs the process of the port in a thread of this one."""
+    monkeypatch.setattr(board_module.gc, "freeze", lambda: None)
+    running = []
+
+    def start(settings, change=lambda _: None):
+        near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        far.setblocking(False)
+        process = board_module.BoardProcess(settings, Channel(far))
+        change(process)
+        thread = threading.Thread(target=process.run, daemon=True)
+        thread.start()
+        running.append((process, thread, near))
+        return process, thread
+
+    yield start
+    for process, thread, near in running:
+        process.ending = True
+        thread.join(30.0)
+        near.close()
+
+
+def test_a_board_that_takes_no_bytes_does_not_stop_the_ticks(in_thread):
+    """The other end is open but never read: the process must not hang in a write."""
+    master, slave = os.openpty()
+    try:
+        settings = Settings(port=os.ttyname(slave), real_time_priority=0)
+        process, thread = in_thread(
+            settings, lambda process: setattr(process, "grid", TickGrid(1_000_000))
+        )
+        wait_for(lambda: "takes no bytes" in process.core._machine.link_fault, "the fault")
+        process.ending = True
+        thread.join(30.0)
+        assert not thread.is_alive()
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_an_exception_in_the_process_vents(make_rig, in_thread):
+    rig = make_rig()
+    settings = Settings(port=str(rig.port.link), real_time_priority=0)
+    process, thread = in_thread(settings)
+    wait_for(lambda: process.core.arm()[0], "the driver to be armed")
+    process.core._machine._follow = lambda *_: 1 / 0
+    thread.join(30.0)
+    assert not thread.is_alive()
+    wait_for(lambda: rig.vents()[-3:] == [True] * 3, "the last commands")
+
+
+# --------------------------------------------------------------------------------- the end
+
+
+def test_the_end_puts_vent_on_the_wire_and_leaves_the_port(rig):
+    rig.pressurise()
+    assert rig.driver.close() == ""
+    wait_for(lambda: rig.vents()[-3:] == [True] * 3, "the last commands")
+    rig.wait_vented()
+    wait_for(lambda: not rig.port.host_present, "the port to be left")
+    open_port(str(rig.port.link), 115_200).close()
+
+
+@pytest.mark.parametrize(
+    ("fault", "told"), [("unplug", "cannot be reached"), ("deaf", r"chambers .* keep \d+ Pa")]
+)
+def test_an_end_that_may_not_have_vented_says_so(rig, fault, told):
+    """A board that hears nothing, or reads nothing from a pseudo-terminal, keeps its pressures."""
+    rig.pressurise()
+    rig.have(fault)
+    wait_for(lambda: not rig.port.host_present or fault == "deaf", "the fault")
+    assert re.search(f"{told}.*close the air supply", rig.driver.close())
+
+
+# ---------------------------------------------------------------------------- names and rights
+
+
+def test_ports_that_do_not_open_are_named_with_the_remedy(rig, tmp_path):
+    missing, file = str(tmp_path / "ttyNOWHERE"), tmp_path / "file"
+    file.write_text("text")
+    for port, told in (
+        (missing, f"no serial device {re.escape(missing)}.*ports that exist"),
+        (str(rig.port.link), r"in use by another program.*fuser"),
+        (str(file), "is no serial port"),
+    ):
+        with pytest.raises(PortError, match=told):
+            open_port(port, 115_200)
+    with pytest.raises(PortError, match="no serial device"):
+        PortProcess(Settings(port=missing), lambda: None).start()
+
+
+def test_a_pty_of_the_system_is_a_port():
+    """Without an emulator: raw bytes at the other end of a pseudo-terminal."""
+    master, slave = os.openpty()
+    try:
+        device = open_port(os.ttyname(slave), 115_200)
+        device.write(b"<1013.00>\n")
+        assert select.select([master], [], [], 60.0)[0]
+        assert os.read(master, 100) == b"<1013.00>\n"
+        device.close()
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+def test_a_port_is_kept_by_its_stable_name(tmp_path, monkeypatch):
+    (tmp_path / "by-id").mkdir()
+    device, other = tmp_path / "ttyACM0", tmp_path / "ttyACM1"
+    device.touch()
+    other.touch()
+    stable = tmp_path / "by-id" / "usb-Arduino_Mega-if00"
+    stable.symlink_to(device)
+    monkeypatch.setattr(ports, "STABLE_NAMES", tmp_path / "by-id")
+    assert ports.stable_name(str(device)) == str(stable)
+    assert ports.stable_name(str(stable)) == str(stable)
+    assert ports.stable_name(str(other)) == str(other)
+    assert str(stable) in ports.available_ports()
+
+
+def test_without_the_right_to_real_time_it_runs_as_well(monkeypatch):
+    def refuse(*_):
+        raise PermissionError("not allowed")
+
+    monkeypatch.setattr("os.sched_setscheduler", refuse)
+    assert not prefer_thread(10)
+    assert not prefer_thread(0)
