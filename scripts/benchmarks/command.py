@@ -20,7 +20,7 @@ PARTS = {
     "rod": "rod",
     "planning": "planning",
     "driver": "driver",
-    "tracker": "tracker.conditions",
+    "tracker": "tracker.limb",
     "recorder": "recorder",
     "identification": "identification",
     "studies": "studies",

@@ -11,7 +11,7 @@ import psutil
 from distributed import Client, LocalCluster
 
 from der_planner.experiment.console import Progress
-from der_planner.studies.conduct import Settings, conduct
+from der_planner.studies.conduct import PlaySettings, conduct
 from der_planner.studies.study import Study
 from der_planner.studies.tasks import TASKS
 
@@ -59,7 +59,7 @@ def _played(text: str, folder: Path, scheduler: str) -> tuple[float, list[float]
     path.write_text(text)
     study, out = Study.read(path), folder / f"out_{number}"
     begin = time.perf_counter()
-    kept = conduct(study, Settings(out, scheduler), _Silent())
+    kept = conduct(study, PlaySettings(out, scheduler), _Silent())
     wall = time.perf_counter() - begin
     failed = [row["error"] for row in kept.values() if row["error"]]
     if failed:

@@ -17,7 +17,7 @@ from der_planner.limb import Limb
 from der_planner.model import ArcModel, Model, simulate
 from der_planner.model.air import pair_of
 from der_planner.rod import RodState
-from der_planner.studies.twins import Twin, calibrated, read_limb
+from der_planner.studies.cache import Twin, calibrated, read_limb
 from der_planner.twin import LimbTwin
 from der_planner.twin.limb_twin import ATMOSPHERE
 from workspace_setup.basics import ROOT

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from apriltag_tracker.detection import Detector
-from apriltag_tracker.synthetic.camera import CameraModel, Optics, Shape, SyntheticCamera
-from apriltag_tracker.synthetic.shapes import constant_curvature
+from apriltag_tracker.synthetic.camera import CameraModel, Optics, SyntheticCamera
+from apriltag_tracker.synthetic.shapes import Shape, constant_curvature
 from apriltag_tracker.tag_map import TagMap
 
 CONFIG = Path(__file__).resolve().parents[2] / "src" / "apriltag_tracker" / "config"

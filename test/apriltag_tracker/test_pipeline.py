@@ -5,10 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from apriltag_tracker.camera import Intrinsics, lens
+from apriltag_tracker.camera import Intrinsics, pinhole
 from apriltag_tracker.detection import Detector, codes, edges
 from apriltag_tracker.pipeline import LimbTracker, TrackerOptions, Uncertainty, warm_up
-from apriltag_tracker.pose import plane
 from apriltag_tracker.synthetic.camera import Errors, Optics, SyntheticCamera
 
 PERIOD = 1.0 / 30.0
@@ -100,15 +99,6 @@ def test_gaps_are_bridged_marked_and_then_given_up(straight_tags, model, camera,
     assert not observations[-1].bridged
 
 
-def test_a_covered_lens_is_not_valid(straight_tags, model, camera, swing):
-    tracker = LimbTracker(straight_tags, model.intrinsics, TrackerOptions(bridge_frames=0))
-    run(tracker, camera, swing, 3)
-    black = np.zeros((model.intrinsics.height, model.intrinsics.width), np.uint8)
-    observation = tracker.observe(black, 3 * PERIOD)
-    assert observation.estimate is None
-    assert observation.tags == ()
-
-
 def test_without_fixed_tags_nothing_is_placed(straight_tags, model, swing):
     bare = dataclasses.replace(straight_tags, world=())
     camera = SyntheticCamera(model, bare)
@@ -161,9 +151,8 @@ def test_warming_up_leaves_no_kernel_for_the_first_image(detector):
     kernels = [
         edges.refine_quads,
         codes.read_codes,
-        lens.undistort_pixels,
-        lens.distort_to_pixels,
-        plane._locate,
+        pinhole.undistort_pixels,
+        pinhole.distort_to_pixels,
     ]
     before = [len(kernel.signatures) for kernel in kernels]
     assert min(before) == 1

@@ -12,27 +12,26 @@ import cv2
 import numpy as np
 from ament_index_python.packages import get_package_share_directory
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point
+from geometry_msgs.msg import Point, Pose2D
 from numpy.typing import NDArray
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
-from visualization_msgs.msg import MarkerArray
+from visualization_msgs.msg import Marker, MarkerArray
 
 from apriltag_tracker.camera import CameraError, Intrinsics
 from apriltag_tracker.camera.images import Grabbed, ImageReader, Source, SourceError, open_source
 from apriltag_tracker.detection import Detector
-from apriltag_tracker.image_watch import NO_CALIBRATION, ImageWatch
-from apriltag_tracker.node_messages import limb_markers, tag_message
-from apriltag_tracker.overlay import draw_observation
 from apriltag_tracker.pipeline import (
     LimbObservation,
     LimbTracker,
+    PlacedTag,
     TrackerOptions,
     Uncertainty,
     warm_up,
 )
+from apriltag_tracker.reports import NO_CALIBRATION, ImageWatch, draw_observation
 from apriltag_tracker.tag_map import TagMap
-from der_msgs.msg import LimbState, TagDetectionArray
+from der_msgs.msg import LimbState, TagDetection, TagDetectionArray
 from limb_interfaces import qos, stamps, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.gaps import StampGaps
@@ -57,31 +56,16 @@ class TrackerNode(Node):
         calibration = declare(
             self, "calibration_file", "", "camera_info YAML; empty: from the camera_info topic"
         )
-        source = str(
-            declare(
-                self,
-                "source",
-                "topic",
-                "where images come from: topic, /dev/videoN, a video file, or a folder of images",
-            )
-        )
-        rate = float(
-            declare(
-                self,
-                "source_rate",
-                30.0,
-                "images a second from a folder or device",
-                at_least=0.1,
-                at_most=500.0,
-            )
-        )
-        threads = int(declare(self, "threads", 1, "threads of OpenCV", at_least=1, at_most=64))
-        cv2.setNumThreads(threads)
+        where = "where images come from: topic, /dev/videoN, a video file, or a folder of images"
+        source = str(declare(self, "source", "topic", where))
+        rate = self._number("source_rate", 30.0, "images a second from a folder", 0.1, 500.0)
+        cv2.setNumThreads(int(self._number("threads", 1, "threads of OpenCV", 1, 64)))
         self._map = TagMap.from_yaml(str(tag_map))
         self._options = self._declare_options()
         self._detector = self._make_detector()
         check_overrides(self)
-        self._warm_up()
+        # Every kernel is loaded or compiled before the first image.
+        warm_up(self._detector)
         self._gaps = StampGaps()
         self._tracker: LimbTracker | None = None
         self._curve: list[Point] = []
@@ -97,7 +81,7 @@ class TrackerNode(Node):
         )
         self._make_topics()
         if calibration:
-            self._use(Intrinsics.from_yaml(str(calibration)))
+            self._take_calibration(Intrinsics.from_yaml(str(calibration)))
         self._source_name = source
         self._source: Source | None = None
         if source == "topic":
@@ -124,87 +108,50 @@ class TrackerNode(Node):
         lens = self._tracker.intrinsics
         return open_source(source, rate, size=(lens.width, lens.height))
 
-    def _declare_options(self) -> TrackerOptions:
-        def number(name: str, default: float, description: str, at_most: float) -> float:
-            return float(
-                declare(self, name, float(default), description, at_least=0.0, at_most=at_most)
-            )
+    def _number(
+        self, name: str, default: float, description: str, at_least: float, at_most: float
+    ) -> float:
+        """Declare a number; one whose default is whole is whole."""
+        return declare(self, name, default, description, at_least=at_least, at_most=at_most)
 
+    def _declare_options(self) -> TrackerOptions:
+        usual = TrackerOptions()
+        sigma = usual.uncertainty
+        of_heights, of_places = "of limb tags' heights, m", "of limb tags on the limb, m"
+        missing = "frames without limb tags that are bridged and marked"
+        apart = "distance in m from the other tags' shape at which a tag is left out"
+        unsure = "standard deviation of the tip in m above which no tip is told"
+        period = "s between searches of the whole image; 0 searches every image in full"
+        number = self._number
         return TrackerOptions(
-            bridge_frames=int(
-                declare(
-                    self,
-                    "bridge_frames",
-                    TrackerOptions.bridge_frames,
-                    "frames without limb tags that are bridged and marked",
-                    at_least=0,
-                    at_most=30,
-                )
-            ),
-            reject_beyond=number(
-                "reject_beyond",
-                TrackerOptions.reject_beyond,
-                "distance in m from the other tags' shape at which a tag is left out",
-                0.1,
-            ),
+            bridge_frames=int(number("bridge_frames", usual.bridge_frames, missing, 0, 30)),
+            reject_beyond=number("reject_beyond", usual.reject_beyond, apart, 0.0, 0.1),
             largest_tip_sigma=number(
-                "largest_tip_sigma",
-                TrackerOptions.largest_tip_sigma,
-                "standard deviation of the tip in m above which no tip is told",
-                1.0,
+                "largest_tip_sigma", usual.largest_tip_sigma, unsure, 0.0, 1.0
             ),
             uncertainty=Uncertainty(
-                survey=number(
-                    "survey_sigma", Uncertainty.survey, "of fixed tags' positions, m", 0.1
-                ),
-                height=number("height_sigma", Uncertainty.height, "of limb tags' heights, m", 0.1),
-                mounting=number(
-                    "mounting_sigma", Uncertainty.mounting, "of limb tags on the limb, m", 0.1
-                ),
+                survey=number("survey_sigma", sigma.survey, "of fixed tags' places, m", 0.0, 0.1),
+                height=number("height_sigma", sigma.height, of_heights, 0.0, 0.1),
+                mounting=number("mounting_sigma", sigma.mounting, of_places, 0.0, 0.1),
                 mounting_angle=number(
                     "mounting_angle_sigma",
-                    Uncertainty.mounting_angle,
+                    sigma.mounting_angle,
                     "of limb tags' directions, rad",
+                    0.0,
                     1.0,
                 ),
             ),
             full_search_period=number(
-                "full_search_period",
-                TrackerOptions.full_search_period,
-                "s between searches of the whole image; 0 searches every image in full",
-                60.0,
+                "full_search_period", usual.full_search_period, period, 0.0, 60.0
             ),
         )
 
     def _make_detector(self) -> Detector:
         family = self._map.family
-        return Detector(
-            float(
-                declare(
-                    self,
-                    "smallest_tag",
-                    14.0,
-                    "shortest side of a tag in px",
-                    at_least=8.0,
-                    at_most=500.0,
-                )
-            ),
-            int(
-                declare(
-                    self,
-                    "correct_bits",
-                    family.correct_bits,
-                    "wrong bits of a code that are forgiven in a search",
-                    at_least=0,
-                    at_most=family.most_corrected,
-                )
-            ),
-            family=family,
-        )
-
-    def _warm_up(self) -> None:
-        """Compile or load every kernel and check OpenCV's conventions before the first image."""
-        warm_up(self._detector)
+        shortest = self._number("smallest_tag", 14.0, "shortest side of a tag in px", 8.0, 500.0)
+        forgiven = "wrong bits of a code that are forgiven in a search"
+        bits = self._number("correct_bits", family.correct_bits, forgiven, 0, family.most_corrected)
+        return Detector(shortest, int(bits), family=family)
 
     def _make_topics(self) -> None:
         self._tags = self.create_publisher(TagDetectionArray, topics.TAGS, qos.STATES)
@@ -232,9 +179,9 @@ class TrackerNode(Node):
         except CameraError as error:
             self._watch.calibration_problem = str(error)
             return
-        self._use(intrinsics)
+        self._take_calibration(intrinsics)
 
-    def _use(self, intrinsics: Intrinsics) -> None:
+    def _take_calibration(self, intrinsics: Intrinsics) -> None:
         """Take a calibration; one that is like the present one changes nothing."""
         self._watch.calibration_problem = ""
         now = self._tracker.intrinsics if self._tracker is not None else None
@@ -263,7 +210,7 @@ class TrackerNode(Node):
             self._watch.arrived()
             self._fail(message.header.stamp, str(error))
             return
-        self._take(gray, message.header.stamp)
+        self._process(gray, message.header.stamp)
 
     def _poll_source(self) -> None:
         assert self._source is not None
@@ -273,9 +220,9 @@ class TrackerNode(Node):
             self._watch.image_problem = str(error)
             return
         if grabbed is not None:
-            self._take(grabbed.gray, stamps.stamp_from_nanoseconds(grabbed.stamp))
+            self._process(grabbed.gray, stamps.stamp_from_nanoseconds(grabbed.stamp))
 
-    def _take(self, gray: NDArray[np.uint8], stamp: Time) -> None:
+    def _process(self, gray: NDArray[np.uint8], stamp: Time) -> None:
         """Process one image and publish what it says under its own stamp."""
         started = time.perf_counter()
         self._watch.arrived()
@@ -308,12 +255,10 @@ class TrackerNode(Node):
         """Publish everything; returns the latency of the state [s]."""
         state = self._state(observation, stamp)
         self._states.publish(state)
-        array_message = TagDetectionArray(
-            detections=[tag_message(placed) for placed in observation.tags]
-        )
-        array_message.header.stamp = stamp
-        array_message.header.frame_id = topics.BASE_FRAME
-        self._tags.publish(array_message)
+        tags = TagDetectionArray(detections=[_tag_message(placed) for placed in observation.tags])
+        tags.header.stamp = stamp
+        tags.header.frame_id = topics.BASE_FRAME
+        self._tags.publish(tags)
         self._publish_transforms(observation, stamp)
         now = time.monotonic()
         if (
@@ -322,7 +267,7 @@ class TrackerNode(Node):
             and observation.estimate is not None
         ):
             self._last_markers = now
-            self._markers.publish(limb_markers(state))
+            self._markers.publish(_limb_markers(state))
         if self._annotated.get_subscription_count() > 0 and self._tracker is not None:
             picture = draw_observation(gray, observation, self._tracker)
             message = Image(
@@ -390,6 +335,38 @@ class TrackerNode(Node):
         return Health(
             report.level, report.message, {**report.values, "images_missed": self._gaps.missed}
         )
+
+
+def _tag_message(placed: PlacedTag) -> TagDetection:
+    """Return a tag with its place, if the camera's is known."""
+    tag = placed.tag
+    message = TagDetection(
+        id=tag.id,
+        corners=tag.corners.ravel(),
+        on_limb=placed.on_limb,
+        pose_valid=placed.pose is not None,
+        pixel_size=tag.pixel_size,
+        line_residual=tag.line_residual,
+    )
+    if placed.pose is not None:
+        x, y, yaw = placed.pose.tolist()
+        message.pose = Pose2D(x=x, y=y, theta=yaw)
+    return message
+
+
+def _limb_markers(state: LimbState) -> MarkerArray:
+    """Draw the measured limb and its tip for RViz and Foxglove."""
+    line = Marker(ns="measured", id=0, type=Marker.LINE_STRIP, points=list(state.curve))
+    tip = Marker(ns="measured", id=1, type=Marker.SPHERE)
+    for marker in (line, tip):
+        marker.header = state.header
+        marker.color.g = marker.color.b = 0.7
+        marker.color.a = 1.0
+        marker.pose.orientation.w = 1.0
+    line.scale.x = 0.004
+    tip.pose.position = state.tip
+    tip.scale.x = tip.scale.y = tip.scale.z = 0.01
+    return MarkerArray(markers=[line, tip])
 
 
 def main() -> int:

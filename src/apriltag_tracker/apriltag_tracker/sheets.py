@@ -6,6 +6,7 @@ vectors, so that the edges of the tags are as straight as the printer is.
 
 from __future__ import annotations
 
+import argparse
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -91,6 +92,20 @@ class BoardLayout:
             self.marker,
             cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_100),
         )
+
+
+def add_board_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the measures of the board: the same options print it and find it."""
+    default = BoardLayout()
+    parser.add_argument("--columns", type=int, default=default.columns)
+    parser.add_argument("--rows", type=int, default=default.rows)
+    parser.add_argument("--square", type=float, default=default.square, help="edge in m")
+    parser.add_argument("--marker", type=float, default=default.marker, help="edge in m")
+
+
+def given_board(options: argparse.Namespace) -> BoardLayout:
+    """Return the board that the options describe."""
+    return BoardLayout(options.columns, options.rows, options.square, options.marker)
 
 
 def tag_pages(tags: TagMap, paper: str = "a4") -> list[Page]:

@@ -11,8 +11,7 @@ from apriltag_tracker.pose.shape import (
     ShapeFitter,
     ShapePrior,
 )
-from apriltag_tracker.synthetic.camera import Shape
-from apriltag_tracker.synthetic.shapes import constant_curvature
+from apriltag_tracker.synthetic.shapes import Shape, constant_curvature
 
 NOISE = np.diag([2e-5, 2e-5, 1e-3]) ** 2
 

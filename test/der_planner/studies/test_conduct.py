@@ -10,15 +10,12 @@ import pytest
 
 from der_planner.commands import study as study_command
 from der_planner.experiment.console import Progress
-from der_planner.studies import cluster
 from der_planner.studies import conduct as conducting
-from der_planner.studies.conduct import Settings, conduct
-from der_planner.studies.errors import StudyError
-from der_planner.studies.identity import cache
-from der_planner.studies.store import Store
+from der_planner.studies.cache import cache_folder, calibrated
+from der_planner.studies.conduct import Calibrated, PlaySettings, compute, conduct
+from der_planner.studies.factors import StudyError
+from der_planner.studies.store import Outcome, Store
 from der_planner.studies.study import Study
-from der_planner.studies.twins import calibrated
-from der_planner.studies.work import Calibrated, Outcome, compute
 
 from .cluster import Processes, free_port, wait_for
 
@@ -93,7 +90,7 @@ def test_one_or_two_workers_one_of_them_lost_and_rows_that_fail(tmp_path, monkey
     """
     monkeypatch.setenv("DER_LIMB_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(conducting, "ALONE", 0.3)
-    real, started = cluster.local, []
+    real, started = conducting.local, []
 
     @contextlib.contextmanager
     def losing(workers):
@@ -103,11 +100,11 @@ def test_one_or_two_workers_one_of_them_lost_and_rows_that_fail(tmp_path, monkey
                 client.cluster.scale(0)
             yield client
 
-    monkeypatch.setattr(cluster, "local", losing)
+    monkeypatch.setattr(conducting, "local", losing)
     study = Study.read(write(tmp_path, RODS))
     folders = [tmp_path / "one", tmp_path / "two"]
     for workers, folder in enumerate(folders, start=1):
-        conduct(study, Settings(folder, workers=workers), Progress())
+        conduct(study, PlaySettings(folder, workers=workers), Progress())
     assert len(started) >= 3  # a busy machine may lose a worker of its own
     one, two = map(by_key, folders)
     assert one == two
@@ -176,7 +173,7 @@ def test_a_twin_is_calibrated_once(tmp_path, monkeypatch):
     monkeypatch.setenv("DER_LIMB_CACHE", str(tmp_path / "cache"))
     text = "task: run\nfactors: {seed: 5, period: 1, cycles: 1, amplitude: 0.1, model: [der, pcc]}"
     study, out = Study.read(write(tmp_path, text)), tmp_path / "out"
-    conduct(study, Settings(out, workers=2), Progress())
+    conduct(study, PlaySettings(out, workers=2), Progress())
     kept = by_key(out)
     assert len(kept) == 2
     assert all(record["error"] is None for record in kept.values())
@@ -193,7 +190,7 @@ def test_a_twin_is_calibrated_once(tmp_path, monkeypatch):
 def test_rows_that_are_done_again_are_there_once(tmp_path):
     study = Study.read(write(tmp_path, RODS))
     store = Store(tmp_path / "out", study)
-    good, bad = Outcome({"mean_error_m": 0.01, "max_error_m": 0.02}), Outcome(error="lost")
+    good, bad = Outcome({"mean_error_m": 0.01, "max_error_m": 0.02}), Outcome({}, "lost")
     store.keep(study.rows[:3], [bad, good, good], "sources")
     store.keep(study.rows[3:4], [bad], "sources")
     failed = [study.rows[0].key, study.rows[3].key]
@@ -226,7 +223,7 @@ def test_another_study_in_the_folder(tmp_path):
 
 
 def test_no_scheduler(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(cluster, "_PATIENCE", 0.5)
+    monkeypatch.setattr(conducting, "_PATIENCE", 0.5)
     monkeypatch.setattr(study_command, "interrupt_once", lambda: None)
     address = f"tcp://127.0.0.1:{free_port()}"
     options = ["--scheduler", address, "--out", str(tmp_path / "out")]
@@ -237,8 +234,8 @@ def test_no_scheduler(tmp_path, monkeypatch, capsys):
 
 def test_the_cache_is_where_it_is_asked_for(tmp_path, monkeypatch):
     monkeypatch.setenv("DER_LIMB_CACHE", str(tmp_path / "here"))
-    assert cache() == tmp_path / "here"
+    assert cache_folder() == tmp_path / "here"
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("DER_LIMB_CACHE", str(tmp_path / "file" / "below"))
     with pytest.raises(OSError, match="set DER_LIMB_CACHE to a folder"):
-        cache()
+        cache_folder()

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from der_planner.limb import Limb
-from der_planner.studies.draws import Draw, Spread, rows, saltelli
-from der_planner.studies.errors import StudyError
+from der_planner.studies.factors import StudyError
 from der_planner.studies.indices import sobol_indices
-from der_planner.studies.study import SHIPPED, Study
+from der_planner.studies.study import SHIPPED, Draw, Spread, Study, rows, saltelli
 from der_planner.studies.tasks import with_errors
 
 GOOD = {"task": "run", "factors": "{seed: [3, 4], period: [2, 3.5]}"}

@@ -39,8 +39,7 @@ from apriltag_tracker.camera.calibration import (
     with_offsets,
 )
 from apriltag_tracker.camera.images import PICTURES, ImageError, to_grey
-from apriltag_tracker.commands.calibration_board import add_board_arguments, given_board
-from apriltag_tracker.sheets import SheetError
+from apriltag_tracker.sheets import SheetError, add_board_arguments, given_board
 from apriltag_tracker.tag_map import TagMap, TagMapError
 from limb_interfaces import qos
 

@@ -12,13 +12,14 @@ from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
 
-from apriltag_tracker.commands.calibration_board import add_board_arguments, given_board
 from apriltag_tracker.family import FAMILIES
 from apriltag_tracker.sheets import (
     PAPERS,
     Page,
     SheetError,
+    add_board_arguments,
     board_page,
+    given_board,
     tag_pages,
     write_pdf,
     write_svg,

@@ -86,15 +86,16 @@ class _Candidates(NamedTuple):
     """Quadrilaterals of an image.
 
     Attributes:
-        corners, covariances, residuals: of `refine_quads`.
-        misfits, codes: of `read_codes`.
+        corners: (n, 4, 2) px.
+        covariances: (n, 8, 8) px², with what blended cells shift.
+        residuals: (n,) RMS distance of the crossings from the lines [px].
+        codes: (n,) of `read_codes`.
         good: (n,) whether there is a straight border around clear cells that is no mirror image.
     """
 
     corners: NDArray[np.float64]
     covariances: NDArray[np.float64]
     residuals: NDArray[np.float64]
-    misfits: NDArray[np.float64]
     codes: NDArray[np.uint64]
     good: NDArray[np.bool_]
 
@@ -181,7 +182,10 @@ class Detector:
         seen = self._candidates(self._read_as(gray), np.ascontiguousarray(corners))
         wrong = np.bitwise_count(code_table(self.family)[0, list(ids)] ^ seen.codes)
         good = seen.good & (wrong <= self.correct_bits + 1)
-        return [self._tag(seen, i, ids[i]) for i in np.flatnonzero(good).tolist()]
+        return [
+            Tag(ids[i], seen.corners[i], seen.covariances[i], float(seen.residuals[i]))
+            for i in np.flatnonzero(good).tolist()
+        ]
 
     def _read_as(self, gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return an image in which borders are black: the negative of a family with white ones."""
@@ -195,7 +199,13 @@ class Detector:
         for i in np.flatnonzero(seen.good).tolist():
             tag, turn, wrong = nearest_tag(seen.codes[i], self.family)
             if wrong <= self.correct_bits:
-                tags.append(self._tag(seen, i, tag, turn))
+                order = (np.arange(4) + turn) % 4
+                both = np.stack([2 * order, 2 * order + 1], axis=1).ravel()
+                corners, covariance = (
+                    seen.corners[i][order],
+                    seen.covariances[i][np.ix_(both, both)],
+                )
+                tags.append(Tag(tag, corners, covariance, float(seen.residuals[i])))
         return tags
 
     def _candidates(self, image: NDArray[np.uint8], quads: NDArray[np.float64]) -> _Candidates:
@@ -206,22 +216,13 @@ class Detector:
         good = found & (residuals <= self.largest_residual) & (misfits < UNREADABLE)
         good &= misfits <= self.family.largest_misfit
         # Corners run as printed, not as in a mirror; y points down in the image.
-        good &= along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0] < 0.0
-        return _Candidates(corners, covariances, residuals, misfits, codes, good)
-
-    def _tag(self, seen: _Candidates, index: int, tag: int, turn: int = 0) -> Tag:
-        """Return one of the candidates as a tag whose lower left is the corner `turn`."""
-        order = (np.arange(4) + turn) % 4
-        both = np.stack([2 * order, 2 * order + 1], axis=1).ravel()
-        corners = seen.corners[index][order]
-        cell = math.dist(corners[0], corners[2]) / math.sqrt(2.0) / self.family.border_cells
-        shift = _BLENDED * max(seen.misfits[index] - _SHARP_MISFIT, 0.0) * cell
-        return Tag(
-            int(tag),
-            corners,
-            seen.covariances[index][np.ix_(both, both)] + shift**2 * np.eye(8),
-            float(seen.residuals[index]),
-        )
+        turned = along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]
+        good &= turned < 0.0
+        # Half of the cross of the diagonals is the area.
+        cells = np.sqrt(0.5 * np.abs(turned)) / self.family.border_cells
+        shifts = _BLENDED * np.maximum(misfits - _SHARP_MISFIT, 0.0) * cells
+        covariances[good] += shifts[good, None, None] ** 2 * np.eye(8)
+        return _Candidates(corners, covariances, residuals, codes, good)
 
     def _check_conventions(self) -> None:
         """Detect one known tag; check id, corner order, rotation and pixel convention.

@@ -1,17 +1,21 @@
-"""Families of planar curves whose heading is linear in the parameters, and their derivatives."""
+"""Planar curves whose heading is linear in their parameters, and the fit of one to places."""
 
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 PLACE = 3
-"""Numbers of a planar pose: x, y [m], heading [rad]."""
+"""A planar pose has so many numbers: x, y [m], heading [rad]."""
+
+_PASSES = 12
+
+_SETTLED = 1e-5
+"""Steps end when heading [rad] and base [m] change by less than this; its square is left."""
 
 
 class Curve:
@@ -81,66 +85,14 @@ class Curve:
         return points, table
 
 
-@njit(cache=True)
-def wrap(angle: float) -> float:
-    """Return an angle between −π and π."""
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi
-
-
-@njit(cache=True)
-def write_places(
-    parameters: NDArray[np.float64],
-    integral: NDArray[np.float64],
-    inner: NDArray[np.float64],
-    outer: NDArray[np.float64],
-    places: NDArray[np.float64],
-    slopes: NDArray[np.float64],
-) -> None:
-    """Write places x, y, heading (n, 3) of a curve and their derivatives (n, 3, size).
-
-    Args:
-        parameters: (size,) of the curve.
-        integral: (n, points) weights that integrate from the base up to each place.
-        inner: (points, size) derivatives of the heading at the points of the integral.
-        outer: (n, size) the same at the places.
-        places: output.
-        slopes: output.
-    """
-    count, size = outer.shape
-    heading = inner @ parameters
-    cosine, sine = np.cos(heading), np.sin(heading)
-    stretch = 1.0 + parameters[3]
-    slopes[:] = 0.0
-    for i in range(count):
-        x, y = 0.0, 0.0
-        for p in range(inner.shape[0]):
-            weight = integral[i, p]
-            if weight == 0.0:
-                continue
-            along, across = weight * cosine[p], weight * sine[p]
-            x += along
-            y += across
-            for q in range(2, size):
-                slopes[i, 0, q] -= across * inner[p, q]
-                slopes[i, 1, q] += along * inner[p, q]
-        places[i, 0] = parameters[0] + stretch * x
-        places[i, 1] = parameters[1] + stretch * y
-        places[i, 2] = 0.0
-        for q in range(size):
-            slopes[i, 0, q] *= stretch
-            slopes[i, 1, q] *= stretch
-            slopes[i, 2, q] = outer[i, q]
-            places[i, 2] += outer[i, q] * parameters[q]
-        slopes[i, 0, 0] = slopes[i, 1, 1] = 1.0
-        slopes[i, 0, 3], slopes[i, 1, 3] = x, y
-
-
 class Evaluation:
     """A curve at a fixed set of arc lengths: places and their derivatives.
 
     Attributes:
         s: (n,) m, arc lengths.
-        integral, inner, outer: tables of `write_places`.
+        integral: (n, points) weights that integrate from the base up to each place.
+        inner: (points, size) derivatives of the heading at the points of the integral.
+        outer: (n, size) the same at the places.
     """
 
     def __init__(self, curve: Curve, s: Sequence[float]) -> None:
@@ -153,7 +105,77 @@ class Evaluation:
         self, parameters: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return x, y, heading (n, 3) and their derivatives (n, 3, size)."""
+        heading = self.inner @ parameters
+        along, across = self.integral * np.cos(heading), self.integral * np.sin(heading)
+        x, y, stretch = along.sum(axis=1), across.sum(axis=1), 1.0 + parameters[3]
         places = np.empty((len(self.s), PLACE))
-        slopes = np.empty((len(self.s), PLACE, self.outer.shape[1]))
-        write_places(parameters, self.integral, self.inner, self.outer, places, slopes)
+        places[:, 0], places[:, 1] = parameters[0] + stretch * x, parameters[1] + stretch * y
+        places[:, 2] = self.outer @ parameters
+        slopes = np.empty((len(self.s), PLACE, len(parameters)))
+        slopes[:, 0] = -stretch * (across @ self.inner)
+        slopes[:, 1] = stretch * (along @ self.inner)
+        slopes[:, 2] = self.outer
+        slopes[:, 0, 0] = slopes[:, 1, 1] = 1.0
+        slopes[:, 0, 3], slopes[:, 1, 3] = x, y
         return places, slopes
+
+
+@dataclass(frozen=True)
+class CurveFit:
+    """The most probable curve through measured places.
+
+    Attributes:
+        parameters: (size,) of the curve.
+        gain: (size, n, 3) derivative of the parameters by the measurements.
+        residuals: (n, 3) measurements less the fit.
+        left_open: (size, size) how much of each parameter the measurements leave to the prior, in
+            standard deviations of the prior.
+    """
+
+    parameters: NDArray[np.float64]
+    gain: NDArray[np.float64]
+    residuals: NDArray[np.float64]
+    left_open: NDArray[np.float64]
+
+
+def fit_curve(
+    evaluation: Evaluation,
+    measured: NDArray[np.float64],
+    covariances: NDArray[np.float64],
+    prior_sigma: NDArray[np.float64],
+    start: NDArray[np.float64],
+) -> CurveFit:
+    """Fit a curve whose heading is linear in its parameters to places (maximum a posteriori).
+
+    Args:
+        evaluation: of the curve at the n places.
+        measured: (n, 3) x, y [m] and heading [rad].
+        covariances: (n, 3, 3) of their errors, which are independent from place to place.
+        prior_sigma: (size,) standard deviations of the parameters, about zero.
+        start: (size,) parameters to start from.
+    """
+    parameters, size = start.copy(), len(start)
+    whiten = np.linalg.inv(np.linalg.cholesky(covariances))
+    weak = np.diag(prior_sigma**-2.0)
+    for _ in range(_PASSES):
+        places, slopes = evaluation.places(parameters)
+        gaps = measured - places
+        gaps[:, 2] = wrap(gaps[:, 2])
+        rows = (whiten @ slopes).reshape(-1, size)
+        normal = rows.T @ rows + weak
+        right = rows.T @ (whiten @ gaps[:, :, None]).ravel() - weak @ parameters
+        move = np.linalg.solve(normal, right)
+        # A step of more than a radian of heading is damped: the fit may start far away.
+        reach = float(np.abs(evaluation.inner @ move).max())
+        parameters += move * min(1.0, 1.0 / max(reach, 1e-9))
+        if reach < _SETTLED and np.abs(move[:2]).max() < _SETTLED:
+            break
+    by_rows = np.linalg.solve(normal, rows.T).reshape(size, -1, 1, PLACE)
+    gain = np.asarray((by_rows @ whiten)[:, :, 0], dtype=np.float64)
+    left_open = (np.eye(size) - np.tensordot(gain, slopes, 2)) * prior_sigma
+    return CurveFit(parameters, gain, gaps, np.asarray(left_open, dtype=np.float64))
+
+
+def wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return angles between −π and π."""
+    return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi)

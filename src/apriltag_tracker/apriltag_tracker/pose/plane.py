@@ -5,90 +5,39 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from apriltag_tracker.camera import CameraPose, Intrinsics
-from apriltag_tracker.camera.lens import undistort_pixels
-from apriltag_tracker.tag_map import LimbTag
+from apriltag_tracker.tag_map import UNIT_CORNERS, LimbTag
 
 
-@njit(cache=True)
-def planar_pose(
-    corners: NDArray[np.float64], size: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Fit a square of known size to four points of a plane (Kabsch 1976, in the plane).
+def planar_poses(
+    corners: NDArray[np.float64], sizes: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Fit squares of known sizes to four points of a plane each (Kabsch 1976, in the plane).
 
     Args:
-        corners: (4, 2) m, from the printed lower left counter-clockwise.
-        size: edge of the square [m].
+        corners: (n, 4, 2) m, from the printed lower left counter-clockwise.
+        sizes: (n,) m, edges of the squares.
 
     Returns:
-        x, y [m] and yaw [rad]; the derivative (3, 8) of these by the corners x0 y0 x1 …; and the
-        RMS distance of the corners from the square [m].
+        x, y [m] and yaw [rad], (n, 3); their derivatives (n, 3, 8) by the corners x0 y0 x1 …; and
+        the RMS distance (n,) of the corners from the square [m].
     """
-    x = (corners[0, 0] + corners[1, 0] + corners[2, 0] + corners[3, 0]) / 4.0
-    y = (corners[0, 1] + corners[1, 1] + corners[2, 1] + corners[3, 1]) / 4.0
-    half = 0.5 * size
-    cosine, sine = 0.0, 0.0
-    for k in range(4):
-        u = half if k in {1, 2} else -half
-        v = half if k in {2, 3} else -half
-        cosine += u * (corners[k, 0] - x) + v * (corners[k, 1] - y)
-        sine += u * (corners[k, 1] - y) - v * (corners[k, 0] - x)
-    squared = cosine * cosine + sine * sine
-    norm = math.sqrt(squared)
-    jacobian = np.zeros((3, 8))
-    misfit = 0.0
-    for k in range(4):
-        u = half if k in {1, 2} else -half
-        v = half if k in {2, 3} else -half
-        jacobian[0, 2 * k] = 0.25
-        jacobian[1, 2 * k + 1] = 0.25
-        # The square's own centre is zero, so the mean of the corners does not enter the angle.
-        jacobian[2, 2 * k] = (-cosine * v - sine * u) / squared
-        jacobian[2, 2 * k + 1] = (cosine * u - sine * v) / squared
-        gap_x = corners[k, 0] - x - (cosine * u - sine * v) / norm
-        gap_y = corners[k, 1] - y - (sine * u + cosine * v) / norm
-        misfit += gap_x * gap_x + gap_y * gap_y
-    return np.array([x, y, math.atan2(sine, cosine)]), jacobian, math.sqrt(misfit / 4.0)
-
-
-@njit(cache=True)
-def _locate(
-    corners: NDArray[np.float64],
-    covariances: NDArray[np.float64],
-    heights: NDArray[np.float64],
-    sizes: NDArray[np.float64],
-    matrix: NDArray[np.float64],
-    distortion: NDArray[np.float64],
-    rotation: NDArray[np.float64],
-    origin: NDArray[np.float64],
-    places: NDArray[np.float64],
-    spreads: NDArray[np.float64],
-    misfits: NDArray[np.float64],
-) -> None:
-    on_plane = np.empty((4, 2))
-    for i in range(corners.shape[0]):
-        rays = undistort_pixels(corners[i], matrix, distortion)
-        slopes = np.zeros((8, 8))
-        gap = heights[i] - origin[2]
-        for k in range(4):
-            direction = rays[k, 0] * rotation[0] + rays[k, 1] * rotation[1] + rotation[2]
-            for row in range(2):
-                on_plane[k, row] = origin[row] + gap * direction[row] / direction[2]
-                for axis in range(2):
-                    # The lens bends little across a tag: the focal length is the slope of the rays.
-                    change = rotation[axis, row] * direction[2]
-                    change -= direction[row] * rotation[axis, 2]
-                    slopes[2 * k + row, 2 * k + axis] = (
-                        gap * change / direction[2] ** 2 / matrix[axis, axis]
-                    )
-        place, by_corners, misfit = planar_pose(on_plane, sizes[i])
-        gain = by_corners @ slopes
-        places[i] = place
-        spreads[i] = gain @ covariances[i] @ gain.T
-        misfits[i] = misfit
+    centres = corners.mean(axis=1)
+    off = corners - centres[:, None]
+    u, v = np.moveaxis(sizes[:, None, None] * UNIT_CORNERS, 2, 0)
+    cosine = np.sum(u * off[:, :, 0] + v * off[:, :, 1], axis=1)[:, None]
+    sine = np.sum(u * off[:, :, 1] - v * off[:, :, 0], axis=1)[:, None]
+    norm = np.hypot(cosine, sine)
+    turned = np.stack([cosine * u - sine * v, sine * u + cosine * v], axis=2) / norm[:, :, None]
+    misfits = np.sqrt(np.mean(np.sum((off - turned) ** 2, axis=2), axis=1))
+    slopes = np.zeros((len(corners), 3, 8))
+    slopes[:, 0, 0::2] = slopes[:, 1, 1::2] = 0.25
+    # The square's own centre is zero, so the mean of the corners does not enter the angle.
+    slopes[:, 2, 0::2] = (-cosine * v - sine * u) / norm**2
+    slopes[:, 2, 1::2] = (cosine * u - sine * v) / norm**2
+    return np.column_stack([centres, np.arctan2(sine, cosine)]), slopes, misfits
 
 
 def locate(
@@ -113,73 +62,18 @@ def locate(
         Poses (n, 3) x, y [m], yaw [rad]; their (n, 3, 3) covariance from the noise of the corners;
         and the RMS misfit (n,) of the corners to a square of the tag's size [m].
     """
-    count = len(corners)
-    places, spreads = np.empty((count, 3)), np.empty((count, 3, 3))
-    misfits = np.empty(count)
-    _locate(
-        np.ascontiguousarray(corners),
-        np.ascontiguousarray(covariances),
-        np.ascontiguousarray(heights),
-        np.ascontiguousarray(sizes),
-        intrinsics.matrix,
-        intrinsics.distortion,
-        np.ascontiguousarray(pose.rotation),
-        pose.position,
-        places,
-        spreads,
-        misfits,
-    )
-    return places, spreads, misfits
-
-
-@njit(cache=True)
-def _moves_of_a_point(
-    point: NDArray[np.float64],
-    rotation: NDArray[np.float64],
-    translation: NDArray[np.float64],
-    moves: NDArray[np.float64],
-) -> None:
-    """Write how x and y of a point on its plane move with the camera's pose, (2, 6)."""
-    seen = rotation @ point + translation
-    down = np.ascontiguousarray(rotation.T)
-    ray = down @ seen
-    shift = np.zeros(3)
-    for k in range(6):
-        shift[:] = 0.0
-        if k < 3:
-            # e × X of the axis k.
-            after, last = (k + 1) % 3, (k + 2) % 3
-            shift[after], shift[last] = -seen[last], seen[after]
-        else:
-            shift[k - 3] = 1.0
-        turned = down @ shift
-        for row in range(2):
-            moves[row, k] = ray[row] * turned[2] / ray[2] - turned[row]
-
-
-@njit(cache=True)
-def _pose_moves(
-    places: NDArray[np.float64],
-    heights: NDArray[np.float64],
-    sizes: NDArray[np.float64],
-    rotation: NDArray[np.float64],
-    translation: NDArray[np.float64],
-    result: NDArray[np.float64],
-) -> None:
-    right, up = np.empty((2, 6)), np.empty((2, 6))
-    for i in range(places.shape[0]):
-        centre = np.array([places[i, 0], places[i, 1], heights[i]])
-        half = 0.5 * sizes[i]
-        cosine, sine = half * math.cos(places[i, 2]), half * math.sin(places[i, 2])
-        middle = result[i, :2]
-        along, across = np.array([cosine, sine, 0.0]), np.array([-sine, cosine, 0.0])
-        _moves_of_a_point(centre, rotation, translation, middle)
-        _moves_of_a_point(centre + along, rotation, translation, right)
-        _moves_of_a_point(centre + across, rotation, translation, up)
-        for k in range(6):
-            turn = -sine * (right[0, k] - middle[0, k]) + cosine * (right[1, k] - middle[1, k])
-            turn -= cosine * (up[0, k] - middle[0, k]) + sine * (up[1, k] - middle[1, k])
-            result[i, 2, k] = 0.5 * turn / half**2
+    rotation, origin = pose.rotation, pose.position
+    rays = intrinsics.rays(corners.reshape(-1, 2)).reshape(-1, 4, 2)
+    directions = rays @ rotation[:2] + rotation[2]
+    across, down = directions[:, :, :2], directions[:, :, 2:]
+    gap = (heights - origin[2])[:, None, None]
+    places, slopes, misfits = planar_poses(origin[:2] + gap * across / down, sizes)
+    # The lens bends little across a tag: the focal length is the slope of the rays.
+    focal = np.diag(intrinsics.matrix)[:2]
+    changes = rotation[:2, :2].T * down[:, :, :, None] - across[:, :, :, None] * rotation[:2, 2]
+    changes *= gap[:, :, :, None] / down[:, :, :, None] ** 2 / focal
+    gain = np.einsum("npkr,nkra->npka", slopes.reshape(-1, 3, 4, 2), changes).reshape(-1, 3, 8)
+    return places, gain @ covariances @ gain.transpose(0, 2, 1), misfits
 
 
 def pose_moves(
@@ -202,16 +96,21 @@ def pose_moves(
     Returns:
         (n, 3, 6) derivatives of x, y, yaw by ω [rad] and τ [m].
     """
-    result = np.empty((len(places), 3, 6))
-    _pose_moves(
-        np.ascontiguousarray(places),
-        np.ascontiguousarray(heights),
-        np.ascontiguousarray(sizes),
-        np.ascontiguousarray(pose.rotation),
-        np.ascontiguousarray(pose.translation),
-        result,
-    )
-    return result
+    half = 0.5 * sizes
+    cosine, sine = half * np.cos(places[:, 2]), half * np.sin(places[:, 2])
+    centres, zero = np.column_stack([places[:, :2], heights]), np.zeros(len(places))
+    along, over = np.stack([cosine, sine, zero], axis=1), np.stack([-sine, cosine, zero], axis=1)
+    points = np.stack([centres, centres + along, centres + over])
+    seen = points @ pose.rotation.T + pose.translation
+    shifts = np.empty((*seen.shape[:2], 6, 3))
+    shifts[:, :, :3] = np.cross(np.eye(3), seen[:, :, None])
+    shifts[:, :, 3:] = np.eye(3)
+    rays, turned = seen @ pose.rotation, shifts @ pose.rotation
+    moves = rays[:, :, None, :2] / rays[:, :, None, 2:] * turned[..., 2:] - turned[..., :2]
+    middle, right, up = moves.transpose(0, 1, 3, 2)
+    turn = np.einsum("nr,nrk->nk", over[:, :2], right - middle)
+    turn -= np.einsum("nr,nrk->nk", along[:, :2], up - middle)
+    return np.concatenate([middle, 0.5 * (turn / half[:, None] ** 2)[:, None]], axis=1)
 
 
 def centreline_pose(place: NDArray[np.float64], tag: LimbTag) -> NDArray[np.float64]:

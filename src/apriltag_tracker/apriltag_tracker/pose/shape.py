@@ -14,8 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from apriltag_tracker.pose.curve import PLACE, Curve, Evaluation
-from apriltag_tracker.pose.solution import solve_shape
+from apriltag_tracker.pose.curve import PLACE, Curve, CurveFit, Evaluation, fit_curve
 from apriltag_tracker.tag_map import TagMap
 
 
@@ -104,14 +103,6 @@ class LimbEstimate:
         return float(np.sqrt(np.linalg.eigvalsh(both)[-1]))
 
 
-@dataclass(frozen=True)
-class _Fit:
-    parameters: NDArray[np.float64]
-    gain: NDArray[np.float64]
-    residuals: NDArray[np.float64]
-    left_open: NDArray[np.float64]
-
-
 def _carried(gain: NDArray[np.float64], spreads: NDArray[np.float64]) -> NDArray[np.float64]:
     """Carry independent covariances (n, 3, 3), or one for all (3, 3), through a gain (m, n, 3)."""
     by_tag = gain.transpose(1, 0, 2)
@@ -119,7 +110,7 @@ def _carried(gain: NDArray[np.float64], spreads: NDArray[np.float64]) -> NDArray
     return result
 
 
-def _furthest(fit: _Fit) -> float:
+def _furthest(fit: CurveFit) -> float:
     """Return the largest distance of a tag from the fit [m]."""
     return float(np.hypot(fit.residuals[:, 0], fit.residuals[:, 1]).max())
 
@@ -196,7 +187,7 @@ class ShapeFitter:
 
     def _consistent(
         self, tags: list[PlanarTag]
-    ) -> tuple[list[PlanarTag], dict[int, float], _Fit | None]:
+    ) -> tuple[list[PlanarTag], dict[int, float], CurveFit | None]:
         """Leave out tags that are far from the arcs through all others.
 
         Arcs are stiff enough to show a tag on the wrong place, which the smooth fit would follow.
@@ -258,7 +249,7 @@ class ShapeFitter:
         curve: Curve,
         tags: Sequence[PlanarTag],
         start: NDArray[np.float64],
-    ) -> _Fit:
+    ) -> CurveFit:
         """Find the most probable parameters and the gain (size, n, 3) from measurements to them."""
         evaluation = self._evaluation(curve, tuple(tag.arc_length for tag in tags))
         prior = self.prior
@@ -267,29 +258,20 @@ class ShapeFitter:
             if curve.degrees
             else (prior.arc_position, prior.arc_heading)
         )
-        parameters = start[: curve.size].copy()
-        count, size = len(tags), curve.size
-        gain, gap = np.empty((size, count, PLACE)), np.empty((count, PLACE))
-        left_open = np.empty((size, size))
-        solve_shape(
+        position, heading = slack
+        covariances = np.array([tag.covariance for tag in tags])
+        return fit_curve(
+            evaluation,
             np.array([tag.pose for tag in tags]),
-            np.array([tag.covariance for tag in tags]),
-            np.array([slack[0], slack[0], slack[1]]) ** 2,
-            1.0 / self._prior_sigma(curve),
-            evaluation.integral,
-            evaluation.inner,
-            evaluation.outer,
-            parameters,
-            gain,
-            gap,
-            left_open,
+            covariances + np.diag([position, position, heading]) ** 2,
+            self._prior_sigma(curve),
+            start[: curve.size],
         )
-        return _Fit(parameters, gain, gap, left_open)
 
     def _estimate(
         self,
-        fit: _Fit,
-        arcs: _Fit,
+        fit: CurveFit,
+        arcs: CurveFit,
         tags: Sequence[PlanarTag],
         rejected: dict[int, float],
         common: NDArray[np.float64],

@@ -14,14 +14,16 @@ import yaml
 from numpy.typing import NDArray
 
 from apriltag_tracker.camera import CameraError, CameraPose, Intrinsics, project
-from apriltag_tracker.camera.lens import ray_map
+from apriltag_tracker.camera.pinhole import ray_map
 from apriltag_tracker.synthetic import render
-from apriltag_tracker.synthetic.placing import (
+from apriltag_tracker.synthetic.shapes import (
     MOST_INSTANTS,
     PLACEMENT,
+    Centreline,
     Exposure,
     Mounts,
-    place_at,
+    Placements,
+    Shape,
     place_tags,
 )
 from apriltag_tracker.tag_map import LimbTag, TagMap, WorldTag
@@ -66,19 +68,6 @@ class Errors:
     survey: float = 0.0
     mounting: float = 0.0
     mounting_angle: float = 0.0
-
-
-@dataclass(frozen=True)
-class Shape:
-    """A centreline in the plane: arc length (n,) m, points (n, 2) m and heading (n,) rad."""
-
-    arc_length: NDArray[np.float64]
-    points: NDArray[np.float64]
-    heading: NDArray[np.float64]
-
-    def at(self, arc_length: float) -> NDArray[np.float64]:
-        """Return x, y, heading at an arc length (cubic), continued as a line beyond."""
-        return np.array(place_at(self.arc_length, self.points, self.heading, arc_length))
 
 
 @dataclass
@@ -229,24 +218,11 @@ class SyntheticCamera:
             later = Shape(
                 shape.arc_length, shape.points + velocity.points, shape.heading + velocity.heading
             )
-        count = len(self.tags.limb)
-        middle, counts = np.empty((count, PLACEMENT)), np.empty(count, dtype=np.int64)
-        placements = np.empty((count, MOST_INSTANTS, PLACEMENT))
-        place_tags(
-            self._mounts,
-            self._exposure,
-            shape.arc_length,
-            shape.points,
-            shape.heading,
-            later.points,
-            later.heading,
-            middle,
-            placements,
-            counts,
+        limb = Centreline(
+            shape.arc_length, shape.points, shape.heading, later.points, later.heading
         )
-        return self._draw_tags(
-            image, self.tags.limb, self._prints, self._noise, middle, placements, counts
-        )
+        placed = place_tags(self._mounts, self._exposure, limb)
+        return self._draw_tags(image, self.tags.limb, self._prints, self._noise, placed)
 
     def _draw_tags(
         self,
@@ -254,26 +230,12 @@ class SyntheticCamera:
         tags: Sequence[LimbTag | WorldTag],
         prints: render.Prints,
         noise: NDArray[np.int8],
-        middle: NDArray[np.float64],
-        placements: NDArray[np.float64],
-        counts: NDArray[np.int64],
+        placed: Placements,
     ) -> dict[int, NDArray[np.float64]]:
         """Draw placed tags; returns the corners of those that are in the picture, by id."""
-        corners, drawn = np.empty((len(tags), 4, 2)), np.empty(len(tags), dtype=np.bool_)
         starts = self._noise_starts if len(noise) > 1 else np.zeros(len(tags), dtype=np.int64)
-        render.draw_tags(
-            image,
-            self._eye,
-            prints,
-            noise,
-            starts,
-            middle,
-            placements,
-            counts,
-            self._exposure.shares,
-            corners,
-            drawn,
-        )
+        shares = self._exposure.shares
+        corners, drawn = render.draw_tags(image, self._eye, prints, noise, starts, placed, shares)
         return {tag.id: corners[k] for k, tag in enumerate(tags) if drawn[k]}
 
     def _draw_body(self, image: NDArray[np.uint8], shape: Shape) -> None:
@@ -363,7 +325,7 @@ class SyntheticCamera:
         if not len(world):
             return image, {}
         instants = np.repeat(world[:, None], MOST_INSTANTS, axis=1)
-        once, silent = np.ones(len(world), dtype=np.int64), np.zeros(1, dtype=np.int8)
-        tags = self.tags.world
-        corners = self._draw_tags(image, tags, self._print(tags), silent, world, instants, once)
+        still = Placements(world, instants, np.ones(len(world), dtype=np.int64))
+        tags, silent = self.tags.world, np.zeros(1, dtype=np.int8)
+        corners = self._draw_tags(image, tags, self._print(tags), silent, still)
         return image, corners

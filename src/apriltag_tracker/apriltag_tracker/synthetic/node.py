@@ -17,10 +17,9 @@ from apriltag_tracker.synthetic.camera import (
     CameraModel,
     Errors,
     Optics,
-    Shape,
     SyntheticCamera,
 )
-from apriltag_tracker.synthetic.shapes import constant_curvature
+from apriltag_tracker.synthetic.shapes import Shape, constant_curvature
 from apriltag_tracker.tag_map import TagMap
 from der_msgs.msg import LimbShape
 from limb_interfaces import qos, stamps, topics
@@ -50,33 +49,27 @@ class SyntheticCameraNode(Node):
             "YAML file: lens and place of the rendered camera",
         )
         seed = declare(self, "seed", 0, "of noise, floor and set-up errors", at_least=0)
+        number = self._number
         optics = Optics(
-            noise=self._number("noise", Optics.noise, "noise of a pixel, grey levels", 30.0),
-            blur=self._number(
-                "blur", Optics.blur, "blur of the lens, standard deviation in px", 4.0
-            ),
-            exposure=self._number("exposure", Optics.exposure, "exposure time in s", 0.1),
-            light_fall=self._number(
-                "light_fall", Optics.light_fall, "difference of the light over its mean", 1.0
-            ),
+            noise=number("noise", Optics.noise, "noise of a pixel, grey levels", 30.0),
+            blur=number("blur", Optics.blur, "blur of the lens, standard deviation in px", 4.0),
+            exposure=number("exposure", Optics.exposure, "exposure time in s", 0.1),
+            light_fall=number("light_fall", Optics.light_fall, "light's range over its mean", 1.0),
         )
+        surveyed, mounted = "how far fixed tags are from the tag map, in m", "the same of limb tags"
         errors = Errors(
-            survey=self._number(
-                "survey_error", 0.0, "how far fixed tags are from the tag map, in m", 0.01
-            ),
-            mounting=self._number(
-                "mounting_error", 0.0, "how far limb tags are from the tag map, in m", 0.01
-            ),
-            mounting_angle=self._number(
-                "mounting_angle_error", 0.0, "how far limb tags are turned, in rad", 0.3
-            ),
+            survey=number("survey_error", 0.0, surveyed, 0.01),
+            mounting=number("mounting_error", 0.0, mounted, 0.01),
+            mounting_angle=number("mounting_angle_error", 0.0, "limb tags' turn, in rad", 0.3),
         )
         check_overrides(self)
         tags = TagMap.from_yaml(str(tag_map))
         self._camera = SyntheticCamera(
             CameraModel.from_yaml(str(camera)), tags, optics, errors, int(seed)
         )
-        self._warm_up(tags)
+        # Draw once, so that no frame of a run waits for a compiler.
+        straight = constant_curvature(tags.segment_lengths, [0.0] * len(tags.segment_lengths))
+        self._camera.frame(straight, straight)
         self._before: tuple[int, Shape] | None = None
         self._frames = 0
         self._refused = 0
@@ -99,11 +92,6 @@ class SyntheticCameraNode(Node):
         return float(
             declare(self, name, float(default), description, at_least=0.0, at_most=at_most)
         )
-
-    def _warm_up(self, tags: TagMap) -> None:
-        """Draw once, so that no frame of a run waits for a compiler."""
-        straight = constant_curvature(tags.segment_lengths, [0.0] * len(tags.segment_lengths))
-        self._camera.frame(straight, straight)
 
     def _image_message(self) -> Image:
         size = self._camera.model.intrinsics

@@ -14,7 +14,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from apriltag_tracker.camera.lens import distort
+from apriltag_tracker.camera.pinhole import distort
+from apriltag_tracker.synthetic.shapes import Placements
 
 PIXEL_VARIANCE = 1.0 / 12.0
 """Of a box of one pixel [px²]."""
@@ -63,6 +64,25 @@ class Prints(NamedTuple):
 
     cells: NDArray[np.float64]
     border: float
+
+
+class Seen(NamedTuple):
+    """One tag as the camera sees it during an exposure.
+
+    Attributes:
+        maps: (k, 9) from rays to cells (column to the right, row downward), one for each instant of
+            the exposure.
+        shares: (k,) of the exposure that each instant stands for; they sum to 1.
+        across: standard deviation of blur and pixel along the columns of cells [cells].
+        down: the same along the rows.
+        cells: (n, n) printed cells with their margin, 1 is white.
+    """
+
+    maps: NDArray[np.float64]
+    shares: NDArray[np.float64]
+    across: float
+    down: float
+    cells: NDArray[np.float64]
 
 
 def cumulative_table() -> NDArray[np.float64]:
@@ -122,10 +142,7 @@ def _draw_box(
     noise: NDArray[np.int8],
     noise_start: int,
     box: tuple[int, int, int, int],
-    maps: NDArray[np.float64],
-    shares: NDArray[np.float64],
-    spread: tuple[float, float],
-    cells: NDArray[np.float64],
+    seen: Seen,
 ) -> None:
     """Draw one tag into its bounding box.
 
@@ -135,13 +152,10 @@ def _draw_box(
         noise: (n,) grey levels, added to the tag's pixels from `noise_start` on.
         noise_start: place in the noise.
         box: first row, end row, first column, end column.
-        maps: (k, 9) from rays to cells (column to the right, row downward), one for each instant
-            of the exposure.
-        shares: (k,) of the exposure that each instant stands for; they sum to 1.
-        spread: standard deviation of blur and pixel in cells, along columns and rows.
-        cells: (n, n) printed cells with their margin, 1 is white.
+        seen: the tag.
     """
-    count, table = cells.shape[0], eye.table
+    cells, maps, shares, table = seen.cells, seen.maps, seen.shares, eye.table
+    count = cells.shape[0]
     across, down = np.empty(count), np.empty(count)
     position = noise_start
     for row in range(box[0], box[1]):
@@ -153,10 +167,10 @@ def _draw_box(
                 scale = 1.0 / (m[6] * x + m[7] * y + m[8])
                 u = (m[0] * x + m[1] * y + m[2]) * scale
                 v = (m[3] * x + m[4] * y + m[5]) * scale
-                left, right, wide = _shares(u, spread[0], count, table, across)
+                left, right, wide = _shares(u, seen.across, count, table, across)
                 if wide == 0.0:
                     continue
-                top, bottom, high = _shares(v, spread[1], count, table, down)
+                top, bottom, high = _shares(v, seen.down, count, table, down)
                 cover += shares[k] * wide * high
                 for j in range(top, bottom):
                     line = 0.0
@@ -202,9 +216,11 @@ def _write_map(
     down = cell * (eye.rotation[:, 0] * sine - eye.rotation[:, 1] * cosine)
     origin = eye.rotation @ placement[:3] + eye.translation - half * (right + down)
     # Rows of the inverse of the matrix with these columns are their cross products, up to a factor.
-    result[0:3] = np.cross(down, origin)
-    result[3:6] = np.cross(origin, right)
-    result[6:9] = np.cross(right, down)
+    for k in range(3):
+        after, last = (k + 1) % 3, (k + 2) % 3
+        result[k] = down[after] * origin[last] - down[last] * origin[after]
+        result[3 + k] = origin[after] * right[last] - origin[last] * right[after]
+        result[6 + k] = right[after] * down[last] - right[last] * down[after]
 
 
 @njit(cache=True)
@@ -241,13 +257,9 @@ def draw_tags(
     prints: Prints,
     noise: NDArray[np.int8],
     noise_starts: NDArray[np.int64],
-    middle: NDArray[np.float64],
-    placements: NDArray[np.float64],
-    counts: NDArray[np.int64],
+    placed: Placements,
     shares: NDArray[np.float64],
-    corners: NDArray[np.float64],
-    drawn: NDArray[np.bool_],
-) -> None:
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Draw tags over an exposure.
 
     Args:
@@ -256,34 +268,35 @@ def draw_tags(
         prints: the n tags.
         noise: (m,) grey levels, added to the tags' pixels.
         noise_starts: (n,) places in the noise.
-        middle: (n, 5) placements in the middle of the exposure.
-        placements: (n, k, 5) placements at instants of the exposure.
-        counts: (n,) how many instants of a tag there are.
+        placed: where the tags are.
         shares: (k, k) of the exposure that each instant stands for, row `count - 1` for `count`.
-        corners: (n, 4, 2) px, output: true corners in the middle of the exposure.
-        drawn: (n,) output: whether any of a tag is in the picture.
+
+    Returns:
+        True corners (n, 4, 2) px in the middle of the exposure; and whether any of a tag (n,) is in
+        the picture.
     """
-    both, maps = np.empty((8, 2)), np.empty((placements.shape[1], 9))
+    tags = placed.counts.shape[0]
+    corners, drawn = np.empty((tags, 4, 2)), np.empty(tags, dtype=np.bool_)
+    both, maps = np.empty((8, 2)), np.empty((placed.instants.shape[1], 9))
     rows, columns = canvas.shape
     grown = prints.cells.shape[1] / prints.border
-    for tag in range(counts.shape[0]):
-        count = counts[tag]
-        _write_corners(eye, middle[tag], corners[tag])
-        _write_corners(eye, placements[tag, 0], both[:4])
-        _write_corners(eye, placements[tag, count - 1], both[4:])
+    for tag in range(tags):
+        count = placed.counts[tag]
+        _write_corners(eye, placed.middle[tag], corners[tag])
+        _write_corners(eye, placed.instants[tag, 0], both[:4])
+        _write_corners(eye, placed.instants[tag, count - 1], both[4:])
         box = _box_of(both, grown, eye.blur, rows, columns)
         drawn[tag] = box[0] < box[1] and box[2] < box[3]
         if not drawn[tag]:
             continue
         for k in range(count):
-            _write_map(eye, placements[tag, k], prints, maps[k])
+            _write_map(eye, placed.instants[tag, k], prints, maps[k])
         last = both[4:]
         side = math.hypot(last[1, 0] - last[0, 0], last[1, 1] - last[0, 1])
         side += math.hypot(last[2, 0] - last[3, 0], last[2, 1] - last[3, 1])
         other = math.hypot(last[3, 0] - last[0, 0], last[3, 1] - last[0, 1])
         other += math.hypot(last[2, 0] - last[1, 0], last[2, 1] - last[1, 1])
         wide = 2.0 * eye.blur * prints.border
-        _draw_box(
-            canvas, eye, noise, noise_starts[tag], box, maps[:count], shares[count - 1],
-            (wide / side, wide / other), prints.cells[tag],
-        )  # fmt: skip
+        seen = Seen(maps[:count], shares[count - 1], wide / side, wide / other, prints.cells[tag])
+        _draw_box(canvas, eye, noise, noise_starts[tag], box, seen)
+    return corners, drawn

@@ -17,9 +17,8 @@ from pathlib import Path
 
 from der_planner.experiment.console import Progress, interrupt_once
 from der_planner.results.outputs import OutputError, check_folder
-from der_planner.studies.conduct import Settings, conduct
-from der_planner.studies.errors import StudyError
-from der_planner.studies.factors import ERROR, PLANNED, limb_parameters, of_task
+from der_planner.studies.conduct import PlaySettings, conduct
+from der_planner.studies.factors import ERROR, PLANNED, StudyError, limb_parameters, of_task
 from der_planner.studies.store import Store
 from der_planner.studies.study import SHIPPED, Study
 from der_planner.studies.summary import summarise, text_table
@@ -84,7 +83,9 @@ def main() -> int:
         study = Study.read(given.study)
         out = (given.out or Path("studies") / study.name).resolve()
         check_folder(out)
-        settings = Settings(out, given.scheduler, given.workers, given.limit, given.retry_failed)
+        settings = PlaySettings(
+            out, given.scheduler, given.workers, given.limit, given.retry_failed
+        )
         _play(study, settings)
     except OutputError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -102,7 +103,7 @@ def main() -> int:
     return 0
 
 
-def _play(study: Study, settings: Settings) -> None:
+def _play(study: Study, settings: PlaySettings) -> None:
     progress = Progress()
     kept = conduct(study, settings, progress)
     page = summarise(study, kept, Store(settings.out, study))

@@ -32,7 +32,7 @@ from der_planner.control.disturbance import (
     moves_with,
     stays_behind,
 )
-from der_planner.control.repeatability import Played, Runs
+from der_planner.control.repeatability import PlayedRun, Runs
 from der_planner.identification.update import adapted
 from der_planner.limb import Limb, LimbError
 from der_planner.planning.correction import Correction
@@ -44,14 +44,16 @@ Array = NDArray[np.float64]
 _LEAST_SEEN = 0.2
 """Share of the setpoints at which the tip must be seen."""
 PULL = 0.015
-"""Pull toward the best commands, over the tip's way per pressure: the model's answer to a change of
-commands is wrong by some per cent of the movement of each segment, even where they cancel at the
-tip. (A weaker pull lets segments wander against each other near the straight pose, where the tip
-hardly tells them apart.)"""
+"""Pull toward the best commands, over the tip's movement per pressure.
+
+The model's answer to a change of commands is wrong by some per cent of the movement of each
+segment, even where they cancel at the tip. A weaker pull lets segments wander against each other
+near the straight pose, where the tip hardly tells them apart.
+"""
 _HARDER = 3.0
-"""The pull grows by this after a plan that was worse than the best one …"""
+"""Factor by which the pull grows after a plan that was worse than the best one."""
 _HARDEST = 1.0
-"""… up to this."""
+"""Largest pull, over the tip's movement per pressure."""
 _WORSE = 1.02
 """Share of the best plan's error that a plan may leave, beyond repeatability, and not be worse."""
 _SMALLEST_STEP = 0.1
@@ -117,7 +119,7 @@ class Learner:
         self.history: list[LearningRun] = []
         self._of_file = self._correction
         self._plan = plan
-        self._pending: Played | None = None
+        self._pending: PlayedRun | None = None
         self._beyond: Array | None = None
         self._begin()
 
@@ -128,7 +130,7 @@ class Learner:
         period = float(self._plan.time[1] - self._plan.time[0])
         self._runs = Runs(self._plan.tip_reference, period, self._correction.tip_per_pressure)
         self._step, self._pull = 1.0, PULL * self._correction.tip_per_pressure
-        self._best: Played | None = None
+        self._best: PlayedRun | None = None
         self._levels: list[float] = []
         self._fresh = False
 
@@ -175,7 +177,7 @@ class Learner:
         if said:
             said = f"refused: {said}"
         else:
-            accepted, said = self._take(played)
+            accepted, said = self._accept(played)
         if accepted and beyond is not None:
             self._beyond = beyond
         self.history.append(
@@ -204,7 +206,7 @@ class Learner:
             self._plan = dataclasses.replace(self._plan, chambers_beyond=self._beyond)
         return self._plan
 
-    def _next(self, best: Played) -> Plan:
+    def _next(self, best: PlayedRun) -> Plan:
         if self.stopped or not self._fresh:
             return self._as_plan(best)
         self._fresh = False
@@ -219,7 +221,7 @@ class Learner:
 
     def _played(
         self, measured: Measured, commands: ArrayLike | None
-    ) -> tuple[Played, float, float, str]:
+    ) -> tuple[PlayedRun, float, float, str]:
         """Return a run, its mean and largest error [m], and why its limb does not move, if so."""
         plan = self._plan
         given = plan.differential_pressure
@@ -246,20 +248,20 @@ class Learner:
             [np.interp(measured.time[inside], plan.time, axis) for axis in plan.tip_reference.T]
         )
         distance = np.linalg.norm(measured.tip[inside] - wanted, axis=1)
-        played = Played(given, expected, shown)
+        played = PlayedRun(given, expected, shown)
         if not len(distance):
             return played, float("nan"), float("nan"), astray
         return played, float(distance.mean()), float(distance.max()), astray
 
-    def _take(self, run: Played) -> tuple[bool, str]:
+    def _accept(self, run: PlayedRun) -> tuple[bool, str]:
         """Use a run; return whether it was used, and what was done and why."""
         unlike = self._runs.unlike(run)
         if unlike:
             if self._pending is not None and not self._runs.differ(run, self._pending):
                 before, self._pending = self._pending, None
                 self._begin()
-                said = self._use(before)
-                said = self._use(self._seen_by_model(run)) + said.removeprefix(_FIRST)
+                said = self._learn_from(before)
+                said = self._learn_from(self._seen_by_model(run)) + said.removeprefix(_FIRST)
                 return True, (
                     f"the limb has changed ({unlike}, as in the run before): learning starts again "
                     f"from these two runs; {said}"
@@ -270,9 +272,9 @@ class Learner:
                 "rest has changed and learning starts again"
             )
         self._pending = None
-        return True, self._use(run)
+        return True, self._learn_from(run)
 
-    def _use(self, run: Played) -> str:
+    def _learn_from(self, run: PlayedRun) -> str:
         said = ""
         if self._best is None:
             run, said = self._adapt(run)
@@ -280,7 +282,7 @@ class Learner:
         self._fresh = not self.stopped
         return self._weigh(run) + said
 
-    def _adapt(self, first: Played) -> tuple[Played, str]:
+    def _adapt(self, first: PlayedRun) -> tuple[PlayedRun, str]:
         """Bring the model near a first run that is far from it; return the run as it sees it."""
         tip = first.expected.tip + first.shown.value
 
@@ -296,15 +298,15 @@ class Learner:
         self._correction = self._of_file.of(nearer)
         return self._seen_by_model(first), _ADAPTED
 
-    def _seen_by_model(self, run: Played) -> Played:
+    def _seen_by_model(self, run: PlayedRun) -> PlayedRun:
         """Return a run with its disturbance against the present model."""
         expected = self._correction.expected(run.commands)
         value = run.shown.value + run.expected.tip - expected.tip
-        return Played(run.commands, expected, Shown(value, run.shown.variance, run.shown.seen))
+        return PlayedRun(run.commands, expected, Shown(value, run.shown.variance, run.shown.seen))
 
     # All runs --------------------------------------------------------------------------------
 
-    def _weigh(self, run: Played) -> str:
+    def _weigh(self, run: PlayedRun) -> str:
         """Choose best plan, step and pull; return what was decided and why."""
         before = self._best
         if before is None:
@@ -349,7 +351,7 @@ class Learner:
                 )
         return ""
 
-    def _as_plan(self, run: Played) -> Plan:
+    def _as_plan(self, run: PlayedRun) -> Plan:
         """Return the plan of a run's commands, with the tip that all runs let expect."""
         if np.array_equal(run.commands, self._plan.differential_pressure):
             return self._plan

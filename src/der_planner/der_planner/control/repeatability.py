@@ -34,9 +34,9 @@ _PRIOR_FACTOR = 3.0
 _FADE = 2.0
 """Time in which the disturbance fades beyond the first and last picture [s]."""
 _UNLIKE = 4.0
-"""A run that differs from the others by so many standard deviations is not one of them …"""
+"""Difference of a run from the others beyond which it is not one of them [standard deviations]."""
 _NOTABLE = 1.5e-3
-"""… if it also differs by more than this, root mean square [m]."""
+"""Difference of a run from the others that always is too small to tell, root mean square [m]."""
 _SHARES = np.geomspace(0.003, 3.0, 61)
 _DEVIATIONS = np.geomspace(3e-6, 3e-2, 81)
 
@@ -102,7 +102,7 @@ def estimate(pairs: list[Pair]) -> Repeatability:
 
 
 @dataclass(frozen=True)
-class Played:
+class PlayedRun:
     """A run that can be used.
 
     Attributes:
@@ -139,15 +139,15 @@ class Runs:
     Args:
         reference: r̄ (K, 2) at the setpoints [m].
         period: of the setpoints [s].
-        tip_per_pressure: way of the tip per pressure [m/Pa].
+        tip_per_pressure: movement of the tip per pressure [m/Pa].
     """
 
     def __init__(self, reference: Array, period: float, tip_per_pressure: float) -> None:
         self._reference, self._period, self._tip_per_pressure = reference, period, tip_per_pressure
-        self._all: list[Played] = []
+        self._all: list[PlayedRun] = []
         self.repeats = Repeatability()
 
-    def add(self, run: Played) -> None:
+    def add(self, run: PlayedRun) -> None:
         """Take in a run."""
         self._all.append(run)
         self.repeats = estimate(self._pairs())
@@ -159,7 +159,7 @@ class Runs:
                 return run.expected
         return None
 
-    def known(self, about: Played) -> Known:
+    def known(self, about: PlayedRun) -> Known:
         """Return what all runs say of the disturbance under the commands of one run."""
         count = len(self._reference)
         total, weights, squares = np.zeros((count, 2)), np.zeros(count), np.zeros(count)
@@ -175,16 +175,16 @@ class Runs:
         variance = float((1.0 / weights[seen]).mean()) if seen.any() else 0.0
         return Known(without_gaps(value, seen, self._period, _FADE), seen, runs, variance)
 
-    def error(self, run: Played) -> Array:
+    def error(self, run: PlayedRun) -> Array:
         """Return what all runs say that the commands of one leave: tip less r̄ (K, 2) [m]."""
         error: Array = run.expected.tip + self.known(run).value - self._reference
         return error
 
-    def level(self, run: Played) -> float:
+    def level(self, run: PlayedRun) -> float:
         """Return the mean distance from r̄ that all runs say the commands of one leave [m]."""
         return float(np.linalg.norm(self.error(run), axis=1).mean())
 
-    def unlike(self, run: Played) -> str:
+    def unlike(self, run: PlayedRun) -> str:
         """Return how a run differs from all others; empty if it is one of them."""
         if not self._all:
             return ""
@@ -201,14 +201,14 @@ class Runs:
             return ""
         return f"it differs from the runs before by {apart * 100:.2f} cm"
 
-    def differ(self, one: Played, other: Played) -> bool:
+    def differ(self, one: PlayedRun, other: PlayedRun) -> bool:
         """Tell whether two runs that are unlike the others are unlike each other, too."""
         both = one.shown.seen & other.shown.seen
         known = self.known(one)
         from_others = _rms((one.shown.value - known.value)[both & known.seen])
         return _rms((one.shown.value - other.shown.value)[both]) > 0.5 * from_others
 
-    def _movement(self, one: Played, other: Played) -> float:
+    def _movement(self, one: PlayedRun, other: PlayedRun) -> float:
         """Return how far a change of commands moves the tip, segment by segment, squared [m²]."""
         change = one.expected.pressure - other.expected.pressure
         return float((change**2).sum(axis=1).mean()) / 2 * self._tip_per_pressure**2

@@ -67,7 +67,9 @@ def record_twin(
     )
 
 
-def calibrate_twin(seed: int, prior: Limb, *, quick: bool = True) -> tuple[Limb, FitReport]:
+def calibrate_twin(
+    seed: int, prior: Limb, *, quick: bool = True, noise: float = 1.0
+) -> tuple[Limb, FitReport]:
     """Run a calibration on the twin of a seed and fit the prior to it.
 
     Only what a camera and the board would measure is used, with their noise.
@@ -77,6 +79,7 @@ def calibrate_twin(seed: int, prior: Limb, *, quick: bool = True) -> tuple[Limb,
         prior: limb with the geometry, masses and limits, and first guesses of the rest; the twin is
             mounted as it is and carries its `masses`.
         quick: use the short run of a minute and a half instead of three minutes.
+        noise: of tags and board, as a multiple of the usual one.
 
     Returns:
         The identified limb and what the fit says of it.
@@ -86,5 +89,5 @@ def calibrate_twin(seed: int, prior: Limb, *, quick: bool = True) -> tuple[Limb,
     """
     amplitude = AMPLITUDE * prior.pneumatics.pressure_limit
     excitation = calibration_run(amplitude, prior.segment_count, quick)
-    limb, report = fit(prior, record_twin(seed, excitation, limb=prior))
+    limb, report = fit(prior, record_twin(seed, excitation, noise=noise, limb=prior))
     return replace(limb, name=f"{prior.name}, twin {seed}"), report

@@ -210,7 +210,9 @@ def number(value: object, key: str) -> float:
 
 
 def from_mapping(kind: Any, content: object, where: str, retired: Collection[str] = ()) -> Any:
-    """Return a dataclass of numbers from the mapping of a limb file, without its retired keys.
+    """Return a dataclass from the mapping of a limb file, without its retired keys.
+
+    Its fields are numbers, but for a ``name``.
 
     Raises:
         LimbError: no mapping, a key is missing, unknown or no number; ``where`` is named.
@@ -222,4 +224,9 @@ def from_mapping(kind: Any, content: object, where: str, retired: Collection[str
     for item in dataclasses.fields(kind):
         if item.default is dataclasses.MISSING and item.name not in content:
             raise LimbError(f"{where}.{item.name} is missing")
-    return kind(**{key: number(value, f"{where}.{key}") for key, value in content.items()})
+    return kind(
+        **{
+            key: str(value) if key == "name" else number(value, f"{where}.{key}")
+            for key, value in content.items()
+        }
+    )

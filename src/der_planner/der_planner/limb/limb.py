@@ -302,13 +302,13 @@ class Limb:
         refuse_unknown(calibrated, field_names(CalibratedRange), "calibrated.")
         return cls(
             name=str(content.get("name", "limb")),
-            segments=_segments(content.get("segments"), "segments"),
-            pcc_segments=_segments(content.get("pcc_segments") or [], "pcc_segments"),
+            segments=_entries(Segment, content.get("segments"), "segments"),
+            pcc_segments=_entries(Segment, content.get("pcc_segments") or [], "pcc_segments"),
             pneumatics=from_mapping(Pneumatics, content.get("pneumatics"), "pneumatics", _RETIRED),
             connector_length=number(content.get("connector_length", 0.0), "connector_length"),
             base_length=number(content.get("base_length", 0.0), "base_length"),
             gravity=_triple(content.get("gravity", (0.0, 0.0, 0.0))),
-            masses=_masses(content.get("masses") or []),
+            masses=_entries(PointMass, content.get("masses") or [], "masses"),
             calibrated=CalibratedRange(
                 **{key: tuple(float(v) for v in values) for key, values in calibrated.items()}
             ),
@@ -353,27 +353,11 @@ _RETIRED = ("fill_rate", "minimum_supply")
 """Keys of `pneumatics` in older limb files that nothing reads any more."""
 
 
-def _segments(content: object, key: str) -> tuple[Segment, ...]:
+def _entries(kind: Any, content: object, key: str) -> tuple[Any, ...]:
+    """Return the dataclasses of a list of mappings in a limb file."""
     if not isinstance(content, Sequence) or isinstance(content, str):
-        raise LimbError(f"{key} must be a list with one entry a segment")
-    return tuple(
-        from_mapping(Segment, item, f"{key}[{index}]") for index, item in enumerate(content)
-    )
-
-
-def _masses(content: object) -> tuple[PointMass, ...]:
-    if not isinstance(content, Sequence) or isinstance(content, str):
-        raise LimbError(f"masses must be a list of mappings with arc_length and mass: {content!r}")
-    result = []
-    for index, item in enumerate(content):
-        where = f"masses[{index}]"
-        numbers = item
-        if isinstance(item, Mapping):
-            numbers = {key: value for key, value in item.items() if key != "name"}
-        mass: PointMass = from_mapping(PointMass, numbers, where)
-        name = str(item["name"]) if "name" in item else mass.name
-        result.append(dataclasses.replace(mass, name=name))
-    return tuple(result)
+        raise LimbError(f"{key} must be a list of mappings, one an entry, got {content!r}")
+    return tuple(from_mapping(kind, item, f"{key}[{index}]") for index, item in enumerate(content))
 
 
 def _triple(value: object) -> tuple[float, float, float]:

@@ -30,7 +30,6 @@ from scipy.interpolate import BSpline
 from der_planner.model import CONTROL_PERIOD
 from der_planner.planning import paths
 from der_planner.planning.errors import PlanningError
-from der_planner.planning.inverse import check_branch
 from der_planner.planning.nearest import Deviation, line, nearest_path
 from der_planner.planning.transitions import (
     FINE_PERIOD,
@@ -44,7 +43,7 @@ from der_planner.planning.transitions import (
     smooth_step,
     with_transitions,
 )
-from der_planner.planning.workspace import Workspace
+from der_planner.planning.workspace import Workspace, check_branch
 
 Array = NDArray[np.float64]
 
@@ -104,7 +103,7 @@ class Motion:
         period: of one cycle; 0 for a path [s].
         cycles: number of them; 1 for a path.
         path: the tip path of shapes and paths.
-        branch: of the arcs at the first point of a path, see `inverse.BRANCHES`; empty: least
+        branch: of the arcs at the first point of a path, see `workspace.BRANCHES`; empty: least
             pressure.
         nearest: follow the nearest path that the limb can follow instead of refusing one that
             leaves its reach, see `nearest`.
@@ -255,7 +254,7 @@ class Motion:
         sign = (-1.0) ** place if self.name == "opposite_direction" else 1.0 + 0.0 * place
         phase = 2 * np.pi * (time[:, None] - lag) / self.period
         wave = 0.5 * self.amplitude * sign * (1 - np.cos(phase))
-        angles = rest.sag + wave * smooth_step(time / (self.period / 4))[:, None]
+        angles = rest.bend_by_load + wave * smooth_step(time / (self.period / 4))[:, None]
         rate = 2 * np.pi / self.period
         last = phase[-1]
         state = (
@@ -272,7 +271,12 @@ class Motion:
         rest, path = workspace.rest, self.path
         if path is None:
             path = paths.draw_shape(
-                self.name, workspace.arcs, self.amplitude, self.period, self.cycles, rest.sag
+                self.name,
+                workspace.arcs,
+                self.amplitude,
+                self.period,
+                self.cycles,
+                rest.bend_by_load,
             )
         if self.nearest:
             return self._nearest_motion(workspace, path)

@@ -24,10 +24,9 @@ from scipy.interpolate import PchipInterpolator
 from scipy.linalg import solveh_banded
 
 from der_planner.model.series import interpolate
-from der_planner.planning.inverse import BRANCHES
 from der_planner.planning.pace import retimed
 from der_planner.planning.paths import PathLimits, TipPath
-from der_planner.planning.workspace import Workspace
+from der_planner.planning.workspace import BRANCHES, Workspace
 
 Array = NDArray[np.float64]
 
@@ -131,7 +130,7 @@ def nearest_path(
         path: drawn; its times are kept where the slew limit lets them.
         offset: (2,) of the limb's tip from that of the arcs, where loads make it [m].
         limits: speed and acceleration of the tip, for a path whose times mean nothing (`line`).
-        branch: see `inverse.BRANCHES`; empty: whichever comes nearest.
+        branch: see `workspace.BRANCHES`; empty: whichever comes nearest.
         rest: begin and end a path with times at rest, too.
     """
     samples = int(np.clip(math.ceil(path.duration / _SAMPLE), 16, _MOST_SAMPLES)) + 1
@@ -337,9 +336,9 @@ class _Search:
 def _cheapest(total: Array, origin: Array, travel: Array, axis: int) -> tuple[Array, Array]:
     """Return the least cost to come to each state along one axis of the grid, and from where."""
     costs, sources = np.moveaxis(total, axis, -1), np.moveaxis(origin, axis, -1)
-    ways = costs[..., None, :] + travel
-    best = ways.argmin(axis=-1)
-    least = np.take_along_axis(ways, best[..., None], axis=-1)[..., 0]
+    arriving = costs[..., None, :] + travel
+    best = arriving.argmin(axis=-1)
+    least = np.take_along_axis(arriving, best[..., None], axis=-1)[..., 0]
     return (
         np.moveaxis(least, -1, axis),
         np.moveaxis(np.take_along_axis(sources, best, axis=-1), -1, axis),

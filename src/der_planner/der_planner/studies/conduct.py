@@ -1,44 +1,55 @@
-"""A study is played: rows go out to workers, come back, and are kept one by one."""
+"""A study is played: rows go out to workers, come back, and are kept one by one.
+
+Workers are processes of this machine, or of a Dask cluster that runs already. They import this
+module: they need the package, its dependencies and nothing of the study's folder.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import logging
+import math
+import os
 import queue
 import time
-from collections import Counter, deque
-from collections.abc import Iterator
-from contextlib import AbstractContextManager
-from dataclasses import astuple, dataclass, field
+from collections import deque
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from distributed import Client, Future
+from distributed import Client, Future, LocalCluster
 from distributed.scheduler import KilledWorker
+from threadpoolctl import threadpool_limits
 
 from der_planner.experiment.console import Progress
-from der_planner.studies import cluster, identity, work
-from der_planner.studies.cluster import NoSchedulerError, SchedulerLostError, WorkersLostError
-from der_planner.studies.errors import StudyError
-from der_planner.studies.store import Kept, Store
+from der_planner.studies import cache
+from der_planner.studies.cache import Twin
+from der_planner.studies.factors import StudyError
+from der_planner.studies.store import Kept, Outcome, Store
 from der_planner.studies.study import Row, Study
-from der_planner.studies.twins import Twin
-from der_planner.studies.work import Calibrated, Outcome
+from der_planner.studies.tasks import TASKS, Values
 
 _AHEAD = 20
 """Pieces of work under way for each thread of the cluster, so that none waits for its next."""
 _LEAST_AHEAD = 200
-_LOOK = 0.5
-"""Longest time without a look at the cluster [s]."""
-_RETRY = 2.0
-"""Between two attempts to find a lost scheduler [s]."""
+"""Pieces of work under way in any case."""
+_PAUSE = 0.5
+"""The cluster is looked at again after this time [s] at the latest."""
+_PATIENCE = 10.0
+"""A scheduler that should be there is waited for this long [s]."""
 ALONE = 30.0
-"""Time without any worker after which new ones are started, or asked for [s]."""
+"""New workers are started, or asked for, after this time [s] without any."""
 _STARTS = 3
 """Starts of workers, one after the other, that may bring no row at all."""
+_JOIN = "python3 scripts/workspace.py exec dask worker {} --nthreads 1"
 
 
-@dataclass(frozen=True)
-class Settings:
+class ClusterLostError(ConnectionError):
+    """The scheduler is gone, or all processes of this machine, and what had not come back."""
+
+
+class PlaySettings(NamedTuple):
     """How a study is played.
 
     Attributes:
@@ -56,31 +67,7 @@ class Settings:
     retry_failed: bool = False
 
 
-@dataclass(frozen=True)
-class Piece:
-    """Rows that one task computes; the piece with the lowest place is begun first."""
-
-    rows: tuple[Row, ...]
-    twin: Twin | None
-    place: int
-
-
-@dataclass
-class _State:
-    """Rows that are left to do, and rows that are under way."""
-
-    left: deque[Piece]
-    done: int
-    failed: int
-    total: int
-    begun: float = field(default_factory=time.monotonic)
-    made: int = 0
-    sent: dict[str, tuple[Future, Piece]] = field(default_factory=dict)
-    twins: dict[Twin, Future] = field(default_factory=dict)
-    need: Counter[Twin] = field(default_factory=Counter)
-
-
-def conduct(study: Study, settings: Settings, progress: Progress) -> dict[str, Kept]:
+def conduct(study: Study, settings: PlaySettings, progress: Progress) -> dict[str, Kept]:
     """Play the missing rows of a study; return every row that is done, by key, in order.
 
     Raises:
@@ -95,250 +82,300 @@ def conduct(study: Study, settings: Settings, progress: Progress) -> dict[str, K
     again = {key for key, each in kept.items() if each["error"] and settings.retry_failed}
     missing = [row for row in rows if row.key not in kept or row.key in again]
     there = [kept[row.key] for row in rows if row.key in kept and row.key not in again]
-    state = _State(
-        left=deque(pieces(study, missing)),
-        done=len(there),
-        failed=sum(each["error"] is not None for each in there),
-        total=len(rows),
-    )
-    state.need = Counter(piece.twin for piece in state.left if piece.twin is not None)
-    if {each["sources"] for each in there} - {identity.digest()}:
+    failed = sum(each["error"] is not None for each in there)
+    if {each["sources"] for each in there} - {cache.digest()}:
         progress.say(
             "WARNING: some rows that are there were made by other sources or libraries; for rows "
             "that compare in the last digits choose another --out"
         )
     progress.say(
         f"{study.name}: {len(missing)} of {len(rows)} rows to do, into {settings.out}"
-        + (f" ({state.failed} of those done have failed)" if state.failed else "")
+        + (f" ({failed} of those done have failed)" if failed else "")
     )
     if missing:
         store.forget({row.key for row in missing})
-        _play(study, settings, store, state, progress)
+        conductor = _Conductor(study, settings, store, progress)
+        conductor.done, conductor.failed, conductor.total = len(there), failed, len(rows)
+        conductor.play(missing)
     done = store.load()
     return {row.key: done[row.key] for row in rows if row.key in done}
 
 
-def pieces(study: Study, rows: list[Row]) -> Iterator[Piece]:
+# On the workers ----------------------------------------------------------------------------------
+
+
+class Calibrated(NamedTuple):
+    """A limb file's text, or why there is none; and the digest of the worker's sources."""
+
+    limb: str = ""
+    error: str = ""
+    sources: str = ""
+
+
+class Report(NamedTuple):
+    """What a worker sends back for some rows.
+
+    Attributes:
+        outcomes: one for each row.
+        seconds: that it took.
+        sources: digest of the worker's sources.
+    """
+
+    outcomes: tuple[Outcome, ...]
+    seconds: float
+    sources: str
+
+
+def calibrate(twin: Twin, prior: str) -> Calibrated:
+    """Return the calibrated limb of a twin, see `cache.calibrated`."""
+    try:
+        return Calibrated(cache.calibrated(twin, prior), sources=cache.digest())
+    except Exception as error:
+        return Calibrated(error=f"calibration of {twin}: {_words(error)}", sources=cache.digest())
+
+
+def compute(task: str, rows: Sequence[Values], limb: Calibrated) -> Report:
+    """Compute rows of a task, beginning with a limb; on one thread, errors kept as results."""
+    begin = time.perf_counter()
+    with threadpool_limits(1):
+        outcomes = [_outcome(task, values, limb) for values in rows]
+    # A limb that another version calibrated makes rows of another version.
+    sources = limb.sources or cache.digest()
+    return Report(tuple(outcomes), time.perf_counter() - begin, sources)
+
+
+def _outcome(task: str, values: Values, limb: Calibrated) -> Outcome:
+    if limb.error:
+        return Outcome({}, limb.error)
+    try:
+        found = TASKS[task].compute(limb.limb, values)
+    except Exception as error:
+        return Outcome({}, _words(error))
+    # Parquet tells NaN from nothing, people and JSON do not.
+    return Outcome({name: value for name, value in found.items() if not math.isnan(value)})
+
+
+def _words(error: BaseException) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
+# On this machine ---------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def local(workers: int | None) -> Iterator[Client]:
+    """Start worker processes with one thread each on this machine, one a core by default.
+
+    Raises:
+        StudyError: they did not start.
+    """
+    logging.getLogger("distributed").setLevel(logging.ERROR)
+    try:
+        cluster = LocalCluster(
+            n_workers=workers or len(os.sched_getaffinity(0)),
+            threads_per_worker=1,
+            processes=True,
+            host="127.0.0.1",
+            dashboard_address="127.0.0.1:0",
+            memory_limit=0,
+            silence_logs=logging.CRITICAL,
+        )
+    except (OSError, TimeoutError, RuntimeError) as error:
+        raise StudyError(f"the workers of this machine did not start: {error}") from error
+    with cluster, Client(cluster, set_as_default=False) as client:
+        yield client
+
+
+@contextlib.contextmanager
+def remote(address: str, again: bool) -> Iterator[Client]:
+    """Join a cluster by the address of its scheduler; one that was lost is waited for.
+
+    Raises:
+        StudyError: nothing answers there, and has not before.
+    """
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    client: Client | None = None
+    while client is None:
+        try:
+            client = Client(address, timeout=_PATIENCE, set_as_default=False)
+        except (OSError, TimeoutError, ValueError) as error:
+            if again:
+                time.sleep(_PAUSE)
+                continue
+            raise StudyError(
+                f"no Dask scheduler answers at {address} ({error}): start one with 'dask "
+                "scheduler', give the address that it prints, or leave --scheduler away to use "
+                "this machine alone"
+            ) from error
+    try:
+        yield client
+    finally:
+        with contextlib.suppress(Exception):
+            client.close(timeout=2)
+
+
+class Piece(NamedTuple):
+    """Rows that one task computes; the piece with the lowest place is begun first."""
+
+    rows: tuple[Row, ...]
+    twin: Twin | None
+    place: int
+
+
+def pieces(study: Study, rows: Sequence[Row]) -> Iterator[Piece]:
     """Return the rows in pieces of what a task computes together; a piece has one twin."""
-    place = 0
+    place = itertools.count()
     for twin, group in itertools.groupby(rows, key=lambda row: study.task.twin(row.values)):
         left = list(group)
         for begin in range(0, len(left), study.task.batch):
-            yield Piece(tuple(left[begin : begin + study.task.batch]), twin, place)
-            place += 1
+            yield Piece(tuple(left[begin : begin + study.task.batch]), twin, next(place))
 
 
-def _play(
-    study: Study, settings: Settings, store: Store, state: _State, progress: Progress
-) -> None:
-    """Play the rows that are left, on a new cluster each time that a scheduler is lost."""
-
-    def join() -> AbstractContextManager[Client]:
-        if settings.scheduler:
-            return cluster.remote(settings.scheduler)
-        return cluster.local(settings.workers)
-
-    lost, starts = False, 0
-    while state.left:
-        made = state.made
-        try:
-            with join() as client:
-                _welcome(client, settings, progress)
-                lost = False
-                _Session(study, store, state, client, progress, settings.scheduler).run()
-        except WorkersLostError as error:
-            starts = 1 if state.made > made else starts + 1
-            if starts == _STARTS:
-                raise StudyError(
-                    f"the worker processes of this machine ended {starts} times before a row was "
-                    "done: see that memory and disk are not full. Rows that are there are kept"
-                ) from error
-            progress.say(
-                "the worker processes of this machine are gone: starting new ones. "
-                f"{state.done} of {state.total} rows are kept"
-            )
-        except SchedulerLostError:
-            progress.say(
-                f"the scheduler at {settings.scheduler} is gone: waiting for it to come back. "
-                f"{state.done} of {state.total} rows are kept"
-            )
-            lost = True
-        except NoSchedulerError:
-            if not lost:
-                raise
-            time.sleep(_RETRY)
-
-
-def _welcome(client: Client, settings: Settings, progress: Progress) -> None:
-    cluster.check_workers(client)
-    workers = client.nthreads()
-    where = settings.scheduler or "this machine"
-    progress.say(
-        f"{len(workers)} workers with {sum(workers.values())} threads at {where}; "
-        f"dashboard: {_dashboard(client)}"
-    )
-    if not workers:
-        progress.say(f"no worker has joined yet: {_how_to_join(settings.scheduler)}")
-
-
-def _how_to_join(scheduler: str) -> str:
-    return f"python3 scripts/workspace.py exec dask worker {scheduler} --nthreads 1"
-
-
-def _dashboard(client: Client) -> str:
-    if "dashboard" not in client.scheduler_info(n_workers=0).get("services", {}):
-        return "none, the scheduler was started without"
-    link = client.dashboard_link
-    try:
-        import bokeh  # type: ignore[import-not-found]  # noqa: F401, PLC0415
-    except ImportError:
-        return f"{link} (its pages need: .venv/bin/pip install bokeh)"
-    return str(link)
-
-
-class _Session:
-    """The work on one cluster until nothing is left or its scheduler is lost.
-
-    ``scheduler`` is the address of a cluster of others, empty for processes of this machine.
-    """
+class _Conductor:
+    """Sends rows out and keeps what comes back, on one cluster after another if need be."""
 
     def __init__(
-        self,
-        study: Study,
-        store: Store,
-        state: _State,
-        client: Client,
-        progress: Progress,
-        scheduler: str,
+        self, study: Study, settings: PlaySettings, store: Store, progress: Progress
     ) -> None:
-        self._study, self._store, self._state = study, store, state
-        self._client, self._progress, self._scheduler = client, progress, scheduler
-        self._manned = time.monotonic()
-        self._asked = False
+        self._study, self._settings, self._store = study, settings, store
+        self._progress = progress
+        self.done = self.failed = self.total = 0
+        self._begun, self._made = time.monotonic(), 0
+        self._left: deque[Piece] = deque()
+        self._sent: dict[str, tuple[Future, Piece]] = {}
+        self._twins: dict[Twin, Future] = {}
         self._back: queue.SimpleQueue[Future] = queue.SimpleQueue()
         self._threads = 0
-        self._looked = -1e9
+        self._seen = self._manned = 0.0
 
-    def run(self) -> None:
-        """Play the pieces that are left.
+    def play(self, rows: Sequence[Row]) -> None:
+        """Play rows, on a new cluster each time that one is lost.
 
         Raises:
-            SchedulerLostError: the scheduler is gone; what had not come back is left again.
-            WorkersLostError: the same of all processes of this machine.
-            StudyError: the disk is full, or a worker has other sources.
+            StudyError: the disk is full, no worker lasts, or one has other sources.
         """
-        state = self._state
+        self._left.extend(pieces(self._study, rows))
+        scheduler, lost, starts = self._settings.scheduler, False, 0
+        while self._left:
+            made = self._made
+            join = remote(scheduler, lost) if scheduler else local(self._settings.workers)
+            try:
+                with join as client:
+                    self._play_on(client)
+            except ClusterLostError as error:
+                lost, starts = True, 1 if self._made > made else starts + 1
+                if not scheduler and starts == _STARTS:
+                    raise StudyError(
+                        f"the worker processes of this machine ended {starts} times before a row "
+                        "was done: see that memory and disk are not full. Rows that are there are "
+                        "kept"
+                    ) from error
+                gone = "the worker processes of this machine are gone: starting new ones. "
+                if scheduler:
+                    gone = f"the scheduler at {scheduler} is gone: waiting for it to come back. "
+                self._progress.say(f"{gone}{self.done} of {self.total} rows are kept")
+
+    def _play_on(self, client: Client) -> None:
+        """Play the pieces that are left on one cluster.
+
+        Raises:
+            ClusterLostError: it is gone; what had not come back is left again.
+        """
+        workers = client.nthreads()
+        where = self._settings.scheduler or "this machine"
+        self._progress.say(
+            f"{len(workers)} workers with {sum(workers.values())} threads at {where}; "
+            f"dashboard: {client.dashboard_link}"
+        )
+        if not workers:
+            self._progress.say(f"no worker has joined yet: {_JOIN.format(where)}")
+        self._back = queue.SimpleQueue()
+        self._manned = time.monotonic()
         try:
-            while state.left or state.sent:
-                self._look()
-                self._send()
-                self._take(self._next())
+            while self._left or self._sent:
+                self._check(client)
+                self._send(client)
+                with contextlib.suppress(queue.Empty):
+                    self._keep(self._back.get(timeout=_PAUSE))
         finally:
             # What is under way is not lost, it is to do.
-            state.left.extendleft(piece for _, piece in reversed(state.sent.values()))
-            futures = [future for future, _ in state.sent.values()] + list(state.twins.values())
-            state.sent, state.twins = {}, {}
-            if futures and self._client.status == "running":
-                self._client.cancel(futures, force=True)
+            self._left.extendleft(piece for _, piece in reversed(self._sent.values()))
+            futures = [*(future for future, _ in self._sent.values()), *self._twins.values()]
+            self._sent, self._twins = {}, {}
+            if futures and client.status == "running":
+                client.cancel(futures, force=True)
         self._show()
 
-    def _look(self) -> None:
-        """See now and then what the cluster is, and show how far the study is."""
-        if time.monotonic() - self._looked < _LOOK:
+    def _check(self, client: Client) -> None:
+        """See now and then whether the cluster is there, and show how far the study is."""
+        now = time.monotonic()
+        if now - self._seen < _PAUSE:
             return
-        if self._client.status != "running":
-            raise SchedulerLostError(self._client.status)
+        if client.status != "running":
+            raise ClusterLostError(client.status)
         try:
-            self._threads = sum(self._client.nthreads().values())
+            self._threads = sum(client.nthreads().values())
         except (OSError, TimeoutError, RuntimeError, ValueError) as error:
-            raise SchedulerLostError(str(error)) from error
-        self._looked = time.monotonic()
-        self._miss_workers()
+            raise ClusterLostError(str(error)) from error
+        self._seen = now
+        if self._threads:
+            self._manned = now
+        elif now - self._manned > ALONE:
+            if not self._settings.scheduler:
+                raise ClusterLostError("no process of this machine is left")
+            self._manned = math.inf  # it is said once
+            join = _JOIN.format(self._settings.scheduler)
+            self._progress.say(f"no worker is there any more: {join}")
         self._show()
 
-    def _miss_workers(self) -> None:
-        """Start again, or ask for workers, when there has been none for `ALONE`."""
-        if self._threads:
-            self._manned, self._asked = self._looked, False
-        elif self._looked - self._manned > ALONE:
-            if not self._scheduler:
-                raise WorkersLostError("no process of this machine is left")
-            if not self._asked:
-                self._progress.say(f"no worker is there any more: {_how_to_join(self._scheduler)}")
-            self._asked = True
-
-    def _send(self) -> None:
+    def _send(self, client: Client) -> None:
         """Keep enough work under way."""
-        state = self._state
-        ahead = max(_LEAST_AHEAD, _AHEAD * self._threads)
-        while state.left and len(state.sent) < ahead:
-            piece = state.left.popleft()
+        task, ahead = self._study.task.name, max(_LEAST_AHEAD, _AHEAD * self._threads)
+        while self._left and len(self._sent) < ahead:
+            piece = self._left.popleft()
             limb: Any = Calibrated(self._study.limb)
             if piece.twin is not None:
-                limb = self._twin(piece.twin, piece.place)
-            future = self._client.submit(
-                work.compute,
-                self._study.task.name,
-                [row.values for row in piece.rows],
-                limb,
-                key=f"{self._study.task.name}-{piece.rows[0].key}-{len(piece.rows)}",
-                priority=-piece.place,
-            )
-            state.sent[future.key] = (future, piece)
+                # One task, however many rows wait for it.
+                if piece.twin not in self._twins:
+                    key = "-".join(map(str, ("calibrate", *piece.twin)))
+                    self._twins[piece.twin] = client.submit(
+                        calibrate, piece.twin, self._study.limb, key=key, priority=-piece.place
+                    )
+                limb = self._twins[piece.twin]
+            values = [row.values for row in piece.rows]
+            key = f"{task}-{piece.rows[0].key}-{len(piece.rows)}"
+            future = client.submit(compute, task, values, limb, key=key, priority=-piece.place)
+            self._sent[future.key] = (future, piece)
             future.add_done_callback(self._back.put)
 
-    def _twin(self, twin: Twin, place: int) -> Future:
-        """Return the calibration of a twin: one task, however many rows wait for it."""
-        if twin not in self._state.twins:
-            self._state.twins[twin] = self._client.submit(
-                work.calibrate,
-                twin,
-                self._study.limb,
-                key="-".join(map(str, ("calibrate", *astuple(twin)))),
-                priority=-place,
-            )
-        return self._state.twins[twin]
-
-    def _next(self) -> Future | None:
-        try:
-            return self._back.get(timeout=_LOOK)
-        except queue.Empty:
-            return None
-
-    def _take(self, future: Future | None) -> None:
+    def _keep(self, future: Future) -> None:
         """Keep the rows of a task that has come back."""
-        state = self._state
-        if future is None or future.key not in state.sent:
+        if future.key not in self._sent:
             return
         if future.status in ("cancelled", "lost"):
-            raise SchedulerLostError(future.key)
-        piece = state.sent[future.key][1]
+            raise ClusterLostError(future.key)
+        rows = self._sent[future.key][1].rows
         try:
-            if future.status == "error":
-                outcomes, sources, spent = self._broken(future, piece), identity.digest(), 0.0
-            else:
-                report = future.result()
-                outcomes, sources, spent = report.outcomes, report.sources, report.seconds
+            report = self._broken(future, rows) if future.status == "error" else future.result()
         except (OSError, TimeoutError) as error:
-            raise SchedulerLostError(str(error)) from error
-        if sources != identity.digest():
-            raise StudyError(cluster.other_version("that joined the cluster meanwhile"))
-        self._store.keep(piece.rows, outcomes, sources)
-        self._store.note([(piece.rows[0].key, str(len(piece.rows)), spent)])
-        del state.sent[future.key]
-        if piece.twin is not None:
-            state.need[piece.twin] -= 1
-            if not state.need[piece.twin]:
-                state.twins.pop(piece.twin, None)
-        state.done += len(piece.rows)
-        state.made += len(piece.rows)
-        for row, outcome in zip(piece.rows, outcomes, strict=True):
+            raise ClusterLostError(str(error)) from error
+        if report.sources != cache.digest():
+            raise StudyError(
+                "a worker has other sources or libraries than this program, so its rows would not "
+                "compare: bring both to one version and start the worker again"
+            )
+        self._store.keep(rows, report.outcomes, report.sources)
+        self._store.note(f"{rows[0].key},{len(rows)},{report.seconds:.3f}")
+        del self._sent[future.key]
+        self.done += len(rows)
+        self._made += len(rows)
+        for row, outcome in zip(rows, report.outcomes, strict=True):
             if outcome.error:
-                state.failed += 1
+                self.failed += 1
                 self._progress.say(f"  failed: {dict(row.values)}: {outcome.error}")
 
-    def _broken(self, future: Future, piece: Piece) -> tuple[Outcome, ...]:
-        """Return outcomes of rows whose worker ended under them again and again.
+    def _broken(self, future: Future, rows: Sequence[Row]) -> Report:
+        """Return the report on rows whose worker ended under them again and again.
 
         Raises:
             StudyError: a worker could not even begin.
@@ -346,23 +383,17 @@ class _Session:
         error = future.exception()
         if not isinstance(error, KilledWorker):
             raise StudyError(
-                f"a worker cannot compute rows ({type(error).__name__}: {error}): start it in the "
-                "workspace: python3 scripts/workspace.py exec dask worker ADDRESS"
+                f"a worker cannot compute rows ({_words(error)}): start it in the workspace: "
+                f"{_JOIN.format('ADDRESS')}"
             )
-        return (Outcome(error=f"{type(error).__name__}: {error}"),) * len(piece.rows)
+        return Report((Outcome({}, _words(error)),) * len(rows), 0.0, cache.digest())
 
     def _show(self) -> None:
-        state = self._state
-        spent = time.monotonic() - state.begun
-        rate = state.made / spent if spent > 0 else 0.0
-        left = clock((state.total - state.done) / rate) if state.made else "?"
-        failed = f", {state.failed} failed" if state.failed else ""
-        self._progress.bar(
-            state.done,
-            state.total,
-            f"{rate:.3g} rows/s, {left} left, {self._threads} threads{failed}",
-            unit="rows",
-        )
+        rate = self._made / max(time.monotonic() - self._begun, 1e-9)
+        left = clock((self.total - self.done) / rate) if self._made else "?"
+        failed = f", {self.failed} failed" if self.failed else ""
+        text = f"{rate:.3g} rows/s, {left} left, {self._threads} threads{failed}"
+        self._progress.bar(self.done, self.total, text, unit="rows")
 
 
 def clock(seconds: float) -> str:

@@ -17,7 +17,6 @@ from typing import Any
 from der_planner.limb import MOUNTINGS, LimbError, Pneumatics, Segment, declarations, gravity_of
 from der_planner.planning import METHODS
 from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD, NAMES
-from der_planner.studies.errors import StudyError
 
 Value = float | int | str
 RUN, MODEL, IDENTIFICATION = "run", "model", "identification"
@@ -26,6 +25,10 @@ TWIN = (RUN, IDENTIFICATION)
 EVERY = (RUN, MODEL, IDENTIFICATION)
 ERROR = "error."
 """How the name of the error of a limb parameter begins."""
+
+
+class StudyError(RuntimeError):
+    """A study cannot be read, played or kept; the message names the thing and the remedy."""
 
 
 @dataclass(frozen=True)

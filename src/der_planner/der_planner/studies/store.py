@@ -9,20 +9,27 @@ from __future__ import annotations
 import errno
 import io
 import json
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 
-from der_planner.studies import identity
-from der_planner.studies.errors import StudyError
+from der_planner.studies.cache import write_whole
+from der_planner.studies.factors import StudyError
 from der_planner.studies.study import Row, Study
-from der_planner.studies.work import Outcome
 
 Kept = dict[str, Any]
+"""A row as it is kept: key, factors, results, error and sources by column."""
+
+
+class Outcome(NamedTuple):
+    """What became of one row: results by column, empty after an error; kind and message of it."""
+
+    results: dict[str, float]
+    error: str = ""
 
 
 class Store:
@@ -58,8 +65,8 @@ class Store:
                     f"{self.folder} holds the study {theirs.get('name')} of task "
                     f"'{theirs.get('task')}', not of '{mine['task']}': choose another --out"
                 )
-        identity.write_whole(about, json.dumps(mine, indent=1).encode())
-        identity.write_whole(self.folder / "study.yaml", self._study.text.encode())
+        write_whole(about, json.dumps(mine, indent=1).encode())
+        write_whole(self.folder / "study.yaml", self._study.text.encode())
 
     def keep(self, rows: Sequence[Row], outcomes: Sequence[Outcome], sources: str) -> None:
         """Write finished rows, whole or not at all.
@@ -80,7 +87,7 @@ class Store:
         buffer = io.BytesIO()
         pyarrow.parquet.write_table(table, buffer)
         try:
-            identity.write_whole(self._rows / f"{key}.parquet", buffer.getvalue())
+            write_whole(self._rows / f"{key}.parquet", buffer.getvalue())
         except OSError as error:
             raise _unwritable(self._rows, error) from error
 
@@ -100,11 +107,11 @@ class Store:
             if not stay or table["key"][stay[0]].as_py() != path.stem:
                 path.unlink()
 
-    def note(self, lines: Iterable[tuple[str, str, float]]) -> None:
-        """Append (what, where it ran, seconds) to ``times.csv``, which no result depends on."""
+    def note(self, line: str) -> None:
+        """Append a line on what a task took to ``times.csv``, which no result depends on."""
         try:
             with (self.folder / "times.csv").open("a", encoding="utf-8") as file:
-                file.writelines(f"{what},{where},{spent:.3f}\n" for what, where, spent in lines)
+                file.write(f"{line}\n")
         except OSError as error:
             raise _unwritable(self.folder, error) from error
 
@@ -132,7 +139,7 @@ class Store:
         buffer = io.BytesIO()
         pyarrow.csv.write_csv(pa.Table.from_pylist(list(kept.values()), self._schema), buffer)
         try:
-            identity.write_whole(path, buffer.getvalue())
+            write_whole(path, buffer.getvalue())
         except OSError as error:
             raise _unwritable(self.folder, error) from error
         return path

@@ -1,24 +1,29 @@
-"""A study as its file says: the task, its factors, the columns that are kept, the figures."""
+"""A study as its file says: the task, its factors and draws, the kept columns, the figures.
+
+scipy.stats takes most of a second to import: only who draws with it pays for it.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from der_planner.limb import Limb, LimbError
-from der_planner.studies import draws
-from der_planner.studies.draws import Draw, Spread
-from der_planner.studies.errors import StudyError
-from der_planner.studies.factors import Factor, Value, factor
+from der_planner.studies.factors import Factor, StudyError, Value, factor
 from der_planner.studies.tasks import TASKS, Task
 
+Array = NDArray[np.float64]
 SHIPPED = Path(__file__).resolve().parent / "shipped"
 _KEYS = ("name", "about", "task", "limb", "factors", "draw", "keep", "plots")
 _SPREAD = {
@@ -36,6 +41,103 @@ PLOTS = {
 """The kinds of figures, and what each needs."""
 _OPTIONAL = ("kind", "name", "lines", "panels", "title", "per", "log")
 _LOG = ("", "x", "y", "xy")
+
+
+METHODS = ("random", "sobol", "saltelli")
+"""Independent draws; a Sobol sequence; one arranged for Sobol indices (see `saltelli`)."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """What a drawn factor is drawn from.
+
+    Attributes:
+        scale: "even" or "log" between low and high, or "normal" with mean ``low`` and standard
+            deviation ``high``.
+        whole: rounded down to whole numbers.
+    """
+
+    low: float
+    high: float
+    scale: str = "even"
+    whole: bool = False
+
+    def value(self, share: float) -> Value:
+        """Return the value below which ``share`` (0 … 1) of the draws lie."""
+        if self.scale == "normal":
+            from scipy.stats import norm  # noqa: PLC0415
+
+            return float(norm.ppf(share, self.low, self.high))
+        if self.scale == "log":
+            return float(self.low * math.exp(share * math.log(self.high / self.low)))
+        if self.whole:
+            return min(int(self.low) + int(share * (self.high - self.low + 1)), int(self.high))
+        return float(self.low + share * (self.high - self.low))
+
+
+@dataclass(frozen=True)
+class Draw:
+    """How often and how the ranges are drawn from."""
+
+    method: str = "sobol"
+    count: int = 1
+    seed: int = 0
+
+    def shares(self, dimensions: int) -> Array:
+        """Return points (draws, dimensions) in the open unit cube, the same for the same seed."""
+        if self.method == "random":
+            points = np.random.default_rng(self.seed).random((self.count, dimensions))
+        elif self.method == "sobol":
+            points = _sobol(dimensions, self.count, self.seed)
+        else:
+            points = saltelli(dimensions, self.count, self.seed)
+        inside: Array = np.clip(points, 1e-12, 1.0 - 1e-12)
+        return inside
+
+
+def _sobol(dimensions: int, count: int, seed: int) -> Array:
+    from scipy.stats import qmc  # noqa: PLC0415
+
+    sequence = qmc.Sobol(dimensions, rng=np.random.default_rng(seed))
+    points: Array = sequence.random_base2(int(math.log2(count)))
+    return points
+
+
+def saltelli(dimensions: int, count: int, seed: int) -> Array:
+    """Return (count · (dimensions + 2), dimensions) points from which Sobol indices are found.
+
+    Two samples A and B, and for each dimension A with this column of B (Saltelli et al., "Variance
+    based sensitivity analysis of model output", Comput. Phys. Commun. 181, 2010): first all of A,
+    then B, then the mixed ones, as `scipy.stats.sobol_indices` takes their results.
+    """
+    both = _sobol(2 * dimensions, count, seed)
+    a, b = both[:, :dimensions], both[:, dimensions:]
+    mixed = []
+    for column in range(dimensions):
+        table = a.copy()
+        table[:, column] = b[:, column]
+        mixed.append(table)
+    return np.concatenate([a, b, *mixed])
+
+
+def rows(
+    grid: Mapping[str, Sequence[Value]], spreads: Mapping[str, Spread], draw: Draw
+) -> list[dict[str, Value]]:
+    """Return every row: the grid's first factor changes slowest, the draws fastest."""
+    drawn: list[dict[str, Value]] = [{}]
+    if spreads:
+        points = draw.shares(len(spreads))
+        drawn = [
+            {
+                name: spread.value(float(share))
+                for (name, spread), share in zip(spreads.items(), point, strict=True)
+            }
+            for point in points
+        ]
+    combinations = itertools.product(*grid.values())
+    return [
+        dict(zip(grid, values, strict=True)) | each for values in combinations for each in drawn
+    ]
 
 
 @dataclass(frozen=True)
@@ -108,7 +210,7 @@ class Study:
     def rows(self) -> tuple[Row, ...]:
         """Every row once, in the order in which they are begun."""
         made: dict[str, Row] = {}
-        for values in draws.rows(self.grid, self.spreads, self.draw):
+        for values in rows(self.grid, self.spreads, self.draw):
             made.setdefault(key := self.key(values), Row(key, dict(values)))
         return tuple(made.values())
 
@@ -153,7 +255,7 @@ def _parse(content: object, path: Path, text: str) -> Study:
     for values in grid.values():
         combinations *= len(values)
     if spreads:
-        draws.check_draw(draw, spreads, combinations)
+        _check_draw(draw, spreads, combinations)
     keep = _keep(body.get("keep"), task)
     study = Study(
         name=str(body.get("name", path.stem)),
@@ -167,7 +269,7 @@ def _parse(content: object, path: Path, text: str) -> Study:
         text=text,
     )
     plots = _plots(body.get("plots") or [], study)
-    return Study(**{**study.__dict__, "plots": plots})
+    return replace(study, plots=plots)
 
 
 def _mapping(content: object, where: str, known: tuple[str, ...] | None) -> dict[str, Any]:
@@ -227,7 +329,7 @@ def _spread(content: Mapping[str, Any], declared: Factor, where: str) -> Spread:
     scale = str(content.get("scale", "even"))
     low = float(declared.checked(content["low"], f"{where}.low"))
     high = float(declared.checked(content["high"], f"{where}.high"))
-    if scale not in draws.SCALES[:2] or (scale == "log" and low <= 0):
+    if scale not in ("even", "log") or (scale == "log" and low <= 0):
         raise StudyError(f"{where}.scale must be even, or log above 0, got {scale!r}")
     if not low < high:
         raise StudyError(f"{where}.low must be below {where}.high, got {low:g} and {high:g}")
@@ -245,6 +347,30 @@ def _draw(content: object, spreads: Mapping[str, Spread]) -> Draw:
         _whole(given.get("count", 1), "draw.count"),
         _whole(given.get("seed", 0), "draw.seed", least=0),
     )
+
+
+def _check_draw(draw: Draw, spreads: Mapping[str, Spread], combinations: int) -> None:
+    """Refuse draws that cannot be made.
+
+    Raises:
+        StudyError: names the key.
+    """
+    if draw.method not in METHODS:
+        raise StudyError(f"draw.method must be one of {', '.join(METHODS)}, got {draw.method!r}")
+    power = draw.count & (draw.count - 1) == 0
+    if draw.method != "random" and not power:
+        nearest = 2 ** round(math.log2(draw.count))
+        raise StudyError(
+            f"draw.count must be a power of two for {draw.method}, got {draw.count}: "
+            f"choose {nearest}, or method random"
+        )
+    if draw.method == "saltelli" and combinations != 1:
+        raise StudyError(
+            f"draw.method saltelli goes with one value of every other factor, and these make "
+            f"{combinations} combinations: write one study for each"
+        )
+    if draw.method == "saltelli" and len(spreads) < 2:
+        raise StudyError("draw.method saltelli needs two drawn factors or more")
 
 
 def _whole(value: object, where: str, least: int = 1) -> int:

@@ -14,8 +14,8 @@ import numpy as np
 
 from der_planner.results.report import document, figure, section
 from der_planner.results.tables import Table
-from der_planner.studies import identity
-from der_planner.studies.errors import StudyError
+from der_planner.studies import cache
+from der_planner.studies.factors import StudyError
 from der_planner.studies.figures import draw, quantity
 from der_planner.studies.indices import sobol_indices
 from der_planner.studies.store import Kept, Store
@@ -185,7 +185,7 @@ def _provenance(study: Study, kept: Mapping[str, Kept]) -> Table:
     lines = [
         ["task", study.task.name],
         ["drawn", drawn if study.spreads else "nothing"],
-        ["digest of sources and libraries", ", ".join(sources) or identity.digest()],
+        ["digest of sources and libraries", ", ".join(sources) or cache.digest()],
         ["python", platform.python_version()],
         ["machine of this page", f"{platform.node()}, {platform.machine()}"],
     ]

@@ -7,7 +7,7 @@ library, so that a row is the same to the last digit wherever and whenever it is
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from der_planner.limb import Limb, Segment
 from der_planner.model import simulate
 from der_planner.planning import Motion, Plan, plan
-from der_planner.studies import twins
+from der_planner.studies.cache import Twin, fit_twin, read_limb
 from der_planner.studies.factors import (
     ERROR,
     IDENTIFICATION,
@@ -49,8 +49,7 @@ class Task:
         name: in the study's file.
         text: what a row does.
         columns: of its result, each with what it is.
-        work: computes rows: a limb file's text and their values, in; one result each, or what went
-            wrong, out.
+        work: from a limb file's text and a row with its defaults to the row's results.
         batch: rows that are computed together.
         calibrated: a row begins with the limb that a calibration of its twin found.
     """
@@ -58,11 +57,15 @@ class Task:
     name: str
     text: str
     columns: Mapping[str, str]
-    work: Callable[[str, Sequence[Values]], list[Result | Exception]]
+    work: Callable[[str, Mapping[str, Any]], Result]
     batch: int = 1
     calibrated: bool = False
 
-    def twin(self, values: Values) -> twins.Twin | None:
+    def compute(self, limb: str, values: Values) -> Result:
+        """Return the results of a row, by column."""
+        return self.work(limb, with_defaults(values, self.name))
+
+    def twin(self, values: Values) -> Twin | None:
         """Return the calibrated twin that a row needs, if any."""
         row = with_defaults(values, self.name)
         if not self.calibrated or row["calibration"] == "none":
@@ -70,9 +73,9 @@ class Task:
         return twin_of(row)
 
 
-def twin_of(row: Mapping[str, Any]) -> twins.Twin:
+def twin_of(row: Mapping[str, Any]) -> Twin:
     """Return the twin of a row with its defaults, and how it is calibrated."""
-    return twins.Twin(row["seed"], row["calibration"], row["tag_noise"], row["mounting"])
+    return Twin(row["seed"], row["calibration"], row["tag_noise"], row["mounting"])
 
 
 # run: a calibrated twin plays a plan ------------------------------------------------------------
@@ -116,11 +119,7 @@ def _planned(limb: Limb, row: Mapping[str, Any]) -> Plan:
     return plan(limb, motion, model=row["model"], method=method)
 
 
-def _run(limb: str, rows: Sequence[Values]) -> list[Result | Exception]:
-    return [_caught(_play, limb, with_defaults(values, RUN)) for values in rows]
-
-
-def _play(limb: str, row: Mapping[str, Any]) -> Result:
+def _run(limb: str, row: Mapping[str, Any]) -> Result:
     planned = _planned(with_errors(limb_of(limb), row), row)
     loads = loaded(limb_of(limb), row)
     if row["learning_runs"]:
@@ -190,43 +189,13 @@ def _with_feedback(planned: Plan, loads: Limb, row: Mapping[str, Any]) -> tuple[
 # model: the rod itself plays a plan that was made for another rod --------------------------------
 
 
-def _model(limb: str, rows: Sequence[Values]) -> list[Result | Exception]:
-    """Plan for the limb, and play on limbs whose parameters are other by the errors.
-
-    All limbs of one plan are simulated in one call, which does not change any of them.
-    """
-    full = [with_defaults(values, MODEL) for values in rows]
-    results: list[Result | Exception] = [ValueError("not computed")] * len(rows)
-    groups: dict[str, list[int]] = {}
-    for place, row in enumerate(full):
-        motion = {name: value for name, value in row.items() if not name.startswith(ERROR)}
-        groups.setdefault(json.dumps(motion, sort_keys=True), []).append(place)
-    for text, places in groups.items():
-        found = _caught(_simulated, limb, text, [full[place] for place in places])
-        if isinstance(found, Exception) and len(places) > 1:
-            # One limb that cannot be simulated must not take the others with it.
-            for place in places:
-                results[place] = _one(_caught(_simulated, limb, text, [full[place]]))
-            continue
-        for place, result in zip(places, _each(found, len(places)), strict=True):
-            results[place] = result
-    return results
-
-
-def _each(found: list[Result] | Exception, count: int) -> Sequence[Result | Exception]:
-    return [found] * count if isinstance(found, Exception) else found
-
-
-def _one(found: list[Result] | Exception) -> Result | Exception:
-    return found if isinstance(found, Exception) else found[0]
-
-
-def _simulated(limb: str, motion: str, rows: Sequence[Mapping[str, Any]]) -> list[Result]:
-    planned = _plan_once(limb, motion)
-    true = (loaded(with_errors(limb_of(limb), row), row) for row in rows)
-    commands = planned.differential_pressure
-    tips = [simulate(each, planned.time, commands=commands).tip for each in true]
-    return [_errors(planned, tip[:-1]) for tip in tips]
+def _model(limb: str, row: Mapping[str, Any]) -> Result:
+    """Plan for the limb, and play on one whose parameters are other by the errors."""
+    motion = {name: value for name, value in row.items() if not name.startswith(ERROR)}
+    planned = _plan_once(limb, json.dumps(motion, sort_keys=True))
+    true = loaded(with_errors(limb_of(limb), row), row)
+    response = simulate(true, planned.time, commands=planned.differential_pressure)
+    return _errors(planned, response.tip[:-1])
 
 
 @lru_cache(maxsize=8)
@@ -242,18 +211,13 @@ _RECOVERED = (
 )
 
 
-def _identify(limb: str, rows: Sequence[Values]) -> list[Result | Exception]:
-    return [_caught(_recover, limb, with_defaults(values, IDENTIFICATION)) for values in rows]
-
-
-def _recover(limb: str, row: Mapping[str, Any]) -> Result:
+def _identify(limb: str, row: Mapping[str, Any]) -> Result:
     """Compare what a calibration found with what the seed drew, and predict an unseen motion."""
     from der_planner.identification import Excitation, predict, record_twin  # noqa: PLC0415
-    from der_planner.twin.hardware import draw  # noqa: PLC0415
-    from der_planner.twin.truth import known_values  # noqa: PLC0415
+    from der_planner.twin.hardware import draw, known_values  # noqa: PLC0415
 
     prior = limb_of(limb)
-    found, report = twins.fit_twin(twin_of(row), prior)
+    found, report = fit_twin(twin_of(row), prior)
     distances: dict[str, list[float]] = {}
     for name, known in known_values(draw(row["seed"])).items():
         unknown = report.value(name)
@@ -324,18 +288,10 @@ TASKS = {
 # Shared ------------------------------------------------------------------------------------------
 
 
-def _caught(work: Callable[..., Any], *arguments: Any) -> Any:
-    """Return the result, or what went wrong: a row that fails must not end a study."""
-    try:
-        return work(*arguments)
-    except Exception as error:
-        return error
-
-
 @lru_cache(maxsize=64)
 def limb_of(text: str) -> Limb:
     """Return the limb of a limb file's text; the default limb for an empty one."""
-    return twins.read_limb(text) if text else Limb.default()
+    return read_limb(text) if text else Limb.default()
 
 
 def with_errors(limb: Limb, row: Mapping[str, Any]) -> Limb:
