@@ -276,8 +276,10 @@ def _measure(case: str, seconds: float, presses: int = 0) -> Samples:
         samples.ticks = {k: float(v) for k, v in told.items() if k.startswith("tick_to_")}
         samples.real_time_priority = told.get("real_time_priority", "unknown")
         bad = (PressureState.FAULT, PressureState.DISARMED)
-        armed = [s.mode for s in seen.states if s.setpoints_accepted]
-        samples.lost = int(any(mode in bad for mode in armed))
+        lost = [s for s in seen.states if s.setpoints_accepted and s.mode in bad]
+        samples.lost = int(bool(lost))
+        if lost:
+            print(f"driver: vented: {'; '.join(lost[0].faults)}", file=sys.stderr)
         if case == "storm" and presses:
             client.call("pressure_driver/vent", 20.0)
             samples.presses = _press(client, seen, presses)
