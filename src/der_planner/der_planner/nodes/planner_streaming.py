@@ -97,7 +97,7 @@ class PlannerPublishers:
         """
         inputs = len(estimate.bend_angle)
         sigma = np.split(estimate.deviation, np.arange(1, 5) * inputs)
-        curve = schedule.plan.kinematics.curve(estimate.bend_angle)
+        curve = schedule.plan.body.kinematics.curve(estimate.bend_angle)
         self._estimates.publish(
             LimbEstimate(
                 header=_header(instant), plan_id=schedule.plan_id,

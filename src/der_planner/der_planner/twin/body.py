@@ -10,7 +10,7 @@ from elastica import CosseratRod
 from numpy.typing import NDArray
 
 from der_planner.twin.hardware import Hardware
-from der_planner.twin.kernel import Material, RodArrays
+from der_planner.twin.kernel import RodArrays, SectionMaterial
 
 Array = NDArray[np.float64]
 
@@ -38,7 +38,7 @@ class Body:
 
     rod: CosseratRod
     arrays: RodArrays
-    material: Material
+    material: SectionMaterial
     node_arc: Array
     element_segment: NDArray[np.int64]
     vertex_segment: NDArray[np.int64]
@@ -110,14 +110,14 @@ def _set_fittings(rod: CosseratRod, hardware: Hardware, rigid_elements: NDArray[
 
 def _material(
     hardware: Hardware, vertex_segment: NDArray[np.int64], share: Array, elements: int
-) -> Material:
+) -> SectionMaterial:
     per_vertex = [hardware.segments[index] for index in vertex_segment]
 
     def column(name: str) -> Array:
         return np.array([getattr(segment, name) for segment in per_vertex], dtype=float)
 
     count = len(per_vertex)
-    return Material(
+    return SectionMaterial(
         flexible_share=share,
         stiffness=column("bending_stiffness"),
         cubic=column("cubic_stiffness"),
