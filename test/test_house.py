@@ -11,16 +11,13 @@ from typing import TypeVar
 ROOT = Path(__file__).resolve().parents[1]
 MOST_PARAMETERS = 8
 
-NAMED_TWICE = {
-    "Body", "Frame", "Hardware", "Piece",
-    "Playback", "Report", "Snapshot",
-}  # fmt: skip
+NAMED_TWICE = {"Frame", "Report", "Snapshot"}
 """Public class names that mean two things today; no name may be added."""
 
 MANY_PARAMETERS = {
     "_average", "_draw_box", "_locate", "_report",
-    "draw_tags", "from_arrays", "keep", "newton", "node_specs", "parameter", "place",
-    "place_tags", "play", "simulate", "simulate_range", "solve_shape",
+    "draw_tags", "from_arrays", "keep", "newton", "parameter", "place",
+    "place_tags", "simulate", "simulate_range", "solve_shape",
     "uniform", "uniform_mesh",
 }  # fmt: skip
 """Functions with more than `MOST_PARAMETERS` today; no name may be added."""
