@@ -12,15 +12,15 @@ ROOT = Path(__file__).resolve().parents[1]
 MOST_PARAMETERS = 8
 
 NAMED_TWICE = {
-    "Audience", "Body", "Chain", "Frame", "Hardware", "Linearisation", "Motion", "Outcome", "Piece",
-    "Playback", "Played", "Report", "Run", "Settings", "Slopes", "Snapshot", "Track", "Window",
+    "Body", "Frame", "Hardware", "Piece",
+    "Playback", "Report", "Snapshot",
 }  # fmt: skip
 """Public class names that mean two things today; no name may be added."""
 
 MANY_PARAMETERS = {
-    "_average", "_draw_box", "_locate", "_report", "_third", "balance", "balanced_bend",
-    "draw_tags", "from_arrays", "keep", "linearise", "newton", "node_specs", "parameter", "place",
-    "place_tags", "play", "prepare", "simulate", "simulate_many", "simulate_range", "solve_shape",
+    "_average", "_draw_box", "_locate", "_report",
+    "draw_tags", "from_arrays", "keep", "newton", "node_specs", "parameter", "place",
+    "place_tags", "play", "simulate", "simulate_range", "solve_shape",
     "uniform", "uniform_mesh",
 }  # fmt: skip
 """Functions with more than `MOST_PARAMETERS` today; no name may be added."""

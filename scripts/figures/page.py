@@ -18,7 +18,6 @@ from workspace_setup.basics import ROOT
 
 DOC = ROOT / "src" / "der_planner" / "doc"
 DESKTOP = {"width": 1280, "height": 800, "deviceScaleFactor": 1, "mobile": False}
-TALL = {**DESKTOP, "height": 1080}
 TELEPHONE = {"width": 390, "height": 844, "deviceScaleFactor": 2, "mobile": True}
 SETTLING = 1.5
 """[s] for a window to lay itself out in another size."""
@@ -29,11 +28,6 @@ const top = page.drawing.region[0].reduce((best, point) => (point[1] < best[1] ?
 return [box.left + top[0] * box.width / width, box.top + top[1] * box.height / height];
 """
 """Where the reachable region is highest, in the window."""
-FILL_IN = """
-const field = [...document.querySelectorAll('input')].find((one) => one.ariaLabel === arguments[0]);
-field.focus();
-field.select();
-"""
 RING = 17
 """[px] Radius of the drawn ring in the window."""
 POINTS = 24
@@ -73,11 +67,6 @@ class Photographer:
         self.wait(f"return !!{button} && !{button}.disabled", f"the button {name}")
         self.window.execute_script(f"{button}.click()")
 
-    def write(self, label: str, text: str) -> None:
-        """Write into the field of a label, in place of what is there."""
-        self.window.execute_script(FILL_IN, label)
-        self.window.switch_to.active_element.send_keys(text)
-
 
 def draw_ring(photographer: Photographer) -> None:
     """Draw a ring where the tip reaches farthest, and wait for its preview."""
@@ -104,6 +93,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("folder", nargs="?", type=folder_argument, default=DOC)
     folder = parser.parse_args().folder
+    folder.mkdir(parents=True, exist_ok=True)
     with page_graph() as graph:
         photographer = Photographer(graph, folder)
         press = photographer.press
@@ -116,19 +106,6 @@ def main() -> int:
         photographer.take("page_desktop.png")
         photographer.resize(TELEPHONE)
         photographer.take("page_phone.png")
-        photographer.resize(TALL)
-        press("draw")
-        press("stop")
-        graph.wait_mode(PressureState.ARMED)
-        photographer.write("Payload [g]", "20")
-        photographer.write("Period [s]", "12")
-        photographer.write("Note for the recording", "20 g at the tip")
-        press("record")
-        press("play")
-        graph.wait_mode(PressureState.TRACKING)
-        graph.client.spin(15.0)
-        photographer.take("page_playing.png")
-        press("unrecord")
         photographer.resize(DESKTOP)
         photographer.window.get(urljoin(graph.url, "/setup"))
         graph.client.spin(SETTLING)

@@ -17,15 +17,19 @@ from rclpy.signals import SignalHandlerOptions
 from ros2_verbs.cli import CommandError
 from ros2_verbs.messages import interface
 
-AT_LEAST, AT_MOST = 1.5, 6.0
-"""Shortest and longest time [s] of discovery.
+AT_LEAST = 1.5
+"""Shortest time of discovery [s].
 
 The answer to the first announcements of a new participant may stay away; it then sees the others
 when these announce themselves again: the nodes of this workspace every 0.5 s, by the profile in
 FASTRTPS_DEFAULT_PROFILES_FILE, but others every 3 s.
 """
-QUIET, QUIET_WHEN_FOUND = 0.5, 0.2
-"""Time [s] without anything new that ends discovery: in general, and once the wanted is there."""
+AT_MOST = 6.0
+"""Longest time of discovery [s]."""
+QUIET = 0.5
+"""Time without anything new that ends discovery [s]."""
+QUIET_WHEN_FOUND = 0.2
+"""The same [s] once the wanted name is there."""
 
 
 def is_hidden(name: str) -> bool:

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import array
 import dataclasses
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -9,23 +11,29 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
 
 from apriltag_tracker.camera import Intrinsics
 from apriltag_tracker.camera.calibration import (
     BoardFinder,
     BoardView,
     CalibrationError,
-    calibrate_camera,
     calibrate_mounting,
     with_offsets,
 )
-from apriltag_tracker.commands.calibrate_camera import main as run_command
+from apriltag_tracker.camera.calibration import (
+    calibrate_camera as solve,
+)
+from apriltag_tracker.commands import calibrate_camera
+from apriltag_tracker.commands.calibrate_camera import from_bag
 from apriltag_tracker.sheets import BoardLayout
 from apriltag_tracker.synthetic.camera import SyntheticCamera
 from apriltag_tracker.synthetic.shapes import constant_curvature
 from apriltag_tracker.tag_map import TagMap
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
+TOPIC = "/overhead/image"
 LAYOUT = BoardLayout()
 TRUE = Intrinsics.create(
     640,
@@ -88,7 +96,7 @@ def board_pictures(count):
 def test_the_lens_is_recovered_from_pictures():
     finder = BoardFinder(LAYOUT)
     found = [finder.find(image, f"{k}") for k, image in enumerate(board_pictures(12))]
-    result = calibrate_camera([view for view in found if view], 640, 480)
+    result = solve([view for view in found if view], 640, 480)
     assert len(result.per_view) >= 9
     assert result.rms < 0.15
     got, true = result.intrinsics.matrix, TRUE.matrix
@@ -101,7 +109,7 @@ def test_the_lens_is_recovered_from_pictures():
 
 
 def test_errors_are_as_large_as_their_sigmas_say():
-    result = calibrate_camera(corner_views(24, 0.1), 640, 480)
+    result = solve(corner_views(24, 0.1), 640, 480)
     matrix = result.intrinsics.matrix
     values = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
     true = np.array([620.0, 618.0, 322.7, 236.4])
@@ -115,19 +123,19 @@ def test_a_spoilt_picture_is_left_out_by_name():
     random = np.random.default_rng(5)
     spoilt = views[7].pixels + random.normal(0.0, 4.0, views[7].pixels.shape)
     views[7] = dataclasses.replace(views[7], pixels=spoilt)
-    result = calibrate_camera(views, 640, 480, unseen=["dark.png"])
+    result = solve(views, 640, 480, unseen=["dark.png"])
     assert set(result.left_out) == {"view 7", "dark.png"}
     assert result.rms < 0.2
 
 
 def test_too_few_pictures_are_refused_with_advice():
     with pytest.raises(CalibrationError, match="tilted by 20 to 40"):
-        calibrate_camera(corner_views(5, 0.1), 640, 480)
+        solve(corner_views(5, 0.1), 640, 480)
 
 
 def test_pictures_from_one_direction_are_refused():
     with pytest.raises(CalibrationError, match="same direction"):
-        calibrate_camera(corner_views(12, 0.1, tilt=0.01), 640, 480)
+        solve(corner_views(12, 0.1, tilt=0.01), 640, 480)
 
 
 def test_a_corner_of_the_picture_without_corners_is_remarked():
@@ -140,7 +148,7 @@ def test_a_corner_of_the_picture_without_corners_is_remarked():
         )
         for view in views
     ]
-    result = calibrate_camera([view for view in left if len(view.pixels) >= 12], 640, 480)
+    result = solve([view for view in left if len(view.pixels) >= 12], 640, 480)
     assert result.covered < 0.7
     assert any("guess" in remark for remark in result.remarks)
 
@@ -170,42 +178,92 @@ def test_mounting_without_fixed_tags_names_the_cause(tags, model):
         calibrate_mounting(blank, tags, model.intrinsics)
 
 
-def run_script(*arguments):
-    command = [sys.executable, *(str(argument) for argument in arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-
-
 def test_the_script_calibrates_a_folder_of_pictures(tmp_path):
     for k, image in enumerate(board_pictures(12)):
         cv2.imwrite(str(tmp_path / f"{k:02d}.png"), image)
     cv2.imwrite(str(tmp_path / "99.png"), np.full((480, 640), 90, np.uint8))
     out = tmp_path / "camera.yaml"
-    done = run_script(SCRIPTS / "calibrate_camera.py", "intrinsics", tmp_path, "--out", out)
-    assert done.returncode == 0, done.stderr
-    assert "left out: 99.png" in done.stdout
+    said, complaint = calibrate(out, str(tmp_path)).communicate(timeout=120)
+    assert "left out: 99.png" in said, complaint
     assert np.abs(Intrinsics.from_yaml(out).matrix - TRUE.matrix).max() < 3.0
+
+
+def calibrate(out: Path, *arguments: str, **environment: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, SCRIPTS / "calibrate_camera.py", "intrinsics", *arguments, "--out", out],
+        env={**os.environ, **environment},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def test_pictures_come_from_a_bag(tmp_path):
+    types = get_typestore(Stores.ROS2_JAZZY)
+    time, header, image = (
+        types.types[name]
+        for name in ("builtin_interfaces/msg/Time", "std_msgs/msg/Header", "sensor_msgs/msg/Image")
+    )
+    pictures = np.random.default_rng(0).integers(0, 256, (6, 48, 64), dtype=np.uint8)
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        link = writer.add_connection(TOPIC, image.__msgtype__, typestore=types)
+        for k, picture in enumerate(pictures):
+            head = header(time(k + 1, 0), "camera")
+            message = image(head, 48, 64, "mono8", 0, 64, picture.ravel())
+            raw = types.serialize_cdr(message, image.__msgtype__)
+            writer.write(link, (k + 1) * 1_000_000_000, raw)
+    read = [picture for _, picture in from_bag(tmp_path / "bag", TOPIC, every=1.5)]
+    assert np.array_equal(read, pictures[::2])
 
 
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["intrinsics"], "--topic or --bag"),
-        (["intrinsics", "--bag", "/nowhere.mcap"], "/nowhere.mcap"),
-        (["mounting", "--calibration", "/nowhere.yaml"], "/nowhere.yaml"),
+        (["intrinsics", "--out", "x.yaml"], "--topic or --bag"),
+        (["intrinsics", "--bag", "/nowhere.mcap", "--out", "x.yaml"], "/nowhere.mcap"),
+        (["mounting", "--calibration", "/nowhere.yaml", "--out", "x.yaml"], "/nowhere.yaml"),
+        (["intrinsics", "none", "--out", "."], "is a folder: name a file"),
+        (["intrinsics", "none", "--out", "missing/camera.yaml"], "is no folder"),
+        (["intrinsics", "none", "--out", "/proc/camera.yaml"], "cannot be written"),
     ],
 )
-def test_the_script_names_what_is_missing(tmp_path, monkeypatch, capsys, arguments, named):
-    out = ["--out", str(tmp_path / "x.yaml")]
-    monkeypatch.setattr(sys, "argv", ["calibrate_camera.py", *arguments, *out])
-    assert run_command() == 1
-    assert named in capsys.readouterr().err
+def test_mistakes_are_named_in_one_line(tmp_path, monkeypatch, capsys, arguments, named):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["calibrate_camera.py", *arguments])
+    assert calibrate_camera.main() == 1
+    complaint = capsys.readouterr().err
+    assert named in complaint
+    assert len(complaint.splitlines()) == 1
 
 
-def test_the_script_prints_sheets(tmp_path):
-    for what in ("tags", "board"):
-        done = run_script(SCRIPTS / "make_tags.py", what, "--out", tmp_path)
-        assert done.returncode == 0, done.stderr
-        assert (tmp_path / f"{what}.pdf").read_bytes().startswith(b"%PDF")
-    done = run_script(SCRIPTS / "make_tags.py", "tags", "--tag-map", tmp_path / "none.yaml")
-    assert done.returncode == 1
-    assert "none.yaml" in done.stderr
+@pytest.mark.graph
+def test_a_running_camera(graph, tmp_path):
+    from sensor_msgs.msg import Image
+
+    from limb_interfaces import qos
+
+    publisher = graph.client.node.create_publisher(Image, TOPIC, qos.SENSOR_DATA)
+    pictures = list(board_pictures(12))
+    out = tmp_path / "camera.yaml"
+    process = calibrate(
+        out, "--topic", TOPIC, "--every", "0.3", "--count", "16",
+        ROS_DOMAIN_ID=str(graph.domain_id),
+    )  # fmt: skip
+    shown = 0
+
+    def show_the_next() -> bool:
+        nonlocal shown
+        picture = pictures[shown // 3 % len(pictures)]
+        shown += 1
+        high, wide = picture.shape
+        message = Image(height=high, width=wide, encoding="mono8", step=wide)
+        message.data = array.array("B", picture.tobytes())
+        publisher.publish(message)
+        graph.client.spin(0.1)
+        return process.poll() is not None
+
+    graph.client.wait_for(show_the_next, 120.0, "the calibration")
+    _, complaint = process.communicate()
+    assert process.returncode == 0, complaint
+    assert "picture 16 of 16" in complaint
+    assert np.abs(Intrinsics.from_yaml(out).matrix - TRUE.matrix).max() < 5.0

@@ -2,33 +2,20 @@ from __future__ import annotations
 
 import ctypes
 import dataclasses
-import subprocess
-import sys
 from pathlib import Path
 
-import cv2
 import numpy as np
-import pyapriltags
 import pyapriltags.apriltags as c_library
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from apriltag_tracker import family
 from apriltag_tracker.detection import Detector, detector
 from apriltag_tracker.family import FAMILIES, TAG36H11
 from apriltag_tracker.pipeline import LimbTracker
-from apriltag_tracker.sheets import drawing, tag_pages
 from apriltag_tracker.synthetic.camera import Optics, SyntheticCamera
-from apriltag_tracker.tag_map import LimbTag, TagMap
-from benchmarks.tracker.renderer import Scene, render
 
 EACH = pytest.mark.parametrize("each", FAMILIES.values(), ids=FAMILIES)
 STANDARD = ("tagStandard41h12", "tagStandard52h13")
-
-
-@EACH
-def test_tag_0_reads_the_published_code(each):
-    each.check_code_of_tag_0()
 
 
 def test_a_turned_dictionary_is_noticed(monkeypatch):
@@ -116,54 +103,6 @@ def test_other_families_are_refused_with_those_that_there_are(name):
         family.named(name)
 
 
-@EACH
-@pytest.mark.parametrize(
-    ("scene", "limit"),
-    [(Scene("sharp"), 0.03), (Scene("smear", smear=3.0), 0.08)],
-    ids=lambda value: value.name if isinstance(value, Scene) else None,
-)
-def test_tags_of_every_family_are_found_and_honestly_placed(each, scene, limit):
-    # Of the same paper the outer ring takes a part.
-    pixels = scene.pixels * (0.7 if each.outer_ring else 1.0)
-    scene = dataclasses.replace(scene, family=each, pixels=pixels)
-    image, truth = render(scene, 70, (320, 240))
-    found = {tag.id: tag for tag in Detector(family=each).detect(image)}
-    assert found.keys() <= truth.keys()
-    assert len(found) >= 0.9 * len(truth)
-    gaps = [(tag.corners - truth[tag.id]).ravel() for tag in found.values()]
-    assert np.sqrt(np.mean(np.square(gaps))) < limit
-    nees = [
-        gap @ np.linalg.solve(found[k].covariance, gap) / 8.0
-        for k, gap in zip(found, gaps, strict=True)
-    ]
-    assert 0.3 < np.mean(nees) < 3.0
-
-
-@pytest.mark.parametrize("name", ["tag16h5", "tag25h9", "tagStandard41h12"])
-def test_the_c_library_reads_the_same_tags_the_same_way_round(name):
-    pixels = 48.0 if name not in STANDARD else 34.0
-    image, truth = render(Scene("large", pixels=pixels, family=FAMILIES[name]), 71, (320, 240))
-    theirs = pyapriltags.Detector(families=name).detect(image)
-    seen = {tag.tag_id: np.asarray(tag.corners) - 0.5 for tag in theirs if tag.decision_margin > 50}
-    assert seen.keys() >= truth.keys()
-    assert all(np.abs(seen[tag] - corners).max() < 0.5 for tag, corners in truth.items())
-
-
-@pytest.mark.parametrize("name", ["tag16h5", "tag25h9", *STANDARD])
-def test_pictures_without_tags_show_none_of_other_families(name):
-    detector, random = Detector(family=name), np.random.default_rng(17)
-    for _ in range(25):
-        picture = random.integers(0, 256, random.integers(8, 200, 2), dtype=np.uint8)
-        image = cv2.resize(picture, (640, 480), interpolation=cv2.INTER_CUBIC)
-        assert detector.detect(image) == []
-
-
-def test_more_forgiven_cells_than_a_weak_family_bears_are_refused():
-    assert Detector(family="tag16h5").correct_bits == 0
-    with pytest.raises(ValueError, match="0 to 0 with tag16h5"):
-        Detector(correct_bits=1, family="tag16h5")
-
-
 @pytest.mark.parametrize("name", ["tag16h5", "tag25h9", "tagStandard41h12"])
 def test_a_limb_with_another_family_is_tracked(tags, model, swing, name):
     limb = tuple(dataclasses.replace(tag, id=k) for k, tag in enumerate(tags.limb))
@@ -190,39 +129,6 @@ def test_a_detector_of_another_family_than_the_map_is_refused(tags, model):
         LimbTracker(tags, model.intrinsics, detector=Detector(family="tag25h9"))
 
 
-def test_sheets_of_another_family_are_printed(tmp_path):
-    arguments = ["tags", "--family", "tag36h10", "--format", "svg", "--out", str(tmp_path)]
-    code = "import sys; from apriltag_tracker.commands.make_tags import main; sys.exit(main())"
-    done = subprocess.run(
-        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    assert "tag36h10 0" in next(iter(sorted(tmp_path.glob("*.svg")))).read_text()
-
-
-@pytest.mark.parametrize("name", ["tag36h11", *STANDARD])
-def test_a_printed_sheet_is_read_back_in_its_size(name):
-    """The page drawn at 8 px/mm: the first tag is read, and its border has the size asked for."""
-    each = FAMILIES[name]
-    tags = TagMap((0.1,), (LimbTag(4, 0.05, 0.0, 0.02),), (), family=each)
-    figure = drawing(tag_pages(tags)[0])
-    figure.set_dpi(25.4 * 8)
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    picture = cv2.cvtColor(np.asarray(canvas.buffer_rgba()), cv2.COLOR_RGBA2BGR)
-    (found,) = Detector(family=each).detect(picture)
-    assert found.id == 4
-    assert found.pixel_size == pytest.approx(8 * 20.0, abs=0.3)
-    lower_left, lower_right, upper_right, _ = found.corners
-    assert lower_right[0] > lower_left[0] + 100.0
-    assert upper_right[1] < lower_right[1] - 100.0
-
-
-def square_code(each, tag):
-    """Return the cells of a code, (n, n)."""
-    return each.codes()[tag].reshape(each.code_cells, each.code_cells)
-
-
 def spiral(cells):
     """Return a code as the AprilTag 3 library writes it: quadrants from outside in, as they turn.
 
@@ -238,21 +144,8 @@ def spiral(cells):
     return int("".join(map(str, bits)), 2)
 
 
-@pytest.mark.parametrize(
-    ("name", "first"),
-    [
-        ("tag36h11", 0xD7E00984B),
-        ("tag36h10", 0x1A42F9469),
-        ("tag16h5", 0x27C8),
-    ],
-)
-def test_tags_are_those_of_the_c_library_the_same_way_round(name, first):
-    """Tag 0 of the tables in tag36h11.c, tag36h10.c and tag16h5.c of AprilTag 3."""
-    assert spiral(square_code(FAMILIES[name], 0)) == first
-
-
-def test_more_tags_of_a_family_that_the_c_library_does_not_read():
-    """`pyapriltags` is built without tag36h10; these are the next codes of its C table."""
-    known = (0x21A48C08D, 0x26DFDBC5D, 0x2D19B78FB, 0x31C5557DF, 0x3F2B3D349)
-    ours = [square_code(FAMILIES["tag36h10"], tag) for tag in range(1, 6)]
+def test_a_family_that_the_c_library_does_not_read_has_its_codes():
+    """`pyapriltags` is built without tag36h10; these are the first codes of its C table."""
+    known = (0x1A42F9469, 0x21A48C08D, 0x26DFDBC5D, 0x2D19B78FB, 0x31C5557DF, 0x3F2B3D349)
+    ours = FAMILIES["tag36h10"].codes()[:6].reshape(6, 6, 6)
     assert tuple(spiral(code) for code in ours) == known

@@ -99,15 +99,6 @@ def test_gaps_are_bridged_marked_and_then_given_up(straight_tags, model, camera,
     assert not observations[-1].bridged
 
 
-def test_a_covered_lens_is_not_valid(straight_tags, model, camera, swing):
-    tracker = LimbTracker(straight_tags, model.intrinsics, TrackerOptions(bridge_frames=0))
-    run(tracker, camera, swing, 3)
-    black = np.zeros((model.intrinsics.height, model.intrinsics.width), np.uint8)
-    observation = tracker.observe(black, 3 * PERIOD)
-    assert observation.estimate is None
-    assert observation.tags == ()
-
-
 def test_without_fixed_tags_nothing_is_placed(straight_tags, model, swing):
     bare = dataclasses.replace(straight_tags, world=())
     camera = SyntheticCamera(model, bare)

@@ -220,27 +220,3 @@ def test_an_unplugged_camera_is_named_and_comes_back(monkeypatch):
         assert wait_until(there)
     finally:
         source.close()
-
-
-def test_a_frame_is_given_once():
-    camera = FakeCamera()
-    camera.read = lambda first=[True]: (
-        (True, camera.image)
-        if first and first.pop()
-        else (
-            time.sleep(0.01),
-            (False, None),
-        )[1]
-    )
-    source = DeviceSource("/dev/video0", 30.0, time.time_ns, lambda _: camera)
-    try:
-        seen = 0
-        end = time.monotonic() + 0.3
-        while time.monotonic() < end:
-            try:
-                seen += source.read() is not None
-            except SourceError:
-                break
-        assert seen <= 1
-    finally:
-        source.close()

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from apriltag_tracker.camera import CameraError
-from apriltag_tracker.family import TAG36H11
 from apriltag_tracker.synthetic.camera import (
     CameraModel,
     Errors,
@@ -14,50 +13,23 @@ from apriltag_tracker.synthetic.camera import (
     SyntheticCamera,
 )
 from apriltag_tracker.synthetic.shapes import constant_curvature
+from benchmarks.tracker.renderer import BLACK, FULL, WHITE, Scene, draw_patch
 
 CLEAN = Optics(noise=0.0, light_fall=0.0)
 
 
-def brute_force(model, tag, shape, optics, rows, columns, oversampling=6, reach=4):
-    """Sample the printed tag at many points a pixel and blur it: slow, and nothing in common."""
-    fine = oversampling
-    first_row, first_column = rows.start - reach, columns.start - reach
-    count_rows = (rows.stop - rows.start + 2 * reach) * fine
-    count_columns = (columns.stop - columns.start + 2 * reach) * fine
-    y = first_row - 0.5 + (np.arange(count_rows) + 0.5) / fine
-    x = first_column - 0.5 + (np.arange(count_columns) + 0.5) / fine
-    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    plane = model.pose.onto_plane(model.intrinsics.rays(grid), tag.height)
-    place = shape.at(tag.arc_length)
-    cosine, sine = np.cos(place[2]), np.sin(place[2])
-    local = (plane - place[:2]) @ np.array([[cosine, -sine], [sine, cosine]])
-    cells = TAG36H11.printed_cells(tag.id, 1)
-    column = np.floor(local[:, 0] / tag.size * 8 + 5).astype(int)
-    row = np.floor(5 - local[:, 1] / tag.size * 8).astype(int)
-    inside = (column >= 0) & (column < 10) & (row >= 0) & (row < 10)
-    level = np.where(cells[row.clip(0, 9), column.clip(0, 9)] > 0, optics.white, optics.black)
-    picture = np.where(inside, level, 52.0).reshape(count_rows, count_columns)
-    picture = cv2.GaussianBlur(picture, (0, 0), optics.blur * fine)
-    small = picture.reshape(count_rows // fine, fine, count_columns // fine, fine).mean(axis=(1, 3))
-    return small[reach:-reach, reach:-reach]
-
-
 @pytest.mark.parametrize("blur", [0.5, 1.2])
 def test_pixels_agree_with_brute_force_sampling(model, tags, blur):
-    optics = Optics(noise=0.0, light_fall=0.0, blur=blur)
-    camera = SyntheticCamera(model, tags, optics)
+    optics = Optics(noise=0.0, light_fall=0.0, blur=blur, black=FULL * BLACK, white=FULL * WHITE)
     shape = constant_curvature(tags.segment_lengths, [0.5, 0.4])
-    frame = camera.frame(shape)
-    tag = tags.limb[2]
-    low = np.floor(frame.corners[tag.id].min(axis=0)).astype(int) - 1
-    high = np.ceil(frame.corners[tag.id].max(axis=0)).astype(int) + 2
-    rows, columns = slice(low[1], high[1]), slice(low[0], high[0])
-    expected = brute_force(model, tag, shape, optics, rows, columns)
+    frame = SyntheticCamera(model, tags, optics).frame(shape)
+    corners = frame.corners[2]
+    left, top = np.floor(corners.mean(axis=0)).astype(int) - 32
+    drawn = FULL * draw_patch(Scene("", blur=blur), 2, corners - (left, top), 64)
     # The tag's own square: outside of it the limb's body is drawn in another way.
-    mask = np.zeros(frame.image.shape, dtype=np.uint8)
-    cv2.fillConvexPoly(mask, np.round(frame.corners[tag.id]).astype(np.int32), 1)
-    inside = mask[rows, columns] > 0
-    gap = (frame.image[rows, columns] - expected)[inside]
+    mask = np.zeros((64, 64), dtype=np.uint8)
+    cv2.fillConvexPoly(mask, np.round(corners - (left, top)).astype(np.int32), 1)
+    gap = (frame.image[top : top + 64, left : left + 64] - drawn)[mask > 0]
     assert np.abs(gap).max() < 6.0
     assert np.sqrt(np.mean(gap**2)) < 1.2
     assert abs(gap.mean()) < 0.3

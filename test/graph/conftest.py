@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
 
 from der_planner.limb import DEFAULT_LIMB_FILE
-
-# Replayed bags are those of the evaluation's tests, and of the recorder's.
-UNIT_TESTS = Path(__file__).parents[1] / "der_planner"
-sys.path[:0] = [str(UNIT_TESTS / "results"), str(UNIT_TESTS / "bags")]
 
 RIG = """
 driver: {{port: {port}, protocol: ezloop}}

@@ -105,18 +105,10 @@ def test_a_rig_is_calibrated_and_left_vented(graph, rig: Path, tmp_path: Path):
     assert np.all(np.abs(found.static_gain / prior.static_gain - 1.0) < 0.5)
 
 
-@pytest.mark.parametrize(
-    ("rows", "complaint"),
-    [
-        ("time_s,a,b\n0,0,0\n0.05,0,30000\n", "asks for 30000 Pa, the limit is ±24000 Pa"),
-        ("time_s,a,b\n0,0,0\n0.1,0,0\n", "must be 0, 0.05, 0.1"),
-        ("time_s,a\n0,0\n0.05,0\n", "expected time_s and 2 pressures"),
-    ],
-)
-def test_a_table_that_cannot_be_played_starts_nothing(tmp_path: Path, rows: str, complaint: str):
+def test_a_table_that_cannot_be_played_starts_nothing(tmp_path: Path):
     excitation = tmp_path / "excitation.csv"
-    excitation.write_text(rows)
+    excitation.write_text("time_s,a,b\n0,0,0\n0.05,0,30000\n")
     run = calibrate(tmp_path / "x.yaml", excitation, "--graph", "--folder", str(tmp_path / "run"))
     assert run.returncode == 1
-    assert complaint in run.stderr
+    assert "asks for 30000 Pa, the limit is ±24000 Pa" in run.stderr
     assert not (tmp_path / "run").exists()

@@ -151,16 +151,19 @@ def test_a_run_of_both_models_ends_in_a_table_and_leaves_nothing_behind(experime
     assert "0 of 2 trials to play" in again.errors
 
 
-def test_a_tilted_limb_carries_a_payload_in_every_part_of_the_graph(experiment, tmp_path):
+def test_a_tilted_limb_carries_a_payload_and_is_corrected_on_the_graph(experiment, tmp_path):
     known = CalibratedRange((2e4, 2e4), (1.5, 1.5))
     level = dataclasses.replace(Limb.default(), calibrated=known)
     level.to_yaml(tmp_path / "level.yaml")
     loads = ("--mounting", "20", "--payload", "0.02", "--amplitude", "0.3")
     limb = ("--limb", tmp_path / "level.yaml")
-    run = experiment("--models", "der", "--no-report", *limb, *loads)
+    run = experiment("--models", "der", "--feedback", "--no-report", *limb, *loads)
     assert run.finish() == 0, run.errors
     assert "warning: the mounting is 20°, the limb was calibrated as horizontal" in run.errors
-    (entry,) = json.loads((run.out / "results.json").read_text())["runs"]
+    entry, corrected = json.loads((run.out / "results.json").read_text())["runs"]
+    assert corrected["method"] == "paper + feedback"
+    assert corrected["extra"]["feedback"]["latency_median_s"] > 0.0
+    assert max(corrected["extra"]["feedback"]["correction_rms_pa"]) > 10.0
     assert entry["mounting"] == "20°"
     np.testing.assert_allclose(entry["gravity_m_s2"], gravity_of("20"))
     assert (entry["payload_kg"], entry["payload_at_m"]) == (0.02, 0.0)
@@ -202,7 +205,6 @@ def test_a_path_is_drawn_on_the_graph_as_it_is_in_the_file(experiment, tmp_path:
     assert run.finish() == 0, run.errors
     (result,) = json.loads((run.out / "results.json").read_text())["runs"]
     assert (result["motion"], result["model"], result["method"]) == ("arc", "der", "paper")
-    assert result["problems"] == []
     reference = load_run(run.out / result["bag"]).reference
     for point in points:
         assert np.linalg.norm(reference.value - point, axis=1).min() < 1e-3

@@ -45,14 +45,12 @@ def url(graph: Any, tmp_path: Path) -> str:
     graph.start("pressure_driver", "board_emulator", port_link=link)
     graph.client.wait_ready(["board_emulator"])
     graph.start("pressure_driver", "pressure_driver", port=link)
-    nodes = [("der_planner", "limb_twin"), ("apriltag_tracker", "synthetic_camera")]
-    nodes += [("apriltag_tracker", "apriltag_tracker")]
-    for package, executable in nodes:
-        graph.start(package, executable)
+    graph.start("der_planner", "limb_twin")
+    graph.start("apriltag_tracker", "synthetic_camera")
+    graph.start("apriltag_tracker", "apriltag_tracker")
     graph.start("der_planner", "planner", default_method="projected")
     _, url = start_page(graph, drawings=str(tmp_path / "drawings"), on_lost_operator="stop")
-    names = [executable for _, executable in nodes]
-    graph.client.wait_ready(["pressure_driver", "planner", "page", *names])
+    graph.client.wait_ready([process.executable for process in graph.processes])
     return url
 
 

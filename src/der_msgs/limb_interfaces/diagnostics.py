@@ -29,12 +29,16 @@ _LEVELS = {
     "error": DiagnosticStatus.ERROR,
     "stale": DiagnosticStatus.STALE,
 }
-_INTERVAL, _FIRST_INTERVAL = 1.0, 0.2
-"""[s] between two messages: in general, and at first."""
-_FIRST_READY, _FIRST_TIME = 2.0, 20.0
-"""[s] for how long a node speaks more often: once it is ready, and at most."""
+_INTERVAL = 1.0
+"""Time between two messages [s]."""
+_FIRST_INTERVAL = 0.2
+"""Time between two messages of a node that starts [s]."""
+_FIRST_READY = 2.0
+"""Time for which a node that is ready goes on to speak more often [s]."""
+_FIRST_TIME = 20.0
+"""Longest time for which a node that starts speaks more often [s]."""
 _CPU_INTERVAL = 0.5
-"""[s] over which the CPU time is taken at least: over less, its own ticks show."""
+"""Shortest time over which the CPU time is measured [s]: over less, its own ticks show."""
 
 
 class DiagnosticsPublisher:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 
-NANOSECONDS = 1_000_000_000
+from limb_interfaces.stamps import NANOSECONDS
 
 
 class StampGaps:
@@ -23,35 +23,18 @@ class StampGaps:
         self._intervals: deque[int] = deque(maxlen=window)
         self._pause = round(pause * NANOSECONDS)
         self._newest = 0
-        self.received = 0
-        """Messages so far."""
         self.missed = 0
-        """Messages that were not received between them."""
+        """Messages that did not arrive between those that did."""
 
-    @property
-    def period(self) -> float:
-        """Period of the stream [s]; 0 before three messages."""
-        return self._period() / NANOSECONDS
-
-    def _period(self) -> int:
-        if len(self._intervals) < 2:
-            return 0
-        return sorted(self._intervals)[len(self._intervals) // 10]
-
-    def take(self, stamp: int) -> int:
-        """Take the stamp [ns] of a message; return how many were missed just before it.
-
-        Stamps of zero mean nothing. A stamp that goes back begins anew: a replay.
-        """
+    def take(self, stamp: int) -> None:
+        """Take the stamp [ns] of a message; zero means nothing, one that goes back begins anew."""
         if stamp <= 0:
-            return 0
-        self.received += 1
+            return
         before, self._newest = self._newest, stamp
         interval = stamp - before
-        if before == 0 or interval <= 0 or interval > self._pause:
-            return 0
+        if before == 0 or not 0 < interval <= self._pause:
+            return
         self._intervals.append(interval)
-        period = self._period()
-        missing = round(interval / period) - 1 if period else 0
-        self.missed += missing
-        return missing
+        if len(self._intervals) >= 2:
+            period = sorted(self._intervals)[len(self._intervals) // 10]
+            self.missed += round(interval / period) - 1

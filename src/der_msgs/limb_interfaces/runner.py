@@ -7,7 +7,6 @@ import gc
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from typing import Protocol
 
 import rclpy
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
@@ -16,13 +15,6 @@ from rclpy.signals import SignalHandlerOptions
 
 from limb_interfaces import transport
 from limb_interfaces.entry import on_end_signals
-
-
-class ClosableNode(Protocol):
-    """A node that leaves hardware and files in order when it ends."""
-
-    def close(self) -> None:
-        """Vent, flush, release: called exactly once, before the node is destroyed."""
 
 
 def run_node(
@@ -35,9 +27,10 @@ def run_node(
     The signals are those of `limb_interfaces.entry.END_SIGNALS`: Ctrl-C, SIGTERM, a terminal that
     was closed (a dropped ssh, too) and Ctrl-\ end a node in the same order.
 
-    A node with a ``close`` method has it called while its publishers still work, whatever ended
-    the spinning: a signal, an exception in a callback, or the end of the context. A node that
-    cannot go on sets its attribute ``fatal_error`` to a sentence, and the process ends with it.
+    A node with a ``close`` method, which vents, flushes or releases, has it called once while its
+    publishers still work, whatever ended the spinning: a signal, an exception in a callback, or the
+    end of the context. A node that cannot go on sets its attribute ``fatal_error`` to a sentence,
+    and the process ends with it.
 
     Args:
         create: makes the node; an exception ends the process with exit code 1 and its message.
@@ -101,16 +94,16 @@ def _complain(node: Node | None, error: Exception) -> None:
 
 
 def _close(node: Node | None) -> int:
+    """Close and destroy a node; return 1 if it could not leave all in order."""
     if node is None:
         return 0
     exit_code = 0
-    close = getattr(node, "close", None)
-    if close is not None:
-        try:
-            close()
-        except Exception as error:
-            exit_code = 1
-            _complain(node, error)
+    try:
+        if hasattr(node, "close"):
+            node.close()
+    except Exception as error:
+        exit_code = 1
+        _complain(node, error)
     with contextlib.suppress(Exception):
         node.destroy_node()
     return exit_code

@@ -7,7 +7,6 @@ changes.
 from __future__ import annotations
 
 import importlib
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,36 +15,17 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
 from rclpy.node import Node
+from scipy.spatial.transform import Rotation
 
 from limb_interfaces import qos, topics
 
 TF = "/tf"
 CLAMP_FRAME = "limb_clamp"
-"""The clamped end: the origin of `limb_base`, under a name of its own."""
+"""Name of the frame at the clamped end, which is the origin of `limb_base`."""
 TIP_FRAME = "limb_tip"
-"""At the tip, x along the limb."""
+"""Name of the frame at the tip, x along the limb."""
 CAMERA_FRAME = "limb_camera"
-"""Of a camera that names no frame of its own: x right, y down, z out of the lens."""
-
-
-def quaternion(rotation: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    """Return x, y, z, w of a rotation matrix (3, 3), w not negative (Shepperd 1978)."""
-    trace = float(np.trace(rotation))
-    squares = np.array([*(2.0 * np.diag(rotation) - trace), trace]) + 1.0
-    largest = int(np.argmax(squares))
-    skew = [
-        rotation[2, 1] - rotation[1, 2],
-        rotation[0, 2] - rotation[2, 0],
-        rotation[1, 0] - rotation[0, 1],
-    ]
-    if largest == 3:
-        parts = np.array([*skew, squares[3]])
-    else:
-        parts = np.array([*(rotation[largest] + rotation[:, largest]), skew[largest]])
-        parts[largest] = squares[largest]
-    parts = parts / np.linalg.norm(parts) * (1.0 if parts[3] >= 0.0 else -1.0)
-    x, y, z, w = parts.tolist()
-    return x, y, z, w
+"""Name of the frame of a camera that names none: x right, y down, z out of the lens."""
 
 
 def transform(
@@ -64,14 +44,9 @@ def transform(
     message.header.frame_id = topics.BASE_FRAME
     place, turn = message.transform.translation, message.transform.rotation
     place.x, place.y, place.z = map(float, position)
-    turn.x, turn.y, turn.z, turn.w = quaternion(rotation)
+    found = Rotation.from_matrix(rotation).as_quat(canonical=True)
+    turn.x, turn.y, turn.z, turn.w = map(float, found)
     return message
-
-
-def about_z(angle: float) -> NDArray[np.float64]:
-    """Return the rotation (3, 3) by an angle [rad] about z."""
-    cosine, sine = math.cos(angle), math.sin(angle)
-    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
 
 
 def limb_transforms(curve: NDArray[np.float64], stamp: Time) -> list[TransformStamped]:
@@ -82,7 +57,7 @@ def limb_transforms(curve: NDArray[np.float64], stamp: Time) -> list[TransformSt
         stamp: when it was there.
     """
     along = curve[-1] - curve[-2]
-    tip = about_z(math.atan2(along[1], along[0]))
+    tip = Rotation.from_euler("z", np.arctan2(along[1], along[0])).as_matrix()
     return [
         transform(CLAMP_FRAME, (0.0, 0.0, 0.0), np.eye(3), stamp),
         transform(TIP_FRAME, (*curve[-1].tolist(), 0.0), tip, stamp),

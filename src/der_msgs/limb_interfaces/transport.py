@@ -10,12 +10,14 @@ from pathlib import Path
 PROFILE = Path("share/apriltag_tracker/config/fastdds_large_images.xml")
 """Below the prefix into which `apriltag_tracker` is installed."""
 _SETTINGS = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+"""Environment variables that name a profile of Fast DDS."""
 _LOCAL = "DEFAULT_FASTRTPS_PROFILES.xml"
-"""Fast DDS takes a file of this name in the working folder where no setting names another."""
+"""File in the working folder that Fast DDS reads where no variable names another."""
 
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+_THRESHOLDS = (-1, -3)
+"""Settings M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of `malloc.h` of the GNU C library."""
 _KEPT = 64 << 20
-"""Of `malloc.h` of the GNU C library; memory that a process keeps for its next messages [bytes]."""
+"""Memory that a process keeps for its next messages [bytes]."""
 
 
 def keep_buffers() -> bool:
@@ -29,7 +31,7 @@ def keep_buffers() -> bool:
     """
     with contextlib.suppress(OSError, AttributeError):
         library = ctypes.CDLL(None)
-        return all(library.mallopt(key, _KEPT) for key in (_M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD))
+        return all(library.mallopt(key, _KEPT) for key in _THRESHOLDS)
     return False
 
 

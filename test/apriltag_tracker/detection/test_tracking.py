@@ -130,11 +130,10 @@ def test_time_that_goes_back_starts_anew(tags, camera, detector, swing):
     assert tracker.counts.full_searches == 2
 
 
-@pytest.mark.parametrize("level", [0, 255])
-def test_nothing_is_tracked_on_a_blank_image(tags, camera, detector, swing, level):
+def test_nothing_is_tracked_on_a_blank_image(tags, camera, detector, swing):
     tracker = TagTracker(tags.ids, detector)
     frame = camera.frame(swing.shape(0.0))
     tracker.track(frame.image, 0.0)
-    blank = np.full_like(frame.image, level)
+    blank = np.zeros_like(frame.image)
     for k in range(1, 12):
         assert tracker.track(blank, k * PERIOD) == []

@@ -75,19 +75,6 @@ def test_tags_are_placed_at_their_height_with_their_noise(model):
     assert np.allclose(seen, np.sqrt(np.diagonal(spread, axis1=1, axis2=2)), rtol=0.2)
 
 
-def test_a_homography_of_the_base_plane_would_be_millimetres_wrong(model):
-    """The tag's height matters: 30 mm up, 0.2 m from the axis of a camera 0.6 m up."""
-    corners = project(
-        model.intrinsics,
-        model.pose,
-        np.column_stack([square((0.3, 0.0, 0.0), 0.02), np.full(4, 0.03)]),
-    )
-    covariance = np.zeros((1, 8, 8))
-    arguments = (covariance, np.zeros(1), np.array([0.02]), model.intrinsics, model.pose)
-    flat = locate(corners[None], *arguments)[0][0]
-    assert 0.005 < abs(flat[0] - 0.3) < 0.02
-
-
 def test_the_mounting_offset_is_taken_off():
     tag = LimbTag(0, 0.1, 0.03, 0.016, (0.002, -0.001, 0.1))
     place = centreline_pose(np.array([1.0, 2.0, np.pi / 2 + 0.1]), tag)

@@ -9,7 +9,7 @@ import pytest
 from der_planner.control import Learner
 from der_planner.control.library import carried_over, nearest
 from der_planner.limb import Limb
-from der_planner.model import simulate
+from der_planner.model import RodModel, simulate
 from der_planner.planning import Motion, plan
 from der_planner.planning.plan_file import write_plan
 
@@ -65,4 +65,4 @@ def test_a_near_motion_begins_with_less_than_half_of_the_error(library, period, 
 def test_what_is_far_or_of_another_limb_is_not_taken(library):
     assert nearest(library, planned(16.0)) is None
     assert nearest(library, planned(8.0, motion="opposite_direction")) is None
-    assert nearest(library, replace(planned(8.0), limb=OTHER)) is None
+    assert nearest(library, replace(planned(8.0), body=RodModel(OTHER))) is None

@@ -6,8 +6,7 @@ import pytest
 from der_planner.identification import calibrate_twin, predict
 from der_planner.identification.excitation import PERIOD, Excitation, record_twin
 from der_planner.limb import Limb
-from der_planner.twin.hardware import draw
-from der_planner.twin.truth import known_values
+from der_planner.twin.hardware import draw, known_values
 
 pytestmark = pytest.mark.slow
 

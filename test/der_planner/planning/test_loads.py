@@ -62,12 +62,6 @@ def test_plans_begin_and_end_at_rest_and_reach_their_reference(mounting, name, a
     assert np.abs(result.differential_pressure[[0, -1]]).max() < 60.0
 
 
-def test_the_papers_periods_on_a_hanging_limb():
-    result = plan(LIMB.mounted("hanging"), Motion.named("opposite_direction", 0.7, 20.0, 1))
-    assert result.predicted_error < 1e-4
-    assert result.largest_error < 5e-4
-
-
 def test_a_path_is_kept_whatever_the_limb_carries():
     turn = np.linspace(0.0, 2 * np.pi, 121)
     path = np.column_stack([0.222 + 0.004 * np.cos(turn), 0.07 + 0.01 * np.sin(turn)])

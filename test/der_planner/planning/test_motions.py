@@ -34,18 +34,6 @@ def test_every_motion_starts_and_ends_at_rest_in_the_straight_pose(name):
     np.testing.assert_allclose(np.diff(reference.time), 0.05, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_rates_and_accelerations_are_derivatives(name):
-    reference = Motion.named(name, amplitude=0.6, period=4.0, cycles=1).reference(SPACE)
-    time = np.linspace(0.2, reference.duration - 0.2, 57)
-    h = 1e-4
-    _, rates, accelerations = reference.sample(time)
-    before, after = reference.sample(time - h), reference.sample(time + h)
-    scale = np.abs(accelerations).max()
-    np.testing.assert_allclose((after[0] - before[0]) / (2 * h), rates, atol=1e-5)
-    np.testing.assert_allclose((after[1] - before[1]) / (2 * h), accelerations, atol=2e-3 * scale)
-
-
 @pytest.mark.parametrize(
     ("name", "second"),
     [

@@ -8,7 +8,7 @@ import pytest
 from der_planner.limb import Limb
 from der_planner.model import ArcModel, RodModel
 from der_planner.planning import Motion, PlanningError, Workspace, plan
-from der_planner.planning.inverse import BRANCHES
+from der_planner.planning.workspace import BRANCHES
 
 LIMB = Limb.default()
 ARCS = ArcModel(LIMB)
@@ -122,20 +122,6 @@ def test_the_plan_says_how_far_it_is_from_the_drawing(model):
     assert "nearest path leaves" in planned.warnings[0]
     assert np.abs(planned.differential_pressure).max() <= LIMB.pneumatics.pressure_limit
     assert planned.predicted_error < 2e-3
-
-
-@pytest.mark.parametrize(
-    ("time", "tip", "message"),
-    [
-        (None, [(0.2, 0.1), (np.nan, 0.1)], "point 1 of the tip path is not finite"),
-        ([0.0, np.nan], [(0.2, 0.1), (0.2, 0.2)], "times of a tip path must increase"),
-        (None, [(0.2, 0.1)], "two or more points"),
-        (None, np.zeros((3, 3)), r"got shape \(3, 3\)"),
-    ],
-)
-def test_nonsense_is_refused(time, tip, message):
-    with pytest.raises(PlanningError, match=message):
-        Motion.from_tip_path(time, tip, nearest=True)
 
 
 def test_an_unknown_branch_is_refused():

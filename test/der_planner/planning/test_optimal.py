@@ -113,18 +113,6 @@ def test_limited_programme_against_a_general_solver():
     assert value == pytest.approx(best.fun, rel=1e-4)
 
 
-def test_smoothness_makes_commands_smoother():
-    motion = Motion.named("star", period=8.0, cycles=1)
-    rough = solver_for(LIMB, motion).run()
-    smooth = solver_for(LIMB, motion, smoothness=3e-5).run()
-    warm = solver_for(LIMB, motion).warm
-
-    def bends(commands):
-        return np.linalg.norm(np.diff(commands - warm, 2, axis=0))
-
-    assert bends(smooth.commands) < 0.7 * bends(rough.commands)
-
-
 def test_each_window_begins_within_the_limits(monkeypatch):
     """Where a window has moved away from the guess of the next one, there is no jump between."""
     motion = Motion.named("asynchronous", amplitude=0.2, period=4.0, cycles=1)

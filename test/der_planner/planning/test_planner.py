@@ -8,7 +8,6 @@ import pytest
 from der_planner.limb import CalibratedRange, Limb
 from der_planner.model import RodModel, commands
 from der_planner.model.air import Air
-from der_planner.model.bending import bend_angles
 from der_planner.planning import (
     METHODS,
     Motion,
@@ -133,18 +132,6 @@ def test_paper_pressures_are_the_least_squares_solution(model):
         np.testing.assert_allclose(pressures[k], best, rtol=1e-8)
 
 
-@pytest.mark.parametrize("method", ["paper", "projected"])
-def test_at_rest_every_method_is_the_static_inversion(method, model):
-    rng = np.random.default_rng(4)
-    angles = rng.uniform(-1.0, 1.0, size=(5, 2))
-    zero = np.zeros_like(angles)
-    solve = {"paper": model.balance.paper, "projected": model.balance.projected}[method]
-    pressures = solve(angles, zero, zero)
-    for wanted, pressure in zip(angles, pressures, strict=True):
-        resting = model.rod.equilibrium(pressure)
-        np.testing.assert_allclose(bend_angles(model.rod, resting.q), wanted, atol=1e-7)
-
-
 @pytest.mark.parametrize("name", CASES)
 def test_paper_becomes_the_static_inversion_as_speed_goes_to_zero(name):
     model = RodModel(LIMB)
@@ -233,11 +220,6 @@ def test_all_models_get_the_same_reference():
         np.testing.assert_array_equal(plans[0].tip_reference, other.tip_reference)
         np.testing.assert_array_equal(plans[0].time, other.time)
     assert {(p.model, p.method) for p in plans} == set(EVERY)
-
-
-def test_a_plan_begins_and_ends_vented():
-    result = plan(LIMB, Motion.named("asynchronous", period=6.0, cycles=1), "der", "optimal")
-    assert np.abs(result.differential_pressure[[0, -1]]).max() < 50.0
 
 
 @pytest.mark.parametrize(("model_name", "method"), EVERY)
@@ -332,16 +314,6 @@ def test_cancelling_by_progress_ends_the_planning():
         plan(LIMB, Motion.named("asynchronous"), "der", "optimal", progress=progress)
 
 
-def test_held_commands_reach_the_chambers_as_the_lag_says():
-    air = changed(LIMB, {"delay": 0.02}).pneumatics
-    command = np.zeros((40, 1))
-    command[4:] = 1000.0
-    chambers = Air(air).follow(command, 0.05, 10).differential
-    time = ((np.arange(400) + 0.5) * 0.005).reshape(40, 10, 1) - 0.2 - 0.02
-    exact = np.where(time > 0, 1000.0 * (1 - np.exp(-time / air.time_constant)), 0.0)
-    np.testing.assert_allclose(chambers, exact, atol=1e-9)
-
-
 def test_commands_invert_hold_lag_and_delay():
     limb = changed(LIMB, {"delay": 0.03})
     fine = np.arange(401) * 0.025
@@ -360,10 +332,3 @@ def test_the_optimum_is_found_in_few_steps_whatever_the_dead_time(name, period):
     result = plan(late, Motion.named(name, 0.6, period, 1), "der", "optimal")
     assert result.details["steps"] <= 4
     assert result.predicted_error < 3e-5
-
-
-def test_static_pressure_holds_the_angles_of_the_rod():
-    angles = np.array([0.5, -0.6])
-    rod = RodModel(LIMB).rod
-    resting = rod.equilibrium(SPACE.static_pressure(angles))
-    np.testing.assert_allclose(bend_angles(rod, resting.q), angles, rtol=2e-3)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from der_planner.twin.realtime import BACKLOG, RealTimeLoop
+from der_planner.twin.limb_twin import BACKLOG, RealTimeLoop
 
 
 class World:

@@ -29,6 +29,7 @@ from der_planner.bags.writer import METADATA_FILE, RUN_KEY, BagWriter
 MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQII")
+_LENGTH = struct.Struct("<Q")
 _CHUNK = re.compile(rb"\x06.{6}\0\0.{28}(?:\0{4}|\x03\0{3}lz4|\x04\0{3}zstd)", re.DOTALL)
 """What a chunk begins with: opcode, length, two times, size, checksum, name of the compression."""
 _DEFINITIONS = {
@@ -166,26 +167,21 @@ class _File:
             place = after
 
     def _record_at(self, place: int) -> _Record | None:
-        begin = place + _HEAD.size
-        if begin > len(self._data):
+        """Return the record that begins at a byte; None if the bytes there are no record."""
+        try:
+            opcode, length = _HEAD.unpack_from(self._data, place)
+            record = _Record(opcode, place + _HEAD.size, place + _HEAD.size + length)
+            if opcode == Opcode.CHUNK:  # the lengths inside must fit its own
+                name_length = _CHUNK_HEAD.unpack_from(self._data, record.begin)[-1]
+                content = record.begin + _CHUNK_HEAD.size + name_length + _LENGTH.size
+                if (
+                    content + _LENGTH.unpack_from(self._data, content - _LENGTH.size)[0]
+                    != record.end
+                ):
+                    return None
+        except struct.error:  # the file ends before
             return None
-        opcode, length = _HEAD.unpack_from(self._data, place)
-        if not 0 < opcode <= max(Opcode) or begin + length > len(self._data):
-            return None
-        record = _Record(opcode, begin, begin + length)
-        return None if opcode == Opcode.CHUNK and not self._is_chunk(record) else record
-
-    def _is_chunk(self, record: _Record) -> bool:
-        """Tell whether the lengths inside a chunk fit its own."""
-        inside = record.begin + _CHUNK_HEAD.size
-        if inside > record.end:
-            return False
-        name_length = _CHUNK_HEAD.unpack_from(self._data, record.begin)[-1]
-        inside += name_length + 8
-        if inside > record.end:
-            return False
-        (length,) = struct.unpack_from("<Q", self._data, inside - 8)
-        return bool(inside + length == record.end)
+        return record if 0 < opcode <= max(Opcode) and record.end <= len(self._data) else None
 
     def _stream(self, record: _Record) -> ReadDataStream:
         return ReadDataStream(BytesIO(self._data[record.begin : record.end]))

@@ -28,10 +28,6 @@ class EvaluationError(ValueError):
     """A run cannot be evaluated; the message names the run and what it lacks."""
 
 
-def _empty(*shape: int) -> Array:
-    return np.empty(shape)
-
-
 @dataclass(frozen=True)
 class Description:
     """What a run was.
@@ -84,6 +80,10 @@ class Stream:
         return len(self.time)
 
 
+def _nothing(columns: int) -> Stream:
+    return Stream(np.empty(0), np.empty((0, columns)))
+
+
 @dataclass(frozen=True)
 class BoardLog:
     """Setpoints as planned and commands as the board received them (twin only).
@@ -125,11 +125,11 @@ class RunSeries:
     reference: Stream
     predicted: Stream
     tip: Stream
-    bend_angle: Stream = field(default_factory=lambda: Stream(_empty(0), _empty(0, 0)))
-    tip_covariance: Stream = field(default_factory=lambda: Stream(_empty(0), _empty(0, 4)))
-    setpoints: Stream = field(default_factory=lambda: Stream(_empty(0), _empty(0, 0)))
-    commanded: Stream = field(default_factory=lambda: Stream(_empty(0), _empty(0, 0)))
-    measured: Stream = field(default_factory=lambda: Stream(_empty(0), _empty(0, 0)))
+    bend_angle: Stream = field(default_factory=lambda: _nothing(0))
+    tip_covariance: Stream = field(default_factory=lambda: _nothing(4))
+    setpoints: Stream = field(default_factory=lambda: _nothing(0))
+    commanded: Stream = field(default_factory=lambda: _nothing(0))
+    measured: Stream = field(default_factory=lambda: _nothing(0))
     truth: Stream | None = None
     board: BoardLog | None = None
     faults: tuple[str, ...] = ()
@@ -168,33 +168,24 @@ class RunSeries:
         Raises:
             EvaluationError: shapes do not fit or times do not rise; the message says which.
         """
-        clock = _times(time, "time", description)
-        grid = _times(reference_time, "reference_time", description)
-        reference = _rows(tip_reference, len(grid), "tip_reference", description)
-        predicted = (
-            Stream(grid, _rows(tip_predicted, len(grid), "tip_predicted", description))
-            if tip_predicted is not None
-            else Stream(_empty(0), _empty(0, 2))
-        )
-        pressures = {name: Stream(_empty(0), _empty(0, 0)) for name in ("commanded", "measured")}
-        if pressure_time is not None:
-            ticks = _times(pressure_time, "pressure_time", description)
-            for name, value in (("commanded", commanded), ("measured", measured)):
-                if value is not None:
-                    rows = _rows(value, len(ticks), name, description, columns=None)
-                    pressures[name] = Stream(ticks, rows)
+
+        def stream(
+            clock: ArrayLike | None, value: ArrayLike | None, names: tuple[str, str], columns: int
+        ) -> Stream:
+            if clock is None or value is None:
+                return _nothing(columns)
+            instants = _times(clock, names[0], description)
+            return Stream(instants, _rows(value, len(instants), names[1], description, columns))
+
+        asked = "reference_time"
         return cls(
             description=description,
-            reference=Stream(grid, reference),
-            predicted=predicted,
-            tip=Stream(clock, _rows(tip, len(clock), "tip", description)),
-            commanded=pressures["commanded"],
-            measured=pressures["measured"],
-            setpoints=Stream(
-                grid, _rows(setpoints, len(grid), "setpoints", description, columns=None)
-            )
-            if setpoints is not None
-            else Stream(_empty(0), _empty(0, 0)),
+            reference=stream(reference_time, tip_reference, (asked, "tip_reference"), 2),
+            predicted=stream(reference_time, tip_predicted, (asked, "tip_predicted"), 2),
+            tip=stream(time, tip, ("time", "tip"), 2),
+            commanded=stream(pressure_time, commanded, ("pressure_time", "commanded"), 0),
+            measured=stream(pressure_time, measured, ("pressure_time", "measured"), 0),
+            setpoints=stream(reference_time, setpoints, (asked, "setpoints"), 0),
         )
 
 
@@ -207,9 +198,7 @@ def _times(value: ArrayLike, name: str, description: Description) -> Array:
     return array
 
 
-def _rows(
-    value: ArrayLike, count: int, name: str, description: Description, columns: int | None = 2
-) -> Array:
+def _rows(value: ArrayLike, count: int, name: str, description: Description, columns: int) -> Array:
     array = np.asarray(value, dtype=float)
     if array.ndim != 2 or len(array) != count or (columns and array.shape[1] != columns):
         wanted = f"({count}, {columns or 'M'})"

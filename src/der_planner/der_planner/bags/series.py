@@ -106,7 +106,8 @@ def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
     Raises:
         EvaluationError: this limb has no such plan, or no state while it was played.
     """
-    limb, where = record.limbs[namespace], _place(record, namespace)
+    limb = record.limbs.get(namespace, LimbRecord())
+    where = f"{record.path}, {namespace}" if len(record.limbs) > 1 else str(record.path)
     chosen = _choose_plan(limb, where, plan_id)
     stamp, plan = limb.plans[chosen]
     segment_count = int(plan.segment_count)
@@ -167,11 +168,6 @@ def stream(columns: Columns, width: int, origin: int) -> Stream:
     return Stream((stamps - origin) / NANOSECONDS, columns.values(width)[first])
 
 
-def _place(record: BagRecord, namespace: str) -> str:
-    """Return a name of the limb for messages: the bag, and the namespace where it has several."""
-    return f"{record.path}, {namespace}" if len(record.limbs) > 1 else str(record.path)
-
-
 def _others_seen(record: BagRecord, namespace: str) -> str:
     others = [name for name, limb in record.limbs.items() if name != namespace and len(limb.tip)]
     if not others:
@@ -185,20 +181,13 @@ def _choose_limb(record: BagRecord, namespace: str, plan_id: str) -> str:
             known = ", ".join(sorted(record.limbs)) or "none"
             raise EvaluationError(f"{record.path}: no limb {namespace}, only {known}")
         return namespace
-    played = record.played
-    if plan_id:
-        named = [name for name in played if plan_id in record.limbs[name].usable_plans]
-        played = named or played
-    if not played:
+    named = [name for name in record.played if plan_id in record.limbs[name].usable_plans]
+    found = named or record.played
+    if len(found) > 1:
         raise EvaluationError(
-            f"{record.path}: holds no {PLAN_TYPE}: was the recorder started before the planner "
-            "planned?"
+            f"{record.path}: holds runs of several limbs, {', '.join(sorted(found))}: name one"
         )
-    if len(played) > 1:
-        raise EvaluationError(
-            f"{record.path}: holds runs of several limbs, {', '.join(sorted(played))}: name one"
-        )
-    return played[0]
+    return next(iter(found or record.limbs), "")
 
 
 def _choose_plan(limb: LimbRecord, where: str, plan_id: str) -> str:
@@ -207,11 +196,10 @@ def _choose_plan(limb: LimbRecord, where: str, plan_id: str) -> str:
         raise EvaluationError(
             f"{where}: holds no {PLAN_TYPE}: was the recorder started before the planner planned?"
         )
-    if plan_id:
-        if plan_id not in usable:
-            raise EvaluationError(f"{where}: no plan '{plan_id}', only {', '.join(sorted(usable))}")
-        return plan_id
-    return max(usable, key=lambda name: (len(limb.setpoints.get(name, ())), usable[name][0]))
+    if plan_id and plan_id not in usable:
+        raise EvaluationError(f"{where}: no plan '{plan_id}', only {', '.join(sorted(usable))}")
+    most = max(usable, key=lambda name: (len(limb.setpoints.get(name, ())), usable[name][0]))
+    return plan_id or most
 
 
 def _origin(stamp: int, times: Array, setpoints: _Setpoints) -> int:

@@ -32,7 +32,7 @@ from der_planner.control.disturbance import (
     moves_with,
     stays_behind,
 )
-from der_planner.control.repeatability import Played, Runs
+from der_planner.control.repeatability import PlayedRun, Runs
 from der_planner.identification.update import adapted
 from der_planner.limb import Limb, LimbError
 from der_planner.planning.correction import Correction
@@ -117,7 +117,7 @@ class Learner:
         self.history: list[LearningRun] = []
         self._of_file = self._correction
         self._plan = plan
-        self._pending: Played | None = None
+        self._pending: PlayedRun | None = None
         self._beyond: Array | None = None
         self._begin()
 
@@ -128,7 +128,7 @@ class Learner:
         period = float(self._plan.time[1] - self._plan.time[0])
         self._runs = Runs(self._plan.tip_reference, period, self._correction.tip_per_pressure)
         self._step, self._pull = 1.0, PULL * self._correction.tip_per_pressure
-        self._best: Played | None = None
+        self._best: PlayedRun | None = None
         self._levels: list[float] = []
         self._fresh = False
 
@@ -204,7 +204,7 @@ class Learner:
             self._plan = dataclasses.replace(self._plan, chambers_beyond=self._beyond)
         return self._plan
 
-    def _next(self, best: Played) -> Plan:
+    def _next(self, best: PlayedRun) -> Plan:
         if self.stopped or not self._fresh:
             return self._as_plan(best)
         self._fresh = False
@@ -219,7 +219,7 @@ class Learner:
 
     def _played(
         self, measured: Measured, commands: ArrayLike | None
-    ) -> tuple[Played, float, float, str]:
+    ) -> tuple[PlayedRun, float, float, str]:
         """Return a run, its mean and largest error [m], and why its limb does not move, if so."""
         plan = self._plan
         given = plan.differential_pressure
@@ -246,12 +246,12 @@ class Learner:
             [np.interp(measured.time[inside], plan.time, axis) for axis in plan.tip_reference.T]
         )
         distance = np.linalg.norm(measured.tip[inside] - wanted, axis=1)
-        played = Played(given, expected, shown)
+        played = PlayedRun(given, expected, shown)
         if not len(distance):
             return played, float("nan"), float("nan"), astray
         return played, float(distance.mean()), float(distance.max()), astray
 
-    def _take(self, run: Played) -> tuple[bool, str]:
+    def _take(self, run: PlayedRun) -> tuple[bool, str]:
         """Use a run; return whether it was used, and what was done and why."""
         unlike = self._runs.unlike(run)
         if unlike:
@@ -272,7 +272,7 @@ class Learner:
         self._pending = None
         return True, self._use(run)
 
-    def _use(self, run: Played) -> str:
+    def _use(self, run: PlayedRun) -> str:
         said = ""
         if self._best is None:
             run, said = self._adapt(run)
@@ -280,7 +280,7 @@ class Learner:
         self._fresh = not self.stopped
         return self._weigh(run) + said
 
-    def _adapt(self, first: Played) -> tuple[Played, str]:
+    def _adapt(self, first: PlayedRun) -> tuple[PlayedRun, str]:
         """Bring the model near a first run that is far from it; return the run as it sees it."""
         tip = first.expected.tip + first.shown.value
 
@@ -296,15 +296,15 @@ class Learner:
         self._correction = self._of_file.of(nearer)
         return self._seen_by_model(first), _ADAPTED
 
-    def _seen_by_model(self, run: Played) -> Played:
+    def _seen_by_model(self, run: PlayedRun) -> PlayedRun:
         """Return a run with its disturbance against the present model."""
         expected = self._correction.expected(run.commands)
         value = run.shown.value + run.expected.tip - expected.tip
-        return Played(run.commands, expected, Shown(value, run.shown.variance, run.shown.seen))
+        return PlayedRun(run.commands, expected, Shown(value, run.shown.variance, run.shown.seen))
 
     # All runs --------------------------------------------------------------------------------
 
-    def _weigh(self, run: Played) -> str:
+    def _weigh(self, run: PlayedRun) -> str:
         """Choose best plan, step and pull; return what was decided and why."""
         before = self._best
         if before is None:
@@ -349,7 +349,7 @@ class Learner:
                 )
         return ""
 
-    def _as_plan(self, run: Played) -> Plan:
+    def _as_plan(self, run: PlayedRun) -> Plan:
         """Return the plan of a run's commands, with the tip that all runs let expect."""
         if np.array_equal(run.commands, self._plan.differential_pressure):
             return self._plan

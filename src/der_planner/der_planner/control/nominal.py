@@ -66,7 +66,7 @@ class Nominal:
     """
 
     def __init__(self, plan: Plan) -> None:
-        model = RodModel(plan.limb)
+        model = plan.body if isinstance(plan.body, RodModel) else RodModel(plan.limb)
         self.model = model
         self.kinematics = model.kinematics
         held = np.repeat(plan.differential_pressure[-1:], _HELD, axis=0)

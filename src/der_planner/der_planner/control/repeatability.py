@@ -102,7 +102,7 @@ def estimate(pairs: list[Pair]) -> Repeatability:
 
 
 @dataclass(frozen=True)
-class Played:
+class PlayedRun:
     """A run that can be used.
 
     Attributes:
@@ -144,10 +144,10 @@ class Runs:
 
     def __init__(self, reference: Array, period: float, tip_per_pressure: float) -> None:
         self._reference, self._period, self._tip_per_pressure = reference, period, tip_per_pressure
-        self._all: list[Played] = []
+        self._all: list[PlayedRun] = []
         self.repeats = Repeatability()
 
-    def add(self, run: Played) -> None:
+    def add(self, run: PlayedRun) -> None:
         """Take in a run."""
         self._all.append(run)
         self.repeats = estimate(self._pairs())
@@ -159,7 +159,7 @@ class Runs:
                 return run.expected
         return None
 
-    def known(self, about: Played) -> Known:
+    def known(self, about: PlayedRun) -> Known:
         """Return what all runs say of the disturbance under the commands of one run."""
         count = len(self._reference)
         total, weights, squares = np.zeros((count, 2)), np.zeros(count), np.zeros(count)
@@ -175,16 +175,16 @@ class Runs:
         variance = float((1.0 / weights[seen]).mean()) if seen.any() else 0.0
         return Known(without_gaps(value, seen, self._period, _FADE), seen, runs, variance)
 
-    def error(self, run: Played) -> Array:
+    def error(self, run: PlayedRun) -> Array:
         """Return what all runs say that the commands of one leave: tip less r̄ (K, 2) [m]."""
         error: Array = run.expected.tip + self.known(run).value - self._reference
         return error
 
-    def level(self, run: Played) -> float:
+    def level(self, run: PlayedRun) -> float:
         """Return the mean distance from r̄ that all runs say the commands of one leave [m]."""
         return float(np.linalg.norm(self.error(run), axis=1).mean())
 
-    def unlike(self, run: Played) -> str:
+    def unlike(self, run: PlayedRun) -> str:
         """Return how a run differs from all others; empty if it is one of them."""
         if not self._all:
             return ""
@@ -201,14 +201,14 @@ class Runs:
             return ""
         return f"it differs from the runs before by {apart * 100:.2f} cm"
 
-    def differ(self, one: Played, other: Played) -> bool:
+    def differ(self, one: PlayedRun, other: PlayedRun) -> bool:
         """Tell whether two runs that are unlike the others are unlike each other, too."""
         both = one.shown.seen & other.shown.seen
         known = self.known(one)
         from_others = _rms((one.shown.value - known.value)[both & known.seen])
         return _rms((one.shown.value - other.shown.value)[both]) > 0.5 * from_others
 
-    def _movement(self, one: Played, other: Played) -> float:
+    def _movement(self, one: PlayedRun, other: PlayedRun) -> float:
         """Return how far a change of commands moves the tip, segment by segment, squared [m²]."""
         change = one.expected.pressure - other.expected.pressure
         return float((change**2).sum(axis=1).mean()) / 2 * self._tip_per_pressure**2

@@ -66,6 +66,7 @@ class GraphTrial(GraphPlayer):
             page=run.options.page,
         )
         super().__init__(setup, run.options.out / "logs" / run.trial.name, progress)
+        self._publisher: Any = None
 
     def _planner_parameters(self) -> dict[str, Any]:
         parameters: dict[str, Any] = {
@@ -88,15 +89,16 @@ class GraphTrial(GraphPlayer):
     def _join(self, client: GraphClient) -> None:
         super()._join(client)
         client.subscribe(PressurePlan, topics.PLAN, qos.LATCHED)
+        # Before the nodes start, so that the planner knows of it when it is ready.
+        drawn = self._options.path is not None and self._run.learned is None
+        kind, topic = (PathMessage, topics.PATH) if drawn else (MotionCommand, topics.COMMAND)
+        self._publisher = client.node.create_publisher(kind, topic, qos.COMMANDS)
 
     def _begin(self, client: GraphClient) -> Playing:
         drawn = self._options.path if self._run.learned is None else None
-        kind, topic = (PathMessage, topics.PATH) if drawn else (MotionCommand, topics.COMMAND)
-        publisher = client.node.create_publisher(kind, topic, qos.COMMANDS)
-        # The recorder may listen, too.
-        client.wait_for(lambda: self._planner_listens(client, topic), 30.0, "the planner to listen")
+        client.wait_for(lambda: self._planner_listens(client), 30.0, "the planner to listen")
         client.newest.pop(topics.PLAN, None)
-        publisher.publish(self._path(drawn) if drawn else self._command())
+        self._publisher.publish(self._path(drawn) if drawn else self._command())
         plan = client.wait_for(lambda: self._plan_or_refusal(client), PLAN_TIMEOUT, "the plan")
         self._progress.say(
             f"  planned in {plan.solve_time:.2f} s, "
@@ -123,8 +125,9 @@ class GraphTrial(GraphPlayer):
 
         return show
 
-    def _planner_listens(self, client: GraphClient, topic: str) -> bool:
-        found = client.node.get_subscriptions_info_by_topic(client.node.resolve_topic_name(topic))
+    def _planner_listens(self, client: GraphClient) -> bool:
+        # The recorder may listen, too.
+        found = client.node.get_subscriptions_info_by_topic(self._publisher.topic_name)
         return any(info.node_name == "planner" for info in found)
 
     def _path(self, file: Path) -> PathMessage:

@@ -216,15 +216,16 @@ def simulate(
 
 
 @njit(cache=True, nogil=True)
-def _third(q: Vector, v: Vector, arcs: Arcs, frame: Complex, p: int, point: Any, third: Complex,
-           H: Complex, out: Complex) -> None:  # fmt: skip
-    """Put Σ_kl T_skl v_k v_l into out (n,), T = ∂³P/∂q³ of particle p.
+def _third(
+    q: Vector, v: Vector, arcs: Arcs, frame: Complex, p: int, point: Any, third: Complex, H: Complex
+) -> Complex:
+    """Return Σ_kl T_skl v_k v_l (n,), T = ∂³P/∂q³ of particle p.
 
     T_skl = i H of the two larger indices, unless all three are one: everything beyond the segment
     of the smallest index turns as one body. ``third`` (n,) holds exp(iΦ_i) L_i g‴(q_i).
     """
     j, sigma = arcs.owner[p], arcs.place[p]
-    out[:] = 0.0
+    out = np.zeros(q.size, dtype=np.complex128)
     for s in range(j + 1):
         for k in range(j + 1):
             for m in range(j + 1):
@@ -242,6 +243,7 @@ def _third(q: Vector, v: Vector, arcs: Arcs, frame: Complex, p: int, point: Any,
                 else:
                     value = 1j * H[s, k]
                 out[s] += value * v[k] * v[m]
+    return out
 
 
 @njit(cache=True, nogil=True)
@@ -254,7 +256,6 @@ def force_slopes(q: Vector, v: Vector, a: Vector, arcs: Arcs) -> tuple[Vector, V
     by_angle, by_rate = np.zeros((n, n)), np.zeros((n, n))
     J = np.zeros(n, dtype=np.complex128)
     H = np.zeros((n, n), dtype=np.complex128)
-    third = np.zeros(n, dtype=np.complex128)
     turning = np.zeros(n, dtype=np.complex128)
     pushing = np.zeros(n, dtype=np.complex128)
     frame = joints(q, arcs)
@@ -263,7 +264,7 @@ def force_slopes(q: Vector, v: Vector, a: Vector, arcs: Arcs) -> tuple[Vector, V
     for p in range(arcs.owner.size):
         mass, drag, last = arcs.mass[p], arcs.drag[p], arcs.owner[p] + 1
         point = point_derivatives(q, arcs, frame, p, slopes, J, H)
-        _third(q, v, arcs, frame, p, point, slopes[2], H, third)
+        third = _third(q, v, arcs, frame, p, point, slopes[2], H)
         speed, acceleration_ = 0.0 + 0.0j, 0.0 + 0.0j
         for s in range(last):
             turn, push = 0.0 + 0.0j, 0.0 + 0.0j

@@ -133,7 +133,7 @@ def rest_along(time: Array, driven: Array, stiffer: Array, law: RestingLaw, begi
     keep, share = np.zeros(count), np.zeros(count)
     if np.isnan(begin[0, 0]):
         angle[:], z[:], q[:] = law.rest, 0.0, 0.0
-        balance(angle, driven[0], stiffer[0], law, angle.copy(), z, q, keep, share)
+        balance(angle, law, Instant(driven[0], stiffer[0], angle.copy(), z, q, keep, share))
     bend[0] = angle
     for k in range(1, instants):
         for i in range(count):
@@ -141,7 +141,7 @@ def rest_along(time: Array, driven: Array, stiffer: Array, law: RestingLaw, begi
             keep[i] = np.exp(-rate)
             share[i] = (1.0 - keep[i]) / rate
         last = bend[k - 1]
-        balance(angle, driven[k], stiffer[k], law, last, z, q, keep, share)
+        balance(angle, law, Instant(driven[k], stiffer[k], last, z, q, keep, share))
         for i in range(count):
             change = angle[i] - last[i]
             sign = 1.0 if change >= 0.0 else -1.0
@@ -151,23 +151,24 @@ def rest_along(time: Array, driven: Array, stiffer: Array, law: RestingLaw, begi
     return bend
 
 
+class Instant(NamedTuple):
+    """What the balance of one instant knows, (M,) each."""
+
+    driven: Array  # pressures without friction and creep [Pa]
+    stiffer: Array  # growth of the stiffness
+    last: Array  # θ of the instant before [rad]
+    friction: Array  # z of the instant before
+    creep: Array  # q of the instant before [rad]
+    keep: Array  # share of q that is left
+    share: Array  # of a change of θ that q takes; zero: an instant without memory
+
+
 @njit(cache=True)
-def balance(
-    angle: Array,
-    driven: Array,
-    stiffer: Array,
-    law: RestingLaw,
-    last: Array,
-    z: Array,
-    q: Array,
-    keep: Array,
-    share: Array,
-) -> None:
+def balance(angle: Array, law: RestingLaw, instant: Instant) -> None:
     """Move the angles (M,) to where the moments of one instant balance.
 
     One segment after the other, with W to first order about the angles of the sweep before; the
-    balance of all is convex below the load that buckles the limb, so that this converges. ``last``,
-    z and q are those of the instant before; a ``share`` of zero is an instant without memory.
+    balance of all is convex below the load that buckles the limb, so that this converges.
     """
     count = angle.shape[0]
     torque, slope = np.empty(count), np.zeros((count, count))
@@ -183,10 +184,7 @@ def balance(
             for j in range(count):
                 if j != i:
                     pulled += slope[i, j] * (angle[j] - before[j])
-            found = balanced_bend(
-                i, before[i], driven[i], stiffer[i], law, last[i], z[i], q[i], keep[i], share[i],
-                pulled, slope[i, i],
-            )  # fmt: skip
+            found = balanced_bend(i, before[i], law, instant, pulled, slope[i, i])
             step = found - before[i]
             if heavy:
                 step = min(max(step, -_LARGEST_STEP), _LARGEST_STEP)
@@ -198,37 +196,28 @@ def balance(
 
 @njit(cache=True)
 def balanced_bend(
-    i: int,
-    now: float,
-    driven: float,
-    stiffer: float,
-    law: RestingLaw,
-    last: float,
-    z: float,
-    q: float,
-    keep: float,
-    share: float,
-    pulled: float,
-    pulled_slope: float,
+    i: int, now: float, law: RestingLaw, instant: Instant, pulled: float, pulled_slope: float
 ) -> float:
     """Return θ of segment i, where W = pulled + pulled_slope · (θ − now).
 
     Friction makes the residual rise with θ, and bending away from the last angle stiffens the
     segment: there is one root, on the side to which the residual points at the last angle.
     """
-    scale = law.gain[i] / stiffer
+    driven, last = instant.driven[i], instant.last[i]
+    z, kept, share = instant.friction[i], instant.creep[i] * instant.keep[i], instant.share[i]
+    scale = law.gain[i] / instant.stiffer[i]
     memory = share > 0.0
     friction = law.friction[i] if memory else 0.0
     bent = last - law.rest[i]
     error = bent + law.cubic[i] * bent**3 - pulled - pulled_slope * (last - now)
-    error -= scale * (driven - friction * z - law.creep[i] * q * keep)
+    error -= scale * (driven - friction * z - law.creep[i] * kept)
     sign = -1.0 if error > 0.0 else 1.0
     angle = now if memory and (now - last) * sign > 0.0 else last
     for _ in range(30):
         change = angle - last
         fade = np.exp(-abs(change) / law.turn[i]) if memory else 1.0
         moved = sign + (z - sign) * fade
-        load = friction * moved + law.creep[i] * (q * keep + change * share)
+        load = friction * moved + law.creep[i] * (kept + change * share)
         bent = angle - law.rest[i]
         error = bent + law.cubic[i] * bent**3 - scale * (driven - load)
         error -= pulled + pulled_slope * (angle - now)
@@ -287,11 +276,11 @@ def change_along(
                 z[i] = sign + (z[i] - sign) * z_kept[i]
             rub = scale * (law.friction[i] * z_by_change[i] + law.creep[i] * q_by_change[i])
             matrix[i, i] += 1.0 + 3.0 * law.cubic[i] * bent**2 + rub
-            held = bent + law.cubic[i] * bent**3 - torque[i]
+            balanced = bent + law.cubic[i] * bent**3 - torque[i]
             right[i] = rub * angle_moved[i] + scale * change[0][k, i]
             right[i] -= scale * law.friction[i] * z_kept[i] * z_moved[i]
             right[i] -= scale * law.creep[i] * q_kept[i] * q_moved[i]
-            right[i] -= held / stiffer[k, i] * change[1][k, i]
+            right[i] -= balanced / stiffer[k, i] * change[1][k, i]
         after: Array = np.zeros(count)
         if k > 0 or not known:
             after[:] = np.linalg.solve(matrix, right)

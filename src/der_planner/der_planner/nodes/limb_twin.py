@@ -19,7 +19,7 @@ from std_msgs.msg import Header
 from der_msgs.msg import ChamberPressures, LimbPush, LimbShape, LimbState
 from der_planner.limb import PointMass
 from der_planner.twin import LimbTwin, Push, TwinError
-from der_planner.twin.realtime import BACKLOG, RealTimeLoop
+from der_planner.twin.limb_twin import BACKLOG, RealTimeLoop
 from limb_interfaces import parameters, qos, stamps, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.overrides import check_overrides

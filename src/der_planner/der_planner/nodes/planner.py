@@ -31,7 +31,7 @@ from der_planner.nodes.planner_streaming import (
     DriverWatch,
     Ending,
     PlannerPublishers,
-    Playback,
+    Streamer,
 )
 from der_planner.planning import METHODS, Motion, Plan, plan
 from der_planner.planning.streaming import Schedule, first_stamp
@@ -88,10 +88,10 @@ class PlannerNode(Node):
         self._output = PlannerPublishers(self)
         self._diagnostics = DiagnosticsPublisher(self, self._health)
         self._driver = DriverWatch(clock.monotonic, self._options.driver_timeout)
-        self._playback = Playback(self, self._driver, self._now, self._options.lead)
+        self._streamer = Streamer(self, self._driver, self._now, self._options.lead)
         self._corrector = Corrector(self._output, self.get_logger().warning, self._now)
         self._action = MotionAction(
-            self, self._refuses, self._on_command, self._stop_plan, self._playback.find
+            self, self._refuses, self._on_command, self._stop_plan, self._streamer.find
         )
         self._planning = threading.Thread(target=self._run, name="planning", daemon=True)
         self._planning.start()
@@ -106,7 +106,7 @@ class PlannerNode(Node):
     # What comes in -------------------------------------------------------------------------
 
     def _on_driver(self, message: PressureState) -> None:
-        self._playback.update(message)
+        self._streamer.update(message)
         self._corrector.add_pressures(message)
 
     def _on_limb(self, message: LimbState) -> None:
@@ -145,7 +145,7 @@ class PlannerNode(Node):
         Raises:
             ValueError: it cannot be planned; says why.
         """
-        if self._playback.is_spent(message.plan_id):
+        if self._streamer.is_spent(message.plan_id):
             raise ValueError(
                 f"plan '{message.plan_id}' was ended by the driver, which takes no more of it: "
                 "give the command another plan_id, or none"
@@ -160,10 +160,10 @@ class PlannerNode(Node):
 
     def _is_busy(self, plan_id: str) -> bool:
         """Tell whether a plan of this id is being planned or played."""
-        with self._playback.lock:
+        with self._streamer.lock:
             request = self._request
             planned = request is not None and request.plan_id == plan_id
-            return planned or self._playback.find(plan_id) is not None
+            return planned or self._streamer.find(plan_id) is not None
 
     def _on_path(self, message: PathMessage) -> None:
         plan_id = new_plan_id()
@@ -176,7 +176,7 @@ class PlannerNode(Node):
         """Play the newest plan, again if it was played before."""
         with self._lock:
             newest = self._newest
-        position = self._playback.position
+        position = self._streamer.position
         obstacle = self._driver.obstacle()
         if newest is None:
             response.message = "no plan yet: ask for a motion first"
@@ -189,7 +189,7 @@ class PlannerNode(Node):
         else:
             plan_id, result, corrected = newest
             feedback = Feedback(result) if corrected else None
-            schedule = self._play(self._playback.unspent(plan_id), result, 0, feedback)
+            schedule = self._play(self._streamer.unspent(plan_id), result, 0, feedback)
             response.success = True
             response.message = (
                 f"plays plan {schedule.plan_id} ({result.motion}) for {result.duration:.0f} s, "
@@ -208,7 +208,7 @@ class PlannerNode(Node):
 
     def _stop_plan(self, plan_id: str) -> None:
         """Stop as the service does, if this plan is still planned or played."""
-        with self._playback.lock:
+        with self._streamer.lock:
             if self._is_busy(plan_id):
                 self._end_all("stopped", "the action was cancelled")
                 self._status = Status("idle", plan_id, "stopped by a cancelled action")
@@ -235,7 +235,7 @@ class PlannerNode(Node):
         self._last_refusal = f"plan {plan_id}: {reason}"
         with self._lock:
             planned = self._request is not None and self._request.plan_id != plan_id
-        if not planned and not self._playback.busy:
+        if not planned and not self._streamer.busy:
             self._status = Status("refused", plan_id, reason)
         self._action.end(plan_id, "refused", reason)
         self._diagnostics.publish()
@@ -313,7 +313,7 @@ class PlannerNode(Node):
             progress(0.0)
             begun = clock.monotonic()
             stamp = first_stamp(self._now() + allowance, lead, request.start)
-            position = self._playback.position
+            position = self._streamer.position
             start = None if position is None else position[0].leave(stamp)
             result = request.learned
             if result is None:
@@ -340,10 +340,10 @@ class PlannerNode(Node):
         feedback: Feedback | None,
         cancelled: threading.Event | None = None,
     ) -> Schedule:
-        with self._playback.lock:
+        with self._streamer.lock:
             if cancelled is not None and cancelled.is_set():
                 raise Cancelled
-            schedule = self._playback.play(plan_id, result, start)
+            schedule = self._streamer.play(plan_id, result, start)
             if feedback is not None:
                 self._corrector.follow(schedule, feedback)
             return schedule
@@ -370,11 +370,11 @@ class PlannerNode(Node):
 
     def _end_all(self, outcome: str, reason: str) -> tuple[bool, bool]:
         """Cancel planning, stop streaming; tell whether there was either."""
-        with self._playback.lock:
+        with self._streamer.lock:
             request = self._request
             if request is not None:
                 request.cancelled.set()
-            playing = self._playback.stop(outcome, reason)
+            playing = self._streamer.stop(outcome, reason)
         if request is not None:
             self._action.end(request.plan_id, outcome, reason)
         return request is not None, playing
@@ -390,7 +390,7 @@ class PlannerNode(Node):
         current = self._status[:2] == ("streaming", schedule.plan_id)
         if outcome == "finished" and current:
             self._status = Status("done", schedule.plan_id)
-        text = f"plan {schedule.plan_id} {outcome} after {self._playback.share(schedule)}"
+        text = f"plan {schedule.plan_id} {outcome} after {self._streamer.share(schedule)}"
         if outcome in ("vented", "fault", "lost"):
             self.get_logger().error(f"{text}: {reason}")
         else:
@@ -435,16 +435,16 @@ class PlannerNode(Node):
 
     def _show(self) -> None:
         """Ten times a second: end what is over, tell who asked, show the reference limb."""
-        self._playback.end_what_is_over()
+        self._streamer.end_what_is_over()
         self._action.tell(self._status.plan_id, self._status.state, self._progress)
-        position = self._playback.position
+        position = self._streamer.position
         if position is not None:
             self._output.reference_limb(*position, self._options.lead)
 
     def close(self) -> None:
         """Stop streaming and planning; called once before the node goes."""
         self._end_all("stopped", "the planner was ended")
-        self._playback.close()
+        self._streamer.close()
         self._corrector.close()
         self._work.put(None)
 

@@ -23,10 +23,10 @@ from der_msgs.msg import LimbState, MotionCommand
 from der_planner.limb import HEAVIEST, Limb
 from der_planner.methods import LEARNED
 from der_planner.planning import METHODS, Motion, PathLimits, choose_method
-from der_planner.planning.inverse import BRANCHES
 from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD
 from der_planner.planning.plan_file import Plan, learned_plan
 from der_planner.planning.streaming import GRID, Schedule
+from der_planner.planning.workspace import BRANCHES
 from limb_interfaces import topics
 from limb_interfaces.parameters import declare
 from limb_interfaces.stamps import NANOSECONDS, nanoseconds

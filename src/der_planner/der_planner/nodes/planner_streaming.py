@@ -97,7 +97,7 @@ class PlannerPublishers:
         """
         inputs = len(estimate.bend_angle)
         sigma = np.split(estimate.deviation, np.arange(1, 5) * inputs)
-        curve = schedule.plan.kinematics.curve(estimate.bend_angle)
+        curve = schedule.plan.body.kinematics.curve(estimate.bend_angle)
         self._estimates.publish(
             LimbEstimate(
                 header=_header(instant), plan_id=schedule.plan_id,
@@ -245,7 +245,7 @@ class DriverWatch:
 # Playing -----------------------------------------------------------------------------------------
 
 
-class PlaybackListener(Protocol):
+class StreamListener(Protocol):
     """Is told what becomes of the schedules; called from the executor's or the player's thread."""
 
     def scheduled(self, schedule: Schedule) -> None:
@@ -261,7 +261,7 @@ class PlaybackListener(Protocol):
         """A plan is over."""
 
 
-class Playback:
+class Streamer:
     """Plays schedules through a `Player` as long as the driver takes setpoints.
 
     Args:
@@ -272,7 +272,7 @@ class Playback:
     """
 
     def __init__(
-        self, listener: PlaybackListener, driver: DriverWatch, now: Callable[[], int], lead: int
+        self, listener: StreamListener, driver: DriverWatch, now: Callable[[], int], lead: int
     ) -> None:
         self._listener, self._driver, self._now, self._lead = listener, driver, now, lead
         self.lock = threading.RLock()

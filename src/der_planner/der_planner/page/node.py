@@ -14,6 +14,7 @@ import numpy as np
 from ament_index_python.packages import get_package_share_directory
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -154,7 +155,11 @@ class PageNode(Node):
                 self._last_refused = f"a message of {topic} could not be used: {error}"
                 self.get_logger().error(self._last_refused, throttle_duration_sec=10.0)
 
-        return self.create_subscription(kind, topic, take, profile, raw=raw)
+        # Of the two subscriptions to the calibration, one is always told that its QoS does not fit.
+        no_warnings = SubscriptionEventCallbacks(use_default_callbacks=False)
+        return self.create_subscription(
+            kind, topic, take, profile, event_callbacks=no_warnings, raw=raw
+        )
 
     def _on_limb(self, message: LimbState) -> None:
         self._situation.put_limb(message)

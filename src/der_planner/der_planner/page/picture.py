@@ -32,8 +32,7 @@ JPEG_QUALITY = 80
 VIEWS_KEPT = 60
 """The tracker's views of the last 2 s at 30 Hz are kept, so that each picture gets its own."""
 LASTING = 0.5
-"""An estimate or a planned limb is shown for this time [s] after it came; a view of the tracker is
-drawn over pictures that are no further from it."""
+"""An estimate, a planned limb or a tracker's view is drawn over pictures this near to it [s]."""
 PATH_POINTS = 200
 CURVE_POINTS = 40
 SILENT = "The tracker says nothing of these pictures: neither limb nor tags are drawn."

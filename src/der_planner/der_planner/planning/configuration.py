@@ -33,7 +33,6 @@ from der_planner.planning.errors import (
     PlanningError,
     UnreachableError,
 )
-from der_planner.planning.inverse import solve
 from der_planner.planning.loads import check_load, check_stays, stable_rest
 from der_planner.planning.motions import Reference
 from der_planner.planning.transitions import Start, resting_spline, sample_spline
@@ -41,6 +40,7 @@ from der_planner.planning.workspace import (
     NEAREST_TOLERANCE,
     TOLERANCE,
     Workspace,
+    solve,
     static_pressure,
 )
 from der_planner.rod import ConvergenceError, Rod, RodState

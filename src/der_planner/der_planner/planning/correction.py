@@ -16,9 +16,9 @@ from der_planner.model import CONTROL_PERIOD, Model, simulate
 from der_planner.model.simulation import Bend
 from der_planner.planning.configuration import configure
 from der_planner.planning.errors import PlanningError
-from der_planner.planning.inverse import solve
 from der_planner.planning.optimal import Optimiser, OptimiserSettings, Optimum
 from der_planner.planning.plan_file import Plan
+from der_planner.planning.workspace import solve
 from der_planner.rod import ConvergenceError
 
 Array = NDArray[np.float64]
@@ -55,12 +55,12 @@ class Correction:
         plan: by any method.
 
     Raises:
-        PlanningError: the model of the plan is unknown, or its reference is out of reach.
+        PlanningError: the plan's reference is out of reach.
     """
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
-        self._configuration = configure(Model.of(plan.limb, plan.model), plan.reference)
+        self._configuration = configure(plan.body, plan.reference)
 
     def of(self, limb: Limb) -> Correction:
         """Return the same with another limb's model; its plans still name the plan's own limb.

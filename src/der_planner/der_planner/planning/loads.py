@@ -1,4 +1,4 @@
-"""A limb under its loads: where it rests and stays, how it sags, and what pressures can hold.
+"""A limb under its loads: whether it stays where it rests, how it sags, what pressures can hold.
 
 A level limb that is free to sag under gravity along −z comes less far out than arcs of its length
 say. Its reference is therefore the tip of the rod in space, held by pressures so that its segments
@@ -10,72 +10,28 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
 from der_planner.limb import PAYLOAD, Limb
-from der_planner.model import ArcModel, RodModel
+from der_planner.model import RodModel
 from der_planner.model.poses import PoseFinder
 from der_planner.model.series import interpolate
 from der_planner.planning.errors import BucklingError, OverloadError, PlanningError
-from der_planner.planning.inverse import solve
 from der_planner.rod import ConvergenceError, Rod, RodState
 
 Array = NDArray[np.float64]
 
 NEAR = 1.1
 """A standing limb that would buckle under less than this multiple of its load is near that [-]."""
-_STRAIGHT = 1e-3
-"""A limb that rests within this bend of straight starts there [rad]."""
 _APART = 1e-3
 """Two resting shapes that are this far apart are two [m]."""
 _POSE_PERIOD = 0.1
 """Time between two poses of a limb that sags [s]."""
 _HALVINGS = 8
 """Steps of the bisection for the mass that could be carried."""
-
-
-@dataclass(frozen=True)
-class Rest:
-    """The pose in which a vented limb rests, as bend angles of arcs with the rod's tip.
-
-    Attributes:
-        bend_angles: (M,) under the loads [rad].
-        sag: (M,) what the loads alone add to the bend without loads [rad].
-        offset: (2,) of the rod's tip from that of these arcs [m]: stretch, and what arcs cannot do.
-    """
-
-    bend_angles: Array
-    sag: Array
-    offset: Array
-
-
-def rest_of(arcs: ArcModel, rod: Callable[[], RodModel]) -> Rest:
-    """Return where a vented limb rests.
-
-    Args:
-        arcs: of the limb.
-        rod: gives the rod of the same limb, if it is needed.
-
-    Without gravity that is its rest curvature. With gravity it is the rod's equilibrium, and the
-    arcs that have its tip.
-
-    Raises:
-        BucklingError: the limb does not stay where it rests.
-    """
-    own = arcs.free_angles
-    if np.abs(own).max() < _STRAIGHT:
-        own = np.zeros_like(own)
-    if not arcs.is_loaded:
-        return Rest(own, np.zeros_like(own), np.zeros(2))
-    state = stable_rest(rod())
-    angles = solve(arcs, state.q[None, -3:-1], rod().bend_of(state))[0][0]
-    if np.abs(angles).max() < _STRAIGHT:
-        angles = np.zeros_like(angles)
-    return Rest(angles, angles - own, state.q[-3:-1] - arcs.tip(angles))
 
 
 def stable_rest(model: RodModel) -> RodState:

@@ -30,7 +30,6 @@ from scipy.interpolate import BSpline
 from der_planner.model import CONTROL_PERIOD
 from der_planner.planning import paths
 from der_planner.planning.errors import PlanningError
-from der_planner.planning.inverse import check_branch
 from der_planner.planning.nearest import Deviation, line, nearest_path
 from der_planner.planning.transitions import (
     FINE_PERIOD,
@@ -44,7 +43,7 @@ from der_planner.planning.transitions import (
     smooth_step,
     with_transitions,
 )
-from der_planner.planning.workspace import Workspace
+from der_planner.planning.workspace import Workspace, check_branch
 
 Array = NDArray[np.float64]
 
@@ -104,7 +103,7 @@ class Motion:
         period: of one cycle; 0 for a path [s].
         cycles: number of them; 1 for a path.
         path: the tip path of shapes and paths.
-        branch: of the arcs at the first point of a path, see `inverse.BRANCHES`; empty: least
+        branch: of the arcs at the first point of a path, see `workspace.BRANCHES`; empty: least
             pressure.
         nearest: follow the nearest path that the limb can follow instead of refusing one that
             leaves its reach, see `nearest`.

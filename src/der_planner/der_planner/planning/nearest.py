@@ -24,10 +24,9 @@ from scipy.interpolate import PchipInterpolator
 from scipy.linalg import solveh_banded
 
 from der_planner.model.series import interpolate
-from der_planner.planning.inverse import BRANCHES
 from der_planner.planning.pace import retimed
 from der_planner.planning.paths import PathLimits, TipPath
-from der_planner.planning.workspace import Workspace
+from der_planner.planning.workspace import BRANCHES, Workspace
 
 Array = NDArray[np.float64]
 
@@ -131,7 +130,7 @@ def nearest_path(
         path: drawn; its times are kept where the slew limit lets them.
         offset: (2,) of the limb's tip from that of the arcs, where loads make it [m].
         limits: speed and acceleration of the tip, for a path whose times mean nothing (`line`).
-        branch: see `inverse.BRANCHES`; empty: whichever comes nearest.
+        branch: see `workspace.BRANCHES`; empty: whichever comes nearest.
         rest: begin and end a path with times at rest, too.
     """
     samples = int(np.clip(math.ceil(path.duration / _SAMPLE), 16, _MOST_SAMPLES)) + 1

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from der_planner.limb import Limb, LimbError
 from der_planner.model import CONTROL_PERIOD, Model
-from der_planner.model.bending import Kinematics
 from der_planner.planning.configuration import configure
 from der_planner.planning.errors import PlanningError
 from der_planner.planning.motions import Reference
@@ -47,8 +46,7 @@ class Plan:
         bend_angles: (K, M) of the model's reference configuration [rad].
         motion, model, method: names, as they were asked for.
         amplitude, period, cycles: of the motion; 0, 0 and 1 for a path.
-        limb: the robot it was made for.
-        kinematics: of the model, for drawing.
+        body: the model of the limb that it was made for.
         solve_time: wall time of the planning [s].
         warnings: sentences: limits that cut the wanted pressures, ranges that were left.
         details: numbers of the method: iterations, cost, Newton steps.
@@ -67,12 +65,16 @@ class Plan:
     amplitude: float
     period: float
     cycles: int
-    limb: Limb
-    kinematics: Kinematics
+    body: Model
     solve_time: float
     warnings: tuple[str, ...] = ()
     details: dict[str, float] = field(default_factory=dict)
     chambers_beyond: Array | None = None
+
+    @property
+    def limb(self) -> Limb:
+        """The limb that it was made for, as its model sees it."""
+        return self.body.limb
 
     @property
     def tip_reference(self) -> Array:
@@ -81,7 +83,7 @@ class Plan:
 
     def curve(self, index: int) -> Array:
         """Return the centreline (P, 2) [m] of the reference configuration at a setpoint."""
-        return self.kinematics.curve(self.bend_angles[index])
+        return self.body.kinematics.curve(self.bend_angles[index])
 
     @property
     def error(self) -> Array:
@@ -214,8 +216,7 @@ def _plan_of(content: Any) -> Plan:
         amplitude=float(content["amplitude"]),
         period=float(content["period"]),
         cycles=int(content["cycles"]),
-        limb=body.limb,
-        kinematics=body.kinematics,
+        body=body,
         solve_time=float(content["solve_time"]),
         chambers_beyond=beyond,
     )

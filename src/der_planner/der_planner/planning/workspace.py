@@ -1,4 +1,10 @@
-"""What a limb reaches within its pressure limit, and where it rests."""
+"""What a limb reaches within its pressure limit, and where it rests.
+
+A limb of two segments reaches most points in two ways, on either side of the fold where the
+Jacobian loses its rank (the straight limb lies on that fold). A branch is named by how the last
+segment bends compared with the fold: ``counter_clockwise`` or ``clockwise``. All points of a path
+are solved in the same matrix operations, each from its own first guess, which decides the branch.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +19,7 @@ from der_planner.model import NODES, ArcModel, Model, RodModel
 from der_planner.model.bending import Kinematics
 from der_planner.model.series import interpolate
 from der_planner.planning.errors import PlanningError, UnreachableError
-from der_planner.planning.inverse import branch_of, check_branch, solve
-from der_planner.planning.loads import Rest, rest_of, sagging_tips
+from der_planner.planning.loads import sagging_tips, stable_rest
 
 Array = NDArray[np.float64]
 
@@ -23,6 +28,15 @@ TOLERANCE = 1e-3
 NEAREST_TOLERANCE = 5e-3
 """The same [m] for a nearest path: along the edge of what arcs reach, a rod's polyline stays behind
 by 1 to 2 mm."""
+PRIOR_WEIGHT = 1e-5
+"""Pull toward the first guess [m/rad]: decides what the tip leaves open (straight limb, M > 2)."""
+BRANCHES = ("counter_clockwise", "clockwise")
+"""Names of the two ways in which two segments reach a point."""
+_ITERATIONS = 60
+_SMALLEST_STEP = 1e-11
+"""Change of the bend angles that ends the iteration [rad]."""
+_STRAIGHT = 1e-3
+"""A limb that rests within this bend of straight starts there [rad]."""
 _LARGEST_STRIDE = 0.15
 """Change of a bend angle between anchors of a path up to which what lies between is safe [rad]."""
 
@@ -42,6 +56,21 @@ class Solution:
     branch: str
     distance: float
     pressure: float
+
+
+@dataclass(frozen=True)
+class Rest:
+    """The pose in which a vented limb rests, as bend angles of arcs with the rod's tip.
+
+    Attributes:
+        bend_angles: (M,) under the loads [rad].
+        sag: (M,) what the loads alone add to the bend without loads [rad].
+        offset: (2,) of the rod's tip from that of these arcs [m]: stretch, and what arcs cannot do.
+    """
+
+    bend_angles: Array
+    sag: Array
+    offset: Array
 
 
 class Workspace:
@@ -84,7 +113,16 @@ class Workspace:
         Raises:
             BucklingError: it does not stay there.
         """
-        return rest_of(self.arcs, lambda: self.rod)
+        own = self.arcs.free_angles
+        if np.abs(own).max() < _STRAIGHT:
+            own = np.zeros_like(own)
+        if not self.is_loaded:
+            return Rest(own, np.zeros_like(own), np.zeros(2))
+        state = stable_rest(self.rod)
+        angles = solve(self.arcs, state.q[None, -3:-1], self.rod.bend_of(state))[0][0]
+        if np.abs(angles).max() < _STRAIGHT:
+            angles = np.zeros_like(angles)
+        return Rest(angles, angles - own, state.q[-3:-1] - self.arcs.tip(angles))
 
     def sagging_tips(self, time: Array, angles: Array) -> Array:
         """Return the tips (K, 2) [m] of the rod in space that bends by angles (K, M) [rad].
@@ -147,8 +185,8 @@ class Workspace:
         Args:
             time: (K,) [s].
             tip: (K, 2) [m].
-            angles: (K, M) from `inverse.solve` [rad].
-            misses: (K,) distances from `inverse.solve` [m].
+            angles: (K, M) from `solve` [rad].
+            misses: (K,) distances from `solve` [m].
             tolerance: largest distance that still counts as reached [m].
             kinematics: that solved the path; None: the arcs.
 
@@ -241,7 +279,7 @@ class Workspace:
         Args:
             time: (K,) of the points, for messages [s].
             tip: (K, 2) [m].
-            branch: at the first point, see `inverse.BRANCHES`; empty takes the one with the least
+            branch: at the first point, see `BRANCHES`; empty takes the one with the least
                 pressure.
 
         Raises:
@@ -297,3 +335,69 @@ def static_pressure(arcs: ArcModel, bend_angles: ArrayLike) -> Array:
         return pressure
     flat = angles.reshape(-1, angles.shape[-1])
     return arcs.inverse_dynamics(flat, 0 * flat, 0 * flat).reshape(angles.shape)
+
+
+def solve(
+    kinematics: Kinematics, tip: ArrayLike, guess: ArrayLike, prior_weight: float = PRIOR_WEIGHT
+) -> tuple[Array, Array]:
+    """Return bend angles (K, M) [rad] near the guess and the distances (K,) [m] that remain.
+
+    Minimises |tip(θ) − r|² + w² |θ − guess|² for every point by Levenberg-Marquardt.
+
+    Args:
+        kinematics: forward kinematics.
+        tip: (K, 2) points r [m].
+        guess: (K, M) first guess, which also chooses the branch [rad].
+        prior_weight: w [m/rad].
+    """
+    target = np.atleast_2d(np.asarray(tip, dtype=float))
+    prior = np.atleast_2d(np.asarray(guess, dtype=float))
+    angles = prior.copy()
+    damping = np.full(len(angles), 1e-9)
+    identity = np.eye(angles.shape[1])
+    weight = prior_weight**2
+
+    def cost(theta: Array) -> Array:
+        miss = kinematics.tip(theta) - target
+        total: Array = (miss**2).sum(-1) + weight * ((theta - prior) ** 2).sum(-1)
+        return total
+
+    present = cost(angles)
+    for _ in range(_ITERATIONS):
+        miss = kinematics.tip(angles) - target
+        jacobian = kinematics.tip_jacobians(angles)
+        normal = np.einsum("kai,kaj->kij", jacobian, jacobian)
+        normal = normal + (weight + damping)[:, None, None] * identity
+        slope = np.einsum("kai,ka->ki", jacobian, miss) + weight * (angles - prior)
+        step = -np.linalg.solve(normal, slope[..., None])[..., 0]
+        length = np.linalg.norm(step, axis=-1, keepdims=True)
+        step = step * np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))
+        trial = cost(angles + step)
+        better = trial <= present
+        angles = np.where(better[:, None], angles + step, angles)
+        present = np.where(better, trial, present)
+        damping = np.where(better, np.maximum(damping / 10, 1e-16), damping * 10 + 1e-12)
+        if np.all(length < _SMALLEST_STEP):
+            break
+    return angles, np.linalg.norm(kinematics.tip(angles) - target, axis=-1)
+
+
+def branch_of(kinematics: Kinematics, bend_angles: ArrayLike) -> str:
+    """Name the branch of a two-segment configuration by the sign of det(∂tip/∂θ).
+
+    det > 0: the last segment bends more counter-clockwise than at the fold.
+    """
+    jacobian = kinematics.tip_jacobians(bend_angles)
+    if jacobian.shape != (2, 2):
+        return ""
+    return BRANCHES[0] if np.linalg.det(jacobian) > 0 else BRANCHES[1]
+
+
+def check_branch(branch: str) -> None:
+    """Refuse the name of a branch that is neither empty nor one of `BRANCHES`.
+
+    Raises:
+        PlanningError: names the choices.
+    """
+    if branch and branch not in BRANCHES:
+        raise PlanningError(f"branch '{branch}' is unknown: choose {' or '.join(BRANCHES)}")

@@ -8,11 +8,13 @@ window from the first to the last setpoint of the plan: E is the mean over the v
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -281,25 +283,20 @@ def evaluate_bags(
         One entry per limb that has a plan, in the order of the paths; one with the reason for a
         bag without any.
     """
-    chosen = settings or EvaluationSettings()
+    evaluate = partial(_evaluate, settings=settings or EvaluationSettings())
     workers = min(workers or _worth_while(paths), len(paths))
-    if workers <= 1:
-        found = []
-        for count, path in enumerate(paths, start=1):
-            found += _evaluate(path, chosen)
+    with contextlib.ExitStack() as stack:
+        found: Iterable[list[Evaluated]] = map(evaluate, paths)
+        if workers > 1:
+            # Forking a process that already runs threads (ROS, BLAS) can deadlock.
+            pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
+            found = stack.enter_context(pool).map(evaluate, paths)
+        entries = []
+        for count, (path, of_bag) in enumerate(zip(paths, found, strict=True), start=1):
+            entries += of_bag
             if progress is not None:
                 progress(count, len(paths), path)
-        return found
-    done: dict[Path, list[Evaluated]] = {}
-    # Forking a process that already runs threads (ROS, BLAS) can deadlock.
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        waiting = {pool.submit(_evaluate, path, chosen): path for path in paths}
-        for count, future in enumerate(as_completed(waiting), start=1):
-            path = waiting[future]
-            done[path] = future.result()
-            if progress is not None:
-                progress(count, len(paths), path)
-    return [entry for path in paths for entry in done[path]]
+    return entries
 
 
 def _worth_while(paths: Sequence[Path]) -> int:

@@ -6,7 +6,7 @@ Only runs that can be compared are compared; the others are left out and the rea
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -119,20 +119,17 @@ def summarise(results: Sequence[RunResult]) -> list[Summary]:
 
 def _summary(key: Key, runs: Sequence[RunResult]) -> Summary:
     namespace, loads, motion, model, method = key
-    errors = np.array([[r.mean_error_m, r.mean_error_x_m, r.mean_error_y_m] for r in runs])
-    mean = errors.mean(axis=0)
-    deviation = errors.std(axis=0, ddof=1) if len(runs) > 1 else np.full(3, np.nan)
+    figures = {}
+    for axis in ("", "_x", "_y"):
+        errors = np.array([getattr(run, f"mean_error{axis}_m") for run in runs])
+        figures[f"mean_error{axis}_m"] = float(errors.mean())
+        figures[f"std_error{axis}_m"] = float(errors.std(ddof=1)) if len(runs) > 1 else np.nan
     return Summary(
         motion=motion,
         model=model,
         method=method,
         trials=len(runs),
-        mean_error_m=float(mean[0]),
-        mean_error_x_m=float(mean[1]),
-        mean_error_y_m=float(mean[2]),
-        std_error_m=float(deviation[0]),
-        std_error_x_m=float(deviation[1]),
-        std_error_y_m=float(deviation[2]),
+        **figures,
         max_error_m=max(run.max_error_m for run in runs),
         valid_fraction=float(np.mean([run.valid_fraction for run in runs])),
         predicted_error_m=float(np.mean([run.predicted_error_m for run in runs])),
@@ -140,18 +137,6 @@ def _summary(key: Key, runs: Sequence[RunResult]) -> Summary:
         namespace=namespace,
         loads=loads,
     )
-
-
-@dataclass
-class _Side:
-    """The runs of one side of a comparison."""
-
-    name: str
-    runs: list[RunResult] = field(default_factory=list)
-
-    @property
-    def errors(self) -> Array:
-        return np.array([run.mean_error_m for run in self.runs])
 
 
 def compare(results: Sequence[RunResult], baseline: str = "pcc") -> list[Comparison]:
@@ -173,11 +158,16 @@ def compare(results: Sequence[RunResult], baseline: str = "pcc") -> list[Compari
             continue
         for (*other, other_model, other_method), others in groups.items():
             if other == [namespace, loads, motion] and other_model == baseline:
-                one = _Side(f"{model} {method}".strip(), runs)
-                two = _Side(f"{other_model} {other_method}".strip(), others)
-                comparison = _compare(motion, one, two)
-                where = namespace if several else ""
-                found.append(replace(comparison, namespace=where, loads=loads))
+                pair = Comparison(
+                    motion,
+                    f"{model} {method}".strip(),
+                    f"{other_model} {other_method}".strip(),
+                    trials=(len(runs), len(others)),
+                    refused=why_not_comparable([*runs, *others]),
+                    namespace=namespace if several else "",
+                    loads=loads,
+                )
+                found.append(pair if pair.refused else _compared(pair, runs, others))
     return found
 
 
@@ -220,28 +210,21 @@ def _references_apart(results: Sequence[RunResult]) -> float:
     return max(gaps, default=0.0)
 
 
-def _compare(motion: str, one: _Side, two: _Side) -> Comparison:
-    reason = why_not_comparable([*one.runs, *two.runs])
-    counts = (len(one.runs), len(two.runs))
-    if reason:
-        return Comparison(motion, one.name, two.name, trials=counts, refused=reason)
-    pairs = _pairs(one.runs, two.runs)
-    difference = float(two.errors.mean() - one.errors.mean())
-    low, high = (
-        _bootstrap([pairs], _mean)
-        if pairs is not None
-        else _bootstrap([one.errors, two.errors], _difference_of_means)
-    )
-    return Comparison(
-        motion,
-        one.name,
-        two.name,
-        difference_m=difference,
+def _compared(pair: Comparison, runs: list[RunResult], others: list[RunResult]) -> Comparison:
+    """Return a comparison with its figures."""
+    one, two = (np.array([run.mean_error_m for run in side]) for side in (runs, others))
+    differences = _pairs(runs, others)
+    if differences is not None:
+        low, high = _bootstrap([differences], _mean)
+    else:
+        low, high = _bootstrap([one, two], _difference_of_means)
+    return replace(
+        pair,
+        difference_m=float(two.mean() - one.mean()),
         low_m=low,
         high_m=high,
-        ratio=float(two.errors.mean() / one.errors.mean()),
-        paired=pairs is not None,
-        trials=counts,
+        ratio=float(two.mean() / one.mean()),
+        paired=differences is not None,
     )
 
 

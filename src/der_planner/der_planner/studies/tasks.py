@@ -214,8 +214,7 @@ _RECOVERED = (
 def _identify(limb: str, row: Mapping[str, Any]) -> Result:
     """Compare what a calibration found with what the seed drew, and predict an unseen motion."""
     from der_planner.identification import Excitation, predict, record_twin  # noqa: PLC0415
-    from der_planner.twin.hardware import draw  # noqa: PLC0415
-    from der_planner.twin.truth import known_values  # noqa: PLC0415
+    from der_planner.twin.hardware import draw, known_values  # noqa: PLC0415
 
     prior = limb_of(limb)
     found, report = fit_twin(twin_of(row), prior)

@@ -69,7 +69,7 @@ class RodArrays(NamedTuple):
     ghost_vertices: NDArray[np.int32]
 
 
-class Material(NamedTuple):
+class SectionMaterial(NamedTuple):
     """The bending law at each vertex (K,): parameters, then the state that it remembers.
 
     moment = stiffness (κ − rest + τ κ̇) + cubic (κ − rest)³ + friction_moment z +
@@ -106,7 +106,7 @@ class Ramp(NamedTuple):
 
 
 @njit(cache=True)
-def bending_law(material: Material, kappa: Array, couple: Array, dt: float) -> None:
+def bending_law(material: SectionMaterial, kappa: Array, couple: Array, dt: float) -> None:
     """Write the planar bending moment of each vertex (K,) [N·m] and advance what it remembers.
 
     Friction is a Bouc-Wen element, κ_f dz = (1 − |z|ⁿ (β sgn(z dκ) + 1 − β)) dκ, kept within ±1,
@@ -142,7 +142,7 @@ def bending_law(material: Material, kappa: Array, couple: Array, dt: float) -> N
 
 @njit(cache=True)
 def advance(
-    rod: RodArrays, material: Material, ramp: Ramp, steps: int, dt: float, drag: float
+    rod: RodArrays, material: SectionMaterial, ramp: Ramp, steps: int, dt: float, drag: float
 ) -> None:
     """Advance the limb by ``steps`` position Verlet steps of ``dt`` [s].
 
@@ -181,7 +181,7 @@ def advance(
 
 
 @njit(cache=True)
-def _internal_forces(rod: RodArrays, material: Material, before: Array, dt: float) -> None:
+def _internal_forces(rod: RodArrays, material: SectionMaterial, before: Array, dt: float) -> None:
     """Fill the stress S (σ − rest + τ σ̇) (3, E) [N] and the internal forces (3, E+1) [N].
 
     The same as PyElastica's kernel, which has no σ̇, with the strains computed once.

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from der_planner.limb import PointMass
 from der_planner.model.air import pair_of
+from der_planner.twin.body import Push
 from der_planner.twin.limb_twin import LimbTwin, TwinError
-from der_planner.twin.loads import Push
 from pressure_driver.emulator.pneumatics import BoardPneumatics
 
 Array = NDArray[np.float64]

@@ -103,68 +103,6 @@ def test_a_command_becomes_a_plan_and_timed_setpoints(planner):
     assert node.process.stop() == 0
 
 
-def test_what_cannot_be_done_is_refused_with_a_reason(planner):
-    from geometry_msgs.msg import Point, Pose, PoseStamped
-    from nav_msgs.msg import Path
-
-    node = planner()
-    cases = [
-        ({"motion": "jump"}, "motion 'jump' is unknown"),
-        ({"model": "fem"}, "model 'fem' is unknown"),
-        ({"model": "pcc", "method": "magic"}, "no method 'magic'"),
-        ({"period": -1.0}, "period must be positive"),
-        ({"amplitude": float("nan")}, "amplitude must be positive"),
-        ({"motion": "same_direction", "amplitude": 1.7}, "out of reach"),
-    ]
-    for number, (fields, reason) in enumerate(cases):
-        node.command(plan_id=f"bad {number}", **fields)
-        node.client.wait_for(
-            lambda number=number: (
-                node.state().get("plan_id") == f"bad {number}"
-                and node.state()["state"] == "refused"
-            ),
-            60.0,
-            reason,
-        )
-        assert reason in node.state()["reason"]
-    path = Path()
-    path.header.frame_id = "limb_base"
-    for x in (0.2, 0.5):
-        path.poses.append(PoseStamped(pose=Pose(position=Point(x=x, y=0.1))))
-    node.paths.publish(path)
-    node.client.wait_for(
-        lambda: "no pressure reaches it" in node.state()["reason"], 60.0, "a refusal"
-    )
-    path.header.frame_id = "map"
-    node.paths.publish(path)
-    node.client.wait_for(lambda: "frame 'map'" in node.state()["reason"], 60.0, "a refusal")
-    assert not node.plans
-    assert not node.setpoints
-
-
-def test_a_path_is_planned_and_a_new_command_takes_over_without_a_jump(planner):
-    from geometry_msgs.msg import Point, Pose, PoseStamped
-    from nav_msgs.msg import Path
-
-    node = planner(path_speed=0.004)  # it must last longer than the next takes to plan
-    path = Path()
-    for y in np.linspace(0.10, 0.13, 7):
-        path.poses.append(PoseStamped(pose=Pose(position=Point(x=0.19, y=float(y)))))
-    node.paths.publish(path)
-    first = node.client.wait_for(lambda: node.plans and node.plans[0], 60.0, "the plan")
-    assert first.motion == "path"
-    node.client.wait_for(lambda: len(node.received(first.plan_id)) > 20, 60.0, "setpoints")
-    node.command(plan_id="second")
-    second = node.wait_plan("second")
-    count = len(second.time)
-    node.client.wait_for(lambda: len(node.received("second")) == count, 60.0, "the rest")
-    messages = [m for _, m in node.setpoints]
-    assert np.all(np.diff([stamp(m) for m in messages]) == 50_000_000)
-    assert 20 < len(node.received(first.plan_id)) < len(first.time)
-    pressures = np.array([m.differential_pressure for m in messages])
-    assert np.abs(np.diff(pressures, axis=0)).max() <= 9000 * 0.05 + 1e-6
-
-
 def test_each_plan_has_the_loads_of_its_time(planner):
     """By parameter, by command, and by a parameter that was set."""
     from rcl_interfaces.msg import Parameter, ParameterValue

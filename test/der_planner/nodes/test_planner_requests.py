@@ -6,10 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from geometry_msgs.msg import Point
+from nav_msgs.msg import Path
 
 from der_msgs.msg import MotionCommand
 from der_planner.limb import Limb
-from der_planner.nodes.planner_requests import from_command
+from der_planner.nodes.planner_requests import from_command, from_path
 from der_planner.planning import Motion, PathLimits, plan
 from der_planner.planning.plan_file import write_plan
 
@@ -54,3 +55,11 @@ def test_a_command_may_carry_a_path_with_a_load_of_its_own():
     ):
         with pytest.raises(ValueError, match=said):
             from_command(MotionCommand(**{"path": path, **fields}), options, 0)
+
+
+def test_a_path_in_another_frame_is_refused():
+    options = SimpleNamespace(limb=Limb.default())
+    message = Path()
+    message.header.frame_id = "map"
+    with pytest.raises(ValueError, match="frame 'map'"):
+        from_path(message, "path", options, 0)

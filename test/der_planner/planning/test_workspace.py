@@ -8,7 +8,7 @@ import pytest
 from der_planner.limb import Limb
 from der_planner.model import ArcModel, RodModel
 from der_planner.model.bending import PolylineKinematics, bend_angles
-from der_planner.planning import Workspace, inverse
+from der_planner.planning import Workspace, workspace
 from der_planner.rod import Rod
 
 LIMB = Limb.default()
@@ -86,7 +86,7 @@ def test_inverse_of_forward_is_the_identity(kinematics):
     away = np.abs(np.linalg.det(kinematics.tip_jacobians(angles))) > 2e-3
     angles = angles[away]
     guess = angles + rng.normal(scale=0.02, size=angles.shape)
-    found, miss = inverse.solve(kinematics, kinematics.tip(angles), guess, prior_weight=0.0)
+    found, miss = workspace.solve(kinematics, kinematics.tip(angles), guess, prior_weight=0.0)
     assert miss.max() < 1e-12
     np.testing.assert_allclose(found, angles, atol=1e-8)
 
@@ -94,23 +94,23 @@ def test_inverse_of_forward_is_the_identity(kinematics):
 def test_both_branches_are_found_and_named():
     point = ARCS.tip(np.radians([35.0, 20.0]))
     found = SPACE.solutions(point)
-    assert {item.branch for item in found} == set(inverse.BRANCHES)
+    assert {item.branch for item in found} == set(workspace.BRANCHES)
     assert len(found) == 2
     for item in found:
         np.testing.assert_allclose(ARCS.tip(item.bend_angles), point, atol=1e-9)
-        assert inverse.branch_of(ARCS, item.bend_angles) == item.branch
+        assert workspace.branch_of(ARCS, item.bend_angles) == item.branch
     assert found[0].pressure <= found[1].pressure
     turns = {item.branch: item.bend_angles[1] for item in found}
     assert turns["counter_clockwise"] > turns["clockwise"]
 
 
-@pytest.mark.parametrize("branch", inverse.BRANCHES)
+@pytest.mark.parametrize("branch", workspace.BRANCHES)
 def test_a_path_stays_on_the_branch_it_was_given(branch):
     turn = np.linspace(0, 2 * np.pi, 50)
     centre = ARCS.tip(np.radians([35.0, 20.0]))
     tip = centre + 0.003 * np.column_stack([np.cos(turn), np.sin(turn)])
     angles = SPACE.follow(turn, tip, branch)
-    assert {inverse.branch_of(ARCS, q) for q in angles} == {branch}
+    assert {workspace.branch_of(ARCS, q) for q in angles} == {branch}
     np.testing.assert_allclose(ARCS.tip(angles), tip, atol=1e-8)
     assert np.abs(np.diff(angles, axis=0)).max() < 0.1
 
@@ -120,7 +120,7 @@ def test_a_path_through_the_straight_pose_is_smooth():
     theta = 0.4 * np.sin(s) ** 3
     for second in (1.0, -1.0):
         wanted = np.column_stack([theta, second * theta])
-        found, miss = inverse.solve(CHAIN, ARCS.tip(wanted), wanted)
+        found, miss = workspace.solve(CHAIN, ARCS.tip(wanted), wanted)
         assert miss.max() < 1e-6
         assert np.all(np.isfinite(found))
         assert (
@@ -134,7 +134,7 @@ def test_more_than_two_segments_stay_near_the_first_guess(count):
     rng = np.random.default_rng(count)
     angles = rng.uniform(0.2, 0.6, size=(30, count))
     guess = angles + rng.normal(scale=0.05, size=angles.shape)
-    found, miss = inverse.solve(kinematics, kinematics.tip(angles), guess)
+    found, miss = workspace.solve(kinematics, kinematics.tip(angles), guess)
     assert miss.max() < 1e-6
     for q, start in zip(found, guess, strict=True):
         null = np.linalg.svd(kinematics.tip_jacobians(q))[2][2:]

@@ -1,0 +1,63 @@
+"""Feedback of the planner node: revisions in time, estimates, lost tags, and slow solutions."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.graph
+
+
+def test_solutions_that_take_too_long_never_hold_up_the_plan():
+    """Every command comes too late: setpoints go out meanwhile, and then the plan is left alone."""
+    from der_msgs.msg import LimbState
+    from der_planner.control import Feedback
+    from der_planner.limb import Limb
+    from der_planner.nodes.planner_feedback import Corrector
+    from der_planner.planning import Motion, plan
+    from der_planner.planning.streaming import Schedule
+    from limb_interfaces.stamps import stamp_from_nanoseconds
+
+    class Slow(Feedback):
+        def __init__(self, plan):
+            super().__init__(plan)
+            self.busy, self.released = threading.Event(), threading.Event()
+
+        def command(self, instant):
+            self.busy.set()
+            self.released.wait(60.0)
+            time.sleep(0.3)
+            return super().command(instant)
+
+    class Output:
+        def setpoint(self, schedule, index, pressures, revision):
+            said.append("revised")
+
+        def estimate(self, *arguments, **about):
+            pass
+
+    said = []
+    motion = Motion.named("same_direction", period=60.0, cycles=2)
+    planned = plan(Limb.default(), motion, method="projected")
+    slow = Slow(planned)
+    corrector = Corrector(Output(), said.append, time.time_ns)
+    schedule = Schedule("slow", planned, time.time_ns() - 1_000_000_000)
+    corrector.follow(schedule, slow)
+    assert slow.busy.wait(60.0)
+    # It hangs in its first command; a setpoint's pressures are there all the same.
+    np.testing.assert_array_equal(
+        corrector.pressures(schedule, 30), planned.differential_pressure[30]
+    )
+    assert not slow.released.is_set()
+    slow.released.set()
+    deadline = time.monotonic() + 60.0
+    while not any("late" in text for text in said) and time.monotonic() < deadline:
+        state = LimbState(valid=True, bend_angle=[0.1, 0.1])
+        state.header.stamp = stamp_from_nanoseconds(time.time_ns())
+        corrector.add_state(state)
+        time.sleep(0.02)
+    corrector.close()
+    assert any("late" in text for text in said)
+    assert "revised" not in said
+    assert slow.reason == "late"
