@@ -39,7 +39,7 @@ PRESSES = 200
 
 
 @dataclass
-class Seen:
+class Heard:
     """What the benchmark has heard while one case ran."""
 
     commands: list[ChamberPressures] = field(default_factory=list)
@@ -115,7 +115,7 @@ def _arm(client: GraphClient) -> bool:
     return False
 
 
-def _press(client: GraphClient, seen: Seen, count: int) -> list[float]:
+def _press(client: GraphClient, seen: Heard, count: int) -> list[float]:
     """Press `vent` under a small command; return the times [s] until it is on the wire."""
     publisher = client.node.create_publisher(
         PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS
@@ -215,7 +215,7 @@ class Samples:
     """1 if the run ended or was vented."""
 
 
-def _compare(wanted: Setpoints, seen: Seen) -> Samples:
+def _compare(wanted: Setpoints, seen: Heard) -> Samples:
     """Compare what was asked with what the board received, on the board's clock."""
     by_tick: dict[int, ChamberPressures] = {}
     for command in seen.commands:
@@ -261,7 +261,7 @@ def _figures(case: str, played: list[Samples]) -> dict[str, float | str]:
     return figures
 
 
-def evaluate(case: str, wanted: Setpoints, seen: Seen) -> dict[str, float | str]:
+def evaluate(case: str, wanted: Setpoints, seen: Heard) -> dict[str, float | str]:
     """Return the figures of one playing of a case."""
     return _figures(case, [_compare(wanted, seen)])
 
@@ -280,7 +280,7 @@ def _measure(case: str, seconds: float, presses: int = 0) -> Samples:
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="der_limb_driver_")))
         client = stack.enter_context(GraphClient("benchmark"))
-        seen = Seen()
+        seen = Heard()
         client.subscribe(
             ChamberPressures, topics.TWIN_BOARD_COMMANDS, qos.SETPOINTS, seen.commands.append
         )
