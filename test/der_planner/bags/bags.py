@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from der_planner.bags.topics import OfferedQos, TopicSpec, find_definition
@@ -12,20 +14,33 @@ SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
 
 
-def store():
-    """Return a type store that knows der_msgs by the definitions that bags embed."""
+def store(*names: str):
+    """Return a type store that knows these types, too, by the definitions that bags embed."""
     types = get_typestore(Stores.ROS2_JAZZY)
-    for name in (
-        "LimbState",
-        "PressurePlan",
-        "PressureSetpoint",
-        "PressureState",
-        "ChamberPressures",
-    ):
-        full = f"der_msgs/msg/{name}"
-        found = get_types_from_msg(find_definition(full).text, full)
+    for name in names:
+        found = get_types_from_msg(find_definition(name).text, name)
         types.register({key: value for key, value in found.items() if key not in types.types})
     return types
+
+
+def message(types, name: str, **fields):
+    """Return a message whose other fields are zero, false or empty."""
+    made = {
+        field: fields.pop(field) if field in fields else _zero(types, *what)
+        for field, what in types.fielddefs[name][1]
+    }
+    assert not fields, f"{name} has no {fields}"
+    return types.types[name](**made)
+
+
+def _zero(types, kind, content):
+    if kind == Nodetype.NAME:
+        return message(types, content)
+    if kind == Nodetype.BASE:
+        return "" if content[0] == "string" else np.dtype(content[0]).type().item()
+    (inner, base), size = content
+    many = inner == Nodetype.BASE and base[0] != "string"
+    return np.zeros(size if kind == Nodetype.ARRAY else 0, base[0]) if many else []
 
 
 def spec(name: str, type_name: str, latched: bool = False) -> TopicSpec:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from bags import SECOND, START, spec, store
+from bags import SECOND, START, message, spec, store
 
 from der_planner.bags.writer import RUN_KEY, BagWriter
 from der_planner.results import Description, RunSeries
@@ -44,6 +44,9 @@ def series(
     )
 
 
+OURS = ("LimbState", "PressurePlan", "PressureSetpoint", "PressureState", "ChamberPressures")
+
+
 class BagOfRun:
     """Writes the messages of one run into a bag, with rosbags' serializer."""
 
@@ -53,34 +56,34 @@ class BagOfRun:
         writer: BagWriter | None = None,
         run: str = "{}",
         namespace: str = "/limb",
+        types: tuple[str, ...] = (),
     ) -> None:
         self.namespace = namespace
-        self.types = store()
+        self.types = store(*types, *(f"der_msgs/msg/{name}" for name in OURS))
         self.bag = writer or BagWriter(folder, {RUN_KEY: run})
         self.start = START + 7 * SECOND
 
     def stamp(self, seconds: float) -> int:
         return self.start + round(seconds * SECOND)
 
-    def header(self, seconds: float):
-        stamp = self.stamp(seconds)
-        kinds = self.types.types
-        return kinds["std_msgs/msg/Header"](
-            stamp=kinds["builtin_interfaces/msg/Time"](sec=stamp // SECOND, nanosec=stamp % SECOND),
-            frame_id="limb_base",
-        )
+    def make(self, name: str, **fields):
+        return message(self.types, name, **fields)
 
-    def write(self, topic: str, kind: str, seconds: float, latched: bool = False, **fields) -> None:
+    def header(self, seconds: float):
+        sec, nanosec = divmod(self.stamp(seconds), SECOND)
+        stamp = self.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id="limb_base")
+
+    def write(self, topic: str, name: str, seconds: float, latched: bool = False, **fields) -> None:
         topic = topic.replace("/limb", self.namespace, 1)
-        name = f"der_msgs/msg/{kind}"
-        message = self.types.types[name](header=self.header(seconds), **fields)
+        name = name if "/" in name else f"der_msgs/msg/{name}"
+        made = self.make(name, header=self.header(seconds), **fields)
         self.bag.add_topic(spec(topic, name, latched))
-        data = bytes(self.types.serialize_cdr(message, name))
+        data = bytes(self.types.serialize_cdr(made, name))
         # A message arrives some time after its stamp; the evaluation must go by the stamp.
         self.bag.write(topic, self.stamp(seconds + 0.03), self.stamp(seconds + 0.02), data)
 
     def plan(self, plan_id="p", model="der", stamp=0.0, gravity=(0.0, 0.0, 0.0)) -> None:
-        zeros = np.zeros(2 * len(TIMES))
         self.write(
             "/limb/plan",
             "PressurePlan",
@@ -99,11 +102,9 @@ class BagOfRun:
             payload_at=0.244 if any(gravity) else 0.0,
             segment_count=2,
             time=TIMES,
-            differential_pressure=zeros,
+            differential_pressure=np.zeros(2 * len(TIMES)),
             tip_reference=reference(TIMES).ravel(),
             tip_predicted=reference(TIMES).ravel(),
-            solve_time=0.1,
-            predicted_error=0.0,
         )
 
     def setpoint(self, index: int, value, plan_id="p", revision=0) -> None:
@@ -118,54 +119,20 @@ class BagOfRun:
         )
 
     def state(self, seconds: float, tip, valid=True, topic="/limb/state") -> None:
-        kinds = self.types.types
-        nan = float("nan")
-        x, y = tip if valid else (nan, nan)
-        self.write(
-            topic,
-            "LimbState",
-            seconds,
-            valid=valid,
-            reason="",
-            tip=kinds["geometry_msgs/msg/Point"](x=float(x), y=float(y), z=0.0),
-            tip_covariance=np.zeros(4),
-            tip_systematic=np.zeros(4),
-            bend_angle=np.array([0.1, 0.2]),
-            bend_angle_sigma=np.zeros(2),
-            curvature=np.zeros(2),
-            elongation=1.0,
-            residual=0.0,
-            curve=[],
-            tags_used=5,
-            latency=0.02,
-        )
+        x, y = tip if valid else (np.nan, np.nan)
+        point = self.make("geometry_msgs/msg/Point", x=float(x), y=float(y))
+        angles = np.array([0.1, 0.2])
+        self.write(topic, "LimbState", seconds, valid=valid, tip=point, bend_angle=angles)
 
     def pressure(self, seconds: float, commanded, measured, mode=2, faults=()) -> None:
-        kinds = self.types.types
         self.write(
             "/limb/pressure_state",
             "PressureState",
             seconds,
             mode=mode,
             faults=list(faults),
-            plan_id="p",
-            index=0,
-            setpoint_stamp=kinds["builtin_interfaces/msg/Time"](sec=0, nanosec=0),
             commanded_differential=np.asarray(commanded, dtype=float),
             measured_differential=np.asarray(measured, dtype=float),
-            commanded_chamber=np.zeros(4),
-            measured_chamber=np.zeros(4),
-            valve_opening=np.zeros(4),
-            supply_pressure=0.0,
-            telemetry_age=0.0,
-            round_trip=0.0,
-            setpoints_accepted=0,
-            setpoints_executed=0,
-            setpoints_late=0,
-            setpoints_duplicate=0,
-            setpoints_refused=0,
-            bytes_sent=0,
-            bytes_received=0,
         )
 
     def command(self, seconds: float, differential, sequence: int) -> None:

@@ -15,19 +15,19 @@ from der_planner.model.series import CONTROL_PERIOD, interpolate
 Array = NDArray[np.float64]
 
 _GAP_TIME = 10.0
-"""In which a difference between measured and modelled pressures is expected to fade [s]."""
+"""Time in which a difference between measured and modelled pressures is expected to fade [s]."""
 _GROWTH_TIME = 0.5
-"""In which the growth of that difference fades [s] …"""
+"""Time in which the growth of that difference fades [s]."""
 _GROWTH_SEEN = 0.3
-"""… which is that of the readings of so long [s]."""
+"""Span of the last readings from which that growth is taken [s]."""
 _LONGEST_HOLD = 40
-"""Control periods without a command after which the plan's count again."""
+"""Number of control periods without a command after which the plan's commands count again."""
 _BEFORE = 60
-"""Control periods before the first setpoint in which the limb may be watched."""
+"""Number of control periods before the first setpoint in which the limb may be watched."""
 _GROWTH = 200
-"""Control periods by which the table of commands grows."""
+"""Number of control periods by which the table of commands grows."""
 _KEPT = 6.0
-"""Measured pressures are kept for this long [s]."""
+"""Age up to which measured pressures are kept [s]."""
 
 
 class ChamberLog:
@@ -96,8 +96,8 @@ class ChamberLog:
         table = self._table(k)
         row = k - self._origin
         if self._last is not None and 0 < k - self._last <= _LONGEST_HOLD:
-            held = self._last - self._origin
-            table[held + 1 : row] = table[held]
+            last = self._last - self._origin
+            table[last + 1 : row] = table[last]
         table[row] = command
         self._last = k if self._last is None else max(k, self._last)
         self._gap = None
@@ -156,8 +156,8 @@ class ChamberLog:
         first, last = int(steps[0]) // STEPS, int(steps[-1]) // STEPS
         coming = self._table(last)[first - self._origin : last + 1 - self._origin]
         chambers, before = self.follow(first, coming)
-        held = chambers.differential[before:].reshape(-1, self._inputs)
-        return held[steps - first * STEPS]
+        differential = chambers.differential[before:].reshape(-1, self._inputs)
+        return differential[steps - first * STEPS]
 
     def expected_gap(self, time: Array) -> Array:
         """Return the expected differences (n, M) [Pa] of the chambers from their model.

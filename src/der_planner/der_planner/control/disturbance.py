@@ -22,31 +22,29 @@ Mask = NDArray[np.bool_]
 _NEIGHBOURHOOD = 0.05
 """Standard deviation of the neighbourhood in which a line is fitted [s]."""
 _REACH = 3.0
-"""Samples further away than so many standard deviations do not count."""
+"""Number of standard deviations beyond which samples do not count."""
 _SEEN_WITHIN = 0.1
-"""A setpoint counts as seen if the nearest image is not further away than this [s]."""
+"""Distance of the nearest image up to which a setpoint counts as seen [s]."""
 _LEAST_NOISE = 1e-5
 """Standard deviation of the best tip that is believed [m]."""
-_FOLLOWS = 0.6
-"""An error of more than this share of the way from the start is that of a limb that stays …"""
-_FAR = 0.02
-"""… where the way is longer than this [m] …"""
-_FOR_LONG = 1.0
-"""… for longer than this [s]; it began when the error was last …"""
-_USUAL = 1.5
-"""… below so many times its median until then."""
+_BEHIND_SHARE = 0.6
+"""Error of a limb that stays behind, as a share of its reference's distance from the start."""
+_BEHIND_DISTANCE = 0.02
+"""Distance of the reference from the start from which a limb can be said to stay behind [m]."""
+_BEHIND_TIME = 1.0
+"""Time for which a limb must stay behind [s]."""
+_USUAL_ERROR = 1.5
+"""Multiple of the median error up to which a limb still followed."""
+_LEAST_CORRELATION = 0.5
+"""Correlation of measured and expected tip of a limb that moves with its commands."""
+_LEAST_MOVEMENT = 0.15
+"""Share of the expected movement that a limb makes that moves with its commands."""
+_STILL = 5e-3
+"""Expected movement below which nothing is told of a limb, root mean square [m]."""
 
 
 class LearningError(ValueError):
     """A run or a plan cannot be learned from; the message names the remedy."""
-
-
-_MOVES = 0.5
-"""Least correlation of measured and expected tip of a limb that moves with its commands …"""
-_AT_ALL = 0.15
-"""… and least share of the expected way."""
-_STILL = 5e-3
-"""A tip that is expected to move by less, root mean square, tells nothing of that [m]."""
 
 
 @dataclass(frozen=True)
@@ -172,11 +170,11 @@ def stays_behind(time: Array, tip: Array, wanted: Array) -> float | None:
         tip: (K, 2), NaN where unseen [m].
         wanted: (K, 2) r̄ [m].
     """
-    way = np.linalg.norm(wanted - wanted[0], axis=1)
+    distance = np.linalg.norm(wanted - wanted[0], axis=1)
     missed = np.linalg.norm(tip - wanted, axis=1)
     with np.errstate(invalid="ignore"):
-        behind = (missed > _FOLLOWS * way) & (way > _FAR)
-    needed = max(2, round(_FOR_LONG / float(time[1] - time[0])))
+        behind = (missed > _BEHIND_SHARE * distance) & (distance > _BEHIND_DISTANCE)
+    needed = max(2, round(_BEHIND_TIME / float(time[1] - time[0])))
     # A gap in between neither ends such a stretch nor makes it longer.
     run, begin = 0, 0
     seen = [int(k) for k in np.nonzero(np.isfinite(missed))[0]]
@@ -189,7 +187,7 @@ def stays_behind(time: Array, tip: Array, wanted: Array) -> float | None:
         if run >= needed:
             # It began when the error left what it had been until then.
             before = missed[:begin][np.isfinite(missed[:begin])]
-            usual = _USUAL * float(np.median(before)) if len(before) else 0.0
+            usual = _USUAL_ERROR * float(np.median(before)) if len(before) else 0.0
             well = [j for j in seen if j < begin and missed[j] <= usual]
             return float(time[well[-1]] if well else time[0])
     return None
@@ -210,13 +208,15 @@ def moves_with(tip: Array, expected: Array) -> str:
         return ""
     one = tip[seen] - tip[seen].mean(axis=0)
     other = expected[seen] - expected[seen].mean(axis=0)
-    way, wanted = (float(np.sqrt((part**2).sum() / seen.sum())) for part in (one, other))
-    if wanted < _STILL:
+    moved, expected_movement = (
+        float(np.sqrt((part**2).sum() / seen.sum())) for part in (one, other)
+    )
+    if expected_movement < _STILL:
         return ""
-    if way < _AT_ALL * wanted:
-        return f"the tip moved {way / wanted:.0%} of its way"
-    alike = float((one * other).sum() / seen.sum()) / (way * wanted)
-    if alike < _MOVES:
+    if moved < _LEAST_MOVEMENT * expected_movement:
+        return f"the tip moved {moved / expected_movement:.0%} of its way"
+    alike = float((one * other).sum() / seen.sum()) / (moved * expected_movement)
+    if alike < _LEAST_CORRELATION:
         return f"the tip does not move with the commands (correlation {alike:.2f})"
     return ""
 
@@ -244,7 +244,7 @@ def without_gaps(value: Array, known: Mask, period: float, fade: float) -> Array
 
 
 def chambers_beyond(
-    expected: Array, setpoints: Array, time: ArrayLike, held: ArrayLike
+    expected: Array, setpoints: Array, time: ArrayLike, measured: ArrayLike
 ) -> Array | None:
     """Return by how much the chambers held more than their model in each period (K, M) [Pa].
 
@@ -252,7 +252,7 @@ def chambers_beyond(
         expected: (K, M) mean differential pressures of the model in each period [Pa].
         setpoints: (K,) beginnings of the periods [s].
         time: (n,) instants, in any order [s].
-        held: (n, M) differential pressures in the chambers then [Pa].
+        measured: (n, M) differential pressures in the chambers then [Pa].
 
     Returns:
         None where no reading was whole.
@@ -260,7 +260,7 @@ def chambers_beyond(
     Raises:
         LearningError: shapes that do not fit.
     """
-    instants, values = np.asarray(time, dtype=float), np.asarray(held, dtype=float)
+    instants, values = np.asarray(time, dtype=float), np.asarray(measured, dtype=float)
     wanted = (len(instants), expected.shape[1])
     if instants.ndim != 1 or values.shape != wanted:
         raise LearningError(

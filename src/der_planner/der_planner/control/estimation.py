@@ -270,16 +270,16 @@ class Estimator:
             known = self._update(entry, known)
         return known
 
-    def _period(self, first: int, held: Array) -> None:
+    def _period(self, first: int, differential: Array) -> None:
         """Go on from boundary ``first`` under a control period's chamber pressures (n, M) [Pa]."""
         nominal, inputs = self.nominal, self.inputs
-        steps = nominal.steps(first + np.arange(len(held)))
+        steps = nominal.steps(first + np.arange(len(differential)))
         k = int(nominal.periods(first // STEPS))
         known = self._known[first]
         memory, taken = known.memory, known.taken
         if first % STEPS == 0:
             memory, taken = self._remember(known, nominal.fine_bend[steps[0]] + known.slow)
-        effective = nominal.model.material.without_memory(held, taken)
+        effective = nominal.model.material.without_memory(differential, taken)
         push = nominal.fine_input[k]
         pushed = (effective - nominal.effective[steps]) @ push.T
         move, noise = self._moves[k].copy(), self._noises[k]

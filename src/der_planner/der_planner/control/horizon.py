@@ -91,7 +91,7 @@ class _Rolled(NamedTuple):
     Attributes:
         correction: (W, M) [Pa].
         chambers, before: what the chambers do, and the commands in it before ``first``.
-        held, effective: (W, S, M) in the chambers, and felt [Pa].
+        differential, effective: (W, S, M) in the chambers, and felt [Pa].
         misses: (W, 2) tip − r̄ at the ends of the periods [m].
         bends: (W, M) δθ there [rad].
     """
@@ -100,7 +100,7 @@ class _Rolled(NamedTuple):
     correction: Array
     chambers: Chambers
     before: int
-    held: Array
+    differential: Array
     effective: Array
     misses: Array
     bends: Array
@@ -279,14 +279,14 @@ class Horizon:
         commands = nominal.commands[periods] + correction
         chambers, before = self._chambers.follow(first, commands)
         middle = (first * STEPS + np.arange(self.window * STEPS) + 0.5) * CONTROL_PERIOD / STEPS
-        held = chambers.differential[before:] + self._chambers.expected_gap(middle).reshape(
+        differential = chambers.differential[before:] + self._chambers.expected_gap(middle).reshape(
             self.window, STEPS, inputs
         )
         fine = nominal.steps(first * STEPS + np.arange(self.window * STEPS))
         here = nominal.steps(first * STEPS)
         taken = nominal.taken[fine] + (known.taken - nominal.taken[here])
         taken = taken.reshape(self.window, STEPS, inputs)
-        effective = nominal.model.material.without_memory(held, taken)
+        effective = nominal.model.material.without_memory(differential, taken)
         missing, gain = self._disturbance(known)
         planned = nominal.effective[fine].reshape(self.window, STEPS, inputs).mean(axis=1)
         push = effective.mean(axis=1) * (1.0 + gain) + missing - planned
@@ -300,12 +300,12 @@ class Horizon:
         bend = nominal.bend[ends]
         misses = nominal.tip[ends] + nominal.moved_tip(bend, bends) - nominal.reference[ends]
         misses = misses + known.mean[-2:]
-        return _Rolled(first, correction, chambers, before, held, effective, misses, bends)
+        return _Rolled(first, correction, chambers, before, differential, effective, misses, bends)
 
     def _derivatives(self, rolled: _Rolled, known: Knowledge) -> tuple[Array, Array]:
         """Return ∂misses (W, 2, knots·M) and ∂bends (W, M, knots·M) by the knots' corrections."""
         nominal, inputs = self._nominal, self._nominal.model.inputs
-        slopes = nominal.model.material.slopes(rolled.held, rolled.effective).mean(axis=1)
+        slopes = nominal.model.material.slopes(rolled.differential, rolled.effective).mean(axis=1)
         slopes = slopes * (1.0 + self._disturbance(known)[1])[None, :, None]
         # Pressures by the knots' corrections, then swing by these, period after period.
         reached = rolled.chambers.derivative(rolled.before).mean(axis=1)

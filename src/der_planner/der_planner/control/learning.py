@@ -44,14 +44,16 @@ Array = NDArray[np.float64]
 _LEAST_SEEN = 0.2
 """Share of the setpoints at which the tip must be seen."""
 PULL = 0.015
-"""Pull toward the best commands, over the tip's way per pressure: the model's answer to a change of
-commands is wrong by some per cent of the movement of each segment, even where they cancel at the
-tip. (A weaker pull lets segments wander against each other near the straight pose, where the tip
-hardly tells them apart.)"""
+"""Pull toward the best commands, over the tip's movement per pressure.
+
+The model's answer to a change of commands is wrong by some per cent of the movement of each
+segment, even where they cancel at the tip. A weaker pull lets segments wander against each other
+near the straight pose, where the tip hardly tells them apart.
+"""
 _HARDER = 3.0
-"""The pull grows by this after a plan that was worse than the best one …"""
+"""Factor by which the pull grows after a plan that was worse than the best one."""
 _HARDEST = 1.0
-"""… up to this."""
+"""Largest pull, over the tip's movement per pressure."""
 _WORSE = 1.02
 """Share of the best plan's error that a plan may leave, beyond repeatability, and not be worse."""
 _SMALLEST_STEP = 0.1
@@ -175,7 +177,7 @@ class Learner:
         if said:
             said = f"refused: {said}"
         else:
-            accepted, said = self._take(played)
+            accepted, said = self._accept(played)
         if accepted and beyond is not None:
             self._beyond = beyond
         self.history.append(
@@ -251,15 +253,15 @@ class Learner:
             return played, float("nan"), float("nan"), astray
         return played, float(distance.mean()), float(distance.max()), astray
 
-    def _take(self, run: PlayedRun) -> tuple[bool, str]:
+    def _accept(self, run: PlayedRun) -> tuple[bool, str]:
         """Use a run; return whether it was used, and what was done and why."""
         unlike = self._runs.unlike(run)
         if unlike:
             if self._pending is not None and not self._runs.differ(run, self._pending):
                 before, self._pending = self._pending, None
                 self._begin()
-                said = self._use(before)
-                said = self._use(self._seen_by_model(run)) + said.removeprefix(_FIRST)
+                said = self._learn_from(before)
+                said = self._learn_from(self._seen_by_model(run)) + said.removeprefix(_FIRST)
                 return True, (
                     f"the limb has changed ({unlike}, as in the run before): learning starts again "
                     f"from these two runs; {said}"
@@ -270,9 +272,9 @@ class Learner:
                 "rest has changed and learning starts again"
             )
         self._pending = None
-        return True, self._use(run)
+        return True, self._learn_from(run)
 
-    def _use(self, run: PlayedRun) -> str:
+    def _learn_from(self, run: PlayedRun) -> str:
         said = ""
         if self._best is None:
             run, said = self._adapt(run)

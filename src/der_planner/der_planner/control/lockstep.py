@@ -118,7 +118,7 @@ def play(
     plant: Plant,
     feedback: Feedback | None = None,
     sensors: Sensors | None = None,
-    held: float = 0.0,
+    hold_time: float = 0.0,
     event: Callable[[float], None] = lambda _time: None,
 ) -> Played:
     """Play a plan from rest, with feedback or without.
@@ -128,10 +128,10 @@ def play(
         plant: at rest.
         feedback: of the plan.
         sensors: what it is told.
-        held: for so long after its end the plan's last command is held [s].
+        hold_time: for so long after its end the plan's last command is held [s].
         event: called at every instant of a command or a picture, before the limb moves on.
     """
-    return _Loop(plan, plant, feedback, sensors or Sensors(), event).run(held)
+    return _Loop(plan, plant, feedback, sensors or Sensors(), event).run(hold_time)
 
 
 class _Loop:
@@ -150,30 +150,30 @@ class _Loop:
         self._coming: list[Array] = []
         self._covariance = sensors.covariance(plan.limb.segment_count)
 
-    def run(self, held: float) -> Played:
+    def run(self, hold_time: float) -> Played:
         plan, sensors = self._plan, self._sensors
-        count = len(plan.time) + round(held / CONTROL_PERIOD)
+        count = len(plan.time) + round(hold_time / CONTROL_PERIOD)
         place = np.minimum(np.arange(count), len(plan.time) - 1)
         planned, reference = plan.differential_pressure[place], plan.tip_reference[place]
         ahead = max(1, round(sensors.lead / CONTROL_PERIOD))
         rows = []
         for k in range(ahead):
-            self._ask(k, planned)
+            self._next_command(k, planned)
         for k in range(count):
             instant = k * CONTROL_PERIOD
             self._event(instant)
             if self._feedback is not None:
-                self._tell(instant)
-            self._ask(k + ahead, planned)
+                self._inform(instant)
+            self._next_command(k + ahead, planned)
             command = self._coming.pop(0)
-            rows.append(self._look(instant, command))
+            rows.append(self._state(instant, command))
             self._advance(instant, command)
         columns = [np.array(column) for column in zip(*rows, strict=True)]
-        commanded, held_by, bend, tip, estimated, missing = columns
+        commanded, differential, bend, tip, estimated, missing = columns
         return Played(
             np.arange(count, dtype=np.float64) * CONTROL_PERIOD,
             commanded,
-            held_by,
+            differential,
             bend,
             tip,
             reference,
@@ -182,13 +182,13 @@ class _Loop:
             missing,
         )
 
-    def _ask(self, k: int, planned: Array) -> None:
+    def _next_command(self, k: int, planned: Array) -> None:
         if self._feedback is None:
             self._coming.append(planned[min(k, len(planned) - 1)])
         else:
             self._coming.append(self._feedback.command(k * CONTROL_PERIOD))
 
-    def _tell(self, instant: float) -> None:
+    def _inform(self, instant: float) -> None:
         if self._feedback is None:
             return
         noise = self._sensors.pressure_noise * self._draw.standard_normal(
@@ -199,7 +199,7 @@ class _Loop:
             _, taken, bend, tip = heapq.heappop(self._pictures)
             self._feedback.measure(taken, bend, tip, self._covariance)
 
-    def _look(self, instant: float, command: Array) -> tuple[Array, ...]:
+    def _state(self, instant: float, command: Array) -> tuple[Array, ...]:
         plant, nothing = self._plant, np.full(2, np.nan)
         estimated, missing = nothing, np.full(len(command), np.nan)
         if self._feedback is not None:

@@ -30,14 +30,14 @@ Whole = NDArray[np.signedinteger[Any]]
 
 STEP = CONTROL_PERIOD / STEPS
 """Fine step [s]: the grid of the estimator; `STEPS` of them make a control period."""
-_HELD = 40
+_HOLD = 40
 """Control periods after the plan's end for which the model is rolled on; what comes later is as
 the last of them."""
 _SEGMENTS_KNOWN = 0.02
 """Where a bend moves the tip by less than this per radian, a tip error says nothing about it
 [m/rad]."""
-_BEND_CHANGE, _RATE_CHANGE, _ACCELERATION_CHANGE = 1e-4, 1e-2, 1e-1
-"""Of the finite differences [rad], [rad/s], [rad/s²]."""
+_CHANGES = (1e-4, 1e-2, 1e-1)
+"""Changes of bend, rate and acceleration for finite differences [rad], [rad/s], [rad/s²]."""
 
 
 class Nominal:
@@ -69,8 +69,8 @@ class Nominal:
         model = plan.body if isinstance(plan.body, RodModel) else RodModel(plan.limb)
         self.model = model
         self.kinematics = model.kinematics
-        held = np.repeat(plan.differential_pressure[-1:], _HELD, axis=0)
-        self.commands = np.concatenate([plan.differential_pressure, held])
+        last = np.repeat(plan.differential_pressure[-1:], _HOLD, axis=0)
+        self.commands = np.concatenate([plan.differential_pressure, last])
         count = len(self.commands)
         time = np.arange(count, dtype=np.float64) * CONTROL_PERIOD
         start = plan.reference.start
@@ -86,7 +86,7 @@ class Nominal:
             ),
         )
         self.reference = np.concatenate(
-            [plan.tip_reference, np.repeat(plan.tip_reference[-1:], _HELD, axis=0)]
+            [plan.tip_reference, np.repeat(plan.tip_reference[-1:], _HOLD, axis=0)]
         )
         known = self._known_disturbance(plan, response.tip[: len(plan.time)])
         tip, bend = response.tip[:-1] + known, response.bend_angles[:-1]
@@ -148,7 +148,7 @@ class Nominal:
         if plan.model != "der":
             return np.zeros_like(self.reference)
         known = plan.tip_predicted - model_tip
-        return np.concatenate([known, np.repeat(known[-1:], _HELD, axis=0)])
+        return np.concatenate([known, np.repeat(known[-1:], _HOLD, axis=0)])
 
     def _bend_of(self, bend: Array, moved: Array) -> Array:
         """Return changes of bend (K', M) [rad] that move the tip by (K', 2) [m].
@@ -167,8 +167,7 @@ class Nominal:
         v, a = self._bend_spline(time, 1), self._bend_spline(time, 2)
         count, inputs = q.shape
         each = []
-        changes = (_BEND_CHANGE, _RATE_CHANGE, _ACCELERATION_CHANGE)
-        for place, size in enumerate(changes):
+        for place, size in enumerate(_CHANGES):
             columns = []
             for i in range(inputs):
                 moved = [q, v, a], [q, v, a]

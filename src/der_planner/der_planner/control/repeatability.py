@@ -34,9 +34,9 @@ _PRIOR_FACTOR = 3.0
 _FADE = 2.0
 """Time in which the disturbance fades beyond the first and last picture [s]."""
 _UNLIKE = 4.0
-"""A run that differs from the others by so many standard deviations is not one of them …"""
+"""Difference of a run from the others beyond which it is not one of them [standard deviations]."""
 _NOTABLE = 1.5e-3
-"""… if it also differs by more than this, root mean square [m]."""
+"""Difference of a run from the others that always is too small to tell, root mean square [m]."""
 _SHARES = np.geomspace(0.003, 3.0, 61)
 _DEVIATIONS = np.geomspace(3e-6, 3e-2, 81)
 
@@ -139,7 +139,7 @@ class Runs:
     Args:
         reference: r̄ (K, 2) at the setpoints [m].
         period: of the setpoints [s].
-        tip_per_pressure: way of the tip per pressure [m/Pa].
+        tip_per_pressure: movement of the tip per pressure [m/Pa].
     """
 
     def __init__(self, reference: Array, period: float, tip_per_pressure: float) -> None:

@@ -31,10 +31,9 @@ REASONS = {
 
 
 _SHRINKS = 0.7
-"""A swing whose next way is less than this share of the longest before dies out."""
+"""Share of the largest swing before below which a swing dies out."""
 _JUMP = 1.5
-"""Where a correction's way, or the limb's swing, is so many times what it was before, it was not
-the loop but an event, as a push is: what swung before it does not count."""
+"""Factor by which a correction, or the limb, swings more at once where something hit the limb."""
 
 
 @dataclass(frozen=True)
@@ -171,9 +170,9 @@ class Supervisor:
             self._turns = [_Turns(limits.swing * self.authority) for _ in correction]
         for turns, value in zip(self._turns, correction, strict=True):
             turns.add(time, float(value), swing)
-            way = turns.oscillation(time, limits.turns, limits.window)
-            if way > 0.0 and time - self._astray_at <= limits.window:
-                self.stop(time, "oscillation", way)
+            distance = turns.oscillation(time, limits.turns, limits.window)
+            if distance > 0.0 and time - self._astray_at <= limits.window:
+                self.stop(time, "oscillation", distance)
 
     def late(self, time: float, by: float) -> None:
         """Note that a command came after its instant [s], and by how much [s]."""
@@ -203,24 +202,24 @@ class _Turn:
 
     Attributes:
         time: [s].
-        way: from the turn before [Pa].
+        distance: from the turn before [Pa].
         swing: largest rate of the limb's deviation since the turn before [rad/s].
     """
 
     time: float
-    way: float
+    distance: float
     swing: float
 
     def jumps(self, before: _Turn) -> bool:
-        """Tell if this turn is much larger than the one before."""
-        return self.way > _JUMP * before.way or self.swing > _JUMP * before.swing
+        """Tell if this turn is much larger than the one before, as after a push."""
+        return self.distance > _JUMP * before.distance or self.swing > _JUMP * before.swing
 
 
 class _Turns:
     """Finds where a series turns round by more than a threshold.
 
     Args:
-        threshold: of the way back from an extreme.
+        threshold: change back from an extreme that counts as a turn.
     """
 
     def __init__(self, threshold: float) -> None:
@@ -249,16 +248,16 @@ class _Turns:
         self._last, self._rising, self._swing = extreme, rising, 0.0
 
     def oscillation(self, time: float, turns: int, window: float) -> float:
-        """Return the way between two turns if they are many and nothing dies out, else 0.
+        """Return the distance between two turns if they are many and none dies out, else 0.
 
-        A correction that is cut at its limit keeps its way while the limb's swing dies out.
+        A correction that is cut at its limit keeps its distance while the limb's swing dies out.
         """
         recent = [turn for turn in self._found if turn.time > time - window][-turns:]
         if len(recent) < turns:
             return 0.0
         last, before = recent[-1], recent[:-1]
-        if last.way < _SHRINKS * max(turn.way for turn in before):
+        if last.distance < _SHRINKS * max(turn.distance for turn in before):
             return 0.0
         if last.swing < _SHRINKS * max(turn.swing for turn in before):
             return 0.0
-        return last.way
+        return last.distance

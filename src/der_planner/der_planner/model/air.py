@@ -184,12 +184,12 @@ def pair_of(differential: Array) -> Array:
 
 def _delayed(command: Array, start: Array, delay: float, steps: int) -> Array:
     """Return the commands (K·S, M) in force in each step, ``delay`` steps late."""
-    held = np.repeat(command, steps, axis=0)
+    in_force = np.repeat(command, steps, axis=0)
     if delay > 0:
         whole, part = int(delay), delay - int(delay)
-        padded = np.concatenate([np.tile(start, (whole + 1, 1)), held])
-        held = (1 - part) * padded[1 : len(held) + 1] + part * padded[: len(held)]
-    return held
+        padded = np.concatenate([np.tile(start, (whole + 1, 1)), in_force])
+        in_force = (1 - part) * padded[1 : len(in_force) + 1] + part * padded[: len(in_force)]
+    return in_force
 
 
 @njit(cache=True, nogil=True)
@@ -217,11 +217,11 @@ def lag_rate(pressure: float, law: AirLaw) -> float:
 @njit(cache=True, nogil=True)
 def fallen(pressure: float, goal: float, span: float, law: AirLaw) -> tuple[float, bool]:
     """Return the pressure [Pa] of a vented chamber after a time [s], and if its outlet held it."""
-    held = vented(pressure, law.vent_speed * span, law.vent_exponent)
+    choked = vented(pressure, law.vent_speed * span, law.vent_exponent)
     if law.lag_exponent > 0.0 and goal == 0.0:
-        return held, True
+        return choked, True
     led = goal + (pressure - goal) * np.exp(-span * lag_rate(pressure, law))
-    return max(held, led), held > led
+    return max(choked, led), choked > led
 
 
 @njit(cache=True, nogil=True)

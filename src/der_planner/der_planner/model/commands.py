@@ -52,8 +52,8 @@ def _drawn_out(air: Air, command: Array, period: float, time: Array, pressure: A
     best, least = command, np.full(command.shape[1], np.inf)
     for share in _SHARES_BEFORE:
         ramps = _limit_slew(_advanced(command, step, share), command[0], step)
-        held = air.follow(ramps, period, 2, pressure[0]).differential.mean(axis=1)
-        missed = ((held - wanted) ** 2).sum(axis=0)
+        reached = air.follow(ramps, period, 2, pressure[0]).differential.mean(axis=1)
+        missed = ((reached - wanted) ** 2).sum(axis=0)
         best, least = np.where(missed < least, ramps, best), np.minimum(missed, least)
     return best
 
@@ -190,9 +190,9 @@ def slow_venting(air: Air, time: Array, pressure: Array) -> SlowVenting | None:
     both = np.minimum(chambers[0], chambers[1])
     j = int(np.argmax(both.max(axis=0)))
     fall = -np.gradient(np.abs(pressure[:, j]), time)
-    held = np.maximum(chambers[0, :, j], chambers[1, :, j])
+    fuller = np.maximum(chambers[0, :, j], chambers[1, :, j])
     of = air.pneumatics
-    possible = of.vent_rate * (held / VENT_REFERENCE) ** of.vent_exponent
+    possible = of.vent_rate * (fuller / VENT_REFERENCE) ** of.vent_exponent
     k = int(np.argmax(fall - possible))
     return SlowVenting(
         j, float(time[k]), float(fall[k]), float(possible[k]), float(both[:, j].max())

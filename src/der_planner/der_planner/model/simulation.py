@@ -229,8 +229,8 @@ def _from_commands(
         window = drive.window(command)
 
         def along_bend(change: Array) -> tuple[Array, Array]:
-            held = np.einsum("wsjm,jm->wsm", window.by_command(), change)
-            return np.einsum("wsij,wsj->wsi", window.slopes, held), still
+            differential = np.einsum("wsjm,jm->wsm", window.by_command(), change)
+            return np.einsum("wsij,wsj->wsi", window.slopes, differential), still
 
         return _Felt(window.effective, window.differential, still, drive.memory(), along_bend)
     chambers = model.air.follow(command, period, steps, before)
@@ -239,8 +239,10 @@ def _from_commands(
     effective, memory = material.slow(middle, flat, initial.memory)
 
     def at_rest(change: Array) -> tuple[Array, Array]:
-        held = np.einsum("wsjm,jm->wsm", chambers.derivative(), change).reshape(flat.shape)
-        return material.slow_change(middle, flat, held, initial.memory).reshape(shape), still
+        differential = np.einsum("wsjm,jm->wsm", chambers.derivative(), change).reshape(flat.shape)
+        return material.slow_change(middle, flat, differential, initial.memory).reshape(
+            shape
+        ), still
 
     return _Felt(effective.reshape(shape), chambers.differential, still, memory, at_rest)
 
@@ -267,8 +269,8 @@ def _from_pressures(
             moved = np.einsum("kij,kj->ki", material.slopes(pressure, effective), given)
         return means_between(moved, steps), moved[0]
 
-    held = means_between(pressure, steps)
-    return _Felt(means_between(effective, steps), held, effective[0], left, change)
+    differential = means_between(pressure, steps)
+    return _Felt(means_between(effective, steps), differential, effective[0], left, change)
 
 
 def means_between(pressure: Array, steps: int) -> Array:
@@ -355,8 +357,8 @@ class Drive:
         begin = max(0, first - self._remembered)
         before = command[begin - 1] if begin else self.before
         chambers = self._air.follow(command[begin:], self.period, self.steps, before)
-        held = chambers.differential[first - begin :]
-        effective = self._material.without_memory(held, self._taken[first : len(command)])
+        differential = chambers.differential[first - begin :]
+        effective = self._material.without_memory(differential, self._taken[first : len(command)])
         return Window(self._material, first, chambers, begin, effective)
 
     def memory(self) -> Memory:

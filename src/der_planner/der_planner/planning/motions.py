@@ -254,7 +254,7 @@ class Motion:
         sign = (-1.0) ** place if self.name == "opposite_direction" else 1.0 + 0.0 * place
         phase = 2 * np.pi * (time[:, None] - lag) / self.period
         wave = 0.5 * self.amplitude * sign * (1 - np.cos(phase))
-        angles = rest.sag + wave * smooth_step(time / (self.period / 4))[:, None]
+        angles = rest.bend_by_load + wave * smooth_step(time / (self.period / 4))[:, None]
         rate = 2 * np.pi / self.period
         last = phase[-1]
         state = (
@@ -271,7 +271,12 @@ class Motion:
         rest, path = workspace.rest, self.path
         if path is None:
             path = paths.draw_shape(
-                self.name, workspace.arcs, self.amplitude, self.period, self.cycles, rest.sag
+                self.name,
+                workspace.arcs,
+                self.amplitude,
+                self.period,
+                self.cycles,
+                rest.bend_by_load,
             )
         if self.nearest:
             return self._nearest_motion(workspace, path)

@@ -336,9 +336,9 @@ class _Search:
 def _cheapest(total: Array, origin: Array, travel: Array, axis: int) -> tuple[Array, Array]:
     """Return the least cost to come to each state along one axis of the grid, and from where."""
     costs, sources = np.moveaxis(total, axis, -1), np.moveaxis(origin, axis, -1)
-    ways = costs[..., None, :] + travel
-    best = ways.argmin(axis=-1)
-    least = np.take_along_axis(ways, best[..., None], axis=-1)[..., 0]
+    arriving = costs[..., None, :] + travel
+    best = arriving.argmin(axis=-1)
+    least = np.take_along_axis(arriving, best[..., None], axis=-1)[..., 0]
     return (
         np.moveaxis(least, -1, axis),
         np.moveaxis(np.take_along_axis(sources, best, axis=-1), -1, axis),

@@ -228,9 +228,9 @@ class Optimiser:
         if self.model.air.vents_slowly:
             # A chamber that falls as fast as its outlet lets it does not react to its command: the
             # chambers' response differs from command to command.
-            held = linear.sensitivity(None)[1:] * slope
+            by_pressure = linear.sensitivity(None)[1:] * slope
             spread = window.by_command().mean(axis=1)
-            products = np.moveaxis(held, 3, 0) @ np.moveaxis(spread, 2, 0)[:, None]
+            products = np.moveaxis(by_pressure, 3, 0) @ np.moveaxis(spread, 2, 0)[:, None]
             sensitivity = np.moveaxis(products, 0, 3)
         else:
             sensitivity = linear.sensitivity(self._pulse)[1:] * slope

@@ -236,7 +236,7 @@ def draw_shape(
     amplitude: float,
     period: float,
     cycles: int,
-    sag: Array | None = None,
+    from_bend: Array | None = None,
 ) -> TipPath:
     """Return a shape as a timed path around the tip of a limb bent by 1.2 times the amplitude.
 
@@ -249,11 +249,11 @@ def draw_shape(
         amplitude: bend angle that sets place and size [rad].
         period: of one cycle [s].
         cycles: how many.
-        sag: (M,) bend angles from which the amplitude counts [rad]; None: straight.
+        from_bend: (M,) bend angles from which the amplitude counts [rad]; None: straight.
     """
     bend = np.full(kinematics.segment_count, 1.2 * amplitude)
-    if sag is not None:
-        bend = bend + sag
+    if from_bend is not None:
+        bend = bend + from_bend
     centre = kinematics.tip(bend)
     length = float(kinematics.tip(np.zeros(kinematics.segment_count))[0])
     radius = SHAPE_SIZE * length * amplitude / (np.pi / 4)

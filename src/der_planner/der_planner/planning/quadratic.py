@@ -13,9 +13,9 @@ from der_planner.planning.errors import PlanningError
 Array = NDArray[np.float64]
 
 _PRESSURE = 1e3
-"""The solver works in kPa …"""
+"""Pressure of one unit of the solver [Pa]: in kPa and mm its tolerances mean something."""
 _LENGTH = 1e-3
-"""… and mm, so that its tolerances mean something."""
+"""Length of one unit of the solver [m]."""
 
 
 @dataclass(frozen=True)

@@ -64,12 +64,12 @@ class Rest:
 
     Attributes:
         bend_angles: (M,) under the loads [rad].
-        sag: (M,) what the loads alone add to the bend without loads [rad].
+        bend_by_load: (M,) what the loads alone add to the bend without loads [rad].
         offset: (2,) of the rod's tip from that of these arcs [m]: stretch, and what arcs cannot do.
     """
 
     bend_angles: Array
-    sag: Array
+    bend_by_load: Array
     offset: Array
 
 
