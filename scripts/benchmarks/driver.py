@@ -26,8 +26,7 @@ from der_msgs.msg import (
     PressureState,
 )
 from der_planner.experiment.client import GraphClient
-from der_planner.experiment.errors import GraphError
-from der_planner.experiment.processes import NodeProcess
+from der_planner.experiment.processes import GraphError, NodeProcess
 from limb_interfaces import qos, topics
 from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
 
@@ -39,7 +38,7 @@ PRESSES = 200
 
 
 @dataclass
-class Seen:
+class Heard:
     """What the benchmark has heard while one case ran."""
 
     commands: list[ChamberPressures] = field(default_factory=list)
@@ -67,18 +66,6 @@ def _nodes(case: str, port: str, folder: Path) -> list[tuple[str, str, dict[str,
     ]
 
 
-@contextlib.contextmanager
-def _burners(count: int) -> Iterator[None]:
-    """Keep cores busy with processes that never sleep."""
-    running = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
-    try:
-        yield
-    finally:
-        for process in running:
-            process.kill()
-            process.wait()
-
-
 NODE = """
 import time, rclpy
 rclpy.init()
@@ -88,14 +75,16 @@ time.sleep(3.0)
 
 
 @contextlib.contextmanager
-def _passers_by() -> Iterator[None]:
-    """Have a node a second appear, stay for three seconds and go."""
+def _company(busy: bool, passing: bool) -> Iterator[None]:
+    """Keep every core busy with a process that never sleeps, and have a node a second appear."""
     end, running = threading.Event(), []
 
     def appear() -> None:
-        while not end.wait(1.0):
+        while passing and not end.wait(1.0):
             running.append(subprocess.Popen([sys.executable, "-c", NODE]))
 
+    for _ in range(os.cpu_count() or 1 if busy else 0):
+        running.append(subprocess.Popen([sys.executable, "-c", "while True: pass"]))
     thread = threading.Thread(target=appear)
     thread.start()
     try:
@@ -115,7 +104,7 @@ def _arm(client: GraphClient) -> bool:
     return False
 
 
-def _press(client: GraphClient, seen: Seen, count: int) -> list[float]:
+def _press(client: GraphClient, seen: Heard, count: int) -> list[float]:
     """Press `vent` under a small command; return the times [s] until it is on the wire."""
     publisher = client.node.create_publisher(
         PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS
@@ -201,11 +190,7 @@ class Samples:
     setpoints: int
     latency: list[float]
     """From a setpoint's stamp to its first byte at the board."""
-    jitter: list[float]
-    """Of the intervals between first bytes."""
     late_at_driver: int
-    processor: dict[str, float] = field(default_factory=dict)
-    """Per cent of one core, by the node's name."""
     ticks: dict[str, float] = field(default_factory=dict)
     """Percentiles [ms] of the driver's own ticks, on its own clock."""
     real_time_priority: str = ""
@@ -215,29 +200,25 @@ class Samples:
     """1 if the run ended or was vented."""
 
 
-def _compare(wanted: Setpoints, seen: Seen) -> Samples:
+def _compare(wanted: Setpoints, seen: Heard) -> Samples:
     """Compare what was asked with what the board received, on the board's clock."""
     by_tick: dict[int, ChamberPressures] = {}
     for command in seen.commands:
         by_tick.setdefault(nanoseconds(command.header.stamp) // PERIOD * PERIOD, command)
-    latency, stamps = [], []
+    latency = []
     for stamp, values in wanted.items():
         command = by_tick.get(stamp)
         if command is None:
             continue
         pressure = np.array(command.pressure)
         if np.abs(pressure[0::2] - pressure[1::2] - values).max() < 1.5:
-            stamps.append(nanoseconds(command.header.stamp))
-            latency.append((stamps[-1] - stamp) / 1e9)
-    interval = np.diff(stamps) / 1e9
-    jitter = np.abs(interval[interval < 1.5 * PERIOD / 1e9] - PERIOD / 1e9)
-    return Samples(len(wanted), latency, jitter.tolist(), seen.states[-1].setpoints_late)
+            latency.append((nanoseconds(command.header.stamp) - stamp) / 1e9)
+    return Samples(len(wanted), latency, seen.states[-1].setpoints_late)
 
 
 def _figures(case: str, played: list[Samples]) -> dict[str, float | str]:
     """Return the figures of a case from all its playings together."""
     latency = np.array([value for each in played for value in each.latency])
-    jitter = np.array([value for each in played for value in each.jitter])
     count = sum(each.setpoints for each in played)
     figures: dict[str, float | str] = {
         f"{case}_setpoints": float(count),
@@ -246,24 +227,15 @@ def _figures(case: str, played: list[Samples]) -> dict[str, float | str]:
         f"{case}_setpoints_late_at_the_driver": float(sum(each.late_at_driver for each in played)),
     }
     figures |= _percentiles(f"{case}_stamp_to_first_byte", latency)
-    figures |= _percentiles(f"{case}_tick_jitter", jitter)
     figures[f"{case}_runs_ended_or_vented"] = float(sum(each.lost for each in played))
     if presses := [value for each in played for value in each.presses]:
         figures[f"{case}_vent_presses"] = float(len(presses))
         figures |= _percentiles(f"{case}_vent_press_to_first_byte", np.array(presses))
-    for name in played[0].processor:
-        mean = float(np.mean([each.processor[name] for each in played]))
-        figures[f"{case}_cpu_{name}_percent"] = mean
     for name in played[0].ticks:
         figures[f"{case}_{name}"] = float(np.median([each.ticks[name] for each in played]))
     if played[0].real_time_priority:
         figures[f"{case}_real_time_priority"] = played[0].real_time_priority
     return figures
-
-
-def evaluate(case: str, wanted: Setpoints, seen: Seen) -> dict[str, float | str]:
-    """Return the figures of one playing of a case."""
-    return _figures(case, [_compare(wanted, seen)])
 
 
 def _percentiles(name: str, values: NDArray[np.float64]) -> dict[str, float | str]:
@@ -280,7 +252,7 @@ def _measure(case: str, seconds: float, presses: int = 0) -> Samples:
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="der_limb_driver_")))
         client = stack.enter_context(GraphClient("benchmark"))
-        seen = Seen()
+        seen = Heard()
         client.subscribe(
             ChamberPressures, topics.TWIN_BOARD_COMMANDS, qos.SETPOINTS, seen.commands.append
         )
@@ -296,17 +268,9 @@ def _measure(case: str, seconds: float, presses: int = 0) -> Samples:
                 client.wait_for(lambda: os.path.lexists(port), 60.0, "the emulated port")
         client.wait_ready(processes)
         client.call("pressure_driver/arm", 20.0)
-        if case in ("busy", "ordinary", "storm"):
-            stack.enter_context(_burners(os.cpu_count() or 1))
-        if case == "storm":
-            stack.enter_context(_passers_by())
-        before = {name: process.measure_cpu() for name, process in processes.items()}
-        begin = time.monotonic()
+        stack.enter_context(_company(case not in ("quiet", "graph"), case == "storm"))
         wanted = play(client, seconds)
-        wall = time.monotonic() - begin
         samples = _compare(wanted, seen)
-        for name, process in processes.items():
-            samples.processor[name] = 100.0 * (process.measure_cpu() - before[name]) / wall
         client.spin(1.1)
         told = client.diagnostic_values("pressure_driver")
         samples.ticks = {k: float(v) for k, v in told.items() if k.startswith("tick_to_")}

@@ -47,11 +47,11 @@ class Simulation:
 
     @property
     def mode(self):
-        return self.core.mode
+        return self.core.machine.mode
 
     @property
     def faults(self):
-        return tuple(self.core.faults)
+        return tuple(self.core.machine.faults)
 
     @property
     def gauge(self):
@@ -111,7 +111,7 @@ class Simulation:
 
     def arm(self):
         """Wait until the driver may be armed, and arm it."""
-        self.run_until(lambda: not self.core.obstacles())
+        self.run_until(lambda: not self.core.machine.obstacles(self.steady))
         assert self.core.arm() == (True, "armed")
         self.armings += 1
 
@@ -132,7 +132,7 @@ class Simulation:
         for index in range(round(seconds * 1e9 / PERIOD)):
             verdict = self.offer(shape(index * PERIOD / 1e9), index=index)
             if self.mode is not Mode.FAULT:
-                assert verdict is Verdict.ACCEPTED, self.core.last_refusal
+                assert verdict is Verdict.ACCEPTED, self.core.machine.schedule.reason
             self.tick()
 
     def track(self, seconds=3.0):

@@ -18,10 +18,10 @@ STEP = 10_000.0
 
 def outputs(sim, ticks):
     """Run and return what was commanded at each tick (K, 2) [Pa], with what was before."""
-    found = [sim.core.snapshot().commanded_differential]
+    found = [sim.core.state()["commanded_differential"]]
     for _ in range(ticks):
         sim.tick()
-        found.append(sim.core.snapshot().commanded_differential)
+        found.append(sim.core.state()["commanded_differential"])
     return np.array(found)
 
 
@@ -52,7 +52,7 @@ def test_a_plan_that_streams_on_through_a_vent_is_refused_after_the_next_arming(
     for _ in range(40):
         verdict = sim.offer((9_000.0, 0.0), plan_id="plan of arming 1", index=next(rest))
         assert verdict is Verdict.REFUSED
-        assert "before the driver was armed" in sim.core.last_refusal
+        assert "before the driver was armed" in sim.core.machine.schedule.reason
         sim.tick()
         assert sim.is_vent(sim.sent[-1])
     assert sim.offer((1_000.0, 0.0), plan_id="new") is Verdict.ACCEPTED
@@ -84,7 +84,7 @@ def test_setpoints_without_a_plan_must_pause_after_a_vent(simulate):
         sim.tick()
     for _ in range(60):
         assert typed() is Verdict.REFUSED
-        assert "stop them" in sim.core.last_refusal
+        assert "stop them" in sim.core.machine.schedule.reason
         sim.tick()
     sim.run(RELEASE_TIME + 0.05)
     assert typed() is Verdict.ACCEPTED
@@ -129,10 +129,10 @@ def test_a_second_publisher_is_refused_whatever_its_plan_is_called(simulate, pla
     for _ in range(40):
         assert one.publish(plan_id) is Verdict.ACCEPTED
         assert other.publish(plan_id) is Verdict.REFUSED
-        assert "another publisher" in sim.core.last_refusal
+        assert "another publisher" in sim.core.machine.schedule.reason
         sim.tick()
-        assert sim.core.snapshot().commanded_differential[0] >= 0.0
-    assert sim.core._machine.publishers.refused == 40
+        assert sim.core.state()["commanded_differential"][0] >= 0.0
+    assert sim.core.machine.publishers.refused == 40
     # The first one ends: the second is refused until the driver is armed again.
     for _ in range(80):
         assert other.publish(plan_id) is Verdict.REFUSED
@@ -153,7 +153,7 @@ def test_two_publishers_that_count_in_step_are_both_refused(simulate):
             verdicts.append(publisher.publish())
         sim.tick()
     assert verdicts[4:].count(Verdict.ACCEPTED) == 0
-    assert "two publishers" in sim.core.last_refusal
+    assert "two publishers" in sim.core.machine.schedule.reason
     assert sim.mode is not Mode.TRACKING
     sim.run(3.0)
     assert one.publish() is Verdict.REFUSED
@@ -210,7 +210,7 @@ def test_a_setpoint_that_waits_through_a_ramp_down_is_approached_and_counted(
     assert commanded[:, 0].max() == 24_000.0
     if interpolation == "hold":
         assert 0.0 in commanded[:, 0], "let down while it waited"
-        assert sim.core._machine.limited_ticks == 2
+        assert sim.core.machine.limited_ticks == 2
 
 
 def test_interpolation_goes_on_from_what_is_commanded_and_not_from_the_last_setpoint(simulate):
@@ -219,7 +219,7 @@ def test_interpolation_goes_on_from_what_is_commanded_and_not_from_the_last_setp
     sim.stream(1.5, lambda t: (min(20_000.0 * t, 20_000.0), 0.0))
     sim.run_until(lambda: sim.mode is Mode.VENTING)
     sim.run(1.0)
-    before = sim.core.snapshot().commanded_differential[0]
+    before = sim.core.state()["commanded_differential"][0]
     assert 0.0 < before < 12_000.0
     assert sim.offer((0.0, 0.0), ahead=0.5, plan_id="to zero") is Verdict.ACCEPTED
     commanded = outputs(sim, 12)[:, 0]
@@ -238,7 +238,7 @@ def test_the_first_setpoint_after_arming_is_approached_from_zero(simulate):
     commanded = outputs(sim, 20)
     assert steepest(commanded) <= 1_000.0 * (1.0 + 1e-6)
     assert commanded[-1, 0] > 0.0
-    assert sim.core._machine.limited_ticks > 0
+    assert sim.core.machine.limited_ticks > 0
 
 
 def test_random_setpoints_never_step_the_output(simulate):
@@ -254,7 +254,7 @@ def test_random_setpoints_never_step_the_output(simulate):
                 plan = f"plan {generator.integers(0, 40)}"
                 sim.offer(value, ahead, plan, index)
             sim.tick()
-            commanded.append(sim.core.snapshot().commanded_differential)
+            commanded.append(sim.core.state()["commanded_differential"])
             if sim.mode is Mode.FAULT:
                 break
         live = np.array(commanded)
@@ -273,14 +273,14 @@ def test_a_higher_revision_that_comes_in_time_replaces_the_earlier_one(simulate)
     assert sim.offer((2_000.0, 0.0), index=5) is Verdict.DUPLICATE
     assert sim.offer((3_000.0, 0.0), index=5, revision=2) is Verdict.ACCEPTED
     assert sim.offer((4_000.0, 0.0), index=5, revision=1) is Verdict.DUPLICATE
-    assert "revision 2" in sim.core.last_refusal
+    assert "revision 2" in sim.core.machine.schedule.reason
     assert sim.offer((5_000.0, 0.0), index=6, revision=3) is Verdict.DUPLICATE
     stamp = sim.wall + 4 * TICK
     sim.run(0.2)
-    assert sim.core.setpoint.differential == (3_000.0, 0.0)
+    assert sim.core.machine.schedule.current.differential == (3_000.0, 0.0)
     late = Setpoint(stamp, (6_000.0, 0.0), "plan of arming 1", 5, 3)
     assert sim.core.offer(late, sim.wall) is Verdict.LATE
-    counters = sim.core.counters
+    counters = sim.core.machine.schedule.counters
     assert (counters.accepted, counters.executed, counters.superseded) == (2, 1, 1)
 
 
@@ -292,10 +292,12 @@ def test_a_horizon_that_is_revised_at_every_tick_is_played_newest_first(simulate
         for index in range(step + 1, step + 5):
             value = (100.0 * index + 10.0 * (step + 1), 0.0)
             item = Setpoint(start + index * TICK, value, "horizon", index, step)
-            assert sim.core.offer(item, sim.wall) is Verdict.ACCEPTED, sim.core.last_refusal
+            assert sim.core.offer(item, sim.wall) is Verdict.ACCEPTED, (
+                sim.core.machine.schedule.reason
+            )
         sim.tick()
-        assert sim.core.snapshot().commanded_differential[0] == 110.0 * (step + 1)
-    assert sim.core.counters.missing == 0
+        assert sim.core.state()["commanded_differential"][0] == 110.0 * (step + 1)
+    assert sim.core.machine.schedule.counters.missing == 0
 
 
 def test_gaps_in_the_index_are_counted(simulate):
@@ -304,4 +306,4 @@ def test_gaps_in_the_index_are_counted(simulate):
     for index in (0, 1, 4, 5, 9):
         sim.offer((100.0 * index, 0.0), 0.05 * (index + 1), index=index)
     sim.run(0.6)
-    assert sim.core.counters.missing == 5
+    assert sim.core.machine.schedule.counters.missing == 5

@@ -4,7 +4,9 @@ import contextlib
 import os
 import pty
 import signal
+import subprocess
 import time
+import uuid
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ import pytest
 from driver_bench import difference
 
 from der_msgs.msg import PressureSetpoint, PressureState
+from der_planner.experiment.processes import find_executable
 
 pytestmark = pytest.mark.graph
 
@@ -78,8 +81,6 @@ def test_an_exception_vents(bench):
 
 def start_on_terminal(run):
     """Start the driver in the foreground of a pseudo-terminal of its own, as in a window."""
-    from der_planner.experiment.processes import find_executable
-
     command = [str(find_executable("pressure_driver", "pressure_driver")), "--ros-args"]
     for name, value in run.parameters.items():
         command += ["-p", f"{name}:={value}"]
@@ -111,19 +112,9 @@ def test_a_closed_terminal_vents(bench):
     assert np.ptp(difference(run.commands[-1])) == 0.0
 
 
-@pytest.mark.parametrize(
-    ("package", "executable"),
-    [
-        ("pressure_driver", "pressure_driver"),
-        ("pressure_driver", "board_emulator"),
-        ("der_planner", "planner"),
-        ("der_planner", "recorder"),
-        ("apriltag_tracker", "apriltag_tracker"),
-    ],
-)
-def test_a_signal_while_a_node_is_being_loaded_ends_it_without_a_word(graph, package, executable):
+def test_a_signal_while_a_node_is_being_loaded_ends_it_without_a_word(graph):
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
-        node = graph.start(package, executable, name=f"{executable}_{number}")
+        node = graph.start("pressure_driver", "board_emulator", name=f"board_{number}")
         status = f"/proc/{node.pid}/status"
 
         def caught(bit=1 << number - 1, status=status):
@@ -142,3 +133,29 @@ def test_a_signal_while_a_node_is_being_loaded_ends_it_without_a_word(graph, pac
             time.sleep(0.01)
         assert node.exit_code == 0, node.last_words()
         assert "Traceback" not in node.log.read_text()
+
+
+@pytest.mark.parametrize("nohup", [False, True])
+def test_signals_that_come_again_change_nothing_and_nohup_is_respected(graph, nohup):
+    link = f"/tmp/der_limb_board_test_{uuid.uuid4().hex[:8]}"
+    command = [str(find_executable("pressure_driver", "board_emulator")), "--ros-args"]
+    process = subprocess.Popen(
+        [*(["nohup"] if nohup else []), *command, "-p", f"port_link:={link}"],
+        env={**os.environ, "ROS_DOMAIN_ID": str(graph.domain_id)},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        graph.client.wait_ready(["board_emulator"])
+        if nohup:
+            process.send_signal(signal.SIGHUP)
+            graph.client.spin(1.0)
+            assert process.poll() is None
+        while process.poll() is None:
+            process.send_signal(signal.SIGINT)
+            time.sleep(0.002)
+        assert process.returncode == 0
+    finally:
+        process.kill()
+        process.wait()

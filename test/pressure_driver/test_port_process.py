@@ -341,7 +341,7 @@ def test_a_board_that_takes_no_bytes_does_not_stop_the_ticks(in_thread):
         process, thread = in_thread(
             settings, lambda process: setattr(process, "grid", TickGrid(1_000_000))
         )
-        wait_for(lambda: "takes no bytes" in process.core._machine.link_fault, "the fault")
+        wait_for(lambda: "takes no bytes" in process.core.machine.link_fault, "the fault")
         process.ending = True
         thread.join(30.0)
         assert not thread.is_alive()
@@ -356,7 +356,7 @@ def test_an_exception_in_the_process_vents(make_rig, in_thread):
     settings = Settings(port=str(rig.port.link), real_time_priority=0)
     process, thread = in_thread(settings)
     wait_for(lambda: process.core.arm()[0], "the driver to be armed")
-    process.core._machine._follow = lambda *_: 1 / 0
+    process.core.machine._follow = lambda *_: 1 / 0
     thread.join(30.0)
     assert not thread.is_alive()
     wait_for(lambda: rig.vents()[-3:] == [True] * 3, "the last commands")

@@ -93,7 +93,7 @@ def test_air_trapped_in_all_chambers_is_not_taken_for_rest(simulate, protocol):
     assert sim.vented
     # A ctrlp board tells gauge pressures only.
     room = 101_325.0 if protocol == "ctrlp" else sim.board.pneumatics.atmosphere
-    assert sim.core.atmosphere == pytest.approx(room, abs=250.0)
+    assert sim.core.monitor.rest.mean == pytest.approx(room, abs=250.0)
 
 
 def test_with_the_rooms_pressure_given_less_trapped_air_is_seen_too(simulate):
@@ -128,10 +128,10 @@ def test_rest_is_not_taken_again_from_chambers_that_rest_higher_than_before(simu
     sim.arm()
     sim.core.vent()
     sim.run_until(lambda: sim.mode is Mode.DISARMED)
-    before = sim.core.atmosphere
+    before = sim.core.monitor.rest.mean
     trap(sim, 2_000.0)
     sim.run(6.0)
-    assert sim.core.atmosphere == pytest.approx(before, abs=20.0)
+    assert sim.core.monitor.rest.mean == pytest.approx(before, abs=20.0)
     assert "not vented yet" in sim.core.arm()[1]
 
 
@@ -144,7 +144,7 @@ def test_a_zero_that_was_trapped_air_shows_as_soon_as_it_escapes(simulate):
     sim.run_until(lambda: sim.mode is Mode.FAULT, 5.0)
     assert "below its rest pressure" in sim.faults[0]
     sim.run_until(lambda: sim.core.arm()[0], 8.0)
-    assert sim.core.atmosphere == pytest.approx(sim.board.pneumatics.atmosphere, abs=250.0)
+    assert sim.core.monitor.rest.mean == pytest.approx(sim.board.pneumatics.atmosphere, abs=250.0)
 
 
 # ------------------------------------------------------------------- numbers that are none
@@ -183,7 +183,7 @@ def test_a_few_bad_readings_are_only_skipped(simulate):
         sim.core.received(b"[MPR]: nan 1013.00 1013.00 1013.00\n")
         sim.run(0.5)
     assert sim.mode is Mode.ARMED
-    assert np.isfinite(sim.core.snapshot().measured_chamber).all()
+    assert np.isfinite(sim.core.state()["measured_chamber"]).all()
 
 
 # --------------------------------------------------------------------------- faults and texts
@@ -208,7 +208,7 @@ def test_faults_are_bounded(simulate):
     sim = simulate()
     sim.arm()
     for index in range(1_000):
-        sim.core._machine.fail(f"board reports trouble {index}")
+        sim.core.machine.fail(f"board reports trouble {index}")
     assert len(sim.faults) == MOST_FAULTS
 
 
@@ -233,7 +233,7 @@ def test_reports_of_another_language_are_said_to_be_so(simulate):
     telemetry = sim.board.telemetry
     sim.board.telemetry = lambda: telemetry().replace(b".", b",")  # a decimal comma
     sim.run(3.0)
-    (obstacle,) = sim.core.obstacles()
+    (obstacle,) = sim.core.machine.obstacles(sim.steady)
     assert "not of this language" in obstacle
     assert sim.core.protocol.last_damaged.startswith("[VAL]: 0,00")
     assert not sim.core.arm()[0]

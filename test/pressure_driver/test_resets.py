@@ -43,7 +43,7 @@ def test_a_ctrlp_board_that_boots_late_reports_and_gets_no_pressure_in_psi(simul
     sim = simulate("ctrlp")
     sim.board.restart(3.0)
     sim.run(2.0)
-    assert "kPa" in sim.core.obstacles()[0]
+    assert "kPa" in sim.core.machine.obstacles(sim.steady)[0]
     sim.track()
     assert sim.core.protocol.unsettled == ""
     assert 4_000.0 < sim.gauge.max() < 12_000.0
@@ -76,7 +76,7 @@ def test_echoes_that_stop_are_a_fault_within_two_seconds(simulate, protocol):
     assert sim.mode is Mode.FAULT
     assert sim.steady - begin < 2.0
     assert "not answered" in " ".join(sim.faults)
-    assert "not answered" in " ".join(sim.core.obstacles())
+    assert "not answered" in " ".join(sim.core.machine.obstacles(sim.steady))
     sim.have()
     sim.arm()
 

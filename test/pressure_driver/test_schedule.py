@@ -1,6 +1,5 @@
 """Timed setpoints: when they take effect, and what is refused."""
 
-import numpy as np
 import pytest
 
 from pressure_driver import schedule as schedule_module
@@ -215,37 +214,3 @@ def test_a_stepped_wall_clock_moves_the_grid_and_does_not_stop_it(step):
     assert sum(t is not None for t in ticks) >= 39
     assert all(t == moved + (11 + k) * PERIOD for k, t in enumerate(ticks) if t is not None)
     assert grid.clock_steps == 1
-
-
-@pytest.mark.slow
-def test_two_hours_of_setpoints_without_drift():
-    """At 20 Hz on clocks that drift by 80 ppm, are slewed, and wake the thread late."""
-    generator = np.random.default_rng(14)
-    grid = TickGrid(PERIOD)
-    schedule = SetpointSchedule(Settings())
-    count = 2 * 3600 * 20
-    lateness = generator.exponential(60_000.0, count + 10).astype(np.int64)
-    drift = 80e-6 * np.sin(np.linspace(0.0, 9.0, count + 10))
-    drift_by_tick = (drift * PERIOD).astype(np.int64)
-    values = (3000.0 * np.sin(np.arange(count) * 0.01)).tolist()
-    wall, steady = NOW + 17, 0
-    grid.take(wall, steady)
-    executed = 0
-    for k in range(count):
-        stamp = NOW + (k + 4) * PERIOD
-        schedule.offer(Setpoint(stamp, (values[k], 0.0), "day", k), wall, ZERO)
-        wait = round(grid.delay(wall) * 1e9) + int(lateness[k])
-        wall += wait
-        steady += wait + int(drift_by_tick[k])
-        instant = grid.take(wall, steady)
-        sample = schedule.sample(instant)
-        if sample is not None:
-            assert sample.fresh
-            assert sample.setpoint.stamp == instant
-            assert sample.setpoint.index == executed
-            executed += 1
-    assert schedule.counters.accepted == count
-    assert executed == schedule.counters.executed == count - 3
-    assert grid.missed == grid.clock_steps == 0
-    assert schedule.counters.late == schedule.counters.refused == schedule.counters.superseded == 0
-    assert wall - (NOW + count * PERIOD) < 2_000_000

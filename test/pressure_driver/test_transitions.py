@@ -24,7 +24,7 @@ def test_a_whole_life(simulate, protocol):
     assert order == [
         Mode.DISARMED, Mode.ARMED, Mode.TRACKING, Mode.HOLDING, Mode.VENTING, Mode.ARMED,
     ]  # fmt: skip
-    counters = sim.core.counters
+    counters = sim.core.machine.schedule.counters
     assert counters.accepted == counters.executed == 80
     assert counters.late == counters.refused == counters.duplicate == 0
     assert sim.core.vent()[0]
@@ -53,10 +53,10 @@ def test_holding_goes_on_with_the_next_setpoint(simulate):
     sim = simulate()
     sim.track()
     sim.run_until(lambda: sim.mode is Mode.HOLDING)
-    held = sim.core.snapshot().commanded_differential
+    held = sim.core.state()["commanded_differential"]
     assert sim.offer(held, plan_id="next") is Verdict.ACCEPTED
     sim.run_until(lambda: sim.mode is Mode.TRACKING, 0.3)
-    assert sim.core.setpoint.plan_id == "next"
+    assert sim.core.machine.schedule.current.plan_id == "next"
 
 
 def test_holding_keeps_the_last_pressures_for_the_hold_time(simulate):
@@ -65,11 +65,11 @@ def test_holding_keeps_the_last_pressures_for_the_hold_time(simulate):
     last = None
     silence = 0
     while sim.mode in (Mode.TRACKING, Mode.HOLDING):
-        snapshot = sim.core.snapshot()
-        if snapshot.setpoint.stamp == last:
+        setpoint = sim.core.machine.schedule.current
+        if setpoint.stamp == last:
             silence += 1
-            assert snapshot.commanded_differential == snapshot.setpoint.differential
-        last = snapshot.setpoint.stamp
+            assert sim.core.machine.differential == setpoint.differential
+        last = setpoint.stamp
         sim.tick()
     assert silence * 0.05 == pytest.approx(1.2, abs=0.06)
 
@@ -78,10 +78,10 @@ def test_the_ramp_down_is_as_fast_as_it_says_and_keeps_the_shape(simulate):
     sim = simulate(vent_rate=8_000.0)
     sim.track()
     sim.run_until(lambda: sim.mode is Mode.VENTING)
-    commanded = [sim.core.snapshot().commanded_differential]
+    commanded = [sim.core.state()["commanded_differential"]]
     while sim.mode is Mode.VENTING:
         sim.tick()
-        commanded.append(sim.core.snapshot().commanded_differential)
+        commanded.append(sim.core.state()["commanded_differential"])
     commanded = np.array(commanded)
     largest = np.abs(commanded).max(axis=1)
     assert np.diff(largest)[:-1] == pytest.approx(-400.0)
@@ -117,7 +117,7 @@ def test_vent_works_in_every_live_state_and_is_latched(simulate, protocol, mode)
     sim.run_until(lambda: sim.mode is Mode.DISARMED, 6.0)
     assert sim.vented
     assert sim.offer((1_000.0, 0.0)) is Verdict.REFUSED
-    assert "arm first" in sim.core.last_refusal
+    assert "arm first" in sim.core.machine.schedule.reason
     sim.arm()
 
 
@@ -176,7 +176,7 @@ def test_rest_pressures_are_the_sensors_own(simulate, seed):
     sim = simulate(seed=seed)
     sim.arm()
     reading = sim.board.pneumatics.pressure + sim.board._offset
-    assert sim.core._monitor.rest.pressure == pytest.approx(reading, abs=8.0)
+    assert sim.core.monitor.rest.pressure == pytest.approx(reading, abs=8.0)
 
 
 def test_rest_pressures_are_not_taken_from_chambers_under_pressure(simulate):
@@ -189,7 +189,7 @@ def test_rest_pressures_are_not_taken_from_chambers_under_pressure(simulate):
     assert not sim.core.arm()[0]
     sim.have()
     sim.run_until(lambda: sim.core.arm()[0], 8.0)
-    assert sim.core.atmosphere == pytest.approx(sim.board.pneumatics.atmosphere, abs=250.0)
+    assert sim.core.monitor.rest.mean == pytest.approx(sim.board.pneumatics.atmosphere, abs=250.0)
 
 
 @pytest.mark.parametrize("given", [False, True])
@@ -210,7 +210,7 @@ def test_a_driver_that_finds_the_limb_under_pressure_vents_it_without_a_false_al
 def test_a_given_atmosphere_is_used_as_it_is(simulate):
     sim = simulate(atmosphere=101_000.0)
     sim.run(1.0)
-    assert sim.core.atmosphere == 101_000.0
+    assert sim.core.monitor.rest.mean == 101_000.0
 
 
 def test_untimed_commands(simulate):

@@ -163,7 +163,7 @@ class BoardProcess:
         self._write(data)
         self._late_to_write.append((time.time_ns() - instant) / NANOSECONDS)
         self.core.sent()
-        self._send("state", vars(self.core.snapshot()), self._bytes_sent, self._bytes_received)
+        self._send("state", self.core.state(), self._bytes_sent, self._bytes_received)
         self._renew_emergency()
         now = time.monotonic()
         if now - self._diagnosed_at >= DIAGNOSTICS_PERIOD:
@@ -214,7 +214,7 @@ class BoardProcess:
         now = time.monotonic()
         if verdict is not Verdict.ACCEPTED and now - self._refused_at >= REFUSAL_PERIOD:
             self._refused_at = now
-            self._log(f"{verdict.value}: {self.core.last_refusal}", True)
+            self._log(f"{verdict.value}: {self.core.machine.schedule.reason}", True)
 
     def _show_life(self) -> None:
         """Say something at least every `LONGEST_WAIT`, and notice a node that says nothing."""

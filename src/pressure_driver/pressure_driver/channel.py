@@ -7,7 +7,7 @@ Messages are JSON lists that begin with a word. From the node: ``setpoint``, ``a
 ``port``        vent command (hexadecimal); if the port was opened, its descriptor comes along
 ``lost``        the port is gone
 ``failed``      the port cannot be opened: a sentence
-``state``       the `Snapshot` of each tick, bytes sent, bytes received
+``state``       the state at each tick, bytes sent, bytes received
 ``diagnostics`` level, sentence, values
 ``log``         sentence, whether it is a warning
 ``answer``      to ``arm`` and ``vent``: whether it was done, a sentence

@@ -8,7 +8,6 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 from pressure_driver.admission import Origin
@@ -26,7 +25,7 @@ from pressure_driver.protocols.base import (
     Telemetry,
 )
 from pressure_driver.safety import LIVE, Mode, SafetyMachine
-from pressure_driver.schedule import Counters, Setpoint, Verdict
+from pressure_driver.schedule import Setpoint, Verdict
 from pressure_driver.settings import NANOSECONDS, Settings
 from pressure_driver.telemetry import TelemetryMonitor
 
@@ -34,33 +33,6 @@ LARGEST_CLOCK_STEP = 0.3
 """[s] between two ticks, above slewing and late wakes, that means the wall clock was set."""
 MOST_TEXTS = 20
 """Texts of the board that wait to be logged, one a tick; more are only counted."""
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """The driver at one tick, by the names of `der_msgs/PressureState`."""
-
-    tick: int
-    """[ns]"""
-    setpoint_stamp: int
-    """[ns]"""
-    mode: int
-    faults: list[str]
-    plan_id: str
-    index: int
-    commanded_differential: list[float]
-    measured_differential: list[float]
-    commanded_chamber: list[float]
-    measured_chamber: list[float]
-    valve_opening: list[float]
-    supply_pressure: float
-    telemetry_age: float
-    round_trip: float
-    setpoints_accepted: int
-    setpoints_executed: int
-    setpoints_late: int
-    setpoints_duplicate: int
-    setpoints_refused: int
 
 
 class DriverCore:
@@ -91,10 +63,9 @@ class DriverCore:
         self._settings = settings
         self._steady = steady
         self._log = log
-        self._monitor = TelemetryMonitor(protocol, settings)
-        self._machine = SafetyMachine(settings, self._monitor)
-        self._schedule = self._machine.schedule
-        self._board = BoardWatch(protocol, settings)
+        self.monitor = TelemetryMonitor(protocol, settings)
+        self.machine = SafetyMachine(settings, self.monitor)
+        self.board = BoardWatch(protocol, settings)
         self._texts: deque[str] = deque()
         self._last_tick = 0
         self._last_mode = Mode.DISARMED
@@ -109,18 +80,18 @@ class DriverCore:
     def arm(self) -> tuple[bool, str]:
         """Allow pressure; returns whether, and a sentence."""
         now = self._steady()
-        was_live = self._machine.mode in LIVE
-        result = self._machine.arm(now)
+        was_live = self.machine.mode in LIVE
+        result = self.machine.arm(now)
         if result[0] and not was_live:
             # What the board did meanwhile by itself must not be what it goes on with.
             self.protocol.doubt()
-            self._board.greet_now(now)
+            self.board.greet_now(now)
         self._note_mode()
         return result
 
     def vent(self) -> tuple[bool, str]:
         """Open all chambers and refuse setpoints until armed again."""
-        result = self._machine.vent(self._steady())
+        result = self.machine.vent(self._steady())
         self._note_mode()
         return result
 
@@ -132,105 +103,67 @@ class DriverCore:
             wall: [ns] wall clock.
             origin: where it came from; None inside one program.
         """
-        return self._machine.offer(setpoint, wall, self._steady(), origin)
+        return self.machine.offer(setpoint, wall, self._steady(), origin)
 
     def drop_setpoints(self) -> None:
         """Forget those that wait: the stream counts as ended."""
-        self._schedule.clear()
+        self.machine.schedule.clear()
 
     # ----------------------------------------------------------------------------- state
 
-    def obstacles(self) -> list[str]:
-        """Return what forbids arming now."""
-        return self._machine.obstacles(self._steady())
-
-    @property
-    def atmosphere(self) -> float:
-        """[Pa] measured or given; NaN before."""
-        return self._monitor.rest.mean
-
-    @property
-    def identity(self) -> BoardIdentity | None:
-        """How the board has introduced itself; None before, and where the protocol has no such."""
-        return self._board.identity
-
-    @property
-    def last_refusal(self) -> str:
-        """Why the last setpoint that was not accepted was not."""
-        return self._schedule.reason
-
-    @property
-    def counters(self) -> Counters:
-        """What happened to setpoints since the start."""
-        return self._schedule.counters
-
-    @property
-    def setpoint(self) -> Setpoint | None:
-        """The setpoint in force."""
-        return self._schedule.current
-
-    @property
-    def mode(self) -> Mode:
-        """The state of the state machine."""
-        return self._machine.mode
-
-    @property
-    def faults(self) -> list[str]:
-        """Why the mode is FAULT, worst first."""
-        return self._machine.faults
-
     def highest_pressure(self) -> float:
         """Return the highest gauge pressure [Pa] that was measured; 0 where it counts as none."""
-        pressure = max(self._monitor.gauge)
+        pressure = max(self.monitor.gauge)
         return pressure if pressure > self._settings.vented_tolerance else 0.0
 
-    def snapshot(self) -> Snapshot:
-        """Return the driver as it is now."""
-        monitor, machine, counters = self._monitor, self._machine, self.counters
+    def state(self) -> dict[str, Any]:
+        """Return the driver at this tick, by the names of `der_msgs/PressureState`."""
+        monitor, machine = self.monitor, self.machine
         gauge, base = monitor.gauge, self._wire_atmosphere()
-        current = self.setpoint or Setpoint(0, ())
-        return Snapshot(
-            tick=self._last_tick,
-            setpoint_stamp=current.stamp,
-            mode=machine.mode,
-            faults=machine.faults,
-            plan_id=current.plan_id,
-            index=current.index,
-            commanded_differential=list(machine.differential),
-            measured_differential=[a - b for a, b in zip(gauge[0::2], gauge[1::2], strict=True)],
-            commanded_chamber=[base + value for value in chamber_gauge(machine.differential)],
-            measured_chamber=list(monitor.chamber_pressure),
-            valve_opening=monitor.valve_opening,
-            supply_pressure=monitor.supply_pressure,
-            telemetry_age=monitor.telemetry_age(self._steady()),
-            round_trip=self._board.round_trip,
-            setpoints_accepted=counters.accepted,
-            setpoints_executed=counters.executed,
-            setpoints_late=counters.late,
-            setpoints_duplicate=counters.duplicate,
-            setpoints_refused=counters.refused,
-        )
+        current = machine.schedule.current or Setpoint(0, ())
+        counters = machine.schedule.counters
+        return {
+            "tick": self._last_tick,
+            "setpoint_stamp": current.stamp,
+            "mode": machine.mode,
+            "faults": machine.faults,
+            "plan_id": current.plan_id,
+            "index": current.index,
+            "commanded_differential": list(machine.differential),
+            "measured_differential": [a - b for a, b in zip(gauge[0::2], gauge[1::2], strict=True)],
+            "commanded_chamber": [base + value for value in chamber_gauge(machine.differential)],
+            "measured_chamber": list(monitor.chamber_pressure),
+            "valve_opening": monitor.valve_opening,
+            "supply_pressure": monitor.supply_pressure,
+            "telemetry_age": monitor.telemetry_age(self._steady()),
+            "round_trip": self.board.round_trip,
+            "setpoints_accepted": counters.accepted,
+            "setpoints_executed": counters.executed,
+            "setpoints_late": counters.late,
+            "setpoints_duplicate": counters.duplicate,
+            "setpoints_refused": counters.refused,
+        }
 
     def diagnostics(self) -> tuple[str, str, dict[str, Any]]:
         """Return the level, a sentence and the values for the diagnostics."""
-        machine, protocol, monitor = self._machine, self.protocol, self._monitor
-        obstacles = self.obstacles()
+        machine, protocol, monitor = self.machine, self.protocol, self.monitor
+        obstacles = machine.obstacles(self._steady())
         values = {
             "mode": machine.mode.name,
             "faults": "; ".join(machine.faults) or "none",
             "obstacles_to_arming": "; ".join(obstacles) or "none",
-            "last_refusal": self.last_refusal or "none",
+            "last_refusal": machine.schedule.reason or "none",
             "protocol": protocol.name,
             "protocol_weaknesses": "; ".join(protocol.weaknesses) or "none",
-            "board": self.identity.firmware if self.identity else self.last_text,
-            "atmosphere_pa": f"{self.atmosphere:.0f}",
+            "board": self.board.identity.firmware if self.board.identity else self.last_text,
+            "atmosphere_pa": f"{self.monitor.rest.mean:.0f}",
             "telemetry_age_s": f"{monitor.telemetry_age(self._steady()):.3f}",
-            "round_trip_s": f"{self._board.round_trip:.4f}",
+            "round_trip_s": f"{self.board.round_trip:.4f}",
             "damaged_frames": protocol.rejected,
             "last_damaged_line": protocol.last_damaged or "none",
-            "setpoints_waiting": self._schedule.waiting,
-            "setpoints_superseded": self.counters.superseded,
-            "setpoints_missing": self.counters.missing,
+            "setpoints_waiting": self.machine.schedule.waiting,
+            "setpoints_superseded": machine.schedule.counters.superseded,
+            "setpoints_missing": machine.schedule.counters.missing,
             "setpoints_of_other_publishers": machine.publishers.refused,
             "ticks_held_back_by_slew_limit": machine.limited_ticks,
             "board_texts_not_logged": self.unlogged_texts,
@@ -251,9 +184,9 @@ class DriverCore:
         """Greet and vent: whatever the board held before, it lets go of now."""
         now = self._steady()
         self.protocol.reset()
-        self._monitor.forget()
-        self._machine.link_fault = ""
-        self._board.opened(now)
+        self.monitor.forget()
+        self.machine.link_fault = ""
+        self.board.opened(now)
         self._watch_board(now)
         return self.protocol.start() + self._vent_bytes()
 
@@ -263,21 +196,21 @@ class DriverCore:
         self._watch_wall_clock(instant, now)
         self._last_tick = instant
         self._watch_board(now)
-        vent = self._machine.tick(instant, now)
+        vent = self.machine.tick(instant, now)
         self.venting = vent or bool(self.protocol.unsettled)
         if self.venting:
-            self._machine.command_nothing()
-            return self._board.greeting(now) + self._vent_bytes()
+            self.machine.command_nothing()
+            return self.board.greeting(now) + self._vent_bytes()
         data, self._pending_number = self.protocol.setpoint(
-            self._machine.differential, self._wire_atmosphere(), self._settings.command_validity
+            self.machine.differential, self._wire_atmosphere(), self._settings.command_validity
         )
         return data
 
     def sent(self) -> None:
         """Do what can wait until the bytes of the tick are out."""
         now = self._steady()
-        self._monitor.command(self._machine.differential, now)
-        self._board.has_sent(self._pending_number, now)
+        self.monitor.command(self.machine.differential, now)
+        self.board.has_sent(self._pending_number, now)
         self._note_mode()
         self._note_limit()
         self._note_start()
@@ -289,7 +222,7 @@ class DriverCore:
         return self.protocol.separator + self._vent_bytes()
 
     def _wire_atmosphere(self) -> float:
-        return self.atmosphere if self._monitor.rest.known else STANDARD_ATMOSPHERE
+        return self.monitor.rest.mean if self.monitor.rest.known else STANDARD_ATMOSPHERE
 
     def _vent_bytes(self) -> bytes:
         data, self._pending_number = self.protocol.vent(self._wire_atmosphere())
@@ -302,8 +235,8 @@ class DriverCore:
         self._clock_offset = offset
         if self._last_tick and abs(step) > LARGEST_CLOCK_STEP:
             self._log(f"the clock was set by {step:.1f} s: waiting setpoints are dropped", True)
-            self._schedule.clear()
-            self._schedule.forget_ticks()
+            self.machine.schedule.clear()
+            self.machine.schedule.forget_ticks()
 
     # --------------------------------------------------------------------- from the board
 
@@ -315,52 +248,52 @@ class DriverCore:
         for event in events:
             self._serve(event, now)
         readings = sum(isinstance(event, Telemetry) for event in events)
-        self._monitor.count_lines(readings, self.protocol.rejected - rejected, now)
+        self.monitor.count_lines(readings, self.protocol.rejected - rejected, now)
         self._watch_board(now)
 
     def lost(self, reason: str) -> None:
         """The port is gone: everything that was armed faults."""
-        self._machine.link_fault = reason
-        self._monitor.forget()
+        self.machine.link_fault = reason
+        self.monitor.forget()
         self._note_mode()
 
     def _serve(self, event: Event, now: float) -> None:
         if isinstance(event, Telemetry):
             # Rest pressures are measured only where nothing has been asked of the chambers.
-            resting = self._machine.mode in (Mode.DISARMED, Mode.FAULT)
-            self._monitor.receive(event, now, resting)
+            resting = self.machine.mode in (Mode.DISARMED, Mode.FAULT)
+            self.monitor.receive(event, now, resting)
             if event.chamber_pressure is not None:
-                self._board.reports(self._monitor.chamber_pressure)
+                self.board.reports(self.monitor.chamber_pressure)
         elif isinstance(event, Echo):
-            self._board.take_echo(event, now)
+            self.board.take_echo(event, now)
         elif isinstance(event, BoardReport):
             self._log_text(event.text)
             if event.fatal:
-                self._machine.fail(f"board reports {event.text}")
+                self.machine.fail(f"board reports {event.text}")
         elif isinstance(event, BoardReset):
             self._set_up_anew(event, now)
         elif isinstance(event, BoardIdentity):
-            self._board.check_identity(event)
+            self.board.check_identity(event)
         elif isinstance(event, BoardText):
             self.last_text = event.text
-            self._board.says_words()
+            self.board.says_words()
             self._log_text(event.text)
 
     def _set_up_anew(self, reset: BoardReset, now: float) -> None:
         """Greet a board that has been reset; what was being played must not be played on."""
         self._log(f"the board has been reset: {reset.sign}", True)
-        self._board.has_reset(self._monitor.chamber_pressure, now)
-        self._monitor.forget()
-        if self._machine.mode in LIVE:
-            self._machine.fail(f"the board has been reset: {reset.sign}")
+        self.board.has_reset(self.monitor.chamber_pressure, now)
+        self.monitor.forget()
+        if self.machine.mode in LIVE:
+            self.machine.fail(f"the board has been reset: {reset.sign}")
 
     def _watch_board(self, now: float) -> None:
         """Find out whether the board is set up, reports, and takes commands."""
-        if self._monitor.telemetry_faults(now):
+        if self.monitor.telemetry_faults(now):
             self.protocol.doubt()
-        if (silence := self._board.silence(now)) and self._machine.mode in LIVE:
-            self._machine.fail(silence)
-        self._machine.board_obstacle = self._board.obstacle(now)
+        if (silence := self.board.silence(now)) and self.machine.mode in LIVE:
+            self.machine.fail(silence)
+        self.machine.board_obstacle = self.board.obstacle(now)
 
     # -------------------------------------------------------------------------- to the log
 
@@ -375,7 +308,7 @@ class DriverCore:
 
     def _note_limit(self) -> None:
         """Say when the slew limit begins to hold the output back."""
-        limited = self._machine.limited_ticks
+        limited = self.machine.limited_ticks
         if limited > self._limited_noted and not self._was_limited:
             self._log("the slew limit holds the output back: it follows the setpoints late", True)
         self._was_limited = limited > self._limited_noted
@@ -383,14 +316,14 @@ class DriverCore:
 
     def _note_start(self) -> None:
         """Warn once of a board that has started with pressure in its chambers."""
-        warning = self._board.started_under_pressure(self._monitor.rest.pressure)
+        warning = self.board.started_under_pressure(self.monitor.rest.pressure)
         if warning and not self._start_noted:
             self._log(warning, True)
         self._start_noted = bool(warning)
 
     def _note_mode(self) -> None:
-        mode = self._machine.mode
+        mode = self.machine.mode
         if mode is not self._last_mode:
-            reasons = ": " + "; ".join(self._machine.faults) if mode is Mode.FAULT else ""
+            reasons = ": " + "; ".join(self.machine.faults) if mode is Mode.FAULT else ""
             self._log(f"{self._last_mode.name} -> {mode.name}{reasons}", mode is Mode.FAULT)
             self._last_mode = mode

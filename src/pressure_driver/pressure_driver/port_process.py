@@ -40,7 +40,7 @@ class PortProcess:
 
     def __init__(self, settings: Settings, on_message: Callable[[], None]) -> None:
         self.states: deque[tuple[dict[str, Any], int, int]] = deque(maxlen=100)
-        """`Snapshot` by names, bytes sent, bytes received: of each tick, until they are taken."""
+        """State by names, bytes sent, bytes received: of each tick, until they are taken."""
         self.log: deque[tuple[str, bool]] = deque(maxlen=200)
         """Sentences for the log, and whether they are warnings, until they are taken."""
         self.diagnostics: tuple[str, str, dict[str, Any]] = ("stale", "starting", {})

@@ -232,7 +232,7 @@ def from_options(given: argparse.Namespace) -> Settings:
 def parameter_file(node: str) -> str:
     """Return the text of a node's parameter file, which holds the defaults."""
     lines = [
-        f"# Parameters of {node} with their defaults: written by python3 -m {__name__}",
+        f"# Parameters of {node} with their defaults, as pressure_driver/settings.py writes them.",
         f"# `ros2 param describe /limb/{node} NAME` tells the range of each.",
         f"/**/{node}:",
         "  ros__parameters:",

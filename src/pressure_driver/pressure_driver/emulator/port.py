@@ -7,7 +7,6 @@ import ctypes
 import fcntl
 import os
 import pty
-import sys
 import tty
 from collections import deque
 from collections.abc import Callable
@@ -204,8 +203,6 @@ class LineTap:
 
     def __init__(self, device: str) -> None:
         self._descriptor = -1
-        if sys.platform != "linux":
-            return
         library = ctypes.CDLL(None, use_errno=True)
         descriptor = library.inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC)
         if descriptor < 0:

@@ -35,6 +35,8 @@ HEADER = struct.Struct("<BBH")
 HELLO_BODY = struct.Struct("<BiiIB")
 SETPOINT_HEAD = struct.Struct("<H")
 STATUS_HEAD = struct.Struct("<IHBII")
+LONGEST_FRAME = 256
+"""[bytes] as coded; a longer one is garbage."""
 LARGEST_GAUGE = 1_000_000
 """[Pa] A frame with more is refused."""
 LONGEST_VALIDITY = 60_000
@@ -47,65 +49,6 @@ def crc16(data: bytes) -> int:
     Check value: ``crc16(b"123456789") == 0x29B1``.
     """
     return binascii.crc_hqx(data, 0xFFFF)
-
-
-def stuff(data: bytes) -> bytes:
-    """Return ``data`` coded without zero bytes; on the wire one zero byte ends it."""
-    coded: bytes = cobs.encode(data)
-    return coded
-
-
-def unstuff(coded: bytes) -> bytes | None:
-    """Return the data of a coded frame (without its ending zero), or None if it is damaged."""
-    if not coded:
-        return None
-    try:
-        data: bytes = cobs.decode(coded)
-    except cobs.DecodeError:
-        return None
-    return data
-
-
-class FrameSplitter:
-    """Cuts a byte stream at zero bytes and checks each frame.
-
-    Args:
-        longest: coded bytes; longer frames are dropped as garbage.
-    """
-
-    def __init__(self, longest: int = 256) -> None:
-        self._pieces = StreamCutter(b"\0", longest)
-        self.rejected = 0
-
-    def feed(self, data: bytes) -> list[tuple[int, bytes]]:
-        """Return (place of the first byte, payload without CRC) of every sound frame."""
-        frames: list[tuple[int, bytes]] = []
-        for start, coded in self._pieces.feed(data):
-            if coded == b"":
-                continue
-            payload = None if coded is None else _open(coded)
-            if payload is None:
-                self.rejected += 1
-            else:
-                frames.append((start, payload))
-        return frames
-
-    def reset(self) -> None:
-        """Forget a half-received frame."""
-        self._pieces.reset()
-
-
-def _open(coded: bytes) -> bytes | None:
-    data = unstuff(coded)
-    if data is None or len(data) < 3:
-        return None
-    payload, check = data[:-2], data[-2:]
-    return payload if crc16(payload).to_bytes(2, "little") == check else None
-
-
-def seal(payload: bytes) -> bytes:
-    """Return the wire bytes of a payload: CRC appended (low byte first), stuffed, ended by zero."""
-    return stuff(payload + crc16(payload).to_bytes(2, "little")) + b"\0"
 
 
 class FrameType(IntEnum):
@@ -147,40 +90,62 @@ class Frame:
     body: bytes
 
 
+def seal(payload: bytes) -> bytes:
+    """Return the wire bytes of a payload: CRC appended (low byte first), stuffed, ended by zero."""
+    coded: bytes = cobs.encode(payload + crc16(payload).to_bytes(2, "little"))
+    return coded + b"\0"
+
+
+def unseal(coded: bytes) -> bytes | None:
+    """Return the payload of a frame without its ending zero, or None if it is damaged."""
+    try:
+        data: bytes = cobs.decode(coded)
+    except cobs.DecodeError:
+        return None
+    payload, check = data[:-2], data[-2:]
+    return payload if crc16(payload).to_bytes(2, "little") == check else None
+
+
 def encode(kind: FrameType, sequence: int, body: bytes = b"") -> bytes:
     """Return the wire bytes of a frame."""
     return seal(HEADER.pack(VERSION, kind, sequence & 0xFFFF) + body)
 
 
-class _Frames:
-    """Splits a stream into frames of this version and known type."""
+class FrameSplitter:
+    """Cuts a byte stream into sound frames of this version and of known type.
+
+    Attributes:
+        rejected: frames that were damaged or not understood.
+    """
 
     def __init__(self) -> None:
-        self._splitter = FrameSplitter()
-        self._unknown = 0
-
-    @property
-    def rejected(self) -> int:
-        return self._splitter.rejected + self._unknown
+        self.rejected = 0
+        self._pieces = StreamCutter(b"\0", LONGEST_FRAME)
 
     def feed(self, data: bytes) -> list[tuple[int, Frame]]:
+        """Return (place of the first byte, frame) of every sound frame."""
         frames = []
-        for place, payload in self._splitter.feed(data):
-            if len(payload) < HEADER.size:
-                self._unknown += 1
+        for place, coded in self._pieces.feed(data):
+            if coded == b"":
                 continue
-            version, kind, sequence = HEADER.unpack_from(payload)
-            if version != VERSION or kind not in set(FrameType):
-                self._unknown += 1
-                continue
-            frames.append((place, Frame(FrameType(kind), sequence, payload[HEADER.size :])))
+            payload = unseal(coded) if coded else None
+            frame = _read(payload) if payload and len(payload) >= HEADER.size else None
+            if frame is None:
+                self.rejected += 1
+            else:
+                frames.append((place, frame))
         return frames
 
-    def refuse(self) -> None:
-        self._unknown += 1
-
     def reset(self) -> None:
-        self._splitter.reset()
+        """Forget a half-received frame."""
+        self._pieces.reset()
+
+
+def _read(payload: bytes) -> Frame | None:
+    version, kind, sequence = HEADER.unpack_from(payload)
+    if version != VERSION or kind not in set(FrameType):
+        return None
+    return Frame(FrameType(kind), sequence, payload[HEADER.size :])
 
 
 class NativeHost(HostProtocol):
@@ -198,7 +163,7 @@ class NativeHost(HostProtocol):
         super().__init__(chamber_count)
         if chamber_count > 32:
             raise ValueError(f"a native frame carries at most 32 chambers, got {chamber_count}")
-        self._frames = _Frames()
+        self._frames = FrameSplitter()
         self._sequence = 0
         self._board_time: int | None = None
         self._pressurising: deque[int] = deque(maxlen=128)
@@ -249,7 +214,7 @@ class NativeHost(HostProtocol):
         for _, frame in self._frames.feed(data):
             found = self._interpret(frame)
             if not found:
-                self._frames.refuse()
+                self._frames.rejected += 1
             events += found
         self.rejected = self._frames.rejected
         return events
@@ -328,7 +293,7 @@ class NativeBoard(BoardProtocol):
         self, chamber_count: int = 4, largest_pressure: int = 30_000, firmware: str = "emulator 1"
     ) -> None:
         super().__init__(chamber_count)
-        self._frames = _Frames()
+        self._frames = FrameSplitter()
         self._largest = largest_pressure
         self._firmware = firmware.encode("ascii")
         self._sequence = 0
@@ -339,7 +304,7 @@ class NativeBoard(BoardProtocol):
         for place, frame in self._frames.feed(data):
             command = self._interpret(place, frame)
             if command is None:
-                self._frames.refuse()
+                self._frames.rejected += 1
             else:
                 commands.append(command)
         self.rejected = self._frames.rejected
