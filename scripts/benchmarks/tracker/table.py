@@ -35,7 +35,7 @@ SCENES = (
 )
 
 _FIRST_SEED = 900
-"""First seed of the pictures. The deviation of corners that do not fit a tag was set with them in view."""
+"""First seed of the pictures; the deviation of badly fitting corners was set with them in view."""
 
 _WRONG = 3.0
 """A tag whose corners are further off is a false one [px]."""
