@@ -11,12 +11,10 @@ from typing import TypeVar
 ROOT = Path(__file__).resolve().parents[1]
 MOST_PARAMETERS = 8
 
-NAMED_TWICE = {
-    "Body", "Frame", "Hardware", "Piece", "Playback", "Report", "Seen", "Snapshot",
-}  # fmt: skip
+NAMED_TWICE = {"Frame", "Report", "Seen", "Snapshot"}
 """Public class names that mean two things today; no name may be added."""
 
-MANY_PARAMETERS = {"from_arrays", "parameter", "play", "simulate", "uniform"}
+MANY_PARAMETERS = {"from_arrays", "parameter", "simulate", "uniform"}
 """Functions with more than `MOST_PARAMETERS`, all named by their callers; no name may be added."""
 
 Kind = TypeVar("Kind", bound=ast.AST)

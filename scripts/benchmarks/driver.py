@@ -38,7 +38,7 @@ PRESSES = 200
 
 
 @dataclass
-class Seen:
+class Heard:
     """What the benchmark has heard while one case ran."""
 
     commands: list[ChamberPressures] = field(default_factory=list)
@@ -104,7 +104,7 @@ def _arm(client: GraphClient) -> bool:
     return False
 
 
-def _press(client: GraphClient, seen: Seen, count: int) -> list[float]:
+def _press(client: GraphClient, seen: Heard, count: int) -> list[float]:
     """Press `vent` under a small command; return the times [s] until it is on the wire."""
     publisher = client.node.create_publisher(
         PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS
@@ -200,7 +200,7 @@ class Samples:
     """1 if the run ended or was vented."""
 
 
-def _compare(wanted: Setpoints, seen: Seen) -> Samples:
+def _compare(wanted: Setpoints, seen: Heard) -> Samples:
     """Compare what was asked with what the board received, on the board's clock."""
     by_tick: dict[int, ChamberPressures] = {}
     for command in seen.commands:
@@ -252,7 +252,7 @@ def _measure(case: str, seconds: float, presses: int = 0) -> Samples:
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="der_limb_driver_")))
         client = stack.enter_context(GraphClient("benchmark"))
-        seen = Seen()
+        seen = Heard()
         client.subscribe(
             ChamberPressures, topics.TWIN_BOARD_COMMANDS, qos.SETPOINTS, seen.commands.append
         )

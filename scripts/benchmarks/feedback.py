@@ -23,7 +23,7 @@ from der_planner.bags.reader import BagReader
 from der_planner.bags.record import ESTIMATE_TYPE
 from der_planner.control.feedback import Feedback
 from der_planner.control.lockstep import Played, play
-from der_planner.identification.offline import calibrate_twin
+from der_planner.identification.excitation import calibrate_twin
 from der_planner.limb import Limb
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import Motion, plan

@@ -59,9 +59,8 @@ time.sleep(0.5)
 """
 
 
-def _recorder(folder: Path, images: bool) -> NodeProcess:
-
-    parameters = {"output": str(folder / "bag"), "autostart": True, "record_images": images}
+def _recorder(folder: Path) -> NodeProcess:
+    parameters = {"output": str(folder / "bag"), "autostart": True, "record_images": True}
     return NodeProcess("der_planner", "recorder", parameters, folder)
 
 
@@ -75,7 +74,7 @@ def record_images(seconds: float) -> dict[str, float]:
     """Record 720p mono8 images and six other topics at 30 Hz; count what is missing."""
     with tempfile.TemporaryDirectory(dir=os.environ.get("BENCHMARK_FOLDER")) as name:
         folder = Path(name)
-        process = _recorder(folder, images=True)
+        process = _recorder(folder)
         source = _play_source(seconds)
         try:
             time.sleep(2.0)
@@ -105,7 +104,7 @@ def kill_and_recover(seconds: float) -> dict[str, float]:
     """Kill the recorder while it records images; how much time is missing at the end?"""
     with tempfile.TemporaryDirectory(dir=os.environ.get("BENCHMARK_FOLDER")) as name:
         folder = Path(name)
-        process = _recorder(folder, images=True)
+        process = _recorder(folder)
         source = _play_source(seconds + 30.0)
         try:
             time.sleep(4.0 + seconds)
@@ -115,18 +114,16 @@ def kill_and_recover(seconds: float) -> dict[str, float]:
         finally:
             source.kill()
             source.wait()
-        begin = time.perf_counter()
-        report = recover_bag(folder / "bag")
-        took = time.perf_counter() - begin
-        with BagReader(folder / "bag") as bag:
-            last: dict[str, int] = {}
-            for message in bag.raw(["/limb/camera/image_raw", "/limb/bench/state_0"]):
-                last[message.topic.rsplit("/", 1)[-1]] = message.log_time
         size = sum(path.stat().st_size for path in (folder / "bag").glob("*.mcap"))
+        begin = time.perf_counter()
+        found = recover_bag(folder / "bag")
+        took = time.perf_counter() - begin
+        with BagReader(found.folder) as bag:
+            last = {message.topic: message.log_time for message in bag.raw()}
     return {
-        "killed_lost_of_images_s": (killed - last["image_raw"]) / 1e9,
-        "killed_lost_of_small_topics_s": (killed - last["state_0"]) / 1e9,
-        "recovered_messages": report.message_count,
+        "killed_lost_of_images_s": (killed - last["/limb/camera/image_raw"]) / 1e9,
+        "killed_lost_of_small_topics_s": (killed - last["/limb/bench/state_0"]) / 1e9,
+        "recovered_messages": found.message_count,
         "recover_s_per_GB": took / (size / 1e9),
     }
 
@@ -137,7 +134,9 @@ def evaluate_long_bag(minutes: float) -> dict[str, float]:
         path = Path(name) / "long"
         _write_run(path, minutes * 60.0)
         size = sum(file.stat().st_size for file in path.glob("*.mcap"))
-        took, peak = _evaluate_apart(path)
+        command = [sys.executable, "-c", EVALUATE, str(path)]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+    took, peak = map(float, done.stdout.split())
     return {
         "evaluated_bag_min": minutes,
         "evaluated_bag_MB": size / 1e6,
@@ -156,17 +155,8 @@ print(time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_SELF).ru_m
 """
 
 
-def _evaluate_apart(path: Path) -> tuple[float, float]:
-    """Evaluate in a process of its own; returns seconds and peak memory [MB]."""
-    done = subprocess.run(
-        [sys.executable, "-c", EVALUATE, str(path)], capture_output=True, text=True, check=True
-    )
-    seconds, peak = done.stdout.split()
-    return float(seconds), float(peak)
-
-
 def _write_run(path: Path, seconds: float) -> None:
-    """Write a run with every topic that the evaluation reads, and tags that it must skip."""
+    """Write a run with the topics that the evaluation reads, and tags that it must skip."""
     origin = 1_700_000_000_000_000_000
     bag = BagWriter(path)
 
@@ -184,21 +174,20 @@ def _write_run(path: Path, seconds: float) -> None:
     plan.time, plan.tip_reference = times.tolist(), tip.ravel().tolist()
     plan.tip_predicted, plan.differential_pressure = plan.tip_reference, [0.0] * 2 * len(times)
     write("/limb/plan", plan, 0.0)
-    tags = [TagDetection(id=i) for i in range(12)]
-    curve = [Point() for _ in range(41)]
+    tags = TagDetectionArray(detections=[TagDetection(id=i) for i in range(12)])
+    values = [1000.0, 1000.0]
     for frame in range(round(30 * seconds)):
         when = frame / 30
-        x, y = 0.2 + 0.02 * np.cos(when) + 0.003, 0.06 * np.sin(when) - 0.004
-        state = LimbState(valid=True, tip=Point(x=x, y=y), bend_angle=[0.1, 0.1], curve=curve)
+        place = Point(x=0.203 + 0.02 * np.cos(when), y=0.06 * np.sin(when) - 0.004)
+        curve = [Point() for _ in range(41)]
+        state = LimbState(valid=True, tip=place, bend_angle=[0.1, 0.1], curve=curve)
         write("/limb/state", state, when)
-        write("/limb/tags", TagDetectionArray(detections=tags), when)
-        if frame % 3 < 2:
-            values = [1000.0, 1000.0]
-            pressure = PressureState(commanded_differential=values, measured_differential=values)
-            write("/limb/pressure_state", pressure, when)
-            index = min(len(times) - 1, round(when * 20))
-            setpoint = PressureSetpoint(plan_id="p", index=index, differential_pressure=values)
-            write("/limb/pressure_setpoint", setpoint, float(times[index]))
+        write("/limb/tags", tags, when)
+        pressure = PressureState(commanded_differential=values, measured_differential=values)
+        write("/limb/pressure_state", pressure, when)
+    for index, when in enumerate(times):
+        setpoint = PressureSetpoint(plan_id="p", index=index, differential_pressure=values)
+        write("/limb/pressure_setpoint", setpoint, float(when))
     bag.close()
 
 

@@ -46,8 +46,6 @@ ANGLE_NOISE, TIP_NOISE, PRESSURE_NOISE = np.deg2rad(0.1), 3e-4, 5.0
 
 Mass = tuple[float, float]
 """Arc length from the clamp [m], mass [kg]."""
-Push = tuple[float, float, float, float, float]
-"""From [s], until [s], arc length [m], force toward +x and +y [N]."""
 
 
 class Seen(NamedTuple):
@@ -202,7 +200,6 @@ class LinkChain:
         generator = np.random.default_rng([self.seed, run])
         self._rest_of_run = wander * generator.standard_normal(SEGMENTS)
         self._noise, self._generator = noise, generator
-        self._carried: list[Mass] = []
         self._factor = np.ones(SEGMENTS)
         self._push = (np.array([-1.0, 0.0]), np.zeros(2))
         self._time = 0.0
@@ -241,11 +238,6 @@ class LinkChain:
         advance(self._state, held, duration / steps, steps, *self._push, self._built, self._air)
         self._time += duration
 
-    def carry(self, at: float, mass: float) -> None:
-        """Put a mass [kg] at an arc length [m] from now on; a negative one takes it away."""
-        self._carried.append((at, mass))
-        self._rebuild()
-
     def change_gain(self, factor: ArrayLike) -> None:
         """Scale the gains from now on, by one factor or one a segment (M,)."""
         self._factor = np.broadcast_to(np.asarray(factor, dtype=float), (SEGMENTS,)).copy()
@@ -257,9 +249,7 @@ class LinkChain:
         self._push = (np.array([link, along]), np.array(force, dtype=float))
 
     def _rebuild(self) -> None:
-        self._built = self._links(
-            self.gravity[:2], [*self.masses, *self._carried], self._factor, self._rest_of_run
-        )
+        self._built = self._links(self.gravity[:2], self.masses, self._factor, self._rest_of_run)
 
     def seen(self) -> Seen:
         """Return what the sensors show now, with the noise asked for in `reset`."""
@@ -296,9 +286,7 @@ class LinkChain:
         run: int = 0,
         wander: float = 0.0,
         swing: ArrayLike = (0.0, 0.0),
-        payloads: Sequence[tuple[float, float, float]] = (),
         gains: Sequence[tuple[float, ArrayLike]] = (),
-        pushes: Sequence[Push] = (),
     ) -> Record:
         """Play commands from rest and film them.
 
@@ -307,30 +295,23 @@ class LinkChain:
             commands: (K, M) [Pa].
             camera_rate: [Hz]; the first image is at ``time[0]``. 0: images at ``time``.
             noise, run, wander, swing: as of `reset`.
-            payloads: (instant [s], arc length [m], mass [kg]); a negative mass is taken away.
             gains: (instant [s], factor or (M,) factors) on the gains from then on.
-            pushes: see `Push`.
         """
         instants, wanted = np.asarray(time, dtype=float), np.asarray(commands, dtype=float)
         end = instants[-1] + 0.05
         images = instants
         if camera_rate > 0:
             images = np.arange(instants[0], end + 1e-9, 1.0 / camera_rate)
-        events = [(at, self.carry, (where, mass)) for at, where, mass in payloads]
-        events += [(at, self.change_gain, (factor,)) for at, factor in gains]
-        for first, last, where, x, y in pushes:
-            events += [(first, self.push, (where, (x, y))), (last, self.push, (where, (0, 0)))]
-        events.sort(key=lambda event: event[0])
+        changes = sorted(gains, key=lambda change: change[0])
         self.reset(run=run, noise=noise, wander=wander, swing=swing)
         self._time = float(instants[0])
         seen, held, k = [], np.zeros_like(wanted[0]), 0
-        boundaries = np.concatenate([instants, images, [at for at, _, _ in events if at < end]])
+        boundaries = np.concatenate([instants, images, [at for at, _ in changes if at < end]])
         for now in np.unique(np.round(boundaries, 9)):
             if now > self._time:
                 self._glide(held, float(now) - self._time)
-            while events and events[0][0] <= now + 1e-9:
-                _, act, given = events.pop(0)
-                act(*given)
+            while changes and changes[0][0] <= now + 1e-9:
+                self.change_gain(changes.pop(0)[1])
             if len(seen) < len(images) and abs(images[len(seen)] - now) < 1e-8:
                 seen.append((self.seen(), held))
             while k < len(instants) and instants[k] <= now + 1e-9:

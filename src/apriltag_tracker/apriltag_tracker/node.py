@@ -81,7 +81,7 @@ class TrackerNode(Node):
         )
         self._make_topics()
         if calibration:
-            self._take_calibration(Intrinsics.from_yaml(str(calibration)))
+            self._set_calibration(Intrinsics.from_yaml(str(calibration)))
         self._source_name = source
         self._source: Source | None = None
         if source == "topic":
@@ -179,9 +179,9 @@ class TrackerNode(Node):
         except CameraError as error:
             self._watch.calibration_problem = str(error)
             return
-        self._take_calibration(intrinsics)
+        self._set_calibration(intrinsics)
 
-    def _take_calibration(self, intrinsics: Intrinsics) -> None:
+    def _set_calibration(self, intrinsics: Intrinsics) -> None:
         """Take a calibration; one that is like the present one changes nothing."""
         self._watch.calibration_problem = ""
         now = self._tracker.intrinsics if self._tracker is not None else None

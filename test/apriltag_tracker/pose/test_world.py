@@ -73,12 +73,6 @@ def test_a_map_that_fits_nothing_gives_no_pose(tags, model):
     assert world.problem
 
 
-def test_no_fixed_tag_no_pose(tags, model):
-    world = WorldPose(tags, model.intrinsics)
-    assert world.update([]) is None
-    assert "no fixed tag" in world.problem
-
-
 def test_the_pose_stays_while_fixed_tags_are_covered(tags, model):
     world = WorldPose(tags, model.intrinsics)
     world.update(tags_seen(tags, model, model.pose))

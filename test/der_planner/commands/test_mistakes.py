@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from der_planner.bags.reader import parse_run
-from der_planner.bags.writer import RUN_KEY
 from der_planner.experiment.processes import find_executable
 
 SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"
@@ -70,11 +68,6 @@ def test_mistakes_are_said_before_any_work_is_done(call, module, arguments, code
     assert found == code
     assert "error: " in said
     assert words in said
-
-
-def test_metadata_that_is_no_json_text_is_no_description():
-    for value in ("{broken", 5, {"motion": "circle"}, "[1]"):
-        assert parse_run({RUN_KEY: value}) == {}
 
 
 def test_a_missing_parameter_file_is_named_by_the_node():

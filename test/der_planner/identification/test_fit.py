@@ -111,22 +111,6 @@ def test_known_parameters_are_recovered_within_their_uncertainty(fitted):
     assert report.value("gain[0]").deviation < 0.02 * report.value("gain[0]").value
 
 
-def test_each_model_term_buys_something(log, fitted):
-    _, full = fitted
-    _, linear = fit(Limb.default(), log, geometry=False, terms=())
-    _, static = fit(Limb.default(), log, geometry=False, terms=("asymmetry", "stiffening"))
-    assert full.residual.mean() < 0.5 * static.residual.mean() < 0.5 * linear.residual.mean()
-
-
-def test_unseen_motion_is_predicted(fitted):
-    limb, _ = fitted
-    time = 0.05 * np.arange(500)
-    pressure = 9000.0 * np.stack([np.sin(time / 2), np.sin(time / 3)], axis=1)
-    truth, guess = predict(hidden_limb(), time, pressure), predict(limb, time, pressure)
-    distance = np.linalg.norm(truth.tip - guess.tip, axis=1)
-    assert distance.mean() < 0.003 * limb.length * 2
-
-
 def test_a_limb_that_fits_passes_the_check_and_a_changed_one_does_not(fitted):
     limb, _ = fitted
     assert check(limb, synthetic_log(hidden_limb(), seed=5, slow=True)).fits

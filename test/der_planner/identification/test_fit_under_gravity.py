@@ -11,7 +11,7 @@ from der_planner.identification import CalibrationLog, LogError, fit, predict
 from der_planner.identification.bends import NODES, predicted
 from der_planner.identification.excitation import sweep, waves
 from der_planner.identification.lengths import UnevenTips, uneven_tip, unevenness, with_lengths
-from der_planner.identification.log import Prepared, prepare
+from der_planner.identification.log import Prepared
 from der_planner.identification.terms import FreeTerms
 from der_planner.limb import Limb, gravity_of
 from der_planner.model import RodModel, simulate
@@ -171,10 +171,3 @@ def test_a_prior_that_its_rod_cannot_follow_is_refused_by_name():
         fit(heavy, rows, terms=(), geometry=False)
     with pytest.raises(LogError, match="cannot follow this log"):
         predict(heavy, rows.time, rows.measured_differential)
-
-
-def test_a_log_from_rest_is_used_from_its_first_row():
-    log = chain_log((0.0, -1.7, 0.0))
-    prepared = prepare(log, Limb.default().mounted("10"))
-    assert prepared.usable[:20].all()
-    assert not prepared.warnings

@@ -1,7 +1,6 @@
 """The foreign limb of other tests does what it says of itself."""
 
 import itertools
-import time as clock
 
 import numpy as np
 import pytest
@@ -9,32 +8,6 @@ from link_chain import MASS_PER_LENGTH, LinkChain
 
 TIME = 0.05 * np.arange(200)
 COMMANDS = 12_000.0 * np.stack([np.sin(TIME), np.sin(1.3 * TIME)], axis=1)
-
-
-def test_a_run_repeats_but_for_noise_and_what_it_is_asked_to_vary():
-    chain = LinkChain(3, (9.81, 0.0, 0.0))
-    first = chain.play(TIME, COMMANDS, noise=0.0)
-    begin = clock.process_time()
-    again = LinkChain(3, (9.81, 0.0, 0.0)).play(TIME, COMMANDS, noise=0.0, run=4)
-    assert clock.process_time() - begin < 5.0  # its kernels are compiled once
-    for one, other in zip(first, again, strict=True):
-        np.testing.assert_array_equal(one, other)
-    seen = chain.play(TIME, COMMANDS, run=1)
-    assert 0.5e-4 < np.std(seen.tip - first.tip) < 6e-4
-    assert not np.array_equal(seen.tip, chain.play(TIME, COMMANDS, run=2).tip)
-    wandered = chain.play(TIME, COMMANDS, run=2, noise=0.0, wander=0.05)
-    assert np.abs(wandered.bend_angles[0] - first.bend_angles[0]).max() > 0.01
-    assert np.abs(LinkChain(4).play(TIME, COMMANDS).tip - first.tip).max() > 0.01
-
-
-def test_stepping_and_playing_are_the_same():
-    chain = LinkChain(2)
-    played = chain.play(TIME, COMMANDS, camera_rate=0, noise=0.0)
-    seen = [chain.reset()]
-    seen += [chain.advance(command, 0.05) for command in COMMANDS[:-1]]
-    tips = np.stack([one.tip for one in seen])
-    np.testing.assert_allclose(tips, played.tip, atol=1e-12)
-    np.testing.assert_allclose(seen[-1].differential_pressure, played.measured_differential[-1])
 
 
 def test_it_swings_and_decays_as_stated():
@@ -68,25 +41,6 @@ def test_it_rests_where_torques_balance(gravity):
         x, y = arms.reshape(-1, 2).sum(axis=0)
         weight = x * gravity[1] - y * gravity[0]
         assert drive + weight == pytest.approx(spring + friction, abs=2e-6)
-
-
-def test_payload_gain_and_push_act_from_their_instant_on():
-    chain = LinkChain(0, (0.0, 1.7, 0.0))
-    still = 0 * COMMANDS
-    quiet = chain.play(TIME, still, noise=0.0)
-    events = {
-        "payloads": [(3.0, 0.244, 0.02)],
-        "pushes": [(3.0, 6.0, 0.244, 0.0, 0.05)],
-    }
-    for name, given in events.items():
-        record = chain.play(TIME, still, noise=0.0, **{name: given})
-        before = record.time <= 3.0
-        np.testing.assert_array_equal(record.tip[before], quiet.tip[before])
-        assert record.tip[-1 if name == "payloads" else 170, 1] > quiet.tip[-1, 1] + 0.005
-    weak = chain.play(TIME, COMMANDS, noise=0.0, gains=[(3.0, 0.8)])
-    strong = chain.play(TIME, COMMANDS, noise=0.0)
-    assert np.abs(weak.tip - strong.tip)[:90].max() == 0.0
-    assert np.abs(weak.tip - strong.tip).max() > 0.01
 
 
 def test_a_chamber_falls_by_an_orifice():

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from der_planner.identification import calibrate_twin, predict
-from der_planner.identification.excitation import PERIOD, Excitation
-from der_planner.identification.offline import record_twin
+from der_planner.identification.excitation import PERIOD, Excitation, record_twin
 from der_planner.limb import Limb
 from der_planner.twin.hardware import draw, known_values
 

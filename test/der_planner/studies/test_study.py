@@ -5,7 +5,7 @@ import pytest
 
 from der_planner.limb import Limb
 from der_planner.studies.factors import StudyError
-from der_planner.studies.indices import sobol_indices
+from der_planner.studies.figures import sobol_indices
 from der_planner.studies.study import SHIPPED, Draw, Spread, Study, rows, saltelli
 from der_planner.studies.tasks import with_errors
 

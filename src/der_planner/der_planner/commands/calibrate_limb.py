@@ -27,6 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
+from der_planner.commands.log_options import add_log_options, read_log
 from der_planner.experiment.console import (
     OptionError,
     Progress,
@@ -41,7 +42,6 @@ from der_planner.experiment.processes import GraphError, Hardware, NodeError
 from der_planner.identification import (
     GROUPS,
     CalibrationLog,
-    ColumnMap,
     Excitation,
     FitReport,
     LogError,
@@ -51,13 +51,12 @@ from der_planner.identification import (
     predict,
     prepare,
     read_bag,
-    read_csv,
     read_excitation,
     record_twin,
     within_limits,
     write_excitation,
 )
-from der_planner.identification.offline import AMPLITUDE
+from der_planner.identification.excitation import AMPLITUDE
 from der_planner.limb import Limb, LimbError
 from der_planner.planning.loads import nearly_buckling
 from der_planner.results.outputs import OutputError, check_file, check_folder
@@ -85,13 +84,7 @@ def _arguments() -> argparse.Namespace:
         type=Path,
         help="with --graph: for bag, logs and report (default: calibrations/ and the time)",
     )
-    parser.add_argument(
-        "--namespace",
-        default="",
-        metavar="NAME",
-        help="of the limb, where a bag holds several",
-    )
-    parser.add_argument("--columns", type=Path, help="YAML map of the table's columns")
+    add_log_options(parser)
     parser.add_argument("--prior", type=Path, help="limb file to start from (default: built in)")
     parser.add_argument("--seed", type=int, default=0, help="of the twin (default: 0)")
     parser.add_argument("--quick", action="store_true", help="90 s instead of 200 s of excitation")
@@ -177,7 +170,7 @@ def main() -> int:
         terms = [] if given.terms == "none" else given.terms.split(",")
         terms += ["mass"] if given.fit_mass else []
         limb, report = _fit(prior, log, terms, given)
-        held_out = [_read(path, given) for path in given.held_out]
+        held_out = [read_log(path, given) for path in given.held_out]
         _conclude(limb, report, log, held_out, given)
     except (OptionError, OutputError) as error:
         print(f"error: {error}", file=sys.stderr)
@@ -274,7 +267,7 @@ def _obtain(prior: Limb, given: argparse.Namespace) -> CalibrationLog:
     if given.graph:
         return read_bag(_play_on_graph(prior, given))
     if not given.offline:
-        return _read(given.bag or given.csv, given)
+        return read_log(given.bag or given.csv, given)
     limit = prior.pneumatics.pressure_limit
     run = within_limits(_excitation(prior, limit, given), limit, math.inf)
     print(f"playing {run.duration:.0f} s on the twin of seed {given.seed} …", file=sys.stderr)
@@ -321,14 +314,6 @@ def _play_on_graph(prior: Limb, given: argparse.Namespace) -> Path:
     bag = player.play().bag
     progress.say(f"bag: {bag}")
     return bag
-
-
-def _read(path: Path, given: argparse.Namespace) -> CalibrationLog:
-    if path.suffix == ".csv":
-        if given.columns is None:
-            raise LogError(f"{path} needs --columns FILE")
-        return read_csv(path, ColumnMap.from_yaml(given.columns))
-    return read_bag(path, given.namespace)
 
 
 def _conclude(

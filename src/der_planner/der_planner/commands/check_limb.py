@@ -20,14 +20,12 @@ import dataclasses
 import sys
 from pathlib import Path
 
+from der_planner.commands.log_options import add_log_options, read_log
 from der_planner.experiment.console import OptionError, add_load_options, as_loaded, check_loads
 from der_planner.identification import (
     CalibrationLog,
-    ColumnMap,
     LogError,
     check,
-    read_bag,
-    read_csv,
     update,
 )
 from der_planner.limb import Limb, LimbError
@@ -50,7 +48,7 @@ def main() -> int:
         loaded = as_loaded(limb, given)
         if loaded.other_mounting:
             print(f"warning: {loaded.other_mounting}", file=sys.stderr)
-        logs = [_read(path, given) for path in given.runs]
+        logs = [read_log(path, given) for path in given.runs]
         if given.update:
             return _update(limb, loaded, logs, given.out)
         return max([_check(loaded, log, len(logs) > 1) for log in logs])
@@ -70,13 +68,7 @@ def _parser() -> argparse.ArgumentParser:
         "runs", nargs="+", type=Path, metavar="BAG", help="bags of runs, or CSV tables"
     )
     parser.add_argument("--limb", type=Path, required=True, help="limb file to check")
-    parser.add_argument("--columns", type=Path, help="YAML map of the tables' columns")
-    parser.add_argument(
-        "--namespace",
-        default="",
-        metavar="NAME",
-        help="of the limb, where a bag holds several",
-    )
+    add_log_options(parser)
     parser.add_argument(
         "--update", action="store_true", help="bring gain, rest angle and friction up to date"
     )
@@ -94,12 +86,6 @@ def _check_new(path: Path) -> None:
     check_file(path)
     if path.exists():
         raise OutputError(f"--out {path} is there already: name a new file, limb files are kept")
-
-
-def _read(path: Path, given: argparse.Namespace) -> CalibrationLog:
-    if path.suffix == ".csv":
-        return read_csv(path, ColumnMap.from_yaml(given.columns))
-    return read_bag(path, given.namespace)
 
 
 def _check(limb: Limb, log: CalibrationLog, named: bool) -> int:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from der_planner.limb import (
     declarations,
 )
 from der_planner.results.outputs import OutputError, check_file
+from der_planner.results.tables import Table
 
 PAGE = Path(__file__).resolve().parents[2] / "doc" / "limb_parameters.md"
 _HEAD = """\
@@ -46,18 +46,20 @@ _SECTIONS: tuple[tuple[str, Any], ...] = (
 )
 
 
+_HEADER = ("key", "unit", "range", "default", "meaning", "how to choose", "fit")
+
+
 def page() -> str:
     """Return the page in Markdown."""
-    return "\n".join([_HEAD, *(line for section in _SECTIONS for line in _section(*section))])
+    sections = (f"## {title}\n\n{_table(kind).markdown()}" for title, kind in _SECTIONS)
+    return "\n".join([_HEAD, *sections])
 
 
-def _section(title: str, kind: Any) -> Iterator[str]:
-    yield f"## {title}\n"
-    yield "| key | unit | range | default | meaning | how to choose | fit |"
-    yield "|---|---|---|---|---|---|---|"
+def _table(kind: Any) -> Table:
+    """Return the table of a dataclass's declared parameters."""
     defaults = {item.name: item.default for item in dataclasses.fields(kind)}
-    for name, declared in declarations(kind).items():
-        cells = (
+    rows = [
+        (
             f"`{name}`",
             declared.unit,
             declared.range,
@@ -66,8 +68,9 @@ def _section(title: str, kind: Any) -> Iterator[str]:
             declared.choose,
             _fit(declared.fit),
         )
-        yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
-    yield ""
+        for name, declared in declarations(kind).items()
+    ]
+    return Table(_HEADER, [[cell.replace("|", "\\|") for cell in row] for row in rows])
 
 
 def _default(value: Any) -> str:

@@ -14,7 +14,7 @@ from der_planner.control.lockstep import Played
 from der_planner.experiment.console import Progress
 from der_planner.experiment.options import TrialRun
 from der_planner.experiment.processes import GraphError
-from der_planner.identification.offline import CALIBRATION_RUN
+from der_planner.identification.excitation import CALIBRATION_RUN
 from der_planner.planning import Plan, PlanningError
 from der_planner.planning.plan_file import read_plan
 from der_planner.twin.offline import OfflineTwin

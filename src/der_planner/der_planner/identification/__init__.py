@@ -3,14 +3,15 @@
 from der_planner.identification.check import Check, Prediction, check, plot_prediction, predict
 from der_planner.identification.excitation import (
     Excitation,
+    calibrate_twin,
     calibration_run,
     read_excitation,
+    record_twin,
     within_limits,
     write_excitation,
 )
 from der_planner.identification.fit import fit
 from der_planner.identification.log import CalibrationLog, LogError, prepare
-from der_planner.identification.offline import calibrate_twin, record_twin
 from der_planner.identification.readers import ColumnMap, read_bag, read_csv
 from der_planner.identification.report import FitReport, Unknown
 from der_planner.identification.terms import GROUPS

@@ -1,4 +1,7 @@
-"""The pressures of a calibration run: stairs, slow waves, steps and a band-limited sweep."""
+"""The pressures of a calibration run, and the twin that plays them in one process, in seconds.
+
+The run holds stairs, slow waves, steps and a band-limited sweep.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +11,24 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.identification.log import LogError
+from der_planner.identification.fit import fit
+from der_planner.identification.log import CalibrationLog, LogError
+from der_planner.identification.report import FitReport
+from der_planner.limb import Limb
 from der_planner.model.series import CONTROL_PERIOD as PERIOD
 
 Array = NDArray[np.float64]
+
+ANGLE_NOISE = np.deg2rad(0.1)
+"""Standard deviation of a bend angle from tags [rad]."""
+TIP_NOISE = 3e-4
+"""Standard deviation of a tip from tags [m]."""
+PRESSURE_NOISE = 5.0
+"""Standard deviation of the board's telemetry [Pa]."""
+CALIBRATION_RUN = 1
+"""The run of the twin that a calibration sees; experiments are run 0 of the same hardware."""
+AMPLITUDE = 0.7
+"""Share of the pressure limit that a calibration uses."""
 
 
 @dataclass(frozen=True)
@@ -197,3 +214,72 @@ def _fade(wave: Array, duration: float) -> Array:
     shape[-count:] *= ramp[::-1]
     faded: Array = wave * shape[:, None]
     return faded
+
+
+def record_twin(
+    seed: int,
+    excitation: Excitation,
+    run: int = CALIBRATION_RUN,
+    noise: float = 1.0,
+    limb: Limb | None = None,
+) -> CalibrationLog:
+    """Play an excitation on the twin and return what camera and board would have measured.
+
+    Args:
+        seed: of the hardware.
+        excitation: pressures to play.
+        run: of the same hardware.
+        noise: factor on the sensors' noise.
+        limb: the twin is mounted as this limb is, and carries its masses; None: no loads.
+    """
+    # PyElastica takes a second to import: only who plays pays for it.
+    from der_planner.twin.offline import play  # noqa: PLC0415
+
+    loads = limb or Limb.default()
+    played = play(
+        excitation.time,
+        excitation.differential_pressure,
+        seed,
+        run=run,
+        gravity=loads.gravity,
+        masses=loads.masses,
+    )
+    generator = np.random.default_rng([seed, run])
+
+    def noisy(values: Array, deviation: float) -> Array:
+        return values + noise * deviation * generator.standard_normal(values.shape)
+
+    return CalibrationLog(
+        time=played.time,
+        commanded_differential=played.commanded_differential,
+        measured_differential=noisy(played.measured_differential, PRESSURE_NOISE),
+        bend_angles=noisy(played.bend_angles, ANGLE_NOISE),
+        tip=noisy(played.tip, TIP_NOISE),
+        source=f"twin, seed {seed}, run {run}",
+    )
+
+
+def calibrate_twin(
+    seed: int, prior: Limb, *, quick: bool = True, noise: float = 1.0
+) -> tuple[Limb, FitReport]:
+    """Run a calibration on the twin of a seed and fit the prior to it.
+
+    Only what a camera and the board would measure is used, with their noise.
+
+    Args:
+        seed: of the hardware.
+        prior: limb with the geometry, masses and limits, and first guesses of the rest; the twin is
+            mounted as it is and carries its `masses`.
+        quick: use the short run of a minute and a half instead of three minutes.
+        noise: of tags and board, as a multiple of the usual one.
+
+    Returns:
+        The identified limb and what the fit says of it.
+
+    Raises:
+        LogError: the run does not tell the parameters.
+    """
+    amplitude = AMPLITUDE * prior.pneumatics.pressure_limit
+    excitation = calibration_run(amplitude, prior.segment_count, quick)
+    limb, report = fit(prior, record_twin(seed, excitation, noise=noise, limb=prior))
+    return replace(limb, name=f"{prior.name}, twin {seed}"), report

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import rclpy
@@ -35,22 +36,15 @@ class LimbTwinNode(Node):
     def __init__(self) -> None:
         super().__init__("limb_twin", namespace=topics.NAMESPACE)
         self.fatal_error = ""
-        seed = int(
-            parameters.declare(self, "seed", 0, "draws the hardware of this trial", at_least=0)
-        )
-        run = int(
-            parameters.declare(
-                self, "run", 0, "draws how the rest angles wander in this run", at_least=0
-            )
-        )
-        rate = float(
-            parameters.declare(
-                self, "rate", 30.0, "shapes published per second [Hz]", at_least=1.0, at_most=120.0
-            )
-        )
-        self._twin = self._mount(seed, run)
-        parameters.declare(
-            self, "gain", 1.0, "of the chambers' moments, 1: as drawn; may be set at run time",
+        read: Any = functools.partial(parameters.declare, self)
+        seed = read("seed", 0, "draws the hardware of this trial", at_least=0)
+        run = read("run", 0, "draws how the rest angles wander in this run", at_least=0)
+        rate = read(
+            "rate", 30.0, "shapes published per second [Hz]", at_least=1.0, at_most=120.0
+        )  # fmt: skip
+        self._twin = self._mount(seed, run, read)
+        read(
+            "gain", 1.0, "of the chambers' moments, 1: as drawn; may be set at run time",
             at_least=0.0, at_most=2.0, read_only=False,
         )  # fmt: skip
         check_overrides(self)
@@ -73,22 +67,17 @@ class LimbTwinNode(Node):
         self._thread = threading.Thread(target=self._work, name="physics", daemon=True)
         self._thread.start()
 
-    def _mount(self, seed: int, run: int) -> LimbTwin:
+    def _mount(self, seed: int, run: int, read: Any) -> LimbTwin:
         """Return the twin under the loads that the parameters name.
 
         Raises:
             TwinError: a load is impossible.
         """
-        gravity = parameters.declare(
-            self, "gravity", [0.0, 0.0, 0.0], "acceleration in limb_base: x, y, z [m/s^2]"
-        )
-        masses = parameters.declare(self, "masses", [0.0], "that the limb carries [kg]")
-        places = parameters.declare(
-            self, "masses_at", [0.0], "where each mass sits, from the clamp along the limb [m]"
-        )
-        assert isinstance(gravity, Sequence)
-        assert isinstance(masses, Sequence)
-        assert isinstance(places, Sequence)
+        gravity = read("gravity", [0.0, 0.0, 0.0], "acceleration in limb_base: x, y, z [m/s^2]")
+        masses = read("masses", [0.0], "that the limb carries [kg]")
+        places = read(
+            "masses_at", [0.0], "where each mass sits, from the clamp along the limb [m]"
+        )  # fmt: skip
         if len(gravity) != 3:
             raise TwinError(f"parameter 'gravity' must be three numbers in m/s², got {gravity}")
         if len(masses) != len(places):

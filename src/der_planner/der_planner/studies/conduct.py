@@ -31,9 +31,9 @@ from der_planner.studies.study import Row, Study
 from der_planner.studies.tasks import TASKS, Values
 
 _AHEAD = 20
-"""Pieces of work under way for each thread of the cluster, so that none waits for its next."""
+"""Batchs of work under way for each thread of the cluster, so that none waits for its next."""
 _LEAST_AHEAD = 200
-"""Pieces of work under way in any case."""
+"""Batchs of work under way in any case."""
 _PAUSE = 0.5
 """The cluster is looked at again after this time [s] at the latest."""
 _PATIENCE = 10.0
@@ -112,7 +112,7 @@ class Calibrated(NamedTuple):
     sources: str = ""
 
 
-class Report(NamedTuple):
+class BatchReport(NamedTuple):
     """What a worker sends back for some rows.
 
     Attributes:
@@ -134,14 +134,14 @@ def calibrate(twin: Twin, prior: str) -> Calibrated:
         return Calibrated(error=f"calibration of {twin}: {_words(error)}", sources=cache.digest())
 
 
-def compute(task: str, rows: Sequence[Values], limb: Calibrated) -> Report:
+def compute(task: str, rows: Sequence[Values], limb: Calibrated) -> BatchReport:
     """Compute rows of a task, beginning with a limb; on one thread, errors kept as results."""
     begin = time.perf_counter()
     with threadpool_limits(1):
         outcomes = [_outcome(task, values, limb) for values in rows]
     # A limb that another version calibrated makes rows of another version.
     sources = limb.sources or cache.digest()
-    return Report(tuple(outcomes), time.perf_counter() - begin, sources)
+    return BatchReport(tuple(outcomes), time.perf_counter() - begin, sources)
 
 
 def _outcome(task: str, values: Values, limb: Calibrated) -> Outcome:
@@ -214,21 +214,21 @@ def remote(address: str, again: bool) -> Iterator[Client]:
             client.close(timeout=2)
 
 
-class Piece(NamedTuple):
-    """Rows that one task computes; the piece with the lowest place is begun first."""
+class Batch(NamedTuple):
+    """Rows that one task computes; the batch with the lowest place is begun first."""
 
     rows: tuple[Row, ...]
     twin: Twin | None
     place: int
 
 
-def pieces(study: Study, rows: Sequence[Row]) -> Iterator[Piece]:
-    """Return the rows in pieces of what a task computes together; a piece has one twin."""
+def batches(study: Study, rows: Sequence[Row]) -> Iterator[Batch]:
+    """Return the rows in batches of what a task computes together; a batch has one twin."""
     place = itertools.count()
     for twin, group in itertools.groupby(rows, key=lambda row: study.task.twin(row.values)):
         left = list(group)
         for begin in range(0, len(left), study.task.batch):
-            yield Piece(tuple(left[begin : begin + study.task.batch]), twin, next(place))
+            yield Batch(tuple(left[begin : begin + study.task.batch]), twin, next(place))
 
 
 class _Conductor:
@@ -241,8 +241,8 @@ class _Conductor:
         self._progress = progress
         self.done = self.failed = self.total = 0
         self._begun, self._made = time.monotonic(), 0
-        self._left: deque[Piece] = deque()
-        self._sent: dict[str, tuple[Future, Piece]] = {}
+        self._left: deque[Batch] = deque()
+        self._sent: dict[str, tuple[Future, Batch]] = {}
         self._twins: dict[Twin, Future] = {}
         self._back: queue.SimpleQueue[Future] = queue.SimpleQueue()
         self._threads = 0
@@ -254,7 +254,7 @@ class _Conductor:
         Raises:
             StudyError: the disk is full, no worker lasts, or one has other sources.
         """
-        self._left.extend(pieces(self._study, rows))
+        self._left.extend(batches(self._study, rows))
         scheduler, lost, starts = self._settings.scheduler, False, 0
         while self._left:
             made = self._made
@@ -276,7 +276,7 @@ class _Conductor:
                 self._progress.say(f"{gone}{self.done} of {self.total} rows are kept")
 
     def _play_on(self, client: Client) -> None:
-        """Play the pieces that are left on one cluster.
+        """Play the batches that are left on one cluster.
 
         Raises:
             ClusterLostError: it is gone; what had not come back is left again.
@@ -299,7 +299,7 @@ class _Conductor:
                     self._keep(self._back.get(timeout=_PAUSE))
         finally:
             # What is under way is not lost, it is to do.
-            self._left.extendleft(piece for _, piece in reversed(self._sent.values()))
+            self._left.extendleft(batch for _, batch in reversed(self._sent.values()))
             futures = [*(future for future, _ in self._sent.values()), *self._twins.values()]
             self._sent, self._twins = {}, {}
             if futures and client.status == "running":
@@ -332,20 +332,20 @@ class _Conductor:
         """Keep enough work under way."""
         task, ahead = self._study.task.name, max(_LEAST_AHEAD, _AHEAD * self._threads)
         while self._left and len(self._sent) < ahead:
-            piece = self._left.popleft()
+            batch = self._left.popleft()
             limb: Any = Calibrated(self._study.limb)
-            if piece.twin is not None:
+            if batch.twin is not None:
                 # One task, however many rows wait for it.
-                if piece.twin not in self._twins:
-                    key = "-".join(map(str, ("calibrate", *piece.twin)))
-                    self._twins[piece.twin] = client.submit(
-                        calibrate, piece.twin, self._study.limb, key=key, priority=-piece.place
+                if batch.twin not in self._twins:
+                    key = "-".join(map(str, ("calibrate", *batch.twin)))
+                    self._twins[batch.twin] = client.submit(
+                        calibrate, batch.twin, self._study.limb, key=key, priority=-batch.place
                     )
-                limb = self._twins[piece.twin]
-            values = [row.values for row in piece.rows]
-            key = f"{task}-{piece.rows[0].key}-{len(piece.rows)}"
-            future = client.submit(compute, task, values, limb, key=key, priority=-piece.place)
-            self._sent[future.key] = (future, piece)
+                limb = self._twins[batch.twin]
+            values = [row.values for row in batch.rows]
+            key = f"{task}-{batch.rows[0].key}-{len(batch.rows)}"
+            future = client.submit(compute, task, values, limb, key=key, priority=-batch.place)
+            self._sent[future.key] = (future, batch)
             future.add_done_callback(self._back.put)
 
     def _keep(self, future: Future) -> None:
@@ -374,7 +374,7 @@ class _Conductor:
                 self.failed += 1
                 self._progress.say(f"  failed: {dict(row.values)}: {outcome.error}")
 
-    def _broken(self, future: Future, rows: Sequence[Row]) -> Report:
+    def _broken(self, future: Future, rows: Sequence[Row]) -> BatchReport:
         """Return the report on rows whose worker ended under them again and again.
 
         Raises:
@@ -386,7 +386,7 @@ class _Conductor:
                 f"a worker cannot compute rows ({_words(error)}): start it in the workspace: "
                 f"{_JOIN.format('ADDRESS')}"
             )
-        return Report((Outcome({}, _words(error)),) * len(rows), 0.0, cache.digest())
+        return BatchReport((Outcome({}, _words(error)),) * len(rows), 0.0, cache.digest())
 
     def _show(self) -> None:
         rate = self._made / max(time.monotonic() - self._begun, 1e-9)

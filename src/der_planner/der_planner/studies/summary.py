@@ -16,8 +16,7 @@ from der_planner.results.report import document, figure, section
 from der_planner.results.tables import Table
 from der_planner.studies import cache
 from der_planner.studies.factors import StudyError
-from der_planner.studies.figures import draw, quantity
-from der_planner.studies.indices import sobol_indices
+from der_planner.studies.figures import draw, quantity, sobol_indices
 from der_planner.studies.store import Kept, Store
 from der_planner.studies.study import Study
 

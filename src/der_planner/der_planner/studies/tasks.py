@@ -135,7 +135,7 @@ def _run(limb: str, row: Mapping[str, Any]) -> Result:
 def _learned(planned: Plan, loads: Limb, row: Mapping[str, Any]) -> Plan:
     """Return the plan after runs of it on the same hardware, as a camera would have seen them."""
     from der_planner.control import Learner  # noqa: PLC0415
-    from der_planner.identification.offline import TIP_NOISE  # noqa: PLC0415
+    from der_planner.identification.excitation import TIP_NOISE  # noqa: PLC0415
 
     learner = Learner(planned)
     for run in range(_FIRST_LEARNING_RUN, _FIRST_LEARNING_RUN + row["learning_runs"]):

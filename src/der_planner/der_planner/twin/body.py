@@ -11,7 +11,7 @@ from elastica import CosseratRod
 from numpy.typing import NDArray
 
 from der_planner.limb import BEYOND_THE_TIP
-from der_planner.twin.hardware import Hardware
+from der_planner.twin.hardware import DrawnHardware
 from der_planner.twin.kernel import RodArrays, SectionMaterial
 
 Array = NDArray[np.float64]
@@ -26,7 +26,7 @@ RADIUS = 0.0165
 
 
 @dataclass(frozen=True)
-class Body:
+class LimbBody:
     """A limb of M segments at rest along +x, clamped at the origin.
 
     Attributes:
@@ -46,7 +46,7 @@ class Body:
     vertex_segment: NDArray[np.int64]
 
 
-def build(hardware: Hardware) -> Body:
+def build(hardware: DrawnHardware) -> LimbBody:
     """Return the rod of a limb, straight and unloaded."""
     lengths, owner = [hardware.base_fitting], [-1]
     for index, segment in enumerate(hardware.segments):
@@ -77,7 +77,7 @@ def build(hardware: Hardware) -> Body:
     # What the law of the plane does for itself: only the flexible share of a vertex bends.
     rod.bend_matrix[1, 1, :] /= share
     _set_fittings(rod, hardware, np.nonzero(element_segment < 0)[0])
-    return Body(
+    return LimbBody(
         rod=rod,
         arrays=_arrays(rod),
         material=_material(hardware, vertex_segment, share, len(lengths)),
@@ -87,7 +87,9 @@ def build(hardware: Hardware) -> Body:
     )
 
 
-def _set_sections(rod: CosseratRod, hardware: Hardware, element_segment: NDArray[np.int64]) -> None:
+def _set_sections(
+    rod: CosseratRod, hardware: DrawnHardware, element_segment: NDArray[np.int64]
+) -> None:
     flexible = rod.rest_lengths[element_segment == 0][0]
     for k in range(rod.n_elems):
         # A short stiff fitting would shorten the step for nothing: it gives like a whole element.
@@ -99,7 +101,9 @@ def _set_sections(rod: CosseratRod, hardware: Hardware, element_segment: NDArray
         rod.bend_matrix[i, i, :] = value
 
 
-def _set_fittings(rod: CosseratRod, hardware: Hardware, rigid_elements: NDArray[np.int64]) -> None:
+def _set_fittings(
+    rod: CosseratRod, hardware: DrawnHardware, rigid_elements: NDArray[np.int64]
+) -> None:
     masses = [0.0, hardware.connector_mass, hardware.tip_mass]
     for element, mass in zip(rigid_elements, masses, strict=True):
         rod.mass[element : element + 2] += 0.5 * mass
@@ -111,7 +115,7 @@ def _set_fittings(rod: CosseratRod, hardware: Hardware, rigid_elements: NDArray[
 
 
 def _material(
-    hardware: Hardware, vertex_segment: NDArray[np.int64], share: Array, elements: int
+    hardware: DrawnHardware, vertex_segment: NDArray[np.int64], share: Array, elements: int
 ) -> SectionMaterial:
     per_vertex = [hardware.segments[index] for index in vertex_segment]
 

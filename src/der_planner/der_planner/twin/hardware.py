@@ -91,7 +91,7 @@ class SegmentHardware:
 
 
 @dataclass(frozen=True)
-class Hardware:
+class DrawnHardware:
     """A two-segment limb as built.
 
     Attributes:
@@ -112,7 +112,7 @@ class Hardware:
     drag: float
 
 
-def draw(seed: int) -> Hardware:
+def draw(seed: int) -> DrawnHardware:
     """Draw the hardware of one trial; the same seed gives the same hardware."""
     generator = np.random.default_rng([20_260, seed])
 
@@ -153,7 +153,7 @@ def draw(seed: int) -> Hardware:
                 wander_time=of("wander_time"),
             )
         )
-    hardware = Hardware(
+    hardware = DrawnHardware(
         segments=tuple(segments),
         base_fitting=base,
         connector=connector,
@@ -180,7 +180,7 @@ class KnownValue:
     spread: float = 0.0
 
 
-def known_values(hardware: Hardware) -> dict[str, KnownValue]:
+def known_values(hardware: DrawnHardware) -> dict[str, KnownValue]:
     """Return what a fit should find, by the names of `FitReport.unknowns`, e.g. ``gain[0]``.
 
     Only tests and studies read this. What the two descriptions do not share has no entry: lengths

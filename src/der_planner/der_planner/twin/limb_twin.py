@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from der_planner.limb import PointMass
 from der_planner.twin.body import LoadError, NodeLoads, Push, build
-from der_planner.twin.hardware import Hardware, draw
+from der_planner.twin.hardware import DrawnHardware, draw
 from der_planner.twin.kernel import Ramp, advance
 
 Array = NDArray[np.float64]
@@ -82,7 +82,7 @@ class LimbTwin:
         self,
         seed: int = 0,
         run: int = 0,
-        hardware: Hardware | None = None,
+        hardware: DrawnHardware | None = None,
         atmosphere: float = ATMOSPHERE,
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
         masses: Iterable[PointMass] = (),

@@ -48,7 +48,6 @@ class OfflineTwin:
         seed: draws limb and pneumatics.
         run: draws the wandering rest angles of this run of the same hardware.
         segment_count: M.
-        fine_step: longest time for which the limb feels constant pressures [s].
         gravity: (3,) acceleration in `limb_base` [m/s²].
         masses: what the limb carries from the start beside its own mass.
 
@@ -65,7 +64,6 @@ class OfflineTwin:
         run: int = 0,
         *,
         segment_count: int = 2,
-        fine_step: float = FINE_STEP,
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
         masses: Iterable[PointMass] = (),
     ) -> None:
@@ -76,7 +74,6 @@ class OfflineTwin:
             raise TwinError(
                 f"the twin has {self.twin.segment_count} segments, the pressures {segment_count}"
             )
-        self._fine_step = fine_step
 
     @property
     def differential_pressure(self) -> Array:
@@ -101,7 +98,7 @@ class OfflineTwin:
 
     def rest(self, duration: float) -> None:
         """Let time pass [s] under the last command."""
-        count = max(1, int(np.ceil(duration / self._fine_step - 1e-9)))
+        count = max(1, int(np.ceil(duration / FINE_STEP - 1e-9)))
         for _ in range(count):
             self.twin.step(self.pneumatics.step(duration / count), duration / count)
 
@@ -118,7 +115,6 @@ def play(
     *,
     run: int = 0,
     lead: float = 1.0,
-    fine_step: float = FINE_STEP,
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
     masses: Iterable[PointMass] = (),
     pushes: Iterable[Push] = (),
@@ -134,7 +130,6 @@ def play(
         seed: draws limb and pneumatics.
         run: draws the wandering rest angles of this run of the same hardware.
         lead: vented time before the first setpoint [s].
-        fine_step: longest time for which the limb feels constant pressures [s].
         gravity: (3,) acceleration in `limb_base` [m/s²].
         masses: what the limb carries from the start beside its own mass.
         pushes: what pushes or loads it on the way; their instants are on the axis of ``time``.
@@ -147,7 +142,6 @@ def play(
         seed,
         run,
         segment_count=wanted.shape[1],
-        fine_step=fine_step,
         gravity=gravity,
         masses=masses,
     )
