@@ -33,7 +33,7 @@ _SHIFT = 4
 
 
 @dataclass(frozen=True)
-class Report:
+class ImageReport:
     """Level (`ok`, `warning`, `error`, `stale`), a sentence, and numbers by name."""
 
     level: str
@@ -86,7 +86,7 @@ class ImageWatch:
         self.failed += 1
         self.image_problem = problem
 
-    def report(self, tracker: LimbTracker | None, publishers: int = 0) -> Report:
+    def report(self, tracker: LimbTracker | None, publishers: int = 0) -> ImageReport:
         """Say how things are.
 
         Args:
@@ -104,7 +104,7 @@ class ImageWatch:
             level, message = "error", self.image_problem
         else:
             level, message = self._tracking(tracker)
-        return Report(level, message, values)
+        return ImageReport(level, message, values)
 
     def _silence(self, silent: float, publishers: int) -> tuple[str, str]:
         level = "error" if self._arrivals else "stale"

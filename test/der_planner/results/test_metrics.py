@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from runs import CYCLES, FRAMES, PERIOD, TIMES, reference, series
 
+from der_planner.bags.run import PressureArrays
 from der_planner.results import (
     Description,
     EvaluationError,
@@ -147,7 +148,7 @@ def test_result_survives_json():
         ({"time": FRAMES[::-1]}, "time must be two or more rising"),
         ({"tip": reference(FRAMES)[:-1]}, r"tip must have shape \(\d+, 2\)"),
         ({"tip_reference": reference(TIMES)[:, :1]}, r"tip_reference must have shape"),
-        ({"pressure_time": TIMES, "commanded": np.zeros(3)}, "commanded must have shape"),
+        ({"pressures": PressureArrays(TIMES, np.zeros(3))}, "commanded must have shape"),
     ],
 )
 def test_arrays_of_wrong_shape_are_named(changes, message):

@@ -107,7 +107,7 @@ class CameraModel:
 
 
 @dataclass
-class Frame:
+class RenderedPicture:
     """One picture and the truth about it.
 
     Attributes:
@@ -185,7 +185,7 @@ class SyntheticCamera:
         shape: Shape | None,
         velocity: Shape | None = None,
         covers: Sequence[Sequence[tuple[float, float]]] = (),
-    ) -> Frame:
+    ) -> RenderedPicture:
         """Render one picture, into what was prepared for it.
 
         Args:
@@ -196,7 +196,7 @@ class SyntheticCamera:
         """
         image = self.prepare() if self._prepared is None else self._prepared
         self._prepared = None
-        result = Frame(image, dict(self._world))
+        result = RenderedPicture(image, dict(self._world))
         if shape is not None:
             self._draw_body(image, shape)
             result.corners.update(self._draw_limb_tags(image, shape, velocity))

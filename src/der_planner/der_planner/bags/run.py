@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -84,6 +84,14 @@ def _nothing(columns: int) -> Stream:
     return Stream(np.empty(0), np.empty((0, columns)))
 
 
+class PressureArrays(NamedTuple):
+    """Differential pressures of a run without a bag."""
+
+    time: ArrayLike | None = None  # (P,) [s]
+    commanded: ArrayLike | None = None  # (P, M) [Pa]
+    measured: ArrayLike | None = None  # (P, M) [Pa]
+
+
 @dataclass(frozen=True)
 class BoardLog:
     """Setpoints as planned and commands as the board received them (twin only).
@@ -146,9 +154,7 @@ class RunSeries:
         reference_time: ArrayLike,
         tip_reference: ArrayLike,
         tip_predicted: ArrayLike | None = None,
-        pressure_time: ArrayLike | None = None,
-        commanded: ArrayLike | None = None,
-        measured: ArrayLike | None = None,
+        pressures: PressureArrays | None = None,
         setpoints: ArrayLike | None = None,
     ) -> RunSeries:
         """Build a run from arrays.
@@ -160,9 +166,7 @@ class RunSeries:
             reference_time: (K,) of the setpoints [s], rising from 0.
             tip_reference: (K, 2) [m].
             tip_predicted: (K, 2) [m].
-            pressure_time: (P,) [s].
-            commanded: (P, M) differential pressures [Pa].
-            measured: (P, M) differential pressures [Pa].
+            pressures: commanded and measured ones.
             setpoints: (K, M) commands of the plan [Pa].
 
         Raises:
@@ -178,13 +182,14 @@ class RunSeries:
             return Stream(instants, _rows(value, len(instants), names[1], description, columns))
 
         asked = "reference_time"
+        held = pressures or PressureArrays()
         return cls(
             description=description,
             reference=stream(reference_time, tip_reference, (asked, "tip_reference"), 2),
             predicted=stream(reference_time, tip_predicted, (asked, "tip_predicted"), 2),
             tip=stream(time, tip, ("time", "tip"), 2),
-            commanded=stream(pressure_time, commanded, ("pressure_time", "commanded"), 0),
-            measured=stream(pressure_time, measured, ("pressure_time", "measured"), 0),
+            commanded=stream(held.time, held.commanded, ("pressures.time", "commanded"), 0),
+            measured=stream(held.time, held.measured, ("pressures.time", "measured"), 0),
             setpoints=stream(reference_time, setpoints, (asked, "setpoints"), 0),
         )
 

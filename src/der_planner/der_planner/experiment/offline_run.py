@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from der_planner.bags.run import Description, RunSeries, method_name
+from der_planner.bags.run import Description, PressureArrays, RunSeries, method_name
 from der_planner.control import Feedback, lockstep
 from der_planner.control.lockstep import Played
 from der_planner.experiment.console import Progress
@@ -120,8 +120,8 @@ def load_arrays(path: Path) -> RunSeries:
             reference_time=kept["time"],
             tip_reference=kept["tip_reference"],
             tip_predicted=kept["tip_predicted"],
-            pressure_time=kept["time"],
-            commanded=kept["differential_pressure"],
-            measured=kept["measured_differential"],
+            pressures=PressureArrays(
+                kept["time"], kept["differential_pressure"], kept["measured_differential"]
+            ),
             setpoints=kept["differential_pressure"],
         )

@@ -104,10 +104,7 @@ def parameter(
     text: str,
     choose: str,
     *,
-    above: float | None = None,
-    least: float | None = None,
-    below: float | None = None,
-    most: float | None = None,
+    interval: str = "(-inf, inf)",
     needs: str = "",
     fit: Term | None = None,
 ) -> dict[str, Parameter]:
@@ -117,24 +114,20 @@ def parameter(
         unit: SI; "-" for none.
         text: what it is.
         choose: how to find its value.
-        above: lower end of the range, not allowed itself.
-        least: lower end of the range, allowed.
-        below: upper end of the range, not allowed itself.
-        most: upper end of the range, allowed.
+        interval: the range, "[0, 1)" where 0 is allowed and 1 is not.
         needs: as `Parameter`.
         fit: the unknown of the fit, if any.
     """
-    low = above if above is not None else least
-    high = below if below is not None else most
+    low, high = map(float, interval[1:-1].split(","))
     return {
         _KEY: Parameter(
             unit=unit,
             text=text,
             choose=choose,
-            low=-math.inf if low is None else low,
-            high=math.inf if high is None else high,
-            low_allowed=above is None,
-            high_allowed=below is None,
+            low=low,
+            high=high,
+            low_allowed=not interval.startswith("(") or low == -math.inf,
+            high_allowed=not interval.endswith(")") or high == math.inf,
             needs=needs,
             fit=fit,
         )

@@ -70,7 +70,7 @@ class Limb:
             "m",
             "straight passive piece between two segments",
             "measure it; 0 lets the rod's mesh choose one edge that belongs to neither segment",
-            least=0.0,
+            interval="[0, inf)",
         ),
     )
     gravity: tuple[float, float, float] = field(
@@ -91,7 +91,7 @@ class Limb:
             "m",
             "straight passive piece between the clamp and the first segment",
             "measure it; the calibration corrects it by the tip",
-            least=0.0,
+            interval="[0, inf)",
         ),
     )
     masses: tuple[PointMass, ...] = ()

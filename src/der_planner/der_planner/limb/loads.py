@@ -55,7 +55,7 @@ class PointMass:
             "m",
             "distance from the clamp along the limb",
             "measure along the straight limb; the tip is at the sum of all lengths",
-            least=0.0,
+            interval="[0, inf)",
         )
     )
     mass: float = field(
@@ -63,7 +63,7 @@ class PointMass:
             "kg",
             "what the limb carries there beside its own mass per length",
             "weigh it, with its fastening and tags; what only one run carries is its payload",
-            least=0.0,
+            interval="[0, inf)",
         )
     )
     name: str = "mass"

@@ -31,7 +31,7 @@ class Segment:
             "m",
             "actuated length",
             "measure what bends; the calibration corrects it by the tip",
-            above=0.0,
+            interval="(0, inf)",
         )
     )
     bending_stiffness: float = field(
@@ -39,7 +39,7 @@ class Segment:
             "N·m²",
             "bending stiffness EI",
             "hold it level, hang a small force F on its end: EI = F L³ / (3 · extra deflection)",
-            above=0.0,
+            interval="(0, inf)",
             fit=Term(
                 *("log_stiffness", "-", 0.2, -1.2, 1.2, 0.3, "dynamics"),
                 relative=True,
@@ -52,7 +52,7 @@ class Segment:
             "N",
             "stretching stiffness EA",
             "pull it: force · length / extension; its value hardly matters far above EI / L²",
-            above=0.0,
+            interval="(0, inf)",
         )
     )
     torsional_stiffness: float = field(
@@ -60,7 +60,7 @@ class Segment:
             "N·m²",
             "twisting stiffness GJ, which only the rod in space reads",
             "a round section of incompressible rubber has 2/3 EI",
-            above=0.0,
+            interval="(0, inf)",
         )
     )
     mass_per_length: float = field(
@@ -68,7 +68,7 @@ class Segment:
             "kg/m",
             "mass per length",
             "weigh it, divide by its length",
-            above=0.0,
+            interval="(0, inf)",
             fit=Term(*("log_mass", "-", 0.1, -1.2, 1.2, 0.3, "mass"), relative=True, kept=True),
         )
     )
@@ -77,7 +77,7 @@ class Segment:
             "1/s",
             "damping force per mass and velocity, by air and plate",
             "twice the rate at which the amplitude of a free swing decays",
-            least=0.0,
+            interval="[0, inf)",
             fit=Term(
                 *("log_damping", "-", 0.5, -3.0, 3.0, 0.5, "dynamics"),
                 shared=True,
@@ -91,7 +91,7 @@ class Segment:
             "N·m/Pa",
             "bending moment per differential pressure G",
             "bend angle at a slow pressure / pressure · EI / L; leave it to the calibration",
-            above=0.0,
+            interval="(0, inf)",
             fit=Term(
                 *("gain", "rad/Pa", 5e-5, 5e-6, 5e-4, math.inf, "linear"),
                 per={"length": 1, "bending_stiffness": -1},
@@ -127,7 +127,7 @@ class Segment:
             "s",
             "Kelvin-Voigt time τ in moment = EI (κ + τ κ̇)",
             "0.01 takes away ringing that a real limb does not show; calibration with fast motion",
-            least=0.0,
+            interval="[0, inf)",
             fit=Term(*("material_damping", "s", 0.01, 0.0, 0.1, 0.02, "dynamics"), kept=True),
         ),
     )
@@ -137,7 +137,7 @@ class Segment:
             "-",
             "mass that resists acceleration over mass that weighs",
             "1; less stands for friction, which stiffens small fast strokes; calibration",
-            above=0.0,
+            interval="(0, inf)",
             fit=Term(
                 *("log_inertia", "-", 0.1, -0.7, 0.7, 0.2, "dynamics"),
                 shared=True,
@@ -152,8 +152,7 @@ class Segment:
             "-",
             "relative gain of the left over the mean of both chambers",
             "(left − right) / (left + right) of the bend angles by equal pressures; calibration",
-            above=-1.0,
-            below=1.0,
+            interval="(-1, 1)",
             fit=Term("gain_asymmetry", "-", 0.03, -0.4, 0.4, 0.1, "asymmetry"),
         ),
     )
@@ -172,7 +171,7 @@ class Segment:
             "N·m",
             "saturation of a Dahl friction element",
             "half of the pressure between the branches of a slow loop · moment_gain; calibration",
-            least=0.0,
+            interval="[0, inf)",
             fit=Term(
                 *("friction_pressure", "Pa", 300.0, 0.0, 4000.0, 800.0, "friction"),
                 per={"moment_gain": -1},
@@ -186,7 +185,7 @@ class Segment:
             "1/m",
             "change of curvature over which friction turns round",
             "bend angle in which a reversal has made 63 % of its way / length; calibration",
-            least=0.0,
+            interval="[0, inf)",
             needs="friction_moment",
             fit=Term(
                 *("friction_angle", "rad", 0.1, 0.02, 0.8, 0.1, "friction"),
@@ -201,7 +200,7 @@ class Segment:
             "N·m²",
             "stiffness of a Maxwell element beside EI",
             "EI · relative growth of the bend angle while a pressure is held; calibration",
-            least=0.0,
+            interval="[0, inf)",
             fit=Term(
                 *("creep_pressure", "Pa/rad", 500.0, 0.0, 15000.0, 2000.0, "creep"),
                 per={"moment_gain": -1, "length": -1},
@@ -215,7 +214,7 @@ class Segment:
             "s",
             "relaxation time of the Maxwell element",
             "time in which that growth has come to 63 %; calibration",
-            least=0.0,
+            interval="[0, inf)",
             needs="creep_stiffness",
             fit=Term("creep_time", "s", 15.0, 3.0, 120.0, 15.0, "creep", start=15.0),
         ),
@@ -226,8 +225,7 @@ class Segment:
             "-",
             "moment by the pressure of the segment before, over that of its own: tubes, walls",
             "pressurise the segment before alone: bend here / bend there, if alike; calibration",
-            above=-0.5,
-            below=0.5,
+            interval="(-0.5, 0.5)",
             fit=Term("coupling_before", "-", 0.03, -0.4, 0.4, 0.05, "coupling", neighbour=-1),
         ),
     )
@@ -237,8 +235,7 @@ class Segment:
             "-",
             "moment by the pressure of the segment after, over that of its own: tubes, walls",
             "pressurise the segment after alone: bend here / bend there, if alike; calibration",
-            above=-0.5,
-            below=0.5,
+            interval="(-0.5, 0.5)",
             fit=Term("coupling_after", "-", 0.03, -0.4, 0.4, 0.05, "coupling", neighbour=1),
         ),
     )
@@ -258,7 +255,7 @@ class Pneumatics:
             "Pa",
             "largest |differential pressure| of a plan",
             "what the chambers bear for good, at most the driver's pressure_limit",
-            above=0.0,
+            interval="(0, inf)",
         )
     )
     slew_limit: float = field(
@@ -266,12 +263,15 @@ class Pneumatics:
             "Pa/s",
             "largest |change of a commanded differential pressure| per second",
             "at most the fill rate that the calibration's report names, and the driver's limit",
-            above=0.0,
+            interval="(0, inf)",
         )
     )
     time_constant: float = field(
         metadata=parameter(
-            "s", "first-order lag from command to chamber", "from the calibration", above=0.0
+            "s",
+            "first-order lag from command to chamber",
+            "from the calibration",
+            interval="(0, inf)",
         )
     )
     delay: float = field(
@@ -280,7 +280,7 @@ class Pneumatics:
             "s",
             "dead time from command to the first change in the chamber",
             "from the calibration",
-            least=0.0,
+            interval="[0, inf)",
         ),
     )
     vent_time_constant: float = field(
@@ -289,7 +289,7 @@ class Pneumatics:
             "s",
             "lag while |differential pressure| falls; 0: as time_constant",
             "from the calibration",
-            least=0.0,
+            interval="[0, inf)",
         ),
     )
     vent_rate: float = field(
@@ -298,7 +298,7 @@ class Pneumatics:
             "Pa/s",
             "fall of a chamber at 10 kPa with its outlet wide open; 0: no limit",
             "from the calibration, or the steepest fall after a step from 10 kPa to 0",
-            least=0.0,
+            interval="[0, inf)",
         ),
     )
     vent_exponent: float = field(
@@ -307,8 +307,7 @@ class Pneumatics:
             "-",
             "the fall grows with this power of the chamber's gauge pressure",
             "1/2 is an orifice, 1 a tube (one exponential); a real limb had 2/3; calibration",
-            above=0.0,
-            most=1.0,
+            interval="(0, 1]",
         ),
     )
 
@@ -319,8 +318,7 @@ class Pneumatics:
             "vent_time_constant is that at 10 kPa and falls with this power of the chamber's gauge "
             "pressure; 0: the same at all pressures",
             "as vent_exponent for a valve that opens in proportion to its error; calibration",
-            least=0.0,
-            most=1.0,
+            interval="[0, 1]",
         ),
     )
 
@@ -337,13 +335,19 @@ class CalibratedRange:
     differential_pressure: tuple[float, ...] = field(
         default=(),
         metadata=parameter(
-            "Pa", "largest |differential pressure| seen", "the calibration writes it", least=0.0
+            "Pa",
+            "largest |differential pressure| seen",
+            "the calibration writes it",
+            interval="[0, inf)",
         ),
     )
     bend_angle: tuple[float, ...] = field(
         default=(),
         metadata=parameter(
-            "rad", "largest |bend angle| seen", "the calibration writes it", least=0.0
+            "rad",
+            "largest |bend angle| seen",
+            "the calibration writes it",
+            interval="[0, inf)",
         ),
     )
     gravity: tuple[float, ...] = field(
