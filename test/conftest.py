@@ -15,6 +15,8 @@ ROOT = Path(__file__).resolve().parent.parent
 SHARED = ROOT.parent / "shared"
 sys.path.insert(0, str(ROOT / "scripts"))
 sys.path.insert(0, str(ROOT / "test" / "support"))
+# A run under `nohup` would hand its ignored SIGHUP to every process that a test starts.
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 WHOLE_GRAPH = ("test_calibration", "test_experiment", "test_feedback", "test_page_drawing")

@@ -62,15 +62,13 @@ def interrupt_once() -> None:
     cut the venting short.
     """
     # Without ROS there is nothing to vent, and this package is not there.
-    from limb_interfaces.entry import END_SIGNALS  # noqa: PLC0415
+    from limb_interfaces.entry import on_end_signals  # noqa: PLC0415
 
     def interrupt(number: int, _frame: FrameType | None) -> None:
-        for each in END_SIGNALS:
-            signal.signal(each, signal.SIG_IGN)
+        on_end_signals(signal.SIG_IGN)
         raise KeyboardInterrupt(signal.Signals(number).name)
 
-    for each in END_SIGNALS:
-        signal.signal(each, interrupt)
+    on_end_signals(interrupt)
 
 
 # Loads -------------------------------------------------------------------------------------------
