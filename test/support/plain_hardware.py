@@ -1,11 +1,11 @@
-"""Hardware of the twin whose segments are elastic rods."""
+"""DrawnHardware of the twin whose segments are elastic rods."""
 
 from dataclasses import replace
 
-from der_planner.twin.hardware import Hardware, draw
+from der_planner.twin.hardware import DrawnHardware, draw
 
 
-def plain(seed: int = 0, **changes: float) -> Hardware:
+def plain(seed: int = 0, **changes: float) -> DrawnHardware:
     """Return hardware without friction, creep and stiffening: an elastic rod."""
     hardware = draw(seed)
     segments = tuple(
