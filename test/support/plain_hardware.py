@@ -1,4 +1,4 @@
-"""DrawnHardware of the twin whose segments are elastic rods."""
+"""Hardware of the twin whose segments are elastic rods."""
 
 from dataclasses import replace
 
