@@ -9,6 +9,7 @@ import der_planner
 ROOT = Path(der_planner.__file__).parent
 LAYERS = {
     "methods": 0,
+    "arrays": 0,
     "limb": 1,
     "rod": 2,
     "model": 3,

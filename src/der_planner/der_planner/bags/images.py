@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.bags.reader import BagReader
 from der_planner.bags.record import (
     NANOSECONDS,
@@ -26,7 +27,7 @@ from der_planner.bags.record import (
     header_stamp,
     namespace_of,
 )
-from der_planner.bags.run import Array, RunSeries
+from der_planner.bags.run import RunSeries
 
 IMAGE_TYPE = "sensor_msgs/msg/Image"
 CAMERA_TYPE = "sensor_msgs/msg/CameraInfo"

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.bags.reader import BagError, BagReader
-from der_planner.bags.run import Array
 
 NANOSECONDS = 1_000_000_000
 PLAN_TYPE = "der_msgs/msg/PressurePlan"

@@ -11,11 +11,10 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from der_planner.arrays import Array
 from der_planner.methods import LEARNED
-
-Array = NDArray[np.float64]
 
 
 def method_name(method: str, learned_from: object = None) -> str:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.bags.record import (
     NANOSECONDS,
     PLAN_TYPE,
@@ -25,7 +26,6 @@ from der_planner.bags.record import (
     read_record,
 )
 from der_planner.bags.run import (
-    Array,
     BoardLog,
     Description,
     EvaluationError,

@@ -16,8 +16,8 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.commands.recorded_plan import check_same, plan_of
 from der_planner.control import LearningError
 from der_planner.control.hindsight import Filmed, Smoothed, smooth
@@ -26,8 +26,6 @@ from der_planner.planning import Plan, PlanningError
 from der_planner.planning.plan_file import read_plan
 from der_planner.results import BagError, EvaluationError, RunSeries, load_run
 from der_planner.results.outputs import OutputError, check_file
-
-Array = NDArray[np.float64]
 
 
 def main() -> int:

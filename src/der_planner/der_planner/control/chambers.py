@@ -5,14 +5,13 @@ from __future__ import annotations
 import bisect
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from der_planner.arrays import Array
 from der_planner.control.nominal import STEP, Nominal, Whole
 from der_planner.model import STEPS
 from der_planner.model.air import Chambers
 from der_planner.model.series import CONTROL_PERIOD, interpolate
-
-Array = NDArray[np.float64]
 
 _GAP_TIME = 10.0
 """Time in which a difference between measured and modelled pressures is expected to fade [s]."""

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
+from der_planner.arrays import Array
 from der_planner.model.series import interpolate
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _NEIGHBOURHOOD = 0.05

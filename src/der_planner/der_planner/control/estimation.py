@@ -27,16 +27,15 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from der_planner.arrays import Array
 from der_planner.control.chambers import ChamberLog
 from der_planner.control.knowledge import Estimate, EstimatorSettings, Knowledge
 from der_planner.control.nominal import STEP, Nominal
 from der_planner.model import STEPS
 from der_planner.model.material import Memory
 from der_planner.model.series import CONTROL_PERIOD
-
-Array = NDArray[np.float64]
 
 HISTORY = 2.0
 """Measurements older than this, against the newest instant, come too late [s]."""

@@ -13,9 +13,10 @@ based on what was told before it was asked for.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from threadpoolctl import ThreadpoolController
 
+from der_planner.arrays import Array
 from der_planner.control.chambers import ChamberLog
 from der_planner.control.estimation import Estimator
 from der_planner.control.horizon import Allowed, Horizon, settings_of
@@ -24,8 +25,6 @@ from der_planner.control.nominal import Nominal
 from der_planner.control.supervision import Limits, Supervisor, Warned
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning.plan_file import Plan
-
-Array = NDArray[np.float64]
 
 _THREADS = ThreadpoolController()
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.control.chambers import ChamberLog
 from der_planner.control.estimation import Estimator
 from der_planner.control.knowledge import EstimatorSettings
@@ -18,8 +18,6 @@ from der_planner.control.nominal import STEP, Nominal
 from der_planner.model import STEPS
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning.plan_file import Plan
-
-Array = NDArray[np.float64]
 
 _SLOW = EstimatorSettings(missing_density=100.0)
 """What the model lacks changes more slowly than feedback reckons with, so that a gain that is lower

@@ -23,8 +23,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.control.chambers import ChamberLog
 from der_planner.control.knowledge import Knowledge
 from der_planner.control.nominal import Nominal
@@ -35,8 +35,6 @@ from der_planner.model.commands import within_limits
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning.plan_file import Plan
 from der_planner.planning.quadratic import UnsolvedError, minimise
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

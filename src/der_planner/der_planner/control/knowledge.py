@@ -4,12 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from der_planner.arrays import Array
 from der_planner.model.material import Memory
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

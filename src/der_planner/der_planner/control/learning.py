@@ -21,8 +21,9 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from der_planner.arrays import Array
 from der_planner.control.disturbance import (
     LearningError,
     Measured,
@@ -38,8 +39,6 @@ from der_planner.limb import Limb, LimbError
 from der_planner.planning.correction import Correction
 from der_planner.planning.errors import PlanningError
 from der_planner.planning.plan_file import Plan
-
-Array = NDArray[np.float64]
 
 _LEAST_SEEN = 0.2
 """Share of the setpoints at which the tip must be seen."""

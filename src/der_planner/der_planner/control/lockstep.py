@@ -14,14 +14,11 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.control.feedback import Feedback
 from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning.plan_file import Plan
-
-Array = NDArray[np.float64]
-
 
 _SMALLEST = 1e-5
 """Standard deviation that is told of a measurement without noise [rad], [m]."""

@@ -19,13 +19,13 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.linalg import expm
 
+from der_planner.arrays import Array
 from der_planner.methods import LEARNED
 from der_planner.model import STEPS, Initial, RodModel, simulate
 from der_planner.model.series import CONTROL_PERIOD, interpolate, step_middles
 from der_planner.planning.plan_file import Plan
 from der_planner.planning.transitions import resting_spline, sample_spline
 
-Array = NDArray[np.float64]
 Whole = NDArray[np.signedinteger[Any]]
 
 STEP = CONTROL_PERIOD / STEPS

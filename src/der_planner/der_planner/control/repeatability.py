@@ -20,10 +20,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.control.disturbance import Shown, without_gaps
 from der_planner.planning.correction import Expected
-
-Array = NDArray[np.float64]
 
 _DEGREES = 4.0
 """Independent numbers in the difference of two runs."""

@@ -14,11 +14,9 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.model.series import CONTROL_PERIOD
-
-Array = NDArray[np.float64]
 
 REASONS = {
     "tags lost": "the limb has not been seen for {:.1f} s",

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.identification.least_squares import (
     LeastSquares,
     Rows,
@@ -18,8 +19,6 @@ from der_planner.identification.least_squares import (
 from der_planner.identification.log import CalibrationLog, LogError
 from der_planner.limb import Limb, Pneumatics
 from der_planner.model.air import Air
-
-Array = NDArray[np.float64]
 
 SMOOTH_RATE = 6000.0
 """Rate from which on a change of a command is a step [Pa/s]: its flow is choked, not a lag."""

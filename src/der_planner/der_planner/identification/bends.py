@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.identification.least_squares import (
     LeastSquares,
     Rows,
@@ -22,8 +22,6 @@ from der_planner.identification.least_squares import (
 from der_planner.identification.log import Prepared
 from der_planner.limb import Limb
 from der_planner.model import Material, Model, Response, simulate
-
-Array = NDArray[np.float64]
 
 NODES = 13
 """Nodes of the rod in a fit. Its statics do not depend on them, its first two natural frequencies

@@ -10,13 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.identification.log import CalibrationLog, LogError, bridge, prepare
 from der_planner.limb import Limb
 from der_planner.model import CONTROL_PERIOD, Model, simulate
-
-Array = NDArray[np.float64]
 
 GAIN_DRIFT = 0.08
 """Relative change of a gain above which the limb must be calibrated again."""

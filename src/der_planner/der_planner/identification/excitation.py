@@ -9,15 +9,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.identification.fit import fit
 from der_planner.identification.log import CalibrationLog, LogError
 from der_planner.identification.report import FitReport
 from der_planner.limb import Limb
 from der_planner.model.series import CONTROL_PERIOD as PERIOD
-
-Array = NDArray[np.float64]
 
 ANGLE_NOISE = np.deg2rad(0.1)
 """Standard deviation of a bend angle from tags [rad]."""

@@ -9,8 +9,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.identification.air import AirFit, fit_air
 from der_planner.identification.bends import NODES, BendFit
 from der_planner.identification.lengths import (
@@ -44,8 +44,6 @@ from der_planner.identification.terms import (
 from der_planner.limb import CalibratedRange, Limb
 from der_planner.model import CONTROL_PERIOD, ArcModel, Material, RodModel
 from der_planner.planning.loads import nearly_buckling
-
-Array = NDArray[np.float64]
 
 UNTOLD = 0.8
 """Share of its prior spread above which the deviation of an unknown means that the log does not

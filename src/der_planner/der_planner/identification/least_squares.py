@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-Array = NDArray[np.float64]
+from der_planner.arrays import Array
+
 Rows = tuple[Array, Array]
 """Weighted residuals (R,) and their derivatives by the unknowns (R, P)."""
 

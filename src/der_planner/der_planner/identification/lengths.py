@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.identification.bends import CORRELATION, Predicted, follow
 from der_planner.identification.least_squares import (
     LeastSquares,
@@ -20,8 +21,6 @@ from der_planner.identification.log import CalibrationLog, LogError, Prepared
 from der_planner.limb import Limb
 from der_planner.model import NODES, RodModel
 from der_planner.rod import ConvergenceError
-
-Array = NDArray[np.float64]
 
 LENGTH_PRIOR = 0.05
 """Relative standard deviation of how much of a segment bends: its fittings do not."""

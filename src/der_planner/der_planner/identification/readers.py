@@ -15,14 +15,13 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.bags.reader import BagError
 from der_planner.bags.record import PRESSURE_TYPE, STATE_TYPE, BagRecord, LimbRecord, read_record
 from der_planner.bags.run import Stream
 from der_planner.bags.series import stream
 from der_planner.identification.log import CalibrationLog, LogError, on_grid
 from der_planner.model.series import CONTROL_PERIOD
-
-Array = NDArray[np.float64]
 
 LONGEST_GAP = 0.25
 """Time between two messages of a bag that a straight line may bridge [s]."""

@@ -6,15 +6,13 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.identification.air import AirFit
 from der_planner.identification.lengths import GeometryFit
 from der_planner.limb import Limb
 from der_planner.limb.parameters import REST_SPREAD
 from der_planner.model.resting import weight_of
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,10 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.identification.least_squares import Unknowns
 from der_planner.limb import Limb, Segment, Term, declarations
-
-Array = NDArray[np.float64]
 
 GROUPS = ("asymmetry", "stiffening", "cubic", "coupling", "friction", "creep", "dynamics")
 """Model terms that may be left out, in the order in which they are explained."""

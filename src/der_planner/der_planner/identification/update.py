@@ -15,8 +15,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.identification.bends import CORRELATION, NODES, BendFit
 from der_planner.identification.check import LEAST_MOTION
 from der_planner.identification.fit import UNTOLD
@@ -31,8 +31,6 @@ from der_planner.limb import Limb, Segment
 from der_planner.limb.parameters import REST_SPREAD
 from der_planner.model import RodModel
 from der_planner.rod import ConvergenceError
-
-Array = NDArray[np.float64]
 
 GAIN_SPREAD = 0.35
 """Share of a gain by which it changes from day to day: a real limb's changed by up to a half."""

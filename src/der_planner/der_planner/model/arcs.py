@@ -19,13 +19,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from der_planner.arrays import Array
 from der_planner.limb import Limb
 from der_planner.model import arc_dynamics as kernels
 from der_planner.model.arc_dynamics import Arcs
 from der_planner.model.arc_kernel import arcs_and_slopes
 from der_planner.model.model import NODES, ArcState, Model, Outputs, Rollout, State
 
-Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 QUADRATURE_POINTS = 8

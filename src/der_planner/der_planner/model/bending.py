@@ -14,9 +14,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from der_planner.arrays import Array
 from der_planner.rod import Rod
-
-Array = NDArray[np.float64]
 
 
 def end_edges(rod: Rod) -> list[tuple[int, int]]:

@@ -25,12 +25,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from der_planner.arrays import Array
 from der_planner.limb import Limb
 from der_planner.model.resting import RestingLaw, change_along, rest_along, weight_of
-
-Array = NDArray[np.float64]
 
 _COUPLING_ROUNDS = 60
 """At the most; each leaves the coupling's share of what was left, usually some per cent."""

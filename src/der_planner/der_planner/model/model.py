@@ -13,15 +13,15 @@ from functools import cached_property
 from typing import Any, ClassVar, Literal, Protocol, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from der_planner.arrays import Array
 from der_planner.limb import Limb
 from der_planner.model.air import Air
 from der_planner.model.bending import Kinematics
 from der_planner.model.material import Material
 from der_planner.rod import RodState, Trajectory
 
-Array = NDArray[np.float64]
 Outputs = Literal["", "tip", "all"]
 """What a linearisation keeps the derivatives of: nothing, the tip, or tip and bend angles."""
 

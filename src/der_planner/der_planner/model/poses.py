@@ -16,13 +16,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.model.bending import bend_angles, bend_change, bend_outputs
 from der_planner.model.rod import RodModel
 from der_planner.rod import ConvergenceError, RodState
-
-Array = NDArray[np.float64]
 
 _ITERATIONS = 30
 _SMALL = 1e-7

@@ -17,11 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.limb import Limb
-
-Array = NDArray[np.float64]
 
 _PIECES = 4
 """Straight pieces of a segment that carry its weight."""

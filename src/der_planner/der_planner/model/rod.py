@@ -12,15 +12,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from der_planner.arrays import Array
 from der_planner.limb import Limb
 from der_planner.model.bending import PolylineKinematics, bend_angles, bend_change, bend_outputs
 from der_planner.model.model import NODES, Model, Outputs, Rollout, State
 from der_planner.rod import Rod, RodState
 from der_planner.rod.trajectory import Linearisation
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from der_planner.arrays import Array
+
 Numbers = NDArray[np.floating[Any]] | NDArray[np.integer[Any]]
 
 CONTROL_PERIOD = 0.05

@@ -13,8 +13,9 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from der_planner.arrays import Array
 from der_planner.limb import Limb
 from der_planner.model.air import Chambers
 from der_planner.model.material import Material, Memory
@@ -22,7 +23,6 @@ from der_planner.model.model import FirstOrder, Model, State
 from der_planner.model.series import CONTROL_PERIOD, step_middles
 from der_planner.rod import Trajectory
 
-Array = NDArray[np.float64]
 Bend = Callable[[Array], Array]
 """Bend angles (K, M) [rad] at instants (K,) [s]."""
 

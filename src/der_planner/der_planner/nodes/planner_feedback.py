@@ -13,15 +13,13 @@ from collections import deque
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from der_msgs.msg import LimbState, PressureState
+from der_planner.arrays import Array
 from der_planner.control.feedback import Feedback
 from der_planner.nodes.planner_streaming import PlannerPublishers
 from der_planner.planning.streaming import GRID, Schedule
 from limb_interfaces.stamps import NANOSECONDS, nanoseconds
-
-Array = NDArray[np.float64]
 
 _TRAVEL = 0.015
 """A revision is sent at least this long [s] before its stamp, so that the driver has it in time."""

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 from nav_msgs.msg import Path as PathMessage
-from numpy.typing import NDArray
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
 from der_msgs.action import PlayMotion
 from der_msgs.msg import LimbState, MotionCommand
+from der_planner.arrays import Array
 from der_planner.limb import HEAVIEST, Limb
 from der_planner.methods import LEARNED
 from der_planner.planning import METHODS, Motion, PathLimits, choose_method
@@ -30,8 +30,6 @@ from der_planner.planning.workspace import BRANCHES
 from limb_interfaces import topics
 from limb_interfaces.parameters import declare
 from limb_interfaces.stamps import NANOSECONDS, nanoseconds
-
-Array = NDArray[np.float64]
 
 OLDEST_STAMP = 10
 """A start further back than this [s] is a mistake; a shorter delay is travel and typing."""

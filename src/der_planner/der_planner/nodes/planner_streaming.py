@@ -10,19 +10,17 @@ from typing import Protocol
 
 import numpy as np
 from geometry_msgs.msg import Point, PointStamped
-from numpy.typing import NDArray
 from rclpy.node import Node
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from der_msgs.msg import LimbEstimate, PressurePlan, PressureSetpoint, PressureState
+from der_planner.arrays import Array
 from der_planner.control.knowledge import Estimate
 from der_planner.planning.plan_file import Plan
 from der_planner.planning.streaming import GRID, Player, Schedule, first_stamp
 from limb_interfaces import qos, topics
 from limb_interfaces.stamps import stamp_from_nanoseconds
-
-Array = NDArray[np.float64]
 
 MARGIN = 100_000_000
 """A plan starts this much [ns] after the earliest instant, so that its message travels first."""

@@ -22,13 +22,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.limb import Limb
 from der_planner.model import ArcModel
 from der_planner.page.commands import Load
 from der_planner.planning import Motion, PathLimits, PlanningError, Workspace, plan
 from der_planner.planning.paths import read_csv
-
-Array = NDArray[np.float64]
 
 MOST_POINTS = 20_000
 """A drawing has at most this many points."""

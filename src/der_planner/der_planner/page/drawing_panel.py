@@ -14,8 +14,9 @@ from nicegui import Client, ui
 from nicegui.events import GenericEventArguments
 
 from der_msgs.msg import MotionCommand
+from der_planner.arrays import Array
 from der_planner.page.commands import Answer, Load
-from der_planner.page.drawing import Array, DrawingError, Preview, drawn_pixels
+from der_planner.page.drawing import DrawingError, Preview, drawn_pixels
 from der_planner.page.server import Parts
 from der_planner.page.situation import centimetres
 

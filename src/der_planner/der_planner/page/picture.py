@@ -17,9 +17,9 @@ from apriltag_tracker.camera import CameraPose, Intrinsics, project
 from apriltag_tracker.detection import Tag
 from apriltag_tracker.pose.world import WorldPose
 from apriltag_tracker.tag_map import TagMap
+from der_planner.arrays import Array
 from der_planner.page.situation import NANOSECONDS
 
-Array = NDArray[np.float64]
 Value = TypeVar("Value")
 
 LOOKING = 2.0

@@ -21,9 +21,9 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline, make_interp_spline
 
+from der_planner.arrays import Array
 from der_planner.limb import Limb
 from der_planner.model import ArcModel, Initial, Model, RodModel, State
 from der_planner.model.poses import PoseFinder, Poses
@@ -44,8 +44,6 @@ from der_planner.planning.workspace import (
     static_pressure,
 )
 from der_planner.rod import ConvergenceError, Rod, RodState
-
-Array = NDArray[np.float64]
 
 METHODS = {"der": ("paper", "projected", "optimal"), "pcc": ("paper", "projected", "optimal")}
 """The methods of each model. Arcs have one unknown a pressure: their two balances are the same."""

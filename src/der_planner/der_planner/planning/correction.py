@@ -8,9 +8,9 @@ import time as clock
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
+from der_planner.arrays import Array
 from der_planner.limb import Limb
 from der_planner.model import CONTROL_PERIOD, Model, simulate
 from der_planner.model.simulation import Bend
@@ -21,7 +21,6 @@ from der_planner.planning.plan_file import Plan
 from der_planner.planning.workspace import solve
 from der_planner.rod import ConvergenceError
 
-Array = NDArray[np.float64]
 _THREADS = ThreadpoolController()
 
 _WINDOWS = (100, 150, 150)

@@ -12,17 +12,15 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
+from der_planner.arrays import Array
 from der_planner.limb import PAYLOAD, Limb
 from der_planner.model import RodModel
 from der_planner.model.poses import PoseFinder
 from der_planner.model.series import interpolate
 from der_planner.planning.errors import BucklingError, OverloadError, PlanningError
 from der_planner.rod import ConvergenceError, Rod, RodState
-
-Array = NDArray[np.float64]
 
 NEAR = 1.1
 """A standing limb that would buckle under less than this multiple of its load is near that [-]."""

@@ -24,9 +24,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline
 
+from der_planner.arrays import Array
 from der_planner.model import CONTROL_PERIOD
 from der_planner.planning import paths
 from der_planner.planning.errors import PlanningError
@@ -44,8 +45,6 @@ from der_planner.planning.transitions import (
     with_transitions,
 )
 from der_planner.planning.workspace import Workspace, check_branch
-
-Array = NDArray[np.float64]
 
 JOINT_MOTIONS = ("asynchronous", "same_direction", "opposite_direction")
 NAMES = (*JOINT_MOTIONS, *paths.SHAPES)

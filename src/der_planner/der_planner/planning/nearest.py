@@ -23,12 +23,11 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.linalg import solveh_banded
 
+from der_planner.arrays import Array
 from der_planner.model.series import interpolate
 from der_planner.planning.pace import retimed
 from der_planner.planning.paths import PathLimits, TipPath
 from der_planner.planning.workspace import BRANCHES, Workspace
-
-Array = NDArray[np.float64]
 
 DRAWN_WAVE = 0.01
 """Waves of a line without times that are shorter than this [m] are smoothed to less than half."""

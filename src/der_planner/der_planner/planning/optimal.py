@@ -24,9 +24,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
+from der_planner.arrays import Array
 from der_planner.model import CONTROL_PERIOD, STEPS, Initial, State
 from der_planner.model.commands import within_limits
 from der_planner.model.simulation import Drive, Window
@@ -34,8 +34,6 @@ from der_planner.planning.configuration import Configuration
 from der_planner.planning.motions import Reference
 from der_planner.planning.quadratic import Band, solve_limited
 from der_planner.rod import ConvergenceError
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
+from der_planner.arrays import Array
 from der_planner.planning.paths import PathLimits, evenly_in_time, keep_acceleration
 from der_planner.planning.workspace import Workspace
-
-Array = NDArray[np.float64]
 
 SLEW_SHARE = 0.8
 """Share of the slew limit for changing the static pressures; the rest is for the inertia."""

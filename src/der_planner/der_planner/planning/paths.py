@@ -9,14 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import PchipInterpolator, make_interp_spline
 
+from der_planner.arrays import Array
 from der_planner.model.bending import Kinematics
 from der_planner.model.series import interpolate
 from der_planner.planning.errors import PlanningError
-
-Array = NDArray[np.float64]
 
 LONGEST = 3600.0
 """Longest duration of a motion [s]."""

@@ -15,16 +15,14 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.limb import Limb, LimbError
 from der_planner.model import CONTROL_PERIOD, Model
 from der_planner.planning.configuration import configure
 from der_planner.planning.errors import PlanningError
 from der_planner.planning.motions import Reference
 from der_planner.planning.transitions import Start, resting_spline
-
-Array = NDArray[np.float64]
 
 SCHEMA_VERSION = 1
 SUFFIX = ".yaml"

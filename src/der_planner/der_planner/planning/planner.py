@@ -7,9 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
+from der_planner.arrays import Array
 from der_planner.limb import Limb
 from der_planner.model import CONTROL_PERIOD, NODES, Model, RodModel, simulate
 from der_planner.model.commands import SlowVenting, slow_venting, within_limits
@@ -23,8 +23,6 @@ from der_planner.planning.plan_file import Plan
 from der_planner.planning.transitions import Start
 from der_planner.planning.workspace import Workspace
 from der_planner.rod import ConvergenceError
-
-Array = NDArray[np.float64]
 
 DEFAULT_METHOD = {"der": "optimal", "pcc": "optimal"}
 _THREADS = ThreadpoolController()

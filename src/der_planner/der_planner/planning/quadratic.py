@@ -6,11 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import piqp
-from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.planning.errors import PlanningError
-
-Array = NDArray[np.float64]
 
 _PRESSURE = 1e3
 """Pressure of one unit of the solver [Pa]: in kPa and mm its tolerances mean something."""

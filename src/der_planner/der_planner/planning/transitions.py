@@ -11,12 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline, make_interp_spline
 
+from der_planner.arrays import Array
 from der_planner.model.series import CONTROL_PERIOD
-
-Array = NDArray[np.float64]
 
 FINE_PERIOD = 0.01
 """Time between two samples of a transition, about [s]."""

@@ -12,16 +12,15 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
+from der_planner.arrays import Array
 from der_planner.model import NODES, ArcModel, Model, RodModel
 from der_planner.model.bending import Kinematics
 from der_planner.model.series import interpolate
 from der_planner.planning.errors import PlanningError, UnreachableError
 from der_planner.planning.loads import sagging_tips, stable_rest
-
-Array = NDArray[np.float64]
 
 TOLERANCE = 1e-3
 """Points missed by less than this [m] count as reached (the models' reach differs by less)."""

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from der_planner.bags.run import Array, BoardLog, EvaluationError, RunSeries, Stream
+from der_planner.arrays import Array
+from der_planner.bags.run import BoardLog, EvaluationError, RunSeries, Stream
 
 LARGEST_LAG = 1.0
 """Bound of the estimated lag [s]."""

@@ -21,9 +21,10 @@ from typing import Any
 
 import numpy as np
 
+from der_planner.arrays import Array
 from der_planner.bags.reader import BagError
 from der_planner.bags.record import read_record
-from der_planner.bags.run import Array, EvaluationError, RunSeries
+from der_planner.bags.run import EvaluationError, RunSeries
 from der_planner.bags.series import load_run, run_of
 from der_planner.limb import mounting_of
 from der_planner.results.errors import (

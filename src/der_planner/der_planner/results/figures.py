@@ -16,7 +16,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from der_planner.bags.run import Array, RunSeries, Stream
+from der_planner.arrays import Array
+from der_planner.bags.run import RunSeries, Stream
 from der_planner.results.errors import error_series
 from der_planner.results.evaluation import RunResult
 from der_planner.results.statistics import learning_curves

@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 from matplotlib.axes import Axes
 
+from der_planner.arrays import Array
 from der_planner.bags.images import Picture, Projection, RunImages, Snapshot
-from der_planner.bags.run import Array, EvaluationError, RunSeries
+from der_planner.bags.run import EvaluationError, RunSeries
 from der_planner.results.figures import (
     CM,
     DASHES,

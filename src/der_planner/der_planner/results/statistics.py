@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from der_planner.bags.run import Array
+from der_planner.arrays import Array
 from der_planner.methods import LEARNED
 from der_planner.results.evaluation import RunResult, json_value
 

@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.rod import banded_kernel
 from der_planner.rod.mesh import Mesh
-from der_planner.rod.state import Array, RodState
+from der_planner.rod.state import RodState
 from der_planner.rod.step_kernel import Base, Body, Place, Record, Solver
 
 

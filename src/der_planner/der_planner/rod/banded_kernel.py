@@ -10,8 +10,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from der_planner.arrays import Array
 from der_planner.rod.compile import kernel
-from der_planner.rod.state import Array
 
 
 def _symmetric_solver(b: int) -> Callable[[Array, Array], float]:

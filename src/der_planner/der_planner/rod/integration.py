@@ -13,9 +13,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.rod.backend import Backend, Piece
 from der_planner.rod.mesh import require
-from der_planner.rod.state import Array, ConvergenceError, RodState
+from der_planner.rod.state import ConvergenceError, RodState
 from der_planner.rod.step_kernel import Place, Record, Solver
 from der_planner.rod.trajectory import Solved
 

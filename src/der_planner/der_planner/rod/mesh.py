@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from der_planner.arrays import Array
 from der_planner.limb import Limb
-from der_planner.rod.state import Array
 
 
 @dataclass(frozen=True)

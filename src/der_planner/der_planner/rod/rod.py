@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from der_planner.arrays import Array
 from der_planner.limb import Limb
 from der_planner.rod.integration import Integrator, Method, find_equilibrium
 from der_planner.rod.mesh import (
@@ -25,7 +26,7 @@ from der_planner.rod.mesh import (
 )
 from der_planner.rod.planar.backend import PlanarBackend
 from der_planner.rod.spatial.backend import SpatialBackend
-from der_planner.rod.state import Array, RodState, positions_of
+from der_planner.rod.state import RodState, positions_of
 from der_planner.rod.trajectory import Trajectory, linearisation_of, step_matrices
 
 Plane = Literal["xy", "xz"]

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.rod.banded_kernel import (
     add_product,
     add_transposed_product,
@@ -20,7 +21,6 @@ from der_planner.rod.banded_kernel import (
     solve_transposed,
 )
 from der_planner.rod.compile import allocating_kernel, kernel
-from der_planner.rod.state import Array
 from der_planner.rod.step_kernel import Record
 
 

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.rod.banded_kernel import put
 from der_planner.rod.compile import inlined_kernel, kernel
-from der_planner.rod.state import Array
 
 
 class Body(NamedTuple):

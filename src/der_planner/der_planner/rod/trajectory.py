@@ -8,11 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from der_planner.arrays import Array
 from der_planner.rod import sensitivity_kernel
 from der_planner.rod.backend import Backend
 from der_planner.rod.mesh import array, by_step, require
 from der_planner.rod.sensitivity_kernel import SolveChain
-from der_planner.rod.state import Array, RodState, positions_of
+from der_planner.rod.state import RodState, positions_of
 from der_planner.rod.step_kernel import Record
 
 

@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.results import figures as style
 from der_planner.results.figures import FORMATS, new_figure
 from der_planner.studies.store import Kept
 from der_planner.studies.study import Study
 
-Array = NDArray[np.float64]
 Records = Sequence[Kept]
 _UNITS = {"_m": ("cm", 100.0), "_pa": ("kPa", 1e-3), "_rad": ("°", 180.0 / np.pi)}
 _HEIGHT = 2.3

@@ -17,13 +17,12 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.limb import Limb, LimbError
 from der_planner.studies.factors import Factor, StudyError, Value, factor
 from der_planner.studies.tasks import TASKS, Task
 
-Array = NDArray[np.float64]
 SHIPPED = Path(__file__).resolve().parent / "shipped"
 _KEYS = ("name", "about", "task", "limb", "factors", "draw", "keep", "plots")
 _SPREAD = {

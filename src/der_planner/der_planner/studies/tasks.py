@@ -13,8 +13,8 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.limb import Limb, Segment
 from der_planner.model import simulate
 from der_planner.planning import Motion, Plan, plan
@@ -30,7 +30,6 @@ from der_planner.studies.factors import (
     with_defaults,
 )
 
-Array = NDArray[np.float64]
 Values = Mapping[str, Value]
 Result = dict[str, float]
 _VENTED = 1.0

@@ -10,11 +10,10 @@ import numpy as np
 from elastica import CosseratRod
 from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.limb import BEYOND_THE_TIP
 from der_planner.twin.hardware import DrawnHardware
 from der_planner.twin.kernel import RodArrays, SectionMaterial
-
-Array = NDArray[np.float64]
 
 ELEMENTS_PER_SEGMENT = 8
 AXIAL_STIFFNESS = 1380.0

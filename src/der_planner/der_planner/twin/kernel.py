@@ -24,7 +24,7 @@ from elastica.rod.data_structures import overload_operator_kinematic_numba
 from numba import njit
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from der_planner.arrays import Array
 
 VISCOUS_TIME = 1e-4
 """τ of the material's own damping [s], a loss factor ω τ of 0.02 at the lowest axial mode (37 Hz)

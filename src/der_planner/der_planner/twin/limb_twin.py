@@ -8,14 +8,12 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.limb import PointMass
 from der_planner.twin.body import LoadError, NodeLoads, Push, build
 from der_planner.twin.hardware import DrawnHardware, draw
 from der_planner.twin.kernel import Ramp, advance
-
-Array = NDArray[np.float64]
 
 ATMOSPHERE = 101_325.0
 """Absolute pressure outside the chambers [Pa]."""

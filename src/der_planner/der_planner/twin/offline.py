@@ -6,15 +6,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from der_planner.arrays import Array
 from der_planner.limb import PointMass
 from der_planner.model.air import pair_of
 from der_planner.twin.body import Push
 from der_planner.twin.limb_twin import LimbTwin, TwinError
 from pressure_driver.emulator.pneumatics import BoardPneumatics
-
-Array = NDArray[np.float64]
 
 FINE_STEP = 0.01
 """Chamber pressures are held on the limb for this long [s], half the board's telemetry period."""

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from der_planner.arrays import Array
 from der_planner.rod.backend import Backend, StepKernels, band_to_dense
 from der_planner.rod.mesh import Mesh
 from der_planner.rod.planar import elastic_kernel, step_kernel
 from der_planner.rod.planar.elastic_kernel import PlanarRod, PlanarSpace
-from der_planner.rod.state import Array, RodState
+from der_planner.rod.state import RodState
 from der_planner.rod.step_kernel import Base
 
 _NO_FRAMES = Base(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))

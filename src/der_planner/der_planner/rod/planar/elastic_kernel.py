@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.rod.compile import inlined_kernel, kernel
-from der_planner.rod.state import Array
 from der_planner.rod.step_kernel import Body
 
 

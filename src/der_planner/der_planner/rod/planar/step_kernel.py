@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from der_planner.arrays import Array
 from der_planner.rod.banded_kernel import (
     expand,
     factor_general,
@@ -22,7 +23,6 @@ from der_planner.rod.planar.elastic_kernel import (
     input_columns,
     unsymmetric,
 )
-from der_planner.rod.state import Array
 from der_planner.rod.step_kernel import (
     Place,
     Record,

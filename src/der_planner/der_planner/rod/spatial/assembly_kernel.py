@@ -5,6 +5,7 @@ Derivatives are kept by edge, w = (e, φ), and brought to the nodes at the end.
 
 from __future__ import annotations
 
+from der_planner.arrays import Array
 from der_planner.rod.compile import inlined_kernel, kernel
 from der_planner.rod.spatial.elastic_kernel import (
     SpatialRod,
@@ -12,7 +13,6 @@ from der_planner.rod.spatial.elastic_kernel import (
     add_curvature_hessian,
     node_strains,
 )
-from der_planner.rod.state import Array
 
 
 @inlined_kernel

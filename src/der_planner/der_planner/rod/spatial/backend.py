@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from der_planner.arrays import Array
 from der_planner.rod.backend import Backend, StepKernels, band_to_dense
 from der_planner.rod.mesh import Mesh
 from der_planner.rod.spatial import assembly_kernel, elastic_kernel, step_kernel
 from der_planner.rod.spatial.elastic_kernel import SpatialRod, SpatialSpace
-from der_planner.rod.state import Array, RodState
+from der_planner.rod.state import RodState
 from der_planner.rod.step_kernel import Base
 
 

@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from der_planner.arrays import Array
 from der_planner.rod.compile import kernel
-from der_planner.rod.state import Array
 from der_planner.rod.step_kernel import Base, Body
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from der_planner.arrays import Array
 from der_planner.rod.banded_kernel import (
     expand,
     factor_general,
@@ -35,7 +36,6 @@ from der_planner.rod.spatial.elastic_kernel import (
     node_strains,
     reference_twists,
 )
-from der_planner.rod.state import Array
 from der_planner.rod.step_kernel import (
     Base,
     Place,
