@@ -10,6 +10,8 @@ from apriltag_tracker.detection import Detector, codes, edges
 from apriltag_tracker.pipeline import LimbTracker, TrackerOptions, Uncertainty, warm_up
 from apriltag_tracker.synthetic.camera import Errors, Optics, SyntheticCamera
 
+pytestmark = pytest.mark.slow
+
 PERIOD = 1.0 / 30.0
 
 

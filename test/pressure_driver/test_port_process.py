@@ -28,6 +28,8 @@ from pressure_driver.safety import Mode
 from pressure_driver.schedule import TickGrid
 from pressure_driver.settings import Settings, to_options
 
+pytestmark = pytest.mark.slow
+
 PERIOD = 50_000_000
 
 

@@ -35,6 +35,7 @@ def check(scene, limit, seeds=(70,)):
     assert 0.25 < np.mean(nees) < 3.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "limit"),
     [

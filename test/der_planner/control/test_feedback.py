@@ -14,6 +14,8 @@ from der_planner.limb import Limb
 from der_planner.planning import Motion, Plan, plan
 from der_planner.planning.streaming import Schedule
 
+pytestmark = pytest.mark.slow
+
 LENGTH = 0.244
 
 

@@ -12,6 +12,8 @@ from der_planner.limb import Limb
 from der_planner.model import simulate
 from der_planner.planning import CONTROL_PERIOD, Motion, plan
 
+pytestmark = pytest.mark.slow
+
 LIMB = Limb.default()
 
 

@@ -17,6 +17,8 @@ from der_planner.planning import (
     plan,
 )
 
+pytestmark = pytest.mark.slow
+
 LIMB = Limb.default()
 SPATIAL = dataclasses.replace(LIMB, gravity=(0.0, 0.0, -4.0))
 

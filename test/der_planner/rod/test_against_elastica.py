@@ -5,6 +5,8 @@ import pytest
 
 from der_planner.rod import Rod
 
+pytestmark = pytest.mark.slow
+
 elastica = pytest.importorskip("elastica")
 
 LENGTH, RADIUS, YOUNG, DENSITY, GRAVITY = 0.25, 0.015, 1.5e6, 1240.0, -9.81

@@ -15,6 +15,8 @@ from der_planner.twin.body import AXIAL_STIFFNESS, SHEAR_STIFFNESS
 from der_planner.twin.limb_twin import ATMOSPHERE
 from der_planner.twin.offline import play
 
+pytestmark = pytest.mark.slow
+
 REST = np.full(4, ATMOSPHERE)
 MOUNTINGS = ("hanging", "standing", "sideways", "10", "-30")
 
