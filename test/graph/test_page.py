@@ -178,11 +178,15 @@ def test_what_died_is_not_shown_as_live(rig: WatchedPage) -> None:
 
     assert not browser.execute_script(f"return {lost}")
     goes_silent(rig, browser, rig.page, lost)
-    assert "No connection" in browser.find_element("id", "notices").text
+    rig.wait(
+        lambda: "No connection" in browser.find_element("id", "notices").text, "the lost connection"
+    )
     rig.page.signal(signal.SIGCONT)
     rig.wait(lambda: not browser.execute_script(f"return {lost}"), "the server again")
     silent_after(browser, rig.page, signal.SIGKILL, lost)
-    assert "No connection" in browser.find_element("id", "notices").text
+    rig.wait(
+        lambda: "No connection" in browser.find_element("id", "notices").text, "the lost connection"
+    )
     # As after an hour's sleep, during which the steady clock stands still.
     browser.execute_script("const now = Date.now; Date.now = () => now() + 3600e3;")
     rig.wait(lambda: "for 36" in browser.find_element("id", "notices").text, "the age to show it")
