@@ -87,11 +87,6 @@ class Family:
         """Cells along the edge of the sheet: half a one more on each side of an outer ring."""
         return self.tag_cells + float(self.outer_ring)
 
-    @property
-    def most_wrong(self) -> int:
-        """Wrong cells up to which only one tag can be meant."""
-        return (self.hamming - 1) // 2
-
     def dictionary(self) -> Any:
         """Return OpenCV's dictionary of the family, or one of a single tag that nobody prints."""
         if self.dictionary_id is not None:
