@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import gc
 import sys
-import threading
 from collections.abc import Callable, Sequence
 
 import rclpy
@@ -40,10 +39,11 @@ def run_node(
     Returns:
         0 after one of these signals, 1 after an error.
     """
-    stop = threading.Event()
+    # A handler may interrupt itself: appending takes no lock, as an Event would.
+    signals: list[int] = []
     transport.use_large_messages()
     transport.keep_buffers()
-    on_end_signals(lambda *_: stop.set())
+    on_end_signals(lambda number, _: signals.append(number))
     try:
         rclpy.init(
             args=list(arguments) if arguments is not None else None,
@@ -59,7 +59,7 @@ def run_node(
         _keep_for_good()
         executor = create_executor()
         executor.add_node(node)
-        while rclpy.ok() and not stop.is_set():
+        while rclpy.ok() and not signals:
             executor.spin_once(timeout_sec=0.1)
             if fatal := getattr(node, "fatal_error", None):
                 raise RuntimeError(fatal)
