@@ -24,7 +24,7 @@ from der_planner.methods import LEARNED
 from der_planner.model import CONTROL_PERIOD, Model, simulate
 from der_planner.model.simulation import Bend
 from der_planner.planning.configuration import configure
-from der_planner.planning.errors import PlanningError
+from der_planner.planning.loads import PlanningError
 from der_planner.planning.optimal import Optimiser, OptimiserSettings, Optimum
 from der_planner.planning.plan_file import SUFFIX, Plan, difference, read_plan
 from der_planner.planning.workspace import solve

@@ -30,7 +30,7 @@ from scipy.interpolate import BSpline
 from der_planner.arrays import Array
 from der_planner.model import CONTROL_PERIOD
 from der_planner.planning import paths
-from der_planner.planning.errors import PlanningError
+from der_planner.planning.loads import PlanningError
 from der_planner.planning.nearest import Deviation, line, nearest_path
 from der_planner.planning.timing import (
     FINE_PERIOD,

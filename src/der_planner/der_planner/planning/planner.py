@@ -15,8 +15,7 @@ from der_planner.model import CONTROL_PERIOD, NODES, Model, RodModel, simulate
 from der_planner.model.commands import SlowVenting, slow_venting, within_limits
 from der_planner.model.commands import commands as commands_for
 from der_planner.planning.configuration import METHODS, Configuration, configure
-from der_planner.planning.errors import PlanningError
-from der_planner.planning.loads import nearly_buckling
+from der_planner.planning.loads import PlanningError, nearly_buckling
 from der_planner.planning.motions import Motion, Reference
 from der_planner.planning.optimal import Optimiser
 from der_planner.planning.plan_file import Plan
@@ -107,10 +106,10 @@ def _configured(model: Model, reference: Reference) -> Configuration:
         return configure(model, reference)
     except PlanningError as error:
         if model.name == "pcc" and model.limb.gravity[2]:
-            error.args = (
+            raise PlanningError(
                 f"{error}. Arcs know nothing of the sag out of their plane that this gravity "
-                "brings: plan with the rod (der)",
-            )
+                "brings: plan with the rod (der)"
+            ) from error
         raise
 
 

@@ -8,6 +8,7 @@ are solved in the same matrix operations, each from its own first guess, which d
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,8 +19,7 @@ from scipy.optimize import least_squares
 from der_planner.arrays import Array, interpolate
 from der_planner.model import NODES, ArcModel, Model, RodModel
 from der_planner.model.bending import Kinematics
-from der_planner.planning.errors import PlanningError, UnreachableError
-from der_planner.planning.loads import sagging_tips, stable_rest
+from der_planner.planning.loads import PlanningError, sagging_tips, stable_rest
 
 TOLERANCE = 1e-3
 """Points missed by less than this [m] count as reached (the models' reach differs by less)."""
@@ -37,6 +37,39 @@ _STRAIGHT = 1e-3
 """A limb that rests within this bend of straight starts there [rad]."""
 _LARGEST_STRIDE = 0.15
 """Change of a bend angle between anchors of a path up to which what lies between is safe [rad]."""
+
+
+@dataclass(eq=False)
+class UnreachableError(PlanningError):
+    """A point of the path lies outside what the limb reaches within its pressure limit.
+
+    Attributes:
+        time: of the point in the motion [s].
+        point: (x, y) in `limb_base` [m].
+        distance: to the nearest reachable point [m].
+        required_pressure: largest |differential pressure| the point would need [Pa]; NaN where no
+            pressure reaches it.
+        carried: what the limb carries under gravity [kg].
+    """
+
+    time: float
+    point: tuple[float, float]
+    distance: float
+    required_pressure: float
+    carried: float = 0.0
+
+    def __str__(self) -> str:
+        """Return a sentence for people, with the remedy."""
+        needed = "no pressure reaches it"
+        if not math.isnan(self.required_pressure):
+            needed = f"it would need {self.required_pressure / 1000:.1f} kPa"
+        carries = f"It carries {self.carried * 1000:.1f} g: carry less, move"
+        return (
+            f"the point ({self.point[0]:.4f}, {self.point[1]:.4f}) m at t = {self.time:.2f} s is "
+            f"out of reach: {self.distance * 1000:.1f} mm from what the limb reaches within its "
+            f"pressure limit; {needed}. {carries if self.carried else 'Move'} or shrink the path, "
+            "or lower the amplitude"
+        )
 
 
 @dataclass(frozen=True)
