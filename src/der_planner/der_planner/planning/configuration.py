@@ -26,6 +26,7 @@ from scipy.interpolate import BSpline, make_interp_spline
 
 from der_planner.arrays import Array
 from der_planner.model import ArcModel, Initial, Model, RodModel, State
+from der_planner.model.bending import inverse_kinematics
 from der_planner.model.rod import PoseFinder, Poses
 from der_planner.planning.loads import (
     BucklingError,
@@ -41,8 +42,6 @@ from der_planner.planning.workspace import (
     TOLERANCE,
     UnreachableError,
     Workspace,
-    solve,
-    static_pressure,
 )
 from der_planner.rod import ConvergenceError, Rod, RodState
 
@@ -157,10 +156,10 @@ def _arcs_along(model: ArcModel, reference: Reference) -> ArcConfiguration:
         )
     near = angles + (home - reference.rest)
     # Points that the rod reaches and the arcs miss are no refusal: the plan's error shows them.
-    own = solve(model, tip, near, REFERENCE_PRIOR)[0]
+    own = inverse_kinematics(model, tip, near, REFERENCE_PRIOR)[0]
 
     def needed(arcs: ArcModel) -> Array:
-        return arcs.material.differential_pressure(time, static_pressure(arcs, own), own)
+        return arcs.material.differential_pressure(time, arcs.static_pressure(own), own)
 
     stiffness = np.array([model.smallest_stiffness(pose) for pose in own])
     check_stays(stiffness, time, tip, "arcs")
@@ -224,7 +223,7 @@ def _evenly_along(model: RodModel, reference: Reference) -> RodConfiguration:
         # One angle cannot follow two coordinates: the rod bends as the arc does.
         bend = resting_spline(time, guess, reference.start)
         return RodConfiguration(model, bend, reference.start)
-    angles, misses = solve(model.kinematics, tip, guess, REFERENCE_PRIOR)
+    angles, misses = inverse_kinematics(model.kinematics, tip, guess, REFERENCE_PRIOR)
     tolerance = TOLERANCE if reference.deviation is None else NEAREST_TOLERANCE
     Workspace(model).check_reach(time, tip, angles, misses, tolerance, model.kinematics)
     return RodConfiguration(model, resting_spline(time, angles, reference.start), reference.start)
