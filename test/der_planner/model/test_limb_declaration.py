@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from der_planner.commands.write_limb_page import PAGE, page
-from der_planner.identification.terms import COLUMN, TERMS, to_limb, values_of
+from der_planner.identification.bends import COLUMN, TERMS, to_limb, values_of
 from der_planner.limb import (
     DEFAULT_LIMB_FILE,
     CalibratedRange,
