@@ -9,11 +9,11 @@ import numpy as np
 
 from der_planner.bags.run import RunSeries
 from der_planner.control import Learner, LearningError
-from der_planner.control.library import carried_over, nearest
 from der_planner.experiment.console import Progress
 from der_planner.experiment.options import TrialRun
 from der_planner.experiment.processes import GraphError
 from der_planner.planning import PlanningError
+from der_planner.planning.correction import carried_over, nearest
 from der_planner.planning.plan_file import read_plan, write_plan
 
 FOLDER = "learned"
