@@ -55,11 +55,7 @@ def _arguments() -> argparse.Namespace:
         action="store_true",
         help="estimate a constant lag of each run and take it out before computing E",
     )
-    parser.add_argument("--workers", type=int, default=0, help="processes (default: all cores)")
-    options = parser.parse_args()
-    if options.workers < 0:
-        parser.error(f"--workers is {options.workers}: give 1 or more, or 0 for all cores")
-    return options
+    return parser.parse_args()
 
 
 def _check_outputs(options: argparse.Namespace) -> None:
@@ -102,7 +98,7 @@ def main() -> int:
         return 2
     settings = EvaluationSettings(window=options.window, remove_lag=options.remove_lag)
     bags = expand(options.bags)
-    found = evaluate_bags(bags, settings, workers=options.workers, progress=_show)
+    found = evaluate_bags(bags, settings, _show)
     for entry in found:
         if entry.error:
             print(f"error: {entry.error}", file=sys.stderr)

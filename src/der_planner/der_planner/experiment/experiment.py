@@ -289,14 +289,12 @@ def _conclude(options: Options, kept: Kept, progress: Progress) -> None:
     path = write_results(found, options.out)
     print(format_table(summarise(found), compare(found)))
     _print_instruments(found, kept)
-    figures = [
-        path for plot in (plot_tip, plot_error, plot_pressures) for path in plot(runs, options.out)
-    ]
+    for plot in (plot_tip, plot_error, plot_pressures):
+        plot(runs, options.out)
     learned = plot_learning(found, options.out)
-    figures += learned
     progress.say(f"results: {path}")
     if options.report:
-        written = write_report(runs, found, options.out / "report", drawn=figures)
+        written = write_report(runs, found, options.out / "report")
         progress.say(f"report: {written.page}")
     more = ", learning.png" if learned else ""
     progress.say(f"figures: {options.out}/tip.png, error.png, pressures.png{more}")
