@@ -25,7 +25,6 @@ from typing import Any
 
 from der_planner.commands.learn import add_run, learning_summary
 from der_planner.control import Learner, LearningError
-from der_planner.control.library import carried_over, nearest
 from der_planner.experiment.console import OptionError, Progress, interrupt_once, run_command
 from der_planner.experiment.offline_run import load_arrays, play_offline
 from der_planner.experiment.options import Options, Trial, TrialRun, parse
@@ -34,6 +33,7 @@ from der_planner.identification import LogError, calibrate_twin
 from der_planner.limb import Limb, LimbError, mounting_of
 from der_planner.methods import LEARNED
 from der_planner.planning import PlanningError
+from der_planner.planning.correction import carried_over, nearest
 from der_planner.planning.loads import nearly_buckling
 from der_planner.planning.plan_file import read_plan, write_plan
 from der_planner.results import (

@@ -21,7 +21,7 @@ from der_planner.bags.record import PRESSURE_TYPE, STATE_TYPE, BagRecord, LimbRe
 from der_planner.bags.run import Stream
 from der_planner.bags.series import stream
 from der_planner.identification.log import CalibrationLog, LogError, on_grid
-from der_planner.model.series import CONTROL_PERIOD
+from der_planner.model import CONTROL_PERIOD
 
 LONGEST_GAP = 0.25
 """Time between two messages of a bag that a straight line may bridge [s]."""
