@@ -21,7 +21,7 @@ from der_planner.bags.record import PRESSURE_TYPE, STATE_TYPE, BagRecord, LimbRe
 from der_planner.bags.run import Stream
 from der_planner.bags.series import stream
 from der_planner.identification.log import CalibrationLog, LogError, on_grid
-from der_planner.model.series import CONTROL_PERIOD
+from der_planner.model import CONTROL_PERIOD
 
 LONGEST_GAP = 0.25
 """Time between two messages of a bag that a straight line may bridge [s]."""
@@ -362,6 +362,19 @@ def read_table(path: Path) -> dict[str, Array]:
                 cell, f"line {number}, column '{header[place]}' of {path}"
             )
     return {name: values[:, index] for index, name in enumerate(header)}
+
+
+def read_log(path: Path, columns: Path | None, namespace: str = "") -> CalibrationLog:
+    """Read a bag, or a table (CSV) by the map of its columns.
+
+    Raises:
+        LogError: it cannot be read, or is a table without a map.
+    """
+    if path.suffix != ".csv":
+        return read_bag(path, namespace)
+    if columns is None:
+        raise LogError(f"{path} needs --columns FILE")
+    return read_csv(path, ColumnMap.from_yaml(columns))
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
