@@ -12,7 +12,7 @@ from der_planner.identification.excitation import (
 )
 from der_planner.identification.fit import fit
 from der_planner.identification.log import CalibrationLog, LogError, prepare
-from der_planner.identification.readers import ColumnMap, read_bag, read_csv
+from der_planner.identification.readers import ColumnMap, read_bag, read_csv, read_log
 from der_planner.identification.report import FitReport, Unknown
 from der_planner.identification.terms import GROUPS
 from der_planner.identification.update import Change, Update, update
@@ -39,6 +39,7 @@ __all__ = [
     "read_bag",
     "read_csv",
     "read_excitation",
+    "read_log",
     "record_twin",
     "update",
     "within_limits",

@@ -364,6 +364,19 @@ def read_table(path: Path) -> dict[str, Array]:
     return {name: values[:, index] for index, name in enumerate(header)}
 
 
+def read_log(path: Path, columns: Path | None, namespace: str = "") -> CalibrationLog:
+    """Read a bag, or a table (CSV) by the map of its columns.
+
+    Raises:
+        LogError: it cannot be read, or is a table without a map.
+    """
+    if path.suffix != ".csv":
+        return read_bag(path, namespace)
+    if columns is None:
+        raise LogError(f"{path} needs --columns FILE")
+    return read_csv(path, ColumnMap.from_yaml(columns))
+
+
 def _lines(path: Path) -> list[tuple[int, str]]:
     """Return the lines that hold something, with their numbers from 1; the first is the header."""
     try:
