@@ -20,8 +20,7 @@ from der_planner.identification import CalibrationLog
 from der_planner.identification.bends import NODES, FreeTerms, predicted
 from der_planner.identification.log import Prepared
 from der_planner.limb import Limb
-from der_planner.model import RodModel, simulate
-from der_planner.model.series import CONTROL_PERIOD
+from der_planner.model import CONTROL_PERIOD, RodModel, simulate
 from der_planner.planning import METHODS, Motion, plan
 from der_planner.rod import Rod
 from der_planner.twin.offline import play

@@ -12,7 +12,7 @@ from der_planner.identification.excitation import (
 )
 from der_planner.identification.fit import fit
 from der_planner.identification.log import CalibrationLog, LogError, prepare
-from der_planner.identification.readers import ColumnMap, read_bag, read_csv
+from der_planner.identification.readers import ColumnMap, read_bag, read_csv, read_log
 from der_planner.identification.report import (
     Check,
     FitReport,
@@ -44,6 +44,7 @@ __all__ = [
     "read_bag",
     "read_csv",
     "read_excitation",
+    "read_log",
     "record_twin",
     "update",
     "within_limits",

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from der_planner.arrays import Array
 from der_planner.limb import Limb
-from der_planner.model.series import CONTROL_PERIOD
+from der_planner.model import CONTROL_PERIOD
 
 SMOOTHING = 11
 """Rows of the filter that takes the tags' noise off the bend (0.5 s)."""

@@ -20,7 +20,7 @@ from der_planner.bags.record import PRESSURE_TYPE, STATE_TYPE, BagRecord, LimbRe
 from der_planner.bags.run import Stream
 from der_planner.bags.series import stream
 from der_planner.identification.log import CalibrationLog, LogError, on_grid
-from der_planner.model.series import CONTROL_PERIOD
+from der_planner.model import CONTROL_PERIOD
 
 LONGEST_GAP = 0.25
 """Time between two messages of a bag that a straight line may bridge [s]."""
@@ -267,6 +267,19 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
         tip=tip[keep],
         source=Path(path).name,
     )
+
+
+def read_log(path: Path, columns: Path | None, namespace: str = "") -> CalibrationLog:
+    """Read a bag, or a table (CSV) by the map of its columns.
+
+    Raises:
+        LogError: it cannot be read, or is a table without a map.
+    """
+    if path.suffix != ".csv":
+        return read_bag(path, namespace)
+    if columns is None:
+        raise LogError(f"{path} needs --columns FILE")
+    return read_csv(path, ColumnMap.from_yaml(columns))
 
 
 def _timed(time: Array, path: str | Path) -> NDArray[np.bool_]:

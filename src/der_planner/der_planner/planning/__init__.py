@@ -12,10 +12,9 @@ from der_planner.planning.errors import (
     UnreachableError,
 )
 from der_planner.planning.motions import NAMES, Motion, Reference
-from der_planner.planning.paths import PathLimits
 from der_planner.planning.plan_file import Plan
 from der_planner.planning.planner import DEFAULT_METHOD, choose_method, plan
-from der_planner.planning.transitions import Start
+from der_planner.planning.timing import PathLimits, Start
 from der_planner.planning.workspace import Workspace
 
 __all__ = [

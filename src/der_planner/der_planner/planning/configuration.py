@@ -26,7 +26,7 @@ from scipy.interpolate import BSpline, make_interp_spline
 from der_planner.arrays import Array
 from der_planner.limb import Limb
 from der_planner.model import ArcModel, Initial, Model, RodModel, State
-from der_planner.model.poses import PoseFinder, Poses
+from der_planner.model.rod import PoseFinder, Poses
 from der_planner.planning.errors import (
     BucklingError,
     OverloadError,
@@ -35,7 +35,7 @@ from der_planner.planning.errors import (
 )
 from der_planner.planning.loads import check_load, check_stays, stable_rest
 from der_planner.planning.motions import Reference
-from der_planner.planning.transitions import Start, resting_spline, sample_spline
+from der_planner.planning.timing import Start, resting_spline, sample_spline
 from der_planner.planning.workspace import (
     NEAREST_TOLERANCE,
     TOLERANCE,

@@ -14,11 +14,10 @@ from collections.abc import Callable
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
-from der_planner.arrays import Array
+from der_planner.arrays import Array, interpolate
 from der_planner.limb import PAYLOAD, Limb
 from der_planner.model import RodModel
-from der_planner.model.poses import PoseFinder
-from der_planner.model.series import interpolate
+from der_planner.model.rod import PoseFinder
 from der_planner.planning.errors import BucklingError, OverloadError, PlanningError
 from der_planner.rod import ConvergenceError, Rod, RodState
 

@@ -32,8 +32,10 @@ from der_planner.model import CONTROL_PERIOD
 from der_planner.planning import paths
 from der_planner.planning.errors import PlanningError
 from der_planner.planning.nearest import Deviation, line, nearest_path
-from der_planner.planning.transitions import (
+from der_planner.planning.timing import (
     FINE_PERIOD,
+    LONGEST,
+    PathLimits,
     Start,
     fine_grid,
     led_in,
@@ -116,7 +118,7 @@ class Motion:
     path: paths.TipPath | None = None
     branch: str = ""
     nearest: bool = False
-    limits: paths.PathLimits | None = None
+    limits: PathLimits | None = None
 
     @classmethod
     def named(
@@ -154,9 +156,9 @@ class Motion:
             raise PlanningError(f"cycles must be a whole number of 1 or more, got {cycles}")
         if period < 4 * CONTROL_PERIOD:
             raise PlanningError(f"period is {period} s: the shortest is {4 * CONTROL_PERIOD} s")
-        if period * cycles > paths.LONGEST:
+        if period * cycles > LONGEST:
             raise PlanningError(
-                f"{cycles} cycles of {period} s are longer than {paths.LONGEST:.0f} s: plan fewer"
+                f"{cycles} cycles of {period} s are longer than {LONGEST:.0f} s: plan fewer"
             )
         return cls(name, float(amplitude), float(period), int(cycles), branch=branch)
 
@@ -167,7 +169,7 @@ class Motion:
         tip: ArrayLike,
         name: str = "path",
         branch: str = "",
-        limits: paths.PathLimits | None = None,
+        limits: PathLimits | None = None,
         nearest: bool = False,
     ) -> Motion:
         """Return a motion along a path of the tip.
@@ -191,7 +193,7 @@ class Motion:
         """
         check_branch(branch)
         if nearest and time is None:
-            drawn, limits = line(paths.checked_points(tip)), limits or paths.PathLimits()
+            drawn, limits = line(paths.checked_points(tip)), limits or PathLimits()
             return cls(name, path=drawn, branch=branch, nearest=True, limits=limits)
         path = paths.TipPath.build(time, tip, limits)
         return cls(name, path=path, branch=branch, nearest=nearest)
@@ -201,7 +203,7 @@ class Motion:
         cls,
         path: str | Path,
         branch: str = "",
-        limits: paths.PathLimits | None = None,
+        limits: PathLimits | None = None,
         nearest: bool = False,
     ) -> Motion:
         """Return a motion along a path in a CSV file: columns x, y [m] and, if timed, time [s].

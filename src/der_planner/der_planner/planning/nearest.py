@@ -23,10 +23,9 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.linalg import solveh_banded
 
-from der_planner.arrays import Array
-from der_planner.model.series import interpolate
-from der_planner.planning.pace import retimed
-from der_planner.planning.paths import PathLimits, TipPath
+from der_planner.arrays import Array, interpolate
+from der_planner.planning.paths import TipPath
+from der_planner.planning.timing import PathLimits, retimed
 from der_planner.planning.workspace import BRANCHES, Workspace
 
 DRAWN_WAVE = 0.01

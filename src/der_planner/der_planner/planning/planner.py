@@ -20,7 +20,7 @@ from der_planner.planning.loads import nearly_buckling
 from der_planner.planning.motions import Motion, Reference
 from der_planner.planning.optimal import Optimiser
 from der_planner.planning.plan_file import Plan
-from der_planner.planning.transitions import Start
+from der_planner.planning.timing import Start
 from der_planner.planning.workspace import Workspace
 from der_planner.rod import ConvergenceError
 
@@ -158,8 +158,7 @@ def _optimal(
         said = f"the limits leave a mean error of {missed * 1000:.1f} mm on the model itself"
         warnings.insert(0, f"{said}: {_excess(model, wanted)}")
     warnings += _error_warnings(found.tip, reference, "optimal")
-    details: dict[str, float] = {"steps": found.steps, "limited_windows": found.limited}
-    return _Solved(found.commands, found.tip, warnings, details)
+    return _Solved(found.commands, found.tip, warnings, found.details)
 
 
 def _balanced(configuration: Configuration, reference: Reference, method: str) -> _Solved:

@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
-from der_planner.arrays import Array
+from der_planner.arrays import Array, interpolate
 from der_planner.model import NODES, ArcModel, Model, RodModel
 from der_planner.model.bending import Kinematics
-from der_planner.model.series import interpolate
 from der_planner.planning.errors import PlanningError, UnreachableError
 from der_planner.planning.loads import sagging_tips, stable_rest
 
