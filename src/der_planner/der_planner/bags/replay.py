@@ -85,7 +85,6 @@ def replay(
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
     progress: Callable[[float, float], None] | None = None,
-    keep_going: Callable[[], bool] = lambda: True,
 ) -> int:
     """Play the bag and return the number of messages published.
 
@@ -96,7 +95,6 @@ def replay(
         clock: monotonic seconds.
         sleep: waits some seconds.
         progress: called with played and whole length [s].
-        keep_going: asked before each message; False ends the replay.
 
     Raises:
         BagError: as `choose_topics`.
@@ -109,9 +107,7 @@ def replay(
     pace = _Pace(first, settings.rate, clock, sleep, output)
     count = 0
     for message in bag.raw(list(names), first, last):
-        if not keep_going():
-            break
-        pace.wait_for(message.log_time, keep_going)
+        pace.wait_for(message.log_time)
         output.publish(names[message.topic], message)
         count += 1
         if progress is not None:
@@ -135,9 +131,9 @@ class _Pace:
         self._begin = clock()
         output.show_time(first)
 
-    def wait_for(self, when: int, keep_going: Callable[[], bool]) -> None:
+    def wait_for(self, when: int) -> None:
         """Wait until recorded time is ``when`` [ns]; the clock ticks meanwhile."""
-        while self._shown + CLOCK_PERIOD < when and keep_going():
+        while self._shown + CLOCK_PERIOD < when:
             self._show(self._shown + CLOCK_PERIOD)
         if when > self._shown:
             self._show(when)

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from der_planner.arrays import Array
 from der_planner.results import figures as style
-from der_planner.results.figures import FORMATS, new_figure
+from der_planner.results.figures import new_figure
 from der_planner.studies.store import Kept
 from der_planner.studies.study import Study
 
@@ -60,7 +60,7 @@ def draw(study: Study, kept: Mapping[str, Kept], folder: Path) -> dict[str, list
             continue
         with style.paper_style():
             figure = _indices(plot, indices) if indices else _panels(study, plot, rows)
-            written[plot["name"]] = style.save(figure, folder, plot["name"], FORMATS)
+            written[plot["name"]] = style.save(figure, folder, plot["name"])
     return written
 
 
