@@ -69,12 +69,11 @@ def test_lag_gain_and_bias_are_told_apart(lag: float):
     tip = mean + (late - mean) * [0.9, 1.2] + [0.002, -0.005]
     tip += np.random.default_rng(5).normal(0.0, 2e-4, tip.shape)
     found = split_error(series(tip))
-    assert found.lag == pytest.approx(lag, abs=2e-3)
+    assert found.lag_s == pytest.approx(lag, abs=2e-3)
     assert (found.gain_x, found.gain_y) == pytest.approx((0.9, 1.2), abs=5e-3)
-    assert (found.bias_x, found.bias_y) == pytest.approx((0.002, -0.005), abs=2e-3)
-    steps = [found.rms, found.rms_without_lag, found.rms_without_bias, found.rms_without_gain]
-    assert steps[1] >= steps[2] >= steps[3]
-    assert found.rms_without_gain == pytest.approx(2e-4 * np.sqrt(2), rel=0.2)
+    assert (found.bias_x_m, found.bias_y_m) == pytest.approx((0.002, -0.005), abs=2e-3)
+    assert found.rms_without_lag_m >= found.rms_without_bias_m >= found.rms_without_gain_m
+    assert found.rms_without_gain_m == pytest.approx(2e-4 * np.sqrt(2), rel=0.2)
 
 
 def test_nothing_is_shifted_unless_asked():
@@ -95,7 +94,7 @@ def test_reference_that_rests_has_no_lag():
         reference_time=TIMES,
         tip_reference=np.tile([0.24, 0.0], (len(TIMES), 1)),
     )
-    assert split_error(rest).lag == 0.0
+    assert split_error(rest).lag_s == 0.0
     assert evaluate_run(rest).mean_error_m == pytest.approx(0.001)
 
 

@@ -7,7 +7,7 @@ import html
 import json
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -69,14 +69,6 @@ figcaption, .small { font-size: 0.85rem; color: #555; }
 """
 
 
-@dataclass(frozen=True)
-class Report:
-    """What was written: the page, and everything beside it."""
-
-    page: Path
-    files: tuple[Path, ...]
-
-
 def results_document(results: Sequence[RunResult]) -> dict[str, Any]:
     """Return the content of ``results.json``: runs, summary over trials, comparisons."""
     return {
@@ -113,7 +105,7 @@ def write_report(
     *,
     title: str = "Tracking errors",
     progress: Callable[[str], None] = lambda _: None,
-) -> Report:
+) -> Path:
     """Write page, tables and figures into a folder.
 
     Args:
@@ -125,21 +117,20 @@ def write_report(
         progress: called with what is being made.
 
     Returns:
-        The written files.
+        The page.
 
     Raises:
         BagError: a bag cannot be read again for its frames.
     """
     folder = Path(folder)
-    files = [write_results(results, folder)]
+    write_results(results, folder)
     rows = summarise(results)
     for name, text in (
         ("table.md", error_table(rows).markdown()),
         ("table.csv", csv_table(rows)),
         ("table.tex", error_table(rows).latex()),
     ):
-        files.append(folder / name)
-        files[-1].write_text(text, encoding="utf-8")
+        (folder / name).write_text(text, encoding="utf-8")
     figures: list[str] = []
     plots: dict[str, Callable[[], list[Path]]] = {
         "error": lambda: plot_error(runs, folder),
@@ -151,12 +142,10 @@ def write_report(
     }
     for name, plot in plots.items():
         progress(f"figure {name}")
-        written = plot()
-        files += written
-        figures += [figure(_CAPTIONS[name], path) for path in written if path.suffix == ".png"]
+        figures += [figure(_CAPTIONS[name], path) for path in plot() if path.suffix == ".png"]
     page = folder / "report.html"
     page.write_text(document(title, _sections(results, figures)), encoding="utf-8")
-    return Report(page, (*files, page))
+    return page
 
 
 def document(title: str, sections: Sequence[str]) -> str:
