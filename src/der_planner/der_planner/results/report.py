@@ -16,7 +16,6 @@ from der_planner.bags.run import RunSeries
 from der_planner.results.evaluation import RunResult, json_value
 from der_planner.results.figures import (
     plot_error,
-    plot_latency,
     plot_learning,
     plot_pressures,
     plot_tip,
@@ -43,7 +42,6 @@ _CAPTIONS = {
     "shapes": "Planned and measured limb, over the camera's frames where these were recorded.",
     "pressures": "Differential pressures, commanded and measured; first trial of each model.",
     "learning": "Mean tip error over the runs that a plan was learned from, a line a trial.",
-    "latency": "From the instant of a picture to the first command at the board that knows of it.",
 }
 _DEFINITIONS = """
 <p>r̄ is the tip reference of the plan, interpolated linearly at the stamp of each image; r is the
@@ -73,7 +71,7 @@ def results_document(results: Sequence[RunResult]) -> dict[str, Any]:
     """Return the content of ``results.json``: runs, summary over trials, comparisons."""
     return {
         "format": FORMAT,
-        "runs": [result.to_dict() for result in results],
+        "runs": [json_value(asdict(result)) for result in results],
         "summary": [json_value(asdict(row)) for row in summarise(results)],
         "comparisons": [json_value(asdict(entry)) for entry in compare(results)],
         "side_by_side": side_by_side(results),
@@ -90,12 +88,6 @@ def write_results(results: Sequence[RunResult], folder: Path) -> Path:
     unfinished.write_text(text + "\n", encoding="utf-8")
     os.replace(unfinished, path)
     return path
-
-
-def read_results(path: Path) -> list[RunResult]:
-    """Return the runs of a ``results.json``."""
-    document = json.loads(Path(path).read_text(encoding="utf-8"))
-    return [RunResult.from_dict(entry) for entry in document["runs"]]
 
 
 def write_report(
@@ -138,7 +130,6 @@ def write_report(
         "shapes": lambda: plot_shapes(runs, folder),
         "pressures": lambda: plot_pressures(runs, folder),
         "learning": lambda: plot_learning(results, folder),
-        "latency": lambda: plot_latency(results, folder),
     }
     for name, plot in plots.items():
         progress(f"figure {name}")
