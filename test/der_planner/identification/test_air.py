@@ -118,12 +118,12 @@ def test_a_vented_step_of_the_emulated_board_is_predicted():
 
 def report_of(air: AirFit) -> FitReport:
     none = np.zeros(0)
-    return FitReport("", (), none, (), air, None, none, none, none, none, 1.0, 1, 1, 1.0)
+    return FitReport(Limb.default(), "", (), none, (), air, None, none, none, none, none, 1.0, 1)
 
 
 def test_the_report_says_how_fast_chambers_vent_or_that_it_does_not_know():
     lags = {"time_constant": 0.3, "vent_time_constant": 0.1, "delay": 0.0}
-    open_ = AirFit(lags, lags, 9000.0, np.zeros(2), 40.0)
+    open_ = AirFit(lags, lags, 40.0, 9000.0)
     shown = replace(
         open_,
         numbers={**lags, "vent_rate": 5300.0, "vent_exponent": 0.66},

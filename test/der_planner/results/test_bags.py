@@ -186,7 +186,7 @@ def two_limbs(folder: Path, **offsets) -> None:
 
 def test_two_limbs_in_one_bag_are_evaluated_apart(tmp_path: Path):
     two_limbs(tmp_path / "run", limb=0.002, lab2=0.008)
-    found = evaluate_bags([tmp_path / "run"], workers=1)
+    found = evaluate_bags([tmp_path / "run"])
     errors = {entry.result.namespace: entry.result.mean_error_m for entry in found}
     assert errors == {
         "/limb": pytest.approx(0.002, abs=5e-5),
@@ -209,9 +209,9 @@ def test_two_limbs_in_one_bag_are_evaluated_apart(tmp_path: Path):
 
 def test_a_plan_never_meets_the_state_of_another_limb(tmp_path: Path):
     two_limbs(tmp_path / "run", lab2=0.008)
-    (seen,) = [entry for entry in evaluate_bags([tmp_path / "run"], workers=1) if entry.result]
+    (seen,) = [entry for entry in evaluate_bags([tmp_path / "run"]) if entry.result]
     assert seen.result.namespace == "/lab2"
-    (blind,) = [entry for entry in evaluate_bags([tmp_path / "run"], workers=1) if entry.error]
+    (blind,) = [entry for entry in evaluate_bags([tmp_path / "run"]) if entry.error]
     assert "/limb: no limb state was recorded" in blind.error
     assert "/lab2 are another limb's" in blind.error
 

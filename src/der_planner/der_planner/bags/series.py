@@ -74,14 +74,12 @@ class _Setpoints:
 
 
 def _setpoints(limb: LimbRecord, plan_id: str, segment_count: int) -> _Setpoints:
-    if plan_id not in limb.setpoints:
-        none = np.empty(0, dtype=np.int64)
-        return _Setpoints(none, none, np.empty((0, segment_count)))
     rows = limb.setpoints[plan_id]
-    backward = np.array(limb.setpoint_indices[plan_id])[::-1]
-    index, last = np.unique(backward, return_index=True)
-    last = len(backward) - 1 - last
-    return _Setpoints(index, rows.stamps()[last], rows.values(segment_count)[last])
+    values = rows.values(1 + segment_count)
+    backward = np.flatnonzero(np.isfinite(values[:, 0]))[::-1]
+    index, first = np.unique(values[backward, 0].astype(np.int64), return_index=True)
+    last = backward[first]
+    return _Setpoints(index, rows.stamps()[last], values[last, 1:])
 
 
 def _feedback(limb: LimbRecord, plan: Any, setpoints: _Setpoints) -> dict[str, Any]:
@@ -91,7 +89,7 @@ def _feedback(limb: LimbRecord, plan: Any, setpoints: _Setpoints) -> dict[str, A
     added = setpoints.value[usable] - planned[setpoints.index[usable]]
     if not len(added):
         return {}
-    taken = latencies(limb.revisions.get(plan.plan_id, Revisions()), limb.seen())
+    taken = latencies(limb.revisions[plan.plan_id], limb.seen())
     return {"feedback": described(added, taken)}
 
 
@@ -118,7 +116,7 @@ def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
         raise EvaluationError(
             f"{where}: the plan '{chosen}' carries no stamp and none of its setpoints was recorded"
         )
-    about = _feedback(limb, plan, setpoints) if chosen in limb.revised else {}
+    about = _feedback(limb, plan, setpoints) if limb.revisions[chosen].stamps else {}
     end = times[-1]
     played = int(setpoints.index[-1]) if len(setpoints.index) else len(times) - 1
     faults = [text for when, text in limb.faults if 0 <= (when - origin) / NANOSECONDS <= end]
@@ -198,7 +196,7 @@ def _choose_plan(limb: LimbRecord, where: str, plan_id: str) -> str:
         )
     if plan_id and plan_id not in usable:
         raise EvaluationError(f"{where}: no plan '{plan_id}', only {', '.join(sorted(usable))}")
-    most = max(usable, key=lambda name: (len(limb.setpoints.get(name, ())), usable[name][0]))
+    most = max(usable, key=lambda name: (len(limb.setpoints[name]), usable[name][0]))
     return plan_id or most
 
 

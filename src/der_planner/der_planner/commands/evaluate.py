@@ -13,7 +13,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from der_planner.experiment.console import OptionError, Progress, run_command
+from der_planner.experiment.console import Progress, run_command
 from der_planner.results import (
     BagError,
     EvaluationError,
@@ -56,7 +56,6 @@ def _arguments() -> argparse.Namespace:
         action="store_true",
         help="estimate a constant lag of each run and take it out before computing E",
     )
-    parser.add_argument("--workers", type=int, default=0, help="processes (default: all cores)")
     return parser.parse_args()
 
 
@@ -84,15 +83,13 @@ def main() -> int:
 
 
 def _evaluate(given: argparse.Namespace) -> int:
-    if given.workers < 0:
-        raise OptionError(f"--workers is {given.workers}: give 1 or more, or 0 for all cores")
     for name in ("report", "results"):
         if getattr(given, name) is not None:
             check_folder(getattr(given, name), f"--{name}")
     if given.video is not None:
         check_file(given.video, "--video")
     settings = EvaluationSettings(window=given.window, remove_lag=given.remove_lag)
-    found = evaluate_bags(expand(given.bags), settings, workers=given.workers, progress=_show)
+    found = evaluate_bags(expand(given.bags), settings, _show)
     for entry in found:
         if entry.error:
             print(f"error: {entry.error}", file=sys.stderr)

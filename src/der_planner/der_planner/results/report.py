@@ -6,15 +6,14 @@ import base64
 import html
 import json
 import os
-import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from der_planner.bags.run import RunSeries
-from der_planner.results.evaluation import RunResult
+from der_planner.results.evaluation import RunResult, json_value
 from der_planner.results.figures import (
     plot_error,
     plot_latency,
@@ -83,8 +82,8 @@ def results_document(results: Sequence[RunResult]) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "runs": [result.to_dict() for result in results],
-        "summary": [row.to_dict() for row in summarise(results)],
-        "comparisons": [entry.to_dict() for entry in compare(results)],
+        "summary": [json_value(asdict(row)) for row in summarise(results)],
+        "comparisons": [json_value(asdict(entry)) for entry in compare(results)],
         "side_by_side": side_by_side(results),
     }
 
@@ -113,7 +112,6 @@ def write_report(
     folder: Path,
     *,
     title: str = "Tracking errors",
-    drawn: Sequence[Path] = (),
     progress: Callable[[str], None] = lambda _: None,
 ) -> Report:
     """Write page, tables and figures into a folder.
@@ -124,7 +122,6 @@ def write_report(
         folder: made if missing; receives ``report.html``, ``results.json``, ``table.md``,
             ``table.csv``, ``table.tex`` and each figure as PDF and PNG.
         title: of the page.
-        drawn: files of figures of the same runs that exist already; they are copied.
         progress: called with what is being made.
 
     Returns:
@@ -153,10 +150,8 @@ def write_report(
         "latency": lambda: plot_latency(results, folder),
     }
     for name, plot in plots.items():
-        written = [Path(shutil.copy(path, folder)) for path in drawn if path.stem == name]
-        if not written:
-            progress(f"figure {name}")
-            written = plot()
+        progress(f"figure {name}")
+        written = plot()
         files += written
         figures += [figure(_CAPTIONS[name], path) for path in written if path.suffix == ".png"]
     page = folder / "report.html"

@@ -6,14 +6,14 @@ Only runs that can be compared are compared; the others are left out and the rea
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from der_planner.arrays import Array
 from der_planner.methods import LEARNED
-from der_planner.results.evaluation import RunResult, json_value
+from der_planner.results.evaluation import RunResult
 
 RESAMPLES = 10_000
 CONFIDENCE = 0.95
@@ -50,10 +50,6 @@ class Summary:
     namespace: str = ""
     loads: str = ""
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return what ``results.json`` holds."""
-        return {key: json_value(value) for key, value in asdict(self).items()}
-
 
 @dataclass(frozen=True)
 class Comparison:
@@ -86,10 +82,6 @@ class Comparison:
     refused: str = ""
     namespace: str = ""
     loads: str = ""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return what ``results.json`` holds."""
-        return {key: json_value(value) for key, value in asdict(self).items()}
 
 
 Key = tuple[str, str, str, str, str]

@@ -95,7 +95,7 @@ def draw_all(study: Study, kept: Mapping[str, Kept], folder: Path) -> list[str]:
                 drawn = _panels(study, plot, rows) if rows else None
             if drawn is None:
                 continue
-            written = style.save(drawn, folder, plot["name"], style.FORMATS)
+            written = style.save(drawn, folder, plot["name"])
         labels = {key: quantity(name, study)[0] for key, name in used.items()}
         caption = plot.get("title") or _CAPTIONS[plot["kind"]].format(**labels)
         pictures += [figure(caption, path) for path in written if path.suffix == ".png"]
