@@ -31,7 +31,7 @@ from der_planner.methods import LEARNED
 from der_planner.model import CONTROL_PERIOD, STEPS
 from der_planner.model.air import Chambers
 from der_planner.model.commands import within_limits
-from der_planner.planning.errors import PlanningError
+from der_planner.planning.loads import PlanningError
 from der_planner.planning.optimal import minimise
 from der_planner.planning.plan_file import Plan
 

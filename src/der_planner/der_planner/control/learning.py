@@ -38,7 +38,7 @@ from der_planner.identification.update import adapted
 from der_planner.limb import Limb, LimbError
 from der_planner.methods import LEARNED
 from der_planner.planning.correction import PULL, Correction
-from der_planner.planning.errors import PlanningError
+from der_planner.planning.loads import PlanningError
 from der_planner.planning.plan_file import Plan
 
 _LEAST_SEEN = 0.2

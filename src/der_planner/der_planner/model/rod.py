@@ -131,7 +131,7 @@ class RodModel(Model):
         found, q = trajectory.linearisation, trajectory.q
         linear = None if found is None else RodFirstOrder(self.rod, q, found)
         angles, tip = bend_angles(self.rod, q), trajectory.tip[:, :2]
-        return Rollout(angles, tip, trajectory.final, trajectory, linear)
+        return Rollout(angles, tip, trajectory.final, linear)
 
 
 class Balance:

@@ -20,7 +20,6 @@ from der_planner.limb import Limb
 from der_planner.model.air import Chambers
 from der_planner.model.material import Material, Memory
 from der_planner.model.model import FirstOrder, Model, State
-from der_planner.rod import Trajectory
 
 Bend = Callable[[Array], Array]
 """Bend angles (K, M) [rad] at instants (K,) [s]."""
@@ -105,7 +104,6 @@ class Response:
         tip: (K+1, 2) [m].
         final: state at the end.
         memory: of friction and creep at the last instant at which they were computed.
-        trajectory: of the rod's nodes; None for the arcs.
         derivative: by the commands or pressures that were given, if it was asked for.
     """
 
@@ -116,7 +114,6 @@ class Response:
     tip: Array
     final: State
     memory: Memory
-    trajectory: Trajectory | None = None
     derivative: Derivative | None = None
 
 
@@ -180,7 +177,6 @@ def simulate(
         moved.tip,
         moved.final,
         felt.memory,
-        moved.trajectory,
         derivative,
     )
 

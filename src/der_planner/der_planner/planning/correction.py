@@ -22,12 +22,12 @@ from der_planner.arrays import Array
 from der_planner.limb import Limb
 from der_planner.methods import LEARNED
 from der_planner.model import CONTROL_PERIOD, Model, simulate
+from der_planner.model.bending import inverse_kinematics
 from der_planner.model.simulation import Bend
 from der_planner.planning.configuration import configure
-from der_planner.planning.errors import PlanningError
+from der_planner.planning.loads import PlanningError
 from der_planner.planning.optimal import Optimiser, OptimiserSettings, Optimum
 from der_planner.planning.plan_file import SUFFIX, Plan, difference, read_plan
-from der_planner.planning.workspace import solve
 from der_planner.rod import ConvergenceError
 
 _THREADS = ThreadpoolController()
@@ -200,7 +200,9 @@ class Correction:
 
         A straight limb reaches no further, and bends to no avail where more is wanted of it.
         """
-        angles, _ = solve(self.model.kinematics, wanted, self._plan.bend_angles, _PRIOR)
+        angles, _ = inverse_kinematics(
+            self.model.kinematics, wanted, self._plan.bend_angles, _PRIOR
+        )
         reached: Array = self.model.kinematics.tip(angles)
         return reached
 

@@ -30,7 +30,7 @@ from scipy.interpolate import BSpline
 from der_planner.arrays import Array
 from der_planner.model import CONTROL_PERIOD
 from der_planner.planning import paths
-from der_planner.planning.errors import PlanningError
+from der_planner.planning.loads import PlanningError
 from der_planner.planning.nearest import Deviation, line, nearest_path
 from der_planner.planning.timing import (
     FINE_PERIOD,
@@ -105,7 +105,7 @@ class Motion:
         cycles: number of them; 1 for a path.
         path: the tip path of shapes and paths.
         branch: of the arcs at the first point of a path, see `workspace.BRANCHES`; empty: least
-            pressure.
+            pressure. A nearest path takes whichever comes nearest.
         nearest: follow the nearest path that the limb can follow instead of refusing one that
             leaves its reach, see `nearest`.
         limits: of the tip on a nearest path whose times mean nothing; None: its times count.
@@ -185,6 +185,7 @@ class Motion:
             tip: (P, 2) points in `limb_base` [m].
             name: for tables.
             branch: which way to reach the first point; empty: the one with the least pressure.
+                A nearest path takes the one that comes nearest.
             limits: speed and acceleration for a path without times.
             nearest: follow the nearest path that the limb can follow.
 
@@ -293,17 +294,17 @@ class Motion:
     def _nearest_motion(
         self, workspace: Workspace, path: paths.TipPath
     ) -> tuple[Array, Array, Deviation]:
-        rest, offset = workspace.rest, workspace.rest.offset
-        found = nearest_path(workspace, path, offset, self.limits, self.branch)
+        offset, limits = workspace.rest.offset, self.limits
+        fastest, home = workspace.fastest, workspace.rest.bend_angles
+        time, angles, deviation = nearest_path(workspace, path, offset, limits)
         if workspace.sags:
             # On average: the arcs' reach is longer than that of a limb which sags out of the plane.
-            tips = workspace.sagging_tips(found.time, found.bend_angles)
-            offset = (tips - workspace.arcs.tip(found.bend_angles)).mean(axis=0)
-            found = nearest_path(workspace, path, offset, self.limits, self.branch)
-        fastest, home = workspace.fastest, rest.bend_angles
-        time, angles = with_transitions(fastest, found.time, found.bend_angles, home)
-        if np.any(angles < workspace.low) or np.any(angles > workspace.high):
+            tips = workspace.sagging_tips(time, angles)
+            offset = (tips - workspace.arcs.tip(angles)).mean(axis=0)
+            time, angles, deviation = nearest_path(workspace, path, offset, limits)
+        joined = with_transitions(fastest, time, angles, home)
+        if np.any(joined[1] < workspace.low) or np.any(joined[1] > workspace.high):
             # A transition that begins or ends in full motion near a limit would swing beyond it.
-            found = nearest_path(workspace, path, offset, self.limits, self.branch, rest=True)
-            time, angles = with_transitions(fastest, found.time, found.bend_angles, home)
-        return time, angles, found.deviation
+            time, angles, deviation = nearest_path(workspace, path, offset, limits, rest=True)
+            joined = with_transitions(fastest, time, angles, home)
+        return (*joined, deviation)

@@ -33,7 +33,7 @@ from der_planner.model.air import Air
 from der_planner.model.commands import within_limits
 from der_planner.model.simulation import Drive, Window
 from der_planner.planning.configuration import Configuration
-from der_planner.planning.errors import PlanningError
+from der_planner.planning.loads import PlanningError
 from der_planner.planning.motions import Reference
 from der_planner.rod import ConvergenceError
 

@@ -14,7 +14,7 @@ from scipy.interpolate import make_interp_spline
 
 from der_planner.arrays import Array, interpolate
 from der_planner.model.bending import Kinematics
-from der_planner.planning.errors import PlanningError
+from der_planner.planning.loads import PlanningError
 from der_planner.planning.timing import (
     LONGEST,
     PathLimits,

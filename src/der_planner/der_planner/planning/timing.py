@@ -17,7 +17,7 @@ from scipy.interpolate import BSpline, PchipInterpolator, make_interp_spline
 
 from der_planner.arrays import Array
 from der_planner.model import CONTROL_PERIOD
-from der_planner.planning.errors import PlanningError
+from der_planner.planning.loads import PlanningError
 from der_planner.planning.workspace import Workspace
 
 FINE_PERIOD = 0.01
