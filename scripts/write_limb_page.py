@@ -6,4 +6,4 @@ import sys
 import workspace
 
 if __name__ == "__main__":
-    sys.exit(workspace.run("der_planner.commands.write_limb_page"))
+    sys.exit(workspace.run("figures.limb_page"))

@@ -25,7 +25,7 @@ from der_planner.control.feedback import Feedback
 from der_planner.control.lockstep import Played, play
 from der_planner.identification.excitation import calibrate_twin
 from der_planner.limb import Limb
-from der_planner.model.series import CONTROL_PERIOD
+from der_planner.model import CONTROL_PERIOD
 from der_planner.planning import Motion, plan
 from der_planner.twin import Push
 from der_planner.twin.offline import OfflineTwin

@@ -82,7 +82,6 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
 QOS = "--qos-profile --qos-depth --qos-reliability --qos-durability"
 VERBS = {
     "run": ("Run an executable of a package", "package_name executable_name argv"),
-    "node list": ("List the nodes", "--spin-time --all"),
     "topic list": ("List the topics", "--spin-time --show-types --all"),
     "topic echo": (
         "Print the messages of a topic",
@@ -93,9 +92,7 @@ VERBS = {
         "Publish messages",
         f"topic_name message_type values --rate --once --times --wait-matching-subscriptions {QOS}",
     ),
-    "service list": ("List the services", "--spin-time --show-types --all"),
     "service call": ("Call a service", "service_name service_type values"),
-    "action list": ("List the actions", "--spin-time --show-types --all"),
     "action send_goal": (
         "Send a goal to an action; Ctrl-C cancels it",
         "action_name action_type goal --feedback",

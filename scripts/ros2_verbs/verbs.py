@@ -15,7 +15,7 @@ from typing import Any
 from action_msgs.msg import GoalStatus
 from rcl_interfaces.msg import Parameter, ParameterDescriptor
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
-from rclpy.action import ActionClient, get_action_names_and_types
+from rclpy.action import ActionClient
 from rclpy.duration import Duration
 from rclpy.parameter import get_parameter_value, parameter_value_to_python
 from rclpy.qos import qos_profile_sensor_data
@@ -24,42 +24,17 @@ from ros2_verbs.cli import CommandError
 from ros2_verbs.messages import SHOWN, Filled, interface, to_yaml
 from ros2_verbs.session import Session, is_hidden, qos_profile
 
-# Lists.
-
-
-def _list(options: argparse.Namespace, found_in: Callable[[Session], dict[str, list[str]]]) -> None:
-    with Session(options) as session:
-        session.discover()
-        found = found_in(session)
-    for name, types in found.items():
-        if options.all or not is_hidden(name):
-            print(f"{name} [{', '.join(types)}]" if options.show_types else name)
-
-
-def node_list(options: argparse.Namespace) -> None:
-    """List the nodes; two of one name stand twice."""
-    with Session(options) as session:
-        session.discover()
-        names = session.nodes()
-    print("\n".join(name for name in names if options.all or not is_hidden(name)))
+# Topics.
 
 
 def topic_list(options: argparse.Namespace) -> None:
     """List the topics."""
-    _list(options, Session.topics)
-
-
-def service_list(options: argparse.Namespace) -> None:
-    """List the services."""
-    _list(options, Session.services)
-
-
-def action_list(options: argparse.Namespace) -> None:
-    """List the actions."""
-    _list(options, lambda session: dict(sorted(get_action_names_and_types(session.node))))
-
-
-# Topics.
+    with Session(options) as session:
+        session.discover()
+        found = session.topics()
+    for name, types in found.items():
+        if options.all or not is_hidden(name):
+            print(f"{name} [{', '.join(types)}]" if options.show_types else name)
 
 
 def topic_echo(options: argparse.Namespace) -> None:

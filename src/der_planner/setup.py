@@ -36,10 +36,10 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "planner = der_planner.nodes.entry:planner",
-            "recorder = der_planner.nodes.entry:recorder",
-            "limb_twin = der_planner.nodes.entry:limb_twin",
-            "page = der_planner.nodes.entry:page",
+            "planner = der_planner.nodes:run_planner",
+            "recorder = der_planner.nodes:run_recorder",
+            "limb_twin = der_planner.nodes:run_limb_twin",
+            "page = der_planner.nodes:run_page",
         ],
     },
 )

@@ -154,13 +154,10 @@ def test_bad_input_is_named_and_gives_no_state(graph, states, tags, model):
             break
     assert state.tags_used == len(tags.limb)
 
-    for k, (image, reason) in enumerate(
-        [(good[:480, :640], "640 x 480"), (np.zeros_like(good), "no limb tag")]
-    ):
-        state = answer(image_message(image, now + 301 + k))
-        assert not state.valid
-        assert reason in state.reason
-    client.wait_for(lambda: "no limb tag" in message_of(client), PATIENCE, "the diagnostics")
+    state = answer(image_message(good[:480, :640], now + 301))
+    assert not state.valid
+    assert "640 x 480" in state.reason
+    client.wait_for(lambda: "640 x 480" in message_of(client), PATIENCE, "the diagnostics")
 
 
 def message_of(client):
@@ -192,8 +189,6 @@ def test_pictures_of_a_folder_are_tracked(graph, states, tags, model, tmp_path):
 @pytest.mark.parametrize(
     ("parameters", "named"),
     [
-        ({"calibration_file": "/nowhere/camera.yaml"}, "/nowhere/camera.yaml"),
-        ({"tag_map": "/nowhere/tags.yaml"}, "/nowhere/tags.yaml"),
         ({"source": "/nowhere/video.avi"}, "calibration_file"),
         ({"smallest_tag": 2.0}, "smallest_tag"),
     ],

@@ -43,6 +43,10 @@ def test_images_without_calibration_are_an_error(clock):
     assert "calibrate_camera" in watch.report(None).message
     watch.calibration_problem = "the camera is not calibrated"
     assert watch.report(None).message == "the camera is not calibrated"
+    watch = ImageWatch("/dev/video0", False, clock)
+    watch.image_problem = "the camera /dev/video0 gives no images: was it unplugged?"
+    assert watch.report(None).level == "error"
+    assert "unplugged" in watch.report(None).message
 
 
 def test_a_stream_that_stops_is_an_error(clock, tracker, camera, swing):
@@ -71,14 +75,6 @@ def test_problems_come_before_the_state(clock, tracker):
     assert (report.level, report.message) == ("error", "no limb tag in the image")
     assert report.values["states_invalid"] == 1
     assert report.values["images_failed"] == 1
-
-
-def test_a_silent_device_is_an_error_at_once(clock):
-    watch = ImageWatch("/dev/video0", False, clock)
-    watch.image_problem = "the camera /dev/video0 gives no images: was it unplugged?"
-    report = watch.report(None)
-    assert report.level == "error"
-    assert "unplugged" in report.message
 
 
 def test_the_annotated_picture_marks_the_tip(tracker, camera, swing):

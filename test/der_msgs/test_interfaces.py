@@ -1,43 +1,52 @@
 """The Python half of the contract: gaps in stamps, parameter files, the transport of images."""
 
+import contextlib
 import platform
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from domain import own_domain
+from rclpy.exceptions import ParameterNotDeclaredException
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 from limb_interfaces import transport
+from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.gaps import StampGaps
-from limb_interfaces.overrides import key_matches, node_keys, parameter_files
+from limb_interfaces.overrides import check_overrides, key_matches
+from limb_interfaces.parameters import ParameterError, declare
 
 PERIOD = 33_333_333
 
 
-def declared(given, default, **options):
-    """Declare a parameter of a node whose command line gives it; return its value."""
-    import rclpy
-    from rclpy.node import Node
-
-    from limb_interfaces.parameters import declare
-
+@contextlib.contextmanager
+def node(*arguments, name="declaring"):
+    """Return a node with arguments of a command line, in a domain of this file."""
     context = rclpy.Context()
     rclpy.init(args=[], context=context, domain_id=own_domain(__file__))
-    line = ["--ros-args", "-p", f"wanted:={given}"]
-    node = Node("declaring", context=context, cli_args=line, start_parameter_services=False)
+    line = ["--ros-args", *arguments]
+    made = Node(name, context=context, cli_args=line, start_parameter_services=False)
     try:
-        value = declare(node, "wanted", default, "of a test", **options)
-        assert node.get_parameter("wanted").value == value
-        return value
+        yield made
     finally:
-        node.destroy_node()
+        made.destroy_node()
         rclpy.shutdown(context=context)
 
 
-def test_a_number_is_taken_where_a_text_or_a_float_is_wanted():
-    from limb_interfaces.parameters import ParameterError
+def declared(given, default, **options):
+    """Declare a parameter of a node whose command line gives it; return its value."""
+    with node("-p", f"wanted:={given}") as made:
+        value = declare(made, "wanted", default, "of a test", **options)
+        assert made.get_parameter("wanted").value == value
+        return value
 
+
+def test_a_number_is_taken_where_a_text_or_a_float_is_wanted():
     assert declared("10", "") == "10"
     assert declared("7.5", "") == "7.5"
     mass = declared("0", 0.5, at_least=0.0, at_most=10.0)
@@ -50,6 +59,43 @@ def test_a_number_is_taken_where_a_text_or_a_float_is_wanted():
     ):
         with pytest.raises(ParameterError, match="parameter 'wanted'"):
             declared(given, default, **options)
+
+
+def test_what_no_parameter_took_is_said_and_what_is_unknown_is_not_set(tmp_path):
+    file = tmp_path / "of_another_limb.yaml"
+    file.write_text("/lab7/declaring:\n  ros__parameters: {wanted: 31}\n")
+    with node("-p", "wantde:=1", "--params-file", str(file)) as made:
+        declare(made, "wanted", 3, "of a test", read_only=False)
+        line = ["declaring", "--ros-args", "--params-file", str(file)]
+        with pytest.raises(ParameterError) as refused:
+            check_overrides(made, refuse=True, arguments=line)
+        said = str(refused.value)
+        assert "'wantde' is set, but /declaring has none: did you mean 'wanted'?" in said
+        assert "nothing under /lab7/declaring is for /declaring" in said
+        assert made.set_parameters([Parameter("wanted", value=5)])[0].successful
+        with pytest.raises(ParameterNotDeclaredException, match="paylod"):
+            made.set_parameters([Parameter("paylod", value=5)])
+
+
+def test_a_second_node_of_a_name_ends_with_the_remedy():
+    with node(name="twice") as made:
+        publisher = DiagnosticsPublisher(made, Health)
+        executor = SingleThreadedExecutor(context=made.context)
+        executor.add_node(made)
+
+        def status(**values):
+            pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
+            return DiagnosticArray(status=[DiagnosticStatus(name="/twice", values=pairs)])
+
+        told = made.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        told.publish(status(process="lab:1", started="9e99"))
+        assert publisher.publish() == "ok"
+        told.publish(status(process="lab:2", started="17.0"))
+        for _ in range(1000):
+            if hasattr(made, "fatal_error"):
+                break
+            executor.spin_once(timeout_sec=0.05)
+        assert "/twice is running already (process lab:2): end it first" in made.fatal_error
 
 
 def missed(stamps, **options):
@@ -89,16 +135,6 @@ def test_pauses_replays_and_messages_without_stamp_are_no_gaps():
 )
 def test_keys_of_parameter_files(key, name, fits):
     assert key_matches(key, name) == fits
-
-
-def test_nodes_of_a_parameter_file_and_files_of_a_command_line():
-    content = {
-        "/limb": {"planner": {"ros__parameters": {"a": 1}}},
-        "recorder": {"ros__parameters": {}},
-    }
-    assert list(node_keys(content)) == ["/limb/planner", "/recorder"]
-    line = ["node", "--ros-args", "--params-file", "a.yaml", "-p", "b:=1", "--params-file", "c"]
-    assert parameter_files(line) == ["a.yaml", "c"]
 
 
 def test_the_images_transport_is_set_unless_somebody_did(tmp_path, monkeypatch):

@@ -194,22 +194,6 @@ def test_a_run_on_the_graph_is_learned_from_and_what_was_learned_is_played(exper
     assert run.processes() == {}
 
 
-def test_a_path_is_drawn_on_the_graph_as_it_is_in_the_file(experiment, tmp_path: Path):
-    file = tmp_path / "arc.csv"
-    points = np.array(
-        [[0.20, 0.10], [0.198, 0.104], [0.196, 0.108], [0.194, 0.112], [0.192, 0.116]]
-    )
-    rows = [f"{1000 * i}, {100 * x:.2f}, {100 * y:.2f}" for i, (x, y) in enumerate(points)]
-    file.write_text("\n".join(["time [ms], x [cm], y [cm]", *rows]))
-    run = experiment("--path", str(file), "--models", "der", "--no-report")
-    assert run.finish() == 0, run.errors
-    (result,) = json.loads((run.out / "results.json").read_text())["runs"]
-    assert (result["motion"], result["model"], result["method"]) == ("arc", "der", "paper")
-    reference = load_run(run.out / result["bag"]).reference
-    for point in points:
-        assert np.linalg.norm(reference.value - point, axis=1).min() < 1e-3
-
-
 @pytest.mark.parametrize("victim", ["apriltag_tracker", "pressure_driver"])
 def test_a_killed_node_is_named_and_the_limb_vents(experiment, victim: str):
     run = experiment("--models", "der", "--period", "30")
@@ -249,14 +233,6 @@ def test_a_malformed_limb_file_is_refused_before_anything_starts(experiment, tmp
     assert not run.out.exists()
 
 
-def test_two_graphs_do_not_mix(experiment, graph):
-    graph.start("pressure_driver", "board_emulator", port_link=str(graph.folder / "board"))
-    graph.client.wait_ready(["board_emulator"])
-    run = experiment("--models", "der")
-    assert run.finish() == 1
-    assert "another graph is running in this ROS domain (node 'board_emulator')" in run.errors
-
-
 def test_a_graph_that_begins_meanwhile_is_found_before_the_driver_is_armed(experiment, graph):
     run = experiment("--models", "der")
     run.wait_for_line("starting board_emulator")
@@ -268,9 +244,21 @@ def test_a_graph_that_begins_meanwhile_is_found_before_the_driver_is_armed(exper
     assert run.processes() == {}
 
 
-def test_a_rig_file_takes_the_place_of_the_twin(experiment, graph, rig: Path):
-    run = experiment("--hardware", str(rig), "--models", "der", "--no-report")
+def test_a_rig_file_takes_the_place_of_the_twin_and_follows_a_path_of_a_file(
+    experiment, graph, rig: Path, tmp_path: Path
+):
+    file = tmp_path / "arc.csv"
+    points = np.array(
+        [[0.20, 0.10], [0.198, 0.104], [0.196, 0.108], [0.194, 0.112], [0.192, 0.116]]
+    )
+    rows = [f"{1000 * i}, {100 * x:.2f}, {100 * y:.2f}" for i, (x, y) in enumerate(points)]
+    file.write_text("\n".join(["time [ms], x [cm], y [cm]", *rows]))
+    run = experiment("--hardware", str(rig), "--path", str(file), "--models", "der", "--no-report")
     assert run.finish() == 0, run.errors
-    document = json.loads((run.out / "results.json").read_text())
-    assert document["runs"][0]["valid_fraction"] > 0.9
+    (result,) = json.loads((run.out / "results.json").read_text())["runs"]
+    assert (result["motion"], result["model"], result["method"]) == ("arc", "der", "paper")
+    assert result["valid_fraction"] > 0.9
+    reference = load_run(run.out / result["bag"]).reference
+    for point in points:
+        assert np.linalg.norm(reference.value - point, axis=1).min() < 1e-3
     assert all(process.alive for process in graph.processes), "the rig is not the experiment's"

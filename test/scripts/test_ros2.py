@@ -295,18 +295,9 @@ def talker() -> Iterator[Talker]:
 
 
 @pytest.mark.graph
-@pytest.mark.parametrize(
-    ("command", "wanted"),
-    [
-        ("topic list -t", "/limb/heard [std_msgs/msg/String]"),
-        ("service list --show-types", "/limb/switch [std_srvs/srv/SetBool]"),
-        ("action list -t", f"/limb/play [{PLAY}]"),
-        ("node list", "/limb/talker"),
-    ],
-)
-def test_lists(talker: Talker, command: str, wanted: str):
-    lines = ros2(*command.split()).stdout.splitlines()
-    assert wanted in lines
+def test_topics_are_listed_with_their_types(talker: Talker):
+    lines = ros2("topic", "list", "-t").stdout.splitlines()
+    assert "/limb/heard [std_msgs/msg/String]" in lines
     assert not any("_ros2cli" in line for line in lines)
 
 
@@ -324,13 +315,12 @@ def test_echo(talker: Talker):
 
 
 @pytest.mark.graph
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_hz_until_a_signal_comes(talker: Talker, number: signal.Signals):
+def test_hz_until_a_signal_comes(talker: Talker):
     process = start("topic", "hz", "/limb/array", "--window", "10")
     try:
         lines = [process.stdout.readline(), process.stdout.readline()]
-        process.send_signal(number)
-        assert process.wait(TIMEOUT) == number
+        process.send_signal(signal.SIGINT)
+        assert process.wait(TIMEOUT) == signal.SIGINT
     finally:
         process.kill()
         process.communicate()

@@ -1,6 +1,22 @@
-"""The one type of array in signatures: of float64, its shape in the docstring."""
+"""The one type of array in signatures, its shape in the docstring, and lines between samples."""
+
+from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Numbers = NDArray[np.floating[Any]] | NDArray[np.integer[Any]]
+
+
+def interpolate(instants: Numbers, time: Numbers, values: Array) -> Array:
+    """Return the values (I, M) at instants (I,), on straight lines between samples.
+
+    Args:
+        instants: where values are wanted [s]; beyond the samples the outermost one holds.
+        time: (K,) rising instants of the samples [s].
+        values: (K, M) samples.
+    """
+    return np.stack([np.interp(instants, time, column) for column in values.T], axis=1)

@@ -137,7 +137,8 @@ def test_topics_are_known_though_the_first_chunk_is_damaged(tmp_path, monkeypatc
             recover_bag(folder)
         return
     found = recover_bag(folder)
-    assert (found.damaged_chunks, found.unnamed) == (1, 0)
+    assert found.lost_bytes > 0
+    assert found.unnamed == 0
     assert numbers(found.folder) == list(range(5, 20))
     with BagReader(folder) as reader:  # the damaged bag itself
         assert reader.unfinished

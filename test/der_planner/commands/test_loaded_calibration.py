@@ -87,6 +87,3 @@ def test_loads_that_cannot_be_are_refused(table, monkeypatch, capsys):
     ):
         assert run(calibrate_limb, *given, *wrong, monkeypatch=monkeypatch) != 0
         assert reason in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        run(calibrate_limb, *given, "--payload", 0.05, "--payload", 0.02, monkeypatch=monkeypatch)
-    assert "--payload: given twice" in capsys.readouterr().err

@@ -37,7 +37,6 @@ def call(monkeypatch, capsys, tmp_path):
 @pytest.mark.parametrize(
     ("module", "arguments", "code", "words"),
     [
-        ("der_planner.commands.evaluate", ["b", "--workers", "-1"], 2, "--workers is -1"),
         ("der_planner.commands.evaluate", ["b", "--report", "BUSY"], 2, "cannot be made"),
         ("der_planner.commands.evaluate", ["b", "--video", "BUSY"], 2, "cannot be made"),
         ("der_planner.commands.calibrate_limb", ["--offline", "--out", "BUSY"], 2, "no folder"),
@@ -57,7 +56,6 @@ def call(monkeypatch, capsys, tmp_path):
         ("apriltag_tracker.commands.calibrate_camera", [*LENS, "--bag", __file__], 1, "the bag"),
         ("der_planner.commands.calibrate_limb", ["--offline", "--out", "/proc/x"], 2, "/proc/x"),
         ("der_planner.commands.run_experiment", ["--dry-run", "--out", "BUSY"], 2, "cannot be"),
-        ("der_planner.commands.write_limb_page", ["--out", "BUSY"], 2, "no folder"),
         ("der_planner.commands.study", ["accuracy", "--out", "BUSY"], 2, "no folder"),
         ("benchmarks.command", ["rod", "--json", "BUSY"], 2, "no folder"),
         ("figures.planning", ["--out", "BUSY"], 2, "no folder"),

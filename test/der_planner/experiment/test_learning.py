@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from der_planner.commands.run_experiment import run
 from der_planner.experiment.console import OptionError
-from der_planner.experiment.experiment import run
 from der_planner.experiment.options import parse
 from der_planner.planning.plan_file import read_plan
 

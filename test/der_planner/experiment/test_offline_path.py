@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from der_planner.experiment.experiment import run
+from der_planner.commands.run_experiment import run
 from der_planner.experiment.options import parse
-from der_planner.experiment.processes import GraphError
 from der_planner.limb import CalibratedRange, Limb
 from der_planner.model import RodModel
-from der_planner.planning import Workspace
+from der_planner.planning import PlanningError, Workspace
 
 
 def write_arc(file: Path, scale: float = 1.0) -> None:
@@ -50,7 +49,7 @@ def test_an_unreachable_path_says_where(tmp_path: Path):
     options = parse(["--offline", "--no-calibration", "--path", str(file), "--out", str(tmp_path)])
     nearest = parse(["--offline", "--no-calibration", "--path", str(file), "--nearest"])
     assert nearest.motion("far").reference(Workspace(RodModel(Limb.default()))).deviation.mean > 0.1
-    with pytest.raises(GraphError, match=r"point \(0\.40\d+, 0\.19\d+\) m at t = 0\.00 s"):
+    with pytest.raises(PlanningError, match=r"point \(0\.40\d+, 0\.19\d+\) m at t = 0\.00 s"):
         run(options)
 
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from der_planner.commands.run_experiment import Ledger, run
 from der_planner.experiment.console import OptionError
-from der_planner.experiment.experiment import Ledger, run
 from der_planner.experiment.options import METHODS, parse
 from der_planner.limb import Limb, PointMass
 from der_planner.planning.motions import NAMES
@@ -73,15 +73,15 @@ def test_a_stopped_experiment_goes_on_and_refuses_other_options(tmp_path: Path):
 def test_loads_are_those_of_the_command_line():
     options = parse(["--mounting", "hanging", "--payload", "0.02", "--payload-at", "0.2"])
     default = Limb.default()
-    assert options.mounted(default) == default.mounted("hanging")
-    assert options.loaded(default).masses == (PointMass(0.2, 0.02, "payload"),)
+    assert options.loads.mounted(default) == default.mounted("hanging")
+    assert options.loads.loaded(default).masses == (PointMass(0.2, 0.02, "payload"),)
     # A calibrated limb is a little shorter or longer than the place that was measured.
-    at_tip = parse(["--payload", "0.02", "--payload-at", "0.2465"]).loaded(default)
+    at_tip = parse(["--payload", "0.02", "--payload-at", "0.2465"]).loads.loaded(default)
     assert at_tip.masses[0].arc_length == default.length
     assert at_tip.payload == (0.02, 0.0)
-    assert options.loaded(default).payload == (0.02, 0.2)
+    assert options.loads.loaded(default).payload == (0.02, 0.2)
     hung = default.mounted("30")
-    assert parse([]).loaded(hung) == hung
+    assert parse([]).loads.loaded(hung) == hung
 
 
 def test_a_payload_beyond_the_limb_is_refused_before_anything_starts(tmp_path: Path):

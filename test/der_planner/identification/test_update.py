@@ -144,7 +144,7 @@ def test_the_command_writes_a_new_file_and_never_the_old_one(tmp_path, monkeypat
     assert call(tmp_path / "log.csv", *given) == 3
     assert call("--update", tmp_path / "log.csv", *given) == 0
     assert "nothing was written" in capsys.readouterr().out
-    assert call("--update", tmp_path / "log.csv", *given, "--out", old) == 1
+    assert call("--update", tmp_path / "log.csv", *given, "--out", old) == 2
     assert "is there already" in capsys.readouterr().err
     assert old.read_bytes() == before
     assert call("--update", tmp_path / "log.csv", *given, "--out", new) == 0

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from der_planner.commands.write_limb_page import PAGE, page
-from der_planner.identification.terms import COLUMN, TERMS, to_limb, values_of
+from der_planner.identification.bends import COLUMN, TERMS, to_limb, values_of
 from der_planner.limb import (
     DEFAULT_LIMB_FILE,
     CalibratedRange,
@@ -19,6 +18,7 @@ from der_planner.limb import (
     Segment,
     declarations,
 )
+from figures.limb_page import PAGE, page
 
 LIMB = Limb.default()
 DECLARED = [

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from der_planner.limb import VENT_REFERENCE, Limb
-from der_planner.model import STEPS, Initial, Material, Model, RodModel, simulate
+from der_planner.model import CONTROL_PERIOD, STEPS, Initial, Material, Model, RodModel, simulate
 from der_planner.model.bending import bend_angles
-from der_planner.model.series import CONTROL_PERIOD
 from der_planner.planning import Motion, plan
 from der_planner.planning.configuration import configure
 

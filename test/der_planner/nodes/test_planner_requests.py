@@ -10,9 +10,10 @@ from nav_msgs.msg import Path
 
 from der_msgs.msg import MotionCommand
 from der_planner.limb import Limb
-from der_planner.nodes.planner_requests import from_command, from_path
+from der_planner.nodes.planner_requests import from_command, from_path, start_of
 from der_planner.planning import Motion, PathLimits, plan
 from der_planner.planning.plan_file import write_plan
+from limb_interfaces.stamps import NANOSECONDS
 
 
 def test_a_learned_plan_is_named_in_place_of_the_motion(tmp_path):
@@ -55,6 +56,38 @@ def test_a_command_may_carry_a_path_with_a_load_of_its_own():
     ):
         with pytest.raises(ValueError, match=said):
             from_command(MotionCommand(**{"path": path, **fields}), options, 0)
+
+
+def test_each_command_has_the_loads_of_its_time():
+    """Those that it names, else those of the parameters."""
+    limb = Limb.default().mounted("hanging")
+    options = SimpleNamespace(
+        limb=limb, payload=0.02, payload_at=0.0, model="pcc", method="", branch="", feedback=False
+    )  # fmt: skip
+
+    def loaded(**fields) -> Limb:
+        return from_command(MotionCommand(motion="asynchronous", **fields), options, 0).limb
+
+    assert loaded() == limb.carrying(0.02)
+    assert loaded(payload=0.05, payload_at=0.2) == limb.carrying(0.05, 0.2)
+    tilted = loaded(payload=0.03, mounting="10")
+    assert tilted.payload == (0.03, 0.0)
+    assert tilted.gravity[:2] == (0.0, pytest.approx(-1.7035, abs=1e-4))
+    with pytest.raises(ValueError, match=r"the payload is -0\.1 kg"):
+        loaded(payload=-0.1)
+
+
+@pytest.mark.parametrize(
+    ("ahead", "said"), [(-1.6e9, "s ago"), (2.2e8, "s ahead"), (-5.0, ""), (300.0, "")]
+)
+def test_a_start_in_another_epoch_is_refused(ahead, said):
+    now = 1_700_000_000 * NANOSECONDS
+    wanted = now + round(ahead * NANOSECONDS)
+    if not said:
+        assert start_of(wanted, now) == wanted
+        return
+    with pytest.raises(ValueError, match=said):
+        start_of(wanted, now)
 
 
 def test_a_path_in_another_frame_is_refused():

@@ -121,10 +121,10 @@ def test_a_payload_that_cannot_be_lifted_is_refused_with_what_could_be(model):
 
 def test_a_payload_far_too_heavy_is_named_where_the_limb_cannot_even_take_the_shape():
     motion = Motion.named("asynchronous", 0.35, 8.0, 1)
-    with pytest.raises(OverloadError, match=r"It carries 500\.0 g: 1\d\d\.\d g are possible"):
-        plan(LIMB.mounted("hanging").carrying(0.5), motion, "der", "projected")
-    with pytest.raises(PlanningError, match=r"out of reach.*It carries 2000\.0 g: carry less"):
-        plan(LIMB.mounted("sideways").carrying(2.0), motion, "der", "projected")
+    for mounting, mass in (("hanging", 0.5), ("sideways", 2.0)):
+        said = rf"out of reach.*It carries {1000 * mass:.1f} g: carry less"
+        with pytest.raises(PlanningError, match=said):
+            plan(LIMB.mounted(mounting).carrying(mass), motion, "der", "projected")
 
 
 def test_arcs_that_rest_elsewhere_or_know_nothing_of_a_sag_say_so():

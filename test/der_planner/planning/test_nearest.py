@@ -8,7 +8,6 @@ import pytest
 from der_planner.limb import Limb
 from der_planner.model import ArcModel, RodModel
 from der_planner.planning import Motion, PlanningError, Workspace, plan
-from der_planner.planning.workspace import BRANCHES
 
 LIMB = Limb.default()
 ARCS = ArcModel(LIMB)
@@ -77,9 +76,7 @@ def test_where_the_path_is_left_is_said():
     motion = Motion.from_tip_path(np.linspace(0, 10, 40), line, nearest=True)
     deviation = motion.reference(SPACE).deviation
     assert deviation.point == pytest.approx(line[-1], abs=1e-3)
-    assert len(deviation.spans) == 1
-    begin, end = deviation.spans[0]
-    assert 0.5 < begin < 8.0 < end
+    assert 0.2 < deviation.share < 0.95
     assert "mm" in str(deviation)
 
 
@@ -92,16 +89,6 @@ def test_a_trembling_hand_is_smoothed():
     assert on_circle[inner].std() < 0.3 * radius
     assert reference.deviation.largest < 1e-3
     assert reference.duration < 40.0  # the hand's steps add up to half a minute of path
-
-
-def test_a_branch_that_was_named_is_kept():
-    for branch in BRANCHES:
-        motion = Motion.from_tip_path(None, CENTRE + 0.02 * RING, branch=branch, nearest=True)
-        path = motion.reference(SPACE)
-        inner = path.bend_angles[len(path.time) // 4 : 3 * len(path.time) // 4]
-        sides = np.linalg.det(ARCS.tip_jacobians(inner)) * (1 if branch == BRANCHES[0] else -1)
-        assert sides.min() > -3e-4  # m²/rad²: it may lean on the fold
-        assert sides.max() > 5e-4
 
 
 @pytest.mark.parametrize("segments", [1, 3])

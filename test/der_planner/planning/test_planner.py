@@ -18,7 +18,7 @@ from der_planner.planning import (
     plan,
 )
 from der_planner.planning.configuration import RodConfiguration
-from der_planner.planning.transitions import resting_spline
+from der_planner.planning.timing import resting_spline
 
 LIMB = Limb.default()
 SPACE = Workspace(RodModel(LIMB))

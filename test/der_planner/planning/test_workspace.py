@@ -7,7 +7,7 @@ import pytest
 
 from der_planner.limb import Limb
 from der_planner.model import ArcModel, RodModel
-from der_planner.model.bending import PolylineKinematics, bend_angles
+from der_planner.model.bending import PolylineKinematics, bend_angles, inverse_kinematics
 from der_planner.planning import Workspace, workspace
 from der_planner.rod import Rod
 
@@ -86,7 +86,7 @@ def test_inverse_of_forward_is_the_identity(kinematics):
     away = np.abs(np.linalg.det(kinematics.tip_jacobians(angles))) > 2e-3
     angles = angles[away]
     guess = angles + rng.normal(scale=0.02, size=angles.shape)
-    found, miss = workspace.solve(kinematics, kinematics.tip(angles), guess, prior_weight=0.0)
+    found, miss = inverse_kinematics(kinematics, kinematics.tip(angles), guess, prior_weight=0.0)
     assert miss.max() < 1e-12
     np.testing.assert_allclose(found, angles, atol=1e-8)
 
@@ -120,7 +120,7 @@ def test_a_path_through_the_straight_pose_is_smooth():
     theta = 0.4 * np.sin(s) ** 3
     for second in (1.0, -1.0):
         wanted = np.column_stack([theta, second * theta])
-        found, miss = workspace.solve(CHAIN, ARCS.tip(wanted), wanted)
+        found, miss = inverse_kinematics(CHAIN, ARCS.tip(wanted), wanted)
         assert miss.max() < 1e-6
         assert np.all(np.isfinite(found))
         assert (
@@ -134,7 +134,7 @@ def test_more_than_two_segments_stay_near_the_first_guess(count):
     rng = np.random.default_rng(count)
     angles = rng.uniform(0.2, 0.6, size=(30, count))
     guess = angles + rng.normal(scale=0.05, size=angles.shape)
-    found, miss = workspace.solve(kinematics, kinematics.tip(angles), guess)
+    found, miss = inverse_kinematics(kinematics, kinematics.tip(angles), guess)
     assert miss.max() < 1e-6
     for q, start in zip(found, guess, strict=True):
         null = np.linalg.svd(kinematics.tip_jacobians(q))[2][2:]
@@ -158,5 +158,5 @@ def test_distance_to_reach_agrees_with_a_search():
 def test_static_pressure_inverts_the_angle_limits():
     low, high = SPACE.low, SPACE.high
     np.testing.assert_allclose(
-        SPACE.static_pressure([low, high]), [[-24e3] * 2, [24e3] * 2], rtol=1e-9
+        SPACE.arcs.static_pressure([low, high]), [[-24e3] * 2, [24e3] * 2], rtol=1e-9
     )

@@ -1,6 +1,5 @@
 """The page, the figures over camera frames and the film, from bags with images."""
 
-import base64
 import csv
 import json
 from html.parser import HTMLParser
@@ -12,7 +11,7 @@ import pytest
 from filmed import FilmedRun, pixels
 from runs import FRAMES, TIMES, BagOfRun, reference, series
 
-from der_planner.bags.images import RunImages, gray
+from der_planner.bags.reader import BagReader
 from der_planner.results import (
     EvaluationError,
     compare,
@@ -21,7 +20,7 @@ from der_planner.results import (
     load_run,
     write_report,
 )
-from der_planner.results.overlay import plot_shapes, write_video
+from der_planner.results.overlay import RunImages, gray, plot_shapes, write_video
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +42,8 @@ def bag(tmp_path_factory) -> Path:
 
 
 def test_projection_is_found_from_the_tags_alone(bag: Path):
-    with RunImages(load_run(bag)) as images:
-        project = images.projection()
+    with BagReader(bag) as reader:
+        project = RunImages(reader, load_run(bag)).projection()
     points = np.random.default_rng(3).uniform([0.0, -0.1], [0.24, 0.1], (50, 2))
     assert np.abs(project(points) - pixels(points)).max() < 0.05
     assert project(np.empty((0, 2))).shape == (0, 2)
@@ -52,8 +51,8 @@ def test_projection_is_found_from_the_tags_alone(bag: Path):
 
 def test_snapshot_is_the_nearest_frame(bag: Path):
     frames = FRAMES[FRAMES >= 0]
-    with RunImages(load_run(bag)) as images:
-        shot = images.snapshot(float(frames[40]) + 0.02)
+    with BagReader(bag) as reader:
+        shot = RunImages(reader, load_run(bag)).snapshot(float(frames[40]) + 0.02)
     assert shot.picture.shape == (240, 320)
     assert np.all(shot.picture == 40)
     assert shot.planned.shape == (0, 2)
@@ -95,12 +94,12 @@ def test_report_is_one_page_with_everything_in_it(bag: Path, tmp_path: Path):
     run = load_run(bag)
     other = series(reference(FRAMES) + np.array([0.0, 0.01]), model="pcc", trial=1, seed=1)
     results = [evaluate_run(run), evaluate_run(other)]
-    report = write_report([run, other], results, tmp_path, title="Errors <of a lab>")
-    names = {path.name for path in report.files}
+    written = write_report([run, other], results, tmp_path, title="Errors <of a lab>")
+    names = {path.name for path in tmp_path.iterdir()}
     assert names >= {"results.json", "table.md", "table.csv", "table.tex", "report.html"}
     assert names >= {f"{n}.{e}" for n in ("tip", "error", "shapes") for e in ("png", "pdf")}
     page = Links()
-    text = report.page.read_text()
+    text = written.read_text()
     page.feed(text)
     assert page.open == []
     assert page.sources
@@ -114,23 +113,6 @@ def test_report_is_one_page_with_everything_in_it(bag: Path, tmp_path: Path):
         rows = {row["model"]: float(row["mean_error_m"]) for row in csv.DictReader(file)}
     assert rows["der"] == pytest.approx(0.002, abs=5e-5)
     assert rows["pcc"] == pytest.approx(0.01, abs=5e-5)
-
-
-def test_report_takes_figures_that_are_drawn_already(tmp_path: Path):
-    run = series(reference(FRAMES))
-    drawn = [tmp_path / f"tip.{ending}" for ending in ("png", "pdf")]
-    for path in drawn:
-        path.write_bytes(f"the {path.suffix} of an earlier drawing".encode())
-    seen = []
-    report = write_report(
-        [run], [evaluate_run(run)], tmp_path / "report", drawn=drawn, progress=seen.append
-    )
-    for path in drawn:
-        assert (tmp_path / "report" / path.name).read_bytes() == path.read_bytes()
-    assert base64.b64encode(drawn[0].read_bytes()).decode() in report.page.read_text()
-    assert "figure error" in seen
-    assert "figure tip" not in seen
-    assert (tmp_path / "report" / "error.pdf").exists()
 
 
 def test_film_has_every_frame(bag: Path, tmp_path: Path):
@@ -157,17 +139,11 @@ def test_bag_without_images_has_shapes_but_no_film(tmp_path: Path):
     assert plot_shapes([series(reference(FRAMES))], tmp_path) == []
 
 
-def test_bags_in_parallel_keep_their_order_and_their_errors(bag: Path, tmp_path: Path):
+def test_bags_keep_their_order_and_their_errors(bag: Path, tmp_path: Path):
     missing = tmp_path / "missing"
     seen = []
-    found = evaluate_bags(
-        [bag, missing, bag],
-        workers=2,
-        progress=lambda done, total, _: seen.append((done, total)),
-    )
+    found = evaluate_bags([bag, missing, bag], None, lambda *told: seen.append(told[:2]))
     assert [entry.path for entry in found] == [bag, missing, bag]
     assert f"no bag at {missing}" in found[1].error
     assert found[0].result == found[2].result
     assert seen == [(1, 3), (2, 3), (3, 3)]
-    alone = evaluate_bags([bag], workers=1)
-    assert alone[0].result == found[0].result

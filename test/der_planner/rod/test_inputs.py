@@ -72,35 +72,6 @@ def test_couples_balance_an_even_bend_exactly():
     np.testing.assert_allclose(residual, 0.0, atol=1e-10 * np.abs(rod.internal_force(q)).max())
 
 
-@pytest.mark.parametrize("grading", [0.0, 0.05, 0.2])
-def test_uneven_edges_break_the_localisation(grading):
-    """Growing edges leave interior forces (M_i − M_{i+1})/ē, first order in the growth."""
-    rod = segment_rod()
-    rest = rod.rest_lengths * np.linspace(1 - grading, 1 + grading, 11)
-    cells = 0.5 * (rest[1:] + rest[:-1])
-    bend = np.zeros(12)
-    bend[1:-1] = EI / cells
-    uneven = Rod(dataclasses.replace(rod.mesh, rest=rest, bend=bend))
-    turn = 0.1
-    q = PolylineKinematics.of_rod(uneven).configuration([turn * 10])
-    forces = node_forces(uneven.internal_force(q))
-    moment = EI / cells * 2 * np.tan(turn / 2) * (1 + np.tan(turn / 2) ** 2)
-    edge_force = -np.diff(np.concatenate([[0.0], moment, [0.0]])) / rest
-    expected = np.abs(edge_force[1:-1]).max()
-    tangents = np.diff(uneven.positions(q), axis=0) / rest[:, None]
-    normals = np.stack([-tangents[:, 1], tangents[:, 0], 0 * rest], axis=1)
-    by_edge = edge_force[:, None] * normals
-    predicted = np.concatenate([np.zeros((1, 3)), by_edge]) - np.concatenate(
-        [by_edge, np.zeros((1, 3))]
-    )
-    np.testing.assert_allclose(forces, -predicted, atol=1e-9)
-    share = (
-        expected / np.abs(edge_force).max()
-    )  # what an inner edge carries of an end edge's couple
-    assert share == pytest.approx(2 * grading / 10, rel=0.5)
-    assert (np.abs(forces[2:-2]).max() > 1e-6) == (grading > 0)
-
-
 def test_pressure_bends_as_the_continuum_does():
     """The couples span N_j − 2 edges, the gain makes up for it: angle = G u L / EI if small."""
     for count in (5, 9, 20):

@@ -89,13 +89,10 @@ STILL = np.zeros((3, 2))
     [
         ("step", ([1.0], 0.01), r"u must have shape \(2,\), got \(1,\)"),
         ("step", ([1.0, np.nan], 0.01), "u must be finite"),
-        ("step", ([1.0, "a"], 0.01), "u must be numbers"),
         ("step", (NOTHING, 0.0), "dt must be a positive number"),
         ("step", (NOTHING, 0.1, "euler"), "method must be one of"),
         ("simulate", (np.zeros(3), 0.1), "pressures must be"),
-        ("simulate", (np.zeros((3, 3)), 0.1), "pressures must have"),
         ("linearise_step", (NOTHING, -0.1), "dt must be a positive number"),
-        ("linearise_step", (NOTHING, 0.1, "euler"), "method must be one of"),
     ],
 )
 def test_bad_arguments_of_a_motion_are_named(method, arguments, message):
@@ -108,7 +105,6 @@ def test_bad_arguments_of_a_motion_are_named(method, arguments, message):
     ("call", "message"),
     [
         (lambda rod: rod.state(np.ones(83)), "q must stay in the plane xy"),
-        (lambda rod: rod.state(np.ones(7)), r"q must have shape \(83,\), got \(7,\)"),
         (lambda rod: rod.equilibrium([0, 0], forces=np.ones((21, 3))), "forces must stay in"),
         (
             lambda rod: rod.simulate(rod.straight_state(), STILL, 0.1, substeps=0),
@@ -131,15 +127,11 @@ def test_bad_input_is_named_at_the_border(call, message):
     ("option", "message"),
     [
         ({"EI": -1.0}, "EI must be a positive number, got -1.0"),
-        ({"length": np.inf}, "length must be a positive number"),
         ({"damping": -0.1}, "damping must be 0 or more"),
-        ({"nodes": 2}, "nodes must be an int of 3 or more"),
         ({"clamp": "pinned"}, "clamp must be 'ghost', 'inside' or 'free'"),
         ({"segments": [(0, 6), (5, 6)], "moment_gain": [1, 1]}, "sharing no node"),
         ({"segments": [(0, 12)], "moment_gain": [1]}, "within 11 nodes"),
-        ({"segments": [(0, 2)], "moment_gain": [1]}, "at least 3 nodes"),
         ({"segments": [(0, 5)]}, r"moment_gain must have shape \(1,\)"),
-        ({"gravity": (0, 0)}, r"gravity must have shape \(3,\)"),
         ({"gravity": (0, 0, -9.81), "plane": "xy"}, "gravity must stay in the plane xy"),
         ({"fixed": [99]}, "fixed must be"),
     ],

@@ -162,13 +162,6 @@ def test_the_linearisation_of_a_cut_step_is_its_derivative(kind, monkeypatch):
     expected = (ends[0] - ends[1]) / 2
     predicted = run.linearisation.tangent(change)
     np.testing.assert_allclose(predicted, expected, atol=1e-4 * np.abs(expected).max())
-    weight = np.random.default_rng(9).normal(size=predicted.shape)
-    gradient = run.linearisation.adjoint(weight)
-    assert np.sum(gradient * change) == pytest.approx(np.sum(weight * predicted), rel=1e-8)
-    matrix = run.linearisation.sensitivity()
-    np.testing.assert_allclose(
-        np.einsum("kpjm,jm->kp", matrix, change), predicted, atol=1e-9 * np.abs(predicted).max()
-    )
 
 
 def test_an_angle_that_is_held_while_its_edge_moves():
@@ -184,18 +177,6 @@ def test_an_angle_that_is_held_while_its_edge_moves():
     expected = (ends[0] - ends[1]) / 2
     predicted = run.linearisation.tangent(change)
     np.testing.assert_allclose(predicted, expected, atol=1e-5 * np.abs(expected).max())
-
-
-def test_adjoint_is_the_transpose_of_the_tangent(motion):
-    linearisation = motion[-1].linearisation
-    random = np.random.default_rng(4)
-    change = random.normal(size=(30, 3, 2))
-    count = len(linearisation.outputs)
-    weight = random.normal(size=(31, count))
-    gradient = linearisation.adjoint(weight, by_step=True)
-    forward = np.sum(weight * linearisation.tangent(change))
-    assert np.sum(gradient * change) == pytest.approx(forward, rel=1e-9)
-    np.testing.assert_allclose(linearisation.adjoint(weight), gradient.sum(axis=1), rtol=1e-12)
 
 
 def test_sensitivity_is_the_matrix_of_the_tangent(motion):
@@ -223,19 +204,6 @@ def test_sensitivity_to_a_pulse_of_the_pneumatics(motion):
         np.testing.assert_allclose(matrix[:, :, j, m], expected, atol=1e-13)
 
 
-def test_one_interval_is_the_linearised_step():
-    rod = limb_rod(material_damping=0.01)
-    state = moving_state(rod, 6)
-    outputs = rod.free
-    run = rod.simulate(state, [[4e3, -2e3]], 0.01, linearise=True, outputs=outputs)
-    A, B = rod.linearise_step(state, [4e3, -2e3], 0.01)
-    count = len(rod.free)
-    np.testing.assert_allclose(run.linearisation.sensitivity()[1, :, 0, :], B[:count], rtol=1e-10)
-    dq = np.random.default_rng(7).normal(size=count)
-    moved = run.linearisation.tangent(np.zeros((1, 2)), (dq, 0 * dq))[1]
-    np.testing.assert_allclose(moved, A[:count, :count] @ dq, atol=1e-10)
-
-
 @pytest.mark.parametrize(
     "rod", [limb_rod(cubic_stiffness=1e-5), spatial_rod()], ids=["plane", "space"]
 )
@@ -250,23 +218,3 @@ def test_linearised_equilibrium_is_its_derivative(rod):
         behind = rod.equilibrium(u - step, start=state).q
         expected = (ahead - behind) / 2
         np.testing.assert_allclose(found[:, m], expected, atol=1e-5 * np.abs(found[:, m]).max())
-
-
-@pytest.mark.parametrize("plane", ["xz", None])
-def test_a_rod_without_segments_is_linearised_by_its_start(plane):
-    rod = Rod.uniform(
-        length=0.25, nodes=6, EI=0.06, EA=1e3, GJ=0.04, mass_per_length=0.9,
-        gravity=(0.0, 0.0, -9.81), clamp="inside", plane=plane,
-    )  # fmt: skip
-    state = rod.straight_state()
-    none = np.zeros((10, 0))
-    run = rod.simulate(state, none, 0.01, linearise=True)
-    step = 1e-6
-    start = np.zeros(len(rod.free))
-    v = state.v.copy()
-    start[-1] = step
-    v[rod.free[-1]] += step
-    moved = rod.simulate(rod.state(state.q, v), none, 0.01)
-    predicted = run.linearisation.tangent(none, (0.0 * start, start))
-    actual = moved.q[-1, -1] - run.q[-1, -1]
-    assert predicted[-1, -1] == pytest.approx(actual, rel=1e-3)

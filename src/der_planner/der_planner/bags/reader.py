@@ -12,7 +12,6 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from mcap.reader import make_reader
@@ -91,12 +90,7 @@ class BagReader:
     def __enter__(self) -> BagReader:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stack.close()
 
     def _open(self) -> Reader:
@@ -164,7 +158,11 @@ class BagReader:
                 for record in make_reader(file).iter_metadata():
                     if record.name == RUN_KEY:
                         custom = record.metadata
-        return parse_run(custom)
+        try:
+            value = json.loads(custom.get(RUN_KEY, "") or "{}")
+        except (json.JSONDecodeError, TypeError):  # no JSON, or no text at all
+            return {}
+        return value if isinstance(value, dict) else {}
 
     def raw(
         self,
@@ -208,12 +206,3 @@ class BagReader:
             if used > len(body):
                 raise
             return content
-
-
-def parse_run(custom_data: dict[str, str]) -> dict[str, Any]:
-    """Return the run's description (the recorder's parameter ``metadata``); empty if none."""
-    try:
-        value = json.loads(custom_data.get(RUN_KEY, "") or "{}")
-    except (json.JSONDecodeError, TypeError):  # no JSON, or no text at all
-        return {}
-    return value if isinstance(value, dict) else {}

@@ -5,8 +5,10 @@ Everything of one limb lies in one namespace; a plan is never paired with the st
 
 from __future__ import annotations
 
+import math
 from array import array
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -37,43 +39,33 @@ _LOOK_BACK = 40
 class Columns:
     """Rows of a stamp [ns] and some numbers, appended one by one: 8 bytes a number.
 
-    The first row that is not empty fixes the width; a row of another width becomes NaN (a board
-    that has not measured yet, a limb that was not seen).
+    Rows may be empty: a board that has not measured yet, a limb that was not seen.
     """
 
-    def __init__(self, width: int = 0) -> None:
-        self._stamps = array("q")
-        self._values = array("d")
-        self._width = width
+    def __init__(self) -> None:
+        self._rows: list[tuple[int, array[float]]] = []
 
     def __len__(self) -> int:
-        return len(self._stamps)
+        return len(self._rows)
 
     @property
     def width(self) -> int:
-        """Numbers in a row; 0 before the first row that is not empty."""
-        return self._width
+        """Numbers in the first row that is not empty; 0 without any."""
+        return next((len(numbers) for _, numbers in self._rows if numbers), 0)
 
-    def append(self, stamp: int, values: Sequence[float] | Array) -> None:
+    def append(self, stamp: int, values: Iterable[float]) -> None:
         """Add a row."""
-        if self._width == 0 and len(values):
-            self._width = len(values)
-            self._values.extend([float("nan")] * (self._width * len(self._stamps)))
-        self._stamps.append(stamp)
-        if len(values) == self._width:
-            self._values.extend(float(value) for value in values)
-        else:
-            self._values.extend([float("nan")] * self._width)
+        self._rows.append((stamp, array("d", values)))
 
     def stamps(self) -> NDArray[np.int64]:
         """Return (N,) stamps [ns]."""
-        return np.array(self._stamps, dtype=np.int64)
+        return np.array([stamp for stamp, _ in self._rows], dtype=np.int64)
 
     def values(self, width: int) -> Array:
-        """Return (N, width) numbers; NaN throughout where rows had another width."""
-        if self._width != width:
-            return np.full((len(self), width), np.nan)
-        return np.array(self._values, dtype=float).reshape(-1, width)
+        """Return (N, width) numbers; NaN in rows of another width."""
+        unknown = array("d", [math.nan] * width)
+        rows = [each if len(each) == width else unknown for _, each in self._rows]
+        return np.array(rows, dtype=float).reshape(-1, width)
 
 
 @dataclass
@@ -118,11 +110,9 @@ class LimbRecord:
 
     Attributes:
         plans: by id, each with its stamp [ns].
-        setpoints: by plan id: differential pressures [Pa].
-        setpoint_indices: by plan id, in the order of ``setpoints``.
-        revised: ids of the plans of which a setpoint was revised.
-        revisions: by plan id: those setpoints, with what their estimates had seen.
-        tip, angles: measured tip [m] and bend angles [rad], NaN where the limb was not seen.
+        setpoints: by plan id: their indices, then their differential pressures [Pa].
+        revisions: by plan id: its revised setpoints, with what their estimates had seen.
+        tip, angles: measured tip [m] and bend angles [rad], empty rows where the limb was not seen.
         covariance: of the measured tip [m²], row by row.
         truth: simulated tip [m] (twin only).
         commanded, measured: differential pressures [Pa].
@@ -131,14 +121,12 @@ class LimbRecord:
     """
 
     plans: dict[str, tuple[int, Any]] = field(default_factory=dict)
-    setpoints: dict[str, Columns] = field(default_factory=dict)
-    setpoint_indices: dict[str, array[int]] = field(default_factory=dict)
-    revised: set[str] = field(default_factory=set)
-    revisions: dict[str, Revisions] = field(default_factory=dict)
-    tip: Columns = field(default_factory=lambda: Columns(2))
+    setpoints: dict[str, Columns] = field(default_factory=lambda: defaultdict(Columns))
+    revisions: dict[str, Revisions] = field(default_factory=lambda: defaultdict(Revisions))
+    tip: Columns = field(default_factory=Columns)
     angles: Columns = field(default_factory=Columns)
-    covariance: Columns = field(default_factory=lambda: Columns(4))
-    truth: Columns = field(default_factory=lambda: Columns(2))
+    covariance: Columns = field(default_factory=Columns)
+    truth: Columns = field(default_factory=Columns)
     commanded: Columns = field(default_factory=Columns)
     measured: Columns = field(default_factory=Columns)
     faults: list[tuple[int, str]] = field(default_factory=list)
@@ -161,22 +149,17 @@ class LimbRecord:
     def add_setpoint(self, message: Any) -> None:
         """Add a `PressureSetpoint`."""
         name, stamp = message.plan_id, header_stamp(message)
-        self.setpoints.setdefault(name, Columns()).append(stamp, message.differential_pressure)
-        self.setpoint_indices.setdefault(name, array("q")).append(int(message.index))
-        if message.revision:
-            self.revised.add(name)
-            _, plan = self.plans.get(name, (0, None))
-            planned = () if plan is None else planned_commands(plan)
+        self.setpoints[name].append(stamp, (message.index, *message.differential_pressure))
+        if message.revision and name in self.plans:
+            planned = planned_commands(self.plans[name][1])
             if message.index < len(planned):
                 added = np.asarray(message.differential_pressure) - planned[message.index]
-                self.revisions.setdefault(name, Revisions()).revised(stamp, added)
+                self.revisions[name].revised(stamp, added)
 
     def add_estimate(self, message: Any) -> None:
         """Add a `LimbEstimate`."""
         picture = header_stamp(message) - round(message.age * NANOSECONDS)
-        revisions = self.revisions.get(message.plan_id)
-        if revisions is not None:
-            revisions.estimated(picture, np.asarray(message.correction))
+        self.revisions[message.plan_id].estimated(picture, np.asarray(message.correction))
 
     def add_state(self, message: Any) -> None:
         """Add a `LimbState` of the tracker."""
@@ -225,19 +208,18 @@ class BagRecord:
         return [name for name, limb in self.limbs.items() if limb.usable_plans]
 
 
-def read_record(path: str | Path, *, progress: Callable[[float], None] | None = None) -> BagRecord:
+def read_record(path: str | Path) -> BagRecord:
     """Read everything of a bag that becomes arrays, limb by limb.
 
     Args:
         path: bag folder or file.
-        progress: called with the fraction of the bag's time that was read.
 
     Raises:
         BagError: the bag cannot be read.
     """
     with BagReader(path) as bag:
         try:
-            limbs = _collect(bag, progress)
+            limbs = _collect(bag)
         except BagError:
             raise
         except Exception as error:  # rosbags raises many kinds for damaged content
@@ -259,7 +241,7 @@ def header_stamp(message: Any) -> int:
     return int(message.header.stamp.sec) * NANOSECONDS + int(message.header.stamp.nanosec)
 
 
-def _collect(bag: BagReader, progress: Callable[[float], None] | None) -> dict[str, LimbRecord]:
+def _collect(bag: BagReader) -> dict[str, LimbRecord]:
     """Return what the bag holds of each limb; every topic counts for its own namespace only."""
     limbs: dict[str, LimbRecord] = {}
     receivers: dict[str, Callable[[Any], None]] = {}
@@ -268,11 +250,8 @@ def _collect(bag: BagReader, progress: Callable[[float], None] | None) -> dict[s
         if method is not None:
             limb = limbs.setdefault(namespace_of(name), LimbRecord())
             receivers[name] = partial(method, limb)
-    begin, length = bag.start, max(1, bag.end - bag.start)
-    for count, (name, log_time, message) in enumerate(bag.messages(list(receivers))):
+    for name, _, message in bag.messages(list(receivers)):
         receivers[name](message)
-        if progress is not None and count % 1000 == 0:
-            progress((log_time - begin) / length)
     return limbs
 
 

@@ -8,19 +8,18 @@ read.
 
 from __future__ import annotations
 
-import contextlib
 import mmap
 import re
 import struct
+from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Message, Metadata, Schema
+from mcap.records import Channel, Chunk, Footer, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import breakup_chunk
 
 from der_planner.bags.topics import TopicSpec, parse_qos
@@ -28,15 +27,17 @@ from der_planner.bags.writer import METADATA_FILE, RUN_KEY, BagWriter
 
 MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")
-_CHUNK_HEAD = struct.Struct("<QQQII")
-_LENGTH = struct.Struct("<Q")
+_CHUNK_NUMBERS = 40
+"""Bytes of a chunk beside its messages and the name of their compression."""
 _CHUNK = re.compile(rb"\x06.{6}\0\0.{28}(?:\0{4}|\x03\0{3}lz4|\x04\0{3}zstd)", re.DOTALL)
 """What a chunk begins with: opcode, length, two times, size, checksum, name of the compression."""
-_DEFINITIONS = {
+_OUTSIDE = {
     Opcode.SCHEMA: Schema,
     Opcode.CHANNEL: Channel,
     Opcode.METADATA: Metadata,
+    Opcode.FOOTER: Footer,
 }
+"""Records outside of chunks that are read; messages may stand there, too."""
 
 
 class RecoverError(ValueError):
@@ -51,140 +52,98 @@ class Recovery:
         source: the bag, which is as it was.
         folder: the new bag; None where the source is whole and nothing was written.
         message_count: that could be read.
-        damaged_chunks: whose checksum or content is wrong; their messages are lost.
         lost_bytes: in damaged chunks and in what is no record.
         unnamed: messages that could be read, but whose topic nothing in the file tells.
-        duration: from the first to the last message [s].
     """
 
     source: Path
     folder: Path | None
     message_count: int
-    damaged_chunks: int
     lost_bytes: int
     unnamed: int
-    duration: float
-
-
-class _Record(NamedTuple):
-    opcode: int
-    begin: int
-    end: int
 
 
 class _File:
     """One MCAP file that is read as far as it is whole; what is not is counted."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self.finished = False
-        self.compression = "zstd"
-        self.custom_data: dict[str, str] = {}
-        self.damaged_chunks = self.lost_bytes = self.unnamed = 0
-        self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, Channel] = {}
         with path.open("rb") as file:
             is_empty = path.stat().st_size == 0
             self._data = b"" if is_empty else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        closing = len(MAGIC) if self._data[-len(MAGIC) :] == MAGIC else 0
-        self._end = len(self._data) - closing
-        self._read_definitions()
-
-    def _read_definitions(self) -> None:
-        """Read what stands outside of the chunks: it may tell what a damaged chunk had told."""
+        self._is_closed = self._data[-len(MAGIC) :] == MAGIC
+        self.lost_bytes = 0
+        self.has_index = False
+        self.compression = "zstd"
+        self.custom_data: dict[str, str] = {}
+        schemas: dict[int, Schema] = {}
+        channels: dict[int, Channel] = {}
+        counts: Counter[int] = Counter()
         for record in self._records():
-            if record.opcode in _DEFINITIONS:
-                # Whatever the parser makes of damaged bytes: there are more records.
-                with contextlib.suppress(Exception):
-                    self._learn(_DEFINITIONS[record.opcode].read(self._stream(record)))
-            elif record.opcode == Opcode.FOOTER:
-                self.finished = record.end == self._end < len(self._data)
+            if isinstance(record, Message):
+                counts[record.channel_id] += 1
+            elif isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Metadata) and record.name == RUN_KEY:
+                self.custom_data = dict(record.metadata)
+            elif isinstance(record, Footer):
+                self.has_index = self._is_closed
+        self._topics = {
+            number: _topic_spec(channel, schemas[channel.schema_id])
+            for number, channel in channels.items()
+            if channel.schema_id in schemas
+        }
+        self.message_count = sum(counts[number] for number in self._topics)
+        self.unnamed = counts.total() - self.message_count
 
     def messages(
-        self, progress: Callable[[float], None] | None = None
+        self, progress: Callable[[float], None] | None
     ) -> Iterator[tuple[TopicSpec, Message]]:
-        """Yield what can be read, in the order of the file.
+        """Yield the messages whose topic is known, in the order of the file."""
+        for record in self._records(progress):
+            if isinstance(record, Message) and record.channel_id in self._topics:
+                yield self._topics[record.channel_id], record
 
-        Args:
-            progress: called with the fraction read.
+    def _records(self, progress: Callable[[float], None] | None = None) -> Iterator[McapRecord]:
+        """Yield what is whole, in chunks and outside; count the bytes of what is not.
+
+        Where the bytes are no record, the next chunk is looked for.
         """
-        specs: dict[int, TopicSpec] = {}
-        self.damaged_chunks = self.lost_bytes = self.unnamed = 0
-        for record in self._records(count=True):
-            for message in self._messages_of(record):
-                channel = self._channels.get(message.channel_id)
-                if channel is None or channel.schema_id not in self._schemas:
-                    self.unnamed += 1
-                    continue
-                if channel.id not in specs:
-                    specs[channel.id] = _topic_spec(channel, self._schemas[channel.schema_id])
-                yield specs[channel.id], message
-            if progress is not None:
-                progress(record.end / len(self._data))
-
-    def _messages_of(self, record: _Record) -> list[Message]:
-        """Return the messages of a record, none of a damaged chunk."""
-        if record.opcode == Opcode.MESSAGE:
-            return [Message.read(self._stream(record), record.end - record.begin)]
-        if record.opcode != Opcode.CHUNK:
-            return []
-        try:
-            chunk = Chunk.read(self._stream(record))
-            found = breakup_chunk(chunk, validate_crc=True)
-        except Exception:  # whatever a decompressor or parser makes of damaged bytes
-            self.damaged_chunks += 1
-            self.lost_bytes += record.end - record.begin
-            return []
-        self.compression = chunk.compression or "none"
-        for each in found:
-            self._learn(each)
-        return [each for each in found if isinstance(each, Message)]
-
-    def _learn(self, record: object) -> None:
-        if isinstance(record, Schema):
-            self._schemas[record.id] = record
-        elif isinstance(record, Channel):
-            self._channels[record.id] = record
-        elif isinstance(record, Metadata) and record.name == RUN_KEY:
-            self.custom_data = dict(record.metadata)
-
-    def _records(self, count: bool = False) -> Iterator[_Record]:
-        """Yield the records; where the bytes are none, go on at the next chunk.
-
-        Args:
-            count: count the bytes between as lost.
-        """
+        self.lost_bytes = 0
         place = len(MAGIC) if self._data[: len(MAGIC)] == MAGIC else 0
-        while place < self._end:
-            record = self._record_at(place)
-            if record is not None:
-                yield record
-                place = record.end
-                continue
-            found = _CHUNK.search(self._data, place + 1)
-            after = found.start() if found else self._end
-            self.lost_bytes += (after - place) * count
+        end = len(self._data) - len(MAGIC) * self._is_closed
+        while place < end:
+            try:
+                records, after = self._read(place)
+                yield from records
+            except Exception:  # whatever a parser or decompressor makes of damaged bytes
+                found = _CHUNK.search(self._data, place + 1)
+                after = found.start() if found else end
+                self.lost_bytes += after - place
             place = after
+            if progress is not None:
+                progress(place / len(self._data))
 
-    def _record_at(self, place: int) -> _Record | None:
-        """Return the record that begins at a byte; None if the bytes there are no record."""
-        try:
-            opcode, length = _HEAD.unpack_from(self._data, place)
-            record = _Record(opcode, place + _HEAD.size, place + _HEAD.size + length)
-            if opcode == Opcode.CHUNK:  # the lengths inside must fit its own
-                name_length = _CHUNK_HEAD.unpack_from(self._data, record.begin)[-1]
-                content = record.begin + _CHUNK_HEAD.size + name_length + _LENGTH.size
-                if (
-                    content + _LENGTH.unpack_from(self._data, content - _LENGTH.size)[0]
-                    != record.end
-                ):
-                    return None
-        except struct.error:  # the file ends before
-            return None
-        return record if 0 < opcode <= max(Opcode) and record.end <= len(self._data) else None
-
-    def _stream(self, record: _Record) -> ReadDataStream:
-        return ReadDataStream(BytesIO(self._data[record.begin : record.end]))
+    def _read(self, place: int) -> tuple[list[McapRecord], int]:
+        """Return the records that begin at a byte, several for a chunk, and where they end."""
+        opcode, length = _HEAD.unpack_from(self._data, place)
+        begin = place + _HEAD.size
+        after = begin + length
+        if not 0 < opcode <= max(Opcode) or after > len(self._data):
+            raise RecoverError("no record begins here")
+        if opcode not in (Opcode.CHUNK, Opcode.MESSAGE, *_OUTSIDE):
+            return [], after
+        stream = ReadDataStream(BytesIO(self._data[begin:after]))
+        if opcode == Opcode.MESSAGE:
+            return [Message.read(stream, length)], after
+        if opcode != Opcode.CHUNK:
+            return [_OUTSIDE[Opcode(opcode)].read(stream)], after
+        chunk = Chunk.read(stream)
+        if _CHUNK_NUMBERS + len(chunk.compression) + len(chunk.data) != length:
+            raise RecoverError("the lengths inside do not fit")
+        self.compression = chunk.compression or "none"
+        return breakup_chunk(chunk, validate_crc=True), after
 
 
 def _topic_spec(channel: Channel, schema: Schema) -> TopicSpec:
@@ -198,7 +157,7 @@ def _topic_spec(channel: Channel, schema: Schema) -> TopicSpec:
     )
 
 
-def bag_files(path: Path) -> list[Path]:
+def _bag_files(path: Path) -> list[Path]:
     """Return the MCAP files of a bag in the order of their numbers.
 
     Raises:
@@ -233,54 +192,29 @@ def recover_bag(
         OSError: the bag cannot be read.
     """
     path = Path(path)
-    files = [_File(file) for file in bag_files(path)]
-    has_index = all(file.finished for file in files)
-    if folder is None and has_index and (path.is_file() or (path / METADATA_FILE).exists()):
-        report = _copy(path, files, None, progress)
-        if not report.lost_bytes and not report.unnamed:
-            return report
-    report = _copy(
-        path,
-        files,
-        folder or path.with_name(path.name.removesuffix(".mcap") + "_recovered"),
-        progress,
+    files = [_File(file) for file in _bag_files(path)]
+    found = Recovery(
+        source=path,
+        folder=folder,
+        message_count=sum(file.message_count for file in files),
+        lost_bytes=sum(file.lost_bytes for file in files),
+        unnamed=sum(file.unnamed for file in files),
     )
-    if report.message_count:
-        return report
-    raise RecoverError(f"{path} holds no whole message: nothing can be recovered")
-
-
-def _copy(
-    source: Path,
-    files: list[_File],
-    folder: Path | None,
-    progress: Callable[[float], None] | None,
-) -> Recovery:
-    """Read all files, write their messages into a folder if there is one, and count."""
+    is_whole = not found.lost_bytes and all(file.has_index for file in files)
+    if folder is None and is_whole and (path.is_file() or (path / METADATA_FILE).exists()):
+        return found
+    if not found.message_count and found.unnamed:
+        raise RecoverError(
+            f"{path}: {found.unnamed} messages can be read, but what their topics are was in a "
+            "damaged part of the file: nothing can be recovered"
+        )
+    if not found.message_count:
+        raise RecoverError(f"{path} holds no whole message: nothing can be recovered")
+    folder = folder or path.with_name(path.name.removesuffix(".mcap") + "_recovered")
     custom = {key: text for file in files for key, text in file.custom_data.items()}
-    bag = None
-    count, first, last = 0, 0, 0
+    bag = BagWriter(folder, custom, compression=files[0].compression)
     for file in files:
         for spec, message in file.messages(progress):
-            if folder is not None:
-                bag = bag or BagWriter(folder, custom, compression=file.compression)
-                bag.add_topic(spec)
-                bag.write(spec.name, message.log_time, message.publish_time, message.data)
-            first = min(first, message.log_time) if count else message.log_time
-            last = max(last, message.log_time)
-            count += 1
-    unnamed = sum(file.unnamed for file in files)
-    if unnamed and not count:
-        raise RecoverError(
-            f"{source}: {unnamed} messages can be read, but what their topics are was in a damaged "
-            "part of the file: nothing can be recovered"
-        )
-    return Recovery(
-        source=source,
-        folder=bag.close() if bag is not None else None,
-        message_count=count,
-        damaged_chunks=sum(file.damaged_chunks for file in files),
-        lost_bytes=sum(file.lost_bytes for file in files),
-        unnamed=unnamed,
-        duration=(last - first) * 1e-9,
-    )
+            bag.add_topic(spec)
+            bag.write(spec.name, message.log_time, message.publish_time, message.data)
+    return replace(found, folder=bag.close())

@@ -6,7 +6,6 @@ that plan was played becomes a `RunSeries`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,33 +33,24 @@ from der_planner.bags.run import (
     method_name,
 )
 
-BIN = 0.01
-"""Width of a bin of the histogram of latencies [s]."""
 _LONGEST = 0.5
 """Latencies above this are no latencies of a picture that was waited for [s]."""
 
 
-def load_run(
-    path: str | Path,
-    *,
-    plan_id: str = "",
-    namespace: str = "",
-    progress: Callable[[float], None] | None = None,
-) -> RunSeries:
+def load_run(path: str | Path, *, plan_id: str = "", namespace: str = "") -> RunSeries:
     """Read one run from its bag.
 
     Args:
         path: bag folder or file.
         plan_id: which plan of the bag; the one with the most recorded setpoints if empty.
         namespace: of the limb, e.g. ``/limb``; needed only where limbs of several have plans.
-        progress: called with the fraction of the bag's time that was read.
 
     Raises:
         EvaluationError: the bag has no plan, or no limb state while it was played, or several
             limbs have plans and none is named.
         BagError: the bag cannot be read.
     """
-    record = read_record(path, progress=progress)
+    record = read_record(path)
     return run_of(record, _choose_limb(record, namespace, plan_id), plan_id)
 
 
@@ -74,14 +64,12 @@ class _Setpoints:
 
 
 def _setpoints(limb: LimbRecord, plan_id: str, segment_count: int) -> _Setpoints:
-    if plan_id not in limb.setpoints:
-        none = np.empty(0, dtype=np.int64)
-        return _Setpoints(none, none, np.empty((0, segment_count)))
     rows = limb.setpoints[plan_id]
-    backward = np.array(limb.setpoint_indices[plan_id])[::-1]
-    index, last = np.unique(backward, return_index=True)
-    last = len(backward) - 1 - last
-    return _Setpoints(index, rows.stamps()[last], rows.values(segment_count)[last])
+    values = rows.values(1 + segment_count)
+    backward = np.flatnonzero(np.isfinite(values[:, 0]))[::-1]
+    index, first = np.unique(values[backward, 0].astype(np.int64), return_index=True)
+    last = backward[first]
+    return _Setpoints(index, rows.stamps()[last], values[last, 1:])
 
 
 def _feedback(limb: LimbRecord, plan: Any, setpoints: _Setpoints) -> dict[str, Any]:
@@ -91,7 +79,7 @@ def _feedback(limb: LimbRecord, plan: Any, setpoints: _Setpoints) -> dict[str, A
     added = setpoints.value[usable] - planned[setpoints.index[usable]]
     if not len(added):
         return {}
-    taken = latencies(limb.revisions.get(plan.plan_id, Revisions()), limb.seen())
+    taken = latencies(limb.revisions[plan.plan_id], limb.seen())
     return {"feedback": described(added, taken)}
 
 
@@ -118,7 +106,7 @@ def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
         raise EvaluationError(
             f"{where}: the plan '{chosen}' carries no stamp and none of its setpoints was recorded"
         )
-    about = _feedback(limb, plan, setpoints) if chosen in limb.revised else {}
+    about = _feedback(limb, plan, setpoints) if limb.revisions[chosen].stamps else {}
     end = times[-1]
     played = int(setpoints.index[-1]) if len(setpoints.index) else len(times) - 1
     faults = [text for when, text in limb.faults if 0 <= (when - origin) / NANOSECONDS <= end]
@@ -198,7 +186,7 @@ def _choose_plan(limb: LimbRecord, where: str, plan_id: str) -> str:
         )
     if plan_id and plan_id not in usable:
         raise EvaluationError(f"{where}: no plan '{plan_id}', only {', '.join(sorted(usable))}")
-    most = max(usable, key=lambda name: (len(limb.setpoints.get(name, ())), usable[name][0]))
+    most = max(usable, key=lambda name: (len(limb.setpoints[name]), usable[name][0]))
     return plan_id or most
 
 
@@ -298,11 +286,5 @@ def described(added: Array, taken: Array) -> dict[str, Any]:
     }
     if len(taken):
         median, late = np.quantile(taken, [0.5, 0.99])
-        counts, _ = np.histogram(taken, bins=np.arange(0.0, _LONGEST + BIN / 2, BIN))
-        about |= {
-            "latency_median_s": float(median),
-            "latency_p99_s": float(late),
-            "latency_counts": counts.tolist(),
-            "latency_bin_s": BIN,
-        }
+        about |= {"latency_median_s": float(median), "latency_p99_s": float(late)}
     return about

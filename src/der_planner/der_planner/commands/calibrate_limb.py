@@ -27,16 +27,14 @@ from pathlib import Path
 
 import numpy as np
 
-from der_planner.commands.log_options import add_log_options, read_log
 from der_planner.experiment.console import (
+    Loads,
     OptionError,
     Progress,
     add_load_options,
-    as_loaded,
     check_kilograms,
-    check_loads,
     interrupt_once,
-    without_payload,
+    run_command,
 )
 from der_planner.experiment.processes import GraphError, Hardware, NodeError
 from der_planner.identification import (
@@ -52,6 +50,7 @@ from der_planner.identification import (
     prepare,
     read_bag,
     read_excitation,
+    read_log,
     record_twin,
     within_limits,
     write_excitation,
@@ -59,7 +58,7 @@ from der_planner.identification import (
 from der_planner.identification.excitation import AMPLITUDE
 from der_planner.limb import Limb, LimbError
 from der_planner.planning.loads import nearly_buckling
-from der_planner.results.outputs import OutputError, check_file, check_folder
+from der_planner.results.outputs import check_file, check_folder
 from pressure_driver.settings import Settings
 
 LIGHTEST = 1e-3
@@ -68,11 +67,64 @@ SAME_MASS = 0.01
 """Share by which the fitted lengths may change the mass of a limb that was weighed."""
 
 
-def _arguments() -> argparse.Namespace:
+def main() -> int:
+    """Run the command line: 0 when a limb file was written, 1 after an error, 2 for bad options."""
+    given = _parser().parse_args()
+    return run_command(
+        lambda: _main(given),
+        *(LogError, LimbError, GraphError, NodeError, OSError),
+        stopped="no limb file was written",
+    )
+
+
+def _main(given: argparse.Namespace) -> int:
+    _check(given)
+    loads = Loads.given(given)
+    bare = Limb.from_yaml(given.prior) if given.prior else Limb.default()
+    prior = loads.loaded(bare if given.mass is None else bare.weighing(given.mass))
+    if given.excitation:
+        run = _excitation(prior, prior.pneumatics.pressure_limit, given)
+        write_excitation(run, given.excitation)
+        print(f"{run.duration:.0f} s of excitation in {given.excitation}")
+        return 0
+    if said := nearly_buckling(prior):
+        print(
+            f"warning: with the stiffness and mass of the prior {said}. The fit says whether it "
+            "is so with the stiffness that it finds",
+            file=sys.stderr,
+        )
+    log = _obtain(prior, given)
+    limb, report = _fit(prior, log, loads, given)
+    unseen = [read_log(path, given.columns, given.namespace) for path in given.held_out]
+    kept = loads.unloaded(limb)
+    lines = [report.text(), *(_held_out_text(limb, each, given.longest_gap) for each in unseen)]
+    text = "\n".join([*lines, _weight(kept, given)])
+    print(text)
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    kept.to_yaml(given.out)
+    print(f"limb file: {given.out}")
+    if given.report:
+        given.report.mkdir(parents=True, exist_ok=True)
+        (given.report / "report.txt").write_text(text + "\n")
+        plot_prediction(limb, log, given.report / "prediction.png", *unseen[:1])
+        print(f"report: {given.report}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    _add_sources(parser)
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument("--offline", action="store_true", help="calibrate the twin of --seed")
+    source.add_argument(
+        "--graph", action="store_true", help="play on the running graph, record a bag and fit to it"
+    )
+    source.add_argument("--bag", type=Path, help="fit to a recorded run")
+    source.add_argument("--csv", type=Path, help="fit to a table; needs --columns")
+    source.add_argument(
+        "--excitation", type=Path, metavar="FILE", help="write the run's pressures as CSV and stop"
+    )
     parser.add_argument(
         "--hardware", type=Path, metavar="FILE", help="with --graph: in place of the twin"
     )
@@ -84,7 +136,8 @@ def _arguments() -> argparse.Namespace:
         type=Path,
         help="with --graph: for bag, logs and report (default: calibrations/ and the time)",
     )
-    add_log_options(parser)
+    parser.add_argument("--columns", type=Path, metavar="FILE", help="YAML map of tables' columns")
+    parser.add_argument("--namespace", default="", help="of the limb, where a bag holds several")
     parser.add_argument("--prior", type=Path, help="limb file to start from (default: built in)")
     parser.add_argument("--seed", type=int, default=0, help="of the twin (default: 0)")
     parser.add_argument("--quick", action="store_true", help="90 s instead of 200 s of excitation")
@@ -117,95 +170,56 @@ def _arguments() -> argparse.Namespace:
     )
     parser.add_argument("--out", type=Path, default=Path("limb.yaml"), help="limb file to write")
     parser.add_argument("--report", type=Path, help="folder for report.txt and prediction.png")
-    return _checked(parser, parser.parse_args())
+    return parser
 
 
-def _add_sources(parser: argparse.ArgumentParser) -> None:
-    """Declare where the run comes from, one of which must be given."""
-    source = parser.add_mutually_exclusive_group(required=True)
-    source.add_argument("--offline", action="store_true", help="calibrate the twin of --seed")
-    source.add_argument(
-        "--graph", action="store_true", help="play on the running graph, record a bag and fit to it"
-    )
-    source.add_argument("--bag", type=Path, help="fit to a recorded run")
-    source.add_argument("--csv", type=Path, help="fit to a table; needs --columns")
-    source.add_argument(
-        "--excitation", type=Path, metavar="FILE", help="write the run's pressures as CSV and stop"
-    )
+def _check(given: argparse.Namespace) -> None:
+    """Refuse options that do not go together, and results that cannot be written.
 
-
-def _checked(parser: argparse.ArgumentParser, given: argparse.Namespace) -> argparse.Namespace:
-    """Return the arguments with their defaults; ends the program where they do not go together."""
-    if given.csv and not given.columns:
-        parser.error("--csv needs --columns FILE")
-    for name in ("hardware", "folder"):
-        if getattr(given, name) and not given.graph:
-            parser.error(f"--{name} goes with --graph")
-    if given.play and not (given.graph or given.offline):
-        parser.error("--play goes with --graph or --offline")
-    if not 0 <= given.seed < 2**31:
-        parser.error(f"--seed is {given.seed}: choose 0 to {2**31 - 1}")
+    Raises:
+        OptionError, OutputError: names the option and what it may be.
+    """
+    for wrong, said in (
+        (given.csv and not given.columns, "--csv needs --columns FILE"),
+        (given.hardware and not given.graph, "--hardware goes with --graph"),
+        (given.folder and not given.graph, "--folder goes with --graph"),
+        (
+            given.play and not (given.graph or given.offline),
+            "--play goes with --graph or --offline",
+        ),
+        (not 0 <= given.seed < 2**31, f"--seed is {given.seed}: choose 0 to {2**31 - 1}"),
+        (
+            given.mass is not None and given.fit_mass,
+            "--fit-mass looks for the mass that --mass gives: choose one of the two",
+        ),
+    ):
+        if wrong:
+            raise OptionError(said)
+    if given.mass is not None:
+        check_kilograms("--mass", given.mass, LIGHTEST)
+    if given.excitation:
+        check_file(given.excitation, "--excitation")
+        return
     if given.graph:
         stamp = time.strftime("%Y-%m-%d_%H-%M-%S")
         given.folder = (given.folder or Path("calibrations") / stamp).resolve()
         given.report = given.report or given.folder / "report"
-    return given
-
-
-def main() -> int:
-    """Run the command line: 0 when a limb file was written, 1 after an error, 2 for bad options."""
-    given = _arguments()
-    try:
-        _check_loads(given)
-        _check_outputs(given)
-        bare = Limb.from_yaml(given.prior) if given.prior else Limb.default()
-        prior = as_loaded(bare if given.mass is None else bare.weighing(given.mass), given)
-        if given.excitation:
-            run = _excitation(prior, prior.pneumatics.pressure_limit, given)
-            write_excitation(run, given.excitation)
-            print(f"{run.duration:.0f} s of excitation in {given.excitation}")
-            return 0
-        _say_if_it_hardly_stands(prior)
-        log = _obtain(prior, given)
-        terms = [] if given.terms == "none" else given.terms.split(",")
-        terms += ["mass"] if given.fit_mass else []
-        limb, report = _fit(prior, log, terms, given)
-        held_out = [read_log(path, given) for path in given.held_out]
-        _conclude(limb, report, log, held_out, given)
-    except (OptionError, OutputError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except (LogError, LimbError, GraphError, NodeError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt as error:
-        print(f"stopped by {error or 'SIGINT'}; no limb file was written", file=sys.stderr)
-        return 130
-    return 0
-
-
-def _check_loads(given: argparse.Namespace) -> None:
-    """Refuse loads that no limb has.
-
-    Raises:
-        OptionError: names the option and what it may be.
-    """
-    check_loads(given)
-    if given.mass is None:
-        return
-    check_kilograms("--mass", given.mass, LIGHTEST)
-    if given.fit_mass:
-        raise OptionError("--fit-mass looks for the mass that --mass gives: choose one of the two")
+        check_folder(given.folder, "--folder")
+    check_file(given.out)
+    if given.report:
+        check_folder(given.report, "--report")
 
 
 def _fit(
-    prior: Limb, log: CalibrationLog, terms: list[str], given: argparse.Namespace
+    prior: Limb, log: CalibrationLog, loads: Loads, given: argparse.Namespace
 ) -> tuple[Limb, FitReport]:
     """Fit; a limb that was weighed weighs the same with the lengths that were found."""
+    terms = [] if given.terms == "none" else given.terms.split(",")
+    terms += ["mass"] if given.fit_mass else []
     limb, report = fit(prior, log, terms=terms, longest_gap=given.longest_gap)
     if given.mass is None:
         return limb, report
-    found = without_payload(limb, given)
+    found = loads.unloaded(limb)
     off = found.mass / given.mass - 1.0
     if abs(off) > SAME_MASS:
         print(
@@ -234,32 +248,10 @@ def _weight(limb: Limb, given: argparse.Namespace) -> str:
     return f"{weighs}, as in the prior: it was not weighed (--mass KG)"
 
 
-def _check_outputs(given: argparse.Namespace) -> None:
-    """Refuse what cannot be written before anything is played or fitted."""
-    if given.excitation:
-        check_file(given.excitation, "--excitation")
-        return
-    check_file(given.out)
-    for name in ("folder", "report"):
-        if getattr(given, name):
-            check_folder(getattr(given, name), f"--{name}")
-
-
 def _excitation(prior: Limb, pressure_limit: float, given: argparse.Namespace) -> Excitation:
     if given.play:
         return read_excitation(given.play, prior.segment_count)
     return calibration_run(AMPLITUDE * pressure_limit, prior.segment_count, given.quick)
-
-
-def _say_if_it_hardly_stands(prior: Limb) -> None:
-    """Say before anything is played or fitted what cannot be fitted well."""
-    said = nearly_buckling(prior)
-    if said:
-        print(
-            f"warning: with the stiffness and mass of the prior {said}. The fit says whether it "
-            "is so with the stiffness that it finds",
-            file=sys.stderr,
-        )
 
 
 def _obtain(prior: Limb, given: argparse.Namespace) -> CalibrationLog:
@@ -267,7 +259,7 @@ def _obtain(prior: Limb, given: argparse.Namespace) -> CalibrationLog:
     if given.graph:
         return read_bag(_play_on_graph(prior, given))
     if not given.offline:
-        return read_log(given.bag or given.csv, given)
+        return read_log(given.bag or given.csv, given.columns, given.namespace)
     limit = prior.pneumatics.pressure_limit
     run = within_limits(_excitation(prior, limit, given), limit, math.inf)
     print(f"playing {run.duration:.0f} s on the twin of seed {given.seed} …", file=sys.stderr)
@@ -314,29 +306,6 @@ def _play_on_graph(prior: Limb, given: argparse.Namespace) -> Path:
     bag = player.play().bag
     progress.say(f"bag: {bag}")
     return bag
-
-
-def _conclude(
-    limb: Limb,
-    report: FitReport,
-    log: CalibrationLog,
-    held_out: list[CalibrationLog],
-    given: argparse.Namespace,
-) -> None:
-    text = report.text()
-    for unseen in held_out:
-        text += "\n" + _held_out_text(limb, unseen, given.longest_gap)
-    kept = without_payload(limb, given)
-    text += "\n" + _weight(kept, given)
-    print(text)
-    given.out.parent.mkdir(parents=True, exist_ok=True)
-    kept.to_yaml(given.out)
-    print(f"limb file: {given.out}")
-    if given.report:
-        given.report.mkdir(parents=True, exist_ok=True)
-        (given.report / "report.txt").write_text(text + "\n")
-        plot_prediction(limb, log, given.report / "prediction.png", *held_out[:1])
-        print(f"report: {given.report}")
 
 
 def _held_out_text(limb: Limb, log: CalibrationLog, longest_gap: float) -> str:

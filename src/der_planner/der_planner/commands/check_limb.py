@@ -20,44 +20,34 @@ import dataclasses
 import sys
 from pathlib import Path
 
-from der_planner.commands.log_options import add_log_options, read_log
-from der_planner.experiment.console import OptionError, add_load_options, as_loaded, check_loads
-from der_planner.identification import (
-    CalibrationLog,
-    LogError,
-    check,
-    update,
-)
+from der_planner.experiment.console import Loads, OptionError, add_load_options, run_command
+from der_planner.identification import CalibrationLog, LogError, check, read_log, update
 from der_planner.limb import Limb, LimbError
-from der_planner.results.outputs import OutputError, check_file
+from der_planner.results.outputs import check_file
 
 
 def main() -> int:
     """Run the command line."""
-    parser = _parser()
-    given = parser.parse_intermixed_args()
-    if given.out is not None and not given.update:
-        parser.error("--out is the updated limb file: give --update, too")
-    if given.columns is None and any(path.suffix == ".csv" for path in given.runs):
-        parser.error("a table needs --columns FILE")
-    try:
-        check_loads(given)
-        limb = Limb.from_yaml(given.limb)
-        if given.out is not None:
-            _check_new(given.out)
-        loaded = as_loaded(limb, given)
-        if loaded.other_mounting:
-            print(f"warning: {loaded.other_mounting}", file=sys.stderr)
-        logs = [read_log(path, given) for path in given.runs]
-        if given.update:
-            return _update(limb, loaded, logs, given.out)
-        return max([_check(loaded, log, len(logs) > 1) for log in logs])
-    except OptionError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except (LogError, LimbError, OutputError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    given = _parser().parse_intermixed_args()
+    return run_command(lambda: _main(given), LogError, LimbError, OSError)
+
+
+def _main(given: argparse.Namespace) -> int:
+    if given.out is not None:
+        if not given.update:
+            raise OptionError("--out is the updated limb file: give --update, too")
+        check_file(given.out)
+        if given.out.exists():
+            raise OptionError(f"--out {given.out} is there already: limb files are kept")
+    loads = Loads.given(given)
+    limb = Limb.from_yaml(given.limb)
+    loaded = loads.loaded(limb)
+    if loaded.other_mounting:
+        print(f"warning: {loaded.other_mounting}", file=sys.stderr)
+    logs = [read_log(path, given.columns, given.namespace) for path in given.runs]
+    if given.update:
+        return _update(limb, loaded, logs, given.out)
+    return max([_check(loaded, log, len(logs) > 1) for log in logs])
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -68,24 +58,14 @@ def _parser() -> argparse.ArgumentParser:
         "runs", nargs="+", type=Path, metavar="BAG", help="bags of runs, or CSV tables"
     )
     parser.add_argument("--limb", type=Path, required=True, help="limb file to check")
-    add_log_options(parser)
+    parser.add_argument("--columns", type=Path, metavar="FILE", help="YAML map of tables' columns")
+    parser.add_argument("--namespace", default="", help="of the limb, where a bag holds several")
     parser.add_argument(
         "--update", action="store_true", help="bring gain, rest angle and friction up to date"
     )
     parser.add_argument("--out", type=Path, metavar="FILE", help="updated limb file, a new one")
     add_load_options(parser)
     return parser
-
-
-def _check_new(path: Path) -> None:
-    """Refuse a limb file that is there already.
-
-    Raises:
-        OutputError: it is, or it cannot be written there.
-    """
-    check_file(path)
-    if path.exists():
-        raise OutputError(f"--out {path} is there already: name a new file, limb files are kept")
 
 
 def _check(limb: Limb, log: CalibrationLog, named: bool) -> int:

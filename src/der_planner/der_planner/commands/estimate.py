@@ -12,20 +12,17 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import sys
 from pathlib import Path
 
 import numpy as np
 
 from der_planner.arrays import Array
-from der_planner.commands.recorded_plan import check_same, plan_of
-from der_planner.control import LearningError
+from der_planner.commands.learn import FAILURES, add_plan_options, check_same, plan_of
 from der_planner.control.hindsight import Filmed, Smoothed, smooth
-from der_planner.limb import LimbError
-from der_planner.planning import Plan, PlanningError
-from der_planner.planning.plan_file import read_plan
-from der_planner.results import BagError, EvaluationError, RunSeries, load_run
-from der_planner.results.outputs import OutputError, check_file
+from der_planner.experiment.console import run_command
+from der_planner.planning import Plan
+from der_planner.results import EvaluationError, RunSeries, load_run
+from der_planner.results.outputs import check_file
 
 
 def main() -> int:
@@ -35,25 +32,17 @@ def main() -> int:
     )
     parser.add_argument("bag", type=Path, metavar="BAG", help="of a run")
     parser.add_argument("--out", type=Path, metavar="FILE", help="table (CSV) to write")
-    base = parser.add_mutually_exclusive_group(required=True)
-    base.add_argument("--limb", type=Path, metavar="FILE", help="limb file of the plan in the bag")
-    base.add_argument("--plan", type=Path, metavar="FILE", help="learned plan that was played")
-    parser.add_argument("--namespace", default="", help="of the limb, where a bag holds several")
+    add_plan_options(parser)
     given = parser.parse_args()
-    try:
-        if given.out is not None:
-            check_file(given.out)
-        run = load_run(given.bag, namespace=given.namespace)
-        planned = read_plan(given.plan) if given.plan else plan_of(run, given.limb)
-        smoothed = estimate_run(planned, run)
-    except (OutputError, BagError, EvaluationError, LimbError, PlanningError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except (LearningError, ValueError) as error:
-        print(f"error: {given.bag}: {error}", file=sys.stderr)
-        return 2
-    for line in _said(smoothed, run):
-        print(line)
+    return run_command(lambda: _estimate(given), *FAILURES, code=2)
+
+
+def _estimate(given: argparse.Namespace) -> int:
+    if given.out is not None:
+        check_file(given.out)
+    run = load_run(given.bag, namespace=given.namespace)
+    smoothed = estimate_run(plan_of(run, given), run)
+    print("\n".join(_said(smoothed, run)))
     if given.out is not None:
         write_table(smoothed, given.out)
         print(given.out)
@@ -69,14 +58,17 @@ def estimate_run(planned: Plan, run: RunSeries) -> Smoothed:
 
     Raises:
         LearningError: the run is of another motion.
-        ValueError: it holds no pictures or no measured pressures.
+        EvaluationError: it holds no pictures or no measured pressures.
     """
     check_same(planned, run)
     played = dataclasses.replace(planned, differential_pressure=run.setpoints.value)
     filmed = Filmed(
         run.measured.time, run.measured.value, run.tip.time, run.bend_angle.value, run.tip.value
     )
-    return smooth(played, filmed)
+    try:
+        return smooth(played, filmed)
+    except ValueError as error:
+        raise EvaluationError(f"{run.description.title}: {error}") from error
 
 
 def _said(smoothed: Smoothed, run: RunSeries) -> list[str]:

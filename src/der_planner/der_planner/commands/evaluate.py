@@ -13,6 +13,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from der_planner.experiment.console import Progress, run_command
 from der_planner.results import (
     BagError,
     EvaluationError,
@@ -25,7 +26,7 @@ from der_planner.results import (
     write_results,
 )
 from der_planner.results.errors import WINDOWS
-from der_planner.results.outputs import OutputError, check_file, check_folder
+from der_planner.results.outputs import check_file, check_folder
 from der_planner.results.overlay import write_video
 
 
@@ -55,20 +56,7 @@ def _arguments() -> argparse.Namespace:
         action="store_true",
         help="estimate a constant lag of each run and take it out before computing E",
     )
-    parser.add_argument("--workers", type=int, default=0, help="processes (default: all cores)")
-    options = parser.parse_args()
-    if options.workers < 0:
-        parser.error(f"--workers is {options.workers}: give 1 or more, or 0 for all cores")
-    return options
-
-
-def _check_outputs(options: argparse.Namespace) -> None:
-    """Refuse what cannot be written before the bags are read."""
-    for name in ("report", "results"):
-        if getattr(options, name) is not None:
-            check_folder(getattr(options, name), f"--{name}")
-    if options.video is not None:
-        check_file(options.video, "--video")
+    return parser.parse_args()
 
 
 def expand(paths: list[Path]) -> list[Path]:
@@ -88,21 +76,20 @@ def _show(done: int, total: int, path: Path) -> None:
         print(file=sys.stderr)
 
 
-def _show_step(text: str) -> None:
-    print(f"  {text}", file=sys.stderr, flush=True)
-
-
 def main() -> int:
     """Run the command line; 0 when every bag was evaluated, 1 otherwise."""
-    options = _arguments()
-    try:
-        _check_outputs(options)
-    except OutputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    settings = EvaluationSettings(window=options.window, remove_lag=options.remove_lag)
-    bags = expand(options.bags)
-    found = evaluate_bags(bags, settings, workers=options.workers, progress=_show)
+    given = _arguments()
+    return run_command(lambda: _evaluate(given), BagError, EvaluationError, OSError)
+
+
+def _evaluate(given: argparse.Namespace) -> int:
+    for name in ("report", "results"):
+        if getattr(given, name) is not None:
+            check_folder(getattr(given, name), f"--{name}")
+    if given.video is not None:
+        check_file(given.video, "--video")
+    settings = EvaluationSettings(window=given.window, remove_lag=given.remove_lag)
+    found = evaluate_bags(expand(given.bags), settings, _show)
     for entry in found:
         if entry.error:
             print(f"error: {entry.error}", file=sys.stderr)
@@ -114,14 +101,10 @@ def main() -> int:
     for result in results:
         if result.removed_lag_s:
             print(f"{result.bag}: a lag of {result.removed_lag_s * 1000:.0f} ms was taken out")
-    try:
-        if options.results is not None:
-            print(write_results(results, options.results))
-        if options.report is not None:
-            print(write_report(runs, results, options.report, progress=_show_step).page)
-        if options.video is not None:
-            print(write_video(runs[0], options.video))
-    except (BagError, EvaluationError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    if given.results is not None:
+        print(write_results(results, given.results))
+    if given.report is not None:
+        print(write_report(runs, results, given.report, progress=Progress().say))
+    if given.video is not None:
+        print(write_video(runs[0], given.video))
     return 1 if any(entry.error for entry in found) else 0

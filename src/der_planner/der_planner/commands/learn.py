@@ -11,18 +11,26 @@ plan. Exit code 0: there is a plan; 1: no run was used; 2: a file cannot be used
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import sys
 from pathlib import Path
+from typing import Any
 
-from der_planner.commands.recorded_plan import check_same, plan_of
+import numpy as np
+
 from der_planner.control import Learner, LearningError
-from der_planner.experiment.learning import about, add_run
-from der_planner.experiment.processes import GraphError
-from der_planner.limb import LimbError
-from der_planner.planning import PlanningError
+from der_planner.experiment.console import run_command
+from der_planner.limb import Limb, LimbError
+from der_planner.planning import Motion, Plan, PlanningError, plan
+from der_planner.planning.motions import NAMES
 from der_planner.planning.plan_file import read_plan, write_plan
-from der_planner.results import BagError, EvaluationError, load_run
-from der_planner.results.outputs import OutputError, check_file
+from der_planner.results import BagError, EvaluationError, RunSeries, load_run
+from der_planner.results.outputs import check_file
+
+FAILURES = (BagError, EvaluationError, LearningError, LimbError, PlanningError)
+"""What a bag, a limb file or a plan may be lacking."""
+_SAME_POINT = 2e-3
+"""References whose points lie further apart than this [m] are not of one motion."""
 
 
 def main() -> int:
@@ -32,31 +40,27 @@ def main() -> int:
     )
     parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="bags, oldest first")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the next plan")
-    base = parser.add_mutually_exclusive_group(required=True)
-    base.add_argument("--limb", type=Path, metavar="FILE", help="limb file of the plan in the bags")
-    base.add_argument("--plan", type=Path, metavar="FILE", help="learned plan that was played")
-    parser.add_argument("--namespace", default="", help="of the limb, where a bag holds several")
+    add_plan_options(parser)
     given = parser.parse_args()
-    try:
-        check_file(given.out)
-        runs = [load_run(bag, namespace=given.namespace) for bag in given.bags]
-        first = read_plan(given.plan) if given.plan else plan_of(runs[0], given.limb)
-        learner = Learner(first)
-        for run in runs:
-            check_same(first, run)
-            add_run(learner, run)
-            print(f"{run.description.title}: {_line(learner)}")
-        if not any(run.accepted for run in learner.history):
-            print("error: no run was used, so nothing was learned", file=sys.stderr)
-            return 1
-        following = learner.next()
-        write_plan(following, given.out, about(learner))
-    except (OutputError, BagError, EvaluationError, GraphError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except (LearningError, LimbError, PlanningError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    return run_command(lambda: _learn(given), *FAILURES, code=2)
+
+
+def _learn(given: argparse.Namespace) -> int:
+    check_file(given.out)
+    runs = [load_run(bag, namespace=given.namespace) for bag in given.bags]
+    first = plan_of(runs[0], given)
+    learner = Learner(first)
+    for run in runs:
+        check_same(first, run)
+        add_run(learner, run)
+        last = learner.history[-1]
+        said = f"mean error {last.mean_error * 100:.3f} cm; {last.reason}"
+        print(f"{run.description.title}: {said}")
+    if not any(run.accepted for run in learner.history):
+        print("error: no run was used, so nothing was learned", file=sys.stderr)
+        return 1
+    following = learner.next()
+    write_plan(following, given.out, learning_summary(learner))
     print(
         f"{given.out}: expected mean error {following.predicted_error * 100:.3f} cm"
         + (f"; stopped: {learner.stopped}" if learner.stopped else "")
@@ -64,6 +68,84 @@ def main() -> int:
     return 0
 
 
-def _line(learner: Learner) -> str:
-    run = learner.history[-1]
-    return f"mean error {run.mean_error * 100:.3f} cm; {run.reason}"
+def add_run(learner: Learner, run: RunSeries) -> None:
+    """Add a recorded run to a learner.
+
+    Raises:
+        LearningError: the run's plan has another grid of setpoints, or its arrays do not fit.
+    """
+    given = run.tip_covariance.value
+    whole = len(given) == len(run.tip) and bool(np.isfinite(given).any())
+    measured = run.measured
+    try:
+        learner.add(
+            run.tip.time,
+            run.tip.value,
+            given.reshape(-1, 2, 2) if whole else None,
+            commands=run.setpoints.value,
+            chambers=(measured.time, measured.value) if len(measured) else None,
+        )
+    except LearningError as error:
+        raise LearningError(f"cannot learn from {run.description.title}: {error}") from error
+
+
+def learning_summary(learner: Learner) -> dict[str, Any]:
+    """Return what is kept with a learned plan of the runs that it was learned from."""
+    return {
+        "mean_error_m": [run.mean_error for run in learner.history],
+        "accepted": [run.accepted for run in learner.history],
+        "reasons": [run.reason for run in learner.history],
+        "repeatability_m": learner.repeatability,
+        "stopped": learner.stopped,
+    }
+
+
+# The plan of a recorded run ----------------------------------------------------------------------
+
+
+def add_plan_options(parser: argparse.ArgumentParser) -> None:
+    """Add --limb or --plan, of which one is needed, and --namespace."""
+    base = parser.add_mutually_exclusive_group(required=True)
+    base.add_argument("--limb", type=Path, metavar="FILE", help="limb file of the plan in the bag")
+    base.add_argument("--plan", type=Path, metavar="FILE", help="learned plan that was played")
+    parser.add_argument("--namespace", default="", help="of the limb, where a bag holds several")
+
+
+def plan_of(run: RunSeries, given: argparse.Namespace) -> Plan:
+    """Return the plan of --plan, or the one of a bag's motion for --limb under the bag's loads.
+
+    Raises:
+        LimbError, PlanningError: a file cannot be read, or the motion cannot be planned.
+    """
+    if given.plan:
+        return read_plan(given.plan)
+    told = run.description
+    limb = Limb.from_yaml(given.limb)
+    if any(told.gravity):
+        limb = dataclasses.replace(limb, gravity=told.gravity)
+    limb = limb.carrying(told.payload, told.payload_at or None)
+    if told.motion not in NAMES:
+        raise PlanningError(
+            f"{told.title} holds the drawn path '{told.motion}': give the plan that was played by "
+            "--plan FILE (run_experiment.py --learn keeps plans in its folder learned)"
+        )
+    motion = Motion.named(told.motion, told.amplitude, told.period, told.cycles)
+    return plan(limb, motion, model=told.model)
+
+
+def check_same(planned: Plan, run: RunSeries) -> None:
+    """Refuse a bag that holds another motion.
+
+    Raises:
+        LearningError: its reference is not that of the plan.
+    """
+    wanted, asked = planned.tip_reference, run.reference.value
+    apart = np.inf
+    if wanted.shape == asked.shape:
+        apart = float(np.linalg.norm(wanted - asked, axis=1).max())
+    if apart > _SAME_POINT:
+        raise LearningError(
+            f"{run.description.title} holds another motion than the plan ({len(asked)} and "
+            f"{len(wanted)} setpoints, references up to {apart * 100:.1f} cm apart): give bags of "
+            "one motion and the limb file it was planned with"
+        )

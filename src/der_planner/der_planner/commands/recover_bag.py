@@ -23,17 +23,11 @@ def _show(fraction: float) -> None:
 
 def describe(found: Recovery) -> str:
     """Return a sentence on what was found and done."""
-    held = f"{found.message_count} messages over {found.duration:.1f} s"
+    held = f"{found.source}: {found.message_count} messages"
     if found.folder is None:
-        return f"{found.source}: whole, nothing to recover ({held})"
-    lost = []
-    if found.damaged_chunks:
-        lost.append(f"{found.damaged_chunks} damaged chunks")
-    if found.lost_bytes:
-        lost.append(f"{found.lost_bytes} bytes")
-    if found.unnamed:
-        lost.append(f"{found.unnamed} messages whose topic nothing tells")
-    return f"{found.source}: {held} saved in {found.folder}; lost: {', '.join(lost) or 'nothing'}"
+        return f"{held}, whole, nothing to recover"
+    text = f"{held} saved in {found.folder}; lost: {found.lost_bytes} bytes"
+    return text + f", {found.unnamed} messages whose topic nothing tells" * bool(found.unnamed)
 
 
 def main() -> int:

@@ -12,9 +12,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import signal
 import sys
-import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -28,25 +26,25 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
-from der_planner.bags.reader import (
-    BagError,
-    BagReader,
-    RawMessage,
-    RecordedTopic,
-)
-from der_planner.bags.replay import (
-    NANOSECONDS,
-    ReplaySettings,
-    choose_topics,
-    replay,
-)
+from der_planner.bags.reader import BagError, BagReader, RawMessage, RecordedTopic
+from der_planner.bags.replay import NANOSECONDS, ReplaySettings, choose_topics, replay
+from der_planner.experiment.console import interrupt_once, run_command
 
 ATTEMPTS = 3
+PATIENCE = 3.0
+"""Longest wait for one answer [s]; then the message is sent again."""
 SETTLE = 0.3
 """Time [s] for a receiver's callback after the first message of a topic that nothing answers."""
 
 
-def stamp_of(data: bytes) -> bytes:
+def main() -> int:
+    """Run the command line."""
+    given = _arguments()
+    interrupt_once()
+    return run_command(lambda: _replay(given), BagError)
+
+
+def _stamp(data: bytes) -> bytes:
     """Return the stamp of a serialized message that begins with a std_msgs/Header, as it is."""
     return bytes(data[4:12])
 
@@ -76,7 +74,6 @@ class GraphOutput:
         show_clock: publish /clock.
         step_by: name to publish on that waits for answers, or empty.
         answer: topic of the answers.
-        patience: longest wait for one answer [s]; then the message is sent again, at most twice.
     """
 
     def __init__(
@@ -86,14 +83,13 @@ class GraphOutput:
         show_clock: bool,
         step_by: str = "",
         answer: str = "",
-        patience: float = 3.0,
     ) -> None:
         self.unanswered = 0
-        self._patience = patience
         self._step_by = step_by
         self._begun: set[str] = set()
         self._answers: set[bytes] = set()
-        self._answered = threading.Condition()
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(node)
         self._publishers: dict[str, Publisher] = {
             name: node.create_publisher(message_class(topic.type_name), name, _profile(topic))
             for name, topic in topics.items()
@@ -103,7 +99,7 @@ class GraphOutput:
             self._subscription = node.create_subscription(
                 self._type_of_answer(node, answer),
                 answer,
-                self._on_answer,
+                lambda data: self._answers.add(_stamp(data)),
                 QoSProfile(depth=100),
                 raw=True,
             )
@@ -125,11 +121,6 @@ class GraphOutput:
                 return
             time.sleep(0.02)
 
-    def _on_answer(self, data: bytes) -> None:
-        with self._answered:
-            self._answers.add(stamp_of(data))
-            self._answered.notify_all()
-
     def publish(self, topic: str, message: RawMessage) -> None:
         """Publish one message, and wait for its answer where the topic is stepped by."""
         if topic != self._step_by:
@@ -140,12 +131,13 @@ class GraphOutput:
                 self._publishers[topic].wait_for_all_acked(Duration(seconds=1))
                 time.sleep(SETTLE)
             return
-        stamp = stamp_of(message.data)
-        with self._answered:
-            self._answers.clear()
-            for _ in range(ATTEMPTS):
-                self._publishers[topic].publish(message.data)
-                if self._answered.wait_for(lambda: stamp in self._answers, self._patience):
+        self._answers.clear()
+        for _ in range(ATTEMPTS):
+            self._publishers[topic].publish(message.data)
+            end = time.monotonic() + PATIENCE
+            while time.monotonic() < end:
+                self._executor.spin_once(timeout_sec=0.05)
+                if _stamp(message.data) in self._answers:
                     return
         self.unanswered += 1
 
@@ -193,71 +185,41 @@ def _pairs(values: list[str], what: str) -> dict[str, str]:
     return dict(value.split("=") for value in values)
 
 
-def _run(options: argparse.Namespace, stop: threading.Event) -> int:
+def _replay(given: argparse.Namespace) -> int:
     settings = ReplaySettings(
-        rate=options.rate,
-        start=options.start,
-        stop=options.stop,
-        topics=options.topics,
-        exclude=options.exclude,
-        remap=_pairs(options.remap, "--remap"),
+        rate=given.rate,
+        start=given.start,
+        stop=given.stop,
+        topics=given.topics,
+        exclude=given.exclude,
+        remap=_pairs(given.remap, "--remap"),
     )
-
-    def pause(seconds: float) -> None:
-        stop.wait(seconds)
-
-    stepping = _pairs([options.step_by] if options.step_by else [], "--step-by")
-    with BagReader(options.bag) as bag:
+    stepping = _pairs([given.step_by] if given.step_by else [], "--step-by")
+    with BagReader(given.bag) as bag:
         topics = choose_topics(bag, settings)
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         node = rclpy.create_node("replay_bag")
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        spinner = threading.Thread(target=executor.spin, daemon=True)
-        spinner.start()
         try:
             step_by, answer = next(iter(stepping.items()), ("", ""))
-            output = GraphOutput(node, topics, not options.no_clock, step_by, answer)
-            output.wait_for_receivers(options.wait)
-            count = replay(
-                bag,
-                settings,
-                output,
-                sleep=pause,
-                progress=_show if sys.stderr.isatty() else None,
-                keep_going=lambda: not stop.is_set(),
-            )
+            output = GraphOutput(node, topics, not given.no_clock, step_by, answer)
+            output.wait_for_receivers(given.wait)
+            progress = _show if sys.stderr.isatty() else None
+            count = replay(bag, settings, output, progress=progress)
             time.sleep(0.2)  # the last messages leave the process
         finally:
-            executor.shutdown()
-            spinner.join(5.0)  # a thread that still waits in rcl would abort the process
             node.destroy_node()
             rclpy.try_shutdown()
     print(f"published {count} messages of {len(topics)} topics")
-    if count == 0 and not stop.is_set():
+    if count == 0:
         print(
             "error: nothing was published: no message of the chosen topics lies between --from and "
             "--to (seconds from the bag's first message)",
             file=sys.stderr,
         )
-        return 1
     if output.unanswered:
         print(f"error: {output.unanswered} messages got no answer", file=sys.stderr)
-        return 1
-    return 0
+    return 1 if count == 0 or output.unanswered else 0
 
 
 def _show(played: float, length: float) -> None:
     print(f"\r  {played:7.1f} of {length:.1f} s", end="", file=sys.stderr, flush=True)
-
-
-def main() -> int:
-    """Run the command line."""
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    try:
-        return _run(_arguments(), stop)
-    except BagError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1

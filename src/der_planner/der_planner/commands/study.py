@@ -12,16 +12,14 @@ where it was with the same --out. At the end: OUT/rows.csv, figures, OUT/report/
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
-from der_planner.experiment.console import Progress, interrupt_once
-from der_planner.results.outputs import OutputError, check_folder
-from der_planner.studies.conduct import PlaySettings, conduct
+from der_planner.experiment.console import OptionError, Progress, interrupt_once, run_command
+from der_planner.results.outputs import check_folder
+from der_planner.studies.conduct import PlaySettings, Store, conduct
 from der_planner.studies.factors import ERROR, PLANNED, StudyError, limb_parameters, of_task
-from der_planner.studies.store import Store
+from der_planner.studies.report import means_table, summarise
 from der_planner.studies.study import SHIPPED, Study
-from der_planner.studies.summary import summarise, text_table
 from der_planner.studies.tasks import TASKS
 
 
@@ -65,55 +63,41 @@ def main() -> int:
         0 when every row is done, also failed ones; 1 if the study could not be played; 2 for a bad
         option; 130 if it was stopped.
     """
-    parser = _parser()
-    given = parser.parse_args()
+    given = _parser().parse_args()
     if given.list:
         print(_listing())
         return 0
+    return run_command(
+        lambda: _play(given),
+        StudyError,
+        stopped="what was done is kept, and the same command with the same --out goes on from here",
+    )
+
+
+def _play(given: argparse.Namespace) -> int:
     if given.study is None:
-        parser.error("name a study: a file, or one of those that --list shows")
+        raise OptionError("name a study: a file, or one of those that --list shows")
     for name in ("workers", "limit"):
         if getattr(given, name) is not None and getattr(given, name) < 1:
-            parser.error(f"--{name} is {getattr(given, name)}: 1 or more")
+            raise OptionError(f"--{name} is {getattr(given, name)}: 1 or more")
     if given.scheduler and given.workers:
-        parser.error("--workers is for this machine: a cluster given by --scheduler has its own")
+        raise OptionError("--workers is for this machine: a cluster of --scheduler has its own")
     interrupt_once()
-    out = given.out
-    try:
-        study = Study.read(given.study)
-        out = (given.out or Path("studies") / study.name).resolve()
-        check_folder(out)
-        settings = PlaySettings(
-            out, given.scheduler, given.workers, given.limit, given.retry_failed
-        )
-        _play(study, settings)
-    except OutputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except StudyError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt as error:
-        print(
-            f"stopped by {error or 'SIGINT'}; what was done is kept, and the same command with "
-            f"--out {out} goes on from here",
-            file=sys.stderr,
-        )
-        return 130
-    return 0
-
-
-def _play(study: Study, settings: PlaySettings) -> None:
+    study = Study.read(given.study)
+    out = (given.out or Path("studies") / study.name).resolve()
+    check_folder(out)
     progress = Progress()
+    settings = PlaySettings(out, given.scheduler, given.workers, given.limit, given.retry_failed)
     kept = conduct(study, settings, progress)
-    page = summarise(study, kept, Store(settings.out, study))
+    page = summarise(study, kept, Store(out, study))
     failed = sum(row["error"] is not None for row in kept.values())
-    print(text_table(study, kept))
+    print(means_table(study, kept).text())
     progress.say(f"{len(kept)} of {len(study.rows)} rows are done, {failed} of them failed")
     if failed:
         progress.say("failed rows are in the report; --retry-failed does them again")
-    progress.say(f"rows: {settings.out}/rows.csv, {settings.out}/rows/*.parquet")
+    progress.say(f"rows: {out}/rows.csv, {out}/rows/*.parquet")
     progress.say(f"report: {page}")
+    return 0
 
 
 def _listing() -> str:

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
-from der_planner.arrays import Array
-from der_planner.model.series import interpolate
+from der_planner.arrays import Array, interpolate
 
 Mask = NDArray[np.bool_]
 

@@ -17,13 +17,11 @@ from numpy.typing import ArrayLike
 from threadpoolctl import ThreadpoolController
 
 from der_planner.arrays import Array
-from der_planner.control.chambers import ChamberLog
-from der_planner.control.estimation import Estimator
+from der_planner.control.estimation import Estimate, Estimator
 from der_planner.control.horizon import Allowed, Horizon, settings_of
-from der_planner.control.knowledge import Estimate
-from der_planner.control.nominal import Nominal
+from der_planner.control.nominal import ChamberLog, Nominal
 from der_planner.control.supervision import Limits, Supervisor, Warned
-from der_planner.model.series import CONTROL_PERIOD
+from der_planner.model import CONTROL_PERIOD
 from der_planner.planning.plan_file import Plan
 
 _THREADS = ThreadpoolController()

@@ -25,16 +25,15 @@ from typing import NamedTuple
 import numpy as np
 
 from der_planner.arrays import Array
-from der_planner.control.chambers import ChamberLog
-from der_planner.control.knowledge import Knowledge
-from der_planner.control.nominal import Nominal
+from der_planner.control.estimation import Knowledge
+from der_planner.control.nominal import ChamberLog, Nominal
 from der_planner.methods import LEARNED
-from der_planner.model import STEPS
+from der_planner.model import CONTROL_PERIOD, STEPS
 from der_planner.model.air import Chambers
 from der_planner.model.commands import within_limits
-from der_planner.model.series import CONTROL_PERIOD
+from der_planner.planning.loads import PlanningError
+from der_planner.planning.optimal import minimise
 from der_planner.planning.plan_file import Plan
-from der_planner.planning.quadratic import UnsolvedError, minimise
 
 
 @dataclass(frozen=True)
@@ -346,7 +345,7 @@ class Horizon:
         )
         try:
             return minimise(hessian, gradient, rows, None, tolerance=(1e-5, 1e-6))
-        except UnsolvedError:
+        except PlanningError:
             return np.zeros(len(gradient))
 
 

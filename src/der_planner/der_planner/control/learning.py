@@ -36,19 +36,13 @@ from der_planner.control.disturbance import (
 from der_planner.control.repeatability import PlayedRun, Runs
 from der_planner.identification.update import adapted
 from der_planner.limb import Limb, LimbError
-from der_planner.planning.correction import Correction
-from der_planner.planning.errors import PlanningError
+from der_planner.methods import LEARNED
+from der_planner.planning.correction import PULL, Correction
+from der_planner.planning.loads import PlanningError
 from der_planner.planning.plan_file import Plan
 
 _LEAST_SEEN = 0.2
 """Share of the setpoints at which the tip must be seen."""
-PULL = 0.015
-"""Pull toward the best commands, over the tip's movement per pressure.
-
-The model's answer to a change of commands is wrong by some per cent of the movement of each
-segment, even where they cancel at the tip. A weaker pull lets segments wander against each other
-near the straight pose, where the tip hardly tells them apart.
-"""
 _HARDER = 3.0
 """Factor by which the pull grows after a plan that was worse than the best one."""
 _HARDEST = 1.0
@@ -128,7 +122,7 @@ class Learner:
         self._correction = self._of_file
         period = float(self._plan.time[1] - self._plan.time[0])
         self._runs = Runs(self._plan.tip_reference, period, self._correction.tip_per_pressure)
-        self._step, self._pull = 1.0, PULL * self._correction.tip_per_pressure
+        self._step, self._pull = 1.0, PULL
         self._best: PlayedRun | None = None
         self._levels: list[float] = []
         self._fresh = False
@@ -321,7 +315,7 @@ class Learner:
             said += ", the same plan again"
         elif new > _WORSE * old + min(margin, old):
             self._step /= 2
-            self._pull = min(self._pull * _HARDER, _HARDEST * self._correction.tip_per_pressure)
+            self._pull = min(self._pull * _HARDER, _HARDEST)
             said += f": worse than the best plan, back to it with a step of {self._step:.2f}"
         else:
             self._step = min(1.0, 2 * self._step)
@@ -358,7 +352,7 @@ class Learner:
             self._plan,
             differential_pressure=run.commands,
             tip_predicted=run.expected.tip + self._runs.known(run).value,
-            method="learned",
+            method=LEARNED,
         )
 
 

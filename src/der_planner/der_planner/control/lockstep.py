@@ -17,7 +17,7 @@ import numpy as np
 
 from der_planner.arrays import Array
 from der_planner.control.feedback import Feedback
-from der_planner.model.series import CONTROL_PERIOD
+from der_planner.model import CONTROL_PERIOD
 from der_planner.planning.plan_file import Plan
 
 _SMALLEST = 1e-5

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from der_planner.arrays import Array
-from der_planner.model.series import CONTROL_PERIOD
+from der_planner.model import CONTROL_PERIOD
 
 REASONS = {
     "tags lost": "the limb has not been seen for {:.1f} s",

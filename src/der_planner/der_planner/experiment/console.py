@@ -1,4 +1,4 @@
-"""What the commands share on a terminal: steps and bars, one interrupt, options of loads."""
+"""What the commands share: steps and bars on a terminal, exit codes, options of loads."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ import math
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable
+from dataclasses import dataclass
 from types import FrameType
-from typing import Any
 
 from der_planner.limb import HEAVIEST, Limb, LimbError, gravity_of
+from der_planner.results.outputs import OutputError
 
 
 class OptionError(ValueError):
@@ -71,27 +72,87 @@ def interrupt_once() -> None:
     on_end_signals(interrupt)
 
 
+def run_command(
+    work: Callable[[], int], *failures: type[Exception], stopped: str = "", code: int = 1
+) -> int:
+    """Return the exit code of a command, and say on stderr why it ended early.
+
+    Args:
+        work: what the command does; returns its own exit code.
+        failures: what may go wrong besides the options and the places of results.
+        stopped: what a user who stopped the command has to know.
+        code: of a failure.
+
+    Returns:
+        What ``work`` returns; 2 for options that cannot be, and for results that cannot be written
+        where they are wanted; 130 after a signal.
+    """
+    try:
+        return work()
+    except (OptionError, OutputError) as error:
+        code, said = 2, f"error: {error}"
+    except failures as error:
+        said = f"error: {error}"
+    except KeyboardInterrupt as error:
+        code, said = 130, f"stopped by {error or 'SIGINT'}{stopped and '; '}{stopped}"
+    print(said, file=sys.stderr)
+    return code
+
+
 # Loads -------------------------------------------------------------------------------------------
 
 
-class _Once(argparse.Action):
-    """Keeps the value of an option that must not be given twice."""
+@dataclass(frozen=True)
+class Loads:
+    """How a command line mounts and loads a limb.
 
-    def __call__(
-        self,
-        parser: argparse.ArgumentParser,  # noqa: ARG002
-        namespace: argparse.Namespace,
-        values: str | Sequence[Any] | None,
-        option_string: str | None = None,  # noqa: ARG002
-    ) -> None:
-        given = f"_given_{self.dest}"
-        if hasattr(namespace, given):
-            raise argparse.ArgumentError(
-                self,
-                "given twice; what a limb carries beside one payload goes to its file's masses",
+    Attributes:
+        mounting: see `Limb.mounted`; empty for the gravity of the limb file.
+        payload: carried in the run, beside the masses of the limb file [kg].
+        payload_at: where, along the limb from its clamp [m]; None for the tip.
+    """
+
+    mounting: str = ""
+    payload: float = 0.0
+    payload_at: float | None = None
+
+    @classmethod
+    def given(cls, given: argparse.Namespace) -> Loads:
+        """Return the loads of a command line that has `add_load_options`.
+
+        Raises:
+            OptionError: an unknown mounting, a payload in grams, or the place of no payload.
+        """
+        try:
+            if given.mounting:
+                gravity_of(given.mounting)
+        except LimbError as error:
+            raise OptionError(f"--mounting: {error}") from error
+        check_kilograms("--payload", given.payload, 0.0)
+        at = given.payload_at
+        if at is not None and not given.payload:
+            raise OptionError("--payload-at is the place of a payload: give --payload, too")
+        if at is not None and not (math.isfinite(at) and at >= 0):
+            raise OptionError(
+                f"--payload-at is {at} m: choose 0 to the limb's length, from the clamp"
             )
-        setattr(namespace, given, True)
-        setattr(namespace, self.dest, values)
+        return cls(given.mounting, given.payload, at)
+
+    def mounted(self, limb: Limb) -> Limb:
+        """Return a limb as it is mounted here, without the payload."""
+        return limb.mounted(self.mounting) if self.mounting else limb
+
+    def loaded(self, limb: Limb) -> Limb:
+        """Return a limb as it is mounted here, with the payload.
+
+        Raises:
+            LimbError: the payload is not on the limb.
+        """
+        return self.mounted(limb).carrying(self.payload, self.payload_at)
+
+    def unloaded(self, limb: Limb) -> Limb:
+        """Return a limb of `loaded` without the payload, which was put on last."""
+        return dataclasses.replace(limb, masses=limb.masses[:-1]) if self.payload else limb
 
 
 def add_load_options(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
@@ -106,39 +167,15 @@ def add_load_options(parser: argparse.ArgumentParser | argparse._ArgumentGroup) 
         "--payload",
         type=float,
         default=0.0,
-        action=_Once,
         metavar="KG",
         help="mass that the limb carries in the run, beside the masses of its limb file",
     )
     parser.add_argument(
         "--payload-at",
         type=float,
-        action=_Once,
         metavar="M",
         help="where the payload sits, along the limb from its clamp (without it: the tip)",
     )
-
-
-def check_loads(given: argparse.Namespace) -> None:
-    """Refuse an unknown mounting, a payload in grams, or the place of a payload that is not there.
-
-    Raises:
-        OptionError: names the option and what it may be.
-    """
-    try:
-        if given.mounting:
-            gravity_of(given.mounting)
-    except LimbError as error:
-        raise OptionError(f"--mounting: {error}") from error
-    check_kilograms("--payload", given.payload, 0.0)
-    if given.payload_at is None:
-        return
-    if not given.payload:
-        raise OptionError("--payload-at is the place of a payload: give --payload, too")
-    if not (math.isfinite(given.payload_at) and given.payload_at >= 0):
-        raise OptionError(
-            f"--payload-at is {given.payload_at} m: choose 0 to the limb's length, from the clamp"
-        )
 
 
 def check_kilograms(name: str, mass: float, least: float) -> None:
@@ -151,18 +188,3 @@ def check_kilograms(name: str, mass: float, least: float) -> None:
         return
     grams = f"; {mass:g} g are {mass / 1000:g}" if HEAVIEST < mass <= 1000 * HEAVIEST else ""
     raise OptionError(f"{name} is {mass} kg: choose {least:g} to {HEAVIEST:g}{grams}")
-
-
-def as_loaded(limb: Limb, given: argparse.Namespace) -> Limb:
-    """Return the limb as it is mounted and loaded in the run.
-
-    Raises:
-        LimbError: the mounting is unknown, or the payload is negative or not on the limb.
-    """
-    mounted = limb.mounted(given.mounting) if given.mounting else limb
-    return mounted.carrying(given.payload, given.payload_at)
-
-
-def without_payload(limb: Limb, given: argparse.Namespace) -> Limb:
-    """Return the limb without what only the run carried, which `as_loaded` put on last."""
-    return dataclasses.replace(limb, masses=limb.masses[:-1]) if given.payload else limb

@@ -71,9 +71,9 @@ class GraphTrial(GraphPlayer):
     def _planner_parameters(self) -> dict[str, Any]:
         parameters: dict[str, Any] = {
             "limb_file": str(self._run.limb_file or ""),
-            "mounting": self._options.mounting,
-            "payload": self._options.payload,
-            "payload_at": self._options.payload_at or 0.0,
+            "mounting": self._options.loads.mounting,
+            "payload": self._options.loads.payload,
+            "payload_at": self._options.loads.payload_at or 0.0,
             "feedback": self._trial.feedback,
         }
         if self._run.learned is not None:

@@ -13,9 +13,8 @@ from der_planner.control import Feedback, lockstep
 from der_planner.control.lockstep import Played
 from der_planner.experiment.console import Progress
 from der_planner.experiment.options import TrialRun
-from der_planner.experiment.processes import GraphError
 from der_planner.identification.excitation import CALIBRATION_RUN
-from der_planner.planning import Plan, PlanningError
+from der_planner.planning import Plan
 from der_planner.planning.plan_file import read_plan
 from der_planner.twin.offline import OfflineTwin
 
@@ -30,12 +29,9 @@ def play_offline(run: TrialRun, progress: Progress) -> dict[str, Any]:
         What is kept of it beside its arrays.
 
     Raises:
-        GraphError: the motion cannot be planned; with the planner's reason.
+        PlanningError: the motion cannot be planned.
     """
-    try:
-        planned = read_plan(run.learned) if run.learned is not None else run.plan()
-    except PlanningError as error:
-        raise GraphError(f"the planner refused: {error}") from error
+    planned = read_plan(run.learned) if run.learned is not None else run.plan()
     for warning in planned.warnings:
         progress.say(f"  warning: {warning}")
     played, feedback = _play(planned, run)

@@ -1,5 +1,7 @@
 """The command line of an experiment: what is played, on what, how often, and where to."""
 
+# ruff: noqa: RUF009 - `_option` returns a field
+
 from __future__ import annotations
 
 import argparse
@@ -7,11 +9,11 @@ import dataclasses
 import re
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from der_planner.experiment.console import OptionError, add_load_options, check_loads
+from der_planner.experiment.console import Loads, OptionError, add_load_options
 from der_planner.experiment.processes import Hardware
 from der_planner.limb import Limb
 from der_planner.methods import LEARNED
@@ -28,17 +30,6 @@ from der_planner.planning.motions import NAMES as MOTIONS
 MODELS = tuple(METHODS_BY_MODEL)
 METHODS = METHODS_BY_MODEL["der"]
 DEFAULT_PAGE_PORT = 8080
-DEFAULT_MOTIONS = ("same_direction",)
-RANGES = (
-    ("trials", 1, 1000),
-    ("learn", 0, 100),
-    ("cycles", 1, 1000),
-    ("seed", 0, 2**31 - 1000),
-    ("period", 0.5, 600.0),
-    ("amplitude", 0.01, 2.0),
-    ("page", 1, 65535),
-)
-"""The options that are numbers, each with its smallest and its largest value."""
 
 
 @dataclass(frozen=True)
@@ -79,51 +70,96 @@ class Trial:
         return f"{self.method} + feedback" if self.feedback else self.method
 
 
+def _option(default: Any, text: str, within: tuple[float, float] | None = None, **more: Any) -> Any:
+    """Return the field of an option.
+
+    Args:
+        default: also tells the type of a number and that of a switch.
+        text: for --help.
+        within: the smallest and the largest value of a number.
+        more: what argparse is told besides; ``flag``: the option's name if it is not the field's.
+    """
+    return field(default=default, metadata={"help": text, "within": within, **more})
+
+
 @dataclass(frozen=True)
 class Options:
-    """A parsed and checked command line; see `parser` for what each means."""
+    """A parsed and checked command line. Each field with a help text is an option."""
 
-    motions: tuple[str, ...]
-    models: tuple[str, ...]
-    method: str
-    trials: int
-    amplitude: float
-    period: float
-    cycles: int
-    limb: Path | None
-    calibrate: bool
-    seed: int
-    out: Path
-    hardware: Hardware | None
-    offline: bool
-    dry_run: bool
-    record_images: bool
-    report: bool
-    path: Path | None = None
-    nearest: bool = False
-    page: int | None = None
-    learn: int = 0
-    library: Path | None = None
-    feedback: bool = False
-    mounting: str = ""
-    payload: float = 0.0
-    payload_at: float | None = None
-
-    def mounted(self, limb: Limb) -> Limb:
-        """Return a limb as it is mounted here, without the payload: what is calibrated.
-
-        Raises:
-            LimbError: the mounting is unknown.
-        """
-        return limb.mounted(self.mounting) if self.mounting else limb
-
-    def loaded(self, limb: Limb) -> Limb:
-        """Return a limb as it is mounted here, with the payload: what is planned and played.
-
-        Raises:
-            LimbError: the mounting is unknown, or the payload is not on the limb.
-        """
-        return self.mounted(limb).carrying(self.payload, self.payload_at)
+    motions: tuple[str, ...] = _option(
+        ("same_direction",),
+        f"of {', '.join(MOTIONS)}; all: the first three, which are the paper's",
+        nargs="+",
+        metavar="MOTION",
+    )
+    path: Path | None = _option(
+        None,
+        "draw this path with the tip, in place of --motions: columns x, y and, if timed, time, "
+        "with units as in 'time [s], x [cm], y [cm]' (default units: s and m)",
+        type=Path,
+        metavar="FILE.csv",
+    )
+    nearest: bool = _option(
+        False, "follow the nearest path that the limb can follow where --path leaves its reach"
+    )
+    models: tuple[str, ...] = _option(MODELS, f"of {', '.join(MODELS)}", nargs="+", metavar="MODEL")
+    method: str = _option("optimal", f"of {', '.join(METHODS)}, for both models")
+    learn: int = _option(
+        0,
+        "after each trial, up to N more runs, each of the plan that was learned from the ones "
+        "before",
+        (0, 100),
+        metavar="N",
+    )
+    library: Path | None = _option(
+        None,
+        "of learned plans: trials begin from the nearest one, if it is near",
+        type=Path,
+        metavar="FOLDER",
+    )
+    trials: int = _option(1, "runs of each motion and model", (1, 1000))
+    amplitude: float = _option(DEFAULT_AMPLITUDE, "largest bend of a segment [rad]", (0.01, 2.0))
+    period: float = _option(DEFAULT_PERIOD, "of one cycle [s]", (0.5, 600.0))
+    cycles: int = _option(DEFAULT_CYCLES, "cycles of the motion", (1, 1000))
+    limb: Path | None = _option(
+        None, "limb file; without it each twin is calibrated first", type=Path, metavar="FILE"
+    )
+    calibrate: bool = _option(
+        True,
+        "plan with the default limb file, as if the twin were that limb",
+        flag="--no-calibration",
+    )
+    seed: int = _option(
+        1, "of the first trial's twin; the next trial has the next seed", (0, 2**31 - 1000)
+    )
+    loads: Loads = field(default_factory=Loads)
+    hardware: Hardware | None = _option(
+        None, "a real valve board and camera instead of the twin", type=Path, metavar="FILE"
+    )
+    offline: bool = _option(False, "without ROS, in one process, faster than real time")
+    out: Path = _option(
+        None,
+        "folder of bags, logs, figures and results.json; a folder that holds a stopped "
+        "experiment goes on with it; without it: experiments/ and the time",
+        type=Path,
+        metavar="DIR",
+    )
+    feedback: bool = _option(
+        False, "play every plan of the rod twice: open loop, and corrected while it moves"
+    )
+    page: int | None = _option(
+        None,
+        f"serve the operator's page while the graph runs, at port {DEFAULT_PAGE_PORT} of this "
+        "machine if none is given",
+        (1, 65535),
+        type=int,
+        nargs="?",
+        const=DEFAULT_PAGE_PORT,
+        metavar="PORT",
+    )
+    record_images: bool = _option(False, "raw images into the bags, too")
+    report: bool = _option(True, "skip the HTML report at the end", flag="--no-report")
+    dry_run: bool = _option(False, "say what would be done, start nothing")
 
     def motion(self, name: str) -> Motion:
         """Return the motion of a trial.
@@ -174,130 +210,28 @@ class TrialRun(NamedTuple):
         return plan(self.limb, motion, model=self.trial.model, method=self.trial.method)
 
 
-class _Help(argparse.ArgumentDefaultsHelpFormatter):
-    """Names the default of an option, unless that is nothing, off or zero."""
-
-    def _get_help_string(self, action: argparse.Action) -> str | None:
-        return super()._get_help_string(action) if action.default else action.help
-
-
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     result = argparse.ArgumentParser(
         prog="run_experiment.py",
         description="Play motions on the limb (or its twin) and report the tracking error.",
         epilog="Without options: Case 2 (same_direction), DER and PCC, one trial each, on the twin",
-        formatter_class=_Help,
     )
-    _add_motions(result.add_argument_group("what is played"))
-    _add_stage(result.add_argument_group("on what"))
-    _add_manner(result.add_argument_group("how"))
+    for each in dataclasses.fields(Options):
+        if each.name == "loads":
+            add_load_options(result)
+            continue
+        told = {key: value for key, value in each.metadata.items() if key != "within"}
+        flag = told.pop("flag", f"--{each.name.replace('_', '-')}")
+        if isinstance(each.default, bool):
+            told["action"] = "store_false" if each.default else "store_true"
+        elif each.default:
+            shown = each.default if isinstance(each.default, tuple) else (each.default,)
+            told["help"] += f" (default: {' '.join(map(str, shown))})"
+        if isinstance(each.default, (int, float)) and "action" not in told:
+            told["type"] = type(each.default)
+        result.add_argument(flag, dest=each.name, default=each.default, **told)
     return result
-
-
-def _add_motions(what: argparse._ArgumentGroup) -> None:
-    what.add_argument(
-        "--motions",
-        nargs="+",
-        metavar="MOTION",
-        help=f"of {', '.join(MOTIONS)}; all: the first three, which are the paper's (default: "
-        f"{' '.join(DEFAULT_MOTIONS)})",
-    )
-    what.add_argument(
-        "--path",
-        type=Path,
-        metavar="FILE.csv",
-        help="draw this path with the tip, in place of --motions: columns x, y and, if timed, "
-        "time, with units as in 'time [s], x [cm], y [cm]' (default units: s and m)",
-    )
-    what.add_argument(
-        "--nearest",
-        action="store_true",
-        help="follow the nearest path that the limb can follow where --path leaves its reach",
-    )
-    what.add_argument(
-        "--models", nargs="+", default=list(MODELS), metavar="MODEL", help=f"of {', '.join(MODELS)}"
-    )
-    what.add_argument(
-        "--method", default="optimal", help=f"of {', '.join(METHODS)}, for both models"
-    )
-    what.add_argument(
-        "--learn",
-        type=int,
-        default=0,
-        metavar="N",
-        help="after each trial, up to N more runs, each of the plan that was learned "
-        "from the ones before",
-    )
-    what.add_argument(
-        "--library",
-        type=Path,
-        metavar="FOLDER",
-        help="of learned plans: trials begin from the nearest one, if it is near",
-    )
-    what.add_argument("--trials", type=int, default=1, help="runs of each motion and model")
-    what.add_argument(
-        "--amplitude", type=float, default=DEFAULT_AMPLITUDE, help="largest bend of a segment [rad]"
-    )
-    what.add_argument("--period", type=float, default=DEFAULT_PERIOD, help="of one cycle [s]")
-    what.add_argument("--cycles", type=int, default=DEFAULT_CYCLES, help="cycles of the motion")
-
-
-def _add_stage(where: argparse._ArgumentGroup) -> None:
-    where.add_argument(
-        "--limb",
-        type=Path,
-        metavar="FILE",
-        help="limb file; without it each twin is calibrated first",
-    )
-    where.add_argument(
-        "--no-calibration",
-        action="store_true",
-        help="plan with the default limb file, as if the twin were that limb",
-    )
-    where.add_argument(
-        "--seed",
-        type=int,
-        default=1,
-        help="of the first trial's twin; the next trial has the next seed",
-    )
-    add_load_options(where)
-    where.add_argument(
-        "--hardware",
-        type=Path,
-        metavar="FILE",
-        help="a real valve board and camera instead of the twin",
-    )
-
-
-def _add_manner(how: argparse._ArgumentGroup) -> None:
-    how.add_argument(
-        "--offline", action="store_true", help="without ROS, in one process, faster than real time"
-    )
-    how.add_argument(
-        "--out",
-        type=Path,
-        metavar="DIR",
-        help="folder of bags, logs, figures and results.json; a folder that holds a stopped "
-        "experiment goes on with it; without it: experiments/ and the time",
-    )
-    how.add_argument(
-        "--feedback",
-        action="store_true",
-        help="play every plan of the rod twice: open loop, and corrected while it moves",
-    )
-    how.add_argument(
-        "--page",
-        type=int,
-        nargs="?",
-        const=DEFAULT_PAGE_PORT,
-        metavar="PORT",
-        help=f"serve the operator's page while the graph runs, at port {DEFAULT_PAGE_PORT} of this "
-        "machine if none is given",
-    )
-    how.add_argument("--record-images", action="store_true", help="raw images into the bags, too")
-    how.add_argument("--no-report", action="store_true", help="skip the HTML report at the end")
-    how.add_argument("--dry-run", action="store_true", help="say what would be done, start nothing")
 
 
 def parse(arguments: Sequence[str]) -> Options:
@@ -308,17 +242,17 @@ def parse(arguments: Sequence[str]) -> Options:
         SystemExit: after --help, or when argparse itself refuses.
     """
     given = parser().parse_args(arguments)
+    for each in dataclasses.fields(Options):
+        value = getattr(given, each.name, None)
+        if value is not None and (within := each.metadata.get("within")):
+            least, most = within
+            if not least <= value <= most:
+                raise OptionError(f"--{each.name} is {value}: choose {least} to {most}")
+    loads = Loads.given(given)
     motions = _motions(given)
     models = tuple(dict.fromkeys(given.models))
-    if given.path is None:
-        _check_names("motion", motions, (*MOTIONS, "all"))
     _check_names("model", models, MODELS)
     _check_names("method", (given.method,), METHODS)
-    for name, least, most in RANGES:
-        value = getattr(given, name)
-        if value is not None and not least <= value <= most:
-            raise OptionError(f"--{name} is {value}: choose {least} to {most}")
-    check_loads(given)
     hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
     limb = given.limb or (Path(hardware.limb) if hardware and hardware.limb else None)
     for wrong, said in (
@@ -346,28 +280,19 @@ def parse(arguments: Sequence[str]) -> Options:
     ):
         if wrong:
             raise OptionError(said)
-    out = given.out or Path("experiments") / time.strftime("%Y-%m-%d_%H-%M-%S")
-    as_given = {
-        field.name: getattr(given, field.name)
-        for field in dataclasses.fields(Options)
-        if hasattr(given, field.name)
+    values: dict[str, Any] = {
+        each.name: getattr(given, each.name, None) for each in dataclasses.fields(Options)
     }
+    values |= {"motions": motions, "models": models, "loads": loads, "hardware": hardware}
+    values |= {"limb": limb, "calibrate": limb is None and given.calibrate}
     if given.path is not None:
         # A path has neither amplitude nor period: the plan says so in the same way.
-        as_given |= {"amplitude": 0.0, "period": 0.0, "cycles": 1, "path": given.path.resolve()}
-    return Options(
-        **as_given
-        | {
-            "motions": motions,
-            "models": models,
-            "limb": limb,
-            "calibrate": limb is None and not given.no_calibration,
-            "hardware": hardware,
-            "out": out.resolve(),
-            "report": not given.no_report,
-            "library": given.library.resolve() if given.library is not None else None,
-        }
-    )
+        values |= {"amplitude": 0.0, "period": 0.0, "cycles": 1, "path": given.path.resolve()}
+    out = given.out or Path("experiments") / time.strftime("%Y-%m-%d_%H-%M-%S")
+    values["out"] = out.resolve()
+    if given.library is not None:
+        values["library"] = given.library.resolve()
+    return Options(**values)
 
 
 def _motions(given: argparse.Namespace) -> tuple[str, ...]:
@@ -377,9 +302,10 @@ def _motions(given: argparse.Namespace) -> tuple[str, ...]:
         OptionError: the path cannot be read, or motions are asked for beside it.
     """
     if given.path is None:
-        named = given.motions or DEFAULT_MOTIONS
-        return JOINT_MOTIONS if list(named) == ["all"] else tuple(dict.fromkeys(named))
-    if given.motions:
+        names = JOINT_MOTIONS if list(given.motions) == ["all"] else given.motions
+        _check_names("motion", names, (*MOTIONS, "all"))
+        return tuple(dict.fromkeys(names))
+    if isinstance(given.motions, list):  # the default is a tuple
         raise OptionError("--path is drawn in place of --motions: give one of the two")
     try:
         Motion.from_csv(given.path, nearest=given.nearest)

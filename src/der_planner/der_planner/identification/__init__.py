@@ -1,6 +1,6 @@
 """From logs to a limb file: excitation, fits, reports, and checks of later runs."""
 
-from der_planner.identification.check import Check, Prediction, check, plot_prediction, predict
+from der_planner.identification.bends import GROUPS
 from der_planner.identification.excitation import (
     Excitation,
     calibrate_twin,
@@ -12,9 +12,15 @@ from der_planner.identification.excitation import (
 )
 from der_planner.identification.fit import fit
 from der_planner.identification.log import CalibrationLog, LogError, prepare
-from der_planner.identification.readers import ColumnMap, read_bag, read_csv
-from der_planner.identification.report import FitReport, Unknown
-from der_planner.identification.terms import GROUPS
+from der_planner.identification.readers import ColumnMap, read_bag, read_csv, read_log
+from der_planner.identification.report import (
+    Check,
+    FitReport,
+    Unknown,
+    check,
+    plot_prediction,
+    predict,
+)
 from der_planner.identification.update import Change, Update, update
 
 __all__ = [
@@ -26,7 +32,6 @@ __all__ = [
     "Excitation",
     "FitReport",
     "LogError",
-    "Prediction",
     "Unknown",
     "Update",
     "calibrate_twin",
@@ -39,6 +44,7 @@ __all__ = [
     "read_bag",
     "read_csv",
     "read_excitation",
+    "read_log",
     "record_twin",
     "update",
     "within_limits",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -63,17 +64,17 @@ class AirFit:
     Attributes:
         numbers: of `Pneumatics` by name; without those of venting where the log does not show it.
         deviations: standard deviations of the numbers that were fitted, by name.
-        fill_rate: largest rate of a filling chamber [Pa/s]; NaN without a step.
-        offset: (M,) measured less commanded pressure at rest [Pa].
         residual: root mean square of measured less predicted along smooth commands and, where
             venting is shown, after steps down [Pa].
+        fill_rate: largest rate of a filling chamber [Pa/s]; NaN without a step.
+        offset: (M,) measured less commanded pressure at rest [Pa].
     """
 
     numbers: Mapping[str, float]
     deviations: Mapping[str, float]
-    fill_rate: float
-    offset: Array
     residual: float
+    fill_rate: float = math.nan
+    offset: Array | float = 0.0
 
     def law(self, prior: Pneumatics) -> Pneumatics:
         """Return a law of the air with the fitted numbers in place of the prior's."""
@@ -111,15 +112,8 @@ def fit_air(log: CalibrationLog, period: float) -> AirFit:
         valve = venting.fit(_VALVE, slow.numbers)
         by_degrees = _shown(valve) and valve.residual < VALVE_BETTER * slow.residual
         found = valve if by_degrees else slow
-        found = found._replace(numbers={"vent_lag_exponent": 0.0, **found.numbers})
-    fill_rate = _fill_rate(command, measured, period)
-    return AirFit(found.numbers, found.deviations, fill_rate, offset, found.residual)
-
-
-class _Found(NamedTuple):
-    numbers: Mapping[str, float]
-    deviations: Mapping[str, float]
-    residual: float
+        found = replace(found, numbers={"vent_lag_exponent": 0.0, **found.numbers})
+    return replace(found, fill_rate=_fill_rate(command, measured, period), offset=offset)
 
 
 @dataclass(frozen=True)
@@ -137,7 +131,7 @@ class _Chambers:
         predicted = Air(law).pressures_at_commands(self.command, self.period)
         return np.asarray((predicted - self.measured)[self.rows])
 
-    def fit(self, names: tuple[str, ...], start: Mapping[str, float] | None = None) -> _Found:
+    def fit(self, names: tuple[str, ...], start: Mapping[str, float] | None = None) -> AirFit:
         """Fit the numbers of these names, from other starts where they are given."""
         fitted = [_NUMBERS[name] for name in names]
         begin, low, high, scale, nudge = np.array(fitted).T
@@ -158,10 +152,10 @@ class _Chambers:
         values = search.solve()
         left = float(np.sqrt(np.mean(self.residual(of(values)) ** 2)))
         covariance = search.covariance(values, (left / SOFTNESS) ** 2 / self.period)
-        return _Found(of(values), of(np.sqrt(np.diag(covariance))), left)
+        return AirFit(of(values), of(np.sqrt(np.diag(covariance))), left)
 
 
-def _shown(found: _Found) -> bool:
+def _shown(found: AirFit) -> bool:
     """Tell whether rate and exponent of venting are known well, the rate inside its bounds."""
     rate, number = found.numbers["vent_rate"], _NUMBERS["vent_rate"]
     of_rate, of_exponent = (found.deviations[name] for name in SHOWN)

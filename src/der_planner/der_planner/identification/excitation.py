@@ -15,7 +15,7 @@ from der_planner.identification.fit import fit
 from der_planner.identification.log import CalibrationLog, LogError
 from der_planner.identification.report import FitReport
 from der_planner.limb import Limb
-from der_planner.model.series import CONTROL_PERIOD as PERIOD
+from der_planner.model import CONTROL_PERIOD as PERIOD
 
 ANGLE_NOISE = np.deg2rad(0.1)
 """Standard deviation of a bend angle from tags [rad]."""

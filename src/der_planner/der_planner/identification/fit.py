@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import time as clock
 from collections.abc import Collection, Iterable
 from dataclasses import replace
 from typing import NamedTuple
@@ -12,7 +11,17 @@ import numpy as np
 
 from der_planner.arrays import Array
 from der_planner.identification.air import AirFit, fit_air
-from der_planner.identification.bends import NODES, BendFit
+from der_planner.identification.bends import (
+    COLUMN,
+    GROUPS,
+    NODES,
+    OPTIONAL,
+    TERMS,
+    BendFit,
+    FreeTerms,
+    values_of,
+    without,
+)
 from der_planner.identification.lengths import (
     GeometryFit,
     Unevenness,
@@ -24,23 +33,13 @@ from der_planner.identification.lengths import (
     unevenness,
 )
 from der_planner.identification.log import (
-    LEAST_EXCITATION,
     LONGEST_GAP,
     CalibrationLog,
     LogError,
     Prepared,
     prepare,
 )
-from der_planner.identification.report import FitReport, Unknown, loads_of
-from der_planner.identification.terms import (
-    COLUMN,
-    GROUPS,
-    OPTIONAL,
-    TERMS,
-    FreeTerms,
-    values_of,
-    without,
-)
+from der_planner.identification.report import FitReport, Unknown
 from der_planner.limb import CalibratedRange, Limb
 from der_planner.model import CONTROL_PERIOD, ArcModel, Material, RodModel
 from der_planner.planning.loads import nearly_buckling
@@ -55,8 +54,6 @@ MOST_PASSES = 4
 weight bends unevenly."""
 SAME_LENGTH = 5e-4
 """Change of a length up to which a pass is the last one [m]."""
-LEAST_ROWS = 3
-"""Rows that a log needs for the start in closed form."""
 COMPLIANCE_SPREAD = 0.3
 """Relative standard deviation of the prior's compliance in the start in closed form."""
 EVEN_ERROR = np.deg2rad(5.0)
@@ -93,7 +90,6 @@ def fit(
     Raises:
         LogError: the log cannot tell the limb; the message names what is missing.
     """
-    begin = clock.perf_counter()
     groups = frozenset(terms)
     if not groups <= {*GROUPS, *OPTIONAL}:
         known = (*GROUPS, *OPTIONAL)
@@ -121,6 +117,7 @@ def fit(
     if "dynamics" in groups or limb.weighs_in_plane:
         found, pcc_residual = _with_arcs(found, prepared, warnings)
     return found, FitReport(
+        limb=found,
         source=log.source,
         unknowns=unknowns,
         correlation=correlation,
@@ -133,10 +130,7 @@ def fit(
         span=np.ptp(prepared.bend[prepared.usable], axis=0),
         duration=float(prepared.time[-1] - prepared.time[0]),
         rows=int(prepared.usable.sum()),
-        evaluations=fitted.problem.search.evaluations,
-        fit_time=clock.perf_counter() - begin,
         warnings=tuple(warnings),
-        loads=loads_of(found),
     )
 
 
@@ -220,23 +214,13 @@ def _static_start(free: FreeTerms, prepared: Prepared) -> Array:
 
     The torque is that of the weight of evenly bent segments at the measured bend angles. Without
     gravity it is zero, and the compliance stays the prior's.
-
-    Raises:
-        LogError: too few rows, or an input that was not excited.
     """
     rows = prepared.usable
     pressure, bend = prepared.pressure[rows], prepared.bend[rows]
-    if len(pressure) < LEAST_ROWS:
-        raise LogError(f"only {len(pressure)} rows of the log can be used: record a whole run")
     values, weight = free.values.copy(), Material(free.limb).weight_torques(bend)
     doubt = EVEN_ERROR / COMPLIANCE_SPREAD * np.sqrt(len(bend))
     for index, segment in enumerate(free.limb.segments):
         spread = float(np.std(pressure[:, index]))
-        if spread < LEAST_EXCITATION:
-            raise LogError(
-                f"input {index} was not excited (standard deviation {spread:.0f} Pa): its gain "
-                "cannot be told"
-            )
         known = segment.length / segment.bending_stiffness
         design = np.stack(
             [pressure[:, index] / spread, known * weight[:, index], np.ones(len(pressure))], axis=1
@@ -246,12 +230,8 @@ def _static_start(free: FreeTerms, prepared: Prepared) -> Array:
         seen = np.append(bend[:, index], doubt)
         gain, compliance, rest = np.linalg.lstsq(design, seen, rcond=None)[0]
         stiffer = np.clip(-np.log(max(compliance, 1e-3)), -LARGEST_CHANGE, LARGEST_CHANGE)
-        for term, value in (
-            ("gain", gain / spread),
-            ("rest_angle", rest),
-            ("log_stiffness", stiffer),
-        ):
-            values[index, COLUMN[term]] = value
+        places = [COLUMN[term] for term in ("gain", "rest_angle", "log_stiffness")]
+        values[index, places] = gain / spread, rest, stiffer
     return values
 
 

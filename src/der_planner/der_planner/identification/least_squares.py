@@ -83,7 +83,7 @@ class LeastSquares:
         *,
         cheap: bool = False,
     ) -> None:
-        self.unknowns, self.evaluations = unknowns, 0
+        self.unknowns = unknowns
         self._cheap = cheap
         self._tolerance = 1e-4 * TOLERANCE if cheap else TOLERANCE
         self._most = 10 * MOST_EVALUATIONS if cheap else MOST_EVALUATIONS
@@ -157,7 +157,6 @@ class LeastSquares:
         """Return the rows at values (P,), or None; the last ones are kept."""
         key = values.tobytes()
         if self._last[0] != key:
-            self.evaluations += 1
             found = self._rows(values)
             followed = found is not None and bool(np.all(np.isfinite(found[0])))
             self._last = (key, found if followed else None)

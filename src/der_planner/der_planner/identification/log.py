@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from der_planner.arrays import Array
 from der_planner.limb import Limb
-from der_planner.model.series import CONTROL_PERIOD
+from der_planner.model import CONTROL_PERIOD
 
 SMOOTHING = 11
 """Rows of the filter that takes the tags' noise off the bend (0.5 s)."""
@@ -25,11 +26,6 @@ SWING = np.deg2rad(0.5)
 """Amplitude below which a swing need not be waited for [rad]."""
 LONGEST_SWING = 12.0
 """Longest time at the beginning of a log that is waited for a swing to end [s]."""
-
-WRONG_WAY = (
-    "segment {index} bends the wrong way: positive differential pressure must bend toward +y; "
-    "swap the two chambers or the sign in the column map"
-)
 
 
 class LogError(ValueError):
@@ -87,26 +83,18 @@ class CalibrationLog:
             columns = [on_grid(self.time, column, grid, longest_gap) for column in values.T]
             return np.stack(columns, axis=1)
 
-        return CalibrationLog(
-            grid,
-            table(self.commanded_differential),
-            table(self.measured_differential),
-            table(self.bend_angles),
-            table(self.tip),
-            self.source,
-        )
+        return self._of(grid, table)
 
     def between(self, first: float, last: float) -> CalibrationLog:
         """Return the rows from ``first`` to ``last`` [s]."""
         rows = (self.time >= first) & (self.time <= last)
-        return CalibrationLog(
-            self.time[rows],
-            self.commanded_differential[rows],
-            self.measured_differential[rows],
-            self.bend_angles[rows],
-            self.tip[rows],
-            self.source,
-        )
+        return self._of(self.time[rows], lambda values: values[rows])
+
+    def _of(self, time: Array, table: Callable[[Array], Array]) -> CalibrationLog:
+        """Return the log at other instants, its tables changed by a function."""
+        commanded, measured = table(self.commanded_differential), table(self.measured_differential)
+        angles, tip = table(self.bend_angles), table(self.tip)
+        return CalibrationLog(time, commanded, measured, angles, tip, self.source)
 
 
 def on_grid(time: Array, column: Array, grid: Array, longest_gap: float) -> Array:
@@ -209,9 +197,8 @@ def prepare(
     if to_fit:
         _check_units(pressure, limb)
         _check_tips(grid, limb)
-        _check_commands(grid, warnings)
-        _check_excitation(pressure, warnings)
-        _check_saturation(pressure, limb, warnings)
+        _check_commands(grid)
+        _check_excitation(pressure[valid])
         _check_match(pressure, bend, warnings)
     swinging = _still_swinging(grid.time, pressure, bend, limb)
     if swinging.any():
@@ -278,89 +265,51 @@ def _check_tips(log: CalibrationLog, limb: Limb) -> None:
         )
 
 
-def _check_commands(log: CalibrationLog, warnings: list[str]) -> None:
-    measured = log.measured_differential
-    for index, (command, column) in enumerate(
-        zip(log.commanded_differential.T, measured.T, strict=True)
-    ):
-        both = np.isfinite(command) & np.isfinite(column)
-        if both.sum() < 10 or np.std(command[both]) < LEAST_EXCITATION:
+def _check_commands(log: CalibrationLog) -> None:
+    columns = zip(log.commanded_differential.T, log.measured_differential.T, strict=True)
+    for index, (command, measured) in enumerate(columns):
+        both = np.isfinite(command) & np.isfinite(measured)
+        if both.sum() < 10 or min(np.std(command[both]), np.std(measured[both])) < LEAST_EXCITATION:
             continue
-        agreement = _correlation(command[both], column[both])
+        agreement = float(np.corrcoef(command[both], measured[both])[0, 1])
         if agreement < 0.3:
             raise LogError(
                 f"measured pressure {index} does not follow its command (correlation "
                 f"{agreement:.2f}): check the column map and the tubes"
             )
-        if agreement < 0.8:
-            warnings.append(
-                f"measured pressure {index} follows its command loosely ({agreement:.2f})"
-            )
 
 
-def _check_excitation(pressure: Array, warnings: list[str]) -> None:
-    spread = np.std(pressure, axis=0)
-    for index, value in enumerate(spread):
+def _check_excitation(pressure: Array) -> None:
+    for index, value in enumerate(np.std(pressure, axis=0)):
         if value < LEAST_EXCITATION:
             raise LogError(
                 f"input {index} was not excited (standard deviation {value:.0f} Pa, "
                 f"{LEAST_EXCITATION:.0f} Pa needed): nothing can be told of segment {index}; "
                 "run the calibration motion, or check the unit of the pressures"
             )
-    if pressure.shape[1] > 1:
-        together = np.asarray(np.corrcoef(pressure.T))
-        for i in range(len(together)):
-            for j in range(i):
-                if abs(together[i, j]) > 0.98:
-                    warnings.append(
-                        f"inputs {j} and {i} always move together (correlation "
-                        f"{together[i, j]:+.2f}): "
-                        "swapped columns and coupling between segments cannot be told"
-                    )
-
-
-def _check_saturation(pressure: Array, limb: Limb, warnings: list[str]) -> None:
-    limit = limb.pneumatics.pressure_limit
-    for index, column in enumerate(pressure.T):
-        share = float(np.mean(np.abs(column) > 0.98 * limit))
-        if share > 0.5:
-            raise LogError(
-                f"input {index} is saturated in {100 * share:.0f} % of the log: lower the amplitude"
-            )
-        if share > 0.02:
-            warnings.append(f"input {index} is at its limit in {100 * share:.0f} % of the log")
 
 
 def _check_match(pressure: Array, bend: Array, warnings: list[str]) -> None:
-    """Each segment must follow its own pressure, not its neighbour's, and with the right sign."""
+    """Refuse segments that follow another one's pressure, or their own with the wrong sign."""
     count = pressure.shape[1]
-    if count > 1 and np.abs(np.corrcoef(pressure.T) - np.eye(count)).max() > 0.98:
-        # Which input bends a segment cannot be told: only the sign can.
-        for index in range(count):
-            if np.polyfit(pressure[:, index], bend[:, index], 1)[0] < 0:
-                raise LogError(WRONG_WAY.format(index=index))
-        return
     design = np.concatenate([pressure, np.ones((len(pressure), 1))], axis=1)
-    solution = np.linalg.lstsq(design, bend, rcond=None)[0][:count]
-    for index in range(count):
-        own = solution[index, index]
-        others = np.abs(np.delete(solution[:, index], index))
-        if others.size and others.max() > 1.5 * abs(own):
+    gains = np.linalg.lstsq(design, bend, rcond=None)[0][:count].T
+    if count > 1 and np.abs(np.corrcoef(pressure.T) - np.eye(count)).max() > 0.98:
+        warnings.append(
+            "inputs always move together: swapped columns and coupling between segments cannot be "
+            "told"
+        )
+        pairs = zip(pressure.T, bend.T, strict=True)
+        gains = np.diag([np.polyfit(own, angle, 1)[0] for own, angle in pairs])
+    for index, row in enumerate(gains):
+        most = int(np.argmax(np.abs(row)))
+        if abs(row[most]) > 1.5 * abs(row[index]):
             raise LogError(
-                f"segment {index} bends with input "
-                f"{int(np.argmax(np.abs(solution[:, index])))}, not "
-                f"with input {index}: columns or tubes are swapped"
+                f"segment {index} bends with input {most}, not with input {index}: columns or "
+                "tubes are swapped"
             )
-        if own < 0:
-            raise LogError(WRONG_WAY.format(index=index))
-        if others.size and others.max() > 0.2 * own:
-            warnings.append(
-                f"segment {index} answers to another segment's pressure with "
-                f"{100 * others.max() / own:.0f} % of its own gain"
+        if row[index] < 0:
+            raise LogError(
+                f"segment {index} bends the wrong way: positive differential pressure must bend "
+                "toward +y; swap the two chambers or the sign in the column map"
             )
-
-
-def _correlation(a: Array, b: Array) -> float:
-    if np.std(a) == 0 or np.std(b) == 0:
-        return 0.0
-    return float(np.corrcoef(a, b)[0, 1])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import codecs
 import csv
 import math
-from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -21,23 +20,26 @@ from der_planner.bags.record import PRESSURE_TYPE, STATE_TYPE, BagRecord, LimbRe
 from der_planner.bags.run import Stream
 from der_planner.bags.series import stream
 from der_planner.identification.log import CalibrationLog, LogError, on_grid
-from der_planner.model.series import CONTROL_PERIOD
+from der_planner.model import CONTROL_PERIOD
 
 LONGEST_GAP = 0.25
 """Time between two messages of a bag that a straight line may bridge [s]."""
 LEAST_MESSAGES = 10
 """Messages of pressures, and of valid limb states, that a bag must hold."""
-TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
-PRESSURE_UNITS = {
-    "Pa": 1.0,
-    "hPa": 100.0,
-    "mbar": 100.0,
-    "kPa": 1000.0,
-    "bar": 1e5,
-    "psi": 6894.757,
+UNITS = {
+    "time_unit": {"s": 1.0, "ms": 1e-3, "us": 1e-6},
+    "pressure_unit": {
+        "Pa": 1.0,
+        "hPa": 100.0,
+        "mbar": 100.0,
+        "kPa": 1e3,
+        "bar": 1e5,
+        "psi": 6894.757,
+    },
+    "angle_unit": {"rad": 1.0, "deg": np.pi / 180.0},
+    "length_unit": {"m": 1.0, "mm": 1e-3, "cm": 1e-2},
 }
-ANGLE_UNITS = {"rad": 1.0, "deg": np.pi / 180.0}
-LENGTH_UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
+"""SI value of each unit that a key of a column map may name."""
 REST_SHARE = 0.02
 """Share of a table's largest command below which commands count as rest."""
 VENTING_TIME = 5.0
@@ -119,8 +121,7 @@ class ColumnMap:
         angles: (M,) columns of the segments' angles.
         tip: (2,) columns of x, y in `limb_base`; empty if there are none.
         tags: columns that repeat their last value, all of them, when a tag is lost; empty: never.
-        time_unit, pressure_unit, angle_unit, length_unit: see `TIME_UNITS`, `PRESSURE_UNITS`,
-            `ANGLE_UNITS`, `LENGTH_UNITS`.
+        time_unit, pressure_unit, angle_unit, length_unit: of `UNITS`.
         angle_factor: bend angle per listed angle: 2 for chord angles, −1 for the other sign.
         rest_until: rows at rest before this time [s] give the sensors' offsets and are the zero of
             the pressures; a log that does not rest then, and every log with the word ``auto``, has
@@ -167,42 +168,48 @@ class ColumnMap:
             )
         values: dict[str, Any] = {}
         for key, value in content.items():
-            fits, expected = _KINDS.get(key, _TEXT)
-            if not fits(value):
-                raise LogError(f"column map {path}: {key} is {value!r}, give {expected}")
-            values[key] = value
-            if isinstance(value, list):
-                values[key] = tuple(tuple(v) if isinstance(v, list) else v for v in value)
+            reading, expected = _KINDS.get(key, (str, "one word or name"))
+            try:
+                values[key] = reading(value)
+            except (TypeError, ValueError) as error:
+                raise LogError(f"column map {path}: {key} is {value!r}, give {expected}") from error
         return cls(**values)
 
+    def factor(self, key: str) -> float:
+        """Return the SI value of the unit that a key names.
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _is_names(value: object) -> bool:
-    return isinstance(value, list) and all(isinstance(name, str) for name in value)
-
-
-def _is_stretches(value: object) -> bool:
-    return isinstance(value, list) and all(
-        isinstance(pair, list) and len(pair) == 2 and all(map(_is_number, pair)) for pair in value
-    )
+        Raises:
+            LogError: the unit is unknown.
+        """
+        name = getattr(self, key)
+        if name not in UNITS[key]:
+            raise LogError(f"{key} is '{name}': choose {', '.join(UNITS[key])}")
+        return UNITS[key][name]
 
 
-_NAMES = (_is_names, "a list of columns' names, as [name, name]")
-_TEXT = (lambda value: isinstance(value, str), "one word or name")
-_KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
-    **dict.fromkeys(("commanded", "chambers", "angles", "tags"), _NAMES),
-    "tip": (
-        lambda value: _is_names(value) and len(value) in (0, 2),
-        "the two columns of x and y, as [name, name]",
+def _names(value: object) -> tuple[str, ...]:
+    if not isinstance(value, list):
+        raise TypeError
+    return tuple(map(str, value))
+
+
+def _stretches(value: list[Any]) -> tuple[tuple[float, float], ...]:
+    return tuple((float(first), float(last)) for first, last in value)
+
+
+_KINDS: dict[str, tuple[Callable[[Any], Any], str]] = {
+    **dict.fromkeys(
+        ("commanded", "chambers", "angles", "tags", "tip"),
+        (_names, "a list of columns' names, as [name, name]"),
     ),
-    "angle_factor": (lambda value: _is_number(value) and value != 0, "a number, not 0"),
-    "rest_until": (lambda value: value == "auto" or _is_number(value), "a time in s, or auto"),
-    "ignore": (_is_stretches, "a list of pairs of times in s, as [[1.5, 3.0]]"),
+    "angle_factor": (float, "a number"),
+    "rest_until": (
+        lambda value: value if value == "auto" else float(value),
+        "a time in s, or auto",
+    ),
+    "ignore": (_stretches, "a list of pairs of times in s, as [[1.5, 3.0]]"),
 }
-"""What the value of a key must be, and how that is said; a key that is not here is `_TEXT`."""
+"""How the value of a key is read, and what it must be; a key that is not here is a word."""
 
 
 def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
@@ -213,15 +220,11 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
             names it.
     """
     table = read_table(Path(path))
-    pressure = _unit(columns.pressure_unit, PRESSURE_UNITS, "pressure_unit")
-    angle = _unit(columns.angle_unit, ANGLE_UNITS, "angle_unit") * columns.angle_factor
-    length = _unit(columns.length_unit, LENGTH_UNITS, "length_unit")
     count = len(columns.angles)
     if len(columns.commanded) != count or len(columns.chambers) != 2 * count:
         raise LogError(
             f"the column map names {count} angles: it needs {count} commands and {2 * count} "
-            f"chambers, "
-            f"got {len(columns.commanded)} and {len(columns.chambers)}"
+            f"chambers, got {len(columns.commanded)} and {len(columns.chambers)}"
         )
 
     def pick(names: tuple[str, ...]) -> Array:
@@ -232,11 +235,13 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
             )
         return np.stack([table[name] for name in names], axis=1)
 
-    seconds = _unit(columns.time_unit, TIME_UNITS, "time_unit")
-    time = seconds * pick((columns.time,))[:, 0]
-    command, chambers = pick(columns.commanded), pick(columns.chambers)
-    angles = pick(columns.angles)
-    tip = pick(columns.tip) if columns.tip else np.full((len(time), 2), np.nan)
+    pressure = columns.factor("pressure_unit")
+    time = columns.factor("time_unit") * pick((columns.time,))[:, 0]
+    command, chambers = pressure * pick(columns.commanded), pressure * pick(columns.chambers)
+    angles = columns.factor("angle_unit") * columns.angle_factor * pick(columns.angles)
+    tip = np.full((len(time), 2), np.nan)
+    if columns.tip:
+        tip = columns.factor("length_unit") * pick(columns.tip)
     measured = chambers[:, 0::2] - chambers[:, 1::2]
     if columns.rest_until != 0:
         rest = _rest(time, command, columns.rest_until)
@@ -256,12 +261,25 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
         keep &= (time < first) | (time > last)
     return CalibrationLog(
         time=time[keep],
-        commanded_differential=pressure * command[keep],
-        measured_differential=pressure * measured[keep],
-        bend_angles=angle * angles[keep],
-        tip=length * tip[keep],
+        commanded_differential=command[keep],
+        measured_differential=measured[keep],
+        bend_angles=angles[keep],
+        tip=tip[keep],
         source=Path(path).name,
     )
+
+
+def read_log(path: Path, columns: Path | None, namespace: str = "") -> CalibrationLog:
+    """Read a bag, or a table (CSV) by the map of its columns.
+
+    Raises:
+        LogError: it cannot be read, or is a table without a map.
+    """
+    if path.suffix != ".csv":
+        return read_bag(path, namespace)
+    if columns is None:
+        raise LogError(f"{path} needs --columns FILE")
+    return read_csv(path, ColumnMap.from_yaml(columns))
 
 
 def _timed(time: Array, path: str | Path) -> NDArray[np.bool_]:
@@ -292,7 +310,7 @@ def _rest(time: Array, command: Array, rest_until: float | str) -> NDArray[np.bo
     Args:
         time: (K,) [s].
         command: (K, M) in any unit.
-        rest_until: [s], or ``auto``.
+        rest_until: [s], or ``auto`` for the longest rest.
 
     Raises:
         LogError: it is neither.
@@ -301,29 +319,18 @@ def _rest(time: Array, command: Array, rest_until: float | str) -> NDArray[np.bo
         raise LogError(f"rest_until is '{rest_until}': give a time in s, or auto")
     size = np.abs(command).max(axis=1)
     near: NDArray[np.bool_] = size <= REST_SHARE * np.nanmax(size)
-    if not isinstance(rest_until, str):
-        early: NDArray[np.bool_] = near & (time < rest_until)
-        if early.any():
-            return early
+    if not isinstance(rest_until, str) and (near & (time < rest_until)).any():
+        return near & (time < rest_until)
+    longest = np.zeros(0, dtype=np.int64)
     edges = np.flatnonzero(np.diff(near.astype(int), prepend=0, append=0))
+    for first, end in edges.reshape(-1, 2):
+        rows = np.arange(first, end)
+        if first:  # chambers that were filled before need a while to be at rest
+            rows = rows[time[rows] >= time[first] + VENTING_TIME]
+        longest = max(longest, rows, key=len)
     rest = np.zeros(len(time), dtype=bool)
-    stretches = [
-        # Chambers that were filled before need a while to be at rest.
-        np.flatnonzero(time[first:end] >= (time[first] + VENTING_TIME if first else -np.inf))
-        + first
-        for first, end in edges.reshape(-1, 2)
-    ]
-    if stretches:
-        rest[max(stretches, key=lambda rows: float(np.ptp(time[rows])) if len(rows) else -1.0)] = (
-            True
-        )
+    rest[longest] = True
     return rest
-
-
-def _unit(name: str, known: Mapping[str, float], key: str) -> float:
-    if name not in known:
-        raise LogError(f"{key} is '{name}': choose {', '.join(known)}")
-    return known[name]
 
 
 def read_table(path: Path) -> dict[str, Array]:
@@ -335,64 +342,56 @@ def read_table(path: Path) -> dict[str, Array]:
 
     Raises:
         LogError: the file cannot be read, names a column twice, has fewer than two rows or another
-            number of columns in a row, or holds something that is no number; names line and column.
+            number of columns in a row, or holds something that is no number; names row and column.
     """
-    lines = _lines(path)
-    if not lines:
-        raise LogError(f"the log {path} is empty")
-    separator = next((mark for mark in SEPARATORS if mark in lines[0][1]), ",")
-    rows = list(csv.reader((text for _, text in lines), delimiter=separator))
-    header = [name.strip() for name in rows[0]]
-    twice = [name for name, count in Counter(header).items() if name and count > 1]
+    header_line, *lines = _lines(path)
+    separator = next((mark for mark in SEPARATORS if mark in header_line), ",")
+    header = [name.strip() for name in next(csv.reader([header_line], delimiter=separator))]
+    twice = [name for name in header if name and header.count(name) > 1]
     if twice:
         raise LogError(f"the log {path} has two columns '{twice[0]}': name them differently")
-    if len(rows) > 1 and len(rows[-1]) < len(header):
-        rows.pop()
-    if len(rows) < 3:
+    if lines and lines[-1].count(separator) < len(header) - 1:
+        lines.pop()
+    if len(lines) < 2:
         raise LogError(f"the log {path} has fewer than two rows below its header")
-    values = np.empty((len(rows) - 1, len(header)))
-    for index, row in enumerate(rows[1:]):
-        number = lines[index + 1][0]
-        if len(row) != len(header):
-            raise LogError(
-                f"line {number} of {path} has {len(row)} columns, its header has {len(header)}"
-            )
-        for place, cell in enumerate(row):
-            values[index, place] = _number(
-                cell, f"line {number}, column '{header[place]}' of {path}"
-            )
-    return {name: values[:, index] for index, name in enumerate(header)}
+    try:
+        values = np.loadtxt(
+            lines, delimiter=separator, converters=_number, quotechar='"', comments=None, ndmin=2
+        )
+    except ValueError as error:
+        raise LogError(
+            f"the log {path}, row 0 being the one below its header: {error}; leave cells without a "
+            "value empty, or write NaN"
+        ) from error
+    if values.shape[1] != len(header):
+        raise LogError(
+            f"the rows of {path} have {values.shape[1]} columns, its header has {len(header)}"
+        )
+    return dict(zip(header, values.T, strict=True))
 
 
-def _lines(path: Path) -> list[tuple[int, str]]:
-    """Return the lines that hold something, with their numbers from 1; the first is the header."""
+def _lines(path: Path) -> list[str]:
+    """Return the lines that hold something; the first is the header."""
     try:
         content = path.read_bytes()
     except OSError as error:
         raise LogError(f"cannot read the log {path}: {error.strerror}") from error
+    encoding = "utf-8-sig"
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        text = content.decode("utf-16", errors="replace")
-    else:
-        try:
-            text = content.decode("utf-8-sig")
-        except UnicodeDecodeError:
-            # Names of columns may hold a degree sign of an older program.
-            text = content.decode("cp1252", errors="replace")
-    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
-    while lines and lines[0][1].lstrip().startswith("#"):
+        encoding = "utf-16"
+    try:
+        text = content.decode(encoding)
+    except UnicodeDecodeError:
+        # Names of columns may hold a degree sign of an older program.
+        text = content.decode("cp1252", errors="replace")
+    lines = [line for line in text.splitlines() if line.strip()]
+    while lines and lines[0].lstrip().startswith("#"):
         lines.pop(0)
+    if not lines:
+        raise LogError(f"the log {path} is empty")
     return lines
 
 
-def _number(cell: str, where: str) -> float:
-    text = cell.strip()
-    if not text:
-        return math.nan
-    try:
-        value = float(text if "," not in text else text.replace(",", "."))
-    except ValueError as error:
-        raise LogError(
-            f"{where} is '{text}', which is no number: leave cells without a value empty, or write "
-            "NaN"
-        ) from error
+def _number(cell: str) -> float:
+    value = float(cell.strip().replace(",", ".") or math.nan)
     return value if math.isfinite(value) else math.nan

@@ -1,18 +1,32 @@
-"""Results of a calibration: values, uncertainties, residuals, what a log cannot separate."""
+"""What a calibration found, and how a limb file does on a later run: numbers, text, a figure."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from der_planner.arrays import Array
 from der_planner.identification.air import AirFit
 from der_planner.identification.lengths import GeometryFit
+from der_planner.identification.log import CalibrationLog, LogError, bridge, prepare
 from der_planner.limb import Limb
 from der_planner.limb.parameters import REST_SPREAD
+from der_planner.model import CONTROL_PERIOD, Model, Response, simulate
 from der_planner.model.resting import weight_of
+
+GAIN_DRIFT = 0.08
+"""Relative change of a gain above which the limb must be calibrated again."""
+REST_DRIFT = math.radians(1.5)
+"""Change of a rest angle above which the limb must be calibrated again [rad]."""
+ERROR_GROWTH = 2.5
+"""Error over the calibration's own error above which the limb must be calibrated again."""
+LEAST_ERROR = math.radians(0.4)
+"""Least error of a calibration that `ERROR_GROWTH` multiplies [rad]."""
+LEAST_MOTION = math.radians(3.0)
+"""Predicted range of motion above which the gain is checked [rad]."""
 
 
 @dataclass(frozen=True)
@@ -37,43 +51,11 @@ class Unknown:
 
 
 @dataclass(frozen=True)
-class LoadsFit:
-    """The mass that bends the limb by its weight, and the stiffness that carries it.
-
-    Attributes:
-        gravity: (2,) in the plane [m/s²].
-        mass: `Limb.moving_mass`, without what sits on the stiff base [kg].
-        first_moment: of that about the clamp, of the straight limb [kg·m].
-        stiffness: (M,) EI [N·m²].
-    """
-
-    gravity: tuple[float, float]
-    mass: float
-    first_moment: float
-    stiffness: tuple[float, ...]
-
-
-def loads_of(limb: Limb) -> LoadsFit | None:
-    """Return mass, first moment and stiffness of a limb; None without gravity in its plane."""
-    if not limb.weighs_in_plane:
-        return None
-    straight = replace(limb, gravity=(0.0, 1.0, 0.0))
-    weight = weight_of(straight)
-    count = limb.segment_count
-    mass = limb.moving_mass
-    return LoadsFit(
-        (limb.gravity[0], limb.gravity[1]),
-        float(mass),
-        float(weight.lever.sum() + limb.base_length * mass),
-        tuple(s.bending_stiffness for s in limb.segments[:count]),
-    )
-
-
-@dataclass(frozen=True)
 class FitReport:
     """What a fit found, and how well.
 
     Attributes:
+        limb: that was found, under the loads of the log.
         source: of the log.
         unknowns: (P,) with standard deviations.
         correlation: (P, P) of the unknowns.
@@ -86,12 +68,10 @@ class FitReport:
         span: (M,) range of the measured bend angles [rad].
         duration: of the log [s].
         rows: used by the fit.
-        evaluations: of model and derivatives.
-        fit_time: [s].
         warnings: sentences.
-        loads: the limb's weight and what carries it; None without gravity in the plane.
     """
 
+    limb: Limb
     source: str
     unknowns: tuple[Unknown, ...]
     correlation: Array
@@ -104,10 +84,7 @@ class FitReport:
     span: Array
     duration: float
     rows: int
-    evaluations: int
-    fit_time: float
     warnings: tuple[str, ...] = ()
-    loads: LoadsFit | None = None
 
     def value(self, name: str) -> Unknown:
         """Return the unknown of this name, e.g. ``gain[0]``.
@@ -123,8 +100,7 @@ class FitReport:
     def text(self) -> str:
         """Return the report as text for people."""
         lines = [
-            f"Calibration from {self.source or 'a log'}: {self.duration:.0f} s, {self.rows} rows, "
-            f"fitted in {self.fit_time:.1f} s ({self.evaluations} evaluations)",
+            f"Calibration from {self.source or 'a log'}: {self.duration:.0f} s, {self.rows} rows",
             "",
             f"{'unknown':26s} {'value':>12s} {'std':>10s}  unit",
         ]
@@ -191,21 +167,24 @@ class FitReport:
         ]
 
     def _load_lines(self) -> list[str]:
-        if self.loads is None:
+        limb = self.limb
+        if not limb.weighs_in_plane:
             return []
-        loads = self.loads
-        pull = math.hypot(*loads.gravity)
+        lever = weight_of(replace(limb, gravity=(0.0, 1.0, 0.0))).lever
+        moment = float(lever.sum()) + limb.base_length * limb.moving_mass
         line = (
-            f"loads: gravity of {pull:.2f} m/s² in the plane pulls at {1e3 * loads.mass:.0f} g "
-            f"beyond the base, first moment {1e3 * loads.first_moment:.1f} g·m about the clamp"
+            f"loads: gravity of {math.hypot(*limb.gravity[:2]):.2f} m/s² in the plane pulls at "
+            f"{1e3 * limb.moving_mass:.0f} g beyond the base, first moment {1e3 * moment:.1f} g·m "
+            "about the clamp"
         )
         known = {u.name: u for u in self.unknowns}
         kept = "the mass" if "log_stiffness[0]" in known else "the stiffness"
         told = []
-        for index, stiffness in enumerate(loads.stiffness):
+        for index, segment in enumerate(limb.segments):
             if f"log_stiffness[{index}]" in known:
                 share = known[f"log_stiffness[{index}]"].deviation
-                told.append(f"EI of segment {index} = {stiffness:.4f} N·m² ± {100 * share:.1f} %")
+                stiffness = f"{segment.bending_stiffness:.4f} N·m² ± {100 * share:.1f} %"
+                told.append(f"EI of segment {index} = {stiffness}")
             if f"log_mass[{index}]" in known:
                 found = known[f"log_mass[{index}]"]
                 told.append(
@@ -256,3 +235,179 @@ def _readable(item: Unknown) -> tuple[float, float, str]:
         "Pa/rad": (0.01 * math.radians(45.0), "hPa at 45 deg"),
     }.get(item.unit, (1.0, item.unit))
     return item.value * factor, item.deviation * factor, unit
+
+
+def predict(
+    limb: Limb,
+    time: Array,
+    differential_pressure: Array,
+    model: str = "der",
+) -> Response:
+    """Predict the bend of a limb from the pressures in its chambers.
+
+    Args:
+        limb: calibrated limb.
+        time: (K,) regular [s].
+        differential_pressure: (K, M) measured [Pa], without gaps.
+        model: ``der`` or ``pcc``.
+
+    Returns:
+        Bend angles (K, M) [rad] and tips (K, 2) [m] at ``time`` among others, from the equilibrium
+        of the first pressures on. Measured angles are not used.
+
+    Raises:
+        LogError: the model cannot follow the pressures, or does not come to rest.
+    """
+    try:
+        return simulate(Model.of(limb, model), time, pressures=differential_pressure)
+    except RuntimeError as error:
+        raise LogError(
+            f"the {model} model of the limb '{limb.name}' cannot follow this log ({error}): check "
+            "that the limb file is that of this limb, with its mounting and what it carries"
+        ) from error
+
+
+@dataclass(frozen=True)
+class Check:
+    """How a limb file does on a later run.
+
+    Attributes:
+        fits: the limb need not be calibrated again.
+        findings: sentences; empty where all is well.
+        error: (M,) root mean square open-loop error of the bend angles [rad].
+        tip_error: mean distance of predicted and measured tips [m]; NaN without tips.
+        gain_change: (M,) measured over predicted range of motion, less one; NaN for a segment that
+            hardly moved.
+        rest_change: (M,) mean of measured less predicted, at the gain that fits best [rad].
+    """
+
+    fits: bool
+    findings: tuple[str, ...]
+    error: Array
+    tip_error: float
+    gain_change: Array
+    rest_change: Array
+
+    def text(self) -> str:
+        """Return the verdict for people."""
+        lines = []
+        for index, (error, gain, rest) in enumerate(
+            zip(self.error, self.gain_change, self.rest_change, strict=True)
+        ):
+            change = f"{100 * gain:+.1f} %" if math.isfinite(gain) else "not shown"
+            lines.append(
+                f"segment {index}: open-loop error rms {math.degrees(error):.2f}°, gain "
+                f"{change}, rest angle {math.degrees(rest):+.2f}°"
+            )
+        if math.isfinite(self.tip_error):
+            lines.append(f"tip: mean error {1e3 * self.tip_error:.2f} mm")
+        lines += [f"finding: {text}" for text in self.findings]
+        lines.append(
+            "the limb file fits" if self.fits else "the limb file does not fit: calibrate again"
+        )
+        return "\n".join(lines)
+
+
+def check(limb: Limb, log: CalibrationLog) -> Check:
+    """Compare a limb file with a later run.
+
+    Raises:
+        LogError: the log cannot be used, see `prepare`, or the limb's rod cannot follow it.
+    """
+    prepared = prepare(log, limb, to_fit=False)
+    rows = prepared.usable
+    predicted = predict(limb, prepared.log.time, prepared.pressure)
+    measured = prepared.log.bend_angles
+    error = np.sqrt(np.nanmean((measured - predicted.bend_angles) ** 2, axis=0))
+    gains, rests = np.empty(len(error)), np.empty(len(error))
+    still: list[str] = []
+    for index in range(len(error)):
+        expected, seen = predicted.bend_angles[rows, index], measured[rows, index]
+        if np.ptp(expected) < LEAST_MOTION:
+            gains[index], rests[index] = math.nan, np.mean(seen - expected)
+            still.append(f"segment {index} hardly moved in this run: its gain is not checked")
+            continue
+        slope, offset = np.polyfit(expected, seen, 1)
+        gains[index], rests[index] = slope - 1.0, offset
+    distance = np.linalg.norm(prepared.log.tip - predicted.tip, axis=1)
+    tip_error = float(np.nanmean(distance)) if np.isfinite(distance).any() else math.nan
+    findings = [*prepared.warnings, *_drift(limb, error, gains, rests)]
+    drifted = len(findings) > len(prepared.warnings)
+    findings += still + _range(limb, prepared.pressure[rows], bridge(measured))
+    return Check(not drifted, tuple(findings), error, tip_error, gains, rests)
+
+
+def _drift(limb: Limb, error: Array, gains: Array, rests: Array) -> list[str]:
+    found = []
+    before = limb.provenance.get("residual_deg") or [0.0] * len(error)
+    for index in range(len(error)):
+        if abs(gains[index]) > GAIN_DRIFT:
+            found.append(f"the gain of segment {index} changed by {100 * gains[index]:+.0f} %")
+        if abs(rests[index]) > REST_DRIFT:
+            found.append(
+                f"the rest angle of segment {index} moved by {math.degrees(rests[index]):+.1f}°"
+            )
+        usual = max(LEAST_ERROR, math.radians(float(before[index])))
+        if error[index] > ERROR_GROWTH * usual:
+            found.append(
+                f"the error of segment {index} is {math.degrees(error[index]):.2f}°, at its "
+                f"calibration it was {math.degrees(usual):.2f}°"
+            )
+    return found
+
+
+def _range(limb: Limb, pressure: Array, bend: Array) -> list[str]:
+    found = []
+    for values, known, name, unit, factor in (
+        (pressure, limb.calibrated.differential_pressure, "pressure", "hPa", 0.01),
+        (bend, limb.calibrated.bend_angle, "bend", "°", math.degrees(1.0)),
+    ):
+        if len(known) != limb.segment_count:
+            continue
+        for index, (largest, limit) in enumerate(
+            zip(np.abs(values).max(axis=0), known, strict=True)
+        ):
+            if largest > 1.05 * limit:
+                found.append(
+                    f"the {name} of segment {index} reaches {factor * largest:.0f} {unit}, "
+                    f"calibrated "
+                    f"were {factor * limit:.0f} {unit}"
+                )
+    return found
+
+
+def plot_prediction(
+    limb: Limb, log: CalibrationLog, path: str | Path, held_out: CalibrationLog | None = None
+) -> None:
+    """Write a figure of bend angles, measured and predicted open loop, with the errors below.
+
+    Args:
+        limb: identified.
+        log: that it was fitted to.
+        path: of the PNG.
+        held_out: a log that the fit has not seen.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    logs = [("fitted", log)] + ([("not seen by the fit", held_out)] if held_out else [])
+    figure = Figure(figsize=(5.2 * len(logs), 4.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(2, len(logs), sharex="col", squeeze=False, height_ratios=(2, 1))
+    for column, (title, one) in enumerate(logs):
+        grid = one.resampled(CONTROL_PERIOD)
+        predicted = predict(limb, grid.time, bridge(grid.measured_differential)).bend_angles
+        top, bottom = axes[0, column], axes[1, column]
+        for index in range(limb.segment_count):
+            colour = f"C{index}"
+            measured = np.degrees(grid.bend_angles[:, index])
+            model = np.degrees(predicted[:, index])
+            top.plot(grid.time, measured, colour, lw=1.2, label=f"segment {index}, measured")
+            top.plot(grid.time, model, "k--", lw=0.8, label="predicted" if index == 0 else None)
+            bottom.plot(grid.time, measured - model, colour, lw=0.8)
+        top.set_title(title)
+        top.legend(fontsize=7)
+        bottom.set_xlabel("time [s]")
+    axes[0, 0].set_ylabel("bend angle [deg]")
+    axes[1, 0].set_ylabel("error [deg]")
+    figure.savefig(path, dpi=80)

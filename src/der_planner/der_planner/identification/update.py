@@ -18,7 +18,6 @@ import numpy as np
 
 from der_planner.arrays import Array
 from der_planner.identification.bends import CORRELATION, NODES, BendFit
-from der_planner.identification.check import LEAST_MOTION
 from der_planner.identification.fit import UNTOLD
 from der_planner.identification.least_squares import (
     LeastSquares,
@@ -27,6 +26,7 @@ from der_planner.identification.least_squares import (
     with_differences,
 )
 from der_planner.identification.log import CalibrationLog, LogError, Prepared, prepare
+from der_planner.identification.report import LEAST_MOTION
 from der_planner.limb import Limb, Segment
 from der_planner.limb.parameters import REST_SPREAD
 from der_planner.model import RodModel
@@ -65,18 +65,26 @@ _NUDGE = 1e-3
 """Change of an unknown in its spread, for a difference of two simulations."""
 
 
+NUMBERS = {
+    "gain": "moment_gain",
+    "rest angle": "rest_curvature",
+    "friction": "friction_moment",
+}
+"""Field of `Segment` of each number that changes from day to day."""
+
+
 @dataclass(frozen=True)
 class DayNumbers:
-    """Gain [rad/Pa], rest angle [rad] and friction [N·m] of each segment of a limb, in this order.
+    """The numbers of a limb that change from day to day: those of `NUMBERS`, for each segment.
 
     Attributes:
         limb: with the numbers of its file.
-        names: of the numbers.
-        free: (P,) which of the numbers of all segments may change.
+        names: of the numbers, in the order of `NUMBERS`.
+        free: (P,) places of those that may change in (M, len(names)) of all; None: all.
     """
 
     limb: Limb
-    names: tuple[str, ...] = ("gain", "rest angle", "friction")
+    names: tuple[str, ...] = tuple(NUMBERS)
     free: tuple[int, ...] | None = None
 
     @property
@@ -88,48 +96,52 @@ class DayNumbers:
     @property
     def unknowns(self) -> Unknowns:
         """What is known of the free numbers: those of the file, with the spread of days."""
+        prior, spread, low, high = self._known[self.places].T
+        return Unknowns(prior, spread, low, high, scale=spread)
+
+    @property
+    def _known(self) -> Array:
+        """Prior, spread, least and largest value of all numbers (M len(names), 4)."""
         rows = []
         for segment in self.limb.segments:
             rows += _day(segment)[: len(self.names)]
-        prior, spread, low, high = np.array(rows)[self.places].T
-        return Unknowns(prior, spread, low, high, scale=spread)
+        return np.array(rows)
 
     def limb_with(self, values: Array) -> Limb:
         """Return the limb with the free numbers (P,) put in place, its arcs changed alike."""
-        known = {place: float(value) for place, value in zip(self.places, values, strict=True)}
-        size = len(self.names)
+        numbers = self._known[:, 0]
+        numbers[self.places] = values
+        rows = numbers.reshape(self.limb.segment_count, -1).tolist()
         segments = tuple(
-            _changed(s, [known.get(size * m + n) for n in range(size)])
-            for m, s in enumerate(self.limb.segments)
+            _changed(segment, dict(zip(self.names, row, strict=True)))
+            for segment, row in zip(self.limb.segments, rows, strict=True)
         )
         pairs = zip(self.limb.pcc_segments, self.limb.segments, segments, strict=False)
         return replace(self.limb, segments=segments, pcc_segments=tuple(_alike(*p) for p in pairs))
 
 
 def _day(segment: Segment) -> list[tuple[float, float, float, float]]:
-    """Return prior, spread, least and largest value of a segment's three numbers."""
-    gain, friction = segment.static_gain, segment.friction_moment
-    rest = segment.rest_curvature * segment.length
-    rubs = max(FRICTION_SPREAD * friction, LEAST_FRICTION_SPREAD * segment.moment_gain)
+    """Return prior, spread, least and largest value of a segment's `NUMBERS`."""
+    gain, rest, friction = segment.moment_gain, segment.rest_curvature, segment.friction_moment
+    turned = LARGEST_REST_CHANGE / segment.length
+    rubs = max(FRICTION_SPREAD * friction, LEAST_FRICTION_SPREAD * gain)
     return [
         (gain, GAIN_SPREAD * gain, gain / LARGEST_GAIN_CHANGE, gain * LARGEST_GAIN_CHANGE),
-        (rest, REST_SPREAD, rest - LARGEST_REST_CHANGE, rest + LARGEST_REST_CHANGE),
+        (rest, REST_SPREAD / segment.length, rest - turned, rest + turned),
         (friction, rubs, 0.0, friction + LARGEST_FRICTION_CHANGE * rubs),
     ]
 
 
-def _changed(segment: Segment, numbers: Sequence[float | None]) -> Segment:
-    """Return a segment with gain, rest angle and friction, as far as they are not None."""
-    gain, rest, friction = [*numbers, None][:3]
-    changes = {}
-    if gain is not None:
-        changes["moment_gain"] = gain * segment.bending_stiffness / segment.length
-    if rest is not None:
-        changes["rest_curvature"] = rest / segment.length
-    if friction is not None:
-        changes["friction_moment"] = friction
-        if not segment.friction_curvature:
-            changes["friction_curvature"] = FRICTION_ANGLE / segment.length
+def _sizes(segment: Segment) -> tuple[float, float, float]:
+    """Return gain, rest angle and friction of a `Change` over the fields that hold them."""
+    return segment.length / segment.bending_stiffness, segment.length, 1.0
+
+
+def _changed(segment: Segment, numbers: dict[str, float]) -> Segment:
+    """Return a segment with other `NUMBERS`, by their names."""
+    changes = {NUMBERS[name]: value for name, value in numbers.items()}
+    if numbers.get("friction") and not segment.friction_curvature:
+        changes["friction_curvature"] = FRICTION_ANGLE / segment.length
     return replace(segment, **changes)
 
 
@@ -273,21 +285,22 @@ def update(limb: Limb, logs: CalibrationLog | Sequence[CalibrationLog]) -> tuple
             f"gain, rest angle and friction leave {math.degrees(after.max()):.1f}°: something else "
             "changed, calibrate again"
         )
-    spread = every.unknowns.spread
-    changes = tuple(
-        Change(
+    spread, sizes = every.unknowns.spread, np.array([_sizes(s) for s in limb.segments]).ravel()
+    changes = []
+    for place in every.places:
+        deviation = deviations.get(place, float(spread[place]))
+        change = Change(
             segment=place // len(every.names),
             name=every.names[place % len(every.names)],
-            before=float(known[place]),
-            after=float(values[place]),
-            spread=float(spread[place]),
-            deviation=deviations.get(place, float(spread[place])),
+            before=float(sizes[place] * known[place]),
+            after=float(sizes[place] * values[place]),
+            spread=float(sizes[place] * spread[place]),
+            deviation=float(sizes[place] * deviation),
             told=place in deviations,
         )
-        for place in every.places
-    )
+        changes.append(change)
     found = _with_provenance(found, limb, changes, after, given)
-    return found, Update(changes, before, after, duration, tuple(warnings))
+    return found, Update(tuple(changes), before, after, duration, tuple(warnings))
 
 
 def _solve(every: DayNumbers, runs: Sequence[Prepared]) -> tuple[Array, dict[int, float]]:
@@ -321,25 +334,19 @@ def _refuse_wrong_way(runs: Sequence[Prepared], remaining: Array) -> None:
     Raises:
         LogError: a segment does.
     """
-    measured = np.concatenate([run.log.bend_angles for run in runs])
-    expected = measured - remaining
     ends = np.cumsum([len(run.time) for run in runs])[:-1]
-    usable = np.concatenate([run.usable for run in runs])
-
-    def about_means(table: Array) -> Array:
-        parts = [part - np.nanmean(part, axis=0) for part in np.split(table, ends)]
-        return np.asarray(np.concatenate(parts)[usable].T)
-
-    pairs = zip(about_means(measured), about_means(expected), strict=True)
-    for m, (seen, told) in enumerate(pairs):
-        if min(np.ptp(seen), np.ptp(told)) < LEAST_MOTION:
-            continue
-        if np.corrcoef(seen, told)[0, 1] < WRONG_WAY:
-            raise LogError(
-                f"segment {m} bends the wrong way in these runs: check that they are of this limb, "
-                "that no tubes, signs or columns are swapped, and that what it carries is named; "
-                "else calibrate again"
-            )
+    for run, left in zip(runs, np.split(remaining, ends), strict=True):
+        measured = run.log.bend_angles[run.usable]
+        expected = measured - left[run.usable]
+        for m, (seen, told) in enumerate(zip(measured.T, expected.T, strict=True)):
+            if min(np.ptp(seen), np.ptp(told)) < LEAST_MOTION:
+                continue
+            if np.corrcoef(seen, told)[0, 1] < WRONG_WAY:
+                raise LogError(
+                    f"segment {m} bends the wrong way in these runs: check that they are of this "
+                    "limb, that no tubes, signs or columns are swapped, and that what it carries "
+                    "is named; else calibrate again"
+                )
 
 
 def adapted(limb: Limb, tip_of: Callable[[Limb], Array | None], tip: Array) -> Limb | None:
@@ -386,7 +393,7 @@ def adapted(limb: Limb, tip_of: Callable[[Limb], Array | None], tip: Array) -> L
 def _with_provenance(
     found: Limb,
     before: Limb,
-    changes: tuple[Change, ...],
+    changes: Sequence[Change],
     error: Array,
     logs: Sequence[CalibrationLog],
 ) -> Limb:

@@ -7,8 +7,7 @@ from der_planner.model.arcs import ArcModel
 from der_planner.model.material import Material
 from der_planner.model.model import NODES, ArcState, Model, State
 from der_planner.model.rod import RodModel
-from der_planner.model.series import CONTROL_PERIOD
-from der_planner.model.simulation import STEPS, Initial, Response, simulate
+from der_planner.model.simulation import CONTROL_PERIOD, STEPS, Initial, Response, simulate
 
 __all__ = [
     "CONTROL_PERIOD",

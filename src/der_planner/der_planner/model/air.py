@@ -28,9 +28,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from der_planner.arrays import Array
+from der_planner.arrays import Array, interpolate
 from der_planner.limb import VENT_REFERENCE, Pneumatics
-from der_planner.model.series import interpolate
 
 _TUBE = 1e-3
 """Exponents closer to 1 than this fall exponentially."""

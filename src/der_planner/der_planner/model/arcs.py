@@ -188,16 +188,6 @@ class ArcModel(Model):
         line = np.array(points)
         return np.column_stack([line.real, line.imag])
 
-    def matrices(self, bend_angles: ArrayLike, rates: ArrayLike) -> tuple[Array, Array, Array]:
-        """Return inertia M, Coriolis C and damping D, each (n, n), with Ṁ = C + Cᵀ.
-
-        Args:
-            bend_angles: (n,) [rad].
-            rates: (n,) [rad/s].
-        """
-        M, C, D, _ = self._inertia(self._check("bend_angles", bend_angles), np.asarray(rates))
-        return M, C, D + np.diag(self.stiffness * self.material_damping)
-
     def _inertia(self, q: Array, v: Array) -> tuple[Array, Array, Array, Array]:
         result: tuple[Array, Array, Array, Array] = kernels.inertia(q, v, self.arcs)
         return result
@@ -248,22 +238,6 @@ class ArcModel(Model):
                 break
         return q
 
-    def energy(self, bend_angles: ArrayLike, rates: ArrayLike) -> float:
-        """Return kinetic plus elastic plus gravity's potential energy [J]."""
-        q, v = self._check("bend_angles", bend_angles), self._check("rates", rates)
-        M = self._inertia(q, v)[0]
-        bend = q - self.free_angles
-        elastic = 0.5 * self.stiffness @ bend**2 + 0.25 * self.cubic @ bend**4
-        arcs = self.arcs
-        frame = kernels.joints(q, arcs)
-        slopes = kernels.arc_slopes(q, arcs, frame, 2)
-        J, H = np.zeros(q.size, dtype=complex), np.zeros((q.size, q.size), dtype=complex)
-        potential = 0.0
-        for p, mass in enumerate(arcs.weight):
-            point = self.base + kernels.point_derivatives(q, arcs, frame, p, slopes, J, H)
-            potential -= mass * (point.real * arcs.gravity[0] + point.imag * arcs.gravity[1])
-        return float(0.5 * v @ M @ v + elastic + potential)
-
     def inverse_dynamics(
         self, angles: ArrayLike, rates: ArrayLike, accelerations: ArrayLike
     ) -> Array:
@@ -286,6 +260,15 @@ class ArcModel(Model):
             torque[k] += M @ a[k] + (C + D) @ v[k] - weight
         pressures: Array = torque / self.gain
         return pressures
+
+    def static_pressure(self, bend_angles: ArrayLike) -> Array:
+        """Return the pressures (..., n) [Pa] that hold bend angles (..., n) [rad] at rest."""
+        angles = np.asarray(bend_angles, dtype=float)
+        if not self.is_loaded:
+            pressure: Array = self.elastic_torque(angles) / self.gain
+            return pressure
+        flat = angles.reshape(-1, angles.shape[-1])
+        return self.inverse_dynamics(flat, 0 * flat, 0 * flat).reshape(angles.shape)
 
     def run(
         self, start: State, effective: Array, period: float, linearise: Outputs = ""

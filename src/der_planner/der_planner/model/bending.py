@@ -1,4 +1,4 @@
-"""What a bend angle is, and the shapes of evenly bent limbs: the rod's own polyline and the arcs.
+"""What a bend angle is, the shapes of evenly bent limbs, and the bend that brings a tip to a point.
 
 The bend angle of a segment is the heading where it ends less the heading where it starts [rad],
 counter-clockwise positive, as tags on the stiff pieces between segments show it. A rod's heading
@@ -16,6 +16,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from der_planner.arrays import Array
 from der_planner.rod import Rod
+
+PRIOR_WEIGHT = 1e-5
+"""Pull toward the first guess [m/rad]: decides what the tip leaves open (straight limb, M > 2)."""
+_ITERATIONS = 60
+_SMALLEST_STEP = 1e-11
+"""Change of the bend angles that ends the iteration [rad]."""
 
 
 def end_edges(rod: Rod) -> list[tuple[int, int]]:
@@ -187,3 +193,48 @@ def _points(edges: NDArray[np.complex128]) -> Array:
     nodes = np.cumsum(edges, axis=-1)
     nodes = np.concatenate([np.zeros_like(nodes[..., :1]), nodes], axis=-1)
     return np.stack([nodes.real, nodes.imag], axis=-1)
+
+
+def inverse_kinematics(
+    kinematics: Kinematics, tip: ArrayLike, guess: ArrayLike, prior_weight: float = PRIOR_WEIGHT
+) -> tuple[Array, Array]:
+    """Return bend angles (K, M) [rad] near the guess and the distances (K,) [m] that remain.
+
+    Minimises |tip(θ) − r|² + w² |θ − guess|² for every point by Levenberg-Marquardt.
+
+    Args:
+        kinematics: forward kinematics.
+        tip: (K, 2) points r [m].
+        guess: (K, M) first guess, which also chooses the branch [rad].
+        prior_weight: w [m/rad].
+    """
+    target = np.atleast_2d(np.asarray(tip, dtype=float))
+    prior = np.atleast_2d(np.asarray(guess, dtype=float))
+    angles = prior.copy()
+    damping = np.full(len(angles), 1e-9)
+    identity = np.eye(angles.shape[1])
+    weight = prior_weight**2
+
+    def cost(theta: Array) -> Array:
+        miss = kinematics.tip(theta) - target
+        total: Array = (miss**2).sum(-1) + weight * ((theta - prior) ** 2).sum(-1)
+        return total
+
+    present = cost(angles)
+    for _ in range(_ITERATIONS):
+        miss = kinematics.tip(angles) - target
+        jacobian = kinematics.tip_jacobians(angles)
+        normal = np.einsum("kai,kaj->kij", jacobian, jacobian)
+        normal = normal + (weight + damping)[:, None, None] * identity
+        slope = np.einsum("kai,ka->ki", jacobian, miss) + weight * (angles - prior)
+        step = -np.linalg.solve(normal, slope[..., None])[..., 0]
+        length = np.linalg.norm(step, axis=-1, keepdims=True)
+        step = step * np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))
+        trial = cost(angles + step)
+        better = trial <= present
+        angles = np.where(better[:, None], angles + step, angles)
+        present = np.where(better, trial, present)
+        damping = np.where(better, np.maximum(damping / 10, 1e-16), damping * 10 + 1e-12)
+        if np.all(length < _SMALLEST_STEP):
+            break
+    return angles, np.linalg.norm(kinematics.tip(angles) - target, axis=-1)

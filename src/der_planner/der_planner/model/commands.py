@@ -8,10 +8,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from der_planner.arrays import Array
+from der_planner.arrays import Array, interpolate
 from der_planner.limb import VENT_REFERENCE
 from der_planner.model.air import Air, AirLaw, fallen
-from der_planner.model.series import interpolate
 
 _SHARES_BEFORE = (0.0, 0.2, 0.4, 0.6, 0.8)
 """Shares of a ramp that may come before the jump that it replaces."""

@@ -97,7 +97,15 @@ class Material:
         Raises:
             ValueError: shapes do not fit, or the stiffening makes a pressure unreachable.
         """
-        times, wanted, angles = self._check(time, effective, bend_angle)
+        times, wanted, angles = (
+            np.asarray(each, dtype=float) for each in (time, effective, bend_angle)
+        )
+        expected = (times.size, self._count)
+        if times.ndim != 1 or wanted.shape != expected or angles.shape != expected:
+            raise ValueError(
+                f"expected time (K,), pressures and bend angles (K, {self._count}); got "
+                f"{times.shape}, {wanted.shape}, {angles.shape}"
+            )
         driven = wanted + self.memory_pressures(times, angles)
         result = np.zeros_like(wanted)
         # The neighbours' pressures are known but for what their neighbours change: a contraction.
@@ -119,16 +127,6 @@ class Material:
             if np.abs(result - before).max(initial=0.0) < _SAME_PRESSURE:
                 break
         return result
-
-    def effective_pressure(
-        self, time: ArrayLike, differential: ArrayLike, bend_angle: ArrayLike
-    ) -> Array:
-        """Return the (K, M) effective pressures [Pa] of chamber pressures (K, M), known bend.
-
-        The inverse of `differential_pressure`, with the same arguments.
-        """
-        times, measured, angles = self._check(time, differential, bend_angle)
-        return self.without_memory(measured, self.memory_pressures(times, angles))
 
     def without_memory(self, differential: Array, memory: Array) -> Array:
         """Return effective pressures w (…, M) [Pa] where friction and creep are known.
@@ -296,20 +294,6 @@ class Material:
         return RestingLaw(
             gain, cubic, rest, friction, turn, creep, relaxation, stiffness, weight_of(self._limb)
         )
-
-    def _check(
-        self, time: ArrayLike, pressure: ArrayLike, bend_angle: ArrayLike
-    ) -> tuple[Array, Array, Array]:
-        times = np.asarray(time, dtype=float)
-        pressures = np.asarray(pressure, dtype=float)
-        angles = np.asarray(bend_angle, dtype=float)
-        expected = (times.size, self._count)
-        if times.ndim != 1 or pressures.shape != expected or angles.shape != expected:
-            raise ValueError(
-                f"expected time (K,), pressures and bend angles (K, {self._count}); got "
-                f"{times.shape}, {pressures.shape}, {angles.shape}"
-            )
-        return times, pressures, angles
 
 
 def _coupling_matrix(limb: Limb) -> Array:

@@ -20,7 +20,7 @@ from der_planner.limb import Limb
 from der_planner.model.air import Air
 from der_planner.model.bending import Kinematics
 from der_planner.model.material import Material
-from der_planner.rod import RodState, Trajectory
+from der_planner.rod import RodState
 
 Outputs = Literal["", "tip", "all"]
 """What a linearisation keeps the derivatives of: nothing, the tip, or tip and bend angles."""
@@ -69,14 +69,12 @@ class Rollout:
         bend_angles: (K+1, M) at the beginning of each interval and at the end [rad].
         tip: (K+1, 2) [m].
         final: state at the end, from which the same model can go on.
-        trajectory: of the rod, with all nodes; None for the arcs.
         linear: first-order effect of the pressures; None where it was not asked for.
     """
 
     bend_angles: Array
     tip: Array
     final: State
-    trajectory: Trajectory | None = None
     linear: FirstOrder | None = None
 
 

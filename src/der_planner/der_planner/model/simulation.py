@@ -20,12 +20,12 @@ from der_planner.limb import Limb
 from der_planner.model.air import Chambers
 from der_planner.model.material import Material, Memory
 from der_planner.model.model import FirstOrder, Model, State
-from der_planner.model.series import CONTROL_PERIOD, step_middles
-from der_planner.rod import Trajectory
 
 Bend = Callable[[Array], Array]
 """Bend angles (K, M) [rad] at instants (K,) [s]."""
 
+CONTROL_PERIOD = 0.05
+"""A command is held for this long [s]: setpoints are 50 ms apart."""
 STEPS = 5
 """Integrator steps in a control period: 10 ms."""
 _ARC_STEP = 0.01
@@ -104,7 +104,6 @@ class Response:
         tip: (K+1, 2) [m].
         final: state at the end.
         memory: of friction and creep at the last instant at which they were computed.
-        trajectory: of the rod's nodes; None for the arcs.
         derivative: by the commands or pressures that were given, if it was asked for.
     """
 
@@ -115,7 +114,6 @@ class Response:
     tip: Array
     final: State
     memory: Memory
-    trajectory: Trajectory | None = None
     derivative: Derivative | None = None
 
 
@@ -179,7 +177,6 @@ def simulate(
         moved.tip,
         moved.final,
         felt.memory,
-        moved.trajectory,
         derivative,
     )
 
@@ -271,6 +268,11 @@ def _from_pressures(
 
     differential = means_between(pressure, steps)
     return _Felt(means_between(effective, steps), differential, effective[0], left, change)
+
+
+def step_middles(count: int, steps: int, period: float = CONTROL_PERIOD) -> Array:
+    """Return the middles (count · steps,) of equal steps in ``count`` periods from 0 on [s]."""
+    return (np.arange(count * steps, dtype=np.float64) + 0.5) * (period / steps)
 
 
 def means_between(pressure: Array, steps: int) -> Array:

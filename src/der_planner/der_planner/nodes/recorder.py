@@ -280,21 +280,22 @@ class Recorder(Node):
     def _stop(self) -> tuple[bool, str]:
         assert self._session is not None
         self._take_what_has_arrived()
-        status = self._session.stop()
-        self._session = None
-        self._last_failure = status.failure
-        self._last_bag = str(status.folder)
-        if status.failure:
-            return False, status.failure
+        ended, self._session = self._session, None
+        ended.stop()
+        self._last_failure = ended.failure
+        self._last_bag = str(ended.writer.folder)
+        if ended.failure:
+            return False, ended.failure
         self.get_logger().info(
-            f"closed {status.folder}: {status.messages} messages, {status.dropped} dropped, "
-            f"{sum(self._missed().values())} missed"
+            f"closed {self._last_bag}: {ended.writer.message_count} messages, {ended.dropped} "
+            f"dropped, {sum(self._missed().values())} missed"
         )
-        return True, str(status.folder)
+        return True, self._last_bag
 
     def _on_start(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._session is not None and not self._session.status().failure:
-            response.message = f"already recording into {self._session.folder}: stop that first"
+        if self._session is not None and not self._session.failure:
+            folder = self._session.writer.folder
+            response.message = f"already recording into {folder}: stop that first"
             return response
         if self._session is not None:
             self._stop()
@@ -349,24 +350,24 @@ class Recorder(Node):
             if self._last_failure:
                 return Health("error", self._last_failure, {**values, "state": "failed"})
             return Health("ok", "not recording", {**values, "state": "idle"})
-        status = self._session.status()
+        session, bag = self._session, self._session.writer
         values |= {
-            "state": "paused" if status.paused else "recording",
-            "bag": status.folder,
-            "messages": status.messages,
-            "bytes": status.bytes,
-            "files": status.files,
-            "dropped": status.dropped,
-            "queued_bytes": status.queued_bytes,
+            "state": "paused" if session.paused else "recording",
+            "bag": bag.folder,
+            "messages": bag.message_count,
+            "bytes": bag.byte_count,
+            "files": bag.file_count,
+            "dropped": session.dropped,
+            "queued_bytes": session.queued_bytes,
         }
-        if status.failure:
-            return Health("error", status.failure, {**values, "state": "failed"})
-        if status.dropped:
-            lost = f"{status.dropped} messages dropped: the disk is too slow for what is recorded"
+        if session.failure:
+            return Health("error", session.failure, {**values, "state": "failed"})
+        if session.dropped:
+            lost = f"{session.dropped} messages dropped: the disk is too slow for what is recorded"
             return Health("warning", lost, values)
         if values["missed"]:
             return Health("warning", f"messages that never arrived, {values['missed']}", values)
-        return Health("ok", f"{values['state']} into {status.folder}", values)
+        return Health("ok", f"{values['state']} into {bag.folder}", values)
 
 
 def offered_qos(endpoints: list[TopicEndpointInfo]) -> tuple[OfferedQos, ...]:

@@ -252,7 +252,7 @@ def reachable_region(limb: Limb) -> list[Array]:
     poses = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     tips = space.arcs.tip(poses)
     limit = limb.pneumatics.pressure_limit * (1 + 1e-9)
-    allowed: NDArray[np.bool_] = np.all(np.abs(space.static_pressure(poses)) <= limit, axis=-1)
+    allowed: NDArray[np.bool_] = np.all(np.abs(space.arcs.static_pressure(poses)) <= limit, axis=-1)
     if not allowed.any():
         return []
     corner = tips[allowed].min(axis=0)

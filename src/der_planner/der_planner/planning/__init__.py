@@ -5,18 +5,12 @@
 
 from der_planner.model import CONTROL_PERIOD
 from der_planner.planning.configuration import METHODS
-from der_planner.planning.errors import (
-    BucklingError,
-    OverloadError,
-    PlanningError,
-    UnreachableError,
-)
+from der_planner.planning.loads import BucklingError, OverloadError, PlanningError
 from der_planner.planning.motions import NAMES, Motion, Reference
-from der_planner.planning.paths import PathLimits
 from der_planner.planning.plan_file import Plan
 from der_planner.planning.planner import DEFAULT_METHOD, choose_method, plan
-from der_planner.planning.transitions import Start
-from der_planner.planning.workspace import Workspace
+from der_planner.planning.timing import PathLimits, Start
+from der_planner.planning.workspace import UnreachableError, Workspace
 
 __all__ = [
     "CONTROL_PERIOD",

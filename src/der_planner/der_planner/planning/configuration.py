@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import math
 from abc import ABC, abstractmethod
 from functools import cached_property
 from typing import Self
@@ -24,24 +25,23 @@ import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 
 from der_planner.arrays import Array
-from der_planner.limb import Limb
 from der_planner.model import ArcModel, Initial, Model, RodModel, State
-from der_planner.model.poses import PoseFinder, Poses
-from der_planner.planning.errors import (
+from der_planner.model.bending import inverse_kinematics
+from der_planner.model.rod import PoseFinder, Poses
+from der_planner.planning.loads import (
     BucklingError,
-    OverloadError,
     PlanningError,
-    UnreachableError,
+    check_load,
+    check_stays,
+    stable_rest,
 )
-from der_planner.planning.loads import check_load, check_stays, stable_rest
 from der_planner.planning.motions import Reference
-from der_planner.planning.transitions import Start, resting_spline, sample_spline
+from der_planner.planning.timing import Start, resting_spline, sample_spline
 from der_planner.planning.workspace import (
     NEAREST_TOLERANCE,
     TOLERANCE,
+    UnreachableError,
     Workspace,
-    solve,
-    static_pressure,
 )
 from der_planner.rod import ConvergenceError, Rod, RodState
 
@@ -156,16 +156,14 @@ def _arcs_along(model: ArcModel, reference: Reference) -> ArcConfiguration:
         )
     near = angles + (home - reference.rest)
     # Points that the rod reaches and the arcs miss are no refusal: the plan's error shows them.
-    own = solve(model, tip, near, REFERENCE_PRIOR)[0]
+    own = inverse_kinematics(model, tip, near, REFERENCE_PRIOR)[0]
 
-    def needed(limb: Limb) -> Array:
-        lighter = model if limb is model.limb else model.another(limb)
-        pressure = static_pressure(lighter, own)
-        return lighter.material.differential_pressure(time, pressure, own)
+    def needed(arcs: ArcModel) -> Array:
+        return arcs.material.differential_pressure(time, arcs.static_pressure(own), own)
 
     stiffness = np.array([model.smallest_stiffness(pose) for pose in own])
     check_stays(stiffness, time, tip, "arcs")
-    check_load(model.limb, time, tip, needed(model.limb), needed)
+    check_load(model, time, tip, needed(model), needed)
     return ArcConfiguration(model, resting_spline(time, own, reference.start), reference.start)
 
 
@@ -225,7 +223,7 @@ def _evenly_along(model: RodModel, reference: Reference) -> RodConfiguration:
         # One angle cannot follow two coordinates: the rod bends as the arc does.
         bend = resting_spline(time, guess, reference.start)
         return RodConfiguration(model, bend, reference.start)
-    angles, misses = solve(model.kinematics, tip, guess, REFERENCE_PRIOR)
+    angles, misses = inverse_kinematics(model.kinematics, tip, guess, REFERENCE_PRIOR)
     tolerance = TOLERANCE if reference.deviation is None else NEAREST_TOLERANCE
     Workspace(model).check_reach(time, tip, angles, misses, tolerance, model.kinematics)
     return RodConfiguration(model, resting_spline(time, angles, reference.start), reference.start)
@@ -334,7 +332,6 @@ def _through(time: Array, values: Array, start: Start | None) -> BSpline:
 
 def _poses_along(model: RodModel, reference: Reference) -> LoadedConfiguration:
     """Return the poses of a loaded rod along a reference."""
-    limb = model.limb
     count = max(8, int(np.ceil(reference.duration / _POSE_PERIOD)) + 1)
     time = np.linspace(0.0, reference.duration, count)
     tip = interpolate_smoothly(time, reference.time, reference.tip)
@@ -346,39 +343,21 @@ def _poses_along(model: RodModel, reference: Reference) -> LoadedConfiguration:
     worst = int(np.abs(pressure).max(axis=1).argmax())
     some = np.unique(np.append(np.arange(0, count, _SPARSE), [0, worst, count - 1]))
 
-    def needed(lighter: Limb) -> Array:
-        other = model.another(lighter)
-        fewer = _find_poses(other, time[some], tip[some], guess[some])
-        left = _unreached(lighter, time[some], tip[some], fewer)
-        if left is not None:
-            raise left
-        return _needed(other, time[some], fewer)
+    def needed(lighter: RodModel) -> Array:
+        fewer = _find_poses(lighter, time[some], tip[some], guess[some])
+        return _needed(lighter, time[some], fewer)
 
-    unreached = _unreached(limb, time, tip, poses)
-    try:
-        if unreached is None or limb.masses:
-            check_load(limb, time, tip, pressure, needed)
-    except OverloadError as error:
-        # What keeps the limb from a point is its load only if it would be there with less of it.
-        if unreached is None or error.possible_mass is not None:
-            raise
-    if unreached is not None:
-        raise unreached
+    check_load(model, time, tip, pressure, needed)
     return LoadedConfiguration(model, time, poses, reference.start)
 
 
-def _unreached(limb: Limb, time: Array, tip: Array, poses: Poses) -> UnreachableError | None:
-    """Return the error of poses that miss their points (K, 2) [m]; None where none does."""
-    missed = poses.misses > _POSE_TOLERANCE * limb.length
-    if not missed.any() or limb.segment_count == 1:
-        return None
-    k = int(np.argmax(missed))
-    point = float(tip[k, 0]), float(tip[k, 1])
-    carried = sum(item.mass for item in limb.masses)
-    return UnreachableError(float(time[k]), point, float(poses.misses[k]), float("nan"), carried)
-
-
 def _find_poses(model: RodModel, time: Array, tip: Array, guess: Array) -> Poses:
+    """Return the poses with tips (K, 2) [m], near bend angles (K, M) [rad].
+
+    Raises:
+        BucklingError: the rod would buckle or snap through on the way.
+        UnreachableError: a pose misses its point.
+    """
     try:
         poses = PoseFinder(model, REFERENCE_PRIOR).along(stable_rest(model), tip, guess)
     except ConvergenceError as error:
@@ -388,6 +367,12 @@ def _find_poses(model: RodModel, time: Array, tip: Array, guess: Array) -> Poses
             "through under its load. Shrink or move the motion, or mount the limb otherwise"
         ) from error
     check_stays(poses.smallest_stiffness, time, tip, "limb")
+    missed = poses.misses > _POSE_TOLERANCE * model.limb.length
+    if missed.any() and model.inputs > 1:
+        k = int(np.argmax(missed))
+        point = float(tip[k, 0]), float(tip[k, 1])
+        carried = sum(item.mass for item in model.limb.masses)
+        raise UnreachableError(float(time[k]), point, float(poses.misses[k]), math.nan, carried)
     return poses
 
 

@@ -1,10 +1,18 @@
-"""Planning again from commands that were played, against what the model did not explain of them."""
+"""Planning again from commands that were played, against what the model did not explain of them.
+
+A learned plan also is a start for a new motion: the same one, a little slower or larger. What it
+knows beyond its model is the disturbance d(t) = tip expected − model(commands). A motion of another
+period or amplitude meets nearly the same one at the same phase, so that d is stretched to the new
+duration, scaled by the amplitude, and planned against (`carried_over`).
+"""
 
 from __future__ import annotations
 
 import copy
 import dataclasses
+import math
 import time as clock
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -12,17 +20,26 @@ from threadpoolctl import ThreadpoolController
 
 from der_planner.arrays import Array
 from der_planner.limb import Limb
+from der_planner.methods import LEARNED
 from der_planner.model import CONTROL_PERIOD, Model, simulate
+from der_planner.model.bending import inverse_kinematics
 from der_planner.model.simulation import Bend
 from der_planner.planning.configuration import configure
-from der_planner.planning.errors import PlanningError
+from der_planner.planning.loads import PlanningError
 from der_planner.planning.optimal import Optimiser, OptimiserSettings, Optimum
-from der_planner.planning.plan_file import Plan
-from der_planner.planning.workspace import solve
+from der_planner.planning.plan_file import SUFFIX, Plan, difference, read_plan
 from der_planner.rod import ConvergenceError
 
 _THREADS = ThreadpoolController()
+PULL = 0.015
+"""Pull toward the best commands, over the tip's movement per pressure.
 
+The model's answer to a change of commands is wrong by some per cent of the movement of each
+segment, even where they cancel at the tip. A weaker pull lets segments wander against each other
+near the straight pose, where the tip hardly tells them apart.
+"""
+NEAR = math.log(1.35)
+"""Largest logarithm of the ratio of two periods and amplitudes that are near each other."""
 _WINDOWS = (100, 150, 150)
 """Setpoints that are solved together, for each try; a longer window feels limits further ahead."""
 _NOTABLE_ERROR = 5e-4
@@ -111,7 +128,7 @@ class Correction:
             raise _not_followed(error) from error
         return Expected(response.tip[:-1], response.differential_pressure.mean(axis=1))
 
-    def plan(self, commands: Array, disturbance: Array, pull: float) -> Plan:
+    def plan(self, commands: Array, disturbance: Array, pull: float = PULL) -> Plan:
         """Return the optimum of |tip(u) + d − r̄|² under all limits, near given commands.
 
         The optimiser keeps friction along the plan's own bend. What friction along the bend of the
@@ -120,7 +137,7 @@ class Correction:
         Args:
             commands: (K, M) toward which the plan is pulled, usually played ones [Pa].
             disturbance: d (K, 2), measured tip less the model's, at the setpoints [m].
-            pull: tip error that a deviation from ``commands`` is worth [m/Pa].
+            pull: tip error that a deviation from ``commands`` is worth, over the tip's movement.
 
         Returns:
             The plan, with the method ``learned``; its `tip_predicted` includes the disturbance.
@@ -128,70 +145,64 @@ class Correction:
         Raises:
             PlanningError: the model cannot be rolled forward, or a limited step has no solution.
         """
-        begin = clock.perf_counter()
+        started = clock.perf_counter()
         wanted = self._reachable(self._plan.tip_reference - disturbance)
         tip = self.expected(commands).tip
         rubbed = tip - self.expected(commands, self._configuration.bend_at).tip
-        best: Optimum | None = None
-        steps = 0
+        begin = commands
         try:
             # Matrices of a few hundred rows: more threads only get into other processes' way.
             with _THREADS.limit(limits=1, user_api="blas"):
                 for _ in range(_ROUNDS):
-                    best, used = self._solve(commands, wanted - rubbed, pull, best)
-                    steps += used
-                    tip = self.expected(best.commands).tip
+                    best = self._solve(commands, wanted - rubbed, pull, begin)
+                    begin, tip = best.commands, self.expected(best.commands).tip
                     before, rubbed = rubbed, tip - best.tip
                     if np.linalg.norm(rubbed - before, axis=1).mean() < _SETTLED:
                         break
         except ConvergenceError as error:
             raise _not_followed(error) from error
-        if best is None:
-            raise AssertionError("there is a first round")
         return dataclasses.replace(
             self._plan,
             differential_pressure=best.commands,
             tip_predicted=tip + disturbance,
-            method="learned",
-            solve_time=clock.perf_counter() - begin,
-            details={"steps": steps, "limited_windows": best.limited},
+            method=LEARNED,
+            solve_time=clock.perf_counter() - started,
+            details=best.details,
         )
 
-    def _solve(
-        self, commands: Array, wanted: Array, pull: float, begin: Optimum | None
-    ) -> tuple[Optimum, int]:
-        """Return the best commands for wanted tips (K, 2) [m], and the steps of all windows.
+    def _solve(self, commands: Array, wanted: Array, pull: float, begin: Array) -> Optimum:
+        """Return the best commands for wanted tips (K, 2) [m].
 
         Args:
             commands: (K, M) toward which the plan is pulled [Pa].
-            pull: as of `plan`.
             wanted: of the model without what friction changes.
-            begin: where the search starts; None: at ``commands``.
+            pull: as of `plan`.
+            begin: (K, M) where the search starts [Pa].
         """
-        best, missed, steps = begin, np.inf, 0
+        weight, offset = pull * self.tip_per_pressure, self._plan.tip_reference - wanted
+        found: list[tuple[float, Optimum]] = []
         for window in _WINDOWS:
-            settings = OptimiserSettings(nearness=pull, nearness_vented=pull, window=window)
-            offset = self._plan.tip_reference - wanted
+            settings = OptimiserSettings(nearness=weight, nearness_vented=weight, window=window)
             solver = Optimiser(
                 self._configuration, self._plan.reference, commands, settings, offset
             )
-            outcome = solver.run(begin=None if best is None else best.commands)
-            left = float(np.linalg.norm(outcome.tip - wanted, axis=1).mean())
-            steps += outcome.steps
-            if best is None or left < missed:
-                best, missed = outcome, left
-            if not outcome.limited or left < _NOTABLE_ERROR:
+            outcome = solver.run(begin=begin)
+            missed = float(np.linalg.norm(outcome.tip - wanted, axis=1).mean())
+            found.append((missed, outcome))
+            best = min(found, key=lambda entry: entry[0])[1]
+            if not outcome.limited or missed < _NOTABLE_ERROR:
                 break
-        if best is None:
-            raise AssertionError("there is a first window")
-        return best, steps
+            begin = best.commands
+        return best
 
     def _reachable(self, wanted: Array) -> Array:
         """Return the points of the tip (K, 2) [m] that evenly bent segments reach instead.
 
         A straight limb reaches no further, and bends to no avail where more is wanted of it.
         """
-        angles, _ = solve(self.model.kinematics, wanted, self._plan.bend_angles, _PRIOR)
+        angles, _ = inverse_kinematics(
+            self.model.kinematics, wanted, self._plan.bend_angles, _PRIOR
+        )
         reached: Array = self.model.kinematics.tip(angles)
         return reached
 
@@ -201,3 +212,61 @@ def _not_followed(error: ConvergenceError) -> PlanningError:
         f"the rod cannot be rolled forward against what was measured ({error}): check that the run "
         "belongs to this plan and this limb"
     )
+
+
+# A learned plan as a start for another motion --------------------------------------------------
+
+
+def nearest(folder: str | Path, wanted: Plan) -> tuple[Path, Plan] | None:
+    """Return the learned plan that is nearest to a fresh one, and its file; None: none is near.
+
+    It is of the same limb under the same loads, model, motion and number of cycles, with period and
+    amplitude within a third. Of several the nearest, then the newest is taken; files that hold no
+    plan are passed over.
+
+    Args:
+        folder: of plan files.
+        wanted: the motion planned without what was learned.
+    """
+    found: list[tuple[float, float, Path, Plan]] = []
+    for file in sorted(Path(folder).glob(f"*{SUFFIX}")):
+        try:
+            kept = read_plan(file)
+        except PlanningError:
+            continue
+        far = _distance(kept, wanted)
+        if kept.method == LEARNED and far <= NEAR:
+            found.append((round(far, 6), -file.stat().st_mtime, file, kept))
+    if not found:
+        return None
+    _, _, file, kept = min(found, key=lambda entry: entry[:2])
+    return file, kept
+
+
+def _distance(one: Plan, other: Plan) -> float:
+    """Return how far apart two plans are, infinite where nothing can be carried over."""
+    same = all(getattr(one, key) == getattr(other, key) for key in ("motion", "model", "cycles"))
+    numbers = (one.period, other.period, one.amplitude, other.amplitude)
+    if not same or min(numbers) <= 0 or one.reference.start is not None:
+        return math.inf
+    if difference(one.limb.to_mapping(), other.limb.to_mapping()):
+        return math.inf
+    slower, larger = one.period / other.period, one.amplitude / other.amplitude
+    return math.hypot(math.log(slower), math.log(larger))
+
+
+def carried_over(fresh: Plan, learned: Plan) -> Plan:
+    """Return the plan of a motion that begins from what a near one has learned.
+
+    Args:
+        fresh: the motion planned without it.
+        learned: see `nearest`.
+
+    Raises:
+        PlanningError: a model cannot be rolled forward, or the optimiser found no plan.
+    """
+    model = Correction(learned).expected(learned.differential_pressure).tip
+    shown = (learned.tip_predicted - model) * (fresh.amplitude / learned.amplitude)
+    phase = fresh.time * (learned.duration / fresh.duration)
+    expected = np.column_stack([np.interp(phase, learned.time, axis) for axis in shown.T])
+    return Correction(fresh).plan(fresh.differential_pressure, expected)

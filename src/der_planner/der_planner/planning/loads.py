@@ -1,5 +1,7 @@
 """A limb under its loads: whether it stays where it rests, how it sags, what pressures can hold.
 
+Errors stand beside what raises them: of loads here, of reach in `workspace`.
+
 A level limb that is free to sag under gravity along −z comes less far out than arcs of its length
 say. Its reference is therefore the tip of the rod in space, held by pressures so that its segments
 bend by the motion's angles, as seen along z (`sagging_tips`).
@@ -10,17 +12,19 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
-from der_planner.arrays import Array
+from der_planner.arrays import Array, interpolate
 from der_planner.limb import PAYLOAD, Limb
-from der_planner.model import RodModel
-from der_planner.model.poses import PoseFinder
-from der_planner.model.series import interpolate
-from der_planner.planning.errors import BucklingError, OverloadError, PlanningError
+from der_planner.model import Model, RodModel
+from der_planner.model.rod import PoseFinder
 from der_planner.rod import ConvergenceError, Rod, RodState
+
+AnyModel = TypeVar("AnyModel", bound=Model)
 
 NEAR = 1.1
 """A standing limb that would buckle under less than this multiple of its load is near that [-]."""
@@ -30,6 +34,55 @@ _POSE_PERIOD = 0.1
 """Time between two poses of a limb that sags [s]."""
 _HALVINGS = 8
 """Steps of the bisection for the mass that could be carried."""
+
+
+class PlanningError(ValueError):
+    """A motion, method or limit does not allow a plan; the message says what to change."""
+
+
+class BucklingError(PlanningError):
+    """The limb buckles, snaps through or has more than one rest under its loads."""
+
+
+@dataclass(eq=False)
+class OverloadError(PlanningError):
+    """Holding the limb along a motion takes more pressure than it may have.
+
+    Attributes:
+        time: when most is needed [s].
+        point: (x, y) of the tip then, in `limb_base` [m].
+        segment: which needs most.
+        required_pressure: |differential pressure| that it needs there at rest [Pa].
+        pressure_limit: largest that is allowed [Pa].
+        carried: what the limb carries [kg].
+        possible_mass: most that the limb could carry along this motion [kg]; None: it carries
+            nothing, or cannot be held without it either.
+    """
+
+    time: float
+    point: tuple[float, float]
+    segment: int
+    required_pressure: float
+    pressure_limit: float
+    carried: float
+    possible_mass: float | None
+
+    def __str__(self) -> str:
+        """Return a sentence for people, with the remedy."""
+        remedy = "Shrink or move the motion, or mount the limb otherwise"
+        carried = f"{self.carried * 1000:.1f} g"
+        if self.possible_mass is not None:
+            remedy = (
+                f"It carries {carried}: {self.possible_mass * 1000:.1f} g are possible along this "
+                "motion, or more along a smaller one"
+            )
+        elif self.carried:
+            remedy = f"Even without the {carried} that it carries it is too much. {remedy}"
+        return (
+            f"segment {self.segment} would need {self.required_pressure / 1000:.1f} kPa to hold "
+            f"the limb at t = {self.time:.2f} s, where the tip is to be at ({self.point[0]:.4f}, "
+            f"{self.point[1]:.4f}) m: {self.pressure_limit / 1000:.1f} kPa are allowed. {remedy}"
+        )
 
 
 def stable_rest(model: RodModel) -> RodState:
@@ -138,34 +191,51 @@ def sagging_tips(model: RodModel, time: Array, angles: Array, rest: Array) -> Ar
 
 
 def check_load(
-    limb: Limb, time: Array, tip: Array, pressure: Array, needed: Callable[[Limb], Array]
+    model: AnyModel,
+    time: Array,
+    tip: Array,
+    pressure: Array,
+    needed: Callable[[AnyModel], Array],
 ) -> None:
     """Refuse a motion along which resting takes more pressure than the limb may have.
 
     Args:
-        limb: as the model sees it.
+        model: of the limb.
         time: (K,) [s].
         tip: (K, 2) of the motion [m].
         pressure: (K, M) differential pressures that hold the limb at rest at these instants [Pa].
-        needed: returns the same for a limb that carries less.
+        needed: returns the same of a limb that carries less.
 
     Raises:
         OverloadError: with what is needed, when and where, and what could be carried.
     """
-    limit = limb.pneumatics.pressure_limit
+    limb, limit = model.limb, model.limb.pneumatics.pressure_limit
     if np.abs(pressure).max() <= limit:
         return
+    named = [mass for mass in limb.masses if mass.name == PAYLOAD] or limb.masses
+    carried = sum(mass.mass for mass in named)
+
+    def holds(share: float) -> bool:
+        lighter = tuple(
+            dataclasses.replace(mass, mass=share * mass.mass) if mass in named else mass
+            for mass in limb.masses
+        )
+        try:
+            less = needed(model.another(dataclasses.replace(limb, masses=lighter)))
+        except (ConvergenceError, ValueError):
+            return False
+        return bool(np.abs(less).max() <= limit)
+
+    possible = None
+    if carried and holds(0.0):
+        low, high = 0.0, 1.0
+        for _ in range(_HALVINGS):
+            share = 0.5 * (low + high)
+            low, high = (share, high) if holds(share) else (low, share)
+        possible = low * carried
     k, segment = np.unravel_index(int(np.abs(pressure).argmax()), pressure.shape)
-    carried, possible = 0.0, None
-    if limb.masses:
-        named = [mass.mass for mass in limb.masses if mass.name == PAYLOAD]
-        carried = sum(named) if named else sum(mass.mass for mass in limb.masses)
-        share = _possible_share(limb, needed)
-        possible = None if share is None else share * carried
-    raise OverloadError(
-        float(time[k]), (float(tip[k, 0]), float(tip[k, 1])), int(segment),
-        float(np.abs(pressure[k, segment])), limit, carried, possible,
-    )  # fmt: skip
+    point, most = (float(tip[k, 0]), float(tip[k, 1])), float(np.abs(pressure[k, segment]))
+    raise OverloadError(float(time[k]), point, int(segment), most, limit, carried, possible)
 
 
 def check_stays(stiffness: Array, time: Array, tip: Array, what: str) -> None:
@@ -188,32 +258,3 @@ def check_stays(stiffness: Array, time: Array, tip: Array, what: str) -> None:
             f"({tip[k, 0]:.4f}, {tip[k, 1]:.4f}) m. Shrink or move the motion, or mount the limb "
             "otherwise"
         )
-
-
-def _possible_share(limb: Limb, needed: Callable[[Limb], Array]) -> float | None:
-    """Return the share of its masses that the limb can hold; None: not even its own weight."""
-
-    def holds(share: float) -> bool:
-        try:
-            pressure = needed(_with_share(limb, share))
-        except (ConvergenceError, PlanningError, ValueError):
-            return False
-        return bool(np.abs(pressure).max() <= limb.pneumatics.pressure_limit)
-
-    if not holds(0.0):
-        return None
-    low, high = 0.0, 1.0
-    for _ in range(_HALVINGS):
-        share = 0.5 * (low + high)
-        low, high = (share, high) if holds(share) else (low, share)
-    return low
-
-
-def _with_share(limb: Limb, share: float) -> Limb:
-    """Return the limb with a share of its payload; without a payload: of all that it carries."""
-    every = all(mass.name != PAYLOAD for mass in limb.masses)
-    masses = tuple(
-        dataclasses.replace(mass, mass=share * mass.mass) if every or mass.name == PAYLOAD else mass
-        for mass in limb.masses
-    )
-    return dataclasses.replace(limb, masses=masses)

@@ -30,10 +30,12 @@ from scipy.interpolate import BSpline
 from der_planner.arrays import Array
 from der_planner.model import CONTROL_PERIOD
 from der_planner.planning import paths
-from der_planner.planning.errors import PlanningError
+from der_planner.planning.loads import PlanningError
 from der_planner.planning.nearest import Deviation, line, nearest_path
-from der_planner.planning.transitions import (
+from der_planner.planning.timing import (
     FINE_PERIOD,
+    LONGEST,
+    PathLimits,
     Start,
     fine_grid,
     led_in,
@@ -103,7 +105,7 @@ class Motion:
         cycles: number of them; 1 for a path.
         path: the tip path of shapes and paths.
         branch: of the arcs at the first point of a path, see `workspace.BRANCHES`; empty: least
-            pressure.
+            pressure. A nearest path takes whichever comes nearest.
         nearest: follow the nearest path that the limb can follow instead of refusing one that
             leaves its reach, see `nearest`.
         limits: of the tip on a nearest path whose times mean nothing; None: its times count.
@@ -116,7 +118,7 @@ class Motion:
     path: paths.TipPath | None = None
     branch: str = ""
     nearest: bool = False
-    limits: paths.PathLimits | None = None
+    limits: PathLimits | None = None
 
     @classmethod
     def named(
@@ -154,9 +156,9 @@ class Motion:
             raise PlanningError(f"cycles must be a whole number of 1 or more, got {cycles}")
         if period < 4 * CONTROL_PERIOD:
             raise PlanningError(f"period is {period} s: the shortest is {4 * CONTROL_PERIOD} s")
-        if period * cycles > paths.LONGEST:
+        if period * cycles > LONGEST:
             raise PlanningError(
-                f"{cycles} cycles of {period} s are longer than {paths.LONGEST:.0f} s: plan fewer"
+                f"{cycles} cycles of {period} s are longer than {LONGEST:.0f} s: plan fewer"
             )
         return cls(name, float(amplitude), float(period), int(cycles), branch=branch)
 
@@ -167,7 +169,7 @@ class Motion:
         tip: ArrayLike,
         name: str = "path",
         branch: str = "",
-        limits: paths.PathLimits | None = None,
+        limits: PathLimits | None = None,
         nearest: bool = False,
     ) -> Motion:
         """Return a motion along a path of the tip.
@@ -183,6 +185,7 @@ class Motion:
             tip: (P, 2) points in `limb_base` [m].
             name: for tables.
             branch: which way to reach the first point; empty: the one with the least pressure.
+                A nearest path takes the one that comes nearest.
             limits: speed and acceleration for a path without times.
             nearest: follow the nearest path that the limb can follow.
 
@@ -191,7 +194,7 @@ class Motion:
         """
         check_branch(branch)
         if nearest and time is None:
-            drawn, limits = line(paths.checked_points(tip)), limits or paths.PathLimits()
+            drawn, limits = line(paths.checked_points(tip)), limits or PathLimits()
             return cls(name, path=drawn, branch=branch, nearest=True, limits=limits)
         path = paths.TipPath.build(time, tip, limits)
         return cls(name, path=path, branch=branch, nearest=nearest)
@@ -201,7 +204,7 @@ class Motion:
         cls,
         path: str | Path,
         branch: str = "",
-        limits: paths.PathLimits | None = None,
+        limits: PathLimits | None = None,
         nearest: bool = False,
     ) -> Motion:
         """Return a motion along a path in a CSV file: columns x, y [m] and, if timed, time [s].
@@ -291,17 +294,17 @@ class Motion:
     def _nearest_motion(
         self, workspace: Workspace, path: paths.TipPath
     ) -> tuple[Array, Array, Deviation]:
-        rest, offset = workspace.rest, workspace.rest.offset
-        found = nearest_path(workspace, path, offset, self.limits, self.branch)
+        offset, limits = workspace.rest.offset, self.limits
+        fastest, home = workspace.fastest, workspace.rest.bend_angles
+        time, angles, deviation = nearest_path(workspace, path, offset, limits)
         if workspace.sags:
             # On average: the arcs' reach is longer than that of a limb which sags out of the plane.
-            tips = workspace.sagging_tips(found.time, found.bend_angles)
-            offset = (tips - workspace.arcs.tip(found.bend_angles)).mean(axis=0)
-            found = nearest_path(workspace, path, offset, self.limits, self.branch)
-        fastest, home = workspace.fastest, rest.bend_angles
-        time, angles = with_transitions(fastest, found.time, found.bend_angles, home)
-        if np.any(angles < workspace.low) or np.any(angles > workspace.high):
+            tips = workspace.sagging_tips(time, angles)
+            offset = (tips - workspace.arcs.tip(angles)).mean(axis=0)
+            time, angles, deviation = nearest_path(workspace, path, offset, limits)
+        joined = with_transitions(fastest, time, angles, home)
+        if np.any(joined[1] < workspace.low) or np.any(joined[1] > workspace.high):
             # A transition that begins or ends in full motion near a limit would swing beyond it.
-            found = nearest_path(workspace, path, offset, self.limits, self.branch, rest=True)
-            time, angles = with_transitions(fastest, found.time, found.bend_angles, home)
-        return time, angles, found.deviation
+            time, angles, deviation = nearest_path(workspace, path, offset, limits, rest=True)
+            joined = with_transitions(fastest, time, angles, home)
+        return (*joined, deviation)

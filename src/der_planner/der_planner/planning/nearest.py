@@ -23,11 +23,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.linalg import solveh_banded
 
-from der_planner.arrays import Array
-from der_planner.model.series import interpolate
-from der_planner.planning.pace import retimed
-from der_planner.planning.paths import PathLimits, TipPath
-from der_planner.planning.workspace import BRANCHES, Workspace
+from der_planner.arrays import Array, interpolate
+from der_planner.planning.paths import TipPath
+from der_planner.planning.timing import PathLimits, retimed
+from der_planner.planning.workspace import Workspace
 
 DRAWN_WAVE = 0.01
 """Waves of a line without times that are shorter than this [m] are smoothed to less than half."""
@@ -68,8 +67,7 @@ class Deviation:
         mean: distance over the drawn path's time, or over its length if it has no times [m].
         time: when the nearest path is farthest, after its first point [s].
         point: (x, y) of the drawn path there [m].
-        spans: (begin, end) after its first point [s], between which it is `NOTABLE` away or more.
-        share: of the drawn path that lies in these spans, 0 … 1.
+        share: of the drawn path from which it is `NOTABLE` away or more, 0 … 1.
         slowed: duration over the drawn path's; 1 if it kept its times, NaN if it had none.
     """
 
@@ -77,7 +75,6 @@ class Deviation:
     mean: float
     time: float
     point: tuple[float, float]
-    spans: tuple[tuple[float, float], ...]
     share: float
     slowed: float
 
@@ -99,37 +96,22 @@ class Deviation:
         return "; ".join(parts)
 
 
-@dataclass(frozen=True)
-class NearestPath:
-    """A course of bend angles that a limb can follow.
-
-    Attributes:
-        time: (K,) from 0 [s].
-        bend_angles: (K, M) of arcs [rad].
-        deviation: from the drawn path.
-    """
-
-    time: Array
-    bend_angles: Array
-    deviation: Deviation
-
-
 def nearest_path(
     workspace: Workspace,
     path: TipPath,
     offset: Array,
     limits: PathLimits | None = None,
-    branch: str = "",
     rest: bool = False,
-) -> NearestPath:
-    """Return the nearest path that the limb can follow.
+) -> tuple[Array, Array, Deviation]:
+    """Return the nearest path that the limb can follow, and how far it is from the drawn one.
+
+    The path is its instants (K,) from 0 on [s] and its bend angles (K, M) [rad].
 
     Args:
         workspace: of the limb.
         path: drawn; its times are kept where the slew limit lets them.
         offset: (2,) of the limb's tip from that of the arcs, where loads make it [m].
         limits: speed and acceleration of the tip, for a path whose times mean nothing (`line`).
-        branch: see `workspace.BRANCHES`; empty: whichever comes nearest.
         rest: begin and end a path with times at rest, too.
     """
     samples = int(np.clip(math.ceil(path.duration / _SAMPLE), 16, _MOST_SAMPLES)) + 1
@@ -137,7 +119,7 @@ def nearest_path(
     step = float(time[1])
     wave = TIMED_WAVE if limits is None else DRAWN_WAVE / PACE
     target = _smoothed(drawn.mean(axis=1) - offset, step, wave)
-    angles = _Search(workspace, target, step, branch).run()
+    angles = _Search(workspace, target, step).run()
     # Without overshoot where the course hurries along a limit; what is left of corners goes after.
     course = PchipInterpolator(time, angles)
     clock, along = retimed(workspace, course, path.duration, limits, rest)
@@ -153,7 +135,7 @@ def nearest_path(
         np.interp(time, along, clock),
         slowed,
     )
-    return NearestPath(clock, followed, deviation)
+    return clock, followed, deviation
 
 
 def line(tip: Array) -> TipPath:
@@ -212,15 +194,15 @@ def _second_differences(count: int) -> Array:
 class _Search:
     """Finds the bend angles (K, M) whose tips are nearest to (K, 2) targets, `step` [s] apart."""
 
-    def __init__(self, workspace: Workspace, target: Array, step: float, branch: str) -> None:
+    def __init__(self, workspace: Workspace, target: Array, step: float) -> None:
         self._workspace, self._kinematics = workspace, workspace.arcs
-        self._target, self._step, self._branch = target, step, branch
-        self._count, self._length = workspace.limb.segment_count, workspace.limb.length
+        self._target, self._step, self._count = target, step, workspace.limb.segment_count
         middle = (workspace.low + workspace.high) / 2
         half = (workspace.high - workspace.low) / 2 * (1 - RESERVE)
         self._low, self._high = middle - half, middle + half
         self._limit = workspace.pressure_limit * (1 - RESERVE)
-        self._smooth = (_WEAKEST * self._length) ** 2 * (TIMED_WAVE / (2 * np.pi * step)) ** 4
+        weakest = _WEAKEST * workspace.limb.length
+        self._smooth = weakest**2 * (TIMED_WAVE / (2 * np.pi * step)) ** 4
 
     def run(self) -> Array:
         """Search coarsely, then finely."""
@@ -255,18 +237,9 @@ class _Search:
 
     def _price(self, states: Array) -> Array:
         """Return what a state (G, M) costs wherever the tip should be [m²]."""
-        share = np.abs(self._workspace.static_pressure(states)) / self._limit
+        share = np.abs(self._kinematics.static_pressure(states)) / self._limit
         price: Array = _PRESSURE * _WEAKEST**2 * (share**2).sum(-1)
-        price = price + np.where((share > 1).any(-1), 1.0, 0.0)
-        if self._branch and self._count == 2:
-            price = price + np.where(self._beyond_fold(states) > 0, 1.0, 0.0)
-        return price
-
-    def _beyond_fold(self, angles: Array) -> Array:
-        """Return how far poses (K, 2) are on the other branch than the named one; 0 on it [1]."""
-        side = np.linalg.det(self._kinematics.tip_jacobians(angles)) / self._length**2
-        wrong: Array = np.maximum(-side if self._branch == BRANCHES[0] else side, 0.0)
-        return wrong
+        return price + (share > 1).any(-1)
 
     def _fine(self, angles: Array) -> Array:
         """Return the angles (K, M) at the minimum that lies nearest to the given ones."""
@@ -291,12 +264,10 @@ class _Search:
         return angles
 
     def _excess(self, angles: Array) -> Array:
-        """Return what poses (K, M) have beyond the pressure limit and the fold, (K, …) [m]."""
-        pressure = self._workspace.static_pressure(angles) / self._limit
-        beyond: Array = np.sign(pressure) * np.maximum(np.abs(pressure) - 1, 0.0)
-        if self._branch and self._count == 2:
-            beyond = np.column_stack([beyond, self._beyond_fold(angles)])
-        return beyond * _EXCESS
+        """Return what poses (K, M) have beyond the pressure limit (K, M) [m]."""
+        pressure = self._kinematics.static_pressure(angles) / self._limit
+        beyond: Array = _EXCESS * np.sign(pressure) * np.maximum(np.abs(pressure) - 1, 0.0)
+        return beyond
 
     def _cost(self, angles: Array) -> float:
         missed = self._kinematics.tip(angles) - self._target
@@ -361,15 +332,12 @@ def _deviation(drawn: Array, tip: Array, when: Array, slowed: float) -> Deviatio
     """Compare tips (K, 2) with the drawn path, both evenly spaced along it."""
     distance = np.linalg.norm(drawn - tip, axis=-1)
     farthest = int(distance.argmax())
-    away = distance >= NOTABLE
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], away, [False]]).astype(int)))
     place = drawn[farthest]
     return Deviation(
         largest=float(distance[farthest]),
         mean=float(distance.mean()),
         time=float(when[farthest]),
         point=(float(place[0]), float(place[1])),
-        spans=tuple((float(when[a]), float(when[b - 1])) for a, b in edges.reshape(-1, 2)),
-        share=float(away.mean()),
+        share=float((distance >= NOTABLE).mean()),
         slowed=slowed,
     )

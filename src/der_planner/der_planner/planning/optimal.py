@@ -14,26 +14,33 @@ integrator, with the chambers' response averaged over each period. A response di
 so that a long motion is solved as a row of overlapping windows: each starts from the model's state
 at the end of what the last one settled, and its tail, which does not yet know what follows, is
 solved again by the next. Cost grows with the first power of the motion's length. Where no limit is
-in the way the step is one Cholesky factorisation, else the quadratic programme is handed to
-`der_planner.planning.quadratic`.
+in the way the step is one Cholesky factorisation, else a quadratic programme (`solve_limited`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+import piqp
 from scipy.linalg import cho_factor, cho_solve
 
 from der_planner.arrays import Array
 from der_planner.model import CONTROL_PERIOD, STEPS, Initial, State
+from der_planner.model.air import Air
 from der_planner.model.commands import within_limits
 from der_planner.model.simulation import Drive, Window
 from der_planner.planning.configuration import Configuration
+from der_planner.planning.loads import PlanningError
 from der_planner.planning.motions import Reference
-from der_planner.planning.quadratic import Band, solve_limited
 from der_planner.rod import ConvergenceError
+
+_PRESSURE = 1e3
+"""Pressure of one unit of the solver [Pa]: in kPa and mm its tolerances mean something."""
+_LENGTH = 1e-3
+"""Length of one unit of the solver [m]."""
 
 
 @dataclass(frozen=True)
@@ -64,25 +71,16 @@ class OptimiserSettings:
     reuse: float = 0.7
 
 
-class Quadratic:
+class Quadratic(NamedTuple):
     """The cost of a window around a linearisation: ½ δᵀHδ + gradientᵀδ.
 
-    Args:
+    Attributes:
         jacobian: (2W, W·M) ∂tip/∂command [m/Pa].
         hessian: (W·M, W·M) with smoothness and nearness [m²/Pa²].
     """
 
-    def __init__(self, jacobian: Array, hessian: Array) -> None:
-        self.jacobian = jacobian
-        self._hessian = hessian
-        self._factor = cho_factor(hessian, lower=True)
-
-    def step(self, gradient: Array, band: Band) -> tuple[Array, bool]:
-        """Return the change (W, M) of the commands within the band, and if a limit shaped it."""
-        change: Array = -cho_solve(self._factor, gradient).reshape(band.command.shape)
-        if band.contains(change):
-            return change, False
-        return solve_limited(self._hessian, gradient, band), True
+    jacobian: Array
+    hessian: Array
 
 
 @dataclass(frozen=True)
@@ -100,6 +98,11 @@ class Optimum:
     tip: Array
     steps: int
     limited: int
+
+    @property
+    def details(self) -> dict[str, float]:
+        """Numbers for a plan's `details`."""
+        return {"steps": self.steps, "limited_windows": self.limited}
 
 
 class Optimiser:
@@ -176,21 +179,25 @@ class Optimiser:
 
     def improve(self, command: Array, state: State, first: int, last: int) -> tuple[int, bool]:
         """Improve ``command[first:last]`` in place; return the steps and if a limit was met."""
-        settings = self.settings
+        settings, air = self.settings, self.model.air
         met, damping = False, 0.0
         quadratic: Quadratic | None = None
         cost, misses, window = self._evaluate(command, state, first, last)
+        before = command[first - 1] if first else self.before
         for step in range(settings.iterations):
             rms = _rms(misses)
             if rms < settings.tolerance:
                 return step, met
             if quadratic is None:
                 quadratic = self._linearise(window, state, damping)
-            gradient = quadratic.jacobian.T @ misses.ravel() + self._pull(command, first, last)
-            change, limited = quadratic.step(gradient, self._band(command, first, last))
-            met = met or limited
-            trial = command[:last].copy()
-            trial[first:] += change
+                factor = cho_factor(quadratic.hessian, lower=True)
+            gradient = self._gradient(quadratic, misses, command[:last], first)
+            present, trial = command[first:last], command[:last].copy()
+            wanted = present - cho_solve(factor, gradient).reshape(present.shape)
+            trial[first:], cut = within_limits(wanted, air, CONTROL_PERIOD, before)
+            if cut > 0:
+                met = True
+                trial[first:] = solve_limited(quadratic.hessian, gradient, present, before, air)
             try:
                 new = self._evaluate(trial, state, first, last)
             except ConvergenceError:
@@ -214,8 +221,31 @@ class Optimiser:
         window = self.drive.window(command[:last], first)
         motion = self.model.run(state, window.effective, CONTROL_PERIOD)
         misses = motion.tip[1:] - self.target[first:last]
-        cost = float((misses**2).sum()) + self._roughness(command, first, last)
-        return cost, misses, window
+        pulled = self._weights(last - first) @ self._deviation(command[:last], first)
+        return float((misses**2).sum() + (pulled**2).sum()), misses, window
+
+    def _gradient(self, quadratic: Quadratic, misses: Array, command: Array, first: int) -> Array:
+        """Return half the gradient (W·M,) of the cost at commands (first + W, M)."""
+        weights = self._weights(len(command) - first)
+        pull = weights[:, 2:].T @ (weights @ self._deviation(command, first))
+        gradient: Array = quadratic.jacobian.T @ misses.ravel() + pull.ravel()
+        return gradient
+
+    def _weights(self, size: int) -> Array:
+        """Return smoothness and nearness as rows (2W, W + 2) on the deviations from u⁰ [m/Pa].
+
+        The first two deviations are those of the setpoints before the window.
+        """
+        each = np.eye(size + 2)
+        smooth = self.settings.smoothness * np.diff(each, 2, axis=0)
+        return np.concatenate([smooth, self.nearness * each[2:]])
+
+    def _deviation(self, command: Array, first: int) -> Array:
+        """Return u − u⁰ (W + 2, M) from two setpoints before the window on."""
+        deviation = np.zeros((len(command) - first + 2, command.shape[1]))
+        begin = max(0, first - 2)
+        deviation[2 - (first - begin) :] = command[begin:] - self.warm[begin : len(command)]
+        return deviation
 
     def _linearise(self, window: Window, state: State, damping: float) -> Quadratic:
         """Return the quadratic model of the cost around the commands of a window."""
@@ -234,47 +264,89 @@ class Optimiser:
             sensitivity = linear.sensitivity(self._pulse)[1:] * slope
         size, inputs = slope.shape
         J = sensitivity.reshape(2 * size, size * inputs)
-        second = _second_difference(size)
-        weight = self.settings.smoothness**2 * second.T @ second
-        weight[np.diag_indices(size)] += self.nearness**2 + damping**2
-        return Quadratic(J, J.T @ J + np.kron(weight, np.eye(inputs)))
-
-    def _deviation(self, command: Array, first: int, last: int) -> Array:
-        """Return u − u⁰ (W + 2, M) from two setpoints before the window on."""
-        deviation = np.zeros((last - first + 2, command.shape[1]))
-        begin = max(0, first - 2)
-        deviation[2 - (first - begin) :] = command[begin:last] - self.warm[begin:last]
-        return deviation
-
-    def _roughness(self, command: Array, first: int, last: int) -> float:
-        deviation = self._deviation(command, first, last)
-        bends = np.diff(deviation, 2, axis=0)
-        smooth, near = self.settings.smoothness, self.nearness
-        return float(smooth**2 * (bends**2).sum() + near**2 * (deviation[2:] ** 2).sum())
-
-    def _pull(self, command: Array, first: int, last: int) -> Array:
-        """Return the gradient (W·M,) of smoothness and nearness."""
-        deviation = self._deviation(command, first, last)
-        second = _second_difference(last - first)
-        rough = self.settings.smoothness**2 * second.T @ np.diff(deviation, 2, axis=0)
-        pull: Array = rough + self.nearness**2 * deviation[2:]
-        return pull.ravel()
-
-    def _band(self, command: Array, first: int, last: int) -> Band:
-        limits = self.model.limb.pneumatics
-        before = command[first - 1] if first else self.before
-        return Band(
-            command[first:last], before, limits.pressure_limit, limits.slew_limit * CONTROL_PERIOD
-        )
+        weights = self._weights(size)[:, 2:]
+        pull = weights.T @ weights + damping**2 * np.eye(size)
+        return Quadratic(J, J.T @ J + np.kron(pull, np.eye(inputs)))
 
 
 def _rms(misses: Array) -> float:
     return float(np.sqrt(np.mean((misses**2).sum(axis=1))))
 
 
-def _second_difference(size: int) -> Array:
-    """Return the matrix (size, size) of second differences after two known values."""
-    matrix = np.eye(size)
-    matrix[np.arange(1, size), np.arange(size - 1)] = -2.0
-    matrix[np.arange(2, size), np.arange(size - 2)] = 1.0
-    return matrix
+# Quadratic programmes --------------------------------------------------------------------------
+
+
+def solve_limited(
+    hessian: Array, gradient: Array, command: Array, before: Array, air: Air
+) -> Array:
+    """Return the commands (W, M) u + δ within all limits that minimise ½ δᵀHδ + gradientᵀδ [Pa].
+
+    Args:
+        hessian: H (W·M, W·M), positive definite [m²/Pa²].
+        gradient: (W·M,) [m²/Pa].
+        command: u (W, M), which keeps the limits itself [Pa].
+        before: (M,) command before the first one [Pa].
+        air: pressure and slew limit.
+
+    Raises:
+        PlanningError: the solver gave up, with its status.
+    """
+    total, inputs = command.size, command.shape[1]
+    limit = air.pneumatics.pressure_limit
+    largest = air.pneumatics.slew_limit * CONTROL_PERIOD
+    difference = np.eye(total) - np.eye(total, k=-inputs)
+    steps = np.diff(np.vstack([before, command]), axis=0).ravel()
+    present = command.ravel()
+    change = minimise(
+        hessian,
+        gradient,
+        (difference, -largest - steps, largest - steps),
+        (-limit - present, limit - present),
+        tolerance=(1e-6, 1e-8),
+    )
+    # Cuts off the solver's rounding errors.
+    return within_limits(command + change.reshape(command.shape), air, CONTROL_PERIOD, before)[0]
+
+
+def minimise(
+    hessian: Array,
+    gradient: Array,
+    rows: tuple[Array, Array, Array],
+    box: tuple[Array, Array] | None,
+    tolerance: tuple[float, float],
+) -> Array:
+    """Return the pressures x (n,) [Pa] that minimise ½ xᵀ hessian x + gradientᵀ x under limits.
+
+    Args:
+        hessian: (n, n) positive definite [m²/Pa²].
+        gradient: (n,) [m²/Pa].
+        rows: matrix A (m, n), least and largest A x (m,) [Pa].
+        box: least and largest x (n,) [Pa]; None: not limited.
+        tolerance: of the solver, absolute and relative, in kPa and mm.
+
+    Raises:
+        PlanningError: the solver gave up, with its status.
+    """
+    matrix, low, high = rows
+    least, largest = (None, None) if box is None else (box[0] / _PRESSURE, box[1] / _PRESSURE)
+    scale = (_PRESSURE / _LENGTH) ** 2
+    solver = piqp.DenseSolver()
+    solver.settings.eps_abs, solver.settings.eps_rel = tolerance
+    solver.setup(
+        np.asfortranarray(hessian * scale),
+        gradient * scale / _PRESSURE,
+        None,
+        None,
+        np.asfortranarray(matrix),
+        low / _PRESSURE,
+        high / _PRESSURE,
+        least,
+        largest,
+    )
+    status = solver.solve()
+    if status != piqp.PIQP_SOLVED:
+        raise PlanningError(
+            f"a quadratic programme of {len(gradient)} pressures was not solved ({status}): use "
+            "the method projected, or a longer period"
+        )
+    return np.asarray(solver.result.x) * _PRESSURE

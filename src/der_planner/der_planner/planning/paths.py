@@ -10,38 +10,25 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import PchipInterpolator, make_interp_spline
+from scipy.interpolate import make_interp_spline
 
-from der_planner.arrays import Array
+from der_planner.arrays import Array, interpolate
 from der_planner.model.bending import Kinematics
-from der_planner.model.series import interpolate
-from der_planner.planning.errors import PlanningError
+from der_planner.planning.loads import PlanningError
+from der_planner.planning.timing import (
+    LONGEST,
+    PathLimits,
+    evenly_in_time,
+    keep_acceleration,
+    smooth_step,
+)
 
-LONGEST = 3600.0
-"""Longest duration of a motion [s]."""
 SHAPES = ("circle", "figure_eight", "line", "star")
 """Shapes that the tip can draw."""
 SHAPE_SIZE = 0.04
 """Radius (half length) of a shape over the limb's length, at an amplitude of 45 degrees."""
 _SHAPE_POINTS = 50
 """A quarter of the points of a shape in one cycle."""
-_GRID = 0.02
-"""Time between two samples of a path that gets its timing from limits [s]."""
-_SOFTNESS = 0.2
-"""Half width of the mean that rounds the corners of a speed profile [s]."""
-
-
-@dataclass(frozen=True)
-class PathLimits:
-    """How fast the tip may go along a path that comes without times.
-
-    Attributes:
-        speed: [m/s].
-        acceleration: along and across the path [m/s²].
-    """
-
-    speed: float = 0.03
-    acceleration: float = 0.05
 
 
 @dataclass(frozen=True)
@@ -166,41 +153,6 @@ def time_path(points: Array, limits: PathLimits) -> TipPath:
     return TipPath(instants, spline(along))
 
 
-def keep_acceleration(speed: Array, gain: Array) -> None:
-    """Lower the speeds (K,) until none changes faster than it may, forward and backward.
-
-    Args:
-        speed: largest ones, changed in place.
-        gain: (K − 1,) largest change of the squared speed from one place to the next.
-    """
-    for k in range(len(gain)):
-        speed[k + 1] = min(speed[k + 1], math.sqrt(speed[k] ** 2 + gain[k]))
-    for k in range(len(gain) - 1, -1, -1):
-        speed[k] = min(speed[k], math.sqrt(speed[k + 1] ** 2 + gain[k]))
-
-
-def evenly_in_time(durations: Array, place: Array) -> tuple[Array, Array]:
-    """Return evenly spaced instants from 0 on [s], and the places then, with rounded corners.
-
-    Args:
-        durations: (K − 1,) times from one place to the next [s].
-        place: (K,) along a course.
-
-    Raises:
-        PlanningError: it would last too long.
-    """
-    time = np.concatenate([[0.0], np.cumsum(durations)])
-    if time[-1] > LONGEST:
-        raise PlanningError(
-            f"the path would last {time[-1]:.0f} s, the longest is {LONGEST:.0f} s: draw less, or "
-            "allow a higher speed"
-        )
-    grid = np.linspace(0.0, time[-1], max(20, round(time[-1] / _GRID) + 1))
-    step = float(grid[1])
-    along = _running_mean(PchipInterpolator(time, place)(grid), max(1, round(_SOFTNESS / step)))
-    return np.arange(len(along), dtype=np.float64) * step, along
-
-
 def polygon(corners: Array, period: float) -> TipPath:
     """Return the timed path along straight lines that rests at every corner.
 
@@ -213,20 +165,10 @@ def polygon(corners: Array, period: float) -> TipPath:
     start = 0.0
     for corner, following, share in zip(corners[:-1], corners[1:], shares, strict=True):
         local = np.linspace(0.0, 1.0, max(10, round(share / 0.02)) + 1)[1:]
-        step = local**3 * (10 + local * (6 * local - 15))
         times.append(start + share * local)
-        points.append(corner + step[:, None] * (following - corner))
+        points.append(corner + smooth_step(local)[:, None] * (following - corner))
         start += share
     return TipPath(np.concatenate(times), np.concatenate(points), exact=True)
-
-
-def _running_mean(values: Array, window: int) -> Array:
-    """Return a running mean over 2 window + 1 samples, longer by as much: from rest to rest."""
-    width = 2 * window + 1
-    padded = np.concatenate([np.full(width - 1, values[0]), values, np.full(width - 1, values[-1])])
-    total = np.concatenate([[0.0], np.cumsum(padded)])
-    mean: Array = (total[width:] - total[:-width]) / width
-    return mean
 
 
 def draw_shape(

@@ -20,9 +20,9 @@ from der_planner.arrays import Array
 from der_planner.limb import Limb, LimbError
 from der_planner.model import CONTROL_PERIOD, Model
 from der_planner.planning.configuration import configure
-from der_planner.planning.errors import PlanningError
+from der_planner.planning.loads import PlanningError
 from der_planner.planning.motions import Reference
-from der_planner.planning.transitions import Start, resting_spline
+from der_planner.planning.timing import Start, resting_spline
 
 SCHEMA_VERSION = 1
 SUFFIX = ".yaml"

@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from der_planner.arrays import Array
-from der_planner.limb import Limb
+from der_planner.limb import Limb, Pneumatics
 from der_planner.model import CONTROL_PERIOD, NODES, Model, RodModel, simulate
 from der_planner.model.commands import SlowVenting, slow_venting, within_limits
 from der_planner.model.commands import commands as commands_for
 from der_planner.planning.configuration import METHODS, Configuration, configure
-from der_planner.planning.errors import PlanningError
-from der_planner.planning.loads import nearly_buckling
+from der_planner.planning.loads import PlanningError, nearly_buckling
 from der_planner.planning.motions import Motion, Reference
-from der_planner.planning.optimal import Optimiser
+from der_planner.planning.optimal import Optimiser, Optimum
 from der_planner.planning.plan_file import Plan
-from der_planner.planning.transitions import Start
+from der_planner.planning.timing import Start
 from der_planner.planning.workspace import Workspace
 from der_planner.rod import ConvergenceError
 
@@ -78,15 +76,30 @@ def plan(
         reference = motion.reference(Workspace(rod), start)
         configuration = _configured(body, reference)
         report(0.3)
-        solved = _solve(configuration, reference, method, report)
+        try:
+            # The optimum begins from the projected balance.
+            start_method = "projected" if method == "optimal" else method
+            wanted, slow = balance(configuration, reference, start_method)
+            found = _solve(configuration, reference, method, wanted, report)
+        except ConvergenceError as error:
+            raise PlanningError(
+                f"the rod cannot be rolled forward along this motion ({error}): take a longer "
+                "period, a smaller amplitude, or check the limb file's stiffness and mass"
+            ) from error
     bend, seen = configuration.bend_at(reference.time), body.limb
-    own = [str(reference.deviation or ""), limb.other_mounting, nearly_buckling(seen)]
-    warnings = filter(None, own + solved.warnings + _calibration_warnings(seen, bend))
+    said = [
+        str(reference.deviation or ""),
+        seen.other_mounting,
+        nearly_buckling(seen),
+        *_limit_warnings(configuration, reference, wanted, slow, found, method),
+        _error_warning(found.tip, reference, method),
+        _calibration_warning(seen, bend),
+    ]
     return Plan(
         time=reference.time,
-        differential_pressure=solved.commands,
+        differential_pressure=found.commands,
         reference=reference,
-        tip_predicted=solved.tip,
+        tip_predicted=found.tip,
         bend_angles=bend,
         motion=motion.name,
         model=model,
@@ -96,8 +109,8 @@ def plan(
         cycles=motion.cycles,
         body=body,
         solve_time=clock.perf_counter() - begin,
-        warnings=tuple(warnings),
-        details=solved.details,
+        warnings=tuple(filter(None, said)),
+        details=found.details if method == "optimal" else {},
     )
 
 
@@ -107,72 +120,27 @@ def _configured(model: Model, reference: Reference) -> Configuration:
         return configure(model, reference)
     except PlanningError as error:
         if model.name == "pcc" and model.limb.gravity[2]:
-            error.args = (
+            raise PlanningError(
                 f"{error}. Arcs know nothing of the sag out of their plane that this gravity "
-                "brings: plan with the rod (der)",
-            )
+                "brings: plan with the rod (der)"
+            ) from error
         raise
-
-
-@dataclass(frozen=True)
-class _Solved:
-    commands: Array
-    tip: Array
-    warnings: list[str]
-    details: dict[str, float]
 
 
 def _solve(
     configuration: Configuration,
     reference: Reference,
     method: str,
+    wanted: Array,
     report: Callable[[float], None],
-) -> _Solved:
-    """Return commands that keep the limits, and what the model expects of them.
-
-    Raises:
-        PlanningError: the rod cannot be simulated along the motion; names the remedy.
-    """
-    try:
-        if method == "optimal":
-            return _optimal(configuration, reference, report)
-        return _balanced(configuration, reference, method)
-    except ConvergenceError as error:
-        raise PlanningError(
-            f"the rod cannot be rolled forward along this motion ({error}): take a longer "
-            "period, a smaller amplitude, or check the limb file's stiffness and mass"
-        ) from error
-
-
-def _optimal(
-    configuration: Configuration, reference: Reference, report: Callable[[float], None]
-) -> _Solved:
-    wanted, slow = balance(configuration, reference, "projected")
-    solver = Optimiser(configuration, reference, wanted)
-    found = solver.run(lambda share: report(0.4 + 0.6 * share))
-    missed = _mean_distance(found.tip, reference)
-    warnings = _vent_warnings(slow, missed)
-    model = configuration.model
-    elsewhere = _begins_elsewhere(found.tip, reference) and not _excessive(model, wanted)
-    if found.limited and missed > _NOTABLE_ERROR and not elsewhere and not warnings:
-        said = f"the limits leave a mean error of {missed * 1000:.1f} mm on the model itself"
-        warnings.insert(0, f"{said}: {_excess(model, wanted)}")
-    warnings += _error_warnings(found.tip, reference, "optimal")
-    details: dict[str, float] = {"steps": found.steps, "limited_windows": found.limited}
-    return _Solved(found.commands, found.tip, warnings, details)
-
-
-def _balanced(configuration: Configuration, reference: Reference, method: str) -> _Solved:
-    wanted, slow = balance(configuration, reference, method)
-    model, before = configuration.model, configuration.initial.before
-    commands, cut = within_limits(wanted, model.air, CONTROL_PERIOD, before)
-    tip = tip_under(configuration, commands)
-    warnings = _vent_warnings(slow, _mean_distance(tip, reference))
-    if cut > _NOTABLE_CUT:
-        said = f"limits cut the wanted pressures by up to {cut:.0f} Pa"
-        warnings.insert(0, f"{said}: {_excess(model, wanted)}")
-    warnings += _error_warnings(tip, reference, method)
-    return _Solved(commands, tip, warnings, {})
+) -> Optimum:
+    """Return commands that keep the limits, and what the model expects of them."""
+    if method == "optimal":
+        solver = Optimiser(configuration, reference, wanted)
+        return solver.run(lambda share: report(0.4 + 0.6 * share))
+    air, before = configuration.model.air, configuration.initial.before
+    commands, cut = within_limits(wanted, air, CONTROL_PERIOD, before)
+    return Optimum(commands, tip_under(configuration, commands), 0, int(cut > _NOTABLE_CUT))
 
 
 def choose_method(model: str, method: str) -> str:
@@ -220,74 +188,74 @@ def tip_under(configuration: Configuration, commands: Array) -> Array:
     return response.tip[:-1]
 
 
-def _calibration_warnings(limb: Limb, bend: Array) -> list[str]:
-    said = []
-    seen = np.array(limb.calibrated.bend_angle)
-    if seen.size == limb.segment_count and np.any(np.abs(bend).max(axis=0) > seen * 1.05):
-        j = int(np.argmax(np.abs(bend).max(axis=0) - seen))
+# Warnings --------------------------------------------------------------------------------------
+
+
+def _limit_warnings(
+    configuration: Configuration,
+    reference: Reference,
+    wanted: Array,
+    slow: SlowVenting | None,
+    found: Optimum,
+    method: str,
+) -> list[str]:
+    """Say where slow chambers and limits keep commands from what a balance wants (K, M) [Pa]."""
+    missed = float(np.linalg.norm(found.tip - reference.tip, axis=1).mean())
+    left = f"mean error of {missed * 1000:.1f} mm on the model itself"
+    said, excess = [], _excess(configuration.model.air.pneumatics, wanted)
+    if slow is not None and slow.opposite > _NOTABLE_OPPOSITE:
+        effect = f", which leaves a {left}" if missed > _NOTABLE_ERROR else ""
         said.append(
-            f"segment {j} bends by {np.degrees(np.abs(bend[:, j]).max()):.0f} degrees, "
-            f"its calibration covered {np.degrees(seen[j]):.0f}"
+            f"pressure {slow.index} should fall by {slow.wanted:.0f} Pa/s at {slow.time:.1f} s, "
+            f"where its chamber is vented by {slow.possible:.0f} Pa/s: the opposite chamber is "
+            f"filled by up to {slow.opposite:.0f} Pa to make up for it{effect}; a longer period or "
+            "a smaller amplitude needs less"
         )
+    if excess and found.limited and method != "optimal":
+        cut = np.abs(found.commands - wanted).max()
+        said.insert(0, f"limits cut the wanted pressures by up to {cut:.0f} Pa: {excess}")
+    elif excess and found.limited and missed > _NOTABLE_ERROR and not said:
+        said.append(f"the limits leave a {left}: {excess}")
     return said
 
 
-def _error_warnings(tip: Array, reference: Reference, method: str) -> list[str]:
-    missed = np.linalg.norm(tip - reference.tip, axis=1)
-    if missed.max() <= _LARGE_ERROR:
-        return []
-    remedy = "" if method == "optimal" else ", or the method optimal,"
-    advice = f"a longer period{remedy} or a smaller amplitude misses less"
-    if _begins_elsewhere(tip, reference):
-        advice = (
-            f"it begins {missed[0] * 1000:.1f} mm off, since it rests elsewhere than the limb "
-            "under its load, which no period changes: the rod (der) rests where the limb does"
-        )
-    return [
-        f"the model itself misses the reference by {missed.mean() * 1000:.1f} mm on average and by "
-        f"{missed.max() * 1000:.1f} mm at {reference.time[missed.argmax()]:.1f} s: {advice}"
-    ]
-
-
-def _begins_elsewhere(tip: Array, reference: Reference) -> bool:
-    """Tell whether most of what tips (K, 2) miss is there when the motion begins at rest."""
-    missed = np.linalg.norm(tip - reference.tip, axis=1)
-    return reference.start is None and bool(missed[0] > 0.5 * missed.max())
-
-
-def _mean_distance(tip: Array, reference: Reference) -> float:
-    return float(np.linalg.norm(tip - reference.tip, axis=1).mean())
-
-
-def _vent_warnings(slow: SlowVenting | None, missed: float) -> list[str]:
-    if slow is None or slow.opposite < _NOTABLE_OPPOSITE:
-        return []
-    left = f", which leaves {missed * 1000:.1f} mm of mean error on the model itself"
-    return [
-        f"pressure {slow.index} should fall by {slow.wanted:.0f} Pa/s at {slow.time:.1f} s, where "
-        f"its chamber is vented by {slow.possible:.0f} Pa/s: the opposite chamber is filled by up "
-        f"to {slow.opposite:.0f} Pa to make up for it{left if missed > _NOTABLE_ERROR else ''}; "
-        "a longer period or a smaller amplitude needs less"
-    ]
-
-
-def _wants(wanted: Array) -> tuple[float, float]:
-    """Return the largest pressure [Pa] and the largest change [Pa/s] of wanted commands (K, M)."""
+def _excess(air: Pneumatics, wanted: Array) -> str:
+    """Say what commands (K, M) [Pa] want beyond the limits; empty if nothing."""
     fastest = np.abs(np.diff(wanted, axis=0)).max(initial=0.0) / CONTROL_PERIOD
-    return float(np.abs(wanted).max()), float(fastest)
-
-
-def _excessive(model: Model, wanted: Array) -> bool:
-    air = model.air.pneumatics
-    largest, fastest = _wants(wanted)
-    return largest > air.pressure_limit or fastest > air.slew_limit
-
-
-def _excess(model: Model, wanted: Array) -> str:
-    air = model.air.pneumatics
-    largest, fastest = _wants(wanted)
+    largest = np.abs(wanted).max()
+    if largest <= air.pressure_limit and fastest <= air.slew_limit:
+        return ""
     return (
         f"the motion wants {largest:.0f} Pa and {fastest:.0f} Pa/s, allowed are "
         f"{air.pressure_limit:.0f} Pa and {air.slew_limit:.0f} Pa/s; a longer period or a smaller "
         "amplitude keeps them"
+    )
+
+
+def _error_warning(tip: Array, reference: Reference, method: str) -> str:
+    missed = np.linalg.norm(tip - reference.tip, axis=1)
+    if missed.max() <= _LARGE_ERROR:
+        return ""
+    remedy = "" if method == "optimal" else ", or the method optimal,"
+    advice = f"a longer period{remedy} or a smaller amplitude misses less"
+    if reference.start is None and missed[0] > 0.5 * missed.max():
+        advice = (
+            f"it begins {missed[0] * 1000:.1f} mm off, since it rests elsewhere than the limb "
+            "under its load, which no period changes: the rod (der) rests where the limb does"
+        )
+    return (
+        f"the model itself misses the reference by {missed.mean() * 1000:.1f} mm on average and by "
+        f"{missed.max() * 1000:.1f} mm at {reference.time[missed.argmax()]:.1f} s: {advice}"
+    )
+
+
+def _calibration_warning(limb: Limb, bend: Array) -> str:
+    """Name a segment that bends (K, M) [rad] further than its calibration did."""
+    covered, most = np.array(limb.calibrated.bend_angle), np.abs(bend).max(axis=0)
+    if covered.size != most.size or np.all(most <= covered * 1.05):
+        return ""
+    j = int(np.argmax(most - covered))
+    return (
+        f"segment {j} bends by {np.degrees(most[j]):.0f} degrees, its calibration covered "
+        f"{np.degrees(covered[j]):.0f}"
     )

@@ -11,9 +11,9 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from der_planner.model.series import CONTROL_PERIOD
+from der_planner.model import CONTROL_PERIOD
 from der_planner.planning.plan_file import Plan
-from der_planner.planning.transitions import Start
+from der_planner.planning.timing import Start
 
 GRID = round(CONTROL_PERIOD * 1e9)
 """Setpoints are stamped on multiples of this [ns]."""

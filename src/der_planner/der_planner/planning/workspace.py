@@ -8,6 +8,7 @@ are solved in the same matrix operations, each from its own first guess, which d
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,29 +16,55 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
-from der_planner.arrays import Array
+from der_planner.arrays import Array, interpolate
 from der_planner.model import NODES, ArcModel, Model, RodModel
-from der_planner.model.bending import Kinematics
-from der_planner.model.series import interpolate
-from der_planner.planning.errors import PlanningError, UnreachableError
-from der_planner.planning.loads import sagging_tips, stable_rest
+from der_planner.model.bending import Kinematics, inverse_kinematics
+from der_planner.planning.loads import PlanningError, sagging_tips, stable_rest
 
 TOLERANCE = 1e-3
 """Points missed by less than this [m] count as reached (the models' reach differs by less)."""
 NEAREST_TOLERANCE = 5e-3
 """The same [m] for a nearest path: along the edge of what arcs reach, a rod's polyline stays behind
 by 1 to 2 mm."""
-PRIOR_WEIGHT = 1e-5
-"""Pull toward the first guess [m/rad]: decides what the tip leaves open (straight limb, M > 2)."""
 BRANCHES = ("counter_clockwise", "clockwise")
 """Names of the two ways in which two segments reach a point."""
-_ITERATIONS = 60
-_SMALLEST_STEP = 1e-11
-"""Change of the bend angles that ends the iteration [rad]."""
 _STRAIGHT = 1e-3
 """A limb that rests within this bend of straight starts there [rad]."""
 _LARGEST_STRIDE = 0.15
 """Change of a bend angle between anchors of a path up to which what lies between is safe [rad]."""
+
+
+@dataclass(eq=False)
+class UnreachableError(PlanningError):
+    """A point of the path lies outside what the limb reaches within its pressure limit.
+
+    Attributes:
+        time: of the point in the motion [s].
+        point: (x, y) in `limb_base` [m].
+        distance: to the nearest reachable point [m].
+        required_pressure: largest |differential pressure| the point would need [Pa]; NaN where no
+            pressure reaches it.
+        carried: what the limb carries under gravity [kg].
+    """
+
+    time: float
+    point: tuple[float, float]
+    distance: float
+    required_pressure: float
+    carried: float = 0.0
+
+    def __str__(self) -> str:
+        """Return a sentence for people, with the remedy."""
+        needed = "no pressure reaches it"
+        if not math.isnan(self.required_pressure):
+            needed = f"it would need {self.required_pressure / 1000:.1f} kPa"
+        carries = f"It carries {self.carried * 1000:.1f} g: carry less, move"
+        return (
+            f"the point ({self.point[0]:.4f}, {self.point[1]:.4f}) m at t = {self.time:.2f} s is "
+            f"out of reach: {self.distance * 1000:.1f} mm from what the limb reaches within its "
+            f"pressure limit; {needed}. {carries if self.carried else 'Move'} or shrink the path, "
+            "or lower the amplitude"
+        )
 
 
 @dataclass(frozen=True)
@@ -47,13 +74,11 @@ class Solution:
     Attributes:
         bend_angles: (M,) [rad].
         branch: ``counter_clockwise`` or ``clockwise``; empty for M other than 2.
-        distance: that remains [m].
         pressure: largest |static differential pressure|, with the weight on arcs [Pa].
     """
 
     bend_angles: Array
     branch: str
-    distance: float
     pressure: float
 
 
@@ -118,7 +143,7 @@ class Workspace:
         if not self.is_loaded:
             return Rest(own, np.zeros_like(own), np.zeros(2))
         state = stable_rest(self.rod)
-        angles = solve(self.arcs, state.q[None, -3:-1], self.rod.bend_of(state))[0][0]
+        angles = inverse_kinematics(self.arcs, state.q[None, -3:-1], self.rod.bend_of(state))[0][0]
         if np.abs(angles).max() < _STRAIGHT:
             angles = np.zeros_like(angles)
         return Rest(angles, angles - own, state.q[-3:-1] - self.arcs.tip(angles))
@@ -130,13 +155,6 @@ class Workspace:
             BucklingError: the rod does not stay on the way.
         """
         return sagging_tips(self.rod, time, angles, self.rest.bend_angles)
-
-    def static_pressure(self, bend_angles: ArrayLike) -> Array:
-        """Return differential pressures (..., M) [Pa] that hold bend angles (..., M) [rad] at rest.
-
-        The limb's weight acts on arcs.
-        """
-        return static_pressure(self.arcs, bend_angles)
 
     def _angle_limits(self) -> tuple[Array, Array]:
         bounds = []
@@ -155,16 +173,11 @@ class Workspace:
 
     def _weight_moments(self) -> Array:
         """Return the largest moments (M,) of gravity about where each segment starts [N·m]."""
-        limb, arcs = self.limb, self.arcs
-        pull = float(np.hypot(*limb.gravity[:2]))
-        if pull == 0:
-            return np.zeros(limb.segment_count)
-        starts = np.cumsum(arcs.lengths + arcs.connector) - arcs.lengths - arcs.connector
-        places = [item.arc_length - limb.base_length for item in limb.masses]
-        where = np.append(starts + arcs.lengths / 2, places)
-        mass = np.append(arcs.masses, [item.mass for item in limb.masses])
+        parts = self.arcs.arcs
+        starts = np.cumsum(parts.lengths + parts.connector) - parts.lengths - parts.connector
+        where = starts[parts.owner] + parts.place * parts.lengths[parts.owner] + parts.beyond
         arms = np.maximum(where - starts[:, None], 0.0)
-        moments: Array = pull * arms @ mass
+        moments: Array = np.hypot(*parts.gravity) * arms @ parts.weight
         return moments
 
     def check_reach(
@@ -184,15 +197,15 @@ class Workspace:
         Args:
             time: (K,) [s].
             tip: (K, 2) [m].
-            angles: (K, M) from `solve` [rad].
-            misses: (K,) distances from `solve` [m].
+            angles: (K, M) from `inverse_kinematics` [rad].
+            misses: (K,) distances from `inverse_kinematics` [m].
             tolerance: largest distance that still counts as reached [m].
             kinematics: that solved the path; None: the arcs.
 
         Raises:
             UnreachableError: for the first point that fails.
         """
-        pressures = np.abs(self.static_pressure(angles)).max(axis=-1)
+        pressures = np.abs(self.arcs.static_pressure(angles)).max(axis=-1)
         failed = misses > tolerance
         if not self.is_loaded:
             failed |= pressures > self.pressure_limit
@@ -221,17 +234,17 @@ class Workspace:
             difference: Array = shape.tip(theta) - target
             return difference
 
-        corners = self._grid(np.array([0.25, 0.75]), 4)
-        best = np.inf
-        for start in [np.clip(np.asarray(guess, dtype=float), low, high), *corners]:
-            result = least_squares(
+        starts = [np.asarray(guess, dtype=float), *self._grid(np.array([0.25, 0.75]), 4)]
+        found = [
+            least_squares(
                 miss,
                 np.clip(start, low + 1e-9, high - 1e-9),
                 jac=shape.tip_jacobians,
                 bounds=(low, high),
             )
-            best = min(best, float(np.linalg.norm(result.fun)))
-        return best
+            for start in starts
+        ]
+        return min(float(np.linalg.norm(each.fun)) for each in found)
 
     def _grid(self, shares: Array, most: int) -> Array:
         """Return bend angles (P, M) [rad] at shares of the limits, of limbs with few segments all.
@@ -258,16 +271,13 @@ class Workspace:
         starts = self._grid(np.array([0.1, 0.35, 0.5, 0.65, 0.9]), 3)
         target = np.tile(np.asarray(point, dtype=float), (len(starts), 1))
         found: list[Solution] = []
-        for theta, distance in zip(*solve(self.arcs, target, starts), strict=True):
+        for theta, distance in zip(*inverse_kinematics(self.arcs, target, starts), strict=True):
             inside = np.all(theta >= self.low - 1e-9) and np.all(theta <= self.high + 1e-9)
-            if distance > 1e-6 or not inside:
-                continue
             known = (np.linalg.norm(theta - item.bend_angles) < 1e-3 for item in found)
-            if len(theta) <= 2 and any(known):
+            if distance > 1e-6 or not inside or (len(theta) <= 2 and any(known)):
                 continue
-            pressure = float(np.abs(self.static_pressure(theta)).max())
-            branch = branch_of(self.arcs, theta)
-            found.append(Solution(theta, branch, float(distance), pressure))
+            pressure = float(np.abs(self.arcs.static_pressure(theta)).max())
+            found.append(Solution(theta, branch_of(self.arcs, theta), pressure))
         limit = self.pressure_limit * (1 + 1e-6)
         possible = [item for item in found if item.pressure <= limit]
         return sorted(possible or found, key=lambda item: item.pressure)
@@ -294,7 +304,7 @@ class Workspace:
             if stride == 1 or np.abs(np.diff(coarse, axis=0)).max(initial=0.0) < _LARGEST_STRIDE:
                 break
         guesses = interpolate(np.arange(len(tip)), anchors, coarse)
-        angles, misses = solve(self.arcs, tip, guesses)
+        angles, misses = inverse_kinematics(self.arcs, tip, guesses)
         self.check_reach(time, tip, angles, misses)
         return angles
 
@@ -304,81 +314,25 @@ class Workspace:
         found = self.solutions(tip[0])
         if not found:
             middle = (self.low + self.high) / 2 + 0.1
-            angles, miss = solve(self.arcs, tip[:1], middle[None])
+            angles, miss = inverse_kinematics(self.arcs, tip[:1], middle[None])
             self.check_reach(time[:1], tip[:1], angles, miss, tolerance=1e-6)
             first: Array = angles[0]
             return first
-        chosen = [item for item in found if not branch or item.branch == branch]
-        if not chosen:
-            raise PlanningError(
-                f"the first point ({tip[0, 0]:.4f}, {tip[0, 1]:.4f}) m has no solution "
-                f"on the branch '{branch}' within the pressure limit, only on '{found[0].branch}'"
-            )
-        return chosen[0].bend_angles
+        for item in found:
+            if branch in ("", item.branch):
+                return item.bend_angles
+        raise PlanningError(
+            f"the first point ({tip[0, 0]:.4f}, {tip[0, 1]:.4f}) m has no solution on the branch "
+            f"'{branch}' within the pressure limit, only on '{found[0].branch}'"
+        )
 
     def _continue(self, points: Array, start: Array) -> Array:
         """Return bend angles (K, M) along points (K, 2), each from where the last two lead."""
-        angles = np.zeros((len(points), len(start)))
-        guess = start
+        angles, guess = np.zeros((len(points), len(start))), start
         for k, point in enumerate(points):
-            angles[k] = solve(self.arcs, point[None], guess[None])[0][0]
+            angles[k] = inverse_kinematics(self.arcs, point[None], guess[None])[0][0]
             guess = 2 * angles[k] - angles[k - 1] if k else angles[k]
         return angles
-
-
-def static_pressure(arcs: ArcModel, bend_angles: ArrayLike) -> Array:
-    """Return the pressures (..., M) [Pa] that hold arcs at bend angles (..., M) [rad] at rest."""
-    angles = np.asarray(bend_angles, dtype=float)
-    if not arcs.is_loaded:
-        pressure: Array = arcs.elastic_torque(angles) / arcs.gain
-        return pressure
-    flat = angles.reshape(-1, angles.shape[-1])
-    return arcs.inverse_dynamics(flat, 0 * flat, 0 * flat).reshape(angles.shape)
-
-
-def solve(
-    kinematics: Kinematics, tip: ArrayLike, guess: ArrayLike, prior_weight: float = PRIOR_WEIGHT
-) -> tuple[Array, Array]:
-    """Return bend angles (K, M) [rad] near the guess and the distances (K,) [m] that remain.
-
-    Minimises |tip(θ) − r|² + w² |θ − guess|² for every point by Levenberg-Marquardt.
-
-    Args:
-        kinematics: forward kinematics.
-        tip: (K, 2) points r [m].
-        guess: (K, M) first guess, which also chooses the branch [rad].
-        prior_weight: w [m/rad].
-    """
-    target = np.atleast_2d(np.asarray(tip, dtype=float))
-    prior = np.atleast_2d(np.asarray(guess, dtype=float))
-    angles = prior.copy()
-    damping = np.full(len(angles), 1e-9)
-    identity = np.eye(angles.shape[1])
-    weight = prior_weight**2
-
-    def cost(theta: Array) -> Array:
-        miss = kinematics.tip(theta) - target
-        total: Array = (miss**2).sum(-1) + weight * ((theta - prior) ** 2).sum(-1)
-        return total
-
-    present = cost(angles)
-    for _ in range(_ITERATIONS):
-        miss = kinematics.tip(angles) - target
-        jacobian = kinematics.tip_jacobians(angles)
-        normal = np.einsum("kai,kaj->kij", jacobian, jacobian)
-        normal = normal + (weight + damping)[:, None, None] * identity
-        slope = np.einsum("kai,ka->ki", jacobian, miss) + weight * (angles - prior)
-        step = -np.linalg.solve(normal, slope[..., None])[..., 0]
-        length = np.linalg.norm(step, axis=-1, keepdims=True)
-        step = step * np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))
-        trial = cost(angles + step)
-        better = trial <= present
-        angles = np.where(better[:, None], angles + step, angles)
-        present = np.where(better, trial, present)
-        damping = np.where(better, np.maximum(damping / 10, 1e-16), damping * 10 + 1e-12)
-        if np.all(length < _SMALLEST_STEP):
-            break
-    return angles, np.linalg.norm(kinematics.tip(angles) - target, axis=-1)
 
 
 def branch_of(kinematics: Kinematics, bend_angles: ArrayLike) -> str:

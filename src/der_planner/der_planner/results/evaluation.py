@@ -8,14 +8,9 @@ window from the first to the last setpoint of the plan: E is the mean over the v
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -42,8 +37,6 @@ GAP = 0.5
 LEAST_VALID = 0.9
 """Least share of valid images of such a run."""
 REFERENCE_POINTS = 25
-WORTH_WHILE = 64 << 20
-"""Bags of fewer bytes in total are read by one process."""
 
 
 @dataclass(frozen=True)
@@ -105,20 +98,6 @@ class RunResult:
         place = f" at {self.payload_at_m * 100:.1f} cm" if self.payload_at_m else ""
         return f"{self.mounting}, {self.payload_kg * 1000:.4g} g{place}"
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return what ``results.json`` holds; NaN becomes None, which JSON can say."""
-        return {key: json_value(value) for key, value in dataclasses.asdict(self).items()}
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> RunResult:
-        """Return a result that `to_dict` wrote; unknown keys are kept in ``extra``."""
-        names = {entry.name for entry in dataclasses.fields(cls)}
-        given = {key: _python_value(value) for key, value in data.items() if key in names}
-        for key in ("checks", "extra"):
-            given[key] = dict(data.get(key) or {})
-        given["extra"] |= {key: value for key, value in data.items() if key not in names}
-        return cls(**given)
-
 
 def json_value(value: Any) -> Any:
     """Return a value as JSON can say it: tuples as lists, NaN and infinity as None."""
@@ -127,12 +106,6 @@ def json_value(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [json_value(entry) for entry in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def _python_value(value: Any) -> Any:
-    if isinstance(value, list):
-        return tuple(_python_value(entry) for entry in value)
-    return float("nan") if value is None else value
 
 
 def evaluate_bag(path: str | Path, settings: EvaluationSettings | None = None) -> RunResult:
@@ -190,16 +163,9 @@ def evaluate_run(run: RunSeries, settings: EvaluationSettings | None = None) -> 
         gravity_m_s2=about.gravity,
         payload_kg=about.payload,
         payload_at_m=about.payload_at,
-        lag_s=split.lag,
-        gain_x=split.gain_x,
-        gain_y=split.gain_y,
-        bias_x_m=split.bias_x,
-        bias_y_m=split.bias_y,
-        rms_without_lag_m=split.rms_without_lag,
-        rms_without_bias_m=split.rms_without_bias,
-        rms_without_gain_m=split.rms_without_gain,
+        **dataclasses.asdict(split),
         pressure_rms_error_pa=_pressure_errors(run, first, last),
-        removed_lag_s=split.lag if settings.remove_lag else 0.0,
+        removed_lag_s=split.lag_s if settings.remove_lag else 0.0,
         problems=_problems(run, valid, longest),
         reference_points_m=_reference_points(run, first, last),
         checks=check_tracker(run.tip, run.truth, first, last) | check_board(run.board),
@@ -267,44 +233,24 @@ class Evaluated:
 def evaluate_bags(
     paths: Sequence[Path],
     settings: EvaluationSettings | None = None,
-    *,
-    workers: int = 0,
-    progress: Callable[[int, int, Path], None] | None = None,
+    progress: Callable[[int, int, Path], None] = lambda *_: None,
 ) -> list[Evaluated]:
-    """Evaluate bags in parallel; one that fails does not stop the others.
+    """Evaluate bags one after the other; one that fails does not stop the others.
 
     Args:
         paths: bag folders or files.
         settings: for all of them.
-        workers: processes; 0 = as many as there are cores, but only this one for so few bytes that
-            starting others would take longer; 1 = this process.
         progress: called with the number done, the number of bags and the last one's path.
 
     Returns:
         One entry per limb that has a plan, in the order of the paths; one with the reason for a
         bag without any.
     """
-    evaluate = partial(_evaluate, settings=settings or EvaluationSettings())
-    workers = min(workers or _worth_while(paths), len(paths))
-    with contextlib.ExitStack() as stack:
-        found: Iterable[list[Evaluated]] = map(evaluate, paths)
-        if workers > 1:
-            # Forking a process that already runs threads (ROS, BLAS) can deadlock.
-            pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
-            found = stack.enter_context(pool).map(evaluate, paths)
-        entries = []
-        for count, (path, of_bag) in enumerate(zip(paths, found, strict=True), start=1):
-            entries += of_bag
-            if progress is not None:
-                progress(count, len(paths), path)
+    entries = []
+    for count, path in enumerate(paths, start=1):
+        entries += _evaluate(path, settings or EvaluationSettings())
+        progress(count, len(paths), path)
     return entries
-
-
-def _worth_while(paths: Sequence[Path]) -> int:
-    """Return how many processes pay for their start of a few seconds."""
-    files = [file for path in paths for file in (path.glob("*") if path.is_dir() else [path])]
-    size = sum(file.stat().st_size for file in files if file.is_file())
-    return os.cpu_count() or 1 if size > WORTH_WHILE else 1
 
 
 def _evaluate(path: Path, settings: EvaluationSettings) -> list[Evaluated]:

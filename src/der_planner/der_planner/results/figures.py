@@ -65,11 +65,11 @@ def paper_style() -> Iterator[None]:
         yield
 
 
-def save(figure: Figure, folder: Path, name: str, formats: tuple[str, ...]) -> list[Path]:
-    """Write a figure in every format and return the paths."""
+def save(figure: Figure, folder: Path, name: str) -> list[Path]:
+    """Write a figure in each of `FORMATS` and return the paths."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
-    for suffix in formats:
+    for suffix in FORMATS:
         path = folder / f"{name}.{suffix}"
         # Without a date in it, the same runs give the same file.
         stripped = {"CreationDate": None} if suffix == "pdf" else None
@@ -108,15 +108,12 @@ def by_motion(runs: Sequence[RunSeries]) -> dict[str, list[RunSeries]]:
     return found
 
 
-def plot_tip(
-    runs: Sequence[RunSeries], folder: Path, formats: tuple[str, ...] = FORMATS
-) -> list[Path]:
+def plot_tip(runs: Sequence[RunSeries], folder: Path) -> list[Path]:
     """Draw tip against reference, a row per motion: the path, and x, y over time.
 
     Args:
         runs: any number, of any motions and models.
         folder: where ``tip.png`` and ``tip.pdf`` go.
-        formats: file name endings.
 
     Returns:
         The written files.
@@ -128,7 +125,7 @@ def plot_tip(
         for row, (title, members) in zip(axes, motions.items(), strict=True):
             _draw_tip_row(row, title, members)
         shared_legend(figure, [axes[0][0]])
-        return save(figure, folder, "tip", formats)
+        return save(figure, folder, "tip")
 
 
 def _draw_tip_row(row: Sequence[Axes], title: str, runs: Sequence[RunSeries]) -> None:
@@ -158,15 +155,12 @@ def _draw_tip_row(row: Sequence[Axes], title: str, runs: Sequence[RunSeries]) ->
     over_y.set(xlabel="time [s]", ylabel="y [cm]")
 
 
-def plot_error(
-    runs: Sequence[RunSeries], folder: Path, formats: tuple[str, ...] = FORMATS
-) -> list[Path]:
+def plot_error(runs: Sequence[RunSeries], folder: Path) -> list[Path]:
     """Draw the tip error over time: mean and one standard deviation over trials per model.
 
     Args:
         runs: any number; a column per motion.
         folder: where ``error.png`` and ``error.pdf`` go.
-        formats: file name endings.
     """
     motions = by_motion(runs)
     with paper_style():
@@ -187,7 +181,7 @@ def plot_error(
             axis.set_ylim(bottom=0.0)
         axes[0].set_ylabel("tip error [cm]")
         shared_legend(figure, axes)
-        return save(figure, folder, "error", formats)
+        return save(figure, folder, "error")
 
 
 def _by_model(runs: Sequence[RunSeries]) -> dict[str, list[RunSeries]]:
@@ -226,9 +220,7 @@ def mean_error(runs: Sequence[RunSeries], rate: float = 20.0) -> tuple[Array, Ar
     return grid[keep], mean, deviation
 
 
-def plot_pressures(
-    runs: Sequence[RunSeries], folder: Path, formats: tuple[str, ...] = FORMATS
-) -> list[Path]:
+def plot_pressures(runs: Sequence[RunSeries], folder: Path) -> list[Path]:
     """Draw commanded and measured differential pressures, a row per motion, a column per segment.
 
     The first run of each model stands for its trials. Returns nothing where no run has pressures.
@@ -248,7 +240,7 @@ def plot_pressures(
                 axis.set(xlabel="time [s]", ylabel=f"Δp, segment {segment + 1} [kPa]")
             row[0].set_title(title)
         shared_legend(figure, [axes[0][0]])
-        return save(figure, folder, "pressures", formats)
+        return save(figure, folder, "pressures")
 
 
 def _draw_pressures(row: Sequence[Axes], run: RunSeries, label: str, look: str) -> None:
@@ -269,15 +261,12 @@ def _draw_pressures(row: Sequence[Axes], run: RunSeries, label: str, look: str) 
             axis.plot(stream.time, value, color=look, label=f"{label}, {name}", **dash)
 
 
-def plot_learning(
-    results: Sequence[RunResult], folder: Path, formats: tuple[str, ...] = FORMATS
-) -> list[Path]:
+def plot_learning(results: Sequence[RunResult], folder: Path) -> list[Path]:
     """Draw the learning curves, a line a trial and a column a motion; nothing where there is none.
 
     Args:
         results: of an experiment.
         folder: where ``learning.png`` and ``learning.pdf`` go.
-        formats: file name endings.
     """
     curves = learning_curves(results)
     if not curves:
@@ -291,29 +280,4 @@ def plot_learning(
             axis.set(xlabel="runs learned from", title=motion.replace("_", " "))
             axis.xaxis.get_major_locator().set_params(integer=True)
         axes[0].set_ylabel("mean tip error [cm]")
-        return save(figure, folder, "learning", formats)
-
-
-def plot_latency(
-    results: Sequence[RunResult], folder: Path, formats: tuple[str, ...] = FORMATS
-) -> list[Path]:
-    """Draw the time from a picture to the first setpoint corrected by it, where it is known.
-
-    Args:
-        results: of an experiment; all runs with feedback are counted together.
-        folder: where ``latency.png`` and ``latency.pdf`` go.
-        formats: file name endings.
-    """
-    told = [run.extra.get("feedback", {}) for run in results]
-    counted = [about for about in told if about.get("latency_counts")]
-    if not counted:
-        return []
-    counts = np.sum([about["latency_counts"] for about in counted], axis=0)
-    width = float(counted[0]["latency_bin_s"]) * 1e3
-    with paper_style():
-        figure: Any = new_figure(COLUMN, 2.0)
-        axis = figure.subplots()
-        last = int(np.nonzero(counts)[0][-1]) + 2
-        axis.bar(np.arange(len(counts))[:last] * width, counts[:last], width, align="edge")
-        axis.set(xlabel="from picture to board [ms]", ylabel="pictures")
-        return save(figure, folder, "latency", formats)
+        return save(figure, folder, "learning")

@@ -6,18 +6,16 @@ import base64
 import html
 import json
 import os
-import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from der_planner.bags.run import RunSeries
-from der_planner.results.evaluation import RunResult
+from der_planner.results.evaluation import RunResult, json_value
 from der_planner.results.figures import (
     plot_error,
-    plot_latency,
     plot_learning,
     plot_pressures,
     plot_tip,
@@ -44,7 +42,6 @@ _CAPTIONS = {
     "shapes": "Planned and measured limb, over the camera's frames where these were recorded.",
     "pressures": "Differential pressures, commanded and measured; first trial of each model.",
     "learning": "Mean tip error over the runs that a plan was learned from, a line a trial.",
-    "latency": "From the instant of a picture to the first command at the board that knows of it.",
 }
 _DEFINITIONS = """
 <p>r̄ is the tip reference of the plan, interpolated linearly at the stamp of each image; r is the
@@ -70,21 +67,13 @@ figcaption, .small { font-size: 0.85rem; color: #555; }
 """
 
 
-@dataclass(frozen=True)
-class Report:
-    """What was written: the page, and everything beside it."""
-
-    page: Path
-    files: tuple[Path, ...]
-
-
 def results_document(results: Sequence[RunResult]) -> dict[str, Any]:
     """Return the content of ``results.json``: runs, summary over trials, comparisons."""
     return {
         "format": FORMAT,
-        "runs": [result.to_dict() for result in results],
-        "summary": [row.to_dict() for row in summarise(results)],
-        "comparisons": [entry.to_dict() for entry in compare(results)],
+        "runs": [json_value(asdict(result)) for result in results],
+        "summary": [json_value(asdict(row)) for row in summarise(results)],
+        "comparisons": [json_value(asdict(entry)) for entry in compare(results)],
         "side_by_side": side_by_side(results),
     }
 
@@ -101,21 +90,14 @@ def write_results(results: Sequence[RunResult], folder: Path) -> Path:
     return path
 
 
-def read_results(path: Path) -> list[RunResult]:
-    """Return the runs of a ``results.json``."""
-    document = json.loads(Path(path).read_text(encoding="utf-8"))
-    return [RunResult.from_dict(entry) for entry in document["runs"]]
-
-
 def write_report(
     runs: Sequence[RunSeries],
     results: Sequence[RunResult],
     folder: Path,
     *,
     title: str = "Tracking errors",
-    drawn: Sequence[Path] = (),
     progress: Callable[[str], None] = lambda _: None,
-) -> Report:
+) -> Path:
     """Write page, tables and figures into a folder.
 
     Args:
@@ -124,25 +106,23 @@ def write_report(
         folder: made if missing; receives ``report.html``, ``results.json``, ``table.md``,
             ``table.csv``, ``table.tex`` and each figure as PDF and PNG.
         title: of the page.
-        drawn: files of figures of the same runs that exist already; they are copied.
         progress: called with what is being made.
 
     Returns:
-        The written files.
+        The page.
 
     Raises:
         BagError: a bag cannot be read again for its frames.
     """
     folder = Path(folder)
-    files = [write_results(results, folder)]
+    write_results(results, folder)
     rows = summarise(results)
     for name, text in (
         ("table.md", error_table(rows).markdown()),
         ("table.csv", csv_table(rows)),
         ("table.tex", error_table(rows).latex()),
     ):
-        files.append(folder / name)
-        files[-1].write_text(text, encoding="utf-8")
+        (folder / name).write_text(text, encoding="utf-8")
     figures: list[str] = []
     plots: dict[str, Callable[[], list[Path]]] = {
         "error": lambda: plot_error(runs, folder),
@@ -150,18 +130,13 @@ def write_report(
         "shapes": lambda: plot_shapes(runs, folder),
         "pressures": lambda: plot_pressures(runs, folder),
         "learning": lambda: plot_learning(results, folder),
-        "latency": lambda: plot_latency(results, folder),
     }
     for name, plot in plots.items():
-        written = [Path(shutil.copy(path, folder)) for path in drawn if path.stem == name]
-        if not written:
-            progress(f"figure {name}")
-            written = plot()
-        files += written
-        figures += [figure(_CAPTIONS[name], path) for path in written if path.suffix == ".png"]
+        progress(f"figure {name}")
+        figures += [figure(_CAPTIONS[name], path) for path in plot() if path.suffix == ".png"]
     page = folder / "report.html"
     page.write_text(document(title, _sections(results, figures)), encoding="utf-8")
-    return Report(page, (*files, page))
+    return page
 
 
 def document(title: str, sections: Sequence[str]) -> str:

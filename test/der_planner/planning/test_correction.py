@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from der_planner.control import Learner
-from der_planner.control.library import carried_over, nearest
 from der_planner.limb import Limb
 from der_planner.model import RodModel, simulate
 from der_planner.planning import Motion, plan
+from der_planner.planning.correction import carried_over, nearest
 from der_planner.planning.plan_file import write_plan
 
 LIMB = Limb.default()

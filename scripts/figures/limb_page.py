@@ -5,10 +5,7 @@ python3 scripts/write_limb_page.py
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import sys
-from pathlib import Path
 from typing import Any
 
 from der_planner.limb import (
@@ -21,10 +18,10 @@ from der_planner.limb import (
     Term,
     declarations,
 )
-from der_planner.results.outputs import OutputError, check_file
 from der_planner.results.tables import Table
+from workspace_setup.basics import ROOT
 
-PAGE = Path(__file__).resolve().parents[2] / "doc" / "limb_parameters.md"
+PAGE = ROOT / "src" / "der_planner" / "doc" / "limb_parameters.md"
 _HEAD = """\
 # The parameters of a limb
 
@@ -93,22 +90,7 @@ def _fit(term: Term | None) -> str:
 
 
 def main() -> int:
-    """Run the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, default=PAGE, help="file to write")
-    out = parser.parse_args().out
-    try:
-        check_file(out)
-    except OutputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(page(), encoding="utf-8")
-    print(f"wrote {out}")
+    """Write the page."""
+    PAGE.write_text(page(), encoding="utf-8")
+    print(f"wrote {PAGE}")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

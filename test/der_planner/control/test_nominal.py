@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from der_planner.control.chambers import ChamberLog
-from der_planner.control.nominal import STEP, Nominal
+from der_planner.control.nominal import STEP, ChamberLog, Nominal
 from der_planner.limb import Limb
 from der_planner.planning import Motion, plan
 

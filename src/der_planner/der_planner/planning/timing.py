@@ -1,0 +1,283 @@
+"""When a motion is where: transitions between poses, and how fast a course is gone through.
+
+Transitions are quintics from rest to a motion, from one to another, and back to rest: sequences of
+bend angles (K, M) [rad] on a fine grid of instants. `resting_spline` turns the whole of them into a
+function that can be differentiated twice. `retimed` finds the times of a course from its limits.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import BSpline, PchipInterpolator, make_interp_spline
+
+from der_planner.arrays import Array
+from der_planner.model import CONTROL_PERIOD
+from der_planner.planning.loads import PlanningError
+from der_planner.planning.workspace import Workspace
+
+FINE_PERIOD = 0.01
+"""Time between two samples of a transition, about [s]."""
+LONGEST = 3600.0
+"""Longest duration of a motion [s]."""
+_GRID = 0.02
+"""Time between two samples of a path that gets its timing from limits [s]."""
+_SOFTNESS = 0.2
+"""Half width of the mean that rounds the corners of a speed profile [s]."""
+SLEW_SHARE = 0.8
+"""Share of the slew limit for changing the static pressures; the rest is for the inertia."""
+RISE = 0.5
+"""Time in which bend angles reach their greatest rate [s]."""
+
+
+@dataclass(frozen=True)
+class PathLimits:
+    """How fast the tip may go along a path that comes without times.
+
+    Attributes:
+        speed: [m/s].
+        acceleration: along and across the path [m/s²].
+    """
+
+    speed: float = 0.03
+    acceleration: float = 0.05
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a motion begins, if not at rest: where another one is left.
+
+    Attributes:
+        bend_angles: (M,) of the arcs [rad].
+        rate: (M,) [rad/s].
+        acceleration: (M,) [rad/s²].
+        pressure: (M,) command in force [Pa].
+    """
+
+    bend_angles: Array
+    rate: Array
+    acceleration: Array
+    pressure: Array
+
+
+def sample_spline(spline: BSpline, time: ArrayLike) -> tuple[Array, Array, Array]:
+    """Return value, rate and acceleration of a spline; beyond its ends it rests."""
+    instants = np.asarray(time, dtype=float)
+    first, last = spline.t[spline.k], spline.t[-spline.k - 1]
+    inside = ((instants >= first) & (instants <= last))[..., None]
+    clipped = np.clip(instants, first, last)
+    value: Array = spline(clipped)
+    return (
+        value,
+        np.where(inside, spline(clipped, 1), 0.0),
+        np.where(inside, spline(clipped, 2), 0.0),
+    )
+
+
+def resting_spline(time: ArrayLike, values: ArrayLike, start: Start | None = None) -> BSpline:
+    """Return the quintic spline through (K, M) values that ends at rest and starts as given."""
+    samples = np.asarray(values, dtype=float)
+    rest = np.zeros(samples.shape[1:])
+    begin = (rest, rest) if start is None else (start.rate, start.acceleration)
+    ends: Any = ([(1, begin[0]), (2, begin[1])], [(1, rest), (2, rest)])
+    return make_interp_spline(np.asarray(time), samples, k=5, bc_type=ends)
+
+
+def with_transitions(
+    fastest: Array, time: Array, angles: Array, home: Array
+) -> tuple[Array, Array]:
+    """Return times and angles that begin and end at rest at home.
+
+    Args:
+        fastest: (M,) rates of the bend angles at the slew limit [rad/s].
+        time: (K,) [s].
+        angles: (K, M) of the motion [rad].
+        home: (M,) where the limb rests [rad].
+    """
+    inner = make_interp_spline(time, angles, k=5)
+    ends = [(inner(t), inner(t, 1), inner(t, 2)) for t in (time[0], time[-1])]
+    zero = np.zeros_like(home)
+    lead = _travel_time(fastest, ends[0], home)
+    tail = _travel_time(fastest, ends[1], home)
+    approach = quintic(fine_grid(lead), home, zero, zero, *ends[0])
+    back = quintic(fine_grid(tail), *ends[1], home, zero, zero)
+    between = fine_grid(on_grid(time[-1] - time[0]))
+    middle = inner(np.minimum(time[0] + between, time[-1]))
+    instants = [
+        fine_grid(lead),
+        lead + between[1:],
+        lead + between[-1] + fine_grid(tail)[1:],
+    ]
+    return np.concatenate(instants), np.concatenate([approach, middle[1:], back[1:]])
+
+
+def smooth_step(x: ArrayLike) -> Array:
+    """Return the quintic that goes from 0 to 1 with zero rate and acceleration at both ends."""
+    t = np.clip(np.asarray(x, dtype=float), 0.0, 1.0)
+    step: Array = t**3 * (10 + t * (6 * t - 15))
+    return step
+
+
+def quintic(time: Array, x0: Array, v0: Array, a0: Array, x1: Array, v1: Array, a1: Array) -> Array:
+    """Return (K, M) samples of the quintic between two states over the span of ``time`` (K,)."""
+    span = float(time[-1])
+    t = (time / span)[:, None]
+    start = (x0, span * v0, span**2 * a0)
+    end = (x1, span * v1, span**2 * a1)
+    difference = end[0] - start[0] - start[1] - 0.5 * start[2]
+    slope = end[1] - start[1] - start[2]
+    bow = end[2] - start[2]
+    c3 = 10 * difference - 4 * slope + 0.5 * bow
+    c4 = -15 * difference + 7 * slope - bow
+    c5 = 6 * difference - 3 * slope + 0.5 * bow
+    result: Array = start[0] + t * (start[1] + t * (0.5 * start[2] + t * (c3 + t * (c4 + t * c5))))
+    return result
+
+
+def led_in(
+    fastest: Array, state: tuple[Array, Array, Array], time: Array, angles: Array
+) -> tuple[Array, Array]:
+    """Return time and angles with the transition from a state to their first pose before them.
+
+    The state is angle [rad], rate [rad/s] and acceleration [rad/s²], each (M,); the first pose is
+    at rest. The other arguments are those of `with_transitions`.
+    """
+    zero = np.zeros_like(fastest)
+    lead = fine_grid(_travel_time(fastest, state, angles[0]))
+    approach = quintic(lead, *state, angles[0], zero, zero)
+    return np.append(lead, lead[-1] + time[1:]), np.concatenate([approach, angles[1:]])
+
+
+def on_grid(span: float) -> float:
+    """Return a span rounded up to whole control periods."""
+    return math.ceil(span / CONTROL_PERIOD - 1e-9) * CONTROL_PERIOD
+
+
+def fine_grid(span: float) -> Array:
+    """Return evenly spaced instants from 0 to span, about 10 ms apart."""
+    return np.linspace(0.0, span, max(2, round(span / FINE_PERIOD) + 1))
+
+
+def _travel_time(fastest: Array, state: tuple[Array, Array, Array], home: Array) -> float:
+    """Return how long the limb takes between rest at home and a state, at half of its slew limit.
+
+    Angles (M,) in rad, the result in s.
+    """
+    half = 0.5 * fastest
+    angle, rate, acceleration = (np.abs(p) for p in (state[0] - home, state[1], state[2]))
+    by_angle = np.max(1.875 * angle / half)
+    by_rate = np.max(2 * rate / half)
+    by_acceleration = np.max(np.sqrt(acceleration / half))
+    return on_grid(max(1.0, by_angle, by_rate, by_acceleration))
+
+
+# How fast a course is gone through --------------------------------------------------------------
+
+
+def retimed(
+    workspace: Workspace,
+    course: PchipInterpolator,
+    span: float,
+    limits: PathLimits | None,
+    rest: bool = False,
+) -> tuple[Array, Array]:
+    """Return instants (K,) [s], from 0, and where along a course (K,) the limb is then.
+
+    The course is kept; what changes is when each of its points comes. With ``limits`` it is gone
+    through as fast as they and the slew limit allow, from rest to rest. Without, its own parameter
+    is the time, and it is slowed where the slew limit asks for it.
+
+    Args:
+        workspace: of the limb.
+        course: bend angles [rad] by a parameter [s].
+        span: the parameter goes from 0 to this.
+        limits: speed and acceleration of the tip.
+        rest: begin and end at rest even without limits.
+
+    Raises:
+        PlanningError: it would last too long.
+    """
+    count = int(np.clip(span / 0.01, 200, 40000))
+    place = np.linspace(0.0, span, count)
+    rate, greatest = _rates(workspace, course, place, limits)
+    if limits is None and not rest and np.all(rate >= 1.0):
+        samples = max(20, round(span / _GRID) + 1)
+        return np.linspace(0.0, span, samples), np.linspace(0.0, span, samples)
+    if limits is not None or rest:
+        rate[0] = rate[-1] = 0.0
+    step = float(place[1])
+    keep_acceleration(rate, 2 * np.minimum(greatest[1:], greatest[:-1]) * step)
+    time, along = evenly_in_time(2 * step / np.maximum(rate[1:] + rate[:-1], 1e-6), place)
+    return time, np.clip(along, 0.0, span)
+
+
+def _rates(
+    workspace: Workspace,
+    course: PchipInterpolator,
+    place: Array,
+    limits: PathLimits | None,
+) -> tuple[Array, Array]:
+    """Return the largest rate of the parameter [1] and of its rate [1/s] at places (K,)."""
+    fastest = SLEW_SHARE * workspace.fastest
+    bend, turn = np.abs(course(place, 1)), np.abs(course(place, 2))
+    tiny = 1e-9
+    rate = (fastest / np.maximum(bend, tiny)).min(axis=1)
+    rate = np.minimum(rate, np.sqrt(fastest / RISE / np.maximum(turn, tiny)).min(axis=1))
+    greatest = (fastest / RISE / np.maximum(bend, tiny)).min(axis=1)
+    if limits is None:
+        return np.minimum(rate, 1.0), greatest
+    tip = workspace.arcs.tip(course(place))
+    first = np.gradient(tip, place, axis=0)
+    second = np.linalg.norm(np.gradient(first, place, axis=0), axis=1)
+    speed = np.maximum(np.linalg.norm(first, axis=1), tiny)
+    rate = np.minimum(rate, limits.speed / speed)
+    rate = np.minimum(rate, np.sqrt(limits.acceleration / np.maximum(second, tiny)))
+    return rate, np.minimum(greatest, limits.acceleration / speed)
+
+
+def keep_acceleration(speed: Array, gain: Array) -> None:
+    """Lower the speeds (K,) until none changes faster than it may, forward and backward.
+
+    Args:
+        speed: largest ones, changed in place.
+        gain: (K − 1,) largest change of the squared speed from one place to the next.
+    """
+    for k in range(len(gain)):
+        speed[k + 1] = min(speed[k + 1], math.sqrt(speed[k] ** 2 + gain[k]))
+    for k in range(len(gain) - 1, -1, -1):
+        speed[k] = min(speed[k], math.sqrt(speed[k + 1] ** 2 + gain[k]))
+
+
+def evenly_in_time(durations: Array, place: Array) -> tuple[Array, Array]:
+    """Return evenly spaced instants from 0 on [s], and the places then, with rounded corners.
+
+    Args:
+        durations: (K − 1,) times from one place to the next [s].
+        place: (K,) along a course.
+
+    Raises:
+        PlanningError: it would last too long.
+    """
+    time = np.concatenate([[0.0], np.cumsum(durations)])
+    if time[-1] > LONGEST:
+        raise PlanningError(
+            f"the path would last {time[-1]:.0f} s, the longest is {LONGEST:.0f} s: draw less, or "
+            "allow a higher speed"
+        )
+    grid = np.linspace(0.0, time[-1], max(20, round(time[-1] / _GRID) + 1))
+    step = float(grid[1])
+    along = _running_mean(PchipInterpolator(time, place)(grid), max(1, round(_SOFTNESS / step)))
+    return np.arange(len(along), dtype=np.float64) * step, along
+
+
+def _running_mean(values: Array, window: int) -> Array:
+    """Return a running mean over 2 window + 1 samples, longer by as much: from rest to rest."""
+    width = 2 * window + 1
+    padded = np.concatenate([np.full(width - 1, values[0]), values, np.full(width - 1, values[-1])])
+    total = np.concatenate([[0.0], np.cumsum(padded)])
+    mean: Array = (total[width:] - total[:-width]) / width
+    return mean
