@@ -1,4 +1,4 @@
-"""What a study costs beside its runs: speed-up, cost of a task, memory of a worker."""
+"""What a study costs beside its runs: speed-up, cost of a row, memory of a worker."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ import psutil
 from distributed import Client, LocalCluster
 
 from der_planner.experiment.console import Progress
-from der_planner.studies.conduct import PlaySettings, conduct
+from der_planner.studies.conduct import Calibrated, PlaySettings, compute, conduct
 from der_planner.studies.study import Study
-from der_planner.studies.tasks import TASKS
 
 Figures = dict[str, float | str]
 
@@ -52,20 +51,19 @@ def run(quick: bool) -> Figures:
     return figures
 
 
-def _played(text: str, folder: Path, scheduler: str) -> tuple[float, list[float]]:
-    """Play a study of this text; return its wall time and what each of its tasks took [s]."""
+def _played(text: str, folder: Path, scheduler: str) -> float:
+    """Play a study of this text; return its wall time [s]."""
     number = len(list(folder.iterdir()))
     path = folder / f"study_{number}.yaml"
     path.write_text(text)
-    study, out = Study.read(path), folder / f"out_{number}"
+    study = Study.read(path)
     begin = time.perf_counter()
-    kept = conduct(study, PlaySettings(out, scheduler), _Silent())
+    kept = conduct(study, PlaySettings(folder / f"out_{number}", scheduler), _Silent())
     wall = time.perf_counter() - begin
     failed = [row["error"] for row in kept.values() if row["error"]]
     if failed:
         raise RuntimeError(f"{len(failed)} rows failed: {failed[0]}")
-    lines = (out / "times.csv").read_text().splitlines()
-    return wall, [float(line.rsplit(",", 1)[1]) for line in lines]
+    return wall
 
 
 def _cluster(workers: int) -> LocalCluster:
@@ -88,7 +86,7 @@ def _speed_up(folder: Path, quick: bool) -> Figures:
             address = cluster.scheduler_address
             # Each worker loads its kernels with its first run.
             _played(_RUNS.format(count=4 * workers, period=0.5), folder, address)
-            walls[workers], _ = _played(_RUNS.format(count=count, period=period), folder, address)
+            walls[workers] = _played(_RUNS.format(count=count, period=period), folder, address)
     return {
         "runs_with_1_worker_s": walls[1],
         "runs_with_2_workers_s": walls[2],
@@ -97,16 +95,24 @@ def _speed_up(folder: Path, quick: bool) -> Figures:
 
 
 def _tasks(folder: Path, quick: bool) -> Figures:
-    """Measure what a task costs beside its own work, and the memory of the worker that did it."""
+    """Measure what a row costs beside its own work, and the memory of the worker that did it."""
     figures: Figures = {}
-    rows = TASKS["model"].batch
+    path = folder / "work.yaml"
+    path.write_text(_TASKS.format(count=10))
+    rows = Study.read(path).rows
+    begin = 0.0
+    for place, row in enumerate(rows):
+        if place == 1:  # the first row loads the kernels
+            begin = time.perf_counter()
+        compute("model", row.values, Calibrated())
+    work = (time.perf_counter() - begin) / (len(rows) - 1)
     with _cluster(1) as cluster, Client(cluster) as client:
         address = cluster.scheduler_address
-        _played(_TASKS.format(count=2 * rows), folder, address)
+        _played(_TASKS.format(count=2), folder, address)
         for count in (10, 100) if quick else (10, 100, 1000):
-            wall, times = _played(_TASKS.format(count=count * rows), folder, address)
-            figures[f"cost_of_each_of_{count}_tasks_ms"] = (wall - sum(times)) / count * 1e3
-            figures[f"memory_after_{count}_tasks_mb"] = max(client.run(_memory).values())
+            wall = _played(_TASKS.format(count=count), folder, address)
+            figures[f"cost_of_each_of_{count}_rows_ms"] = (wall / count - work) * 1e3
+            figures[f"memory_after_{count}_rows_mb"] = max(client.run(_memory).values())
     return figures
 
 

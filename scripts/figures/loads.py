@@ -17,7 +17,7 @@ from der_planner.limb import Limb
 from der_planner.model import ArcModel, Model, simulate
 from der_planner.model.air import pair_of
 from der_planner.rod import RodState
-from der_planner.studies.cache import Twin, calibrated, read_limb
+from der_planner.studies.tasks import Twin, calibrated, limb_of
 from der_planner.twin import LimbTwin
 from der_planner.twin.limb_twin import ATMOSPHERE
 from workspace_setup.basics import ROOT
@@ -63,7 +63,7 @@ def draw_shapes(path: Path, seed: int) -> None:
     figure, axes = plt.subplots(1, 4, figsize=(13, 3.8), layout="constrained")
     cases = [(mounting, payload) for mounting in MOUNTINGS for payload in PAYLOADS]
     for axis, (mounting, payload) in zip(axes, cases, strict=True):
-        limb = read_limb(calibrated(Twin(seed, mounting=mounting), "")).carrying(payload)
+        limb = limb_of(calibrated(Twin(seed, mounting=mounting), "")).carrying(payload)
         for held in HELD:
             pressure = np.array(held)
             shapes = {"truth": true_shape(seed, limb, pressure)}

@@ -13,8 +13,7 @@ Nothing here uses the project's rod, arcs, twin, air or material laws. What is d
 
 Lengths (0.122 m each, no fittings), the limits of ±24 kPa and the mean gain, stiffness and mass per
 length are those of the default limb. A seed draws the hardware; seed, run and commands together
-give the same result, always: a run draws the sensors' noise and, where asked for, wandering rest
-angles. One second takes about 5 ms.
+give the same result, always: a run draws the sensors' noise. One second takes about 5 ms.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ import numpy as np
 from link_chain_kernel import Air, Links, State, advance
 from numpy.typing import ArrayLike, NDArray
 
-from der_planner.identification import CalibrationLog, calibration_run
+from der_planner.identification import CalibrationLog
 
 Array = NDArray[np.float64]
 
@@ -54,14 +53,12 @@ class Seen(NamedTuple):
     Attributes:
         time: since `reset` [s].
         differential_pressure: (M,) [Pa].
-        chamber_pressure: (M, 2) gauge [Pa].
         tip: (2,) [m].
         bend_angles: (M,) [rad].
     """
 
     time: float
     differential_pressure: Array
-    chamber_pressure: Array
     tip: Array
     bend_angles: Array
 
@@ -73,7 +70,6 @@ class Record(NamedTuple):
         time: (K,) [s].
         commanded_differential: (K, M) in force at the instant [Pa].
         measured_differential: (K, M) [Pa].
-        chamber_pressure: (K, M, 2) gauge [Pa].
         tip: (K, 2) [m].
         bend_angles: (K, M) [rad].
     """
@@ -81,20 +77,13 @@ class Record(NamedTuple):
     time: Array
     commanded_differential: Array
     measured_differential: Array
-    chamber_pressure: Array
     tip: Array
     bend_angles: Array
 
-    def log(self, source: str = "") -> CalibrationLog:
+    def log(self) -> CalibrationLog:
         """Return what `fit` takes."""
-        return CalibrationLog(
-            self.time,
-            self.commanded_differential,
-            self.measured_differential,
-            self.bend_angles,
-            self.tip,
-            source=source,
-        )
+        time, commanded, measured, tip, bend_angles = self
+        return CalibrationLog(time, commanded, measured, bend_angles, tip)
 
 
 class LinkChain:
@@ -106,9 +95,7 @@ class LinkChain:
         masses: fixed to the limb.
     """
 
-    segment_count = SEGMENTS
     length = SEGMENTS * SEGMENT_LENGTH
-    pressure_limit = 24_000.0
 
     def __init__(
         self, seed: int, gravity: ArrayLike = (0.0, 0.0, 0.0), masses: Sequence[Mass] = ()
@@ -144,9 +131,7 @@ class LinkChain:
         first = _first_frequency(free)
         self._viscosity = 2.0 * DAMPING_RATIO / first * self._stiffness
 
-    def _links(
-        self, gravity: Array, masses: Sequence[Mass], factor: ArrayLike = 1.0, wander: ArrayLike = 0
-    ) -> Links:
+    def _links(self, gravity: Array, masses: Sequence[Mass], factor: ArrayLike = 1.0) -> Links:
         count = len(self._lengths)
         mass = MASS_PER_LENGTH * self._lengths
         first, second = 0.5 * mass * self._lengths, mass * self._lengths**2 / 3.0
@@ -157,7 +142,6 @@ class LinkChain:
                 first[link] += value * along
                 second[link] += value * along**2
         outboard = np.append(np.cumsum(mass[::-1])[::-1][1:], 0.0)
-        rest = (self._rest + wander)[self._owner] / PER_SEGMENT
         return Links(
             length=self._lengths,
             outboard=outboard,
@@ -166,7 +150,7 @@ class LinkChain:
             stiffness=self._stiffness,
             viscosity=getattr(self, "_viscosity", np.zeros(count)),
             hardening=self._hardening,
-            rest=rest,
+            rest=self._rest[self._owner] / PER_SEGMENT,
             owner=self._owner,
             gain=self._gain * np.broadcast_to(factor, (SEGMENTS,))[:, None],
             width=SLIP_WIDTH,
@@ -186,20 +170,17 @@ class LinkChain:
         *,
         run: int = 0,
         noise: float = 0.0,
-        wander: float = 0.0,
         swing: ArrayLike = (0.0, 0.0),
     ) -> Seen:
         """Vent the limb, let it come to rest under its loads, and return what is seen then.
 
         Args:
-            run: of the same hardware; draws noise and wandering rest angles.
+            run: of the same hardware; draws the noise.
             noise: factor on the sensors' noise.
-            wander: standard deviation of the rest angles from run to run [rad].
             swing: bend rates (M,) with which it begins [rad/s].
         """
-        generator = np.random.default_rng([self.seed, run])
-        self._rest_of_run = wander * generator.standard_normal(SEGMENTS)
-        self._noise, self._generator = noise, generator
+        self._generator = np.random.default_rng([self.seed, run])
+        self._noise = noise
         self._factor = np.ones(SEGMENTS)
         self._push = (np.array([-1.0, 0.0]), np.zeros(2))
         self._time = 0.0
@@ -249,7 +230,7 @@ class LinkChain:
         self._push = (np.array([link, along]), np.array(force, dtype=float))
 
     def _rebuild(self) -> None:
-        self._built = self._links(self.gravity[:2], self.masses, self._factor, self._rest_of_run)
+        self._built = self._links(self.gravity[:2], self.masses, self._factor)
 
     def seen(self) -> Seen:
         """Return what the sensors show now, with the noise asked for in `reset`."""
@@ -259,7 +240,6 @@ class LinkChain:
         return Seen(
             self._time,
             chambers[:, 0] - chambers[:, 1],
-            chambers,
             noisy(self.nodes()[-1], TIP_NOISE),
             noisy(np.diff(ends), ANGLE_NOISE),
         )
@@ -284,7 +264,6 @@ class LinkChain:
         *,
         noise: float = 1.0,
         run: int = 0,
-        wander: float = 0.0,
         swing: ArrayLike = (0.0, 0.0),
         gains: Sequence[tuple[float, ArrayLike]] = (),
     ) -> Record:
@@ -294,7 +273,7 @@ class LinkChain:
             time: (K,) rising instants [s]; each command holds until the next, the last one 50 ms.
             commands: (K, M) [Pa].
             camera_rate: [Hz]; the first image is at ``time[0]``. 0: images at ``time``.
-            noise, run, wander, swing: as of `reset`.
+            noise, run, swing: as of `reset`.
             gains: (instant [s], factor or (M,) factors) on the gains from then on.
         """
         instants, wanted = np.asarray(time, dtype=float), np.asarray(commands, dtype=float)
@@ -303,7 +282,7 @@ class LinkChain:
         if camera_rate > 0:
             images = np.arange(instants[0], end + 1e-9, 1.0 / camera_rate)
         changes = sorted(gains, key=lambda change: change[0])
-        self.reset(run=run, noise=noise, wander=wander, swing=swing)
+        self.reset(run=run, noise=noise, swing=swing)
         self._time = float(instants[0])
         seen, held, k = [], np.zeros_like(wanted[0]), 0
         boundaries = np.concatenate([instants, images, [at for at, _ in changes if at < end]])
@@ -318,21 +297,6 @@ class LinkChain:
                 held, k = wanted[k], k + 1
         table = [np.stack(column) for column in zip(*(one for one, _ in seen), strict=True)]
         return Record(images[: len(seen)], np.stack([u for _, u in seen]), *table[1:])
-
-    def log(
-        self, *, amplitude: float = 0.7, quick: bool = True, run: int = 1, swing: ArrayLike = (0, 0)
-    ) -> CalibrationLog:
-        """Play the project's own excitation and return what `fit` takes, at 30 Hz.
-
-        Args:
-            amplitude: share of the pressure limit.
-            quick: 86 s of waves and sweep instead of 198 s.
-            run: draws the noise.
-            swing: bend rates (M,) with which the log begins [rad/s].
-        """
-        excitation = calibration_run(amplitude * self.pressure_limit, SEGMENTS, quick)
-        played = self.play(excitation.time, excitation.differential_pressure, run=run, swing=swing)
-        return played.log(f"chain of links, seed {self.seed}, run {run}")
 
 
 def _first_frequency(links: Links) -> float:

@@ -83,14 +83,6 @@ def test_a_valve_that_opens_in_proportion_to_its_error_is_recognised():
     assert one_lag.numbers["vent_time_constant"] == pytest.approx(0.3, abs=0.03)
 
 
-def test_a_log_that_never_waits_for_an_outlet_leaves_venting_open():
-    air = replace(AIR, vent_rate=5300.0)
-    slow = waves(1_500.0, 2, 300.0)
-    found = fit_air(synthetic_log(air, slow), PERIOD)
-    assert "vent_rate" not in found.numbers
-    assert found.numbers["time_constant"] + found.numbers["delay"] == pytest.approx(0.34, abs=0.1)
-
-
 def test_a_vented_step_of_the_emulated_board_is_predicted():
     """Whose law has chambers of their own, dead bands and coupled neighbours besides."""
     amplitude = 0.7 * Limb.default().pneumatics.pressure_limit

@@ -179,18 +179,6 @@ def test_an_angle_that_is_held_while_its_edge_moves():
     np.testing.assert_allclose(predicted, expected, atol=1e-5 * np.abs(expected).max())
 
 
-def test_adjoint_is_the_transpose_of_the_tangent(motion):
-    linearisation = motion[-1].linearisation
-    random = np.random.default_rng(4)
-    change = random.normal(size=(30, 3, 2))
-    count = len(linearisation.outputs)
-    weight = random.normal(size=(31, count))
-    gradient = linearisation.adjoint(weight, by_step=True)
-    forward = np.sum(weight * linearisation.tangent(change))
-    assert np.sum(gradient * change) == pytest.approx(forward, rel=1e-9)
-    np.testing.assert_allclose(linearisation.adjoint(weight), gradient.sum(axis=1), rtol=1e-12)
-
-
 def test_sensitivity_is_the_matrix_of_the_tangent(motion):
     linearisation = motion[-1].linearisation
     matrix = linearisation.sensitivity()

@@ -9,12 +9,6 @@ from der_planner.twin.offline import play
 from pressure_driver.emulator.pneumatics import BoardPneumatics
 
 
-def test_each_differential_goes_into_one_chamber_of_its_pair():
-    np.testing.assert_array_equal(
-        pair_of(np.array([300.0, -20.0])).ravel(), [300.0, 0.0, 0.0, 20.0]
-    )
-
-
 def test_rows_are_what_was_before_the_setpoint():
     time = np.arange(40) * 0.05
     pressure = np.zeros((40, 2))

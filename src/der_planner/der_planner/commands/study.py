@@ -16,11 +16,10 @@ from pathlib import Path
 
 from der_planner.experiment.console import OptionError, Progress, interrupt_once, run_command
 from der_planner.results.outputs import check_folder
-from der_planner.studies.conduct import PlaySettings, conduct
+from der_planner.studies.conduct import PlaySettings, Store, conduct
 from der_planner.studies.factors import ERROR, PLANNED, StudyError, limb_parameters, of_task
-from der_planner.studies.store import Store
+from der_planner.studies.report import means_table, summarise
 from der_planner.studies.study import SHIPPED, Study
-from der_planner.studies.summary import summarise, text_table
 from der_planner.studies.tasks import TASKS
 
 
@@ -92,7 +91,7 @@ def _play(given: argparse.Namespace) -> int:
     kept = conduct(study, settings, progress)
     page = summarise(study, kept, Store(out, study))
     failed = sum(row["error"] is not None for row in kept.values())
-    print(text_table(study, kept))
+    print(means_table(study, kept).text())
     progress.say(f"{len(kept)} of {len(study.rows)} rows are done, {failed} of them failed")
     if failed:
         progress.say("failed rows are in the report; --retry-failed does them again")

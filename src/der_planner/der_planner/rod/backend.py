@@ -1,4 +1,4 @@
-"""Arrays and compiled kernels of one rod: what rods in a plane and in space share.
+"""State, arrays and compiled kernels of one rod: what rods in a plane and in space share.
 
 The kernels know some coordinates only (in a plane two a node), and with a ghost clamp one node
 more, before the others. A backend goes between their unknowns and the public layout q in R^(4N-1).
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,8 +17,63 @@ from numpy.typing import NDArray
 from der_planner.arrays import Array
 from der_planner.rod import banded_kernel
 from der_planner.rod.mesh import Mesh
-from der_planner.rod.state import RodState
 from der_planner.rod.step_kernel import Base, Body, Place, Record, Solver
+
+
+@dataclass(frozen=True)
+class RodState:
+    """Configuration and velocity of N nodes, with the frames that its angles count from.
+
+    Attributes:
+        q: (4N-1,) positions [m] and edge angles [rad]: x0, φ0, x1, φ1, …, x_{N-1}.
+        v: (4N-1,) its rate [m/s, rad/s].
+        directors: (N-1, 3) first reference director of each edge, time-parallel transported from
+            the straight rod; φ is counted from it.
+        reference_twist: (N,) twist of the reference frames at each node [rad] (node 0: against the
+            ghost edge; the last entry is not used).
+    """
+
+    q: Array
+    v: Array
+    directors: Array
+    reference_twist: Array
+
+    @property
+    def positions(self) -> Array:
+        """(N, 3) node positions [m]."""
+        return positions_of(self.q)
+
+    @property
+    def angles(self) -> Array:
+        """(N-1,) edge angles φ [rad]."""
+        return self.q[3::4].copy()
+
+
+def positions_of(q: Array) -> Array:
+    """Return the (…, N, 3) node positions of (…, 4N-1) configurations."""
+    padded = np.concatenate([q, np.zeros((*q.shape[:-1], 1))], axis=-1)
+    nodes = padded.shape[-1] // 4
+    return padded.reshape(*q.shape[:-1], nodes, 4)[..., :3].copy()
+
+
+class ConvergenceError(RuntimeError):
+    """Newton's iteration did not converge; nothing wrong was returned.
+
+    Attributes:
+        step: index of the time step (or load step) that failed, 0 for a single step.
+        residual: largest component of the last Newton update [m or rad].
+        iterations: Newton iterations spent in the failed step.
+        state: the last converged state, from which a caller may go on with a shorter step.
+    """
+
+    def __init__(
+        self, message: str, *, step: int, residual: float, iterations: int, state: RodState
+    ) -> None:
+        super().__init__(message)
+        self.step = step
+        self.residual = residual
+        self.iterations = iterations
+        self.state = state
 
 
 class Piece(NamedTuple):

@@ -143,16 +143,6 @@ def add_product(a: Array, x: Array, y: Array) -> None:
 
 
 @kernel
-def add_transposed_product(a: Array, x: Array, y: Array) -> None:
-    """Add Aᵀ x to y for a general band a and vectors x, y (n,)."""
-    n = a.shape[0]
-    b = (a.shape[1] - 1) // 2
-    for i in range(n):
-        for k in range(max(0, i - b), min(n, i + b + 1)):
-            y[k] += a[i, k - i + b] * x[i]
-
-
-@kernel
 def solve_columns(a: Array, x: Array) -> None:
     """Solve L U y = x in place for the columns of x (n, C)."""
     n = a.shape[0]
@@ -185,19 +175,3 @@ def solve_one(a: Array, x: Array) -> None:
         for k in range(i + 1, min(n, i + b + 1)):
             x[i] -= a[i, k - i + b] * x[k]
         x[i] *= a[i, b]
-
-
-@kernel
-def solve_transposed(a: Array, x: Array) -> None:
-    """Solve (L U)ᵀ y = x in place for one column x (n,)."""
-    n = a.shape[0]
-    b = (a.shape[1] - 1) // 2
-    for i in range(n):
-        x[i] *= a[i, b]
-        value = x[i]
-        for k in range(i + 1, min(n, i + b + 1)):
-            x[k] -= a[i, k - i + b] * value
-    for i in range(n - 1, -1, -1):
-        value = x[i]
-        for k in range(max(0, i - b), i):
-            x[k] -= a[i, k - i + b] * value

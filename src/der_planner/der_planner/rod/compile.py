@@ -1,7 +1,7 @@
 """How the kernels are compiled and when a cached compilation is stale.
 
 Numba checks only the file of a cached function, not the files of the functions that it calls. The
-decorator here therefore drops the caches of the whole package when any kernel source has changed.
+module therefore drops the caches of a whole part when any of its kernels' sources has changed.
 """
 
 from __future__ import annotations
@@ -14,26 +14,29 @@ from typing import Any
 
 import numba
 
-_FOLDER = Path(__file__).resolve().parent
+PARTS = [Path(__file__).resolve().parents[1] / name for name in ("rod", "model", "twin")]
+"""Folders of the parts of this package that have compiled kernels."""
 _FLAGS = {"contract", "reassoc", "nsz", "arcp"}  # NaN must stay visible: it ends an iteration
 
 
-def drop_stale_caches() -> None:
-    """Delete cached kernels if any kernel source is not the one that they were compiled from."""
-    digest = hashlib.sha256()
-    for source in [Path(__file__), *sorted(_FOLDER.rglob("*_kernel.py"))]:
-        digest.update(source.read_bytes())
-    stamp = _FOLDER / "__pycache__" / "kernels.sha256"
+def drop_stale_caches(folder: Path) -> None:
+    """Delete a part's cached kernels if a source of them is not what they were compiled from."""
+    digest = hashlib.sha256(Path(__file__).read_bytes())
+    for source in sorted(folder.rglob("*.py")):
+        if b"njit" in source.read_bytes() or source.stem.endswith("_kernel"):
+            digest.update(source.read_bytes())
+    stamp = folder / "__pycache__" / "kernels.sha256"
     with contextlib.suppress(OSError):  # a read-only install: numba then caches elsewhere by itself
         if stamp.exists() and stamp.read_text() == digest.hexdigest():
             return
         stamp.parent.mkdir(exist_ok=True)
-        for index in _FOLDER.rglob("__pycache__/*_kernel.*.nbi"):
+        for index in folder.rglob("__pycache__/*.nbi"):
             index.unlink(missing_ok=True)
         stamp.write_text(digest.hexdigest())
 
 
-drop_stale_caches()
+for part in PARTS:
+    drop_stale_caches(part)
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.arrays import Array
-from der_planner.rod.backend import Backend, Piece
+from der_planner.rod.backend import Backend, ConvergenceError, Piece, RodState
 from der_planner.rod.mesh import require
-from der_planner.rod.state import ConvergenceError, RodState
 from der_planner.rod.step_kernel import Place, Record, Solver
 from der_planner.rod.trajectory import Solved
 

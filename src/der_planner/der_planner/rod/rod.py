@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from der_planner.arrays import Array
 from der_planner.limb import Limb
+from der_planner.rod.backend import RodState, positions_of
+from der_planner.rod.dimensions import PlanarBackend, SpatialBackend
 from der_planner.rod.integration import Integrator, Method, find_equilibrium
 from der_planner.rod.mesh import (
     Mesh,
@@ -24,9 +26,6 @@ from der_planner.rod.mesh import (
     require,
     voronoi_lengths,
 )
-from der_planner.rod.planar.backend import PlanarBackend
-from der_planner.rod.spatial.backend import SpatialBackend
-from der_planner.rod.state import RodState, positions_of
 from der_planner.rod.trajectory import Trajectory, linearisation_of, step_matrices
 
 Plane = Literal["xy", "xz"]
@@ -188,7 +187,6 @@ class Rod:
         motion = self.simulate(state, still, 1e-3, linearise=True)
         if motion.linearisation is not None:
             motion.linearisation.tangent(still)
-            motion.linearisation.adjoint(np.zeros((2, len(motion.linearisation.outputs))))
             motion.linearisation.sensitivity()
         self.linearise_step(state, still[0], 1e-3)
         self.energy(state)
@@ -271,8 +269,8 @@ class Rod:
             method: as in `step`.
             forces: (N, 3) constant point forces [N].
             linearise: also keep the exact linearisation of every step: `Trajectory.linearisation`
-                has `.tangent(pressure change) -> output change`, `.adjoint(output weight) ->
-                gradient` and `.sensitivity(pulse=None)` (K+1, P, K, M), all compiled.
+                has `.tangent(pressure change) -> output change` and `.sensitivity(pulse=None)`
+                (K+1, P, K, M), both compiled.
             outputs: (P,) indices into q of the outputs; default the tip's free coordinates.
             halvings: how often a step may be cut in two; 0 means never.
 

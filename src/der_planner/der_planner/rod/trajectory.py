@@ -9,12 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from der_planner.arrays import Array
-from der_planner.rod import sensitivity_kernel
-from der_planner.rod.backend import Backend
+from der_planner.rod import step_kernel
+from der_planner.rod.backend import Backend, RodState, positions_of
 from der_planner.rod.mesh import array, by_step, require
-from der_planner.rod.sensitivity_kernel import SolveChain
-from der_planner.rod.state import RodState, positions_of
-from der_planner.rod.step_kernel import Record
+from der_planner.rod.step_kernel import Record, SolveChain
 
 
 class Solved(NamedTuple):
@@ -36,9 +34,9 @@ class Solved(NamedTuple):
 class Linearisation:
     """First-order effect of the pressures on P outputs along a simulated motion of K intervals.
 
-    A product with the K·P × K·M sensitivity (`tangent`) or its transpose (`adjoint`) costs about as
-    much as the simulation's linear solves; the matrix itself (`sensitivity`) K/2 times as much, at
-    vector speed. Both ways are exact for the discrete motion.
+    A product with the K·P × K·M sensitivity (`tangent`) costs about as much as the simulation's
+    linear solves; the matrix itself (`sensitivity`) K/2 times as much, at vector speed. Both are
+    exact for the discrete motion.
 
     In space an output that is an angle counts from frames transported from those of the simulated
     motion, as `Rod.state(q, like=…)` does; positions do not depend on frames.
@@ -73,7 +71,7 @@ class Linearisation:
         change = by_step(pressures, self.steps, self.input_count)
         require(len(change) == self.intervals, "pressures", f"{self.intervals} rows", len(change))
         out = np.empty((self.intervals + 1, len(self.outputs)))
-        sensitivity_kernel.tangent(change, self._initial(start), self._chain, out)
+        step_kernel.tangent(change, self._initial(start), self._chain, out)
         return out
 
     def _initial(self, start: tuple[ArrayLike, ArrayLike] | None) -> Array:
@@ -82,22 +80,6 @@ class Linearisation:
             for row, value in enumerate(start):
                 initial[row, self._state_rows] = array(value, self._state_rows.shape, "start")
         return initial
-
-    def adjoint(self, weights: ArrayLike, *, by_step: bool = False) -> Array:
-        """Return the gradient of Σ weights·outputs by the pressures: the transpose of `tangent`.
-
-        Args:
-            weights: (K+1, P).
-            by_step: keep one row for each step, (K, S, M), instead of (K, M).
-        """
-        weight = array(weights, (self.intervals + 1, len(self.outputs)), "weights")
-        gradient = np.empty((self.intervals, self.steps, self.input_count))
-        start = np.empty((2, len(self._chain.mass)))
-        sensitivity_kernel.adjoint(weight, self._chain, gradient, start)
-        if by_step:
-            return gradient
-        total: Array = gradient.sum(axis=1)
-        return total
 
     def sensitivity(self, pulse: ArrayLike | None = None) -> Array:
         """Return ∂output/∂input (K+1, P, K, M) [m/Pa], zero where the input comes later.
@@ -113,7 +95,7 @@ class Linearisation:
             rows = np.shape(pulse)[0] if np.ndim(pulse) else 0
             shape = array(pulse, (rows, self.input_count), "pulse")
         out = np.zeros((self.intervals + 1, len(self.outputs), self.intervals, self.input_count))
-        sensitivity_kernel.sensitivity(shape, self.intervals, self.steps, 16, self._chain, out)
+        step_kernel.sensitivity(shape, self.intervals, self.steps, 16, self._chain, out)
         return out
 
 
@@ -178,6 +160,6 @@ def step_matrices(backend: Backend, solved: Solved) -> tuple[Array, Array]:
     for solve in range(len(solved.steps)):
         y = np.zeros(shape)
         y[:, 2 * count :] = solved.record.inputs[solve]
-        sensitivity_kernel.advance(solve, dq, dv, y, before, chain)
+        step_kernel.advance(solve, dq, dv, y, before, chain)
     both = np.concatenate([dq[rows], dv[rows]])
     return both[:, : 2 * count], both[:, 2 * count :]

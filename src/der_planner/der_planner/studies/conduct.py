@@ -2,51 +2,54 @@
 
 Workers are processes of this machine, or of a Dask cluster that runs already. They import this
 module: they need the package, its dependencies and nothing of the study's folder.
+
+A row is kept as a small Parquet file, whole or not there: it is written beside its place and moved
+there. Its name is the row's key, so no row is there twice. A study that was stopped goes on where
+it was, whatever stopped it.
 """
 
 from __future__ import annotations
 
 import contextlib
-import itertools
+import csv
+import errno
+import io
 import logging
 import math
 import os
 import queue
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import pyarrow as pa
+import pyarrow.parquet
 from distributed import Client, Future, LocalCluster
 from distributed.scheduler import KilledWorker
 from threadpoolctl import threadpool_limits
 
 from der_planner.experiment.console import Progress
-from der_planner.studies import cache
-from der_planner.studies.cache import Twin
-from der_planner.studies.factors import StudyError
-from der_planner.studies.store import Kept, Outcome, Store
+from der_planner.studies.factors import StudyError, Value
 from der_planner.studies.study import Row, Study
-from der_planner.studies.tasks import TASKS, Values
+from der_planner.studies.tasks import TASKS, Twin, calibrated, digest
 
+Kept = dict[str, Any]
+"""A row as it is kept: key, factors, results, error and sources by column."""
 _AHEAD = 20
-"""Batchs of work under way for each thread of the cluster, so that none waits for its next."""
+"""Rows under way for each thread of the cluster, so that none waits for its next."""
 _LEAST_AHEAD = 200
-"""Batchs of work under way in any case."""
+"""Rows under way in any case."""
 _PAUSE = 0.5
 """The cluster is looked at again after this time [s] at the latest."""
-_PATIENCE = 10.0
+PATIENCE = 10.0
 """A scheduler that should be there is waited for this long [s]."""
 ALONE = 30.0
-"""New workers are started, or asked for, after this time [s] without any."""
-_STARTS = 3
-"""Starts of workers, one after the other, that may bring no row at all."""
+"""Time [s] without any process of this machine after which a study ends."""
 _JOIN = "python3 scripts/workspace.py exec dask worker {} --nthreads 1"
-
-
-class ClusterLostError(ConnectionError):
-    """The scheduler is gone, or all processes of this machine, and what had not come back."""
+_KEPT = "Rows that are there are kept: the same command goes on from here"
 
 
 class PlaySettings(NamedTuple):
@@ -76,14 +79,15 @@ def conduct(study: Study, settings: PlaySettings, progress: Progress) -> dict[st
     """
     store = Store(settings.out, study)
     rows = study.rows[: settings.limit]
-    kept = store.load()
-    if store.unreadable:
-        progress.say(f"{store.unreadable} files of rows were not whole: done again")
-    again = {key for key, each in kept.items() if each["error"] and settings.retry_failed}
-    missing = [row for row in rows if row.key not in kept or row.key in again]
-    there = [kept[row.key] for row in rows if row.key in kept and row.key not in again]
-    failed = sum(each["error"] is not None for each in there)
-    if {each["sources"] for each in there} - {cache.digest()}:
+    there = {
+        key: each
+        for key, each in store.load().items()
+        if not (each["error"] and settings.retry_failed)
+    }
+    missing = [row for row in rows if row.key not in there]
+    done = [there[row.key] for row in rows if row.key in there]
+    failed = sum(each["error"] is not None for each in done)
+    if {each["sources"] for each in done} - {digest()}:
         progress.say(
             "WARNING: some rows that are there were made by other sources or libraries; for rows "
             "that compare in the last digits choose another --out"
@@ -93,12 +97,111 @@ def conduct(study: Study, settings: PlaySettings, progress: Progress) -> dict[st
         + (f" ({failed} of those done have failed)" if failed else "")
     )
     if missing:
-        store.forget({row.key for row in missing})
-        conductor = _Conductor(study, settings, store, progress)
-        conductor.done, conductor.failed, conductor.total = len(there), failed, len(rows)
-        conductor.play(missing)
-    done = store.load()
-    return {row.key: done[row.key] for row in rows if row.key in done}
+        with _cluster(settings) as client:
+            _Conductor(study, settings.scheduler, store, progress).play(client, missing)
+    kept = store.load()
+    return {row.key: kept[row.key] for row in rows if row.key in kept}
+
+
+# Rows on disk ------------------------------------------------------------------------------------
+
+
+class Outcome(NamedTuple):
+    """What became of one row.
+
+    Attributes:
+        results: by column; empty after an error.
+        error: kind and message.
+        sources: digest of the sources that computed it.
+    """
+
+    results: dict[str, float]
+    error: str = ""
+    sources: str = ""
+
+
+def _write_whole(path: Path, data: bytes) -> None:
+    """Write a file whole or not at all."""
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        unfinished.write_bytes(data)
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+class Store:
+    """The folder of a study: ``study.yaml``, ``rows/*.parquet``, at its end ``rows.csv``.
+
+    Args:
+        folder: made if missing.
+        study: whose rows are kept.
+
+    Raises:
+        StudyError: the folder cannot be written.
+    """
+
+    def __init__(self, folder: Path, study: Study) -> None:
+        self.folder, self._study = folder, study
+        kinds = {float: pa.float64(), int: pa.int64(), str: pa.string()}
+        columns = [("key", pa.string())]
+        columns += [(name, kinds[type(each.default)]) for name, each in study.factors.items()]
+        columns += [(name, pa.float64()) for name in study.keep]
+        self._schema = pa.schema([*columns, ("error", pa.string()), ("sources", pa.string())])
+        with self._written():
+            (folder / "rows").mkdir(parents=True, exist_ok=True)
+            _write_whole(folder / "study.yaml", study.text.encode())
+
+    @contextlib.contextmanager
+    def _written(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            remedy = "free some space" if error.errno == errno.ENOSPC else "make it writable"
+            raise StudyError(
+                f"cannot write into {self.folder}: {error.strerror or error}. Rows that are there "
+                f"are kept: {remedy} and start again with the same --out, or choose another"
+            ) from error
+
+    def keep(self, row: Row, outcome: Outcome) -> None:
+        """Write a finished row, whole or not at all.
+
+        Raises:
+            StudyError: the disk is full, or the folder cannot be written any more.
+        """
+        results = {name: outcome.results.get(name) for name in self._study.keep}
+        ended = {"error": outcome.error or None, "sources": outcome.sources}
+        record = {"key": row.key, **row.values, **results, **ended}
+        buffer = io.BytesIO()
+        pyarrow.parquet.write_table(pa.Table.from_pylist([record], self._schema), buffer)
+        with self._written():
+            _write_whole(self.folder / "rows" / f"{row.key}.parquet", buffer.getvalue())
+
+    def load(self) -> dict[str, Kept]:
+        """Return the rows of the study that are done, by key, in the order of the table.
+
+        A file that is not whole, as after a loss of power, is removed. A row that was kept without
+        a column that the study now asks for counts as not done.
+        """
+        found: dict[str, Kept] = {}
+        for path in sorted((self.folder / "rows").glob("*.parquet")):
+            try:
+                table = pyarrow.parquet.read_table(path)
+            except (pa.ArrowInvalid, OSError):
+                path.unlink(missing_ok=True)
+                continue
+            if set(self._study.keep) <= set(table.column_names):
+                found |= {record["key"]: record for record in table.to_pylist()}
+        return {row.key: found[row.key] for row in self._study.rows if row.key in found}
+
+    def write_table(self, kept: Mapping[str, Kept]) -> None:
+        """Write all rows as one table, ``rows.csv``, in the order of the study."""
+        text = io.StringIO()
+        table = csv.DictWriter(text, self._schema.names, extrasaction="ignore")
+        table.writeheader()
+        table.writerows(kept.values())
+        with self._written():
+            _write_whole(self.folder / "rows.csv", text.getvalue().encode())
 
 
 # On the workers ----------------------------------------------------------------------------------
@@ -112,47 +215,28 @@ class Calibrated(NamedTuple):
     sources: str = ""
 
 
-class BatchReport(NamedTuple):
-    """What a worker sends back for some rows.
-
-    Attributes:
-        outcomes: one for each row.
-        seconds: that it took.
-        sources: digest of the worker's sources.
-    """
-
-    outcomes: tuple[Outcome, ...]
-    seconds: float
-    sources: str
-
-
 def calibrate(twin: Twin, prior: str) -> Calibrated:
-    """Return the calibrated limb of a twin, see `cache.calibrated`."""
+    """Return the calibrated limb of a twin, see `tasks.calibrated`."""
     try:
-        return Calibrated(cache.calibrated(twin, prior), sources=cache.digest())
+        return Calibrated(calibrated(twin, prior), sources=digest())
     except Exception as error:
-        return Calibrated(error=f"calibration of {twin}: {_words(error)}", sources=cache.digest())
+        return Calibrated(error=f"calibration of {twin}: {_words(error)}", sources=digest())
 
 
-def compute(task: str, rows: Sequence[Values], limb: Calibrated) -> BatchReport:
-    """Compute rows of a task, beginning with a limb; on one thread, errors kept as results."""
-    begin = time.perf_counter()
-    with threadpool_limits(1):
-        outcomes = [_outcome(task, values, limb) for values in rows]
-    # A limb that another version calibrated makes rows of another version.
-    sources = limb.sources or cache.digest()
-    return BatchReport(tuple(outcomes), time.perf_counter() - begin, sources)
-
-
-def _outcome(task: str, values: Values, limb: Calibrated) -> Outcome:
+def compute(task: str, values: Mapping[str, Value], limb: Calibrated) -> Outcome:
+    """Compute a row of a task, beginning with a limb; on one thread, an error kept as a result."""
+    # A limb that another version calibrated makes a row of another version.
+    sources = limb.sources or digest()
     if limb.error:
-        return Outcome({}, limb.error)
+        return Outcome({}, limb.error, sources)
     try:
-        found = TASKS[task].compute(limb.limb, values)
+        with threadpool_limits(1):
+            found = TASKS[task].compute(limb.limb, values)
     except Exception as error:
-        return Outcome({}, _words(error))
+        return Outcome({}, _words(error), sources)
     # Parquet tells NaN from nothing, people and JSON do not.
-    return Outcome({name: value for name, value in found.items() if not math.isnan(value)})
+    told = {name: value for name, value in found.items() if not math.isnan(value)}
+    return Outcome(told, sources=sources)
 
 
 def _words(error: BaseException) -> str:
@@ -163,219 +247,138 @@ def _words(error: BaseException) -> str:
 
 
 @contextlib.contextmanager
-def local(workers: int | None) -> Iterator[Client]:
-    """Start worker processes with one thread each on this machine, one a core by default.
+def _cluster(settings: PlaySettings) -> Iterator[Client]:
+    """Join a cluster, or start processes with one thread each on this machine.
 
     Raises:
-        StudyError: they did not start.
-    """
-    logging.getLogger("distributed").setLevel(logging.ERROR)
-    try:
-        cluster = LocalCluster(
-            n_workers=workers or len(os.sched_getaffinity(0)),
-            threads_per_worker=1,
-            processes=True,
-            host="127.0.0.1",
-            dashboard_address="127.0.0.1:0",
-            memory_limit=0,
-            silence_logs=logging.CRITICAL,
-        )
-    except (OSError, TimeoutError, RuntimeError) as error:
-        raise StudyError(f"the workers of this machine did not start: {error}") from error
-    with cluster, Client(cluster, set_as_default=False) as client:
-        yield client
-
-
-@contextlib.contextmanager
-def remote(address: str, again: bool) -> Iterator[Client]:
-    """Join a cluster by the address of its scheduler; one that was lost is waited for.
-
-    Raises:
-        StudyError: nothing answers there, and has not before.
+        StudyError: nothing answers at the address, or the processes did not start.
     """
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    client: Client | None = None
-    while client is None:
+    with contextlib.ExitStack() as stack:
         try:
-            client = Client(address, timeout=_PATIENCE, set_as_default=False)
-        except (OSError, TimeoutError, ValueError) as error:
-            if again:
-                time.sleep(_PAUSE)
-                continue
+            where: Any = settings.scheduler
+            if not where:
+                where = stack.enter_context(
+                    LocalCluster(
+                        n_workers=settings.workers or len(os.sched_getaffinity(0)),
+                        threads_per_worker=1,
+                        processes=True,
+                        host="127.0.0.1",
+                        dashboard_address="127.0.0.1:0",
+                        memory_limit=0,
+                        silence_logs=logging.CRITICAL,
+                    )
+                )
+            client = Client(where, timeout=PATIENCE, set_as_default=False)
+        except (OSError, TimeoutError, RuntimeError, ValueError) as error:
             raise StudyError(
-                f"no Dask scheduler answers at {address} ({error}): start one with 'dask "
-                "scheduler', give the address that it prints, or leave --scheduler away to use "
-                "this machine alone"
+                f"no Dask scheduler answers at {settings.scheduler or 'this machine'} ({error}): "
+                "start one with 'dask scheduler' and give the address that it prints, or leave "
+                "--scheduler away to use this machine alone"
             ) from error
-    try:
-        yield client
-    finally:
-        with contextlib.suppress(Exception):
-            client.close(timeout=2)
-
-
-class Batch(NamedTuple):
-    """Rows that one task computes; the batch with the lowest place is begun first."""
-
-    rows: tuple[Row, ...]
-    twin: Twin | None
-    place: int
-
-
-def batches(study: Study, rows: Sequence[Row]) -> Iterator[Batch]:
-    """Return the rows in batches of what a task computes together; a batch has one twin."""
-    place = itertools.count()
-    for twin, group in itertools.groupby(rows, key=lambda row: study.task.twin(row.values)):
-        left = list(group)
-        for begin in range(0, len(left), study.task.batch):
-            yield Batch(tuple(left[begin : begin + study.task.batch]), twin, next(place))
+        try:
+            yield client
+        finally:
+            with contextlib.suppress(Exception):
+                client.close(timeout=2)
 
 
 class _Conductor:
-    """Sends rows out and keeps what comes back, on one cluster after another if need be."""
+    """Sends rows out to a cluster and keeps what comes back."""
 
-    def __init__(
-        self, study: Study, settings: PlaySettings, store: Store, progress: Progress
-    ) -> None:
-        self._study, self._settings, self._store = study, settings, store
-        self._progress = progress
-        self.done = self.failed = self.total = 0
-        self._begun, self._made = time.monotonic(), 0
-        self._left: deque[Batch] = deque()
-        self._sent: dict[str, tuple[Future, Batch]] = {}
+    def __init__(self, study: Study, scheduler: str, store: Store, progress: Progress) -> None:
+        self._study, self._scheduler = study, scheduler
+        self._store, self._progress = store, progress
+        self._sent: dict[str, tuple[Future, Row]] = {}
         self._twins: dict[Twin, Future] = {}
         self._back: queue.SimpleQueue[Future] = queue.SimpleQueue()
-        self._threads = 0
-        self._seen = self._manned = 0.0
+        self._begun = self._manned = time.monotonic()
+        self._seen, self._threads = 0.0, 0
+        self._made = self._failed = 0
 
-    def play(self, rows: Sequence[Row]) -> None:
-        """Play rows, on a new cluster each time that one is lost.
-
-        Raises:
-            StudyError: the disk is full, no worker lasts, or one has other sources.
-        """
-        self._left.extend(batches(self._study, rows))
-        scheduler, lost, starts = self._settings.scheduler, False, 0
-        while self._left:
-            made = self._made
-            join = remote(scheduler, lost) if scheduler else local(self._settings.workers)
-            try:
-                with join as client:
-                    self._play_on(client)
-            except ClusterLostError as error:
-                lost, starts = True, 1 if self._made > made else starts + 1
-                if not scheduler and starts == _STARTS:
-                    raise StudyError(
-                        f"the worker processes of this machine ended {starts} times before a row "
-                        "was done: see that memory and disk are not full. Rows that are there are "
-                        "kept"
-                    ) from error
-                gone = "the worker processes of this machine are gone: starting new ones. "
-                if scheduler:
-                    gone = f"the scheduler at {scheduler} is gone: waiting for it to come back. "
-                self._progress.say(f"{gone}{self.done} of {self.total} rows are kept")
-
-    def _play_on(self, client: Client) -> None:
-        """Play the batches that are left on one cluster.
+    def play(self, client: Client, rows: Sequence[Row]) -> None:
+        """Play rows.
 
         Raises:
-            ClusterLostError: it is gone; what had not come back is left again.
+            StudyError: the disk is full, the cluster is gone, or a worker has other sources.
         """
+        where = self._scheduler or "this machine"
         workers = client.nthreads()
-        where = self._settings.scheduler or "this machine"
-        self._progress.say(
-            f"{len(workers)} workers with {sum(workers.values())} threads at {where}; "
-            f"dashboard: {client.dashboard_link}"
-        )
+        self._progress.say(f"{len(workers)} workers at {where}; dashboard: {client.dashboard_link}")
         if not workers:
             self._progress.say(f"no worker has joined yet: {_JOIN.format(where)}")
-        self._back = queue.SimpleQueue()
-        self._manned = time.monotonic()
+        left = deque(enumerate(rows))
         try:
-            while self._left or self._sent:
-                self._check(client)
-                self._send(client)
+            while left or self._sent:
+                self._look(client, len(rows))
+                while left and len(self._sent) < max(_LEAST_AHEAD, _AHEAD * self._threads):
+                    self._send(client, *left.popleft())
                 with contextlib.suppress(queue.Empty):
                     self._keep(self._back.get(timeout=_PAUSE))
         finally:
-            # What is under way is not lost, it is to do.
-            self._left.extendleft(batch for _, batch in reversed(self._sent.values()))
             futures = [*(future for future, _ in self._sent.values()), *self._twins.values()]
-            self._sent, self._twins = {}, {}
             if futures and client.status == "running":
                 client.cancel(futures, force=True)
-        self._show()
+        self._show(len(rows))
 
-    def _check(self, client: Client) -> None:
+    def _look(self, client: Client, total: int) -> None:
         """See now and then whether the cluster is there, and show how far the study is."""
         now = time.monotonic()
         if now - self._seen < _PAUSE:
             return
-        if client.status != "running":
-            raise ClusterLostError(client.status)
         try:
+            if client.status != "running":
+                raise OSError(client.status)
             self._threads = sum(client.nthreads().values())
         except (OSError, TimeoutError, RuntimeError, ValueError) as error:
-            raise ClusterLostError(str(error)) from error
+            raise StudyError(f"the scheduler is gone ({error}). {_KEPT}") from error
         self._seen = now
-        if self._threads:
+        if self._threads or self._scheduler:
             self._manned = now
         elif now - self._manned > ALONE:
-            if not self._settings.scheduler:
-                raise ClusterLostError("no process of this machine is left")
-            self._manned = math.inf  # it is said once
-            join = _JOIN.format(self._settings.scheduler)
-            self._progress.say(f"no worker is there any more: {join}")
-        self._show()
+            raise StudyError(f"no worker process of this machine is left. {_KEPT}")
+        self._show(total)
 
-    def _send(self, client: Client) -> None:
-        """Keep enough work under way."""
-        task, ahead = self._study.task.name, max(_LEAST_AHEAD, _AHEAD * self._threads)
-        while self._left and len(self._sent) < ahead:
-            batch = self._left.popleft()
-            limb: Any = Calibrated(self._study.limb)
-            if batch.twin is not None:
-                # One task, however many rows wait for it.
-                if batch.twin not in self._twins:
-                    key = "-".join(map(str, ("calibrate", *batch.twin)))
-                    self._twins[batch.twin] = client.submit(
-                        calibrate, batch.twin, self._study.limb, key=key, priority=-batch.place
-                    )
-                limb = self._twins[batch.twin]
-            values = [row.values for row in batch.rows]
-            key = f"{task}-{batch.rows[0].key}-{len(batch.rows)}"
-            future = client.submit(compute, task, values, limb, key=key, priority=-batch.place)
-            self._sent[future.key] = (future, batch)
-            future.add_done_callback(self._back.put)
+    def _send(self, client: Client, place: int, row: Row) -> None:
+        """Send a row out; the one with the lowest place is begun first."""
+        limb: Any = Calibrated(self._study.limb)
+        twin = self._study.task.twin(row.values)
+        if twin is not None:
+            # One task, however many rows wait for it.
+            if twin not in self._twins:
+                key = "-".join(map(str, ("calibrate", *twin)))
+                self._twins[twin] = client.submit(
+                    calibrate, twin, self._study.limb, key=key, priority=-place
+                )
+            limb = self._twins[twin]
+        task, key = self._study.task.name, f"row-{row.key}"
+        future = client.submit(compute, task, dict(row.values), limb, key=key, priority=-place)
+        self._sent[future.key] = (future, row)
+        future.add_done_callback(self._back.put)
 
     def _keep(self, future: Future) -> None:
-        """Keep the rows of a task that has come back."""
-        if future.key not in self._sent:
-            return
-        if future.status in ("cancelled", "lost"):
-            raise ClusterLostError(future.key)
-        rows = self._sent[future.key][1].rows
+        """Keep the row of a task that has come back."""
+        _, row = self._sent[future.key]
         try:
-            report = self._broken(future, rows) if future.status == "error" else future.result()
+            if future.status not in ("finished", "error"):
+                raise OSError(future.status)
+            outcome = self._broken(future) if future.status == "error" else future.result()
         except (OSError, TimeoutError) as error:
-            raise ClusterLostError(str(error)) from error
-        if report.sources != cache.digest():
+            raise StudyError(f"the scheduler is gone ({error}). {_KEPT}") from error
+        if outcome.sources != digest():
             raise StudyError(
                 "a worker has other sources or libraries than this program, so its rows would not "
                 "compare: bring both to one version and start the worker again"
             )
-        self._store.keep(rows, report.outcomes, report.sources)
-        self._store.note(f"{rows[0].key},{len(rows)},{report.seconds:.3f}")
+        self._store.keep(row, outcome)
         del self._sent[future.key]
-        self.done += len(rows)
-        self._made += len(rows)
-        for row, outcome in zip(rows, report.outcomes, strict=True):
-            if outcome.error:
-                self.failed += 1
-                self._progress.say(f"  failed: {dict(row.values)}: {outcome.error}")
+        self._made += 1
+        if outcome.error:
+            self._failed += 1
+            self._progress.say(f"  failed: {dict(row.values)}: {outcome.error}")
 
-    def _broken(self, future: Future, rows: Sequence[Row]) -> BatchReport:
-        """Return the report on rows whose worker ended under them again and again.
+    def _broken(self, future: Future) -> Outcome:
+        """Return the outcome of a row whose workers ended under it again and again.
 
         Raises:
             StudyError: a worker could not even begin.
@@ -386,21 +389,11 @@ class _Conductor:
                 f"a worker cannot compute rows ({_words(error)}): start it in the workspace: "
                 f"{_JOIN.format('ADDRESS')}"
             )
-        return BatchReport((Outcome({}, _words(error)),) * len(rows), 0.0, cache.digest())
+        return Outcome({}, _words(error), digest())
 
-    def _show(self) -> None:
+    def _show(self, total: int) -> None:
         rate = self._made / max(time.monotonic() - self._begun, 1e-9)
-        left = clock((self.total - self.done) / rate) if self._made else "?"
-        failed = f", {self.failed} failed" if self.failed else ""
+        left = timedelta(seconds=round((total - self._made) / rate)) if self._made else "?"
+        failed = f", {self._failed} failed" if self._failed else ""
         text = f"{rate:.3g} rows/s, {left} left, {self._threads} threads{failed}"
-        self._progress.bar(self.done, self.total, text, unit="rows")
-
-
-def clock(seconds: float) -> str:
-    """Return a duration as people say it."""
-    whole = round(seconds)
-    if whole < 120:
-        return f"{whole} s"
-    if whole < 7200:
-        return f"{whole // 60} min"
-    return f"{whole // 3600} h {whole % 3600 // 60} min"
+        self._progress.bar(self._made, total, text, unit="rows")

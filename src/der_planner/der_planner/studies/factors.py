@@ -7,10 +7,9 @@ values with every default filled in.
 from __future__ import annotations
 
 import contextlib
-import difflib
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,7 +42,7 @@ class Factor:
             whole numbers, a str for names.
         low, high: range of a number.
         choices: names to choose of.
-        also: what may stand in place of a name, and what raises a `LimbError` for anything else.
+        degrees: whether an angle may stand in place of a name, as that of a mounting.
     """
 
     unit: str
@@ -53,14 +52,14 @@ class Factor:
     low: float = -math.inf
     high: float = math.inf
     choices: tuple[str, ...] = ()
-    also: tuple[str, Callable[[str], object]] | None = None
+    degrees: bool = False
 
     @property
     def range(self) -> str:
         """What may be given, in words."""
         if self.choices:
-            other = "" if self.also is None else f", or {self.also[0]}"
-            return f"one of {', '.join(self.choices)}{other}"
+            angle = ", or degrees by which its plane is tilted about the straight limb"
+            return f"one of {', '.join(self.choices)}{angle if self.degrees else ''}"
         kind = "a whole number" if isinstance(self.default, int) else "a number"
         return f"{kind} from {self.low:g} to {self.high:g}"
 
@@ -76,9 +75,9 @@ class Factor:
                 value = next((name for name in said if name in self.choices), value)
             if value in self.choices:
                 return str(value)
-            if self.also is not None and not isinstance(value, bool):
+            if self.degrees and not isinstance(value, bool):
                 with contextlib.suppress(LimbError):
-                    self.also[1](str(value))
+                    gravity_of(str(value))
                     return str(value)
         elif isinstance(value, (int, float)) and not isinstance(value, bool):
             whole = isinstance(self.default, int)
@@ -123,7 +122,7 @@ FACTORS: dict[str, Factor] = {
         EVERY,
         "horizontal",
         choices=tuple(MOUNTINGS),
-        also=("degrees by which its plane is tilted about the straight limb", gravity_of),
+        degrees=True,
     ),
     "payload": Factor("kg", "carried while it plays, not when calibrated", PLANNED, 0.0, 0.0, 10.0),
     "payload_at": Factor(
@@ -150,11 +149,11 @@ _NOT_VARIED = ("pressure_limit", "slew_limit")
 """Limits are not errors of a model."""
 
 
-def limb_parameters() -> dict[str, tuple[str, str]]:
-    """Return (part of the limb, what it is) of each parameter that ``error.NAME`` may change."""
+def limb_parameters() -> dict[str, str]:
+    """Return what each parameter is that ``error.NAME`` may change."""
     return {
-        name: (part, declared.text)
-        for part, kind in (("segments", Segment), ("pneumatics", Pneumatics))
+        name: declared.text
+        for kind in (Segment, Pneumatics)
         for name, declared in declarations(kind).items()
         if name not in _NOT_VARIED
     }
@@ -169,12 +168,9 @@ def split_error(name: str) -> tuple[str, int | None]:
     match = re.fullmatch(r"(\w+)(?:\[(\d+)\])?", name.removeprefix(ERROR))
     known = limb_parameters()
     if match is None or match[1] not in known:
-        nearest = _nearest(name.removeprefix(ERROR), known)
-        raise StudyError(
-            f"factors.{name}: no such parameter of a limb{nearest}; known: {', '.join(known)}"
-        )
+        raise StudyError(f"factors.{name}: no such parameter of a limb; known: {', '.join(known)}")
     segment = None if match[2] is None else int(match[2])
-    if segment is not None and known[match[1]][0] != "segments":
+    if segment is not None and match[1] not in declarations(Segment):
         raise StudyError(f"factors.{name}: {match[1]} is one for the limb: leave [{segment}] away")
     return match[1], segment
 
@@ -188,16 +184,13 @@ def factor(name: str, task: str) -> Factor:
     if name.startswith(ERROR) and task in PLANNED:
         parameter, segment = split_error(name)
         place = "" if segment is None else f" of segment {segment}"
-        text = f"relative error of {parameter}{place}: {limb_parameters()[parameter][1]}"
+        text = f"relative error of {parameter}{place}: {limb_parameters()[parameter]}"
         return Factor("-", text, PLANNED, 0.0, -0.99, 100.0)
     known = of_task(task)
     if name not in known:
         several = [*known, f"{ERROR}PARAMETER"] if task in PLANNED else list(known)
         reason = "is not read by" if name in FACTORS or name.startswith(ERROR) else "is unknown to"
-        raise StudyError(
-            f"factors.{name} {reason} task '{task}'{_nearest(name, known)}; "
-            f"known: {', '.join(several)}"
-        )
+        raise StudyError(f"factors.{name} {reason} task '{task}'; known: {', '.join(several)}")
     return known[name]
 
 
@@ -209,8 +202,3 @@ def of_task(task: str) -> dict[str, Factor]:
 def with_defaults(row: Mapping[str, Value], task: str) -> dict[str, Any]:
     """Return a row with the default of every factor that it does not name."""
     return {name: each.default for name, each in of_task(task).items()} | dict(row)
-
-
-def _nearest(name: str, known: Mapping[str, object]) -> str:
-    close = difflib.get_close_matches(name, known, n=1)
-    return f" (did you mean {close[0]}?)" if close else ""

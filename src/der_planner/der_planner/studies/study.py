@@ -25,11 +25,8 @@ from der_planner.studies.tasks import TASKS, Task
 
 SHIPPED = Path(__file__).resolve().parent / "shipped"
 _KEYS = ("name", "about", "task", "limb", "factors", "draw", "keep", "plots")
-_SPREAD = {
-    frozenset({"low", "high"}): "even",
-    frozenset({"low", "high", "scale"}): "",
-    frozenset({"mean", "deviation"}): "normal",
-}
+METHODS = ("random", "sobol", "saltelli")
+"""Independent draws; a Sobol sequence; one arranged for Sobol indices (see `saltelli`)."""
 PLOTS = {
     "lines": ("x", "y"),
     "map": ("x", "y", "value"),
@@ -38,12 +35,8 @@ PLOTS = {
     "indices": ("of",),
 }
 """The kinds of figures, and what each needs."""
-_OPTIONAL = ("kind", "name", "lines", "panels", "title", "per", "log")
-_LOG = ("", "x", "y", "xy")
-
-
-METHODS = ("random", "sobol", "saltelli")
-"""Independent draws; a Sobol sequence; one arranged for Sobol indices (see `saltelli`)."""
+_FACTORS_OF_PLOTS = ("lines", "panels", "per")
+_MORE_OF_PLOTS = ("kind", "name", "title", "log")
 
 
 @dataclass(frozen=True)
@@ -245,89 +238,76 @@ def _parse(content: object, path: Path, text: str) -> Study:
     if name not in TASKS:
         raise StudyError(f"task must be one of {', '.join(TASKS)}, got {name!r}")
     task = TASKS[name]
-    given = _mapping(body.get("factors"), "factors", None)
+    given = _mapping(body.get("factors"), "factors")
     if not given:
         raise StudyError("factors is missing: name at least one, e.g. 'seed: [1, 2, 3]'")
-    grid, spreads = _factors(given, task)
-    draw = _draw(body.get("draw"), spreads)
-    combinations = 1
-    for values in grid.values():
-        combinations *= len(values)
-    if spreads:
-        _check_draw(draw, spreads, combinations)
-    keep = _keep(body.get("keep"), task)
+    found = {each: _values(value, factor(each, name), each) for each, value in given.items()}
+    grid = {each: values for each, values in found.items() if isinstance(values, list)}
+    spreads = {each: spread for each, spread in found.items() if isinstance(spread, Spread)}
     study = Study(
         name=str(body.get("name", path.stem)),
         about=str(body.get("about", "")).strip(),
         task=task,
         grid=grid,
         spreads=spreads,
-        draw=draw,
-        keep=keep,
+        draw=_draw(body.get("draw"), spreads, math.prod(map(len, grid.values()))),
+        keep=_keep(body.get("keep"), task),
         limb=_limb(body.get("limb"), path),
         text=text,
     )
-    plots = _plots(body.get("plots") or [], study)
-    return replace(study, plots=plots)
+    return replace(study, plots=_plots(body.get("plots") or [], study))
 
 
-def _mapping(content: object, where: str, known: tuple[str, ...] | None) -> dict[str, Any]:
+def _mapping(content: object, where: str, known: Sequence[str] = ()) -> dict[str, Any]:
+    """Return the keys of a part of the file, all of them ``known`` ones where these are given."""
     if content is None:
         return {}
     if not isinstance(content, Mapping):
         raise StudyError(f"{where} must be keys with values, got {type(content).__name__}")
     for key in content:
-        if known is not None and key not in known:
+        if known and key not in known:
             raise StudyError(f"{where}: unknown key '{key}'; known: {', '.join(known)}")
     return {str(key): value for key, value in content.items()}
 
 
-def _factors(
-    given: Mapping[str, Any], task: Task
-) -> tuple[dict[str, list[Value]], dict[str, Spread]]:
-    grid: dict[str, list[Value]] = {}
-    spreads: dict[str, Spread] = {}
-    for name, content in given.items():
-        declared, where = factor(name, task.name), f"factors.{name}"
-        if not isinstance(content, Mapping):
-            values = content if isinstance(content, list) else [content]
-            if not values:
-                raise StudyError(f"{where} is an empty list")
-            grid[name] = [
-                declared.checked(value, f"{where}[{index}]" if len(values) > 1 else where)
-                for index, value in enumerate(values)
-            ]
-        elif set(content) == {"first", "count"}:
-            first = declared.checked(content["first"], f"{where}.first")
-            count = _whole(content["count"], f"{where}.count")
-            if not isinstance(first, int):
-                raise StudyError(f"{where}: first and count are for whole numbers")
-            last = declared.checked(first + count - 1, f"{where}.count")
-            grid[name] = list(range(first, int(last) + 1))
-        else:
-            spreads[name] = _spread(content, declared, where)
-    return grid, spreads
+def _values(content: Any, declared: Factor, name: str) -> list[Value] | Spread:
+    """Return the values of a factor, or what it is drawn from."""
+    where = f"factors.{name}"
+    if not isinstance(content, Mapping):
+        values = content if isinstance(content, list) else [content]
+        if not values:
+            raise StudyError(f"{where} is an empty list")
+        return [
+            declared.checked(value, f"{where}[{index}]" if len(values) > 1 else where)
+            for index, value in enumerate(values)
+        ]
+    if set(content) != {"first", "count"}:
+        return _spread(content, declared, where)
+    first = declared.checked(content["first"], f"{where}.first")
+    if not isinstance(first, int):
+        raise StudyError(f"{where}: first and count are for whole numbers")
+    count = _whole(content["count"], f"{where}.count")
+    declared.checked(first + count - 1, f"{where}.count")
+    return list(range(first, first + count))
 
 
 def _spread(content: Mapping[str, Any], declared: Factor, where: str) -> Spread:
-    scale = _SPREAD.get(frozenset(content))
-    if scale is None:
+    if declared.choices:
+        raise StudyError(f"{where}: names cannot be drawn from a range: list them")
+    if set(content) == {"mean", "deviation"}:
+        deviation = content["deviation"]
+        if not isinstance(deviation, (int, float)) or not deviation > 0:
+            raise StudyError(f"{where}.deviation must be above 0, got {deviation!r}")
+        mean = declared.checked(content["mean"], f"{where}.mean")
+        return Spread(float(mean), float(deviation), "normal")
+    if set(content) - {"scale"} != {"low", "high"}:
         raise StudyError(
             f"{where} must be a value, a list, {{first, count}} of whole numbers, {{low, high}} "
             f"with scale (even or log) if wanted, or {{mean, deviation}}; got the keys "
             f"{', '.join(map(str, content))}"
         )
-    if declared.choices:
-        raise StudyError(f"{where}: names cannot be drawn from a range: list them")
-    if scale == "normal":
-        mean = declared.checked(content["mean"], f"{where}.mean")
-        deviation = content["deviation"]
-        if not isinstance(deviation, (int, float)) or not deviation > 0:
-            raise StudyError(f"{where}.deviation must be above 0, got {deviation!r}")
-        return Spread(float(mean), float(deviation), "normal")
     scale = str(content.get("scale", "even"))
-    low = float(declared.checked(content["low"], f"{where}.low"))
-    high = float(declared.checked(content["high"], f"{where}.high"))
+    low, high = (float(declared.checked(content[key], f"{where}.{key}")) for key in ("low", "high"))
     if scale not in ("even", "log") or (scale == "log" and low <= 0):
         raise StudyError(f"{where}.scale must be even, or log above 0, got {scale!r}")
     if not low < high:
@@ -335,41 +315,28 @@ def _spread(content: Mapping[str, Any], declared: Factor, where: str) -> Spread:
     return Spread(low, high, scale, isinstance(declared.default, int))
 
 
-def _draw(content: object, spreads: Mapping[str, Spread]) -> Draw:
+def _draw(content: object, spreads: Mapping[str, Spread], combinations: int) -> Draw:
     given = _mapping(content, "draw", ("method", "count", "seed"))
-    if spreads and "count" not in given:
+    if not spreads:
+        if given:
+            raise StudyError("draw is given, but no factor has {low, high} or {mean, deviation}")
+        return Draw()
+    if "count" not in given:
         raise StudyError(f"draw.count is missing: {', '.join(spreads)} are drawn")
-    if given and not spreads:
-        raise StudyError("draw is given, but no factor has {low, high} or {mean, deviation}")
-    return Draw(
-        str(given.get("method", "sobol")),
-        _whole(given.get("count", 1), "draw.count"),
-        _whole(given.get("seed", 0), "draw.seed", least=0),
-    )
-
-
-def _check_draw(draw: Draw, spreads: Mapping[str, Spread], combinations: int) -> None:
-    """Refuse draws that cannot be made.
-
-    Raises:
-        StudyError: names the key.
-    """
-    if draw.method not in METHODS:
-        raise StudyError(f"draw.method must be one of {', '.join(METHODS)}, got {draw.method!r}")
-    power = draw.count & (draw.count - 1) == 0
-    if draw.method != "random" and not power:
-        nearest = 2 ** round(math.log2(draw.count))
+    method, count = str(given.get("method", "sobol")), _whole(given["count"], "draw.count")
+    if method not in METHODS:
+        raise StudyError(f"draw.method must be one of {', '.join(METHODS)}, got {method!r}")
+    if method != "random" and count & (count - 1):
         raise StudyError(
-            f"draw.count must be a power of two for {draw.method}, got {draw.count}: "
-            f"choose {nearest}, or method random"
+            f"draw.count must be a power of two for {method}, got {count}: choose "
+            f"{2 ** round(math.log2(count))}, or method random"
         )
-    if draw.method == "saltelli" and combinations != 1:
+    if method == "saltelli" and (combinations != 1 or len(spreads) < 2):
         raise StudyError(
-            f"draw.method saltelli goes with one value of every other factor, and these make "
-            f"{combinations} combinations: write one study for each"
+            "draw.method saltelli needs two drawn factors or more, and one value of every other "
+            f"factor; these make {combinations} combinations: write one study for each"
         )
-    if draw.method == "saltelli" and len(spreads) < 2:
-        raise StudyError("draw.method saltelli needs two drawn factors or more")
+    return Draw(method, count, _whole(given.get("seed", 0), "draw.seed", least=0))
 
 
 def _whole(value: object, where: str, least: int = 1) -> int:
@@ -404,30 +371,26 @@ def _limb(content: object, path: Path) -> str:
 def _plots(content: object, study: Study) -> tuple[dict[str, str], ...]:
     if not isinstance(content, list):
         raise StudyError("plots must be a list, each with a kind")
-    plots = []
+    columns, plots = (*study.factors, *study.keep), []
     for index, item in enumerate(content):
         where = f"plots[{index}]"
-        plot = {key: str(value) for key, value in _mapping(item, where, None).items()}
+        plot = {key: str(value) for key, value in _mapping(item, where).items()}
         kind = plot.get("kind", "")
         if kind not in PLOTS:
             raise StudyError(f"{where}.kind must be one of {', '.join(PLOTS)}, got {kind!r}")
-        _mapping(plot, where, (*PLOTS[kind], *_OPTIONAL))
-        for need in PLOTS[kind]:
-            if need not in plot:
-                raise StudyError(f"{where}.{need} is missing: a {kind} needs {PLOTS[kind]}")
-        for key in ("x", "y", "value", "of", "lines", "panels", "per"):
-            columns = (*study.factors, *study.keep)
+        named = (*PLOTS[kind], *_FACTORS_OF_PLOTS)
+        _mapping(plot, where, (*named, *_MORE_OF_PLOTS))
+        for key in named:
+            if key not in plot and key in PLOTS[kind]:
+                raise StudyError(f"{where}.{key} is missing: a {kind} needs {PLOTS[kind]}")
             if key in plot and plot[key] not in columns:
                 raise StudyError(
                     f"{where}.{key}: no column '{plot[key]}'; there are {', '.join(columns)}"
                 )
-        if plot.get("log", "") not in _LOG:
-            raise StudyError(f"{where}.log must be x, y or xy, got {plot['log']!r}")
         if kind == "indices" and study.draw.method != "saltelli":
             raise StudyError(f"{where}: indices need draw.method saltelli")
         plots.append({"name": f"{kind}_{index}", **plot})
     names = [plot["name"] for plot in plots]
-    for name in names:
-        if names.count(name) > 1 or "/" in name:
-            raise StudyError(f"plots: the name '{name}' must be a file's, and come once")
+    if len(set(names)) < len(names) or "/" in "".join(names):
+        raise StudyError(f"plots: the names {', '.join(names)} must be files', each once")
     return tuple(plots)

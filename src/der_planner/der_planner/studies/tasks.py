@@ -6,29 +6,47 @@ library, so that a row is the same to the last digit wherever and whenever it is
 
 from __future__ import annotations
 
+import fcntl
+import hashlib
 import json
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+import yaml
+from threadpoolctl import threadpool_limits
 
+import der_planner
 from der_planner.arrays import Array
-from der_planner.limb import Limb, Segment
+from der_planner.control import Feedback, Learner, lockstep
+from der_planner.identification import (
+    Excitation,
+    FitReport,
+    calibrate_twin,
+    predict,
+    record_twin,
+)
+from der_planner.identification.excitation import TIP_NOISE
+from der_planner.limb import Limb, Pneumatics, declarations
 from der_planner.model import simulate
 from der_planner.planning import Motion, Plan, plan
-from der_planner.studies.cache import Twin, fit_twin, read_limb
 from der_planner.studies.factors import (
     ERROR,
     IDENTIFICATION,
     MODEL,
     RUN,
     Value,
-    limb_parameters,
     split_error,
     with_defaults,
 )
+from der_planner.twin import offline
+from der_planner.twin.hardware import draw, known_values
+from pressure_driver.emulator import pneumatics
 
 Values = Mapping[str, Value]
 Result = dict[str, float]
@@ -38,6 +56,9 @@ _FIRST_LEARNING_RUN = 10
 """Runs of a twin's hardware from here on are learned from; the one that counts is run 0."""
 _UNSEEN_RUN = 2
 """The run of a twin's hardware on which an identified limb is tried."""
+_PARTS = ("limb", "rod", "model", "identification", "twin", "planning", "control")
+"""Parts of der_planner on which a row and a calibrated twin depend."""
+_LIBRARIES = ("numpy", "scipy", "numba", "pyelastica", "piqp")
 
 
 @dataclass(frozen=True)
@@ -49,7 +70,6 @@ class Task:
         text: what a row does.
         columns: of its result, each with what it is.
         work: from a limb file's text and a row with its defaults to the row's results.
-        batch: rows that are computed together.
         calibrated: a row begins with the limb that a calibration of its twin found.
     """
 
@@ -57,7 +77,6 @@ class Task:
     text: str
     columns: Mapping[str, str]
     work: Callable[[str, Mapping[str, Any]], Result]
-    batch: int = 1
     calibrated: bool = False
 
     def compute(self, limb: str, values: Values) -> Result:
@@ -69,12 +88,84 @@ class Task:
         row = with_defaults(values, self.name)
         if not self.calibrated or row["calibration"] == "none":
             return None
-        return twin_of(row)
+        return Twin.of(row)
 
 
-def twin_of(row: Mapping[str, Any]) -> Twin:
-    """Return the twin of a row with its defaults, and how it is calibrated."""
-    return Twin(row["seed"], row["calibration"], row["tag_noise"], row["mounting"])
+class Twin(NamedTuple):
+    """A twin and how it is calibrated.
+
+    Attributes:
+        seed: of the hardware.
+        calibration: "quick" (90 s) or "long" (200 s).
+        noise: of tags and board, as a multiple of the usual one.
+        mounting: see `der_planner.limb.loads`.
+    """
+
+    seed: int
+    calibration: str = "quick"
+    noise: float = 1.0
+    mounting: str = "horizontal"
+
+    @classmethod
+    def of(cls, row: Mapping[str, Any]) -> Twin:
+        """Return the twin of a row with its defaults."""
+        return cls(row["seed"], row["calibration"], row["tag_noise"], row["mounting"])
+
+    def fit(self, prior: Limb) -> tuple[Limb, FitReport]:
+        """Play a calibration and fit the prior to what camera and board would measure.
+
+        Raises:
+            LogError: the run does not tell the parameters.
+        """
+        quick, mounted = self.calibration == "quick", prior.mounted(self.mounting)
+        return calibrate_twin(self.seed, mounted, quick=quick, noise=self.noise)
+
+
+# What a machine keeps: calibrated twins, by what they depend on ----------------------------------
+
+
+@lru_cache(maxsize=1)
+def digest() -> str:
+    """Return the digest of sources and of the versions of the libraries that compute."""
+    found = hashlib.sha256(" ".join(f"{name} {version(name)}" for name in _LIBRARIES).encode())
+    root = Path(next(iter(der_planner.__path__)))
+    files = [file for part in _PARTS for file in sorted((root / part).rglob("*.py"))]
+    for file in [*files, Path(__file__), Path(str(pneumatics.__file__))]:
+        found.update(file.name.encode() + file.read_bytes())
+    return found.hexdigest()[:16]
+
+
+def calibrated(twin: Twin, prior: str) -> str:
+    """Return the limb file's text of a calibrated twin, from the machine's cache if it is there.
+
+    The cache is the folder DER_LIMB_CACHE, or ~/.cache/der_limb. Two processes that ask for the
+    same twin at once compute it once: the second one waits.
+
+    Args:
+        twin: which, and how.
+        prior: text of the limb file that the fit begins with; empty for the default limb.
+    """
+    about = repr((tuple(twin), prior, digest()))
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "der_limb"
+    folder = Path(os.environ.get("DER_LIMB_CACHE") or home) / "twins"
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{hashlib.sha256(about.encode()).hexdigest()[:32]}.yaml"
+    unfinished = path.with_suffix(".part")
+    with path.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # it ends with a killed process
+        if not path.exists():
+            with threadpool_limits(1):  # more threads change the last digits
+                limb, _ = twin.fit(limb_of(prior))
+            # What a fit took of the clock differs from run to run; the limb does not.
+            replace(limb, provenance={"source": f"{twin}"}).to_yaml(unfinished)
+            os.replace(unfinished, path)
+        return path.read_text(encoding="utf-8")
+
+
+@lru_cache(maxsize=64)
+def limb_of(text: str) -> Limb:
+    """Return the limb of a limb file's text; the default limb for an empty one."""
+    return Limb.from_mapping(yaml.safe_load(text)) if text else Limb.default()
 
 
 # run: a calibrated twin plays a plan ------------------------------------------------------------
@@ -103,14 +194,14 @@ def _errors(planned: Plan, tip: Array) -> Result:
     }
 
 
-def loaded(limb: Limb, row: Mapping[str, Any]) -> Limb:
+def _loaded(limb: Limb, row: Mapping[str, Any]) -> Limb:
     """Return a limb as a row mounts it, with the row's payload."""
     at = row["payload_at"]
     return limb.mounted(row["mounting"]).carrying(row["payload"], at if at > 0 else None)
 
 
 def _planned(limb: Limb, row: Mapping[str, Any]) -> Plan:
-    limb = loaded(limb, {**row, "payload": row["payload"] if row["payload_known"] == "yes" else 0})
+    limb = _loaded(limb, {**row, "payload": row["payload"] if row["payload_known"] == "yes" else 0})
     motion = Motion.named(
         row["motion"], amplitude=row["amplitude"], period=row["period"], cycles=row["cycles"]
     )
@@ -120,7 +211,7 @@ def _planned(limb: Limb, row: Mapping[str, Any]) -> Plan:
 
 def _run(limb: str, row: Mapping[str, Any]) -> Result:
     planned = _planned(with_errors(limb_of(limb), row), row)
-    loads = loaded(limb_of(limb), row)
+    loads = _loaded(limb_of(limb), row)
     if row["learning_runs"]:
         planned = _learned(planned, loads, row)
     tip, held = (_with_feedback if row["feedback"] == "on" else _blind)(planned, loads, row)
@@ -133,9 +224,6 @@ def _run(limb: str, row: Mapping[str, Any]) -> Result:
 
 def _learned(planned: Plan, loads: Limb, row: Mapping[str, Any]) -> Plan:
     """Return the plan after runs of it on the same hardware, as a camera would have seen them."""
-    from der_planner.control import Learner  # noqa: PLC0415
-    from der_planner.identification.excitation import TIP_NOISE  # noqa: PLC0415
-
     learner = Learner(planned)
     for run in range(_FIRST_LEARNING_RUN, _FIRST_LEARNING_RUN + row["learning_runs"]):
         tip, beyond = _blind(planned, loads, row, run)
@@ -150,10 +238,7 @@ def _learned(planned: Plan, loads: Limb, row: Mapping[str, Any]) -> Plan:
 
 def _blind(planned: Plan, loads: Limb, row: Mapping[str, Any], run: int = 0) -> tuple[Array, Array]:
     """Return the twin's tips (K, 2) [m] and chamber less commanded pressures (K, M) [Pa]."""
-    # PyElastica takes a second to import: only who plays pays for it.
-    from der_planner.twin.offline import play  # noqa: PLC0415
-
-    played = play(
+    played = offline.play(
         planned.time,
         planned.differential_pressure,
         seed=row["seed"],
@@ -166,11 +251,7 @@ def _blind(planned: Plan, loads: Limb, row: Mapping[str, Any], run: int = 0) -> 
 
 def _with_feedback(planned: Plan, loads: Limb, row: Mapping[str, Any]) -> tuple[Array, Array]:
     """Return the same of a run whose commands are revised by what camera and board tell."""
-    from der_planner.control.feedback import Feedback  # noqa: PLC0415
-    from der_planner.control.lockstep import Sensors, play  # noqa: PLC0415
-    from der_planner.twin.offline import OfflineTwin  # noqa: PLC0415
-
-    usual, noise = Sensors(), row["tag_noise"]
+    usual, noise = lockstep.Sensors(), row["tag_noise"]
     sensors = replace(
         usual,
         latency=row["latency"],
@@ -179,9 +260,9 @@ def _with_feedback(planned: Plan, loads: Limb, row: Mapping[str, Any]) -> tuple[
         pressure_noise=noise * usual.pressure_noise,
         seed=row["seed"],
     )
-    plant = OfflineTwin(row["seed"], gravity=loads.gravity, masses=loads.masses)
+    plant = offline.OfflineTwin(row["seed"], gravity=loads.gravity, masses=loads.masses)
     plant.rest(_VENTED)
-    played = play(planned, plant, Feedback(planned), sensors)
+    played = lockstep.play(planned, plant, Feedback(planned), sensors)
     return played.tip, played.differential_pressure - played.commanded
 
 
@@ -192,7 +273,7 @@ def _model(limb: str, row: Mapping[str, Any]) -> Result:
     """Plan for the limb, and play on one whose parameters are other by the errors."""
     motion = {name: value for name, value in row.items() if not name.startswith(ERROR)}
     planned = _plan_once(limb, json.dumps(motion, sort_keys=True))
-    true = loaded(with_errors(limb_of(limb), row), row)
+    true = _loaded(with_errors(limb_of(limb), row), row)
     response = simulate(true, planned.time, commands=planned.differential_pressure)
     return _errors(planned, response.tip[:-1])
 
@@ -212,11 +293,8 @@ _RECOVERED = (
 
 def _identify(limb: str, row: Mapping[str, Any]) -> Result:
     """Compare what a calibration found with what the seed drew, and predict an unseen motion."""
-    from der_planner.identification import Excitation, predict, record_twin  # noqa: PLC0415
-    from der_planner.twin.hardware import draw, known_values  # noqa: PLC0415
-
     prior = limb_of(limb)
-    found, report = fit_twin(twin_of(row), prior)
+    found, report = Twin.of(row).fit(prior)
     distances: dict[str, list[float]] = {}
     for name, known in known_values(draw(row["seed"])).items():
         unknown = report.value(name)
@@ -262,7 +340,6 @@ TASKS = {
         "plan for a limb, play on the rod of a limb whose parameters are other by error.…",
         _ERRORS,
         _model,
-        batch=16,
     ),
     IDENTIFICATION: Task(
         IDENTIFICATION,
@@ -287,42 +364,29 @@ TASKS = {
 # Shared ------------------------------------------------------------------------------------------
 
 
-@lru_cache(maxsize=64)
-def limb_of(text: str) -> Limb:
-    """Return the limb of a limb file's text; the default limb for an empty one."""
-    return read_limb(text) if text else Limb.default()
-
-
 def with_errors(limb: Limb, row: Mapping[str, Any]) -> Limb:
     """Return a limb whose parameters are larger by the row's relative errors (``error.NAME``).
 
     Both models get them, where the calibration gave the arcs numbers of their own.
     """
-    kinds = limb_parameters()
     for name, value in row.items():
         if not name.startswith(ERROR):
             continue
         parameter, place = split_error(name)
-        if kinds[parameter][0] == "pneumatics":
-            air = limb.pneumatics
-            changed = {parameter: getattr(air, parameter) * (1.0 + value)}
-            limb = replace(limb, pneumatics=replace(air, **changed))
+        if parameter in declarations(Pneumatics):
+            limb = replace(limb, pneumatics=_larger(limb.pneumatics, parameter, value))
             continue
-        limb = replace(
-            limb,
-            segments=_larger(limb.segments, parameter, place, value),
-            pcc_segments=_larger(limb.pcc_segments, parameter, place, value),
-        )
+        changed: dict[str, Any] = {
+            kind: tuple(
+                _larger(each, parameter, value) if place in (None, index) else each
+                for index, each in enumerate(getattr(limb, kind))
+            )
+            for kind in ("segments", "pcc_segments")
+        }
+        limb = replace(limb, **changed)
     return limb
 
 
-def _larger(
-    segments: tuple[Segment, ...], parameter: str, place: int | None, error: float
-) -> tuple[Segment, ...]:
-    """Return segments with a parameter larger by a relative error, of one of them or of all."""
-    return tuple(
-        replace(each, **{parameter: getattr(each, parameter) * (1.0 + error)})
-        if place in (None, index)
-        else each
-        for index, each in enumerate(segments)
-    )
+def _larger(part: Any, parameter: str, error: float) -> Any:
+    """Return a segment, or the air, with a parameter larger by a relative error."""
+    return replace(part, **{parameter: getattr(part, parameter) * (1.0 + error)})

@@ -24,6 +24,7 @@ from elastica.rod.data_structures import overload_operator_kinematic_numba
 from numba import njit
 from numpy.typing import NDArray
 
+import der_planner.rod.compile  # noqa: F401 - drops caches that are older than this source
 from der_planner.arrays import Array
 
 VISCOUS_TIME = 1e-4
