@@ -10,13 +10,12 @@ pytestmark = pytest.mark.graph
 
 
 def test_a_tracker_without_camera_is_named_with_the_cure(graph):
-    from der_planner.experiment.client import Patience
     from der_planner.experiment.processes import GraphError
 
     graph.start("apriltag_tracker", "apriltag_tracker")
     graph.client.wait_for(lambda: "apriltag_tracker" in graph.client.diagnostics, 60, "its word")
     with pytest.raises(GraphError, match=r"'apriltag_tracker' was not ready.*start the camera"):
-        graph.client.wait_ready(["apriltag_tracker"], Patience(waiting=1.0, failing=1.0))
+        graph.client.wait_ready(["apriltag_tracker"], patience=1.0, failing=1.0)
 
 
 def test_a_driver_without_its_board_ends_with_the_port_and_the_remedy(graph):

@@ -18,7 +18,7 @@ class Stage:
         self.events: list[tuple[float, str, object]] = []
 
     def sleep(self, seconds: float) -> None:
-        assert seconds > 0
+        assert seconds >= 0
         self.now += seconds
 
     def publish(self, topic, message) -> None:

@@ -49,7 +49,7 @@ def test_every_message_of_ours_is_complete_and_hashes_right():
         assert types.hash_rihs01(name) == definition.type_hash
 
 
-def test_fields_with_bounds_arrays_defaults_and_constants(tmp_path: Path):
+def test_fields_with_bounds_arrays_defaults_and_constants(tmp_path: Path, monkeypatch):
     messages = tmp_path / "share" / "odd_msgs" / "msg"
     messages.mkdir(parents=True)
     (messages / "Inner.msg").write_text("float64 x\n")
@@ -57,7 +57,8 @@ def test_fields_with_bounds_arrays_defaults_and_constants(tmp_path: Path):
         "# Inner in a comment\nuint8 KIND=3\nstring NAME='Inner x'\nstring<=8 label\n"
         "Inner[<=4] few # other_msgs/Missing\nodd_msgs/Inner[3] three\nint32 count 7\n"
     )
-    definition = find_definition("odd_msgs/msg/Outer", [tmp_path])
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
+    definition = find_definition("odd_msgs/msg/Outer")
     assert definition.text.count("MSG: odd_msgs/Inner\n") == 1
     types = get_types_from_msg(definition.text, "odd_msgs/msg/Outer")
     assert set(types) == {"odd_msgs/msg/Outer", "odd_msgs/msg/Inner"}

@@ -22,6 +22,8 @@ def fill(bag: BagWriter, count: int, step: int = SECOND // 10, first: int = 0) -
     bag.add_topic(spec("/talk", TEXT))
     for index in range(first, first + count):
         bag.write("/talk", START + index * step, START + index * step - 5, string(f"word {index}"))
+        if index % 30 == 29:
+            bag.flush()
 
 
 def test_rosbags_and_mcap_read_what_was_written(tmp_path: Path):
@@ -83,7 +85,7 @@ def test_bytes_behind_the_content_are_no_damage_but_missing_ones_are(tmp_path: P
 @pytest.mark.parametrize("how", ["size", "time"])
 def test_split_repeats_latched_messages(tmp_path: Path, how: str):
     options = {"split_bytes": 20_000} if how == "size" else {"split_seconds": 2.0}
-    bag = BagWriter(tmp_path / "run", compression="none", chunk_size=2_000, **options)
+    bag = BagWriter(tmp_path / "run", compression="none", **options)
     bag.add_topic(spec("/plan", TEXT, latched=True))
     bag.write("/plan", START, START, string("the plan"))
     fill(bag, 60 if how == "time" else 900)
@@ -139,7 +141,7 @@ FULL_DISK = """
     from bags import START, SECOND, TEXT, spec, string
     from der_planner.bags.writer import BagWriter, BagWriteError
     resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, resource.RLIM_INFINITY))
-    bag = BagWriter(Path({folder!r}), compression="none", chunk_size=4_000)
+    bag = BagWriter(Path({folder!r}), compression="none")
     bag.add_topic(spec("/talk", TEXT))
     try:
         for index in range(10_000):

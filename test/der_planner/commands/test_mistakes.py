@@ -37,7 +37,6 @@ def call(monkeypatch, capsys, tmp_path):
 @pytest.mark.parametrize(
     ("module", "arguments", "code", "words"),
     [
-        ("der_planner.commands.evaluate", ["b", "--workers", "-1"], 2, "--workers is -1"),
         ("der_planner.commands.evaluate", ["b", "--report", "BUSY"], 2, "cannot be made"),
         ("der_planner.commands.evaluate", ["b", "--video", "BUSY"], 2, "cannot be made"),
         ("der_planner.commands.calibrate_limb", ["--offline", "--out", "BUSY"], 2, "no folder"),

@@ -208,19 +208,18 @@ class BagRecord:
         return [name for name, limb in self.limbs.items() if limb.usable_plans]
 
 
-def read_record(path: str | Path, *, progress: Callable[[float], None] | None = None) -> BagRecord:
+def read_record(path: str | Path) -> BagRecord:
     """Read everything of a bag that becomes arrays, limb by limb.
 
     Args:
         path: bag folder or file.
-        progress: called with the fraction of the bag's time that was read.
 
     Raises:
         BagError: the bag cannot be read.
     """
     with BagReader(path) as bag:
         try:
-            limbs = _collect(bag, progress)
+            limbs = _collect(bag)
         except BagError:
             raise
         except Exception as error:  # rosbags raises many kinds for damaged content
@@ -242,7 +241,7 @@ def header_stamp(message: Any) -> int:
     return int(message.header.stamp.sec) * NANOSECONDS + int(message.header.stamp.nanosec)
 
 
-def _collect(bag: BagReader, progress: Callable[[float], None] | None) -> dict[str, LimbRecord]:
+def _collect(bag: BagReader) -> dict[str, LimbRecord]:
     """Return what the bag holds of each limb; every topic counts for its own namespace only."""
     limbs: dict[str, LimbRecord] = {}
     receivers: dict[str, Callable[[Any], None]] = {}
@@ -251,11 +250,8 @@ def _collect(bag: BagReader, progress: Callable[[float], None] | None) -> dict[s
         if method is not None:
             limb = limbs.setdefault(namespace_of(name), LimbRecord())
             receivers[name] = partial(method, limb)
-    begin, length = bag.start, max(1, bag.end - bag.start)
-    for count, (name, log_time, message) in enumerate(bag.messages(list(receivers))):
+    for name, _, message in bag.messages(list(receivers)):
         receivers[name](message)
-        if progress is not None and count % 1000 == 0:
-            progress((log_time - begin) / length)
     return limbs
 
 

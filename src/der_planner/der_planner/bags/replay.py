@@ -104,45 +104,24 @@ def replay(
     last = bag.end + 1
     if settings.stop is not None:
         last = min(last, bag.start + round(settings.stop * NANOSECONDS))
-    pace = _Pace(first, settings.rate, clock, sleep, output)
-    count = 0
+    begin, shown, count = clock(), first, 0
+    output.show_time(first)
+
+    def show(when: int) -> None:
+        nonlocal shown
+        if settings.rate > 0:
+            due = begin + (when - first) / NANOSECONDS / settings.rate
+            sleep(max(0.0, due - clock()))
+        shown = when
+        output.show_time(when)
+
     for message in bag.raw(list(names), first, last):
-        pace.wait_for(message.log_time)
+        while shown + CLOCK_PERIOD < message.log_time:
+            show(shown + CLOCK_PERIOD)
+        if message.log_time > shown:
+            show(message.log_time)
         output.publish(names[message.topic], message)
         count += 1
         if progress is not None:
             progress((message.log_time - first) / NANOSECONDS, (last - first) / NANOSECONDS)
     return count
-
-
-class _Pace:
-    """Lets recorded time pass."""
-
-    def __init__(
-        self,
-        first: int,
-        rate: float,
-        clock: Callable[[], float],
-        sleep: Callable[[float], None],
-        output: Output,
-    ) -> None:
-        self._first = self._shown = first
-        self._rate, self._clock, self._sleep, self._output = rate, clock, sleep, output
-        self._begin = clock()
-        output.show_time(first)
-
-    def wait_for(self, when: int) -> None:
-        """Wait until recorded time is ``when`` [ns]; the clock ticks meanwhile."""
-        while self._shown + CLOCK_PERIOD < when:
-            self._show(self._shown + CLOCK_PERIOD)
-        if when > self._shown:
-            self._show(when)
-
-    def _show(self, when: int) -> None:
-        if self._rate > 0:
-            due = self._begin + (when - self._first) / NANOSECONDS / self._rate
-            left = due - self._clock()
-            if left > 0:
-                self._sleep(left)
-        self._shown = when
-        self._output.show_time(when)

@@ -6,7 +6,6 @@ that plan was played becomes a `RunSeries`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,33 +33,24 @@ from der_planner.bags.run import (
     method_name,
 )
 
-BIN = 0.01
-"""Width of a bin of the histogram of latencies [s]."""
 _LONGEST = 0.5
 """Latencies above this are no latencies of a picture that was waited for [s]."""
 
 
-def load_run(
-    path: str | Path,
-    *,
-    plan_id: str = "",
-    namespace: str = "",
-    progress: Callable[[float], None] | None = None,
-) -> RunSeries:
+def load_run(path: str | Path, *, plan_id: str = "", namespace: str = "") -> RunSeries:
     """Read one run from its bag.
 
     Args:
         path: bag folder or file.
         plan_id: which plan of the bag; the one with the most recorded setpoints if empty.
         namespace: of the limb, e.g. ``/limb``; needed only where limbs of several have plans.
-        progress: called with the fraction of the bag's time that was read.
 
     Raises:
         EvaluationError: the bag has no plan, or no limb state while it was played, or several
             limbs have plans and none is named.
         BagError: the bag cannot be read.
     """
-    record = read_record(path, progress=progress)
+    record = read_record(path)
     return run_of(record, _choose_limb(record, namespace, plan_id), plan_id)
 
 
@@ -296,11 +286,5 @@ def described(added: Array, taken: Array) -> dict[str, Any]:
     }
     if len(taken):
         median, late = np.quantile(taken, [0.5, 0.99])
-        counts, _ = np.histogram(taken, bins=np.arange(0.0, _LONGEST + BIN / 2, BIN))
-        about |= {
-            "latency_median_s": float(median),
-            "latency_p99_s": float(late),
-            "latency_counts": counts.tolist(),
-            "latency_bin_s": BIN,
-        }
+        about |= {"latency_median_s": float(median), "latency_p99_s": float(late)}
     return about

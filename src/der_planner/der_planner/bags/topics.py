@@ -42,17 +42,16 @@ def installed_prefixes() -> tuple[Path, ...]:
     return tuple(Path(part) for part in value.split(os.pathsep) if part)
 
 
-def find_definition(type_name: str, prefixes: Sequence[Path] | None = None) -> Definition:
+def find_definition(type_name: str) -> Definition:
     """Collect the definition of a message type from the installed share folders.
 
     Args:
         type_name: ``package/msg/Name``.
-        prefixes: where to look, first hit wins; the sourced workspaces if None.
 
     Raises:
         DefinitionError: the type, or one that it contains, is not installed.
     """
-    return _find(type_name, tuple(installed_prefixes() if prefixes is None else prefixes))
+    return _find(type_name, installed_prefixes())
 
 
 @cache

@@ -32,6 +32,7 @@ METADATA_FILE = "metadata.yaml"
 RUN_KEY = "run"
 """Name of the MCAP metadata record, and of the custom-data entry, that holds the run's JSON."""
 CHUNK_SIZE = 1 << 20
+"""A chunk holds at most this before it is compressed [bytes]."""
 LARGE = 1 << 17
 """Messages of so many bytes get a chunk of their own, so that whoever reads only the small ones
 does not have to read the images between them."""
@@ -70,7 +71,6 @@ class BagWriter:
         compression: of chunks: ``none``, ``lz4`` or ``zstd``.
         split_bytes: begin a new file after this many bytes; 0 = never.
         split_seconds: begin a new file after this recorded time [s]; 0 = never.
-        chunk_size: largest chunk [bytes] before compression.
         minimum_free: close the bag when the disk has fewer free bytes; 0 = do not look.
 
     Raises:
@@ -86,7 +86,6 @@ class BagWriter:
         compression: str = "zstd",
         split_bytes: int = 0,
         split_seconds: float = 0.0,
-        chunk_size: int = CHUNK_SIZE,
         minimum_free: int = 0,
     ) -> None:
         self.folder = Path(folder)
@@ -94,7 +93,6 @@ class BagWriter:
         self._compression = COMPRESSIONS[compression]
         self._split_bytes = split_bytes
         self._split_time = round(split_seconds * 1e9)
-        self._chunk_size = chunk_size
         self._minimum_free = minimum_free
         self._topics: dict[str, TopicSpec] = {}
         self._counts: dict[str, int] = {}
@@ -216,9 +214,7 @@ class BagWriter:
     def _open_file(self) -> None:
         name = f"{self.folder.name}_{len(self._files)}.mcap"
         self._file = (self.folder / name).open("xb")
-        self._writer = Writer(
-            self._file, chunk_size=self._chunk_size, compression=self._compression
-        )
+        self._writer = Writer(self._file, chunk_size=CHUNK_SIZE, compression=self._compression)
         self._files.append(FileSummary(name))
         self._channels: dict[str, Channel] = {}
         self._schemas: dict[str, Schema] = {}
@@ -237,7 +233,7 @@ class BagWriter:
             return
         self._small.append((spec, log_time, publish_time, data))
         self._small_bytes += len(data)
-        if self._small_bytes >= self._chunk_size:
+        if self._small_bytes >= CHUNK_SIZE:
             self._emit_small()
 
     def _emit_small(self) -> None:

@@ -104,7 +104,7 @@ def _evaluate(given: argparse.Namespace) -> int:
     if given.results is not None:
         print(write_results(results, given.results))
     if given.report is not None:
-        print(write_report(runs, results, given.report, progress=Progress().say).page)
+        print(write_report(runs, results, given.report, progress=Progress().say))
     if given.video is not None:
         print(write_video(runs[0], given.video))
     return 1 if any(entry.error for entry in found) else 0

@@ -357,8 +357,7 @@ def _conclude(options: Options, kept: Kept, progress: Progress) -> None:
     figures += plot_learning(found, options.out)
     progress.say(f"results: {path}")
     if options.report:
-        written = write_report(runs, found, options.out / "report")
-        progress.say(f"report: {written.page}")
+        progress.say(f"report: {write_report(runs, found, options.out / 'report')}")
     names = [path.name for path in figures if path.suffix == ".png"]
     progress.say(f"figures: {options.out}/{', '.join(names)}")
 

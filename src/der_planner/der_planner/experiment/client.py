@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
 
@@ -24,29 +24,10 @@ from limb_interfaces import qos, topics
 READY = (DiagnosticStatus.OK, DiagnosticStatus.WARN)
 
 
-@dataclass(frozen=True)
-class Patience:
-    """How long a node may take to get ready [s], by the level of its diagnostics.
-
-    Attributes:
-        silent: while it says nothing.
-        waiting: while it says that it waits for something, e.g. for its kernels to compile at the
-            first start on a machine.
-        failing: while it says that something is wrong.
-    """
-
-    silent: float = 120.0
-    waiting: float = 90.0
-    failing: float = 25.0
-
-    def of(self, status: DiagnosticStatus | None) -> float:
-        """Return the patience with a node of this status."""
-        if status is None:
-            return self.silent
-        return self.failing if status.level == DiagnosticStatus.ERROR else self.waiting
-
-
-PATIENCE = Patience()
+PATIENCE = 120.0
+"""Longest time [s] until a node is ready, e.g. while its kernels compile at the first start."""
+FAILING = 25.0
+"""Longest time [s] until a node is ready that says that something is wrong."""
 
 
 class GraphClient:
@@ -68,7 +49,6 @@ class GraphClient:
         )
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
-        self._clients: dict[str, Any] = {}
         self._processes: list[NodeProcess] = []
         self.diagnostics: dict[str, DiagnosticStatus] = {}
         self.newest: dict[str, Any] = {}
@@ -124,63 +104,59 @@ class GraphClient:
         while (left := end - time.monotonic()) > 0:
             self._executor.spin_once(timeout_sec=min(left, 0.05))
 
-    def wait_for(
-        self,
-        condition: Callable[[], Any],
-        timeout: float,
-        what: str,
-        progress: Callable[[float], None] | None = None,
-    ) -> Any:
+    def wait_for(self, condition: Callable[[], Any], timeout: float, what: str) -> Any:
         """Serve callbacks until ``condition()`` is true, and return its value.
 
         Args:
             condition: looked at after every callback.
             timeout: [s].
             what: completes the sentence "waited … s for …".
-            progress: called about ten times a second with the seconds waited.
 
         Raises:
             GraphError: the time is over.
             NodeError: a watched process has ended.
         """
-        begin = time.monotonic()
-        shown = begin
+        end = time.monotonic() + timeout
         while not (value := condition()):
             for process in self._processes:
                 process.check()
-            now = time.monotonic()
-            if now - begin > timeout:
+            if time.monotonic() > end:
                 raise GraphError(f"waited {timeout:.0f} s for {what}")
-            if progress is not None and now - shown > 0.1:
-                progress(now - begin)
-                shown = now
             self._executor.spin_once(timeout_sec=0.05)
         return value
 
-    def wait_ready(self, names: Iterable[str], patience: Patience = PATIENCE) -> None:
+    def wait_ready(
+        self, names: Iterable[str], patience: float = PATIENCE, failing: float = FAILING
+    ) -> None:
         """Wait until the diagnostics of all these nodes are ok or warning.
+
+        Args:
+            names: of the nodes.
+            patience: with all of them [s].
+            failing: with a node that says that something is wrong [s].
 
         Raises:
             GraphError: names the node that is not ready and what it says.
             NodeError: a watched process has ended.
         """
-        unready = {name: time.monotonic() for name in names}
+        begin, unready = time.monotonic(), set(names)
 
         def all_ready() -> bool:
-            for name, since in list(unready.items()):
+            for name in list(unready):
                 status = self.diagnostics.get(name)
                 if status is not None and status.level in READY:
-                    del unready[name]
+                    unready.remove(name)
                     continue
-                limit = patience.of(status)
-                if time.monotonic() - since > limit:
+                bad = status is not None and status.level == DiagnosticStatus.ERROR
+                limit = failing if bad else patience
+                if time.monotonic() - begin > limit:
                     said = status.message if status is not None else "nothing"
                     raise GraphError(
                         f"node '{name}' was not ready within {limit:.0f} s; it says: {said}"
                     )
             return not unready
 
-        self.wait_for(all_ready, patience.silent + 10.0, "the nodes")
+        self.wait_for(all_ready, math.inf, "the nodes")
 
     def diagnostic_values(self, name: str) -> dict[str, str]:
         """Return the key-value pairs of a node's newest diagnostics, empty before the first."""
@@ -193,13 +169,12 @@ class GraphClient:
         Raises:
             GraphError: there is no such service, no answer, or the answer is a refusal.
         """
-        if service not in self._clients:
-            self._clients[service] = self.node.create_client(Trigger, service)
-        client = self._clients[service]
+        client = self.node.create_client(Trigger, service)
         self.wait_for(client.service_is_ready, timeout, f"the service {service}")
         future = client.call_async(Trigger.Request())
         self.wait_for(future.done, timeout, f"an answer of the service {service}")
         answer = future.result()
+        self.node.destroy_client(client)
         if not answer.success:
             raise GraphError(f"{service} was refused: {answer.message}")
         return str(answer.message)

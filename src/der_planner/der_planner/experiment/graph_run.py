@@ -29,6 +29,8 @@ DISCOVERY = 1.0
 """The orchestrator listens for another graph this long [s] before it starts nodes."""
 ARMING = 5.0
 """The driver may refuse to be armed this long [s] before the run is given up."""
+PORT_VENTS = 3.0
+"""The process of a dead driver's port has vented the limb after this time [s]."""
 VENTED_PRESSURE = 1000.0
 """A limb counts as vented below this differential pressure [Pa]."""
 
@@ -100,7 +102,7 @@ class GraphPlayer(ABC):
             client.spin(DISCOVERY)
             self._refuse_second_graph(client, specs)
             self._join(client)
-            with self._everything_stops(client, specs):
+            with self._everything_stops(client):
                 self._start(client, specs, port)
                 # A graph that was not seen at once, or that began meanwhile, is known by now.
                 self._refuse_second_graph(client, specs, own=1)
@@ -125,8 +127,11 @@ class GraphPlayer(ABC):
     def _start(self, client: GraphClient, specs: list[NodeSpec], port: str) -> None:
         begin = time.monotonic()
         self._progress.say(f"  starting {', '.join(spec.executable for spec in specs)}")
+        remap = self._setup.hardware.remap if self._setup.hardware is not None else None
         for spec in specs:
-            self._begin_process(spec)
+            self._processes[spec.executable] = NodeProcess(
+                spec.package, spec.executable, spec.parameters, self._logs, remap
+            )
             client.watch(self._processes.values())
             if spec.executable == "board_emulator":
                 client.wait_for(lambda: os.path.exists(port), 60.0, "the emulated board's port")
@@ -135,19 +140,6 @@ class GraphPlayer(ABC):
         if "page" in self._processes:
             address = client.diagnostic_values("page").get("url", "unknown")
             self._progress.say(f"  the operator's page is at {address}?token={PAGE_TOKEN}")
-
-    def _begin_process(self, spec: NodeSpec, name: str = "") -> NodeProcess:
-        hardware = self._setup.hardware
-        process = NodeProcess(
-            spec.package,
-            spec.executable,
-            spec.parameters,
-            self._logs,
-            hardware.remap if hardware is not None else None,
-            name=name,
-        )
-        self._processes[spec.executable] = process
-        return process
 
     def _record(self, client: GraphClient) -> GraphRun:
         bag = Path(client.call("recorder/start"))
@@ -189,15 +181,10 @@ class GraphPlayer(ABC):
             if state is not None and state.mode == PressureState.FAULT:
                 raise GraphError(f"the driver vented: {'; '.join(state.faults) or 'fault'}")
             playing.feed()
+            self._progress.bar(min(played(), length), length, "played")
             return played() >= length
 
-        client.wait_for(
-            finished,
-            length + 30.0,
-            "the end of the motion",
-            lambda _: self._progress.bar(played(), length, "played"),
-        )
-        self._progress.bar(length, length, "played")
+        client.wait_for(finished, length + 30.0, "the end of the motion")
 
     def _vent(self, client: GraphClient) -> None:
         client.call("pressure_driver/vent")
@@ -210,33 +197,30 @@ class GraphPlayer(ABC):
 
         client.wait_for(vented, 30.0, "the chambers to vent")
 
-    def _vent_whatever_happened(self, client: GraphClient, specs: list[NodeSpec]) -> None:
-        """Vent after an error; a dead driver is started again, since boards have no watchdog."""
+    def _vent_after_error(self, client: GraphClient) -> None:
+        """Vent; where the driver has died, the process of its port does it by itself."""
         driver = self._processes.get("pressure_driver")
         if driver is None:
             return
         self._progress.say("  venting the limb")
         client.watch(())
         try:
-            if not driver.alive:
-                client.diagnostics.pop("pressure_driver", None)
-                (spec,) = (each for each in specs if each.executable == "pressure_driver")
-                client.watch([self._begin_process(spec, "pressure_driver_restarted")])
-                client.wait_ready(["pressure_driver"])
-            self._vent(client)
-        except (GraphError, NodeError) as error:
+            if driver.alive:
+                self._vent(client)
+            else:
+                client.spin(PORT_VENTS)
+        except GraphError as error:
             self._progress.say(
                 f"  WARNING: the limb may still be under pressure ({error}); close its air supply"
             )
-        client.watch(())
 
     @contextlib.contextmanager
-    def _everything_stops(self, client: GraphClient, specs: list[NodeSpec]) -> Iterator[None]:
+    def _everything_stops(self, client: GraphClient) -> Iterator[None]:
         """Stop every node at the end; after an error or an interrupt, vent first."""
         try:
             yield
         except BaseException:
-            self._vent_whatever_happened(client, specs)
+            self._vent_after_error(client)
             self._stop_all()
             raise
         client.watch(())

@@ -16,7 +16,7 @@ from der_planner.bags.series import load_run
 from der_planner.results.errors import EvaluationSettings, error_series, split_error
 from der_planner.results.evaluation import RunResult, evaluate_bag, evaluate_bags, evaluate_run
 from der_planner.results.figures import plot_error, plot_learning, plot_pressures, plot_tip
-from der_planner.results.report import read_results, write_report, write_results
+from der_planner.results.report import write_report, write_results
 from der_planner.results.statistics import Comparison, Summary, compare, summarise
 from der_planner.results.tables import csv_table, error_table, format_comparison, format_table
 
@@ -44,7 +44,6 @@ __all__ = [
     "plot_learning",
     "plot_pressures",
     "plot_tip",
-    "read_results",
     "split_error",
     "summarise",
     "write_report",

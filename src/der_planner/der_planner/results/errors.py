@@ -56,24 +56,22 @@ class Split:
     r(t) ≈ g r̄(t − τ) + b per axis, fitted by least squares over the window; τ is common.
 
     Attributes:
-        lag: τ [s], positive when the limb is late.
+        lag_s: τ [s], positive when the limb is late.
         gain_x, gain_y: g.
-        bias_x, bias_y: mean of r − r̄ over the window after the lag is taken out [m].
-        rms: of |r − r̄| [m].
-        rms_without_lag: after the lag is taken out.
-        rms_without_bias: after the mean is taken out, too.
-        rms_without_gain: after the gains are fitted, too: neither lag, bias nor gain explains it.
+        bias_x_m, bias_y_m: mean of r − r̄ over the window after the lag is taken out [m].
+        rms_without_lag_m: RMS of |r − r̄| [m] after the lag is taken out.
+        rms_without_bias_m: after the mean is taken out, too.
+        rms_without_gain_m: after the gains are fitted, too: neither lag, bias nor gain explains it.
     """
 
-    lag: float
+    lag_s: float
     gain_x: float
     gain_y: float
-    bias_x: float
-    bias_y: float
-    rms: float
-    rms_without_lag: float
-    rms_without_bias: float
-    rms_without_gain: float
+    bias_x_m: float
+    bias_y_m: float
+    rms_without_lag_m: float
+    rms_without_bias_m: float
+    rms_without_gain_m: float
 
 
 @dataclass(frozen=True)
@@ -98,7 +96,7 @@ def error_series(run: RunSeries, settings: EvaluationSettings | None = None) -> 
         EvaluationError: there is no valid image in the window.
     """
     settings = settings or EvaluationSettings()
-    lag = split_error(run, settings).lag if settings.remove_lag else 0.0
+    lag = split_error(run, settings).lag_s if settings.remove_lag else 0.0
     first, last = window(run, settings)
     time = run.tip.time - lag
     inside = (time >= first) & (time <= last) & np.isfinite(run.tip.value).all(axis=1)
@@ -156,20 +154,18 @@ def split_error(run: RunSeries, settings: EvaluationSettings | None = None) -> S
         )
     time, measured = run.tip.time[inside], run.tip.value[inside]
     lag = _best_lag(run.reference, time, measured, margin)
-    present = interpolate(run.reference, time)
     late = interpolate(run.reference, time - lag)
     offset = (measured - late).mean(axis=0)
     gains, fitted = _fit_gains(late, measured)
     return Split(
-        lag=lag,
+        lag_s=lag,
         gain_x=float(gains[0]),
         gain_y=float(gains[1]),
-        bias_x=float(offset[0]),
-        bias_y=float(offset[1]),
-        rms=_rms(measured - present),
-        rms_without_lag=_rms(measured - late),
-        rms_without_bias=_rms(measured - late - offset),
-        rms_without_gain=_rms(measured - fitted),
+        bias_x_m=float(offset[0]),
+        bias_y_m=float(offset[1]),
+        rms_without_lag_m=_rms(measured - late),
+        rms_without_bias_m=_rms(measured - late - offset),
+        rms_without_gain_m=_rms(measured - fitted),
     )
 
 

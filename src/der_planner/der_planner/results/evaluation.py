@@ -98,20 +98,6 @@ class RunResult:
         place = f" at {self.payload_at_m * 100:.1f} cm" if self.payload_at_m else ""
         return f"{self.mounting}, {self.payload_kg * 1000:.4g} g{place}"
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return what ``results.json`` holds; NaN becomes None, which JSON can say."""
-        return {key: json_value(value) for key, value in dataclasses.asdict(self).items()}
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> RunResult:
-        """Return a result that `to_dict` wrote; unknown keys are kept in ``extra``."""
-        names = {entry.name for entry in dataclasses.fields(cls)}
-        given = {key: _python_value(value) for key, value in data.items() if key in names}
-        for key in ("checks", "extra"):
-            given[key] = dict(data.get(key) or {})
-        given["extra"] |= {key: value for key, value in data.items() if key not in names}
-        return cls(**given)
-
 
 def json_value(value: Any) -> Any:
     """Return a value as JSON can say it: tuples as lists, NaN and infinity as None."""
@@ -120,12 +106,6 @@ def json_value(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [json_value(entry) for entry in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def _python_value(value: Any) -> Any:
-    if isinstance(value, list):
-        return tuple(_python_value(entry) for entry in value)
-    return float("nan") if value is None else value
 
 
 def evaluate_bag(path: str | Path, settings: EvaluationSettings | None = None) -> RunResult:
@@ -183,16 +163,9 @@ def evaluate_run(run: RunSeries, settings: EvaluationSettings | None = None) -> 
         gravity_m_s2=about.gravity,
         payload_kg=about.payload,
         payload_at_m=about.payload_at,
-        lag_s=split.lag,
-        gain_x=split.gain_x,
-        gain_y=split.gain_y,
-        bias_x_m=split.bias_x,
-        bias_y_m=split.bias_y,
-        rms_without_lag_m=split.rms_without_lag,
-        rms_without_bias_m=split.rms_without_bias,
-        rms_without_gain_m=split.rms_without_gain,
+        **dataclasses.asdict(split),
         pressure_rms_error_pa=_pressure_errors(run, first, last),
-        removed_lag_s=split.lag if settings.remove_lag else 0.0,
+        removed_lag_s=split.lag_s if settings.remove_lag else 0.0,
         problems=_problems(run, valid, longest),
         reference_points_m=_reference_points(run, first, last),
         checks=check_tracker(run.tip, run.truth, first, last) | check_board(run.board),

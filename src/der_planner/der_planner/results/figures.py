@@ -281,25 +281,3 @@ def plot_learning(results: Sequence[RunResult], folder: Path) -> list[Path]:
             axis.xaxis.get_major_locator().set_params(integer=True)
         axes[0].set_ylabel("mean tip error [cm]")
         return save(figure, folder, "learning")
-
-
-def plot_latency(results: Sequence[RunResult], folder: Path) -> list[Path]:
-    """Draw the time from a picture to the first setpoint corrected by it, where it is known.
-
-    Args:
-        results: of an experiment; all runs with feedback are counted together.
-        folder: where ``latency.png`` and ``latency.pdf`` go.
-    """
-    told = [run.extra.get("feedback", {}) for run in results]
-    counted = [about for about in told if about.get("latency_counts")]
-    if not counted:
-        return []
-    counts = np.sum([about["latency_counts"] for about in counted], axis=0)
-    width = float(counted[0]["latency_bin_s"]) * 1e3
-    with paper_style():
-        figure: Any = new_figure(COLUMN, 2.0)
-        axis = figure.subplots()
-        last = int(np.nonzero(counts)[0][-1]) + 2
-        axis.bar(np.arange(len(counts))[:last] * width, counts[:last], width, align="edge")
-        axis.set(xlabel="from picture to board [ms]", ylabel="pictures")
-        return save(figure, folder, "latency")

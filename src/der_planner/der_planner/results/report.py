@@ -7,7 +7,7 @@ import html
 import json
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,6 @@ from der_planner.bags.run import RunSeries
 from der_planner.results.evaluation import RunResult, json_value
 from der_planner.results.figures import (
     plot_error,
-    plot_latency,
     plot_learning,
     plot_pressures,
     plot_tip,
@@ -43,7 +42,6 @@ _CAPTIONS = {
     "shapes": "Planned and measured limb, over the camera's frames where these were recorded.",
     "pressures": "Differential pressures, commanded and measured; first trial of each model.",
     "learning": "Mean tip error over the runs that a plan was learned from, a line a trial.",
-    "latency": "From the instant of a picture to the first command at the board that knows of it.",
 }
 _DEFINITIONS = """
 <p>r̄ is the tip reference of the plan, interpolated linearly at the stamp of each image; r is the
@@ -69,19 +67,11 @@ figcaption, .small { font-size: 0.85rem; color: #555; }
 """
 
 
-@dataclass(frozen=True)
-class Report:
-    """What was written: the page, and everything beside it."""
-
-    page: Path
-    files: tuple[Path, ...]
-
-
 def results_document(results: Sequence[RunResult]) -> dict[str, Any]:
     """Return the content of ``results.json``: runs, summary over trials, comparisons."""
     return {
         "format": FORMAT,
-        "runs": [result.to_dict() for result in results],
+        "runs": [json_value(asdict(result)) for result in results],
         "summary": [json_value(asdict(row)) for row in summarise(results)],
         "comparisons": [json_value(asdict(entry)) for entry in compare(results)],
         "side_by_side": side_by_side(results),
@@ -100,12 +90,6 @@ def write_results(results: Sequence[RunResult], folder: Path) -> Path:
     return path
 
 
-def read_results(path: Path) -> list[RunResult]:
-    """Return the runs of a ``results.json``."""
-    document = json.loads(Path(path).read_text(encoding="utf-8"))
-    return [RunResult.from_dict(entry) for entry in document["runs"]]
-
-
 def write_report(
     runs: Sequence[RunSeries],
     results: Sequence[RunResult],
@@ -113,7 +97,7 @@ def write_report(
     *,
     title: str = "Tracking errors",
     progress: Callable[[str], None] = lambda _: None,
-) -> Report:
+) -> Path:
     """Write page, tables and figures into a folder.
 
     Args:
@@ -125,21 +109,20 @@ def write_report(
         progress: called with what is being made.
 
     Returns:
-        The written files.
+        The page.
 
     Raises:
         BagError: a bag cannot be read again for its frames.
     """
     folder = Path(folder)
-    files = [write_results(results, folder)]
+    write_results(results, folder)
     rows = summarise(results)
     for name, text in (
         ("table.md", error_table(rows).markdown()),
         ("table.csv", csv_table(rows)),
         ("table.tex", error_table(rows).latex()),
     ):
-        files.append(folder / name)
-        files[-1].write_text(text, encoding="utf-8")
+        (folder / name).write_text(text, encoding="utf-8")
     figures: list[str] = []
     plots: dict[str, Callable[[], list[Path]]] = {
         "error": lambda: plot_error(runs, folder),
@@ -147,16 +130,13 @@ def write_report(
         "shapes": lambda: plot_shapes(runs, folder),
         "pressures": lambda: plot_pressures(runs, folder),
         "learning": lambda: plot_learning(results, folder),
-        "latency": lambda: plot_latency(results, folder),
     }
     for name, plot in plots.items():
         progress(f"figure {name}")
-        written = plot()
-        files += written
-        figures += [figure(_CAPTIONS[name], path) for path in written if path.suffix == ".png"]
+        figures += [figure(_CAPTIONS[name], path) for path in plot() if path.suffix == ".png"]
     page = folder / "report.html"
     page.write_text(document(title, _sections(results, figures)), encoding="utf-8")
-    return Report(page, (*files, page))
+    return page
 
 
 def document(title: str, sections: Sequence[str]) -> str:

@@ -5,7 +5,7 @@ Only runs that can be compared are compared; the others are left out and the rea
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -206,10 +206,7 @@ def _compared(pair: Comparison, runs: list[RunResult], others: list[RunResult]) 
     """Return a comparison with its figures."""
     one, two = (np.array([run.mean_error_m for run in side]) for side in (runs, others))
     differences = _pairs(runs, others)
-    if differences is not None:
-        low, high = _bootstrap([differences], _mean)
-    else:
-        low, high = _bootstrap([one, two], _difference_of_means)
+    low, high = _interval(two, one) if differences is None else _interval(differences)
     return replace(
         pair,
         difference_m=float(two.mean() - one.mean()),
@@ -230,35 +227,24 @@ def _pairs(one: list[RunResult], two: list[RunResult]) -> Array | None:
     return np.array([second[seed] - first[seed] for seed in sorted(first)])
 
 
-def _bootstrap(samples: Sequence[Array], statistic: Callable[..., Any]) -> tuple[float, float]:
-    """Return the percentile interval of a statistic of samples that were drawn independently [m].
+def _interval(*samples: Array) -> tuple[float, float]:
+    """Return the percentile bootstrap interval of a mean, or of a difference of means [m].
 
     NaN where a sample has fewer than two values. The seed is fixed: the same runs give the same
     interval.
+
+    Args:
+        samples: of differences; or two drawn independently, of the baseline and of the model.
     """
     if min(len(sample) for sample in samples) < 2:
         return float("nan"), float("nan")
-    # It takes most of a second to import: only who compares trials pays for it.
-    from scipy.stats import bootstrap  # noqa: PLC0415
-
-    found = bootstrap(
-        samples,
-        statistic,
-        n_resamples=RESAMPLES,
-        confidence_level=CONFIDENCE,
-        method="percentile",
-        vectorized=True,
-        rng=np.random.default_rng(SEED),
-    )
-    return float(found.confidence_interval.low), float(found.confidence_interval.high)
-
-
-def _mean(sample: Array, axis: int = -1) -> Array:
-    return np.asarray(np.mean(sample, axis=axis))
-
-
-def _difference_of_means(one: Array, two: Array, axis: int = -1) -> Array:
-    return np.asarray(np.mean(two, axis=axis) - np.mean(one, axis=axis))
+    random = np.random.default_rng(SEED)
+    means = [
+        random.choice(sample, size=(RESAMPLES, len(sample))).mean(axis=1) for sample in samples
+    ]
+    resampled = means[0] if len(means) == 1 else means[0] - means[1]
+    low, high = np.quantile(resampled, [0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2])
+    return float(low), float(high)
 
 
 def learned_from(method: str) -> int:

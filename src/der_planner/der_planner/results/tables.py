@@ -8,7 +8,7 @@ import io
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TypeVar
 
 from der_planner.results.evaluation import RunResult
@@ -186,11 +186,7 @@ def _named(entry: Summary | Comparison) -> str:
 
 def csv_table(rows: Sequence[Summary]) -> str:
     """Return the table as CSV, in SI units with the unit in each column's name."""
-    names = [
-        "motion", "model", "method", "trials", "mean_error_m", "mean_error_x_m", "mean_error_y_m",
-        "std_error_m", "std_error_x_m", "std_error_y_m", "max_error_m", "valid_fraction",
-        "predicted_error_m", "namespace", "loads",
-    ]  # fmt: skip
+    names = [field.name for field in fields(Summary) if field.name != "problems"]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(names)
