@@ -111,7 +111,7 @@ class Simulation:
 
     def arm(self):
         """Wait until the driver may be armed, and arm it."""
-        self.run_until(lambda: not self.core.machine.obstacles(self.steady))
+        self.run_until(lambda: not self.core.obstacles())
         assert self.core.arm() == (True, "armed")
         self.armings += 1
 

@@ -36,6 +36,21 @@ def test_options_of_the_command_give_the_settings_back():
     assert settings.from_options(parser.parse_args(settings.to_options(given))) == given
 
 
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        ({"over_pressure": 20_000.0}, "'over_pressure'.*'pressure_limit'"),
+        ({"supply_high": 110_000.0}, "'supply_low'.*'supply_high'"),
+        ({"rate": 3.0}, "'command_validity'.*'rate'"),
+        ({"pressure_limit": -5.0}, "'pressure_limit'.*allowed"),
+        ({"protocol": "modbus"}, "ezloop, ctrlp, native"),
+    ],
+)
+def test_parameters_that_cannot_work_are_named(values, told):
+    with pytest.raises(settings.SettingError, match=told):
+        settings.Settings(**values)
+
+
 def vectors():
     found = dict(VECTOR.findall(PROTOCOL))
     assert len(found) >= 7

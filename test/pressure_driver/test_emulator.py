@@ -9,7 +9,7 @@ import pytest
 
 from pressure_driver.emulator.board import EmulatedBoard, FaultError, Faults
 from pressure_driver.emulator.pneumatics import BoardPneumatics
-from pressure_driver.emulator.port import EmulatedPort
+from pressure_driver.emulator.runner import EmulatedPort
 from pressure_driver.protocols import board_protocol, host_protocol
 
 SEEDS = range(8)

@@ -16,12 +16,10 @@ import pytest
 
 from pressure_driver import board as board_module
 from pressure_driver import ports
-from pressure_driver.channel import Channel
+from pressure_driver.channel import Channel, PortProcess
 from pressure_driver.emulator.board import EmulatedBoard, Faults
 from pressure_driver.emulator.pneumatics import BoardPneumatics
-from pressure_driver.emulator.port import EmulatedPort
-from pressure_driver.emulator.runner import BoardRunner
-from pressure_driver.port_process import PortProcess
+from pressure_driver.emulator.runner import BoardRunner, EmulatedPort
 from pressure_driver.ports import PortError, open_port, prefer_thread
 from pressure_driver.protocols import NAMES, board_protocol
 from pressure_driver.safety import Mode
@@ -31,6 +29,8 @@ from pressure_driver.settings import Settings, to_options
 pytestmark = pytest.mark.slow
 
 PERIOD = 50_000_000
+COUNT = itertools.count(1)
+"""Of messages, as the middleware counts them."""
 
 
 def wait_for(condition, what, limit=60.0):
@@ -41,16 +41,23 @@ def wait_for(condition, what, limit=60.0):
 
 
 class Rig:
-    """An emulated board in this process, and settings for a driver on its port."""
+    """An emulated board in this process, and a driver on its port; its times are short."""
 
     def __init__(self, folder, protocol):
         self.commands = []
-        self.port = EmulatedPort(str(folder / "board"), 115_200)
+        self.port = EmulatedPort(str(folder / f"board_{protocol}"), 115_200)
         self.board = EmulatedBoard(board_protocol(protocol), BoardPneumatics(2, 1), 1)
         self.runner = BoardRunner(self.board, self.port, on_command=self.commands.append)
         self.runner.start()
-        self.settings = Settings(port=str(self.port.link), protocol=protocol, slew_limit=1e6)
-        self.said, self.state, self.driver, self.armings = [], {}, None, 0
+        self.settings = Settings(
+            port=str(self.port.link),
+            protocol=protocol,
+            atmosphere=self.board.atmosphere,
+            slew_limit=1e6,
+            vent_rate=2e4,
+            hold_time=0.2,
+        )
+        self.said, self.state, self.armings = [], {}, 0
 
     def start(self):
         """Have the node's end of the driver in this process, and the port's in one of its own."""
@@ -71,10 +78,6 @@ class Rig:
     def mode(self):
         return self.state.get("mode")
 
-    def arm(self):
-        wait_for(lambda: self.ask("arm"), "the driver to be armed")
-        self.armings += 1
-
     def ask(self, word):
         self.send("alive")
         return self.driver.ask(word)[0]
@@ -85,7 +88,8 @@ class Rig:
 
     def pressurise(self):
         """Arm and play until a chamber is full."""
-        self.arm()
+        wait_for(lambda: self.ask("arm"), "the driver to be armed")
+        self.armings += 1
         wait_for(lambda: self.offer((3000.0, -2000.0)) or self.pressurised(), "pressure")
 
     def pressurised(self):
@@ -105,106 +109,8 @@ class Rig:
         self.runner.set_faults(Faults.parse(texts, 4))
 
     def close(self):
-        if self.driver is not None:
-            self.driver.close()
+        self.driver.close()
         self.runner.close()
-
-
-COUNT = itertools.count(1)
-
-
-@pytest.fixture
-def make_rig(tmp_path):
-    made = []
-
-    def make(protocol="ezloop"):
-        made.append(Rig(tmp_path, protocol))
-        return made[-1]
-
-    yield make
-    for rig in made:
-        rig.close()
-
-
-@pytest.fixture
-def rig(make_rig):
-    return make_rig().start()
-
-
-# ------------------------------------------------------------------------------- it plays
-
-
-def test_setpoints_arrive_in_order_not_before_their_stamps(rig):
-    rig.arm()
-    start = (time.time_ns() // PERIOD + 10) * PERIOD
-    wanted = {start + k * PERIOD: 300.0 * (k + 1) for k in range(20)}
-    for index, (stamp, value) in enumerate(wanted.items()):
-        rig.offer((value, 0.0), stamp, index)
-    wait_for(lambda: rig.send("alive") or rig.mode == Mode.TRACKING, "tracking")
-    wait_for(lambda: rig.send("alive") or rig.mode == Mode.ARMED, "the ramp down")
-    first_seen = {}
-    for command in rig.commands:
-        value = round(command.pressure[0] - command.pressure[1], 1)
-        first_seen.setdefault(value, command.stamp)
-    seen = {stamp: first_seen[value] for stamp, value in wanted.items() if value in first_seen}
-    assert len(seen) >= 1
-    assert list(seen.values()) == sorted(seen.values())
-    assert all(at >= stamp for stamp, at in seen.items())
-    assert rig.state["setpoints_accepted"] == len(wanted)
-
-
-def test_a_vent_is_sent_at_once_and_refuses_what_comes(rig):
-    rig.pressurise()
-    assert rig.ask("vent")
-    count = len(rig.commands)
-    rig.offer((3000.0, 0.0))
-    rig.wait_vented()
-    assert all(rig.vents(count + 1))
-
-
-def test_by_hand_it_takes_lines_from_a_terminal(make_rig):
-    rig = make_rig()
-    command = [sys.executable, "-m", "pressure_driver.board", *to_options(rig.settings)]
-    process = subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
-    )
-
-    def armed():
-        process.stdin.write("arm\n")
-        return "True" in (line := process.stdout.readline()) or line == "armed\n"
-
-    wait_for(armed, "an answer")
-    process.stdin.write("3000 -2000\n")
-    wait_for(rig.pressurised, "pressure")
-    process.stdin.close()
-    assert process.wait(30.0) == 0
-    rig.wait_vented()
-
-
-# ---------------------------------------------------------------- one of the two processes ends
-
-
-@pytest.mark.parametrize("protocol", NAMES)
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-def test_the_node_vents_for_a_process_of_the_port_that_dies_or_hangs(make_rig, protocol, number):
-    rig = make_rig(protocol).start()
-    rig.pressurise()
-    os.kill(rig.driver.process_id, number)
-    wait_for(lambda: rig.driver.error, "the node to notice")
-    assert re.search("has ended|no sign of life", rig.driver.error)
-    assert "check that the chambers are down" in rig.driver.error
-    rig.wait_vented()
-    assert not rig.driver.ask("arm")[0]
-    wait_for(lambda: not rig.port.host_present, "a port that nobody holds")
-
-
-def test_a_process_of_the_port_that_dies_without_its_board_is_told_of(rig):
-    rig.pressurise()
-    rig.have("unplug")
-    wait_for(lambda: rig.mode == Mode.FAULT, "the fault")
-    os.kill(rig.driver.process_id, signal.SIGKILL)
-    wait_for(lambda: rig.driver.error, "the node to notice")
-    assert "close the air supply" in rig.driver.error
 
 
 class SilentNode(Rig):
@@ -229,15 +135,21 @@ class SilentNode(Rig):
 
     def ask(self, word):
         self.send(word)
-        while (content := self.channel.receive()[0])[0] != "answer":
-            self.note(content)
+        while (content := self.listen())[0] != "answer":
+            pass
         return content[1]
 
-    def note(self, content):
+    def fileno(self):
+        return self.channel.fileno()
+
+    def listen(self):
+        """Return the next message, and note the mode."""
+        content, _ = self.channel.receive()
         if content[0] == "state":
             self.state = content[1]
             if self.modes[-1:] != [self.mode]:
                 self.modes.append(self.mode)
+        return content
 
     def close(self):
         self.channel.socket.close()
@@ -247,40 +159,128 @@ class SilentNode(Rig):
 
 
 @pytest.fixture
-def silent_node(tmp_path, request):
-    rig = SilentNode(tmp_path, request.param).start()
-    yield rig
-    rig.close()
+def make_rigs(tmp_path):
+    """Return a function that starts one rig for each protocol."""
+    made = []
+
+    def make(*protocols, kind=Rig):
+        made.extend(kind(tmp_path, protocol) for protocol in protocols)
+        return [rig.start() for rig in made]
+
+    yield make
+    for rig in made:
+        rig.close()
 
 
-@pytest.mark.parametrize("silent_node", NAMES, indirect=True)
-def test_the_process_of_the_port_vents_for_a_node_that_ends(silent_node):
-    silent_node.pressurise()
-    silent_node.channel.socket.close()
-    assert silent_node.process.wait(30.0) == 1
-    assert b"the driver's node has ended: the vent command was" in silent_node.process.stderr.read()
-    silent_node.wait_vented()
+@pytest.fixture
+def rig(make_rigs):
+    return make_rigs("ezloop")[0]
 
 
-@pytest.mark.parametrize("silent_node", NAMES, indirect=True)
-def test_a_node_that_hangs_has_the_limb_let_down_and_may_go_on(silent_node):
+# -------------------------------------------------------------------------------- it plays
+
+
+def test_setpoints_arrive_not_before_their_stamps_vent_at_once_and_the_end_leaves_the_port(rig):
+    wait_for(lambda: rig.ask("arm"), "the driver to be armed")
+    start = (time.time_ns() // PERIOD + 6) * PERIOD
+    wanted = {start + k * PERIOD: 300.0 * (k + 1) for k in range(12)}
+    for index, (stamp, value) in enumerate(wanted.items()):
+        rig.offer((value, 0.0), stamp, index)
+    wait_for(lambda: rig.send("alive") or rig.mode == Mode.TRACKING, "tracking")
+    wait_for(lambda: rig.send("alive") or rig.mode == Mode.ARMED, "the ramp down")
+    first_seen = {}
+    for command in rig.commands:
+        value = round(command.pressure[0] - command.pressure[1], 1)
+        first_seen.setdefault(value, command.stamp)
+    seen = {stamp: first_seen[value] for stamp, value in wanted.items() if value in first_seen}
+    assert len(seen) >= 1
+    assert list(seen.values()) == sorted(seen.values())
+    assert all(at >= stamp for stamp, at in seen.items())
+    assert rig.state["setpoints_accepted"] == len(wanted)
+
+    rig.pressurise()
+    assert rig.ask("vent")
+    count = len(rig.commands)
+    rig.offer((3000.0, 0.0))
+    rig.wait_vented()
+    assert all(rig.vents(count + 1))
+
+    rig.pressurise()
+    assert rig.driver.close() == ""
+    wait_for(lambda: rig.vents()[-3:] == [True] * 3, "the last commands")
+    rig.wait_vented()
+    wait_for(lambda: not rig.port.host_present, "the port to be left")
+    open_port(str(rig.port.link), 115_200).close()
+
+
+def test_by_hand_it_takes_lines_from_a_terminal(rig):
+    rig.driver.close()
+    command = [sys.executable, "-m", "pressure_driver.board", *to_options(rig.settings)]
+    process = subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
+    )
+
+    def armed():
+        process.stdin.write("arm\n")
+        return process.stdout.readline() == "armed\n"
+
+    wait_for(armed, "an answer")
+    process.stdin.write("3000 -2000\n")
+    wait_for(rig.pressurised, "pressure")
+    process.stdin.close()
+    assert process.wait(30.0) == 0
+    rig.wait_vented()
+
+
+# ------------------------------------------------------------- one of the two processes ends
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_the_node_vents_for_a_process_of_the_port_that_dies_or_hangs(make_rigs, number):
+    rigs = make_rigs(*NAMES)
+    for rig in rigs:
+        rig.pressurise()
+        os.kill(rig.driver.process_id, number)
+    for rig in rigs:
+        wait_for(lambda rig=rig: rig.driver.error, "the node to notice")
+        assert re.search("(has ended|no sign of life).* was sent", rig.driver.error)
+        rig.wait_vented()
+        assert not rig.driver.ask("arm")[0]
+        wait_for(lambda rig=rig: not rig.port.host_present, "a port that nobody holds")
+
+
+def test_a_node_that_hangs_has_the_limb_let_down_and_may_go_on_and_one_that_ends_is_vented_for(
+    make_rigs,
+):
     """Though setpoints for seconds have arrived: nobody could stop them."""
-    rig = silent_node
-    rig.arm()
+    rigs = make_rigs(*NAMES, kind=SilentNode)
+    for rig in rigs:
+        wait_for(lambda rig=rig: rig.ask("arm"), "the driver to be armed")
     start = (time.time_ns() // PERIOD + 10) * PERIOD
-    for index in range(180):
+    for rig, index in itertools.product(rigs, range(180)):
         rig.offer((3000.0, -2000.0), start + index * PERIOD, index)
-    while rig.modes[-1:] != [Mode.ARMED] or Mode.VENTING not in rig.modes:
-        rig.note(rig.channel.receive()[0])
+    waiting = set(rigs)
+    while waiting:
+        for rig in select.select(waiting, [], [], 30.0)[0]:
+            rig.listen()
+            if Mode.VENTING in rig.modes and rig.mode == Mode.ARMED:
+                waiting.remove(rig)
         assert time.time_ns() < start + 178 * PERIOD, "played to the end"
-    assert rig.modes[-4:] == [Mode.TRACKING, Mode.HOLDING, Mode.VENTING, Mode.ARMED]
-    wait_for(lambda: rig.offer((3000.0, -2000.0)) or rig.pressurised(), "pressure again")
+    for rig in rigs:
+        assert rig.modes[-4:] == [Mode.TRACKING, Mode.HOLDING, Mode.VENTING, Mode.ARMED]
+        wait_for(lambda rig=rig: rig.offer((3000.0, -2000.0)) or rig.pressurised(), "pressure")
+        rig.channel.socket.close()
+    for rig in rigs:
+        assert rig.process.wait(30.0) == 1
+        told = rig.process.stderr.read()
+        assert b"the driver's node has ended: the vent command was sent" in told
+        rig.wait_vented()
 
 
 # ------------------------------------------------------------------------------- the port
 
 
-def test_an_unplug_faults_and_the_return_vents(rig):
+def test_an_unplug_faults_and_the_return_vents_and_a_death_without_the_board_is_told_of(rig):
     rig.pressurise()
     rig.have("unplug:0.5")
     wait_for(lambda: rig.mode == Mode.FAULT, "the fault")
@@ -292,6 +292,11 @@ def test_an_unplug_faults_and_the_return_vents(rig):
     assert rig.mode == Mode.FAULT
     rig.have()
     rig.pressurise()
+    rig.have("unplug")
+    wait_for(lambda: rig.mode == Mode.FAULT, "the fault")
+    os.kill(rig.driver.process_id, signal.SIGKILL)
+    wait_for(lambda: rig.driver.error, "the node to notice")
+    assert "close the air supply" in rig.driver.error
 
 
 def test_a_port_that_takes_no_bytes_is_a_fault_and_old_setpoints_are_not_sent_afterwards(rig):
@@ -316,17 +321,18 @@ def test_a_port_that_takes_no_bytes_is_a_fault_and_old_setpoints_are_not_sent_af
 def in_thread(monkeypatch):
     """Return a function that runs the process of the port in a thread of this one."""
     monkeypatch.setattr(board_module.gc, "freeze", lambda: None)
+    monkeypatch.setattr(board_module, "EMPTYING_TIME", 0.5)
     running = []
 
-    def start(settings, change=lambda _: None):
+    def start(settings, **parts):
         near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         far.setblocking(False)
         process = board_module.BoardProcess(settings, Channel(far))
-        change(process)
+        vars(process).update(parts)
         thread = threading.Thread(target=process.run, daemon=True)
         thread.start()
         running.append((process, thread, near))
-        return process, thread
+        return process, thread, Channel(near)
 
     yield start
     for process, thread, near in running:
@@ -340,10 +346,8 @@ def test_a_board_that_takes_no_bytes_does_not_stop_the_ticks(in_thread):
     master, slave = os.openpty()
     try:
         settings = Settings(port=os.ttyname(slave), real_time_priority=0)
-        process, thread = in_thread(
-            settings, lambda process: setattr(process, "grid", TickGrid(1_000_000))
-        )
-        wait_for(lambda: "takes no bytes" in process.core.machine.link_fault, "the fault")
+        process, thread, _ = in_thread(settings, grid=TickGrid(1_000_000))
+        wait_for(lambda: "takes no bytes" in process.core.obstacles()[0], "the fault")
         process.ending = True
         thread.join(30.0)
         assert not thread.is_alive()
@@ -353,10 +357,9 @@ def test_a_board_that_takes_no_bytes_does_not_stop_the_ticks(in_thread):
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_an_exception_in_the_process_vents(make_rig, in_thread):
-    rig = make_rig()
-    settings = Settings(port=str(rig.port.link), real_time_priority=0)
-    process, thread = in_thread(settings)
+def test_an_exception_in_the_process_vents(rig, in_thread):
+    rig.driver.close()
+    process, thread, _ = in_thread(rig.settings)
     wait_for(lambda: process.core.arm()[0], "the driver to be armed")
     process.core.machine._follow = lambda *_: 1 / 0
     thread.join(30.0)
@@ -364,27 +367,22 @@ def test_an_exception_in_the_process_vents(make_rig, in_thread):
     wait_for(lambda: rig.vents()[-3:] == [True] * 3, "the last commands")
 
 
-# --------------------------------------------------------------------------------- the end
-
-
-def test_the_end_puts_vent_on_the_wire_and_leaves_the_port(rig):
-    rig.pressurise()
-    assert rig.driver.close() == ""
-    wait_for(lambda: rig.vents()[-3:] == [True] * 3, "the last commands")
-    rig.wait_vented()
-    wait_for(lambda: not rig.port.host_present, "the port to be left")
-    open_port(str(rig.port.link), 115_200).close()
-
-
 @pytest.mark.parametrize(
     ("fault", "told"), [("unplug", "cannot be reached"), ("deaf", r"chambers .* keep \d+ Pa")]
 )
-def test_an_end_that_may_not_have_vented_says_so(rig, fault, told):
+def test_an_end_that_may_not_have_vented_says_so(rig, in_thread, fault, told):
     """A board that hears nothing, or reads nothing from a pseudo-terminal, keeps its pressures."""
+    rig.driver.close()
+    process, thread, channel = in_thread(rig.settings)
+    rig.send, rig.ask = channel.send, lambda _: process.core.arm()[0]
     rig.pressurise()
     rig.have(fault)
     wait_for(lambda: not rig.port.host_present or fault == "deaf", "the fault")
-    assert re.search(f"{told}.*close the air supply", rig.driver.close())
+    rig.send("end")
+    thread.join(30.0)
+    while (content := channel.receive()[0])[0] != "ended":
+        pass
+    assert re.search(f"{told}.*close the air supply", content[1])
 
 
 # ---------------------------------------------------------------------------- names and rights

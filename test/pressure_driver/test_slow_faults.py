@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pressure_driver import telemetry
-from pressure_driver.board_watch import BoardWatch
+from pressure_driver.core import BoardWatch
 from pressure_driver.emulator import board as board_module
 from pressure_driver.protocols import NAMES, host_protocol
 from pressure_driver.protocols.base import Echo
@@ -125,29 +125,6 @@ def test_no_motion_of_a_sound_limb_is_taken_for_a_leak(noisy, protocol, seed, pe
     assert stream_until_fault(sim, 60.0, motion) is None, sim.faults
 
 
-def test_an_ezloop_board_that_starts_under_pressure_is_warned_of_and_ends_vented(simulate):
-    said = []
-    sim = simulate("ezloop")
-    sim.core._log = lambda text, _: said.append(text)
-    sim.track()
-    sim.board.restart(0.1)
-    sim.stream(0.5, steady)
-    assert sim.mode is Mode.FAULT
-    sim.run(10.0)
-    assert sim.vented
-    # It believes in a room of a higher pressure, and fills to more than it is told.
-    assert sim.board.atmosphere > sim.board.pneumatics.atmosphere + 1_000.0
-    assert sum("power it anew" in text for text in said) == 1
-    sim.arm()
-    assert stream_until_fault(sim, 20.0, lambda t: (min(3_000.0 * t, 9_000.0), 0.0)) < 16.0
-    sim.run(8.0)
-    assert sim.vented
-    sim.board.restart(0.1)
-    sim.run(0.5)
-    sim.track()
-    assert sim.core._start_noted is False
-
-
 def test_a_board_that_fills_a_little_too_high_ends_vented(simulate):
     sim = simulate("ezloop")
     sim.board.atmosphere += 1_800.0  # what it took for the room's pressure
@@ -155,19 +132,6 @@ def test_a_board_that_fills_a_little_too_high_ends_vented(simulate):
     assert stream_until_fault(sim, 20.0) < 16.0
     assert "filled too high" in sim.faults[0]
     assert "powered anew" in sim.faults[0]
-
-
-def test_a_driver_whose_opening_of_the_port_starts_a_board_under_pressure_says_so(simulate):
-    said = []
-    sim = simulate("ezloop")
-    sim.core._log = lambda text, _: said.append(text)
-    sim.board.pneumatics.command(sim.board.pneumatics.atmosphere + np.array([9e3, 9e3, 0, 0]))
-    sim.board.pneumatics.step(3.0)
-    sim._receive(sim.core.opening())
-    sim.core.received(sim.board.boot())
-    sim.run(12.0)
-    assert sim.vented
-    assert any("power it anew" in text for text in said)
 
 
 def test_a_late_status_of_an_older_command_leaves_the_newest_waiting():

@@ -24,9 +24,9 @@ def test_a_whole_life(simulate, protocol):
     assert order == [
         Mode.DISARMED, Mode.ARMED, Mode.TRACKING, Mode.HOLDING, Mode.VENTING, Mode.ARMED,
     ]  # fmt: skip
-    counters = sim.core.machine.schedule.counters
-    assert counters.accepted == counters.executed == 80
-    assert counters.late == counters.refused == counters.duplicate == 0
+    counters = sim.core.machine.schedule.counts
+    assert counters["accepted"] == counters["executed"] == 80
+    assert counters["late"] == counters["refused"] == counters["duplicate"] == 0
     assert sim.core.vent()[0]
     sim.run_until(lambda: sim.mode is Mode.DISARMED, 10.0)
     assert sim.is_vent(sim.sent[-1])
@@ -221,3 +221,15 @@ def test_untimed_commands(simulate):
     assert sim.mode is Mode.TRACKING
     pressure = np.array(sim.received[-1].pressure)
     assert pressure[0::2] - pressure[1::2] == pytest.approx([2_000.0, -500.0])
+
+
+@pytest.mark.parametrize("protocol", NAMES)
+@pytest.mark.parametrize("seconds", [0.4, 5.0])
+def test_a_machine_that_stands_still_for_a_moment_ends_no_run(simulate, protocol, seconds):
+    """The emulated board stands still as well: nobody has been silent."""
+    sim = simulate(protocol)
+    sim.track()
+    sim.time += round(seconds * 1e9)
+    sim.stream(1.0, lambda _: (9_000.0, -5_000.0))
+    assert sim.faults == ()
+    assert sim.mode is Mode.TRACKING

@@ -27,18 +27,17 @@ from typing import Any
 import serial
 
 from pressure_driver import ports
-from pressure_driver.admission import Origin
-from pressure_driver.channel import Channel, Terminal
+from pressure_driver.channel import Channel
 from pressure_driver.core import DriverCore
+from pressure_driver.following import Duration
 from pressure_driver.ports import PortError
 from pressure_driver.protocols import host_protocol
-from pressure_driver.schedule import Setpoint, TickGrid, Verdict
+from pressure_driver.safety import Mode
+from pressure_driver.schedule import Origin, Setpoint, TickGrid, Verdict
 from pressure_driver.settings import NANOSECONDS, SettingError, Settings, add_options, from_options
 
-FIRST_RETRY = 0.1
-"""[s] after a lost port until it is looked for again."""
-LAST_RETRY = 2.0
-"""[s] between looks after a long absence."""
+RETRY_TIME = 0.2
+"""[s] between two attempts to open a port that was lost."""
 LONGEST_WAIT = 0.03
 """[s] after which the loop turns at the latest: to look for a lost port, to show life."""
 UNREAD_TIME = 1.0
@@ -52,14 +51,52 @@ REFUSAL_PERIOD = 1.0
 """[s] between two lines of the log about refused setpoints."""
 MOST_MESSAGES = 100
 """Messages that are served before the next look at the clock."""
-VENT_REPEATS = 3
-"""How often the vent command is sent at the end: there may be no checksum, and no second chance."""
-LAST_WORDS_TIME = 0.5
-"""[s] that the operating system may take to send them."""
+LAST_WORDS_TIME = 0.2
+"""[s] for which the vent command is repeated at the end: there may be no checksum."""
 EMPTYING_TIME = 3.0
 """[s] in which pressures must begin to fall at the end: boards take up to 1.7 s to obey."""
 EMPTYING_SHARE = 0.8
 """Of the pressure at the end, below which it counts as falling."""
+
+
+class Terminal:
+    """Takes the place of the node when the process is started by hand."""
+
+    def __init__(self) -> None:
+        self._lines: deque[str] = deque()
+        self._shown_at = 0.0
+
+    def fileno(self) -> int:
+        """Return the descriptor to wait for."""
+        return sys.stdin.fileno()
+
+    def send(self, word: str, *content: Any, descriptor: int | None = None) -> None:  # noqa: ARG002
+        """Print a message; the state once a second."""
+        if word == "state" and time.monotonic() - self._shown_at >= 1.0:
+            self._shown_at = time.monotonic()
+            state = content[0]
+            measured = [round(value, 0) for value in state["measured_chamber"]]
+            commanded = state["commanded_differential"]
+            mode = Mode(state["mode"]).name
+            print(mode, "commanded", commanded, "measured", measured, flush=True)
+        elif word in ("log", "answer", "failed", "ended"):
+            print(content[1] if word == "answer" else content[0], flush=True)
+
+    def receive(self) -> tuple[list[Any], int | None]:
+        """Return the next line as a message; the end of the lines ends the process.
+
+        Raises:
+            BlockingIOError: there is no line.
+        """
+        if not self._lines:
+            if not select.select([self], [], [], 0.0)[0]:
+                raise BlockingIOError
+            text = os.read(self.fileno(), 4096).decode()
+            self._lines += text.splitlines() if text else ["end"]
+        words = self._lines.popleft().split() or ["alive"]
+        with contextlib.suppress(ValueError):
+            return ["setpoint", 0, [float(word) for word in words], "", 0, 0, "", 0, True], None
+        return words[:1], None
 
 
 class BoardProcess:
@@ -83,16 +120,13 @@ class BoardProcess:
         self._bytes_waiting: select.epoll | None = None
         self._bytes_sent = self._bytes_received = self._reconnects = 0
         self._unsent = b""
-        self._drained_at = 0.0
+        self._unread = Duration()
         self._was_venting = True
-        self._emergency = b""
-        self._retry_delay, self._retry_at = FIRST_RETRY, 0.0
-        self._name_exists = True
-        self._heard_at = self._said_at = time.monotonic()
+        self._retry_at = 0.0
+        self._heard_at = self._said_at = self.core.clock()
         self._diagnosed_at = self._refused_at = 0.0
         self._node_is_silent = False
-        self._late_to_wake: deque[float] = deque(maxlen=1200)
-        self._late_to_write: deque[float] = deque(maxlen=1200)
+        self._late: deque[float] = deque(maxlen=1200)
         self._real_time = ports.prefer_thread(settings.real_time_priority)
 
     def run(self) -> int:
@@ -102,6 +136,7 @@ class BoardProcess:
         except PortError as error:
             self._send("failed", str(error))
             return 1
+        problem, duration, node_has_ended = "", LAST_WORDS_TIME, False
         try:
             self._opened()
             gc.collect()
@@ -110,21 +145,26 @@ class BoardProcess:
                 self._turn()
             problem = self._empty()
         except EOFError:
-            return self._replace_node()
+            duration, node_has_ended = ports.VENT_TIME, True
         finally:
-            reached = self._send_last_words()
-            self._release(drop=not reached)
-        if not reached:
+            unreached = self._send_last_words(duration)
+        if unreached:
             alone = " (a board with a watchdog vents by itself)"
             problem = (
                 f"the board on {self._port} cannot be reached and may hold its pressures"
                 f"{alone if self.core.protocol.has_watchdog else ''}: {ports.ADVICE}"
             )
         self._send("ended", problem)
-        return 1 if problem else 0
+        if node_has_ended:
+            # Whoever reads the standard error may stand still, and the limb is vented: do not wait.
+            signal.alarm(1)
+            told = problem or f"the vent command was sent for {duration:g} s"
+            with contextlib.suppress(OSError):
+                os.write(2, f"board: the driver's node has ended: {told}\n".encode())
+        return 1 if problem or node_has_ended else 0
 
     def _send(self, *message: Any, descriptor: int | None = None) -> None:
-        self._said_at = time.monotonic()
+        self._said_at = self.core.clock()
         self._channel.send(*message, descriptor=descriptor)
 
     def _log(self, text: str, warning: bool) -> None:
@@ -140,10 +180,8 @@ class BoardProcess:
         if self._bytes_waiting is not None:
             watched.append(self._bytes_waiting)
         readable, _, _ = select.select(watched, [], [], delay)
-        wall = time.time_ns()
-        instant = self.grid.take(wall, time.monotonic_ns())
+        instant = self.grid.take(time.time_ns())
         if instant is not None:
-            self._late_to_wake.append((wall - instant) / NANOSECONDS)
             self._tick(instant)
         if self._channel in readable:
             self._serve_messages()
@@ -161,11 +199,10 @@ class BoardProcess:
         self._was_venting = venting
         self._watch_queue()
         self._write(data)
-        self._late_to_write.append((time.time_ns() - instant) / NANOSECONDS)
+        self._late.append((time.time_ns() - instant) / NANOSECONDS)
         self.core.sent()
         self._send("state", self.core.state(), self._bytes_sent, self._bytes_received)
-        self._renew_emergency()
-        now = time.monotonic()
+        now = self.core.clock()
         if now - self._diagnosed_at >= DIAGNOSTICS_PERIOD:
             self._diagnosed_at = now
             self._diagnose()
@@ -174,15 +211,13 @@ class BoardProcess:
         level, text, values = self.core.diagnostics()
         values |= {
             "ticks_missed": self.grid.missed,
-            "clock_steps": self.grid.clock_steps,
             "reconnects": self._reconnects,
             "real_time_priority": self._real_time,
         }
-        for name, times in (("wake", self._late_to_wake), ("write", self._late_to_write)):
-            recent = sorted(times)
-            for label, share in {"p50": 0.5, "p99": 0.99, "max": 1.0}.items():
-                late = recent[round(share * (len(recent) - 1))]
-                values[f"tick_to_{name}_{label}_ms"] = f"{1000.0 * late:.3f}"
+        late = sorted(self._late)
+        for label, share in {"p50": 0.5, "p99": 0.99, "max": 1.0}.items():
+            value = late[round(share * (len(late) - 1))]
+            values[f"tick_to_write_{label}_ms"] = f"{1000.0 * value:.3f}"
         self._send("diagnostics", level, text, values)
 
     # ------------------------------------------------------------------------------ the node
@@ -191,7 +226,7 @@ class BoardProcess:
         with contextlib.suppress(BlockingIOError):
             for _ in range(MOST_MESSAGES):
                 (word, *content), _ = self._channel.receive()
-                self._heard_at = time.monotonic()
+                self._heard_at = self.core.clock()
                 self._serve(word, content)
 
     def _serve(self, word: str, content: list[Any]) -> None:
@@ -202,23 +237,27 @@ class BoardProcess:
         elif word == "arm":
             self._send("answer", *self.core.arm())
         elif word == "vent":
-            answer = self.core.vent()
-            self._drop_unsent()
-            self._write(self.core.emergency())
-            self._send("answer", *answer)
+            self._send("answer", *self._vent_now())
         elif word == "end":
             self.ending = True
 
     def _offer(self, setpoint: Setpoint, origin: Origin) -> None:
         verdict = self.core.offer(setpoint, time.time_ns(), origin)
-        now = time.monotonic()
+        now = self.core.clock()
         if verdict is not Verdict.ACCEPTED and now - self._refused_at >= REFUSAL_PERIOD:
             self._refused_at = now
             self._log(f"{verdict.value}: {self.core.machine.schedule.reason}", True)
 
+    def _vent_now(self) -> tuple[bool, str]:
+        """Vent before the next tick, and before all that waits to be sent."""
+        answer = self.core.vent()
+        self._drop_unsent()
+        self._write(self.core.emergency())
+        return answer
+
     def _show_life(self) -> None:
         """Say something at least every `LONGEST_WAIT`, and notice a node that says nothing."""
-        now = time.monotonic()
+        now = self.core.clock()
         if now - self._said_at >= LONGEST_WAIT:
             self._send("alive")
         silent = isinstance(self._channel, Channel) and now - self._heard_at > NODE_PATIENCE
@@ -228,29 +267,6 @@ class BoardProcess:
                 self._log(f"the node said nothing for {NODE_PATIENCE:g} s", True)
         self._node_is_silent = silent
 
-    def _replace_node(self) -> int:
-        """Vent in the place of a node that has ended without a goodbye, and say so."""
-        outcome = ports.vent_port(
-            -1 if self._device is None else self._device.fileno(), self.core.emergency()
-        )
-        if self._device is not None:
-            ports.release_port(self._device, drop=False)
-            self._device = None
-        # Whoever reads the standard error may stand still, and the limb is vented: do not wait.
-        signal.signal(signal.SIGALRM, signal.SIG_DFL)
-        signal.alarm(1)
-        with contextlib.suppress(OSError):
-            os.write(2, f"board: the driver's node has ended: {outcome}\n".encode())
-        return 1
-
-    def _renew_emergency(self) -> None:
-        """Tell the node the vent command again if it has changed: it names the room's pressure."""
-        if self.core.protocol.has_watchdog and self._emergency:
-            return  # it names a number, and any will do
-        if (command := self.core.emergency()) != self._emergency:
-            self._emergency = command
-            self._send("port", command.hex())
-
     # ------------------------------------------------------------------------------ the port
 
     def _opened(self) -> None:
@@ -259,23 +275,33 @@ class BoardProcess:
         # kernel finish pending deliveries first, which on busy cores takes milliseconds.
         self._bytes_waiting = select.epoll()
         self._bytes_waiting.register(self._device.fileno(), select.EPOLLIN | select.EPOLLET)
-        self._drained_at = time.monotonic()
+        self._unread = Duration()
         self._write(self.core.opening())
         if self._device is not None:
-            self._emergency = self.core.emergency()
-            self._send("port", self._emergency.hex(), descriptor=self._device.fileno())
+            command = self.core.emergency().hex()
+            self._send("port", command, descriptor=self._device.fileno())
+
+    def _look_for_port(self) -> None:
+        """Open a port that was lost as soon as its name is there again."""
+        if self._device is not None or time.monotonic() < self._retry_at:
+            return
+        if os.path.exists(self._port):
+            self._retry_at = time.monotonic() + RETRY_TIME
+            with contextlib.suppress(PortError):
+                self._device = ports.open_port(self._port, self._baud_rate)
+                self._reconnects += 1
+                self._log(f"{self._port} is back", True)
+                self._opened()
 
     def _watch_queue(self) -> None:
         """Lose the port if what has been written stays where it is: the board does not read."""
         if self._device is None:
             return
-        now = time.monotonic()
-        waiting = len(self._unsent)
+        now, waiting = self.core.clock(), len(self._unsent)
         with contextlib.suppress(OSError):
             waiting += self._device.out_waiting
-        if not waiting:
-            self._drained_at = now
-        elif now - self._drained_at > UNREAD_TIME:
+        self._unread.note(waiting > 0, now)
+        if self._unread.until(now) > UNREAD_TIME:
             self._lose(
                 f"the board on {self._port} does not read: {waiting} bytes have been waiting for "
                 f"{UNREAD_TIME:g} s"
@@ -298,8 +324,6 @@ class BoardProcess:
         except (serial.SerialException, OSError) as error:
             self._lose(f"reading from {self._port} failed: {error}")
             return
-        if data:
-            self._retry_delay = FIRST_RETRY
         self._bytes_received += len(data)
         self.core.received(data)
 
@@ -330,8 +354,7 @@ class BoardProcess:
         self._release(drop=True)
         self._send("lost")
         self._unsent = b""
-        self._name_exists = os.path.exists(self._port)
-        self._retry_at = time.monotonic() + self._retry_delay
+        self._retry_at = time.monotonic() + RETRY_TIME
         self._log(reason, True)
         self.core.lost(f"serial link lost: {reason}")
 
@@ -342,60 +365,28 @@ class BoardProcess:
             ports.release_port(self._device, drop)
         self._bytes_waiting = self._device = None
 
-    def _look_for_port(self) -> None:
-        """Open the port as soon as its name is there again; if it does not open, later again."""
-        if self._device is not None:
-            return
-        exists = os.path.exists(self._port)
-        if exists and not self._name_exists:
-            self._retry_at, self._retry_delay = 0.0, FIRST_RETRY
-        self._name_exists = exists
-        if not exists or time.monotonic() < self._retry_at:
-            return
-        self._retry_delay = min(self._retry_delay * 1.6, LAST_RETRY)
-        self._retry_at = time.monotonic() + self._retry_delay
-        with contextlib.suppress(PortError):
-            self._device = ports.open_port(self._port, self._baud_rate)
-            self._reconnects += 1
-            self._log(f"{self._port} is back", True)
-            self._opened()
-
     # ------------------------------------------------------------------------------- the end
 
     def _empty(self) -> str:
         """Vent, and go on until the pressures fall; return what to do if they do not."""
-        self.core.vent()
-        self._drop_unsent()
-        self._write(self.core.emergency())
-        before, deadline = self.core.highest_pressure(), time.monotonic() + EMPTYING_TIME
+        self._vent_now()
+        before, deadline = self.core.highest_pressure(), self.core.clock() + EMPTYING_TIME
         while self.core.highest_pressure() > EMPTYING_SHARE * before:
-            if time.monotonic() > deadline:
+            if self.core.clock() > deadline:
                 left = self.core.highest_pressure()
                 return f"the chambers on {self._port} keep {left:.0f} Pa: {ports.ADVICE}"
             self._turn()
         return ""
 
-    def _send_last_words(self) -> bool:
-        """Return whether the last vent commands have left the operating system in time."""
+    def _send_last_words(self, duration: float) -> str:
+        """Repeat the vent command and leave the port; return what is left to be done."""
         if self._device is None and os.path.exists(self._port):
             with contextlib.suppress(PortError):
                 self._device = ports.open_port(self._port, self._baud_rate)
-        if self._device is None:
-            return False
-        self._drop_unsent()
-        farewell = self.core.emergency() * VENT_REPEATS
-        deadline = time.monotonic() + LAST_WORDS_TIME
-        with contextlib.suppress(OSError, serial.SerialException):
-            while farewell or self._device.out_waiting:
-                if time.monotonic() > deadline:
-                    return False
-                with contextlib.suppress(BlockingIOError):
-                    farewell = farewell[os.write(self._device.fileno(), farewell) :]
-                time.sleep(0.002)
-            # The last bytes may still be in the port's hardware buffer.
-            time.sleep(64 * 10 / self._baud_rate)
-            return True
-        return False
+        descriptor = -1 if self._device is None else self._device.fileno()
+        problem = ports.vent_port(descriptor, self.core.emergency(), duration)
+        self._release(drop=bool(problem))
+        return problem
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

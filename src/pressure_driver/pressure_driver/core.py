@@ -7,11 +7,9 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
-from pressure_driver.admission import Origin
-from pressure_driver.board_watch import BoardWatch
 from pressure_driver.following import chamber_gauge
 from pressure_driver.protocols.base import (
     STANDARD_ATMOSPHERE,
@@ -25,14 +23,93 @@ from pressure_driver.protocols.base import (
     Telemetry,
 )
 from pressure_driver.safety import LIVE, Mode, SafetyMachine
-from pressure_driver.schedule import Setpoint, Verdict
+from pressure_driver.schedule import Origin, RunningClock, Setpoint, Verdict
 from pressure_driver.settings import NANOSECONDS, Settings
-from pressure_driver.telemetry import TelemetryMonitor
+from pressure_driver.telemetry import Condition, TelemetryMonitor
 
 LARGEST_CLOCK_STEP = 0.3
 """[s] between two ticks, above slewing and late wakes, that means the wall clock was set."""
 MOST_TEXTS = 20
 """Texts of the board that wait to be logged, one a tick; more are only counted."""
+IDENTITY_RETRY = 1.0
+"""[s] after which a board that has not introduced or set itself up is greeted again."""
+ECHO_TIMEOUT = 1.0
+"""[s] without an echo of any command, on boards that echo: the board takes no commands."""
+
+
+class BoardWatch:
+    """What is known about the board beside its pressures: which it is, and whether it answers.
+
+    Args:
+        protocol: the driver's end of the board's language.
+        settings: what the board must reach.
+    """
+
+    def __init__(self, protocol: HostProtocol, settings: Settings) -> None:
+        self.identity: BoardIdentity | None = None
+        self.round_trip = float("nan")
+        """[s] from the last command that was echoed to its echo."""
+        self._protocol = protocol
+        self._settings = settings
+        self._unanswered: deque[tuple[int | None, float]] = deque(maxlen=64)
+        self._greeted_at = 0.0
+
+    def opened(self, now: float) -> None:
+        """The port has been opened, and the board greeted: nothing is known about it."""
+        self.identity = None
+        self._unanswered.clear()
+        self._greeted_at = now
+
+    def greet_now(self, now: float) -> None:
+        """Have what the board does not confirm asked at the next tick (steady clock [s])."""
+        self._greeted_at = now - IDENTITY_RETRY
+
+    def greeting(self, now: float) -> bytes:
+        """Return the greeting again while it has not been answered; a board may boot slowly."""
+        unknown = self._protocol.introduces_itself and self.identity is None
+        answered = not (self._protocol.unsettled or unknown)
+        if answered or now - self._greeted_at < IDENTITY_RETRY:
+            return b""
+        self._greeted_at = now
+        return self._protocol.start()
+
+    def has_sent(self, number: int | None, now: float) -> None:
+        """A command with this number, if its protocol has numbers, has gone out."""
+        self._unanswered.append((number, now))
+
+    def take_echo(self, echo: Echo, now: float) -> None:
+        """Measure the round trip; an echo without a number is that of the newest command."""
+        numbers = [number for number, _ in self._unanswered]
+        # A status that left the board before the newest command came echoes an older one: the
+        # newest goes on waiting for its own.
+        if echo.sequence not in numbers:
+            return
+        answered = len(numbers) if echo.sequence is None else numbers.index(echo.sequence) + 1
+        for _ in range(answered):
+            self.round_trip = now - self._unanswered.popleft()[1]
+
+    def conditions(self, now: float) -> Iterator[Condition]:
+        """Say what about the board forbids arming (steady clock [s])."""
+        protocol, identity = self._protocol, self.identity
+        wanted = self._settings.pressure_limit
+        problem = ""
+        if protocol.introduces_itself and identity is None:
+            problem = "the board has not introduced itself yet"
+        elif identity and identity.chamber_count != protocol.chamber_count:
+            problem = (
+                f"the board has {identity.chamber_count} chambers, the driver expects "
+                f"{protocol.chamber_count}: set the parameter 'segment_count'"
+            )
+        elif identity and identity.largest_pressure < wanted:
+            problem = (
+                f"the board reaches {identity.largest_pressure:.0f} Pa, less than 'pressure_limit' "
+                f"({wanted:.0f} Pa): lower the parameter"
+            )
+        if problem := problem or protocol.unsettled:
+            yield Condition(problem, lasting=False)
+        waits_since = self._unanswered[0][1] if self._unanswered else now
+        if protocol.echoes and now - waits_since > ECHO_TIMEOUT:
+            yield Condition(f"the board has not answered a command for {ECHO_TIMEOUT:g} s")
 
 
 class DriverCore:
@@ -60,26 +137,33 @@ class DriverCore:
         """Texts of the board that came too fast for the log."""
         self.last_text = ""
         """What the board has said last in plain words."""
-        self._settings = settings
-        self._steady = steady
-        self._log = log
+        self.clock = RunningClock(2.0 * settings.period / NANOSECONDS, steady)
+        """Counts the seconds of every patience."""
         self.monitor = TelemetryMonitor(protocol, settings)
-        self.machine = SafetyMachine(settings, self.monitor)
+        self.machine = SafetyMachine(settings, self.monitor, self._conditions)
         self.board = BoardWatch(protocol, settings)
+        self._settings = settings
+        self._log = log
+        self._link_fault = "the serial port is not open"
         self._texts: deque[str] = deque()
         self._last_tick = 0
         self._last_mode = Mode.DISARMED
         self._pending_number: int | None = None
-        self._limited_noted = 0
-        self._was_limited = False
-        self._start_noted = False
         self._clock_offset = 0.0
+
+    def _conditions(self, now: float) -> Iterator[Condition]:
+        """Say everything that is wrong; without a port there is no telemetry: one cause."""
+        if self._link_fault:
+            yield Condition(self._link_fault)
+            return
+        yield from self.board.conditions(now)
+        yield from self.monitor.conditions(now)
 
     # -------------------------------------------------------------------------- requests
 
     def arm(self) -> tuple[bool, str]:
         """Allow pressure; returns whether, and a sentence."""
-        now = self._steady()
+        now = self.clock()
         was_live = self.machine.mode in LIVE
         result = self.machine.arm(now)
         if result[0] and not was_live:
@@ -91,7 +175,7 @@ class DriverCore:
 
     def vent(self) -> tuple[bool, str]:
         """Open all chambers and refuse setpoints until armed again."""
-        result = self.machine.vent(self._steady())
+        result = self.machine.vent(self.clock())
         self._note_mode()
         return result
 
@@ -103,11 +187,15 @@ class DriverCore:
             wall: [ns] wall clock.
             origin: where it came from; None inside one program.
         """
-        return self.machine.offer(setpoint, wall, self._steady(), origin)
+        return self.machine.offer(setpoint, wall, self.clock(), origin)
 
     def drop_setpoints(self) -> None:
         """Forget those that wait: the stream counts as ended."""
         self.machine.schedule.clear()
+
+    def obstacles(self) -> list[str]:
+        """Return what forbids arming now."""
+        return self.machine.obstacles(self.clock())
 
     # ----------------------------------------------------------------------------- state
 
@@ -121,7 +209,7 @@ class DriverCore:
         monitor, machine = self.monitor, self.machine
         gauge, base = monitor.gauge, self._wire_atmosphere()
         current = machine.schedule.current or Setpoint(0, ())
-        counters = machine.schedule.counters
+        counts = machine.schedule.counts
         return {
             "tick": self._last_tick,
             "setpoint_stamp": current.stamp,
@@ -135,19 +223,18 @@ class DriverCore:
             "measured_chamber": list(monitor.chamber_pressure),
             "valve_opening": monitor.valve_opening,
             "supply_pressure": monitor.supply_pressure,
-            "telemetry_age": monitor.telemetry_age(self._steady()),
+            "telemetry_age": monitor.telemetry_age(self.clock()),
             "round_trip": self.board.round_trip,
-            "setpoints_accepted": counters.accepted,
-            "setpoints_executed": counters.executed,
-            "setpoints_late": counters.late,
-            "setpoints_duplicate": counters.duplicate,
-            "setpoints_refused": counters.refused,
+            **{
+                f"setpoints_{name}": counts[name]
+                for name in ("accepted", "executed", "late", "duplicate", "refused")
+            },
         }
 
     def diagnostics(self) -> tuple[str, str, dict[str, Any]]:
         """Return the level, a sentence and the values for the diagnostics."""
         machine, protocol, monitor = self.machine, self.protocol, self.monitor
-        obstacles = machine.obstacles(self._steady())
+        obstacles = self.obstacles()
         values = {
             "mode": machine.mode.name,
             "faults": "; ".join(machine.faults) or "none",
@@ -156,14 +243,13 @@ class DriverCore:
             "protocol": protocol.name,
             "protocol_weaknesses": "; ".join(protocol.weaknesses) or "none",
             "board": self.board.identity.firmware if self.board.identity else self.last_text,
-            "atmosphere_pa": f"{self.monitor.rest.mean:.0f}",
-            "telemetry_age_s": f"{monitor.telemetry_age(self._steady()):.3f}",
+            "atmosphere_pa": f"{monitor.rest.mean:.0f}",
+            "telemetry_age_s": f"{monitor.telemetry_age(self.clock()):.3f}",
             "round_trip_s": f"{self.board.round_trip:.4f}",
             "damaged_frames": protocol.rejected,
             "last_damaged_line": protocol.last_damaged or "none",
-            "setpoints_waiting": self.machine.schedule.waiting,
-            "setpoints_superseded": machine.schedule.counters.superseded,
-            "setpoints_missing": machine.schedule.counters.missing,
+            "setpoints_waiting": machine.schedule.waiting,
+            "setpoints_superseded": machine.schedule.counts["superseded"],
             "setpoints_of_other_publishers": machine.publishers.refused,
             "ticks_held_back_by_slew_limit": machine.limited_ticks,
             "board_texts_not_logged": self.unlogged_texts,
@@ -182,20 +268,19 @@ class DriverCore:
 
     def opening(self) -> bytes:
         """Greet and vent: whatever the board held before, it lets go of now."""
-        now = self._steady()
         self.protocol.reset()
         self.monitor.forget()
-        self.machine.link_fault = ""
-        self.board.opened(now)
-        self._watch_board(now)
+        self._link_fault = ""
+        self.board.opened(self.clock())
         return self.protocol.start() + self._vent_bytes()
 
     def tick(self, instant: int) -> bytes:
         """Return the command of the tick at this wall time [ns]."""
-        now = self._steady()
-        self._watch_wall_clock(instant, now)
+        now = self.clock()
+        self._watch_wall_clock(instant)
         self._last_tick = instant
-        self._watch_board(now)
+        if self.monitor.silence(now):
+            self.protocol.doubt()
         vent = self.machine.tick(instant, now)
         self.venting = vent or bool(self.protocol.unsettled)
         if self.venting:
@@ -208,12 +293,10 @@ class DriverCore:
 
     def sent(self) -> None:
         """Do what can wait until the bytes of the tick are out."""
-        now = self._steady()
+        now = self.clock()
         self.monitor.command(self.machine.differential, now)
         self.board.has_sent(self._pending_number, now)
         self._note_mode()
-        self._note_limit()
-        self._note_start()
         if self._texts:
             self._log(f"board: {self._texts.popleft()}", False)
 
@@ -228,9 +311,9 @@ class DriverCore:
         data, self._pending_number = self.protocol.vent(self._wire_atmosphere())
         return data
 
-    def _watch_wall_clock(self, instant: int, now: float) -> None:
+    def _watch_wall_clock(self, instant: int) -> None:
         """Drop the schedule if the wall clock was set: its stamps do not mean what they meant."""
-        offset = instant / NANOSECONDS - now
+        offset = instant / NANOSECONDS - self.clock.steady
         step = offset - self._clock_offset
         self._clock_offset = offset
         if self._last_tick and abs(step) > LARGEST_CLOCK_STEP:
@@ -242,28 +325,23 @@ class DriverCore:
 
     def received(self, data: bytes) -> None:
         """Decode what the board has sent."""
-        now = self._steady()
+        now = self.clock()
         rejected = self.protocol.rejected
         events = self.protocol.decode(data)
         for event in events:
             self._serve(event, now)
         readings = sum(isinstance(event, Telemetry) for event in events)
         self.monitor.count_lines(readings, self.protocol.rejected - rejected, now)
-        self._watch_board(now)
 
     def lost(self, reason: str) -> None:
         """The port is gone: everything that was armed faults."""
-        self.machine.link_fault = reason
+        self._link_fault = reason
         self.monitor.forget()
-        self._note_mode()
 
     def _serve(self, event: Event, now: float) -> None:
         if isinstance(event, Telemetry):
             # Rest pressures are measured only where nothing has been asked of the chambers.
-            resting = self.machine.mode in (Mode.DISARMED, Mode.FAULT)
-            self.monitor.receive(event, now, resting)
-            if event.chamber_pressure is not None:
-                self.board.reports(self.monitor.chamber_pressure)
+            self.monitor.receive(event, now, self.machine.mode in (Mode.DISARMED, Mode.FAULT))
         elif isinstance(event, Echo):
             self.board.take_echo(event, now)
         elif isinstance(event, BoardReport):
@@ -273,27 +351,20 @@ class DriverCore:
         elif isinstance(event, BoardReset):
             self._set_up_anew(event, now)
         elif isinstance(event, BoardIdentity):
-            self.board.check_identity(event)
+            self.board.identity = event
         elif isinstance(event, BoardText):
             self.last_text = event.text
-            self.board.says_words()
             self._log_text(event.text)
 
     def _set_up_anew(self, reset: BoardReset, now: float) -> None:
         """Greet a board that has been reset; what was being played must not be played on."""
-        self._log(f"the board has been reset: {reset.sign}", True)
-        self.board.has_reset(self.monitor.chamber_pressure, now)
+        reason = f"the board has been reset: {reset.sign}"
+        self._log(reason, True)
+        self.board.identity = None
+        self.board.greet_now(now)
         self.monitor.forget()
         if self.machine.mode in LIVE:
-            self.machine.fail(f"the board has been reset: {reset.sign}")
-
-    def _watch_board(self, now: float) -> None:
-        """Find out whether the board is set up, reports, and takes commands."""
-        if self.monitor.telemetry_faults(now):
-            self.protocol.doubt()
-        if (silence := self.board.silence(now)) and self.machine.mode in LIVE:
-            self.machine.fail(silence)
-        self.machine.board_obstacle = self.board.obstacle(now)
+            self.machine.fail(reason)
 
     # -------------------------------------------------------------------------- to the log
 
@@ -301,25 +372,8 @@ class DriverCore:
         """Keep what the board says for the log, unless it talks too much."""
         if len(self._texts) < MOST_TEXTS:
             self._texts.append(text)
-            return
-        if not self.unlogged_texts:
-            self._log("the board sends text faster than it is logged: the rest is counted", True)
-        self.unlogged_texts += 1
-
-    def _note_limit(self) -> None:
-        """Say when the slew limit begins to hold the output back."""
-        limited = self.machine.limited_ticks
-        if limited > self._limited_noted and not self._was_limited:
-            self._log("the slew limit holds the output back: it follows the setpoints late", True)
-        self._was_limited = limited > self._limited_noted
-        self._limited_noted = limited
-
-    def _note_start(self) -> None:
-        """Warn once of a board that has started with pressure in its chambers."""
-        warning = self.board.started_under_pressure(self.monitor.rest.pressure)
-        if warning and not self._start_noted:
-            self._log(warning, True)
-        self._start_noted = bool(warning)
+        else:
+            self.unlogged_texts += 1
 
     def _note_mode(self) -> None:
         mode = self.machine.mode

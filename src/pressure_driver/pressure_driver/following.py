@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from statistics import fmean
+from typing import NamedTuple
 
 from pressure_driver.settings import Settings
 
 LONGEST_DELAY = 2.0
 """[s] from a command to the pressure: 0.2 to 1.7 s in logs of a real board."""
-LEAK_BLOCKS = 10
-"""Parts of the parameter `leak_time`: how often leaks are looked for in that time."""
+LEAK_LOOKS = 10
+"""How often leaks are looked for in the parameter `leak_time`."""
 LONGEST_GAP = 1.0
 """[s] between two readings, above which the mean values begin afresh."""
 
@@ -20,6 +22,21 @@ LONGEST_GAP = 1.0
 def chamber_gauge(differential: Sequence[float]) -> list[float]:
     """Return the gauge pressures (2M,) [Pa] of pairs: one chamber vented, the other at |u|."""
     return [gauge for value in differential for gauge in (max(value, 0.0), max(-value, 0.0))]
+
+
+class Duration:
+    """How long something has gone on without a break."""
+
+    def __init__(self) -> None:
+        self._since = math.inf
+
+    def note(self, goes_on: bool, now: float) -> None:
+        """Tell whether it goes on now (steady clock [s])."""
+        self._since = min(self._since, now) if goes_on else math.inf
+
+    def until(self, now: float) -> float:
+        """Return for how long [s]; −inf if it does not go on."""
+        return now - self._since
 
 
 class Following:
@@ -39,7 +56,7 @@ class Following:
         self._gauge = math.nan
         self._upper = self._lower = 0.0
         self._time: float | None = None
-        self._outside_since: float | None = None
+        self._outside = Duration()
         self._leaks = LeakWatch(self._name, settings)
 
     def command(self, pressure: float, now: float) -> None:
@@ -70,11 +87,9 @@ class Following:
         self._move_envelope(now)
         self._gauge = gauge
         tolerance = self._settings.follow_tolerance
-        if not (gauge > self._upper + tolerance or gauge < self._lower - tolerance):
-            self._outside_since = None
-        elif self._outside_since is None:
-            self._outside_since = now
-        self._leaks.receive(self._lower, self._upper, gauge, opening, now)
+        outside = gauge > self._upper + tolerance or gauge < self._lower - tolerance
+        self._outside.note(outside, now)
+        self._leaks.receive(Reading(now, self._lower, self._upper, gauge, opening))
 
     def restart(self, gauge: float, now: float) -> None:
         """Start afresh from what is measured now."""
@@ -82,13 +97,12 @@ class Following:
         self._upper = max(known, self._command)
         self._lower = min(known, self._command)
         self._time = now
-        self._outside_since = None
+        self._outside.note(False, now)
         self._leaks.restart()
 
     def faults(self, now: float) -> Iterator[str]:
         """Say whether the chamber does not follow its command, or loses air."""
-        since = self._outside_since
-        if since is not None and now - since >= self._settings.follow_time:
+        if self._outside.until(now) >= self._settings.follow_time:
             yield (
                 f"{self._name} does not follow: {self._gauge:.0f} Pa gauge, commanded "
                 f"{self._command:.0f} Pa"
@@ -97,18 +111,19 @@ class Following:
             yield self._leaks.fault
 
 
-@dataclass
-class _Block:
-    """Sums over the readings in one part of the leak time."""
+class Reading(NamedTuple):
+    """What one chamber measures, between what the slowest sound valves would have reached."""
 
-    since: float
-    count: int = 0
-    shortfall: float = 0.0
-    excess: float = 0.0
-    opening: float = 0.0
-    rise: float = 0.0
-    lowest: float = math.inf
-    highest: float = -math.inf
+    time: float
+    """[s] steady clock."""
+    lowest: float
+    """[Pa] gauge, while filling."""
+    highest: float
+    """[Pa] gauge, while venting."""
+    gauge: float
+    """[Pa]."""
+    opening: float
+    """Of the inlet, 0 … 1 or NaN."""
 
 
 class LeakWatch:
@@ -127,66 +142,49 @@ class LeakWatch:
         """What was found at the last look."""
         self._name = name
         self._settings = settings
-        self._blocks: deque[_Block] = deque(maxlen=LEAK_BLOCKS)
-        self._block: _Block | None = None
-        self._last_at = -math.inf
-        self._expected = 0.0
+        self._readings: deque[Reading] = deque()
+        self._next_look = math.inf
 
     def restart(self) -> None:
         """Forget all readings."""
         self.fault = ""
-        self._blocks.clear()
-        self._block = None
+        self._readings.clear()
 
-    def receive(
-        self, expected: float, highest: float, gauge: float, opening: float, now: float
-    ) -> None:
-        """Take what the slowest sound valves would have reached, and what is measured.
-
-        Args:
-            expected: [Pa] gauge, while filling.
-            highest: [Pa] gauge, while venting.
-            gauge: [Pa].
-            opening: of the inlet, 0 … 1 or NaN.
-            now: [s] steady clock.
-        """
-        if now - self._last_at > LONGEST_GAP or not math.isfinite(gauge):
+    def receive(self, reading: Reading) -> None:
+        """Take a reading, and look for a leak from time to time."""
+        readings, leak_time = self._readings, self._settings.leak_time
+        if readings and reading.time - readings[-1].time > LONGEST_GAP:
             self.restart()
-            self._expected = expected
-        self._last_at = now
-        block = self._block = self._block or _Block(now)
-        block.count += 1
-        block.shortfall += expected - gauge
-        block.excess += gauge - highest
-        block.opening += opening
-        block.rise += max(expected - self._expected, 0.0)
-        block.lowest = min(block.lowest, expected)
-        block.highest = max(block.highest, expected)
-        self._expected = expected
-        if now - block.since >= self._settings.leak_time / LEAK_BLOCKS:
-            self._blocks.append(block)
-            self._block = None
-            self.fault = self._judge() if len(self._blocks) == LEAK_BLOCKS else ""
+        if not math.isfinite(reading.gauge):
+            self.restart()
+            return
+        if not readings:
+            self._next_look = reading.time + leak_time
+        readings.append(reading)
+        while reading.time - readings[0].time > leak_time:
+            readings.popleft()
+        if reading.time >= self._next_look:
+            self._next_look += leak_time / LEAK_LOOKS
+            self.fault = self._judge()
 
     def _judge(self) -> str:
-        blocks, settings = self._blocks, self._settings
-        count = sum(block.count for block in blocks)
-        shortfall = sum(block.shortfall for block in blocks) / count
-        excess = sum(block.excess for block in blocks) / count
-        opening = sum(block.opening for block in blocks) / count
-        rise = sum(block.rise for block in blocks)
-        lowest = min(block.lowest for block in blocks)
-        span = max(block.highest for block in blocks) - lowest
-        allowed = settings.leak_tolerance + LONGEST_DELAY / settings.leak_time * span
+        settings = self._settings
+        _, lowest, highest, gauge, opening = zip(*self._readings, strict=True)
+        shortfall = fmean(lowest) - fmean(gauge)
+        excess = fmean(gauge) - fmean(highest)
+        open_share = fmean(opening)
+        rise = sum(max(after - before, 0.0) for before, after in itertools.pairwise(lowest))
+        allowed = settings.leak_tolerance
+        allowed += LONGEST_DELAY / settings.leak_time * (max(lowest) - min(lowest))
         fill_share = rise / (settings.slowest_fill * settings.leak_time)
-        pressed = lowest > settings.vented_tolerance
+        pressed = min(lowest) > settings.vented_tolerance
         mean = f"in the mean of {settings.leak_time:g} s"
         told = f"{mean} ('leak_tolerance' allows {settings.leak_tolerance:.0f} Pa)"
         if shortfall > allowed:
             return f"{self._name} loses air: {shortfall:.0f} Pa below its command {told}"
-        if pressed and opening > settings.leak_opening + fill_share:
+        if pressed and open_share > settings.leak_opening + fill_share:
             return (
-                f"{self._name} loses air: its inlet valve was open by {opening:.0%} {mean} "
+                f"{self._name} loses air: its inlet valve was open by {open_share:.0%} {mean} "
                 f"('leak_opening' allows {settings.leak_opening:.0%} at steady pressure)"
             )
         if pressed and excess > allowed:

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
-from rclpy.event_handler import QoSSubscriptionMatchedInfo, SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
@@ -16,12 +13,10 @@ from std_srvs.srv import Trigger
 from der_msgs.msg import PressureSetpoint, PressureState
 from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
-from limb_interfaces.overrides import check_overrides
-from limb_interfaces.parameters import ParameterError, declare
+from limb_interfaces.parameters import ParameterError, check_overrides, declare
 from limb_interfaces.runner import run_node
 from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
-from pressure_driver.port_process import PortProcess
-from pressure_driver.safety import Mode
+from pressure_driver.channel import PortProcess
 from pressure_driver.settings import Declared, Settings, declarations
 
 PASCAL_PER_HECTOPASCAL = 100.0
@@ -86,14 +81,12 @@ class PressureDriver(Node):
             topics.PRESSURE_SETPOINT,
             self._on_setpoint,
             qos.SETPOINTS,
-            event_callbacks=SubscriptionEventCallbacks(matched=self._on_publishers),
         )
         if settings.accept_cmd_u_t:
             self.create_subscription(Float64MultiArray, CMD_U_T, self._on_cmd_u_t, qos.SETPOINTS)
         DiagnosticsPublisher(self, self._report, hardware_id=settings.port)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(LIFE_PERIOD, self._show_life, clock=steady)
-        self.add_on_set_parameters_callback(self._refuse_simulated_time)
         self.get_logger().info(
             f"{settings.protocol} board on {settings.port}: vented, waiting for `arm`"
         )
@@ -120,15 +113,6 @@ class PressureDriver(Node):
         number = info["publication_sequence_number"]
         self._port.send("setpoint", *setpoint, topic, number, alone)
 
-    def _on_publishers(self, change: QoSSubscriptionMatchedInfo) -> None:
-        mode = self._port.diagnostics[2].get("mode")
-        if change.current_count_change < 0 and mode == Mode.TRACKING.name:
-            self.get_logger().warning(
-                f"a publisher of {self._setpoint_topic} has gone while setpoints are played; "
-                f"{change.current_count} left",
-                throttle_duration_sec=1.0,
-            )
-
     def _on_vent(self, _: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
         answer.success, answer.message = self._port.ask("vent")
         return answer
@@ -140,14 +124,6 @@ class PressureDriver(Node):
     def _show_life(self) -> None:
         self._port.send("alive")
         self.fatal_error = self._port.error
-
-    def _refuse_simulated_time(self, parameters: list[Parameter]) -> SetParametersResult:
-        for parameter in parameters:
-            if parameter.name == "use_sim_time" and parameter.value:
-                return SetParametersResult(
-                    successful=False, reason="'use_sim_time': the driver moves air in real time"
-                )
-        return SetParametersResult(successful=True)
 
     # ----------------------------------------------------------------------------- outputs
 

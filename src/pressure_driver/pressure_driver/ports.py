@@ -6,6 +6,7 @@ import contextlib
 import errno
 import fcntl
 import os
+import struct
 import termios
 import time
 from pathlib import Path
@@ -17,8 +18,8 @@ STABLE_NAMES = Path("/dev/serial/by-id")
 """Where the system keeps names of ports that survive re-plugging."""
 RELEASE_TIME = 4.0
 """[s] in which a process that vents after the end of its driver has let go of the port."""
-VENT_TIME = 2.0
-"""[s] for which `vent_port` repeats the vent command: bytes may be damaged."""
+VENT_TIME = 1.0
+"""[s] for which one process of the driver vents in the place of the other."""
 VENT_PERIOD = 0.05
 """[s] between two of its vent commands."""
 ADVICE = "close the air supply"
@@ -127,35 +128,33 @@ def release_port(device: serial.Serial, drop: bool = True) -> None:
         device.close()
 
 
-def vent_port(descriptor: int, command: bytes) -> str:
-    """Send the vent command again and again for `VENT_TIME`, before all that waits to be sent.
-
-    For a process that has lost the other one of the driver: nobody else writes any more.
+def vent_port(descriptor: int, command: bytes, duration: float) -> str:
+    """Send the vent command again and again, before all that waits to be sent.
 
     Args:
         descriptor: of the open port; −1 if there is none.
         command: opens every chamber, complete after any half-sent bytes.
+        duration: [s] for which it is repeated: bytes may be damaged.
 
     Returns:
-        What came of it, as a sentence.
+        What is left to be done, or nothing if the last command has left.
     """
     if descriptor < 0:
         return f"the board cannot be reached: {ADVICE}"
-    count, end = 0, time.monotonic() + VENT_TIME
-    with contextlib.suppress(termios.error):
+    taken, end = False, time.monotonic() + duration
+    try:
         termios.tcflush(descriptor, termios.TCOFLUSH)
-    while time.monotonic() < end:
-        try:
-            count += os.write(descriptor, command) == len(command)
-        except BlockingIOError:
-            with contextlib.suppress(termios.error):
+        while time.monotonic() < end:
+            try:
+                taken = os.write(descriptor, command) == len(command)
+            except BlockingIOError:
+                taken = False
                 termios.tcflush(descriptor, termios.TCOFLUSH)
-        except OSError as error:
-            return f"the port is gone ({error}) after {count} vent commands: {ADVICE}"
-        time.sleep(VENT_PERIOD)
-    if not count:
-        return f"the board takes no bytes: {ADVICE}"
-    return f"the vent command was sent {count} times; check that the chambers are down"
+            time.sleep(VENT_PERIOD)
+        (waiting,) = struct.unpack("i", fcntl.ioctl(descriptor, termios.TIOCOUTQ, bytes(4)))
+    except (OSError, termios.error) as error:
+        return f"the port is gone ({error}): {ADVICE}"
+    return "" if taken and not waiting else f"the board takes no bytes: {ADVICE}"
 
 
 def release_descriptor(descriptor: int) -> None:

@@ -17,12 +17,20 @@ Everything here is plain Python with the time passed in.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from enum import IntEnum
 
-from pressure_driver.admission import Origin, PublisherGate, SpentPlans
-from pressure_driver.schedule import Sample, Setpoint, SetpointSchedule, Verdict
+from pressure_driver.schedule import (
+    Origin,
+    PublisherGate,
+    Sample,
+    Setpoint,
+    SetpointSchedule,
+    SpentPlans,
+    Verdict,
+)
 from pressure_driver.settings import NANOSECONDS, Settings
-from pressure_driver.telemetry import TelemetryMonitor
+from pressure_driver.telemetry import Condition, TelemetryMonitor
 
 
 class Mode(IntEnum):
@@ -47,26 +55,29 @@ class SafetyMachine:
     Args:
         settings: limits and times.
         monitor: of the board's telemetry.
+        conditions: returns everything that is wrong at a time of the steady clock [s].
     """
 
-    def __init__(self, settings: Settings, monitor: TelemetryMonitor) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        monitor: TelemetryMonitor,
+        conditions: Callable[[float], Iterable[Condition]],
+    ) -> None:
         self.schedule = SetpointSchedule(settings)
         """Of timed setpoints."""
         self.monitor = monitor
-        self._settings = settings
         self.mode = Mode.DISARMED
         self.faults: list[str] = []
         """Why the mode is FAULT, worst first."""
-        self.link_fault: str = "the serial port is not open"
-        """What is wrong with the line; empty while it works."""
-        self.board_obstacle: str = ""
-        """What is wrong with the board itself; empty if nothing is."""
-        self._zero = (0.0,) * settings.segment_count
-        self.differential = self._zero
-        """(M,) [Pa] commanded at the last tick."""
         self.publishers = PublisherGate()
         self.limited_ticks = 0
         """Ticks at which the output was held back by the slew limit."""
+        self._settings = settings
+        self._conditions = conditions
+        self._zero = (0.0,) * settings.segment_count
+        self.differential = self._zero
+        """(M,) [Pa] commanded at the last tick."""
         self._spent = SpentPlans()
         self._target = self._zero
         self._latched = False
@@ -102,21 +113,7 @@ class SafetyMachine:
 
     def obstacles(self, now: float) -> list[str]:
         """Return what forbids arming now."""
-        monitor = self.monitor
-        if self.link_fault:
-            return [self.link_fault]
-        if self.board_obstacle:
-            return [self.board_obstacle]
-        found = monitor.telemetry_faults(now)
-        if found:
-            return found
-        found = monitor.overpressure_faults() + monitor.supply_obstacles(now)
-        found += monitor.reading_faults(now)
-        if problem := monitor.rest.problem:
-            found.append(problem)
-        elif not monitor.vented():
-            found.append("the chambers are not vented yet: " + monitor.describe_gauge())
-        return found
+        return [condition.text for condition in self._conditions(now)]
 
     def vent(self, now: float) -> tuple[bool, str]:
         """Open everything at once and stay so until armed again. Works in every state."""
@@ -141,19 +138,18 @@ class SafetyMachine:
             now: [s] steady clock.
             origin: where it came from; None inside one program.
         """
-        schedule, plan = self.schedule, setpoint.plan_id
+        plan = setpoint.plan_id
         if self.mode not in LIVE or self._latched:
             self._spent.hear(plan, now)
             self._spent.spend()
-            return schedule.refuse(f"setpoints are refused while {self.mode.name}: arm first")
+            return self.schedule.refuse(setpoint, f"refused while {self.mode.name}: arm first")
         reason = self._spent.refuse(plan, now)
         if not reason and origin is not None:
             reason = self.publishers.refuse(origin)
         if reason:
-            name = f" of '{plan}'" if plan else ""
-            return schedule.refuse(f"setpoint {setpoint.index}{name}: {reason}")
+            return self.schedule.refuse(setpoint, reason)
         self._spent.hear(plan, now)
-        return schedule.offer(setpoint, wall, self.differential)
+        return self.schedule.offer(setpoint, wall, self.differential)
 
     def fail(self, reason: str) -> None:
         """Go to FAULT for a reason from outside (the line, the board's own report)."""
@@ -247,27 +243,16 @@ class SafetyMachine:
             self._latched = False
             self.mode = Mode.DISARMED
         elif now - self._vent_since > self._settings.vent_timeout:
-            self._fault(
-                [
-                    f"not vented within {self._settings.vent_timeout:g} s of `vent`: "
-                    + self.monitor.describe_gauge()
-                ]
-            )
+            gauge = self.monitor.describe_gauge()
+            self.fail(f"not vented within {self._settings.vent_timeout:g} s of `vent`: {gauge}")
 
     def _look_for_faults(self, now: float) -> None:
-        monitor = self.monitor
-        found = [*monitor.overpressure_faults(), *monitor.following_faults(now)]
-        if self.mode in LIVE:
-            # Without a port there is no telemetry either: one cause, one reason.
-            silent = [self.link_fault] if self.link_fault else monitor.telemetry_faults(now)
-            found += silent + monitor.supply_faults(now) + monitor.reading_faults(now)
-            found += monitor.below_rest_faults(now)
-        elif self.mode is Mode.FAULT:
-            if self.link_fault:
-                found.append(self.link_fault)
-            elif monitor.heard:
-                found += monitor.telemetry_faults(now) + monitor.supply_faults(now)
-                found += monitor.reading_faults(now)
+        found = list(self.monitor.following_faults(now))
+        found += [
+            condition.text
+            for condition in self._conditions(now)
+            if condition.always or (condition.lasting and self.mode is not Mode.DISARMED)
+        ]
         if found:
             self._fault(found)
 

@@ -1,15 +1,15 @@
-"""Timed setpoints, and the grid of ticks at which they take effect.
+"""Which setpoints are taken, when they take effect, and the grid of ticks at which they do.
 
-The clock is whatever the caller passes in as nanoseconds. A setpoint takes effect at the first tick
-at or after its stamp.
+The wall clock is whatever the caller passes in as nanoseconds. A setpoint takes effect at the first
+tick at or after its stamp.
 """
 
 from __future__ import annotations
 
 import bisect
 import math
-from collections import deque
-from collections.abc import Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import NamedTuple
@@ -19,7 +19,11 @@ from pressure_driver.settings import NANOSECONDS, Settings
 CAPACITY = 4096
 """Setpoints that may wait."""
 REMEMBERED_PLANS = 256
-"""Plans that have been replaced and are still known as such."""
+"""Plans that have been replaced, or were heard before the last arming, and are known as such."""
+REMEMBERED_PUBLISHERS = 16
+"""Refused publishers whose newest message is remembered."""
+RELEASE_TIME = 1.0
+"""[s] of silence after which hand-typed setpoints, which have no plan, are taken again."""
 
 
 class Verdict(Enum):
@@ -48,27 +52,10 @@ class Setpoint:
 class Sample(NamedTuple):
     """What the schedule asks for at one tick."""
 
-    setpoint: Setpoint
-    """The one in force."""
     differential: tuple[float, ...]
-    """(M,) [Pa] its pressures, or interpolated toward the next."""
+    """(M,) [Pa] the pressures of the setpoint in force, or interpolated toward the next."""
     fresh: bool
     """The setpoint came into force at this tick, or the value moves toward the next."""
-
-
-@dataclass
-class Counters:
-    """What happened to setpoints since the start."""
-
-    accepted: int = 0
-    executed: int = 0
-    late: int = 0
-    duplicate: int = 0
-    refused: int = 0
-    superseded: int = 0
-    """Accepted, but replaced by a new plan, by a revision or by a later one in the same tick."""
-    missing: int = 0
-    """Places of a plan, counted by `index`, that were not there when a later one took effect."""
 
 
 class SetpointSchedule:
@@ -81,7 +68,9 @@ class SetpointSchedule:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.period = settings.period
-        self.counters = Counters()
+        self.counts: Counter[str] = Counter()
+        """Setpoints since the start by verdict; also those ``executed``, and ``superseded`` by a
+        new plan, by a revision or by a later one in the same tick."""
         self.reason = ""
         """Why the last setpoint that was not accepted was not."""
         self._waiting: list[Setpoint] = []
@@ -116,25 +105,18 @@ class SetpointSchedule:
         Returns:
             What became of it; `reason` says why unless it was accepted.
         """
-        verdict, reason = self._judge(setpoint, now, held)
-        if verdict is Verdict.ACCEPTED:
-            self.counters.accepted += 1
-            return verdict
-        plan = f" of '{setpoint.plan_id}'" if setpoint.plan_id else ""
-        self.reason = f"setpoint {setpoint.index}{plan}: {reason}"
-        if verdict is Verdict.LATE:
-            self.counters.late += 1
-        elif verdict is Verdict.DUPLICATE:
-            self.counters.duplicate += 1
-        else:
-            self.counters.refused += 1
-        return verdict
+        return self._count(setpoint, *self._judge(setpoint, now, held))
 
-    def refuse(self, reason: str) -> Verdict:
+    def refuse(self, setpoint: Setpoint, reason: str) -> Verdict:
         """Count a setpoint that was refused for a reason outside the schedule."""
-        self.counters.refused += 1
-        self.reason = reason
-        return Verdict.REFUSED
+        return self._count(setpoint, Verdict.REFUSED, reason)
+
+    def _count(self, setpoint: Setpoint, verdict: Verdict, reason: str) -> Verdict:
+        self.counts[verdict.value] += 1
+        if verdict is not Verdict.ACCEPTED:
+            plan = f" of '{setpoint.plan_id}'" if setpoint.plan_id else ""
+            self.reason = f"setpoint {setpoint.index}{plan}: {reason}"
+        return verdict
 
     def _judge(self, setpoint: Setpoint, now: int, held: Sequence[float]) -> tuple[Verdict, str]:
         if problem := self._value_problem(setpoint):
@@ -168,12 +150,14 @@ class SetpointSchedule:
         self, setpoint: Setpoint, held: Sequence[float], untimed: bool
     ) -> tuple[Verdict, str]:
         """Put a setpoint into its place; of two for the same instant, the newest untimed wins."""
-        place = self._place(setpoint.stamp)
-        same_stamp = place < len(self._waiting) and self._waiting[place].stamp == setpoint.stamp
-        replaces = not self._belongs(setpoint)
+        waiting = self._waiting
+        place = bisect.bisect_left(waiting, setpoint.stamp, key=lambda item: item.stamp)
+        same_stamp = place < len(waiting) and waiting[place].stamp == setpoint.stamp
+        newest = waiting[-1] if waiting else self._current
+        replaces = newest is not None and newest.plan_id != setpoint.plan_id
         revises = False
         if same_stamp and not replaces and not untimed:
-            there = self._waiting[place]
+            there = waiting[place]
             revises = there.index == setpoint.index and setpoint.revision > there.revision
             if not revises:
                 return Verdict.DUPLICATE, (
@@ -181,57 +165,32 @@ class SetpointSchedule:
                 )
         if setpoint.plan_id in self._replaced:
             return Verdict.REFUSED, "this plan has been replaced by a newer one"
-        if len(self._waiting) >= CAPACITY and not replaces:
-            return Verdict.REFUSED, f"{len(self._waiting)} setpoints are waiting already"
-        before = self._waiting[place - 1] if place else None
+        if len(waiting) >= CAPACITY and not replaces:
+            return Verdict.REFUSED, f"{len(waiting)} setpoints are waiting already"
+        before = waiting[place - 1] if place else None
+        problem = self._slew_problem(before, setpoint, held)
         following = place + 1 if same_stamp else place
-        after = None if replaces or following >= len(self._waiting) else self._waiting[following]
-        if revises:
-            after = (
-                None  # the next one is about to be revised as well; the output is limited anyway
-            )
-        if problem := self._slew_problem(before, setpoint, held) or (
-            self._slew_problem(setpoint, after, held) if after else ""
-        ):
+        # Behind a revision, the next one is about to be revised as well.
+        if not problem and not replaces and not revises and following < len(waiting):
+            problem = self._slew_problem(setpoint, waiting[following], held)
+        if problem:
             return Verdict.REFUSED, problem
-        if replaces:
-            self._replace_from(place)
-        elif same_stamp:
-            del self._waiting[place]
-            self.counters.superseded += 1
-        self._waiting.insert(place, setpoint)
-        return Verdict.ACCEPTED, ""
-
-    def _place(self, stamp: int) -> int:
-        """Return where a stamp belongs among those that wait; mostly at the end."""
-        if not self._waiting or self._waiting[-1].stamp < stamp:
-            return len(self._waiting)
-        return bisect.bisect_left(self._waiting, stamp, key=lambda item: item.stamp)
-
-    def _replace_from(self, place: int) -> None:
-        """Drop what an older plan had from this place on, and let it say no more."""
-        newest = self._waiting[-1] if self._waiting else self._current
-        self.counters.superseded += len(self._waiting) - place
-        del self._waiting[place:]
-        if newest is not None and newest.plan_id:
+        if replaces and newest is not None and newest.plan_id:
             self._replaced.append(newest.plan_id)
-
-    def _belongs(self, setpoint: Setpoint) -> bool:
-        """Tell whether the newest known setpoint is of the same plan."""
-        newest = self._waiting[-1] if self._waiting else self._current
-        return newest is None or newest.plan_id == setpoint.plan_id
+        end = len(waiting) if replaces else following
+        self.counts["superseded"] += end - place
+        waiting[place:end] = [setpoint]
+        return Verdict.ACCEPTED, ""
 
     def _slew_problem(self, before: Setpoint | None, after: Setpoint, held: Sequence[float]) -> str:
         if before is None:
             reference, gap = held, self.period
             if self._current is not None:
-                gap = max(after.stamp - self._current.stamp, self.period)
-                gap = min(gap, 2 * self.period)
+                gap = min(after.stamp - self._current.stamp, 2 * self.period)
         else:
             reference, gap = before.differential, after.stamp - before.stamp
-        duration = max(gap, self.period) / NANOSECONDS
         slew = max(abs(a - b) for a, b in zip(after.differential, reference, strict=True))
-        slew /= duration
+        slew /= max(gap, self.period) / NANOSECONDS
         if slew > self.settings.slew_limit * (1.0 + 1e-9):
             return f"changes by {slew:.0f} Pa/s, the limit is {self.settings.slew_limit:.0f} Pa/s"
         return ""
@@ -253,22 +212,17 @@ class SetpointSchedule:
             What to command, or None before the first setpoint.
         """
         self._last_tick = max(self._last_tick, tick)
-        due = 0
-        while due < len(self._waiting) and self._waiting[due].stamp <= tick:
-            self._count_missing(
-                self._waiting[due - 1] if due else self._current, self._waiting[due]
-            )
-            due += 1
+        due = bisect.bisect_right(self._waiting, tick, key=lambda item: item.stamp)
         if due:
             self._current = self._waiting[due - 1]
             del self._waiting[:due]
-            self.counters.executed += 1
-            self.counters.superseded += due - 1
+            self.counts["executed"] += 1
+            self.counts["superseded"] += due - 1
         current = self._current
         if current is None:
             return None
         if self.settings.interpolation == "hold" or not self._waiting:
-            return Sample(current, current.differential, fresh=bool(due))
+            return Sample(current.differential, fresh=bool(due))
         if due or not held:
             begin, start = current.stamp, current.differential
         else:
@@ -278,83 +232,169 @@ class SetpointSchedule:
         moved = tuple(
             a + share * (b - a) for a, b in zip(start, following.differential, strict=True)
         )
-        return Sample(current, moved, fresh=True)
-
-    def _count_missing(self, before: Setpoint | None, after: Setpoint) -> None:
-        """Count the places of one plan that are not there between two setpoints in force."""
-        if before is not None and before.plan_id and before.plan_id == after.plan_id:
-            self.counters.missing += max(after.index - before.index - 1, 0)
+        return Sample(moved, fresh=True)
 
     def forget_ticks(self) -> None:
         """Accept earlier stamps again, as after the wall clock was set back."""
         self._last_tick = -(2**62)
 
 
+# ------------------------------------------------------------------------- whose are taken
+
+
+class Origin(NamedTuple):
+    """Where a setpoint came from.
+
+    A publisher is told by the numbers that it counts its messages with: the middleware of ROS 2
+    Jazzy hands these to a node, and not the publisher's identity.
+    """
+
+    topic: str
+    number: int
+    """The publisher's own count of its messages."""
+    alone: bool
+    """The topic has no other publisher."""
+
+
+class PublisherGate:
+    """Keeps to the publisher that is heard first after an arming, until the next arming."""
+
+    def __init__(self) -> None:
+        self.refused = 0
+        """Setpoints of other publishers since the start."""
+        self.release()
+
+    def release(self) -> None:
+        """Take whoever is heard next: the driver has been armed."""
+        self._owner: Origin | None = None
+        self._in_step = False
+        self._others: deque[tuple[str, int]] = deque(maxlen=REMEMBERED_PUBLISHERS)
+
+    def refuse(self, origin: Origin) -> str:
+        """Return why a setpoint from there is not taken, or nothing if it is."""
+        reason = self._judge(origin)
+        if reason:
+            self.refused += 1
+        else:
+            self._owner = origin
+        return reason
+
+    def _judge(self, origin: Origin) -> str:
+        owner = self._owner
+        if owner is None:
+            return ""
+        counted = origin.number - owner.number if origin.topic == owner.topic else -1
+        before = (origin.topic, origin.number - 1)
+        # A number that two publishers have reached does not tell any more which of them goes on.
+        if counted == 0 or (counted == 1 and before in self._others):
+            self._in_step = True
+        if self._in_step:
+            return "two publishers count in step and cannot be told apart: stop one and arm again"
+        if counted == 1 or (counted > 1 and origin.alone):
+            return ""
+        if before in self._others:
+            self._others.remove(before)
+        self._others.append((origin.topic, origin.number))
+        return f"another publisher on '{owner.topic}' is being played: stop it and arm again"
+
+
+class SpentPlans:
+    """Remembers what was heard before the last arming, so that it does not go on after it."""
+
+    def __init__(self) -> None:
+        self._heard: deque[str] = deque(maxlen=REMEMBERED_PLANS)
+        self._spent: deque[str] = deque(maxlen=REMEMBERED_PLANS)
+        self._unnamed_at = -math.inf
+        self._unnamed_are_spent = False
+
+    def hear(self, plan_id: str, now: float) -> None:
+        """Note the plan of a setpoint, empty for hand-typed ones (steady clock [s])."""
+        if not plan_id:
+            self._unnamed_at = now
+        elif plan_id not in self._heard:
+            self._heard.append(plan_id)
+
+    def spend(self) -> None:
+        """Refuse from now on whatever has been heard until now."""
+        self._spent += [plan_id for plan_id in self._heard if plan_id not in self._spent]
+        self._heard.clear()
+        self._unnamed_are_spent = True
+
+    def refuse(self, plan_id: str, now: float) -> str:
+        """Return why a plan is not taken after this arming, or nothing if it is."""
+        if plan_id in self._spent:
+            return "this plan was sent before the driver was armed: send a new plan"
+        if plan_id or not self._unnamed_are_spent:
+            return ""
+        self._unnamed_are_spent = now - self._unnamed_at < RELEASE_TIME
+        if not self._unnamed_are_spent:
+            return ""
+        self._unnamed_at = now
+        return (
+            "setpoints without a plan have gone on since before the driver was armed: "
+            f"stop them for {RELEASE_TIME:g} s"
+        )
+
+
+# ---------------------------------------------------------------------------------- clocks
+
+
 class TickGrid:
     """The absolute time grid of the ticks: when the next is due, and for which instant it stands.
 
     Ticks fall on whole multiples of the period of the wall clock that stamps messages (ROS time),
-    so they cannot drift against the stamps. How far this clock is from the steady one is taken anew
-    at every tick, so that a clock that is slewed or set moves the grid by itself.
+    so they cannot drift against the stamps. A clock that is slewed or set moves the grid.
 
     Args:
         period: [ns] between ticks.
-
-    Raises:
-        ValueError: the period is not positive.
     """
 
     def __init__(self, period: int) -> None:
-        if period <= 0:
-            raise ValueError(f"the tick period must be positive, got {period} ns")
         self.period = period
         self.missed = 0
-        """Ticks that were skipped since the thread woke more than a period late."""
-        self.clock_steps = 0
-        """Times that the wall clock jumped by more than a period against the steady clock."""
+        """Ticks that were skipped since the process woke more than a period late."""
         self._last: int | None = None
-        self._offset: int | None = None
-
-    def next_tick(self, wall: int) -> int:
-        """Return the wall time [ns] of the next tick, given the wall time now."""
-        following = (wall // self.period + 1) * self.period
-        if self._last is None:
-            return following
-        return max(self._last + self.period, self._floor(wall))
 
     def delay(self, wall: int) -> float:
-        """Return the time [s] from now to the next tick; zero or less if it is due.
+        """Return the time [s] from a wall time [ns] to the next tick; zero or less if it is due.
 
         Never more than a period: a wall clock that was set back must not stop the ticks.
         """
-        return min(self.next_tick(wall) - wall, self.period) / NANOSECONDS
+        before = wall // self.period * self.period if self._last is None else self._last
+        return min(before + self.period - wall, self.period) / NANOSECONDS
 
-    def take(self, wall: int, steady: int) -> int | None:
-        """Return the instant [ns] of the tick that is due now, or None if none is.
-
-        Args:
-            wall: [ns] the clock that stamps messages, now.
-            steady: [ns] the steady clock, now.
-        """
-        self._watch_steps(wall, steady)
-        if self._last is None:
-            if self._offset is None:
-                self._offset = wall - steady
-            self._last = self._floor(wall)
+    def take(self, wall: int) -> int | None:
+        """Return the instant [ns] of the tick that is due at a wall time, or None if none is."""
+        due = wall // self.period * self.period
+        last, self._last = self._last, due
+        if last is None or last - self.period <= due <= last:
+            self._last = due if last is None else last
             return None
-        due = self._floor(wall)
-        if due <= self._last:
-            return None
-        self.missed += (due - self._last) // self.period - 1
-        self._last = due
+        self.missed += max(due - last, self.period) // self.period - 1
         return due
 
-    def _floor(self, wall: int) -> int:
-        return wall // self.period * self.period
 
-    def _watch_steps(self, wall: int, steady: int) -> None:
-        offset = wall - steady
-        if self._offset is not None and abs(offset - self._offset) > self.period:
-            self.clock_steps += 1
-            self._last = self._floor(wall)
-        self._offset = offset
+class RunningClock:
+    """The steady clock without the time in which this process was kept from running.
+
+    Patience is counted on it, so that a machine which stands still is not taken for a board or a
+    node that is silent.
+
+    Args:
+        longest_step: [s] between two calls that counts at most.
+        steady: returns the steady clock [s].
+    """
+
+    def __init__(self, longest_step: float, steady: Callable[[], float]) -> None:
+        self._longest_step = longest_step
+        self._read_steady = steady
+        self.steady = steady()
+        """[s] the steady clock itself, at the last call."""
+        self._now = 0.0
+
+    def __call__(self) -> float:
+        """Return the seconds that this process has been running."""
+        steady = self._read_steady()
+        self._now += min(steady - self.steady, self._longest_step)
+        self.steady = steady
+        return self._now

@@ -6,8 +6,9 @@ import math
 from collections import deque
 from collections.abc import Iterator, Sequence
 from statistics import fmean
+from typing import NamedTuple
 
-from pressure_driver.following import Following, chamber_gauge
+from pressure_driver.following import Duration, Following, chamber_gauge
 from pressure_driver.protocols.base import STANDARD_ATMOSPHERE, HostProtocol, Telemetry
 from pressure_driver.settings import Settings
 
@@ -42,6 +43,17 @@ REST_SPREAD = 100.0
 REST_DRIFT = 20.0
 """[Pa] that the means of its two halves may differ by."""
 NOT_STEADY = "chambers must be vented and steady"
+
+
+class Condition(NamedTuple):
+    """Something that is wrong with the line, the board, the supply or a chamber."""
+
+    text: str
+    """A sentence; only numbers stand behind its colon."""
+    lasting: bool = True
+    """It has lasted for its patience: it is a fault while armed. Before, it forbids arming only."""
+    always: bool = False
+    """It is a fault while disarmed, too."""
 
 
 class RestPressures:
@@ -140,13 +152,12 @@ class TelemetryMonitor:
 
     def __init__(self, protocol: HostProtocol, settings: Settings) -> None:
         count = protocol.chamber_count
-        self.settings = settings
         self.rest = RestPressures(count, settings.atmosphere)
         self.valve_opening = [math.nan] * count
         self.supply_pressure = math.nan
+        self._settings = settings
         self._protocol = protocol
         self._following = [Following(chamber, settings) for chamber in range(count)]
-        self._must_tell_supply = protocol.reports_supply and settings.supply_required
         self._bad_chamber = 0
         self.forget()
 
@@ -154,15 +165,14 @@ class TelemetryMonitor:
         """Forget the newest telemetry, as after a disconnect."""
         self.chamber_pressure: Sequence[float] = [math.nan] * self._protocol.chamber_count
         """(2M,) [Pa] absolute, as measured; NaN before the first reading."""
-        self._read_at: float | None = None
+        self._heard = False
+        self._read_at = 0.0
+        self._supply_at = -math.inf
         self._changed_at = 0.0
         self._over_count = 0
-        self._supply_at: float | None = None
-        self._supply_bad_since: float | None = None
-        self._below_since: float | None = None
-        self._bad_readings: deque[float] = deque(maxlen=MOST_BAD_READINGS)
-        self._line_quality: deque[tuple[float, int, int]] = deque()
-        self._sound = self._damaged = 0
+        self._supply_bad = Duration()
+        self._below_rest = Duration()
+        self._lines: deque[tuple[float, int, int, int]] = deque()
         self.rest.forget_readings()
 
     @property
@@ -171,14 +181,9 @@ class TelemetryMonitor:
         both = zip(self.chamber_pressure, self.rest.pressure, strict=True)
         return [reading - rest for reading, rest in both]
 
-    @property
-    def heard(self) -> bool:
-        """Whether chamber pressures have come since the port was opened."""
-        return self._read_at is not None
-
     def telemetry_age(self, now: float) -> float:
         """Return the age [s] of the newest chamber pressures; NaN before the first."""
-        return math.nan if self._read_at is None else now - self._read_at
+        return now - self._read_at if self._heard else math.nan
 
     def describe_gauge(self) -> str:
         """Return the gauge pressures as text, in kPa."""
@@ -186,7 +191,7 @@ class TelemetryMonitor:
 
     def vented(self) -> bool:
         """Tell whether every chamber reads about its rest pressure."""
-        return all(abs(value) <= self.settings.vented_tolerance for value in self.gauge)
+        return all(abs(value) <= self._settings.vented_tolerance for value in self.gauge)
 
     # ---------------------------------------------------------------------------- readings
 
@@ -209,7 +214,10 @@ class TelemetryMonitor:
             resting: the chambers have been commanded to vent, so rest pressures may be measured.
         """
         if telemetry.supply_pressure is not None:
-            self._receive_supply(telemetry.supply_pressure, now)
+            supply = self.supply_pressure = telemetry.supply_pressure
+            self._supply_at = now
+            within = self._settings.supply_low <= supply <= self._settings.supply_high
+            self._supply_bad.note(not within, now)
         if telemetry.valve_opening is not None:
             self.valve_opening = list(telemetry.valve_opening)
         reading = telemetry.chamber_pressure
@@ -218,140 +226,127 @@ class TelemetryMonitor:
         low, high = PLAUSIBLE_READING
         bad = [chamber for chamber, value in enumerate(reading) if not low < value < high]
         if bad:
-            self._bad_readings.append(now)
+            self._lines.append((now, 0, 0, 1))
             self._bad_chamber = bad[0]
             return
         if tuple(reading) != tuple(self.chamber_pressure):
             self._changed_at = now
         self.chamber_pressure = reading
-        if self._read_at is None:
+        if not self._heard:
             self.restart_following(now)
-        self._read_at = now
-        known = self.rest.known
-        reference = self.rest.pressure if known else [STANDARD_ATMOSPHERE] * len(reading)
-        over = max(a - b for a, b in zip(reading, reference, strict=True))
-        self._over_count = self._over_count + 1 if over > self.settings.over_pressure else 0
+        self._heard, self._read_at = True, now
+        self._judge_pressures(now, resting)
+
+    def _judge_pressures(self, now: float, resting: bool) -> None:
+        reading, gauge = self.chamber_pressure, self.gauge
+        over = max(gauge if self.rest.known else [p - STANDARD_ATMOSPHERE for p in reading])
+        self._over_count = self._over_count + 1 if over > self._settings.over_pressure else 0
         if resting:
             self.rest.receive(reading, now)
         else:
             self.rest.forget_readings()
         gauge = self.gauge
-        if not min(gauge) < -BELOW_REST:
-            self._below_since = None
-        elif self._below_since is None:
-            self._below_since = now
+        self._below_rest.note(min(gauge) < -BELOW_REST, now)
         for chamber, value, opening in zip(self._following, gauge, self.valve_opening, strict=True):
             chamber.receive(value, opening, now)
 
-    def _receive_supply(self, pressure: float, now: float) -> None:
-        self.supply_pressure, self._supply_at = pressure, now
-        if self.settings.supply_low <= pressure <= self.settings.supply_high:
-            self._supply_bad_since = None
-        elif self._supply_bad_since is None:
-            self._supply_bad_since = now
-
     def count_lines(self, sound: int, damaged: int, now: float) -> None:
         """Count lines or frames that came: with readings, and damaged ones."""
-        self._line_quality.append((now, sound, damaged))
-        self._sound += sound
-        self._damaged += damaged
-        self._forget_old_lines(now)
+        self._lines.append((now, sound, damaged, 0))
 
-    def _forget_old_lines(self, now: float) -> None:
-        while self._line_quality and now - self._line_quality[0][0] > READING_WINDOW:
-            _, sound, damaged = self._line_quality.popleft()
-            self._sound -= sound
-            self._damaged -= damaged
+    def _recent_lines(self, now: float) -> tuple[int, int, int]:
+        """Return how many lines had readings, were damaged, had a reading that cannot be."""
+        while self._lines and now - self._lines[0][0] > READING_WINDOW:
+            self._lines.popleft()
+        _, sound, damaged, bad = zip(*self._lines, strict=True) if self._lines else ((),) * 4
+        return sum(sound), sum(damaged), sum(bad)
 
     # ------------------------------------------------------------------------------ faults
 
-    def telemetry_faults(self, now: float) -> list[str]:
-        """Say whether the board is silent, or speaks without being understood."""
-        if self._read_at is None:
-            self._forget_old_lines(now)
-            if self._damaged < MOST_DAMAGED:
-                return ["no telemetry from the board yet"]
-            return [
-                f"no telemetry from the board yet: {self._damaged} lines or frames of the last "
+    def silence(self, now: float) -> str:
+        """Return that the board is silent or speaks without being understood, or nothing."""
+        age = self.telemetry_age(now)
+        if not self._heard:
+            damaged = self._recent_lines(now)[1]
+            if damaged < MOST_DAMAGED:
+                return "no telemetry from the board yet"
+            return (
+                f"no telemetry from the board yet: {damaged} lines or frames of the last "
                 f"{READING_WINDOW:g} s are not of this language and number of chambers (see "
                 "'last_damaged_line' in the diagnostics); look at 'protocol', 'baud_rate' and "
                 "'segment_count'"
-            ]
-        age = now - self._read_at
-        if age > self.settings.telemetry_timeout:
-            return [f"no telemetry: the last came {age:.1f} s ago"]
+            )
+        if age > self._settings.telemetry_timeout:
+            return f"no telemetry: the last came {age:.1f} s ago"
         if self._protocol.tells_pascals and self._read_at - self._changed_at > FROZEN_TIME:
-            return [f"telemetry is frozen: no reading has changed in {FROZEN_TIME:g} s"]
-        return []
-
-    def overpressure_faults(self) -> list[str]:
-        """Say whether a chamber is over-pressurised."""
-        if self._over_count < SAMPLES_TO_TRIP:
-            return []
-        most = max(self.chamber_pressure)
-        return [
-            f"over-pressure in chamber {list(self.chamber_pressure).index(most)}: it reads "
-            f"{most:.0f} Pa, the limit is {self.settings.over_pressure:.0f} Pa above the atmosphere"
-        ]
+            return f"telemetry is frozen: no reading has changed in {FROZEN_TIME:g} s"
+        return ""
 
     def following_faults(self, now: float) -> Iterator[str]:
         """Say which chambers do not follow their commands, or lose air."""
         for chamber in self._following:
             yield from chamber.faults(now)
 
-    def supply_faults(self, now: float) -> list[str]:
-        """Say whether the supply has left its bounds, or is told no more."""
-        longest = self.settings.telemetry_timeout + self.settings.supply_time
-        if self._must_tell_supply and self._supply_at is not None:
-            age = now - self._supply_at
-            # A board that is silent altogether is another fault.
-            if age > longest and not self.telemetry_faults(now):
-                return [f"no reading of the supply: the last came {age:.1f} s ago"]
-        since = self._supply_bad_since
-        if since is None or now - since < self.settings.supply_time:
-            return []
-        return [self._supply_problem()]
+    def conditions(self, now: float) -> Iterator[Condition]:
+        """Say what is wrong with the telemetry, the pressures and the supply."""
+        if silence := self.silence(now):
+            # Other readings are old then: one cause, one reason.
+            yield Condition(silence, lasting=self._heard)
+            return
+        if self._over_count >= SAMPLES_TO_TRIP:
+            most = max(self.chamber_pressure)
+            limit = self._settings.over_pressure
+            yield Condition(
+                f"over-pressure in chamber {list(self.chamber_pressure).index(most)}: it reads "
+                f"{most:.0f} Pa, the limit is {limit:.0f} Pa above the atmosphere",
+                always=True,
+            )
+        yield from self._supply_conditions(now)
+        yield from self._line_conditions(now)
+        if self._below_rest.until(now) >= BELOW_REST_TIME:
+            yield Condition(
+                "a chamber is below its rest pressure: the rest was measured with air trapped; "
+                + self.describe_gauge()
+            )
+        if problem := self.rest.problem:
+            yield Condition(problem, lasting=False)
+        elif not self.vented():
+            text = "the chambers are not vented yet: " + self.describe_gauge()
+            yield Condition(text, lasting=False)
 
-    def supply_obstacles(self, now: float) -> list[str]:
-        """Say why the supply forbids arming: no fresh reading, or one out of bounds."""
-        stale = self._supply_at is None or now - self._supply_at > self.settings.telemetry_timeout
-        if self._must_tell_supply and stale:
-            return ["the board has not told its supply pressure yet"]
-        return [] if self._supply_bad_since is None else [self._supply_problem()]
-
-    def _supply_problem(self) -> str:
-        if not math.isfinite(self.supply_pressure):
-            return "no reading of the supply: the board reports that it is not a number"
-        side = "low" if self.supply_pressure < self.settings.supply_low else "high"
-        return (
+    def _supply_conditions(self, now: float) -> Iterator[Condition]:
+        settings, age = self._settings, now - self._supply_at
+        if self._protocol.reports_supply and settings.supply_required:
+            timeout = settings.telemetry_timeout
+            if age > timeout:
+                text = "the board has not told its supply pressure yet"
+                if math.isfinite(age):
+                    text = f"no reading of the supply: the last came {age:.1f} s ago"
+                yield Condition(text, lasting=timeout + settings.supply_time < age < math.inf)
+        bad_time = self._supply_bad.until(now)
+        if bad_time < 0.0:
+            return
+        side = "low" if self.supply_pressure < settings.supply_low else "high"
+        text = (
             f"supply too {side}: {self.supply_pressure:.0f} Pa, allowed "
-            f"{self.settings.supply_low:.0f} to {self.settings.supply_high:.0f} Pa absolute"
+            f"{settings.supply_low:.0f} to {settings.supply_high:.0f} Pa absolute"
         )
+        if not math.isfinite(self.supply_pressure):
+            text = "no reading of the supply: the board reports that it is not a number"
+        yield Condition(text, lasting=bad_time >= settings.supply_time)
 
-    def reading_faults(self, now: float) -> list[str]:
+    def _line_conditions(self, now: float) -> Iterator[Condition]:
         """Say whether a sensor reads nonsense, or the line damages much of what it carries."""
-        found = []
-        bad = self._bad_readings
-        if len(bad) == MOST_BAD_READINGS and now - bad[0] <= READING_WINDOW:
+        sound, damaged, bad = self._recent_lines(now)
+        total = damaged + sound
+        if bad >= MOST_BAD_READINGS:
             low, high = PLAUSIBLE_READING
-            found.append(
-                f"chamber {self._bad_chamber} has no plausible reading: {len(bad)} of the last "
+            yield Condition(
+                f"chamber {self._bad_chamber} has no plausible reading: {bad} of the last "
                 f"{READING_WINDOW:g} s were no number or outside {low:.0f} to {high:.0f} Pa"
             )
-        self._forget_old_lines(now)
-        damaged, total = self._damaged, self._damaged + self._sound
         if damaged >= MOST_DAMAGED and damaged >= DAMAGED_SHARE * total:
-            found.append(
+            yield Condition(
                 f"damaged telemetry: {damaged} of {total} lines or frames in the last "
                 f"{READING_WINDOW:g} s"
             )
-        return found
-
-    def below_rest_faults(self, now: float) -> list[str]:
-        """Say whether a chamber reads less than at rest, which vented air cannot."""
-        if self._below_since is None or now - self._below_since < BELOW_REST_TIME:
-            return []
-        return [
-            "a chamber is below its rest pressure: the rest was measured with air trapped; "
-            + self.describe_gauge()
-        ]

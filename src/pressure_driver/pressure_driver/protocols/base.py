@@ -172,8 +172,6 @@ class HostProtocol(ABC):
     """Whether the board repeats every command (`Echo`)."""
     tells_pascals: ClassVar[bool] = False
     """Whether pressures are told finely enough that those of a working sensor always tremble."""
-    measures_room_at_start: ClassVar[bool] = False
-    """Whether the board takes what it reads when it starts for the room's pressure."""
     assumed_atmosphere: float = STANDARD_ATMOSPHERE
     """[Pa] added to the reports of boards that only know gauge pressures."""
 

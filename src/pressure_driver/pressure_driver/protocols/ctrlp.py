@@ -13,7 +13,7 @@ From the board, lines of ms since boot, a kind, and gauge pressures, separated b
 
 and echoes of commands, which begin with an underscore: ``_NEW SET: 0.05<TAB>7.50<TAB>…``,
 ``_NEW UNITS: kPa<TAB>kPa`` (of commands and of reports; older boards may repeat the number),
-``_UNREC: …``. A SET is repeated as the board took it, within its own limits (MAXP). Each channel is
+``_UNREC: …``. A board that cuts a SET at its own limit (MAXP) does not follow. Each channel is
 regulated on its own, so both chambers of a pair are named. There is no checksum and no watchdog. A
 board that has measured more than its limit vents until the next MODE.
 
@@ -53,19 +53,11 @@ LARGEST_GAUGE = 500.0
 RAMP_TIME = 0.05
 """[s] in which the board moves from one setpoint to the next: one tick."""
 
-MOST_WRONG_ECHOES = 3
-"""In a row: a line on its way may be damaged, in either direction."""
-ECHO_TOLERANCE = 0.02
-"""[kPa] The board repeats two decimals of what it has converted to psi and back."""
-REMEMBERED_COMMANDS = 32
-"""An echo may be of any of these: lines wait on their way."""
-
 _NUMBERS = r"(?:\t-?(?:\d{1,4}(?:\.\d{1,6})?|nan|inf))+"
 """Firmware prints nan or inf for a sensor that is broken: the driver judges that."""
 _REPORT = re.compile(r"\d{1,10}\t[012]" + _NUMBERS)
 _ECHO = re.compile(r"(?:NEW )?(?:SET|UNITS|MODE|TIME|ECHO|ON|OFF)\b")
 _UNITS_ECHO = re.compile(r"(?:NEW )?UNITS:?(?:\s+(?:1(?:\.0*)?|kPa)){1,2}\s*", re.IGNORECASE)
-_SET_ECHO = re.compile(r"NEW SET:?\s*\d{1,4}(?:\.\d{1,6})?(" + _NUMBERS + ")")
 _UNITS_UNKNOWN = "the board has not confirmed that it works in kPa"
 _COMMAND = re.compile(r"[A-Z]{2,12}(?:;-?\d{1,6}(?:\.\d{1,6})?)*")
 
@@ -85,8 +77,6 @@ class CtrlpHost(LineHost):
         super().__init__(chamber_count)
         self.unsettled = _UNITS_UNKNOWN
         self._times: deque[int] = deque(maxlen=4)
-        self._commanded: deque[list[float]] = deque(maxlen=REMEMBERED_COMMANDS)
-        self._wrong_echoes = 0
 
     def doubt(self) -> None:
         """Have the units confirmed again before the next setpoint."""
@@ -96,8 +86,6 @@ class CtrlpHost(LineHost):
         """Forget a half-received line and everything that the board has confirmed."""
         super().reset()
         self._times.clear()
-        self._commanded.clear()
-        self._wrong_echoes = 0
         self.doubt()
 
     def start(self) -> bytes:
@@ -122,13 +110,11 @@ class CtrlpHost(LineHost):
             if not size <= LARGEST_GAUGE:
                 raise ValueError(f"a difference of {difference} Pa does not fit a ctrlp command")
             values += [size, 0.0] if difference >= 0.0 else [0.0, size]
-        self._commanded.append(values)
         numbers = ";".join(f"{value:.3f}" for value in values)
         return f"SET;{RAMP_TIME:.3f};{numbers}\n".encode(), None
 
     def vent(self, atmosphere: float) -> tuple[bytes, int | None]:  # noqa: ARG002
         """Zero gauge pressure on every channel, without a ramp."""
-        self._commanded.append([0.0] * self.chamber_count)
         return ("SET;0.000" + ";0.000" * self.chamber_count + "\n").encode(), None
 
     def decode(self, data: bytes) -> list[Event]:
@@ -156,7 +142,7 @@ class CtrlpHost(LineHost):
         if not _REPORT.fullmatch(line):
             # Words are free text; digits and tabs are the rest of a damaged report.
             words = any(character.isalpha() for character in line) and "\t" not in line
-            return self._take_text(line) if words else None
+            return self._parse_words(line) if words else None
         time, kind, *parts = line.split("\t")
         values = [float(part) for part in parts]
         expected = 1 if kind == "2" else self.chamber_count
@@ -176,40 +162,16 @@ class CtrlpHost(LineHost):
 
     def _parse_echo(self, text: str) -> Event:
         if text.startswith("NEW SET"):
-            return self._take_set_echo(text)
+            return Echo()
         if text.startswith("UNREC"):
             return BoardReport("a command was not understood", fatal=False)
         if _UNITS_ECHO.fullmatch(text):
             self.unsettled = ""
         elif "UNITS" in text:
             self.unsettled = f"{_UNITS_UNKNOWN}: it answers '{text}'"
-        return BoardText(text) if _ECHO.match(text) else self._take_text(text)
+        return BoardText(text) if _ECHO.match(text) else self._parse_words(text)
 
-    def _take_set_echo(self, text: str) -> Event:
-        """Compare what the board repeats with what it was sent, where it tells all numbers."""
-        found = _SET_ECHO.fullmatch(text)
-        values = [float(part) for part in found[1].split("\t")[1:]] if found else []
-        if len(values) != self.chamber_count or self.unsettled or self._was_commanded(values):
-            self._wrong_echoes = 0
-            return Echo()
-        self._wrong_echoes += 1
-        if self._wrong_echoes != MOST_WRONG_ECHOES:
-            return Echo()
-        told = ", ".join(f"{value:.2f}" for value in values)
-        sent = ", ".join(f"{value:.2f}" for value in self._commanded[-1])
-        return BoardReport(
-            f"other pressures than it was sent: {told} kPa, commanded {sent} kPa; see its limits "
-            "(MAXP, MINP) and its firmware",
-            fatal=True,
-        )
-
-    def _was_commanded(self, values: list[float]) -> bool:
-        return any(
-            all(abs(a - b) <= ECHO_TOLERANCE for a, b in zip(values, sent, strict=True))
-            for sent in reversed(self._commanded)
-        )
-
-    def _take_text(self, text: str) -> Event:
+    def _parse_words(self, text: str) -> Event:
         """Words that are no echo come from a board that starts; tabs are left by damaged lines."""
         if self.unsettled or "\t" in text:
             return BoardText(text)

@@ -60,7 +60,6 @@ class EzloopHost(LineHost):
     )
     reports_supply = True
     tells_pascals = True
-    measures_room_at_start = True
 
     def __init__(self, chamber_count: int = 4) -> None:
         super().__init__(chamber_count)
@@ -104,7 +103,7 @@ class EzloopHost(LineHost):
         if not separator or tag not in ("[MPR]", "[RPR]", "[VAL]"):
             # A line with a bracket, or of digits only, is the rest of a damaged report.
             damaged = "[" in line or "]" in line or not any(c.isalpha() for c in line)
-            return None if damaged else self._take_text(line)
+            return None if damaged else self._parse_words(line)
         values = _numbers(rest.strip(), None)
         expected = 1 if tag == "[RPR]" else self.chamber_count
         if values is None or len(values) != expected:
@@ -119,7 +118,7 @@ class EzloopHost(LineHost):
             return Telemetry(supply_pressure=pascals[0])
         return Telemetry(chamber_pressure=pascals)
 
-    def _take_text(self, line: str) -> Event:
+    def _parse_words(self, line: str) -> Event:
         """Words after reports: the board only talks while it boots, so it has started again."""
         if self._reporting and _WORD.search(line):
             self._reporting = False

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import binascii
 import struct
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -166,12 +165,9 @@ class NativeHost(HostProtocol):
         self._frames = FrameSplitter()
         self._sequence = 0
         self._board_time: int | None = None
-        self._pressurising: deque[int] = deque(maxlen=128)
 
     def _next(self) -> int:
         self._sequence = (self._sequence + 1) & 0xFFFF
-        if self._sequence in self._pressurising:
-            self._pressurising.remove(self._sequence)  # of 65536 commands ago
         return self._sequence
 
     def start(self) -> bytes:
@@ -199,8 +195,6 @@ class NativeHost(HostProtocol):
                 raise ValueError(f"a difference of {difference} Pa does not fit a native frame")
             body += struct.pack("<ii", round(max(difference, 0.0)), round(max(-difference, 0.0)))
         sequence = self._next()
-        if any(body[SETPOINT_HEAD.size :]):
-            self._pressurising.append(sequence)
         return encode(FrameType.SETPOINT, sequence, body), sequence
 
     def vent(self, atmosphere: float) -> tuple[bytes, int | None]:  # noqa: ARG002
@@ -258,7 +252,7 @@ class NativeHost(HostProtocol):
             ),
             supply_pressure=float(supply) if flags & StatusFlag.SUPPLY_KNOWN else None,
         )
-        return [*self._look_for_reset(time), telemetry, Echo(echo), *self._look_at(flags, echo)]
+        return [*self._look_for_reset(time), telemetry, Echo(echo)]
 
     def _look_for_reset(self, time: int) -> list[Event]:
         """Compare the board's clock, which counts ms modulo 2^32, with that of the last STATUS."""
@@ -267,21 +261,10 @@ class NativeHost(HostProtocol):
             return []
         return [BoardReset("its clock has gone back")]
 
-    def _look_at(self, flags: int, echo: int) -> list[Event]:
-        """Say whether the board has let go of pressures that it has been told to hold."""
-        if echo not in self._pressurising:
-            return []
-        if flags & StatusFlag.EXPIRED:
-            return [BoardReport("expired: no setpoint has come in time, it has vented", fatal=True)]
-        if flags & StatusFlag.VENTED:
-            return [BoardReport("vented, though pressures are commanded", fatal=True)]
-        return []
-
     def reset(self) -> None:
         """Forget a half-received frame, and the board's clock."""
         self._frames.reset()
         self._board_time = None
-        self._pressurising.clear()
 
 
 class NativeBoard(BoardProtocol):
