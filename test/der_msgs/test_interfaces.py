@@ -15,11 +15,10 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from limb_interfaces import transport
+from limb_interfaces import runner
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
-from limb_interfaces.gaps import StampGaps
-from limb_interfaces.overrides import check_overrides, key_matches
-from limb_interfaces.parameters import ParameterError, declare
+from limb_interfaces.parameters import ParameterError, check_overrides, declare, key_matches
+from limb_interfaces.stamps import StampGaps
 
 PERIOD = 33_333_333
 
@@ -138,24 +137,24 @@ def test_keys_of_parameter_files(key, name, fits):
 
 
 def test_the_images_transport_is_set_unless_somebody_did(tmp_path, monkeypatch):
-    profile = tmp_path / transport.PROFILE
+    profile = tmp_path / runner.PROFILE
     for name in ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("AMENT_PREFIX_PATH", f"/nowhere:{tmp_path}")
-    assert transport.use_large_messages() is None
+    assert runner.use_large_messages() is None
     profile.parent.mkdir(parents=True)
     profile.write_text("<profiles/>")
-    assert transport.use_large_messages() == profile
+    assert runner.use_large_messages() == profile
     monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", "mine.xml")
-    assert transport.use_large_messages() is None
+    assert runner.use_large_messages() is None
 
 
 _RECEIVE = """
 import resource, sys
-from limb_interfaces import transport
+from limb_interfaces import runner
 if "keep" in sys.argv:
-    assert transport.keep_buffers()
+    assert runner.keep_buffers()
 before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 for _ in range(50):
     copies = [bytearray(1 << 20) for _ in range(4)]

@@ -34,10 +34,9 @@ from apriltag_tracker.tag_map import TagMap
 from der_msgs.msg import LimbState, TagDetection, TagDetectionArray
 from limb_interfaces import qos, stamps, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
-from limb_interfaces.gaps import StampGaps
-from limb_interfaces.overrides import check_overrides
-from limb_interfaces.parameters import declare
+from limb_interfaces.parameters import check_overrides, declare
 from limb_interfaces.runner import run_node
+from limb_interfaces.stamps import StampGaps
 from limb_interfaces.transforms import TransformPublisher, camera_transform, limb_transforms
 
 ANNOTATED_IMAGE = "camera/image_annotated"

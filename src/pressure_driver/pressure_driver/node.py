@@ -13,8 +13,7 @@ from std_srvs.srv import Trigger
 from der_msgs.msg import PressureSetpoint, PressureState
 from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
-from limb_interfaces.overrides import check_overrides
-from limb_interfaces.parameters import ParameterError, declare
+from limb_interfaces.parameters import ParameterError, check_overrides, declare
 from limb_interfaces.runner import run_node
 from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
 from pressure_driver.channel import PortProcess

@@ -24,8 +24,7 @@ from apriltag_tracker.tag_map import TagMap
 from der_msgs.msg import LimbShape
 from limb_interfaces import qos, stamps, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
-from limb_interfaces.overrides import check_overrides
-from limb_interfaces.parameters import declare
+from limb_interfaces.parameters import check_overrides, declare
 from limb_interfaces.runner import run_node
 
 FRAME = "camera_optical_frame"

@@ -23,7 +23,7 @@ from der_planner.twin import LimbTwin, Push, TwinError
 from der_planner.twin.limb_twin import BACKLOG, RealTimeLoop
 from limb_interfaces import parameters, qos, stamps, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
-from limb_interfaces.overrides import check_overrides
+from limb_interfaces.parameters import check_overrides
 from limb_interfaces.runner import run_node
 
 SILENCE = 1.0

@@ -37,7 +37,7 @@ from der_planner.planning import METHODS, Motion, Plan, plan
 from der_planner.planning.streaming import Schedule, first_stamp
 from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
-from limb_interfaces.overrides import check_overrides
+from limb_interfaces.parameters import check_overrides
 from limb_interfaces.runner import run_node
 from limb_interfaces.stamps import NANOSECONDS
 

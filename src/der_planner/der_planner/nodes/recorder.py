@@ -24,7 +24,7 @@ from der_planner.bags.topics import DefinitionError, OfferedQos, TopicSpec
 from der_planner.bags.writer import COMPRESSIONS, RUN_KEY, BagWriteError, BagWriter
 from limb_interfaces import parameters, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
-from limb_interfaces.overrides import check_overrides
+from limb_interfaces.parameters import check_overrides
 from limb_interfaces.runner import run_node
 
 IMAGE_TYPE = "sensor_msgs/msg/Image"
@@ -216,7 +216,7 @@ class Recorder(Node):
             source.missed += lacking
             self._session.put(source.spec, arrived, sent, data)
 
-    def _take_what_has_arrived(self) -> None:
+    def _receive_waiting(self) -> None:
         """Receive what waits: on a busy machine, services may overtake earlier messages."""
         for source in self._sources.values():
             waiting, count = source.subscription, 0
@@ -235,7 +235,7 @@ class Recorder(Node):
     # Services
 
     def _start(self) -> str:
-        self._take_what_has_arrived()
+        self._receive_waiting()
         metadata = self._run_metadata()
         output = self._parameter("output")
         folder = Path(output) if output else Path(time.strftime("bag_%Y_%m_%d-%H_%M_%S"))
@@ -279,7 +279,7 @@ class Recorder(Node):
 
     def _stop(self) -> tuple[bool, str]:
         assert self._session is not None
-        self._take_what_has_arrived()
+        self._receive_waiting()
         ended, self._session = self._session, None
         ended.stop()
         self._last_failure = ended.failure
@@ -318,7 +318,7 @@ class Recorder(Node):
         if self._session is None:
             response.message = "not recording: start a recording first"
             return response
-        self._take_what_has_arrived()
+        self._receive_waiting()
         self._session.paused = request.data
         response.success = True
         response.message = "paused" if request.data else "recording again"

@@ -39,8 +39,7 @@ from der_planner.page.window import lay_out
 from der_planner.planning import PathLimits
 from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
-from limb_interfaces.overrides import check_overrides
-from limb_interfaces.parameters import declare
+from limb_interfaces.parameters import check_overrides, declare
 from limb_interfaces.runner import run_node
 from limb_interfaces.stamps import nanoseconds
 
