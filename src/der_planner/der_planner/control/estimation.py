@@ -133,10 +133,9 @@ class Knowledge:
     row: int = 0
 
     @property
-    def rate(self) -> Array:
-        """(M,) δθ̇ [rad/s]."""
-        inputs = len(self.taken)
-        return self.mean[inputs : 2 * inputs]
+    def parts(self) -> list[Array]:
+        """δθ [rad], δθ̇ [rad/s], d [Pa] and g [-], (M,) each, and b (2,) [m]."""
+        return np.split(self.mean, np.arange(1, 5) * len(self.taken))
 
 
 @dataclass(frozen=True)
@@ -268,9 +267,8 @@ class Estimator:
     def estimate(self, time: float) -> Estimate:
         """Return bend, rates, tip and what the model lacks at an instant [s]."""
         known = self.at(time)
-        inputs = self.inputs
         bend, rate, tip = self.nominal.at(time)
-        change, speed, missing, gain, offset = np.split(known.mean, np.arange(1, 5) * inputs)
+        change, speed, missing, gain, offset = known.parts
         rows = self.tip_rows(bend, change)
         return Estimate(
             time=time,

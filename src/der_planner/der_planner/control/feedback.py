@@ -18,10 +18,11 @@ from threadpoolctl import ThreadpoolController
 
 from der_planner.arrays import Array
 from der_planner.control.estimation import Estimate, Estimator
-from der_planner.control.horizon import Allowed, Horizon, settings_of
+from der_planner.control.horizon import Horizon
 from der_planner.control.nominal import ChamberLog, Nominal
 from der_planner.control.supervision import Limits, Supervisor, Warned
 from der_planner.model import CONTROL_PERIOD
+from der_planner.model.commands import within_limits
 from der_planner.planning.plan_file import Plan
 
 _THREADS = ThreadpoolController()
@@ -43,16 +44,14 @@ class Feedback:
     def __init__(self, plan: Plan, limits: Limits | None = None) -> None:
         self.plan = plan
         self._nominal = Nominal(plan)
-        air = plan.limb.pneumatics
         limits = limits or Limits()
-        authority = limits.authority * air.pressure_limit
-        self._allowed = Allowed(authority, air.pressure_limit, air.slew_limit * CONTROL_PERIOD)
+        authority = limits.authority * plan.limb.pneumatics.pressure_limit
         length = sum(segment.length for segment in plan.limb.segments)
         self._supervisor = Supervisor(limits, authority, length)
         self._chambers = ChamberLog(self._nominal)
         self._estimator = Estimator(self._nominal, self._chambers)
-        self._horizon = Horizon(self._nominal, self._chambers, settings_of(plan))
-        self._horizon.warm_up(self._estimator.beginning(0), self._allowed)
+        self._horizon = Horizon(self._nominal, self._chambers, authority)
+        self._horizon.warm_up(self._estimator.beginning(0))
 
     @property
     def reason(self) -> str:
@@ -139,19 +138,20 @@ class Feedback:
             with _THREADS.limit(limits=1, user_api="blas"):
                 known = self._estimator.at(instant)
                 age = instant - self._estimator.newest
-                swing = float(np.linalg.norm(known.rate))
+                swing = float(np.linalg.norm(known.parts[1]))
                 missed = self._estimator.missed(known, k)
                 share = supervisor.advance(instant, age, known.strange)
                 if share > 0.0:
-                    correction = share * self._horizon.solve(k, known, self._allowed)
+                    correction = share * self._horizon.solve(k, known)
         except np.linalg.LinAlgError:
             correction[:] = np.nan
         if not np.isfinite(correction).all():
             supervisor.stop(instant, "inconsistent", np.inf)
             correction = np.zeros_like(planned)
-        limit, step = self._allowed.limit, self._allowed.step
-        command: Array = np.clip(planned + correction, before - step, before + step)
-        command = np.clip(command, -limit, limit)
+        air = self._nominal.model.air
+        command: Array = within_limits((planned + correction)[None], air, CONTROL_PERIOD, before)[
+            0
+        ][0]
         supervisor.sent(instant, command - planned, swing, missed)
         self._chambers.send(k, command)
         self._estimator.changed(instant)

@@ -115,7 +115,6 @@ def play(
     plant: Plant,
     feedback: Feedback | None = None,
     sensors: Sensors | None = None,
-    hold_time: float = 0.0,
     event: Callable[[float], None] = lambda _time: None,
 ) -> Played:
     """Play a plan from rest, with feedback or without.
@@ -125,116 +124,98 @@ def play(
         plant: at rest.
         feedback: of the plan.
         sensors: what it is told.
-        hold_time: for so long after its end the plan's last command is held [s].
         event: called at every instant of a command or a picture, before the limb moves on.
     """
-    return _Loop(plan, plant, feedback, sensors or Sensors(), event).run(hold_time)
+    sensors = sensors or Sensors()
+    planned, segments = plan.differential_pressure, plan.limb.segment_count
+    told = None if feedback is None else _Told(plant, feedback, sensors, segments)
+    ahead = max(1, round(sensors.lead / CONTROL_PERIOD))
+
+    def command(k: int) -> Array:
+        if feedback is None:
+            last: Array = planned[min(k, len(planned) - 1)]
+            return last
+        return feedback.command(k * CONTROL_PERIOD)
+
+    commands, rows = [command(k) for k in range(ahead)], []
+    for k in range(len(planned)):
+        instant = k * CONTROL_PERIOD
+        event(instant)
+        if told is not None:
+            told.inform(instant)
+        commands.append(command(k + ahead))
+        estimated = (np.full(2, np.nan), np.full(segments, np.nan))
+        if feedback is not None:
+            estimate = feedback.estimate(instant)
+            lacking = estimate.missing_pressure + estimate.gain_error * estimate.effective_pressure
+            estimated = estimate.tip, lacking
+        rows.append(
+            (commands[k], plant.differential_pressure, plant.bend_angles, plant.tip, *estimated)
+        )
+        _advance(plant, commands[k], instant, sensors.frame_rate, event, told)
+    columns = [np.array(column) for column in zip(*rows, strict=True)]
+    commanded, differential, bend, tip, estimated_tip, missing = columns
+    return Played(
+        plan.time,
+        commanded,
+        differential,
+        bend,
+        tip,
+        plan.tip_reference,
+        commanded - planned,
+        estimated_tip,
+        missing,
+    )
 
 
-class _Loop:
-    def __init__(
-        self,
-        plan: Plan,
-        plant: Plant,
-        feedback: Feedback | None,
-        sensors: Sensors,
-        event: Callable[[float], None],
-    ) -> None:
-        self._plan, self._plant, self._feedback = plan, plant, feedback
-        self._sensors, self._event = sensors, event
+def _advance(
+    plant: Plant,
+    command: Array,
+    instant: float,
+    frame_rate: float,
+    event: Callable[[float], None],
+    told: _Told | None,
+) -> None:
+    """Let a control period pass, with a picture at every instant of one."""
+    now, end = instant, instant + CONTROL_PERIOD
+    first, last = (math.ceil(time * frame_rate - 1e-6) for time in (instant, end))
+    for taken in np.arange(first, last) / frame_rate:
+        if taken > now:
+            plant.advance(command, taken - now)
+            now = taken
+            event(now)
+        if told is not None:
+            told.film(taken)
+    if end > now:
+        plant.advance(command, end - now)
+
+
+class _Told:
+    """Tells feedback what camera and board show of a plant: with noise, and pictures late."""
+
+    def __init__(self, plant: Plant, feedback: Feedback, sensors: Sensors, segments: int) -> None:
+        self._plant, self._feedback, self._sensors = plant, feedback, sensors
         self._draw = np.random.default_rng([47, sensors.seed])
         self._pictures: list[tuple[float, float, Array, Array]] = []
-        self._coming: list[Array] = []
-        self._covariance = sensors.covariance(plan.limb.segment_count)
+        self._covariance = sensors.covariance(segments)
 
-    def run(self, hold_time: float) -> Played:
-        plan, sensors = self._plan, self._sensors
-        count = len(plan.time) + round(hold_time / CONTROL_PERIOD)
-        place = np.minimum(np.arange(count), len(plan.time) - 1)
-        planned, reference = plan.differential_pressure[place], plan.tip_reference[place]
-        ahead = max(1, round(sensors.lead / CONTROL_PERIOD))
-        rows = []
-        for k in range(ahead):
-            self._next_command(k, planned)
-        for k in range(count):
-            instant = k * CONTROL_PERIOD
-            self._event(instant)
-            if self._feedback is not None:
-                self._inform(instant)
-            self._next_command(k + ahead, planned)
-            command = self._coming.pop(0)
-            rows.append(self._state(instant, command))
-            self._advance(instant, command)
-        columns = [np.array(column) for column in zip(*rows, strict=True)]
-        commanded, differential, bend, tip, estimated, missing = columns
-        return Played(
-            np.arange(count, dtype=np.float64) * CONTROL_PERIOD,
-            commanded,
-            differential,
-            bend,
-            tip,
-            reference,
-            commanded - planned,
-            estimated,
-            missing,
-        )
-
-    def _next_command(self, k: int, planned: Array) -> None:
-        if self._feedback is None:
-            self._coming.append(planned[min(k, len(planned) - 1)])
-        else:
-            self._coming.append(self._feedback.command(k * CONTROL_PERIOD))
-
-    def _inform(self, instant: float) -> None:
-        if self._feedback is None:
-            return
-        noise = self._sensors.pressure_noise * self._draw.standard_normal(
-            self._plan.limb.segment_count
-        )
-        self._feedback.pressures(instant, self._plant.differential_pressure + noise)
+    def inform(self, instant: float) -> None:
+        """Tell the pressures of an instant [s], and the pictures that have arrived."""
+        pressure = self._plant.differential_pressure
+        noise = self._sensors.pressure_noise * self._draw.standard_normal(len(pressure))
+        self._feedback.pressures(instant, pressure + noise)
         while self._pictures and self._pictures[0][0] <= instant:
             _, taken, bend, tip = heapq.heappop(self._pictures)
             self._feedback.measure(taken, bend, tip, self._covariance)
 
-    def _state(self, instant: float, command: Array) -> tuple[Array, ...]:
-        plant, nothing = self._plant, np.full(2, np.nan)
-        estimated, missing = nothing, np.full(len(command), np.nan)
-        if self._feedback is not None:
-            estimate = self._feedback.estimate(instant)
-            estimated = estimate.tip
-            missing = estimate.missing_pressure + estimate.gain_error * estimate.effective_pressure
-        return (
-            command,
-            plant.differential_pressure,
-            plant.bend_angles,
-            plant.tip,
-            estimated,
-            missing,
-        )
-
-    def _advance(self, instant: float, command: Array) -> None:
-        """Let a control period pass, with a picture at every instant of one."""
-        rate, end = self._sensors.frame_rate, instant + CONTROL_PERIOD
-        first, last = math.ceil(instant * rate - 1e-6), math.ceil(end * rate - 1e-6)
-        now = instant
-        for picture in range(first, last):
-            taken = picture / rate
-            if taken > now:
-                self._plant.advance(command, taken - now)
-                now = taken
-                self._event(now)
-            self._film(taken)
-        if end > now:
-            self._plant.advance(command, end - now)
-
-    def _film(self, taken: float) -> None:
+    def film(self, taken: float) -> None:
+        """Take a picture at an instant [s]; it arrives later."""
         sensors, plant = self._sensors, self._plant
-        if self._feedback is None or not sensors.seen(taken):
+        if not sensors.seen(taken):
             return
         bend = plant.bend_angles
         bend = bend + sensors.bend_noise * self._draw.standard_normal(len(bend))
         tip = plant.tip + sensors.tip_noise * self._draw.standard_normal(2)
         delay = sensors.latency + sensors.jitter * float(self._draw.standard_normal())
-        heapq.heappush(
-            self._pictures, (taken + max(delay, 0.5 * sensors.latency), taken, bend, tip)
-        )
+        arrives = taken + max(delay, 0.5 * sensors.latency)
+        heapq.heappush(self._pictures, (arrives, taken, bend, tip))

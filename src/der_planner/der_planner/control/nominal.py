@@ -78,6 +78,7 @@ class Nominal:
         before: (M,) command before the first one [Pa].
         effective: (K'·STEPS, M) effective pressures of the fine steps [Pa].
         taken: (K'·STEPS, M) pressures that friction and creep take of them [Pa].
+        is_learned: whether the plan was learned.
         watched: whether readings of the chambers are compared with the model: not on a learned plan
             that does not say what its chambers hold beyond their model.
         fine_transition, fine_input: (K', 2M, 2M) and (K', 2M, M) of (δθ, δθ̇) in one fine step.
@@ -120,7 +121,8 @@ class Nominal:
         self.fine_bend = sample_spline(spline, middle)[0]
         self.taken = model.material.memory_pressures(middle, self.fine_bend)
         beyond = plan.chambers_beyond
-        self.watched = beyond is not None or not plan.method.startswith(LEARNED)
+        self.is_learned = plan.method.startswith(LEARNED)
+        self.watched = beyond is not None or not self.is_learned
         self._beyond = np.zeros((1, inputs)) if beyond is None else beyond
         self._linearise(time)
 

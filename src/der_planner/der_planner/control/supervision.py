@@ -28,10 +28,8 @@ REASONS = {
 """Every reason with the sentence of its warning."""
 
 
-_SHRINKS = 0.7
-"""Share of the largest swing before below which a swing dies out."""
-_JUMP = 1.5
-"""Factor by which a correction, or the limb, swings more at once where something hit the limb."""
+_GOES_ON = 0.7
+"""Share of its largest swing below which something that swings begins or dies out."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +49,8 @@ class Limits:
             stays within this share of the limb's length from r̄: a limb that needs much, and
             follows, is not left to a plan that may be further off.
         swing: from one turn of a swinging correction to the next, as a share of the authority.
-        turns: so many of them are an oscillation, unless it dies out …
-        window: … if they come within this time [s].
+        turns: so many of them within the window are an oscillation, unless it begins or dies out.
+        window: time in which the turns are counted [s].
         late: commands that come too late; one in time makes up for half of one.
     """
 
@@ -110,7 +108,9 @@ class Supervisor:
         self._limited_since: float | None = None
         self._late = 0.0
         self._astray_at = -math.inf
-        self._turns: list[_Turns] = []
+        self._recent: deque[tuple[Array, float]] = deque(
+            maxlen=round(limits.window / CONTROL_PERIOD)
+        )
 
     def take_over(self, other: Supervisor) -> None:
         """Go on with the share of another plan's feedback; what ended it does not count here."""
@@ -164,13 +164,32 @@ class Supervisor:
                 self.stop(time, "saturation", self.authority)
         else:
             self._limited_since = None
-        if not self._turns:
-            self._turns = [_Turns(limits.swing * self.authority) for _ in correction]
-        for turns, value in zip(self._turns, correction, strict=True):
-            turns.add(time, float(value), swing)
-            distance = turns.oscillation(time, limits.turns, limits.window)
-            if distance > 0.0 and time - self._astray_at <= limits.window:
-                self.stop(time, "oscillation", distance)
+        self._recent.append((correction, swing))
+        distance = self._oscillation()
+        if distance > 0.0 and time - self._astray_at <= limits.window:
+            self.stop(time, "oscillation", distance)
+
+    def _oscillation(self) -> float:
+        """Return how far a correction swings [Pa] if it and the limb swing on and on; else 0.
+
+        After a push they swing more than before, and later less. A correction that is cut at its
+        limit swings as far as before while the limb's swing dies out.
+        """
+        limits = self.limits
+        if len(self._recent) < (self._recent.maxlen or 0):
+            return 0.0
+        corrections, swings = (np.array(each) for each in zip(*self._recent, strict=True))
+        third, least = len(swings) // 3, limits.swing * self.authority
+        if min(swings[:third].max(), swings[-third:].max()) < _GOES_ON * swings.max():
+            return 0.0
+        for series in corrections.T:
+            distance = float(np.ptp(series))
+            away = series - (series.max() + series.min()) / 2
+            sides = np.sign(away[np.abs(away) > least / 2])
+            goes_on = min(np.ptp(series[:third]), np.ptp(series[-third:])) >= _GOES_ON * distance
+            if goes_on and np.count_nonzero(np.diff(sides)) >= limits.turns:
+                return distance
+        return 0.0
 
     def late(self, time: float, by: float) -> None:
         """Note that a command came after its instant [s], and by how much [s]."""
@@ -192,70 +211,3 @@ class Supervisor:
         if self.reason != name:
             self.reason = name
             self.warnings.append(Warned(time, name, REASONS[name].format(number)))
-
-
-@dataclass(frozen=True)
-class _Turn:
-    """Where a correction turned round.
-
-    Attributes:
-        time: [s].
-        distance: from the turn before [Pa].
-        swing: largest rate of the limb's deviation since the turn before [rad/s].
-    """
-
-    time: float
-    distance: float
-    swing: float
-
-    def jumps(self, before: _Turn) -> bool:
-        """Tell if this turn is much larger than the one before, as after a push."""
-        return self.distance > _JUMP * before.distance or self.swing > _JUMP * before.swing
-
-
-class _Turns:
-    """Finds where a series turns round by more than a threshold.
-
-    Args:
-        threshold: change back from an extreme that counts as a turn.
-    """
-
-    def __init__(self, threshold: float) -> None:
-        self._threshold = threshold
-        self._low = self._high = self._last = self._swing = 0.0
-        self._rising: bool | None = None
-        self._found: deque[_Turn] = deque(maxlen=16)
-
-    def add(self, time: float, value: float, swing: float) -> None:
-        """Look at the next value, and at the rate with which the limb swings then."""
-        self._low, self._high = min(self._low, value), max(self._high, value)
-        self._swing = max(self._swing, swing)
-        if self._rising is not False and value < self._high - self._threshold:
-            self._turn(time, self._high, rising=False)
-            self._low = value
-        elif self._rising is not True and value > self._low + self._threshold:
-            self._turn(time, self._low, rising=True)
-            self._high = value
-
-    def _turn(self, time: float, extreme: float, *, rising: bool) -> None:
-        if self._rising is not None:
-            turn = _Turn(time, abs(extreme - self._last), self._swing)
-            if self._found and turn.jumps(self._found[-1]):
-                self._found.clear()
-            self._found.append(turn)
-        self._last, self._rising, self._swing = extreme, rising, 0.0
-
-    def oscillation(self, time: float, turns: int, window: float) -> float:
-        """Return the distance between two turns if they are many and none dies out, else 0.
-
-        A correction that is cut at its limit keeps its distance while the limb's swing dies out.
-        """
-        recent = [turn for turn in self._found if turn.time > time - window][-turns:]
-        if len(recent) < turns:
-            return 0.0
-        last, before = recent[-1], recent[:-1]
-        if last.distance < _SHRINKS * max(turn.distance for turn in before):
-            return 0.0
-        if last.swing < _SHRINKS * max(turn.swing for turn in before):
-            return 0.0
-        return last.distance
