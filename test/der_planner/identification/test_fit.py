@@ -16,7 +16,7 @@ from der_planner.identification.bends import (
     values_of,
 )
 from der_planner.identification.excitation import calibration_run, steps, sweep, waves
-from der_planner.identification.lengths import fit_geometry, with_lengths
+from der_planner.identification.lengths import fit_geometry, lengths_of, with_lengths
 from der_planner.identification.log import Prepared
 from der_planner.limb import Limb
 from der_planner.model import RodModel
@@ -139,7 +139,7 @@ def test_lengths_are_recovered_from_tips():
     time, none = 0.05 * np.arange(400), np.zeros((400, 2))
     found = fit_geometry(Limb.default(), CalibrationLog(time, none, none, angles, tip))
     assert found is not None
-    error = np.append(found.lengths - [0.1195, 0.1235], [found.base - 5e-3, found.connector - 6e-3])
+    error = lengths_of(found.limb) - [0.1195, 0.1235, 5e-3, 6e-3]
     assert np.all(np.abs(error) < 3 * found.uncertainty)
     assert found.residual < 0.4e-3 < found.residual_before
 

@@ -14,26 +14,20 @@ from der_planner.identification.fit import fit
 from der_planner.identification.log import CalibrationLog, LogError, prepare
 from der_planner.identification.readers import ColumnMap, read_bag, read_csv, read_log
 from der_planner.identification.report import (
-    Check,
     FitReport,
-    Unknown,
     check,
     plot_prediction,
     predict,
 )
-from der_planner.identification.update import Change, Update, update
+from der_planner.identification.update import update
 
 __all__ = [
     "GROUPS",
     "CalibrationLog",
-    "Change",
-    "Check",
     "ColumnMap",
     "Excitation",
     "FitReport",
     "LogError",
-    "Unknown",
-    "Update",
     "calibrate_twin",
     "calibration_run",
     "check",

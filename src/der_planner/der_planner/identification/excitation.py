@@ -108,30 +108,19 @@ def within_limits(excitation: Excitation, pressure_limit: float, slew_limit: flo
     return replace(excitation, differential_pressure=pressure)
 
 
-def directions(segment_count: int) -> list[Array]:
-    """Return each input alone, all together and alternating, as (M,) signs."""
-    result = [*np.eye(segment_count)]
-    if segment_count > 1:
-        result += [np.ones(segment_count), (-1.0) ** np.arange(segment_count)]
-    return result
-
-
-def staircase(
-    amplitude: float, segment_count: int = 2, levels: int = 2, hold: float = 3.0
-) -> Array:
-    """Return a staircase (K, M) [Pa] both ways along each of `directions`.
+def staircase(amplitude: float, segment_count: int = 2) -> Array:
+    """Return a staircase (K, M) [Pa] both ways: each input alone, all together and alternating.
 
     Args:
-        amplitude: largest |differential pressure| [Pa].
+        amplitude: largest |differential pressure| [Pa], in two stairs of 3 s each.
         segment_count: M.
-        levels: stairs from zero to the amplitude.
-        hold: duration of a stair [s].
     """
-    up = np.arange(1, levels + 1) / levels
-    down = up[-2::-1]
-    cycle = np.concatenate([up, down, [0.0], -up, -down, [0.0]])
-    heights = np.concatenate([np.outer(cycle, way) for way in directions(segment_count)])
-    return np.repeat(amplitude * heights, round(hold / PERIOD), axis=0)
+    ways = [*np.eye(segment_count)]
+    if segment_count > 1:
+        ways += [np.ones(segment_count), (-1.0) ** np.arange(segment_count)]
+    cycle = np.array([0.5, 1.0, 0.5, 0.0, -0.5, -1.0, -0.5, 0.0])
+    heights = np.concatenate([np.outer(cycle, way) for way in ways])
+    return np.repeat(amplitude * heights, round(3.0 / PERIOD), axis=0)
 
 
 def waves(amplitude: float, segment_count: int = 2, duration: float = 64.0) -> Array:
@@ -149,9 +138,9 @@ def waves(amplitude: float, segment_count: int = 2, duration: float = 64.0) -> A
     return _fade(np.stack(columns, axis=1), 2.0)
 
 
-def steps(amplitude: float, segment_count: int = 2, hold: float = 4.0) -> Array:
-    """Return one step up and down of each input in turn (K, M) [Pa], for air and ring-down."""
-    count = round(hold / PERIOD)
+def steps(amplitude: float, segment_count: int = 2) -> Array:
+    """Return one step of 4 s up and down of each input in turn (K, M) [Pa], for air and swing."""
+    count = round(4.0 / PERIOD)
     blocks = []
     for index in range(segment_count):
         for height in (amplitude, 0.0):
@@ -161,15 +150,10 @@ def steps(amplitude: float, segment_count: int = 2, hold: float = 4.0) -> Array:
     return np.concatenate(blocks)
 
 
-def sweep(
-    amplitude: float,
-    segment_count: int = 2,
-    duration: float = 16.0,
-    band: tuple[float, float] = (0.1, 1.2),
-) -> Array:
-    """Return a sweep (K, M) [Pa] through a band of frequencies [Hz], its inputs out of step."""
+def sweep(amplitude: float, segment_count: int = 2, duration: float = 16.0) -> Array:
+    """Return a sweep (K, M) [Pa] from 0.1 to 1.2 Hz, its inputs out of step."""
     t = np.arange(round(duration / PERIOD)) * PERIOD
-    low, high = band
+    low, high = 0.1, 1.2
     phase = 2 * np.pi * low * duration / np.log(high / low) * ((high / low) ** (t / duration) - 1)
     columns = [np.sin(phase * (1 + 0.15 * index)) for index in range(segment_count)]
     return _fade(amplitude * np.stack(columns, axis=1), 1.0)

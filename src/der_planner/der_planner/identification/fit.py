@@ -101,7 +101,7 @@ def fit(
     prepared = replace(recorded, pressure=recorded.pressure - offset)
     fitted = _fit_bends_and_lengths(limb, prepared, groups, geometry)
     if fitted.lengths is not None:
-        warnings += filter(None, [lengths_at_their_end(limb, fitted.lengths.lengths)])
+        warnings += filter(None, [lengths_at_their_end(limb, fitted.lengths.limb)])
     unknowns, correlation = _told(fitted)
     if "dynamics" in groups and _all_untold(unknowns):
         warnings.append(

@@ -61,9 +61,6 @@ class GeometryFit:
 
     Attributes:
         limb: with the fitted lengths.
-        lengths: (M,) [m].
-        connector: between two segments [m]; the prior's for one segment.
-        base: between clamp and first segment [m].
         uncertainty: (M + 2,) standard deviations of lengths, base and connector [m]; without the
             connector for one segment.
         residual_before, residual: root mean square distance of the tips from those of an evenly
@@ -71,9 +68,6 @@ class GeometryFit:
     """
 
     limb: Limb
-    lengths: Array
-    connector: float
-    base: float
     uncertainty: Array
     residual_before: float
     residual: float
@@ -120,9 +114,6 @@ def fit_geometry(
     found = with_lengths(limb, best)
     return GeometryFit(
         limb=found,
-        lengths=np.array([segment.length for segment in found.segments]),
-        connector=found.connector_length,
-        base=found.base_length,
         uncertainty=np.sqrt(np.diag(search.covariance(best))),
         residual_before=_distance(difference(limb)),
         residual=_distance(difference(found)),
@@ -246,21 +237,23 @@ def _known(prior: Limb) -> Unknowns:
     return Unknowns(start, spread, low, high, scale=spread)
 
 
-def lengths_at_their_end(prior: Limb, lengths: Array) -> str:
-    """Return a sentence where the lengths (M,) of segments went as far as they may; else empty."""
-    measured = np.array([segment.length for segment in prior.segments])
-    share = lengths / measured
-    ends = (share < LENGTH_RANGE[0] + _AT_END) | (share > LENGTH_RANGE[1] - _AT_END)
-    if not ends.any():
+def lengths_at_their_end(prior: Limb, found: Limb) -> str:
+    """Return a sentence where the lengths of segments went as far as they may; else empty."""
+    ends = []
+    for index, (given, fitted) in enumerate(zip(prior.segments, found.segments, strict=True)):
+        share = fitted.length / given.length
+        if LENGTH_RANGE[0] + _AT_END < share < LENGTH_RANGE[1] - _AT_END:
+            continue
+        ends.append(
+            f"segment {index} is given as {1e3 * given.length:.0f} mm and was found to be "
+            f"{1e3 * fitted.length:.0f} mm or {'less' if share < 1 else 'more'}"
+        )
+    if not ends:
         return ""
-    named = ", ".join(
-        f"segment {index} is given as {1e3 * measured[index]:.0f} mm and was found to be "
-        f"{1e3 * lengths[index]:.0f} mm" + (" or less" if share[index] < 1 else " or more")
-        for index in np.flatnonzero(ends)
-    )
     return (
-        f"lengths as far from the prior's as they may be: {named}. Measure the segments and give "
-        "their lengths in the limb file of --prior; check the unit and the origin of the tips"
+        f"lengths as far from the prior's as they may be: {', '.join(ends)}. Measure the segments "
+        "and give their lengths in the limb file of --prior; check the unit and the origin of the "
+        "tips"
     )
 
 

@@ -78,12 +78,7 @@ class CalibrationLog:
             longest_gap: between two valid rows of a column that a straight line may bridge [s].
         """
         grid = np.arange(self.time[0], self.time[-1] + 1e-9, period)
-
-        def table(values: Array) -> Array:
-            columns = [on_grid(self.time, column, grid, longest_gap) for column in values.T]
-            return np.stack(columns, axis=1)
-
-        return self._of(grid, table)
+        return self._of(grid, lambda table: on_grid(self.time, table, grid, longest_gap))
 
     def between(self, first: float, last: float) -> CalibrationLog:
         """Return the rows from ``first`` to ``last`` [s]."""
@@ -97,27 +92,29 @@ class CalibrationLog:
         return CalibrationLog(time, commanded, measured, angles, tip, self.source)
 
 
-def on_grid(time: Array, column: Array, grid: Array, longest_gap: float) -> Array:
-    """Return a column (G,) on a regular grid, by straight lines between its known rows.
+def on_grid(time: Array, table: Array, grid: Array, longest_gap: float) -> Array:
+    """Return a table (G, N) on a regular grid, by straight lines between known rows of a column.
 
     Args:
         time: (K,) rising [s].
-        column: (K,), NaN where nothing is known.
+        table: (K, N), NaN where nothing is known.
         grid: (G,) regular instants [s].
         longest_gap: between two known rows that a line may bridge [s]; a row of the grid in a
             longer one is NaN, unless it is nearer to a known row than the grid's period.
     """
-    known = np.isfinite(column)
-    if not known.any():
-        return np.full(grid.size, np.nan)
+    result = np.full((grid.size, table.shape[1]), np.nan)
     period = grid[1] - grid[0] if grid.size > 1 else 0.0
-    instants = time[known]
-    result: Array = np.interp(grid, instants, column[known])
-    after = instants[np.clip(np.searchsorted(instants, grid, "left"), 0, len(instants) - 1)]
-    before = instants[np.clip(np.searchsorted(instants, grid, "right") - 1, 0, None)]
-    edge = np.minimum(np.abs(after - grid), np.abs(before - grid))
-    result[(after - before > longest_gap) & (edge > period)] = np.nan
-    result[(grid < instants[0] - period) | (grid > instants[-1] + period)] = np.nan
+    for column, found in zip(table.T, result.T, strict=True):
+        known = np.isfinite(column)
+        if not known.any():
+            continue
+        instants = time[known]
+        found[:] = np.interp(grid, instants, column[known])
+        after = instants[np.clip(np.searchsorted(instants, grid, "left"), 0, len(instants) - 1)]
+        before = instants[np.clip(np.searchsorted(instants, grid, "right") - 1, 0, None)]
+        edge = np.minimum(np.abs(after - grid), np.abs(before - grid))
+        found[(after - before > longest_gap) & (edge > period)] = np.nan
+        found[(grid < instants[0] - period) | (grid > instants[-1] + period)] = np.nan
     return result
 
 

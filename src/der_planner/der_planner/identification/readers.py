@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from der_planner.arrays import Array
 from der_planner.bags.reader import BagError
 from der_planner.bags.record import PRESSURE_TYPE, STATE_TYPE, BagRecord, LimbRecord, read_record
-from der_planner.bags.run import Stream
 from der_planner.bags.series import stream
 from der_planner.identification.log import CalibrationLog, LogError, on_grid
 from der_planner.model import CONTROL_PERIOD
@@ -80,19 +79,9 @@ def read_bag(path: str | Path, namespace: str = "") -> CalibrationLog:
         raise LogError(f"in {path} pressures and limb states do not overlap: check the clocks")
     grid = np.arange(start, end, CONTROL_PERIOD)
     commanded, tip = stream(limb.commanded, count, origin), stream(limb.tip, 2, origin)
-
-    def table(one: Stream) -> Array:
-        columns = [on_grid(one.time, column, grid, LONGEST_GAP) for column in one.value.T]
-        return np.stack(columns, axis=1)
-
-    return CalibrationLog(
-        grid - start,
-        table(commanded),
-        table(measured),
-        table(angles),
-        table(tip),
-        Path(path).name,
-    )
+    streams = (commanded, measured, angles, tip)
+    tables = [on_grid(one.time, one.value, grid, LONGEST_GAP) for one in streams]
+    return CalibrationLog(grid - start, tables[0], tables[1], tables[2], tables[3], Path(path).name)
 
 
 def _choose_limb(record: BagRecord, namespace: str) -> LimbRecord:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import datetime
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -75,47 +75,39 @@ NUMBERS = {
 
 @dataclass(frozen=True)
 class DayNumbers:
-    """The numbers of a limb that change from day to day: those of `NUMBERS`, for each segment.
+    """The numbers of a limb that change from day to day: `NUMBERS` of each segment.
 
     Attributes:
         limb: with the numbers of its file.
-        names: of the numbers, in the order of `NUMBERS`.
-        free: (P,) places of those that may change in (M, len(names)) of all; None: all.
+        free: (P,) places of those that may change among all (3 M).
     """
 
     limb: Limb
-    names: tuple[str, ...] = tuple(NUMBERS)
-    free: tuple[int, ...] | None = None
+    free: list[int]
 
-    @property
-    def places(self) -> list[int]:
-        """(P,) places of the free numbers in (M, len(names)) of all."""
-        count = self.limb.segment_count * len(self.names)
-        return list(range(count)) if self.free is None else list(self.free)
+    @classmethod
+    def of(cls, limb: Limb, names: Collection[str] = tuple(NUMBERS)) -> DayNumbers:
+        """Return the numbers of these names in all segments."""
+        free = [name in names for name in NUMBERS] * limb.segment_count
+        return cls(limb, np.flatnonzero(free).tolist())
 
     @property
     def unknowns(self) -> Unknowns:
         """What is known of the free numbers: those of the file, with the spread of days."""
-        prior, spread, low, high = self._known[self.places].T
+        prior, spread, low, high = self._known[self.free].T
         return Unknowns(prior, spread, low, high, scale=spread)
 
     @property
     def _known(self) -> Array:
-        """Prior, spread, least and largest value of all numbers (M len(names), 4)."""
-        rows = []
-        for segment in self.limb.segments:
-            rows += _day(segment)[: len(self.names)]
-        return np.array(rows)
+        """Prior, spread, least and largest value of all numbers (3 M, 4)."""
+        return np.array([row for segment in self.limb.segments for row in _day(segment)])
 
     def limb_with(self, values: Array) -> Limb:
         """Return the limb with the free numbers (P,) put in place, its arcs changed alike."""
         numbers = self._known[:, 0]
-        numbers[self.places] = values
+        numbers[self.free] = values
         rows = numbers.reshape(self.limb.segment_count, -1).tolist()
-        segments = tuple(
-            _changed(segment, dict(zip(self.names, row, strict=True)))
-            for segment, row in zip(self.limb.segments, rows, strict=True)
-        )
+        segments = tuple(map(_changed, self.limb.segments, rows))
         pairs = zip(self.limb.pcc_segments, self.limb.segments, segments, strict=False)
         return replace(self.limb, segments=segments, pcc_segments=tuple(_alike(*p) for p in pairs))
 
@@ -137,10 +129,10 @@ def _sizes(segment: Segment) -> tuple[float, float, float]:
     return segment.length / segment.bending_stiffness, segment.length, 1.0
 
 
-def _changed(segment: Segment, numbers: dict[str, float]) -> Segment:
-    """Return a segment with other `NUMBERS`, by their names."""
-    changes = {NUMBERS[name]: value for name, value in numbers.items()}
-    if numbers.get("friction") and not segment.friction_curvature:
+def _changed(segment: Segment, numbers: Sequence[float]) -> Segment:
+    """Return a segment with other `NUMBERS`."""
+    changes = dict(zip(NUMBERS.values(), numbers, strict=True))
+    if changes["friction_moment"] and not segment.friction_curvature:
         changes["friction_curvature"] = FRICTION_ANGLE / segment.length
     return replace(segment, **changes)
 
@@ -170,7 +162,6 @@ class Change:
         before, after: values.
         spread: standard deviation before, that of days.
         deviation: standard deviation after.
-        told: the runs tell it; if not, it keeps its value.
     """
 
     segment: int
@@ -179,7 +170,11 @@ class Change:
     after: float
     spread: float
     deviation: float
-    told: bool
+
+    @property
+    def told(self) -> bool:
+        """Whether the runs tell it; if not, it keeps its value."""
+        return self.deviation < self.spread
 
     def text(self) -> str:
         """Return the line for people."""
@@ -262,7 +257,7 @@ def update(limb: Limb, logs: CalibrationLog | Sequence[CalibrationLog]) -> tuple
             f"the runs last {duration:.1f} s altogether: an update needs {LEAST_DURATION:.0f} s, "
             "and half a minute in which all segments move to tell all of it"
         )
-    every = DayNumbers(limb)
+    every = DayNumbers.of(limb)
     known = every.unknowns.prior
     try:
         remaining = BendFit(every, RodModel(limb, NODES), runs).remaining(known)
@@ -273,8 +268,8 @@ def update(limb: Limb, logs: CalibrationLog | Sequence[CalibrationLog]) -> tuple
         ) from error
     _refuse_wrong_way(runs, remaining)
     values, deviations = _solve(every, runs)
-    told = replace(every, free=tuple(deviations))
-    found = told.limb_with(values[told.places])
+    told = replace(every, free=list(deviations))
+    found = told.limb_with(values[told.free])
     before, after = (
         np.sqrt(np.nanmean(left**2, axis=0))
         for left in (remaining, BendFit(every, RodModel(limb, NODES), runs).remaining(values))
@@ -285,20 +280,14 @@ def update(limb: Limb, logs: CalibrationLog | Sequence[CalibrationLog]) -> tuple
             f"gain, rest angle and friction leave {math.degrees(after.max()):.1f}°: something else "
             "changed, calibrate again"
         )
-    spread, sizes = every.unknowns.spread, np.array([_sizes(s) for s in limb.segments]).ravel()
+    spread = every.unknowns.spread
+    deviation = np.array([deviations.get(place, spread[place]) for place in every.free])
+    sizes = np.array([_sizes(segment) for segment in limb.segments]).ravel()
+    sized = (sizes * np.stack([known, values, spread, deviation])).T
     changes = []
-    for place in every.places:
-        deviation = deviations.get(place, float(spread[place]))
-        change = Change(
-            segment=place // len(every.names),
-            name=every.names[place % len(every.names)],
-            before=float(sizes[place] * known[place]),
-            after=float(sizes[place] * values[place]),
-            spread=float(sizes[place] * spread[place]),
-            deviation=float(sizes[place] * deviation),
-            told=place in deviations,
-        )
-        changes.append(change)
+    for place, numbers in zip(every.free, sized.tolist(), strict=True):
+        index, kind = divmod(place, len(NUMBERS))
+        changes.append(Change(index, tuple(NUMBERS)[kind], *numbers))
     found = _with_provenance(found, limb, changes, after, given)
     return found, Update(tuple(changes), before, after, duration, tuple(warnings))
 
@@ -309,18 +298,18 @@ def _solve(every: DayNumbers, runs: Sequence[Prepared]) -> tuple[Array, dict[int
     values = every.unknowns.prior
     for _ in range(MOST_PASSES):
         problem = BendFit(numbers, RodModel(every.limb, NODES), runs)
-        free = problem.search.solve(values[numbers.places], factor)
+        free = problem.search.solve(values[numbers.free], factor)
         values = every.unknowns.prior.copy()
-        values[numbers.places] = free
+        values[numbers.free] = free
         factor = max(1.0, problem.excess(problem.remaining(free)))
         deviation = np.sqrt(np.diag(problem.search.covariance(free, factor)))
         told = deviation <= UNTOLD * numbers.unknowns.spread
         deviations = {
-            p: float(d) for p, d, t in zip(numbers.places, deviation, told, strict=True) if t
+            p: float(d) for p, d, t in zip(numbers.free, deviation, told, strict=True) if t
         }
         if not deviations:
             return every.unknowns.prior, {}
-        numbers = replace(numbers, free=tuple(deviations))
+        numbers = replace(numbers, free=list(deviations))
     return values, deviations
 
 
@@ -366,7 +355,7 @@ def adapted(limb: Limb, tip_of: Callable[[Limb], Array | None], tip: Array) -> L
         None where the limb is near the run already, or nothing much is gained.
     """
     seen = np.isfinite(tip).all(axis=1)
-    numbers = DayNumbers(limb, ("gain", "rest angle"))
+    numbers = DayNumbers.of(limb, ("gain", "rest angle"))
     unknowns = numbers.unknowns
 
     def missed(values: Array) -> Array:

@@ -277,7 +277,7 @@ class Streamer:
         """Held where playing begins and where it is ended."""
         self._open: list[Schedule] = []  # played, or waiting for their start; oldest first
         self._spent: set[str] = set()
-        self._player = Player(now, self._send, lambda _: None, lead)
+        self._player = Player(now, self._send, lead)
 
     @property
     def position(self) -> tuple[Schedule, int] | None:
