@@ -4,7 +4,7 @@ import re
 import sys
 
 import pytest
-from chain_calibration import write_csv
+from log_table import write_csv
 from link_chain import LinkChain
 
 from der_planner.commands import calibrate_limb, check_limb
