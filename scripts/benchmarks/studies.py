@@ -11,7 +11,7 @@ import psutil
 from distributed import Client, LocalCluster
 
 from der_planner.experiment.console import Progress
-from der_planner.studies.conduct import Calibrated, PlaySettings, compute, conduct
+from der_planner.studies.conduct import PlaySettings, compute, conduct
 from der_planner.studies.study import Study
 
 Figures = dict[str, float | str]
@@ -104,7 +104,7 @@ def _tasks(folder: Path, quick: bool) -> Figures:
     for place, row in enumerate(rows):
         if place == 1:  # the first row loads the kernels
             begin = time.perf_counter()
-        compute("model", row.values, Calibrated())
+        compute("model", row.values, "")
     work = (time.perf_counter() - begin) / (len(rows) - 1)
     with _cluster(1) as cluster, Client(cluster) as client:
         address = cluster.scheduler_address

@@ -8,14 +8,10 @@ import pytest
 from pressure_driver.safety import Mode
 from pressure_driver.schedule import (
     RELEASE_TIME,
-    REMEMBERED_PLANS,
     Origin,
     Setpoint,
-    SetpointSchedule,
-    SpentPlans,
     Verdict,
 )
-from pressure_driver.settings import Settings
 
 TICK = 50_000_000
 STEP = 10_000.0
@@ -29,10 +25,6 @@ def outputs(sim, ticks):
         sim.tick()
         found.append(sim.core.state()["commanded_differential"])
     return np.array(found)
-
-
-def steepest(commanded):
-    return np.abs(np.diff(commanded, axis=0)).max()
 
 
 # ----------------------------------------------------------------------- a plan and its arming
@@ -64,16 +56,6 @@ def test_a_plan_that_streams_on_through_a_vent_is_refused_after_the_next_arming(
     assert sim.offer((1_000.0, 0.0), plan_id="new") is Verdict.ACCEPTED
 
 
-def test_the_rest_of_a_plan_that_had_ended_before_the_vent_is_refused_too(simulate):
-    sim = simulate()
-    sim.arm()
-    sim.stream(0.5, lambda t: (2_000.0 * t, 0.0))
-    sim.run_until(lambda: sim.mode is Mode.ARMED)
-    sim.core.vent()
-    sim.run_until(lambda: sim.core.arm()[0])
-    assert sim.offer((1_000.0, 0.0), plan_id="plan of arming 1", index=99) is Verdict.REFUSED
-
-
 def test_setpoints_without_a_plan_must_pause_after_a_vent(simulate):
     sim = simulate()
     sim.arm()
@@ -94,19 +76,6 @@ def test_setpoints_without_a_plan_must_pause_after_a_vent(simulate):
         sim.tick()
     sim.run(RELEASE_TIME + 0.05)
     assert typed() is Verdict.ACCEPTED
-
-
-def test_what_is_remembered_is_bounded():
-    plans = SpentPlans()
-    for index in range(5 * REMEMBERED_PLANS):
-        plans.hear(f"plan {index}", 0.0)
-        plans.spend()
-    assert len(plans._spent) == REMEMBERED_PLANS
-    assert plans.refuse(f"plan {5 * REMEMBERED_PLANS - 1}", 0.0)
-    schedule = SetpointSchedule(Settings())
-    for index in range(3 * REMEMBERED_PLANS):
-        schedule.offer(Setpoint(TICK, (0.0, 0.0), f"plan {index}"), 0, (0.0, 0.0))
-    assert len(schedule._replaced) == REMEMBERED_PLANS
 
 
 # ------------------------------------------------------------------------- one publisher at a time
@@ -189,36 +158,6 @@ def test_another_topic_is_another_publisher(simulate):
 # ----------------------------------------------------------------- the output moves by its limit
 
 
-def test_no_tick_moves_more_than_the_slew_limit_after_a_hold(simulate):
-    sim = simulate()
-    sim.arm()
-    sim.stream(1.0, lambda t: (min(40_000.0 * t, 24_000.0), 0.0))
-    sim.run_until(lambda: sim.mode is Mode.HOLDING)
-    # Each is far from the last one in time, as checked when it comes, and near in ticks.
-    for index, value in enumerate((14_000.0, 4_000.0, -6_000.0, -16_000.0, -24_000.0)):
-        sim.core.offer(
-            Setpoint(sim.wall + 4 * TICK - (4 - index), (value, 0.0), "down", index), sim.wall
-        )
-    commanded = outputs(sim, 12)
-    assert steepest(commanded) <= STEP * (1.0 + 1e-6)
-
-
-@pytest.mark.parametrize("interpolation", ["hold", "linear"])
-def test_a_setpoint_that_waits_through_a_ramp_down_is_approached_and_counted(
-    simulate, interpolation
-):
-    sim = simulate(interpolation=interpolation, hold_time=0.1, vent_rate=50_000.0)
-    sim.arm()
-    sim.stream(1.0, lambda t: (min(40_000.0 * t, 24_000.0), 0.0))
-    assert sim.offer((24_000.0, 0.0), ahead=4.0, index=20) is Verdict.ACCEPTED
-    commanded = outputs(sim, 100)
-    assert steepest(commanded) <= STEP * (1.0 + 1e-6)
-    assert commanded[:, 0].max() == 24_000.0
-    if interpolation == "hold":
-        assert 0.0 in commanded[:, 0], "let down while it waited"
-        assert sim.core.machine.limited_ticks == 2
-
-
 def test_interpolation_goes_on_from_what_is_commanded_and_not_from_the_last_setpoint(simulate):
     sim = simulate(interpolation="linear")
     sim.arm()
@@ -232,19 +171,6 @@ def test_interpolation_goes_on_from_what_is_commanded_and_not_from_the_last_setp
     assert commanded.max() <= before
     assert np.all(np.diff(commanded) <= 0.0)
     assert commanded[-1] == 0.0
-
-
-def test_the_first_setpoint_after_arming_is_approached_from_zero(simulate):
-    sim = simulate(slew_limit=20_000.0)
-    sim.arm()
-    for index in range(1, 9):
-        assert sim.offer((1_000.0 * index, 0.0), 0.05 * index, index=index) is Verdict.ACCEPTED
-    # The first ones are lost on the way to the output, as when the thread is held up.
-    sim.time += 5 * TICK
-    commanded = outputs(sim, 20)
-    assert steepest(commanded) <= 1_000.0 * (1.0 + 1e-6)
-    assert commanded[-1, 0] > 0.0
-    assert sim.core.machine.limited_ticks > 0
 
 
 def test_random_setpoints_never_step_the_output(simulate):

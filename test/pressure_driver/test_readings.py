@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pressure_driver.protocols import NAMES
-from pressure_driver.safety import MOST_FAULTS, Mode
+from pressure_driver.safety import Mode
 
 # ---------------------------------------------------------------------------------- supply
 
@@ -44,19 +44,12 @@ def test_a_board_without_a_sensor_of_the_supply_needs_a_parameter(simulate):
 
 
 @pytest.mark.parametrize("protocol", ["ezloop", "native"])
-@pytest.mark.parametrize("supply", [450_000.0, 900_000.0, 1_000.0])
-def test_an_implausible_supply_is_a_fault_and_forbids_arming(simulate, protocol, supply):
+@pytest.mark.parametrize("supply", [900_000.0, 1_000.0])
+def test_an_implausible_supply_forbids_arming(simulate, protocol, supply):
     sim = simulate(protocol)
-    sim.arm()
     sim.have(f"supply:{supply}")
-    sim.run_until(lambda: sim.mode is Mode.FAULT, 0.7)
-    assert "supply too" in sim.faults[0]
-    sim.run(3.0)
+    sim.run(4.0)
     assert "supply too" in sim.core.arm()[1]
-    fresh = simulate(protocol)
-    fresh.have(f"supply:{supply}")
-    fresh.run(4.0)
-    assert "supply too" in fresh.core.arm()[1]
 
 
 def test_a_supply_that_is_not_a_number_is_a_fault(simulate):
@@ -202,14 +195,6 @@ def test_a_further_fault_while_in_fault_is_added(simulate):
     sim.core.lost("serial link lost: pulled")
     sim.run(1.0)
     assert sim.faults[2:] == ("serial link lost: pulled",)
-
-
-def test_faults_are_bounded(simulate):
-    sim = simulate()
-    sim.arm()
-    for index in range(1_000):
-        sim.core.machine.fail(f"board reports trouble {index}")
-    assert len(sim.faults) == MOST_FAULTS
 
 
 def test_text_of_the_board_is_logged_once_a_tick(simulate):

@@ -13,30 +13,6 @@ from pressure_driver.schedule import Verdict
 # --------------------------------------------------------------------------------- refusals
 
 
-@pytest.mark.parametrize("protocol", NAMES)
-@pytest.mark.parametrize(
-    ("differential", "ahead", "reason"),
-    [
-        ((float("nan"), 0.0), 0.2, "not finite"),
-        ((1_000.0,), 0.2, "expected 2"),
-        ((24_500.0, 0.0), 0.2, "limit"),
-        ((15_000.0, 0.0), 0.2, "Pa/s"),
-        ((1_000.0, 0.0), 11.0, "ahead"),
-        ((1_000.0, 0.0), -0.1, "after its stamp"),
-    ],
-)
-def test_what_is_refused_never_reaches_the_wire(simulate, protocol, differential, ahead, reason):
-    sim = simulate(protocol)
-    sim.arm()
-    sim.tick()
-    before = len(sim.sent)
-    assert sim.offer(differential, ahead) in (Verdict.REFUSED, Verdict.LATE)
-    assert reason in sim.core.machine.schedule.reason
-    sim.run(1.0)
-    assert sim.mode is Mode.ARMED
-    assert all(sim.is_vent(data) for data in sim.sent[before:])
-
-
 def test_nothing_but_vent_is_sent_until_armed(simulate):
     sim = simulate()
     for index in range(40):
@@ -253,13 +229,3 @@ def test_a_bad_line_still_ends_vented(simulate, protocol, fault):
     sim.core.vent()
     sim.run(8.0)
     assert sim.vented
-
-
-def test_the_round_trip_is_measured_where_there_are_echoes(simulate):
-    for protocol in ("ctrlp", "native"):
-        sim = simulate(protocol)
-        sim.run(2.0)
-        assert np.isfinite(sim.core.state()["round_trip"])
-    sim = simulate("ezloop")
-    sim.run(2.0)
-    assert np.isnan(sim.core.state()["round_trip"])

@@ -5,7 +5,7 @@ import pytest
 
 from pressure_driver.protocols import NAMES
 from pressure_driver.safety import Mode
-from pressure_driver.schedule import Setpoint, Verdict
+from pressure_driver.schedule import Verdict
 
 
 @pytest.mark.parametrize("protocol", NAMES)
@@ -49,16 +49,6 @@ def test_each_setpoint_is_on_the_wire_at_its_stamp(simulate, protocol):
         assert pressure[0::2] - pressure[1::2] == pytest.approx(u, abs=1.1)
 
 
-def test_holding_goes_on_with_the_next_setpoint(simulate):
-    sim = simulate()
-    sim.track()
-    sim.run_until(lambda: sim.mode is Mode.HOLDING)
-    held = sim.core.state()["commanded_differential"]
-    assert sim.offer(held, plan_id="next") is Verdict.ACCEPTED
-    sim.run_until(lambda: sim.mode is Mode.TRACKING, 0.3)
-    assert sim.core.machine.schedule.current.plan_id == "next"
-
-
 def test_holding_keeps_the_last_pressures_for_the_hold_time(simulate):
     sim = simulate(setpoint_timeout=0.2, hold_time=1.0)
     sim.track()
@@ -90,11 +80,13 @@ def test_the_ramp_down_is_as_fast_as_it_says_and_keeps_the_shape(simulate):
     assert ratio == pytest.approx(ratio[0])
 
 
-def test_venting_on_the_ramp_goes_on_with_the_next_setpoint(simulate):
+@pytest.mark.parametrize("mode", [Mode.HOLDING, Mode.VENTING])
+def test_holding_and_the_ramp_down_go_on_with_the_next_setpoint(simulate, mode):
     sim = simulate()
     sim.track()
-    sim.run_until(lambda: sim.mode is Mode.VENTING)
-    assert sim.offer((3_000.0, -1_000.0), plan_id="next") is Verdict.ACCEPTED
+    sim.run_until(lambda: sim.mode is mode)
+    held = sim.core.state()["commanded_differential"]
+    assert sim.offer(held, plan_id="next") is Verdict.ACCEPTED
     sim.run_until(lambda: sim.mode is Mode.TRACKING, 0.3)
 
 
@@ -143,15 +135,6 @@ def test_a_vent_that_does_not_empty_the_chambers_is_a_fault(simulate):
     assert "not vented" in sim.faults[0]
 
 
-def test_arming_twice_is_no_harm(simulate):
-    sim = simulate()
-    sim.track(1.0)
-    success, text = sim.core.arm()
-    assert success
-    assert "already armed" in text
-    assert sim.mode is Mode.TRACKING
-
-
 def test_arming_waits_for_telemetry_rest_and_empty_chambers(simulate):
     sim = simulate()
     assert "telemetry" in sim.core.arm()[1]
@@ -171,7 +154,7 @@ def test_arming_waits_for_telemetry_rest_and_empty_chambers(simulate):
     assert sim.faults == ()
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_rest_pressures_are_the_sensors_own(simulate, seed):
     sim = simulate(seed=seed)
     sim.arm()
@@ -205,22 +188,6 @@ def test_a_driver_that_finds_the_limb_under_pressure_vents_it_without_a_false_al
     after_a_crash.run_until(lambda: after_a_crash.core.arm()[0], 8.0)
     assert after_a_crash.vented
     assert Mode.FAULT not in after_a_crash.modes
-
-
-def test_a_given_atmosphere_is_used_as_it_is(simulate):
-    sim = simulate(atmosphere=101_000.0)
-    sim.run(1.0)
-    assert sim.core.monitor.rest.mean == 101_000.0
-
-
-def test_untimed_commands(simulate):
-    sim = simulate()
-    sim.arm()
-    assert sim.core.offer(Setpoint(0, (2_000.0, -500.0)), sim.wall) is Verdict.ACCEPTED
-    sim.tick()
-    assert sim.mode is Mode.TRACKING
-    pressure = np.array(sim.received[-1].pressure)
-    assert pressure[0::2] - pressure[1::2] == pytest.approx([2_000.0, -500.0])
 
 
 @pytest.mark.parametrize("protocol", NAMES)

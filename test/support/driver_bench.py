@@ -8,8 +8,6 @@ import time
 import uuid
 
 import numpy as np
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters
 
 from der_msgs.msg import ChamberPressures, PressureSetpoint, PressureState
 from limb_interfaces import qos, topics
@@ -144,19 +142,6 @@ class Bench:
         while self.gauge().max() < 2000.0:
             assert time.monotonic() < deadline, "no pressure in any chamber"
             self.play(8, lambda k: (min(900.0 * (k + 1), 3500.0), -min(500.0 * (k + 1), 2000.0)))
-
-    def have(self, faults):
-        """Tell the emulated board to have these faults and no others."""
-        node = self.client.node
-        service = node.create_client(SetParameters, "board_emulator/set_parameters")
-        self.wait(service.service_is_ready, "the emulator's parameter service")
-        value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=faults)
-        future = service.call_async(
-            SetParameters.Request(parameters=[Parameter(name="faults", value=value)])
-        )
-        self.wait(future.done, "the emulator to take its faults")
-        assert future.result().results[0].successful, future.result().results[0].reason
-        node.destroy_client(service)
 
 
 def difference(command):

@@ -27,12 +27,11 @@ from typing import Any
 import serial
 
 from pressure_driver import ports
-from pressure_driver.channel import Channel
+from pressure_driver.channel import Channel, Terminal
 from pressure_driver.core import DriverCore
 from pressure_driver.following import Duration
 from pressure_driver.ports import PortError
 from pressure_driver.protocols import host_protocol
-from pressure_driver.safety import Mode
 from pressure_driver.schedule import Origin, Setpoint, TickGrid, Verdict
 from pressure_driver.settings import NANOSECONDS, SettingError, Settings, add_options, from_options
 
@@ -57,46 +56,6 @@ EMPTYING_TIME = 3.0
 """[s] in which pressures must begin to fall at the end: boards take up to 1.7 s to obey."""
 EMPTYING_SHARE = 0.8
 """Of the pressure at the end, below which it counts as falling."""
-
-
-class Terminal:
-    """Takes the place of the node when the process is started by hand."""
-
-    def __init__(self) -> None:
-        self._lines: deque[str] = deque()
-        self._shown_at = 0.0
-
-    def fileno(self) -> int:
-        """Return the descriptor to wait for."""
-        return sys.stdin.fileno()
-
-    def send(self, word: str, *content: Any, descriptor: int | None = None) -> None:  # noqa: ARG002
-        """Print a message; the state once a second."""
-        if word == "state" and time.monotonic() - self._shown_at >= 1.0:
-            self._shown_at = time.monotonic()
-            state = content[0]
-            measured = [round(value, 0) for value in state["measured_chamber"]]
-            commanded = state["commanded_differential"]
-            mode = Mode(state["mode"]).name
-            print(mode, "commanded", commanded, "measured", measured, flush=True)
-        elif word in ("log", "answer", "failed", "ended"):
-            print(content[1] if word == "answer" else content[0], flush=True)
-
-    def receive(self) -> tuple[list[Any], int | None]:
-        """Return the next line as a message; the end of the lines ends the process.
-
-        Raises:
-            BlockingIOError: there is no line.
-        """
-        if not self._lines:
-            if not select.select([self], [], [], 0.0)[0]:
-                raise BlockingIOError
-            text = os.read(self.fileno(), 4096).decode()
-            self._lines += text.splitlines() if text else ["end"]
-        words = self._lines.popleft().split() or ["alive"]
-        with contextlib.suppress(ValueError):
-            return ["setpoint", 0, [float(word) for word in words], "", 0, 0, "", 0, True], None
-        return words[:1], None
 
 
 class BoardProcess:

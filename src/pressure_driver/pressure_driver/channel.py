@@ -22,15 +22,18 @@ import contextlib
 import json
 import os
 import queue
+import select
 import socket
 import subprocess
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any
 
 from pressure_driver import ports
+from pressure_driver.safety import Mode
 from pressure_driver.settings import Settings, to_options
 
 LOOK = 0.05
@@ -81,6 +84,46 @@ class Channel:
         if not data:
             raise EOFError
         return json.loads(data), descriptors[0] if descriptors else None
+
+
+class Terminal:
+    """Takes the place of the node when the process is started by hand."""
+
+    def __init__(self) -> None:
+        self._lines: deque[str] = deque()
+        self._shown_at = 0.0
+
+    def fileno(self) -> int:
+        """Return the descriptor to wait for."""
+        return sys.stdin.fileno()
+
+    def send(self, word: str, *content: Any, descriptor: int | None = None) -> None:  # noqa: ARG002
+        """Print a message; the state once a second."""
+        if word == "state" and time.monotonic() - self._shown_at >= 1.0:
+            self._shown_at = time.monotonic()
+            state = content[0]
+            measured = [round(value, 0) for value in state["measured_chamber"]]
+            commanded = state["commanded_differential"]
+            mode = Mode(state["mode"]).name
+            print(mode, "commanded", commanded, "measured", measured, flush=True)
+        elif word in ("log", "answer", "failed", "ended"):
+            print(content[1] if word == "answer" else content[0], flush=True)
+
+    def receive(self) -> tuple[list[Any], int | None]:
+        """Return the next line as a message; the end of the lines ends the process.
+
+        Raises:
+            BlockingIOError: there is no line.
+        """
+        if not self._lines:
+            if not select.select([self], [], [], 0.0)[0]:
+                raise BlockingIOError
+            text = os.read(self.fileno(), 4096).decode()
+            self._lines += text.splitlines() if text else ["end"]
+        words = self._lines.popleft().split() or ["alive"]
+        with contextlib.suppress(ValueError):
+            return ["setpoint", 0, [float(word) for word in words], "", 0, 0, "", 0, True], None
+        return words[:1], None
 
 
 class PortProcess:

@@ -4,12 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from der_planner.commands.run_experiment import Ledger, run
+from der_planner.commands.run_experiment import Ledger
 from der_planner.experiment.console import OptionError
-from der_planner.experiment.options import METHODS, parse
+from der_planner.experiment.options import parse
 from der_planner.limb import Limb, PointMass
-from der_planner.planning.motions import NAMES
-from der_planner.results.outputs import OutputError
 
 
 @pytest.mark.parametrize(
@@ -21,12 +19,10 @@ from der_planner.results.outputs import OutputError
         (["--trials", "0"], "--trials"),
         (["--period", "0.1"], "--period"),
         (["--hardware", "/nowhere/rig.yaml"], "/nowhere/rig.yaml"),
-        (["--mounting", "upside"], "--mounting: mounting 'upside' is unknown"),
-        (["--payload", "-0.1"], "--payload"),
-        (["--payload-at", "0.2"], "give --payload, too"),
         (["--nearest"], "--nearest is about a path"),
         (["--page", "70000"], "--page is 70000"),
         (["--page", "--offline"], "does not go with --offline"),
+        (["--library", "/nowhere"], "/nowhere is no folder"),
     ],
 )
 def test_a_bad_option_is_refused_by_its_name(arguments, named):
@@ -52,12 +48,6 @@ def test_trials_share_seeds_between_models_and_differ_between_trials():
     assert len({trial.name for trial in trials}) == len(trials)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_a_method_counts_for_both_models(method):
-    trials = parse(["--method", method]).plan_of_trials()
-    assert [(trial.model, trial.method) for trial in trials] == [("der", method), ("pcc", method)]
-
-
 def test_a_stopped_experiment_goes_on_and_refuses_other_options(tmp_path: Path):
     arguments = ["--out", str(tmp_path), "--trials", "2"]
     options = parse(arguments)
@@ -68,6 +58,16 @@ def test_a_stopped_experiment_goes_on_and_refuses_other_options(tmp_path: Path):
     assert again.finished(second) is None
     with pytest.raises(OptionError, match=r"period = 20\.0, not 6\.0"):
         Ledger(parse([*arguments, "--period", "6"])).finished(first)
+    # Another path of the same name is not taken for done.
+    file = tmp_path / "curve.csv"
+    file.write_text("x,y\n0.20,0.10\n0.19,0.12\n")
+    drawn = ["--path", str(file), *arguments]
+    trial = parse(drawn).plan_of_trials()[0]
+    Ledger(parse(drawn)).record(trial, {"arrays": "somewhere"})
+    assert Ledger(parse(drawn)).finished(trial) == {"arrays": "somewhere"}
+    file.write_text("x,y\n0.20,0.10\n0.18,0.12\n")
+    with pytest.raises(OptionError, match="path_sha256"):
+        Ledger(parse(drawn)).finished(trial)
 
 
 def test_loads_are_those_of_the_command_line():
@@ -84,18 +84,6 @@ def test_loads_are_those_of_the_command_line():
     assert parse([]).loads.loaded(hung) == hung
 
 
-def test_a_payload_beyond_the_limb_is_refused_before_anything_starts(tmp_path: Path):
-    with pytest.raises(OptionError, match=r"arc_length must be at most"):
-        run(parse(["--payload", "0.02", "--payload-at", "0.3", "--out", str(tmp_path / "out")]))
-    assert not (tmp_path / "out").exists()
-
-
-def test_every_motion_of_the_planner_is_taken():
-    motions = parse(["--motions", *NAMES]).motions
-    assert motions == NAMES
-    assert {"circle", "figure_eight", "line", "star"} < set(motions)
-
-
 def test_a_path_is_refused_with_its_line_and_the_remedy(tmp_path: Path):
     file = tmp_path / "my path.csv"
     file.write_text("time [s], x [cm], y [cm]\n0, 20, 10\n1, here, 11\n")
@@ -105,24 +93,3 @@ def test_a_path_is_refused_with_its_line_and_the_remedy(tmp_path: Path):
     assert parse(["--path", str(file)]).plan_of_trials()[0].name == "my_path_der_optimal_trial1"
     with pytest.raises(OptionError, match="give one of the two"):
         parse(["--path", str(file), "--motions", "star"])
-
-
-def test_another_path_of_the_same_name_is_not_taken_for_done(tmp_path: Path):
-    file = tmp_path / "curve.csv"
-    file.write_text("x,y\n0.20,0.10\n0.19,0.12\n")
-    arguments = ["--path", str(file), "--out", str(tmp_path)]
-    options = parse(arguments)
-    trial = options.plan_of_trials()[0]
-    Ledger(options).record(trial, {"arrays": "somewhere"})
-    assert Ledger(parse(arguments)).finished(trial) == {"arrays": "somewhere"}
-    file.write_text("x,y\n0.20,0.10\n0.18,0.12\n")
-    with pytest.raises(OptionError, match="path_sha256"):
-        Ledger(parse(arguments)).finished(trial)
-
-
-def test_a_folder_that_cannot_be_written_is_refused_before_anything_starts(tmp_path: Path):
-    file = tmp_path / "taken"
-    file.write_text("not a folder")
-    for more in ([], ["--dry-run"]):
-        with pytest.raises(OutputError, match=rf"--out {file} cannot be made"):
-            run(parse(["--offline", "--out", str(file), *more]))

@@ -1,15 +1,19 @@
 """A study is played: on processes of this machine, on a cluster that breaks, and after a stop."""
 
+import os
 import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pyarrow.parquet
 import pytest
+from distributed import LocalCluster
 
 from der_planner.experiment.console import Progress
 from der_planner.studies import conduct as conducting
 from der_planner.studies.conduct import (
-    Calibrated,
     Outcome,
     PlaySettings,
     Store,
@@ -20,9 +24,8 @@ from der_planner.studies.factors import StudyError
 from der_planner.studies.study import Study
 from der_planner.studies.tasks import calibrated
 
-from .cluster import Processes, free_port, wait_for
-
 pytestmark = pytest.mark.slow
+SCRIPT = Path(__file__).resolve().parents[3] / "scripts" / "study.py"
 
 # A twin that is planned for without calibration, in motions of a second: a whole run, and short.
 TWINS = """
@@ -54,36 +57,18 @@ plots:
 """
 
 
-@pytest.fixture
-def processes(tmp_path):
-    running = Processes(tmp_path)
-    yield running
-    running.close()
-
-
-def write(folder: Path, text: str, name: str = "small.yaml") -> Path:
-    path = folder / name
+def write(folder: Path, text: str) -> Path:
+    path = folder / "small.yaml"
     path.write_text(text)
     return path
 
 
-def records(folder: Path) -> list[dict]:
-    """Return every record of every file, so that what is there twice shows."""
-    return [
-        record
-        for path in sorted((folder / "rows").glob("*.parquet"))
-        for record in pyarrow.parquet.read_table(path).to_pylist()
-    ]
-
-
 def by_key(folder: Path) -> dict[str, dict]:
-    found = records(folder)
-    assert len({record["key"] for record in found}) == len(found), "a row is there twice"
-    return {record["key"]: record for record in found}
-
-
-def count(folder: Path) -> int:
-    return len(list((folder / "rows").glob("*.parquet")))
+    """Return the record of every file by its name, which is its key."""
+    return {
+        path.stem: pyarrow.parquet.read_table(path).to_pylist()[0]
+        for path in (folder / "rows").glob("*.parquet")
+    }
 
 
 def test_one_or_two_workers_and_rows_that_fail(tmp_path, monkeypatch):
@@ -110,57 +95,63 @@ def test_one_or_two_workers_and_rows_that_fail(tmp_path, monkeypatch):
     assert conduct(study, settings, Progress()) == one
 
 
-def test_a_cluster_that_breaks(tmp_path, processes):
-    """A worker is killed, then the scheduler: nothing is lost, nothing comes twice."""
-    path = write(tmp_path, TWINS.format(count=14))
-    study, out = Study.read(path), tmp_path / "out"
-    scheduler = processes.scheduler()
-    doomed, other = processes.worker(), processes.worker()
-    arguments = [str(path), "--scheduler", processes.address, "--out", str(out)]
-    command = processes.study(*arguments)
-    wait_for(lambda: count(out) >= 2, "two rows")
-    doomed.send_signal(signal.SIGKILL)
-    before = count(out)
-    wait_for(lambda: count(out) >= before + 3, "rows of the other worker")
-    scheduler.send_signal(signal.SIGKILL)
-    assert command.wait(300) == 1, processes.said()
-    assert "the scheduler is gone" in processes.said()
-    assert "the same command goes on from here" in processes.said()
-    kept = {name.name: name.stat().st_mtime_ns for name in (out / "rows").iterdir()}
-    assert len(kept) < len(study.rows), "the study was over before its scheduler was killed"
-    other.wait(300)
-    processes.scheduler()
-    processes.worker()
-    assert processes.study(*arguments).wait(600) == 0, processes.said()
-    assert set(by_key(out)) == {row.key for row in study.rows}
-    after = {name.name: name.stat().st_mtime_ns for name in (out / "rows").iterdir()}
-    assert {name: after[name] for name in kept} == kept, "a row that was there was done again"
-    assert "14 of 14 rows are done, 0 of them failed" in processes.said()
-    assert "<h1>Study small</h1>" in (out / "report" / "report.html").read_text()
+class Breaking(Progress):
+    """Ends a worker process when two rows are there, and the whole cluster when five are."""
+
+    def __init__(self, cluster: LocalCluster) -> None:
+        super().__init__()
+        self._cluster, self._doomed = cluster, cluster.workers[0].pid
+
+    def bar(self, done: float, total: float, text: str, unit: str = "s") -> None:
+        if done >= 2 and self._doomed:
+            os.kill(self._doomed, signal.SIGKILL)
+            self._doomed = 0
+        if done >= 5:
+            self._cluster.close()
 
 
-def test_a_stopped_study_goes_on(tmp_path, processes):
+def test_a_cluster_that_breaks(tmp_path, monkeypatch):
+    """A worker is killed, then the scheduler is gone: nothing is lost, nothing is done again."""
+    monkeypatch.setattr(conducting, "_PAUSE", 0.0)
+    study, out = Study.read(write(tmp_path, TWINS.format(count=14))), tmp_path / "out"
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        settings = PlaySettings(out, cluster.scheduler_address)
+        with pytest.raises(StudyError, match=r"scheduler is gone.*same command goes on from here"):
+            conduct(study, settings, Breaking(cluster))
+    kept = {path: path.stat().st_mtime_ns for path in (out / "rows").iterdir()}
+    assert 5 <= len(kept) < len(study.rows)
+    found = conduct(study, PlaySettings(out), Progress())
+    assert list(found) == [row.key for row in study.rows]
+    assert {record["error"] for record in found.values()} == {None}
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+
+
+def test_a_stopped_study_goes_on(tmp_path):
     """SIGTERM ends it in order, SIGKILL does not; both go on, with the digits of a run at once."""
     path = write(tmp_path, TWINS.format(count=8))
     study, out = Study.read(path), tmp_path / "out"
-    arguments = [str(path), "--out", str(out), "--workers", "1"]
+    command = [sys.executable, str(SCRIPT), str(path), "--out", str(out), "--workers", "1"]
     for number, code in ((signal.SIGTERM, 130), (signal.SIGKILL, -signal.SIGKILL)):
-        before = count(out) if out.exists() else 0
-        command = processes.study(*arguments)
-        wait_for(lambda least=before + 2: out.exists() and count(out) >= least, "two rows")
-        command.send_signal(number)
-        assert command.wait(300) == code, processes.said()
-    assert "stopped by SIGTERM; what was done is kept" in processes.said()
+        least = len(by_key(out)) + 2
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as running:
+            while len(by_key(out)) < least:
+                assert running.poll() is None, running.communicate()
+                time.sleep(0.02)
+            running.send_signal(number)
+            _, said = running.communicate(timeout=300)
+        assert running.returncode == code, said
+        assert code < 0 or "stopped by SIGTERM; what was done is kept" in said
     # As a loss of power leaves it: a file without its content.
     some = sorted((out / "rows").iterdir())[0]
     some.write_bytes(some.read_bytes()[:100])
-    assert processes.study(*arguments, "--limit", "6").wait(600) == 0, processes.said()
+    subprocess.run([*command, "--limit", "6"], check=True, timeout=600)
     stopped = by_key(out)
     assert {row.key for row in study.rows[:6]} <= set(stopped)
     for row in study.rows[:6:2]:
-        outcome = compute("run", row.values, Calibrated())
+        outcome = compute("run", row.values, "")
         for column in study.keep:
             assert stopped[row.key][column] == outcome.results[column]
+    assert "<h1>Study small</h1>" in (out / "report" / "report.html").read_text()
 
 
 def test_a_twin_is_calibrated_once(tmp_path, monkeypatch):
@@ -181,21 +172,14 @@ def test_a_twin_is_calibrated_once(tmp_path, monkeypatch):
 
 
 def test_what_cannot_be_written_is_named(tmp_path):
-    study = Study.read(write(tmp_path, RODS))
     (tmp_path / "file").write_text("")
-    with pytest.raises(StudyError, match=f"cannot write into {tmp_path / 'file'}"):
-        Store(tmp_path / "file", study)
-    store = Store(tmp_path / "out", study)
-    # A file name that is too long for the disk stands for a full one, which no test may make.
-    (tmp_path / "out" / "rows").rmdir()
-    (tmp_path / "out" / "rows").symlink_to("/dev/full")
-    with pytest.raises(StudyError, match="Rows that are there are kept"):
-        store.keep(study.rows[0], Outcome({"mean_error_m": 1.0}))
+    with pytest.raises(StudyError, match=f"cannot write into {tmp_path / 'file'}: .* kept"):
+        Store(tmp_path / "file", Study.read(write(tmp_path, RODS)))
 
 
 def test_no_scheduler(tmp_path, monkeypatch):
     monkeypatch.setattr(conducting, "PATIENCE", 0.5)
-    address = f"tcp://127.0.0.1:{free_port()}"
+    address = "tcp://127.0.0.1:1"
     study = Study.read(write(tmp_path, RODS))
     with pytest.raises(StudyError, match=f"no Dask scheduler answers at {address}"):
         conduct(study, PlaySettings(tmp_path / "out", address), Progress())

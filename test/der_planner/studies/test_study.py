@@ -6,7 +6,7 @@ import pytest
 from der_planner.limb import Limb
 from der_planner.studies.factors import StudyError
 from der_planner.studies.report import sobol_indices
-from der_planner.studies.study import SHIPPED, Draw, Spread, Study, rows, saltelli
+from der_planner.studies.study import SHIPPED, Draw, Spread, Study, rows
 from der_planner.studies.tasks import with_errors
 
 GOOD = {"task": "run", "factors": "{seed: [3, 4], period: [2, 3.5]}"}
@@ -24,16 +24,6 @@ def test_shipped_studies(path):
     assert found.about
     assert found.plots
     assert len({row.key for row in found.rows}) == len(found.rows) >= 100
-
-
-def test_the_first_factor_changes_slowest(tmp_path):
-    found = study(tmp_path)
-    assert [tuple(row.values.values()) for row in found.rows] == [
-        (3, 2.0),
-        (3, 3.5),
-        (4, 2.0),
-        (4, 3.5),
-    ]
 
 
 def test_a_key_depends_on_what_the_row_does_alone(tmp_path):
@@ -66,18 +56,6 @@ def test_names_that_yaml_takes_for_something_else(tmp_path):
     }
     with pytest.raises(StudyError, match=r"mounting must be one of horizontal.*or degrees"):
         study(tmp_path, factors="{mounting: upside}")
-
-
-def test_both_models_have_every_method(tmp_path):
-    found = study(tmp_path, factors="{model: [der, pcc], method: [optimal, projected, paper]}")
-    assert [tuple(row.values.values()) for row in found.rows] == [
-        ("der", "optimal"),
-        ("der", "projected"),
-        ("der", "paper"),
-        ("pcc", "optimal"),
-        ("pcc", "projected"),
-        ("pcc", "paper"),
-    ]
 
 
 @pytest.mark.parametrize(
@@ -172,16 +150,6 @@ def test_indices_of_a_function_whose_indices_are_known(tmp_path):
         assert low < indices[name].total < high
     kept[found.rows[7].key]["mean_error_m"] = None
     assert sobol_indices(found, kept, "mean_error_m") == ()
-
-
-def test_saltelli_changes_one_column_at_a_time():
-    table = saltelli(3, 8, seed=1)
-    a, b = table[:8], table[8:16]
-    for column in range(3):
-        mixed = table[16 + 8 * column : 24 + 8 * column]
-        assert np.array_equal(mixed[:, column], b[:, column])
-        others = [k for k in range(3) if k != column]
-        assert np.array_equal(mixed[:, others], a[:, others])
 
 
 def test_errors_of_parameters():

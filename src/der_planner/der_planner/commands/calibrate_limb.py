@@ -276,12 +276,6 @@ def _play_on_graph(prior: Limb, given: argparse.Namespace) -> Path:
     hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
     driver = hardware.driver if hardware else {}
     defaults = Settings()
-    count = int(driver.get("segment_count", defaults.segment_count))
-    if count != prior.segment_count:
-        raise OptionError(
-            f"the driver's segment_count is {count}, the limb '{prior.name}' has "
-            f"{prior.segment_count}: give the limb's --prior, or set it in the hardware file"
-        )
     limit = min(
         prior.pneumatics.pressure_limit,
         float(driver.get("pressure_limit", defaults.pressure_limit)),

@@ -69,13 +69,6 @@ def expand(paths: list[Path]) -> list[Path]:
     return found
 
 
-def _show(done: int, total: int, path: Path) -> None:
-    if sys.stderr.isatty() or done == total:
-        print(f"\r  {done} of {total} bags read, {path.name}", end="", file=sys.stderr, flush=True)
-    if done == total:
-        print(file=sys.stderr)
-
-
 def main() -> int:
     """Run the command line; 0 when every bag was evaluated, 1 otherwise."""
     given = _arguments()
@@ -89,7 +82,12 @@ def _evaluate(given: argparse.Namespace) -> int:
     if given.video is not None:
         check_file(given.video, "--video")
     settings = EvaluationSettings(window=given.window, remove_lag=given.remove_lag)
-    found = evaluate_bags(expand(given.bags), settings, _show)
+    progress = Progress()
+    found = evaluate_bags(
+        expand(given.bags),
+        settings,
+        lambda done, total, path: progress.bar(done, total, path.name, unit="bags read"),
+    )
     for entry in found:
         if entry.error:
             print(f"error: {entry.error}", file=sys.stderr)
@@ -104,7 +102,7 @@ def _evaluate(given: argparse.Namespace) -> int:
     if given.results is not None:
         print(write_results(results, given.results))
     if given.report is not None:
-        print(write_report(runs, results, given.report, progress=Progress().say))
+        print(write_report(runs, results, given.report, progress=progress.say))
     if given.video is not None:
         print(write_video(runs[0], given.video))
     return 1 if any(entry.error for entry in found) else 0

@@ -11,24 +11,23 @@ second, so no image is lost however slow the receiver is, and the answers are th
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
-import rclpy
 from rclpy.duration import Duration
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
 from der_planner.bags.reader import BagError, BagReader, RawMessage, RecordedTopic
 from der_planner.bags.replay import NANOSECONDS, ReplaySettings, choose_topics, replay
-from der_planner.experiment.console import interrupt_once, run_command
+from der_planner.experiment.client import GraphClient
+from der_planner.experiment.console import Progress, interrupt_once, run_command
+from der_planner.experiment.processes import GraphError
 
 ATTEMPTS = 3
 PATIENCE = 3.0
@@ -41,7 +40,7 @@ def main() -> int:
     """Run the command line."""
     given = _arguments()
     interrupt_once()
-    return run_command(lambda: _replay(given), BagError)
+    return run_command(lambda: _replay(given), BagError, GraphError)
 
 
 def _stamp(data: bytes) -> bytes:
@@ -69,57 +68,58 @@ class GraphOutput:
     """Publishes on the graph; waits for answers where asked to.
 
     Args:
-        node: that publishes.
+        client: whose node publishes.
         topics: recorded topics by the name to publish on.
         show_clock: publish /clock.
         step_by: name to publish on that waits for answers, or empty.
         answer: topic of the answers.
+
+    Raises:
+        BagError: a message cannot be published here.
+        GraphError: nothing answers.
     """
 
     def __init__(
         self,
-        node: Node,
+        client: GraphClient,
         topics: dict[str, RecordedTopic],
         show_clock: bool,
         step_by: str = "",
         answer: str = "",
     ) -> None:
         self.unanswered = 0
-        self._step_by = step_by
+        self._client, self._step_by = client, step_by
         self._begun: set[str] = set()
         self._answers: set[bytes] = set()
-        self._executor = SingleThreadedExecutor()
-        self._executor.add_node(node)
+        node = client.node
         self._publishers: dict[str, Publisher] = {
             name: node.create_publisher(message_class(topic.type_name), name, _profile(topic))
             for name, topic in topics.items()
         }
         self._clock = node.create_publisher(Clock, "/clock", 10) if show_clock else None
         if step_by:
-            self._subscription = node.create_subscription(
-                self._type_of_answer(node, answer),
+            kind = client.wait_for(
+                lambda: dict(node.get_topic_names_and_types()).get(answer),
+                20.0,
+                f"{answer}: start the node that answers first",
+            )
+            node.create_subscription(
+                message_class(kind[0]),
                 answer,
                 lambda data: self._answers.add(_stamp(data)),
                 QoSProfile(depth=100),
                 raw=True,
             )
 
-    def _type_of_answer(self, node: Node, answer: str) -> Any:
-        deadline = time.monotonic() + 20.0
-        while time.monotonic() < deadline:
-            for name, types in node.get_topic_names_and_types():
-                if name == answer:
-                    return message_class(types[0])
-            time.sleep(0.05)
-        raise BagError(f"nothing publishes {answer}: start the node that answers first")
-
     def wait_for_receivers(self, seconds: float) -> None:
         """Wait until every topic has a subscriber, at most so long."""
-        deadline = time.monotonic() + seconds
-        while time.monotonic() < deadline:
-            if all(p.get_subscription_count() for p in self._publishers.values()):
-                return
-            time.sleep(0.02)
+        publishers = self._publishers.values()
+        with contextlib.suppress(GraphError):
+            self._client.wait_for(
+                lambda: all(each.get_subscription_count() for each in publishers),
+                seconds,
+                "receivers",
+            )
 
     def publish(self, topic: str, message: RawMessage) -> None:
         """Publish one message, and wait for its answer where the topic is stepped by."""
@@ -134,11 +134,11 @@ class GraphOutput:
         self._answers.clear()
         for _ in range(ATTEMPTS):
             self._publishers[topic].publish(message.data)
-            end = time.monotonic() + PATIENCE
-            while time.monotonic() < end:
-                self._executor.spin_once(timeout_sec=0.05)
-                if _stamp(message.data) in self._answers:
-                    return
+            with contextlib.suppress(GraphError):
+                self._client.wait_for(
+                    lambda: _stamp(message.data) in self._answers, PATIENCE, "an answer"
+                )
+                return
         self.unanswered += 1
 
     def show_time(self, now: int) -> None:
@@ -195,20 +195,19 @@ def _replay(given: argparse.Namespace) -> int:
         remap=_pairs(given.remap, "--remap"),
     )
     stepping = _pairs([given.step_by] if given.step_by else [], "--step-by")
-    with BagReader(given.bag) as bag:
+    step_by, answer = next(iter(stepping.items()), ("", ""))
+    progress = Progress()
+    with BagReader(given.bag) as bag, GraphClient("replay_bag") as client:
         topics = choose_topics(bag, settings)
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        node = rclpy.create_node("replay_bag")
-        try:
-            step_by, answer = next(iter(stepping.items()), ("", ""))
-            output = GraphOutput(node, topics, not given.no_clock, step_by, answer)
-            output.wait_for_receivers(given.wait)
-            progress = _show if sys.stderr.isatty() else None
-            count = replay(bag, settings, output, progress=progress)
-            time.sleep(0.2)  # the last messages leave the process
-        finally:
-            node.destroy_node()
-            rclpy.try_shutdown()
+        output = GraphOutput(client, topics, not given.no_clock, step_by, answer)
+        output.wait_for_receivers(given.wait)
+        count = replay(
+            bag,
+            settings,
+            output,
+            progress=lambda played, length: progress.bar(played, length, "played"),
+        )
+        time.sleep(0.2)  # the last messages leave the process
     print(f"published {count} messages of {len(topics)} topics")
     if count == 0:
         print(
@@ -219,7 +218,3 @@ def _replay(given: argparse.Namespace) -> int:
     if output.unanswered:
         print(f"error: {output.unanswered} messages got no answer", file=sys.stderr)
     return 1 if count == 0 or output.unanswered else 0
-
-
-def _show(played: float, length: float) -> None:
-    print(f"\r  {played:7.1f} of {length:.1f} s", end="", file=sys.stderr, flush=True)

@@ -28,7 +28,6 @@ from typing import Any, NamedTuple
 import pyarrow as pa
 import pyarrow.parquet
 from distributed import Client, Future, LocalCluster
-from distributed.scheduler import KilledWorker
 from threadpoolctl import threadpool_limits
 
 from der_planner.experiment.console import Progress
@@ -207,43 +206,29 @@ class Store:
 # On the workers ----------------------------------------------------------------------------------
 
 
-class Calibrated(NamedTuple):
-    """A limb file's text, or why there is none; and the digest of the worker's sources."""
+def compute(task: str, values: Mapping[str, Value], limb: str) -> Outcome:
+    """Compute a row of a task, on one thread; an error is kept as a result.
 
-    limb: str = ""
-    error: str = ""
-    sources: str = ""
-
-
-def calibrate(twin: Twin, prior: str) -> Calibrated:
-    """Return the calibrated limb of a twin, see `tasks.calibrated`."""
-    try:
-        return Calibrated(calibrated(twin, prior), sources=digest())
-    except Exception as error:
-        return Calibrated(error=f"calibration of {twin}: {_words(error)}", sources=digest())
-
-
-def compute(task: str, values: Mapping[str, Value], limb: Calibrated) -> Outcome:
-    """Compute a row of a task, beginning with a limb; on one thread, an error kept as a result."""
-    # A limb that another version calibrated makes a row of another version.
-    sources = limb.sources or digest()
-    if limb.error:
-        return Outcome({}, limb.error, sources)
+    Args:
+        task: name.
+        values: of the factors that the study names.
+        limb: text of the limb file that the row begins with; empty for the default limb.
+    """
     try:
         with threadpool_limits(1):
-            found = TASKS[task].compute(limb.limb, values)
+            found = TASKS[task].compute(limb, values)
     except Exception as error:
-        return Outcome({}, _words(error), sources)
+        return Outcome({}, _words(error), digest())
     # Parquet tells NaN from nothing, people and JSON do not.
     told = {name: value for name, value in found.items() if not math.isnan(value)}
-    return Outcome(told, sources=sources)
+    return Outcome(told, sources=digest())
 
 
 def _words(error: BaseException) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
-# On this machine ---------------------------------------------------------------------------------
+# The cluster -----------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
@@ -341,14 +326,14 @@ class _Conductor:
 
     def _send(self, client: Client, place: int, row: Row) -> None:
         """Send a row out; the one with the lowest place is begun first."""
-        limb: Any = Calibrated(self._study.limb)
+        limb: Any = self._study.limb
         twin = self._study.task.twin(row.values)
         if twin is not None:
             # One task, however many rows wait for it.
             if twin not in self._twins:
                 key = "-".join(map(str, ("calibrate", *twin)))
                 self._twins[twin] = client.submit(
-                    calibrate, twin, self._study.limb, key=key, priority=-place
+                    calibrated, twin, self._study.limb, key=key, priority=-place
                 )
             limb = self._twins[twin]
         task, key = self._study.task.name, f"row-{row.key}"
@@ -378,13 +363,13 @@ class _Conductor:
             self._progress.say(f"  failed: {dict(row.values)}: {outcome.error}")
 
     def _broken(self, future: Future) -> Outcome:
-        """Return the outcome of a row whose workers ended under it again and again.
+        """Return the outcome of a row whose twin or whose workers failed again and again.
 
         Raises:
             StudyError: a worker could not even begin.
         """
         error = future.exception()
-        if not isinstance(error, KilledWorker):
+        if isinstance(error, ImportError):
             raise StudyError(
                 f"a worker cannot compute rows ({_words(error)}): start it in the workspace: "
                 f"{_JOIN.format('ADDRESS')}"

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatter
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from der_planner.arrays import Array
 from der_planner.results import figures as style
@@ -124,23 +124,22 @@ def _panels(study: Study, plot: Mapping[str, str], rows: Records) -> Figure:
             panel.set_xticks([], minor=True)
         if "y" in log:
             panel.set_yscale("log")
+            panel.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             panel.yaxis.set_major_formatter("{x:g}")
-            panel.yaxis.set_minor_formatter(LogFormatter())
+            panel.yaxis.set_minor_formatter(NullFormatter())
         elif plot["kind"] == "lines":
             panel.set_ylim(bottom=0.0)
         values = sorted({row[plot["x"]] for row in rows})
-        if plot["kind"] == "lines" and len(values) <= _MOST_TICKS:
-            _name_ticks(panel, values, quantity(plot["x"], study)[1])
+        if isinstance(values[0], str):
+            panel.tick_params(axis="x", rotation=30)
+        elif plot["kind"] == "lines" and len(values) <= _MOST_TICKS:
+            scale = quantity(plot["x"], study)[1]
+            panel.set_xticks([x * scale for x in values], [f"{x * scale:.3g}" for x in values])
+        elif plot["kind"] == "scatter" and "x" not in log:
+            panel.locator_params(axis="x", nbins=5)
     if plot.get("title"):
         drawn.suptitle(plot["title"])
     return drawn
-
-
-def _name_ticks(panel: Axes, values: Sequence[Any], scale: float) -> None:
-    if isinstance(values[0], str):
-        panel.tick_params(axis="x", rotation=30)
-    else:
-        panel.set_xticks([x * scale for x in values], [f"{x * scale:.3g}" for x in values])
 
 
 def _groups(by: str | None, rows: Records) -> Iterator[tuple[Any, Records]]:
@@ -150,31 +149,30 @@ def _groups(by: str | None, rows: Records) -> Iterator[tuple[Any, Records]]:
 
 
 def _lines(study: Study, plot: Mapping[str, str], rows: Records, panel: Axes) -> None:
-    """Draw the mean of y over x, one line for each value of ``lines``, ± a standard deviation."""
-    y_scale, by = quantity(plot["y"], study)[1], plot.get("lines")
+    """Draw the mean of y over x, one line for each value of ``lines``, ± a standard deviation.
+
+    A scatter has a point for each row instead.
+    """
+    (x_label, x_scale), (y_label, y_scale) = (quantity(plot[key], study) for key in ("x", "y"))
+    by = plot.get("lines")
     for place, (value, mine) in enumerate(_groups(by, rows)):
-        groups = [(x, _column(each, plot["y"]) * y_scale) for x, each in _groups(plot["x"], mine)]
-        x = _scaled([x for x, _ in groups], quantity(plot["x"], study)[1])
-        mean = np.array([each.mean() for _, each in groups])
-        deviation = np.array([each.std(ddof=1) if len(each) > 1 else 0.0 for _, each in groups])
         colour = style.colour(str(value), place)
         label = value.upper() if by == "model" else f"{by} {value}" if by else None
+        if plot["kind"] == "scatter":
+            x = _scaled([row[plot["x"]] for row in mine], x_scale)
+            y = _column(mine, plot["y"]) * y_scale
+            panel.plot(x, y, ".", ms=3, color=colour, label=label)
+            continue
+        groups = [(x, _column(each, plot["y"]) * y_scale) for x, each in _groups(plot["x"], mine)]
+        x = _scaled([x for x, _ in groups], x_scale)
+        mean = np.array([each.mean() for _, each in groups])
+        deviation = np.array([each.std(ddof=1) if len(each) > 1 else 0.0 for _, each in groups])
         dashes = style.DASHES.get(str(value), "-")
         panel.plot(x, mean, "o" + dashes, ms=3, label=label, color=colour)
         panel.fill_between(x, mean - deviation, mean + deviation, alpha=0.18, lw=0, color=colour)
-    _label(study, plot, panel)
-
-
-def _scatter(study: Study, plot: Mapping[str, str], rows: Records, panel: Axes) -> None:
-    """Draw a point for each row, in a colour for each value of ``lines``."""
-    scales = [quantity(plot[key], study)[1] for key in ("x", "y")]
-    for place, (value, mine) in enumerate(_groups(plot.get("lines"), rows)):
-        x, y = (
-            _scaled([row[plot[key]] for row in mine], scale)
-            for key, scale in zip(("x", "y"), scales, strict=True)
-        )
-        panel.plot(x, y, ".", ms=3, color=style.colour(str(value), place), label=str(value))
-    _label(study, plot, panel)
+    panel.set(xlabel=x_label, ylabel=y_label)
+    if by:
+        panel.legend()
 
 
 def _histogram(study: Study, plot: Mapping[str, str], rows: Records, panel: Axes) -> None:
@@ -211,15 +209,9 @@ def _map(study: Study, plot: Mapping[str, str], rows: Records, panel: Axes) -> N
 _KINDS: dict[str, Callable[[Study, Mapping[str, str], Records, Axes], None]] = {
     "lines": _lines,
     "map": _map,
-    "scatter": _scatter,
+    "scatter": _lines,
     "histogram": _histogram,
 }
-
-
-def _label(study: Study, plot: Mapping[str, str], panel: Axes) -> None:
-    panel.set(xlabel=quantity(plot["x"], study)[0], ylabel=quantity(plot["y"], study)[0])
-    if plot.get("lines"):
-        panel.legend()
 
 
 def _column(rows: Records, name: str) -> Array:

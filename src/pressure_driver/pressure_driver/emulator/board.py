@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -9,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pressure_driver.emulator.pneumatics import BoardPneumatics
+from pressure_driver.emulator.pneumatics import SUPPLY_PRESSURE, BoardPneumatics
 from pressure_driver.protocols.base import BoardCommand, BoardProtocol, BoardReading
 
 SENSOR_OFFSET = 200.0
@@ -19,21 +20,21 @@ SENSOR_NOISE = 5.0
 
 
 WORDS = {
-    "drop": "drop:SHARE (of the chunks that come from the host are lost)",
-    "corrupt": "corrupt:SHARE (of all bytes, both ways, get a bit flipped)",
-    "delay": "delay:SECONDS (telemetry is held back)",
-    "mute": "mute (no telemetry)",
-    "deaf": "deaf (every command is ignored)",
-    "echoless": "echoless (commands are executed and not repeated)",
-    "reset": "reset[:SECONDS] (the board loses power for SECONDS, 0.2 if not given)",
-    "stick": "stick:CHAMBER (its valves stop moving)",
-    "leak": "leak:CHAMBER[:RATE] (a hole drains it at RATE 1/s, 3 if not given)",
-    "runaway": "runaway:CHAMBER (its inlet valve stays open)",
-    "supply": "supply:PASCAL (absolute pressure of the reservoir)",
-    "unplug": "unplug[:SECONDS] (the port disappears, and comes back after SECONDS)",
+    "drop": ("drop:SHARE (of the chunks that come from the host are lost)", 1, 1),
+    "corrupt": ("corrupt:SHARE (of all bytes, both ways, get a bit flipped)", 1, 1),
+    "delay": ("delay:SECONDS (telemetry is held back)", 1, 1),
+    "mute": ("mute (no telemetry)", 0, 0),
+    "deaf": ("deaf (every command is ignored)", 0, 0),
+    "echoless": ("echoless (commands are executed and not repeated)", 0, 0),
+    "reset": ("reset[:SECONDS] (the board loses power for SECONDS, 0.2 if not given)", 0, 1),
+    "stick": ("stick:CHAMBER (its valves stop moving)", 1, 1),
+    "leak": ("leak:CHAMBER[:RATE] (a hole drains it at RATE 1/s, 3 if not given)", 1, 2),
+    "runaway": ("runaway:CHAMBER (its inlet valve stays open)", 1, 1),
+    "supply": ("supply:PASCAL (absolute pressure of the reservoir)", 1, 1),
+    "unplug": ("unplug[:SECONDS] (the port disappears, and comes back after SECONDS)", 0, 1),
 }
-"""Word and usage of every fault."""
-USAGE = ", ".join(WORDS.values())
+"""Of every fault: its usage, the fewest and the most numbers behind its word."""
+USAGE = ", ".join(usage for usage, _, _ in WORDS.values())
 
 
 class FaultError(ValueError):
@@ -42,11 +43,7 @@ class FaultError(ValueError):
 
 @dataclass
 class Faults:
-    """The faults in force.
-
-    Raises:
-        FaultError: in `parse`, for a text that is not understood.
-    """
+    """The faults in force."""
 
     drop: float = 0.0
     corrupt: float = 0.0
@@ -55,58 +52,51 @@ class Faults:
     deaf: bool = False
     echoless: bool = False
     reset: float | None = None
-    stuck: tuple[int, ...] = ()
+    stuck: list[int] = field(default_factory=list)
     leaks: dict[int, float] = field(default_factory=dict)
-    runaway: tuple[int, ...] = ()
+    runaway: list[int] = field(default_factory=list)
     supply: float | None = None
     unplugged: bool = False
     replug_after: float | None = None
 
     @classmethod
     def parse(cls, texts: Iterable[str], chamber_count: int) -> Faults:
-        """Return the faults named by texts such as ``stick:1``; empty texts are skipped."""
+        """Return the faults named by texts such as ``stick:1``; empty texts are skipped.
+
+        Raises:
+            FaultError: a text is not understood.
+        """
         faults = cls()
-        for text in texts:
-            if text.strip():
-                faults._add(text.strip(), chamber_count)
+        for text in filter(None, map(str.strip, texts)):
+            word, *arguments = text.split(":")
+            _, fewest, most = WORDS.get(word, ("", 1, 0))
+            numbers = []
+            with contextlib.suppress(ValueError):
+                numbers = [float(argument) for argument in arguments]
+            sound = fewest <= len(arguments) == len(numbers) <= most
+            if not sound or any(not number >= 0.0 for number in numbers):
+                raise FaultError(f"fault '{text}' is not one of: {USAGE}")
+            if word in ("stick", "leak", "runaway") and numbers[0] not in range(chamber_count):
+                raise FaultError(f"fault '{text}': chambers are 0 … {chamber_count - 1}")
+            if word in ("drop", "corrupt") and numbers[0] > 1.0:
+                raise FaultError(f"fault '{text}': a share is 0 … 1")
+            faults._set(word, numbers)
         return faults
 
-    def _add(self, text: str, chamber_count: int) -> None:
-        word, *arguments = text.split(":")
-        try:
-            numbers = [float(argument) for argument in arguments]
-        except ValueError:
-            numbers = [float("nan")]
-        wanted = dict.fromkeys(("mute", "deaf", "echoless"), (0, 0))
-        wanted |= {"leak": (1, 2), "unplug": (0, 1), "reset": (0, 1)}
-        low, high = wanted.get(word, (1, 1))
-        well_formed = low <= len(numbers) <= high and all(number >= 0.0 for number in numbers)
-        if word not in WORDS or not well_formed:
-            raise FaultError(f"fault '{text}' is not one of: {USAGE}")
-        if word in ("stick", "leak", "runaway") and not (
-            numbers[0].is_integer() and numbers[0] < chamber_count
-        ):
-            raise FaultError(f"fault '{text}': chambers are 0 … {chamber_count - 1}")
-        if word in ("drop", "corrupt") and numbers[0] > 1.0:
-            raise FaultError(f"fault '{text}': a share is 0 … 1")
-        self._set(word, numbers)
-
     def _set(self, word: str, numbers: list[float]) -> None:
-        if word in ("drop", "corrupt", "delay", "supply"):
-            setattr(self, word, numbers[0])
-        elif word in ("mute", "deaf", "echoless"):
-            setattr(self, word, True)
-        elif word == "reset":
-            self.reset = numbers[0] if numbers else 0.2
-        elif word == "stick":
-            self.stuck += (int(numbers[0]),)
+        if word == "stick":
+            self.stuck.append(int(numbers[0]))
         elif word == "runaway":
-            self.runaway += (int(numbers[0]),)
+            self.runaway.append(int(numbers[0]))
         elif word == "leak":
             self.leaks[int(numbers[0])] = numbers[1] if len(numbers) > 1 else 3.0
-        else:
+        elif word == "unplug":
             self.unplugged = True
             self.replug_after = numbers[0] if numbers else None
+        elif word == "reset":
+            self.reset = numbers[0] if numbers else 0.2
+        else:
+            setattr(self, word, numbers[0] if numbers else True)
 
     def damage(self, data: bytes, generator: np.random.Generator) -> bytes:
         """Return ``data`` with bits flipped as `corrupt` says."""
@@ -185,9 +175,7 @@ class EmulatedBoard:
             air.stuck[chamber] = True
         for chamber, rate in faults.leaks.items():
             air.leak[chamber] = rate
-        air.supply_pressure = (
-            air.parameters.supply_pressure if faults.supply is None else faults.supply
-        )
+        air.supply_pressure = SUPPLY_PRESSURE if faults.supply is None else faults.supply
         self._apply()
 
     def receive(self, data: bytes, stamp: int) -> tuple[list[ReceivedCommand], bytes]:

@@ -29,6 +29,9 @@ TELEMETRY_PERIOD = 50_000_000
 """[ns] 20 Hz, as boards report."""
 AIR_PERIOD = 20_000_000
 """[ns] 50 Hz, at which chamber pressures are published."""
+LONGEST_STEP = 0.1
+"""[s] by which the board's time advances at once: when this process stands still, or the wall clock
+is set, the board's watchdog does not run out meanwhile."""
 _IN_MODIFY = 0x2
 """Of inotify: written to."""
 BITS_PER_BYTE = 10
@@ -323,8 +326,7 @@ class BoardRunner:
                 self.port.plug()
             if now >= next_air or now >= next_telemetry:
                 elapsed = (now - air_time) / NANOSECONDS
-                # A wall clock that was set must not blow up the air.
-                pressure = self.board.step(min(max(elapsed, 0.0), 0.5))
+                pressure = self.board.step(min(max(elapsed, 0.0), LONGEST_STEP))
                 air_time = now
                 if now >= next_air:
                     self._on_air(now, pressure)
