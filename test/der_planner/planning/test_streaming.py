@@ -25,7 +25,7 @@ class Clock:
 
 class Sent:
     def __init__(self, clock):
-        self.clock, self.items, self.over = clock, [], []
+        self.clock, self.items = clock, []
         self.changed = threading.Condition()
 
     def send(self, schedule, index):
@@ -33,10 +33,9 @@ class Sent:
             self.items.append((schedule, index, self.clock()))
             self.changed.notify_all()
 
-    def finished(self, schedule):
-        with self.changed:
-            self.over.append(schedule)
-            self.changed.notify_all()
+    @property
+    def over(self):
+        return [schedule for schedule, index, _ in self.items if index == schedule.count - 1]
 
     def wait(self, condition):
         with self.changed:
@@ -53,7 +52,7 @@ def short():
 def stage():
     clock = Clock()
     sent = Sent(clock)
-    player = Player(clock, sent.send, sent.finished, LEAD)
+    player = Player(clock, sent.send, LEAD)
     yield clock, sent, player
     player.close()
 

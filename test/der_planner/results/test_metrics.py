@@ -134,7 +134,7 @@ def test_error_series_and_metrics_agree():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"time": FRAMES[::-1]}, "time must be two or more rising"),
+        ({"time": FRAMES[::-1]}, "times of tip must be two or more rising"),
         ({"tip": reference(FRAMES)[:-1]}, r"tip must have shape \(\d+, 2\)"),
         ({"tip_reference": reference(TIMES)[:, :1]}, r"tip_reference must have shape"),
         ({"pressures": PressureArrays(TIMES, np.zeros(3))}, "commanded must have shape"),

@@ -171,42 +171,46 @@ class RunSeries:
         Raises:
             EvaluationError: shapes do not fit or times do not rise; the message says which.
         """
-
-        def stream(
-            clock: ArrayLike | None, value: ArrayLike | None, names: tuple[str, str], columns: int
-        ) -> Stream:
-            if clock is None or value is None:
-                return _nothing(columns)
-            instants = _times(clock, names[0], description)
-            return Stream(instants, _rows(value, len(instants), names[1], description, columns))
-
-        asked = "reference_time"
         held = pressures or PressureArrays()
         return cls(
             description=description,
-            reference=stream(reference_time, tip_reference, (asked, "tip_reference"), 2),
-            predicted=stream(reference_time, tip_predicted, (asked, "tip_predicted"), 2),
-            tip=stream(time, tip, ("time", "tip"), 2),
-            commanded=stream(held.time, held.commanded, ("pressures.time", "commanded"), 0),
-            measured=stream(held.time, held.measured, ("pressures.time", "measured"), 0),
-            setpoints=stream(reference_time, setpoints, (asked, "setpoints"), 0),
+            reference=_stream(description, "tip_reference", reference_time, tip_reference, 2),
+            predicted=_stream(description, "tip_predicted", reference_time, tip_predicted, 2),
+            tip=_stream(description, "tip", time, tip, 2),
+            commanded=_stream(description, "commanded", held.time, held.commanded),
+            measured=_stream(description, "measured", held.time, held.measured),
+            setpoints=_stream(description, "setpoints", reference_time, setpoints),
         )
 
 
-def _times(value: ArrayLike, name: str, description: Description) -> Array:
-    array = np.asarray(value, dtype=float)
-    if array.ndim != 1 or len(array) < 2 or not np.all(np.diff(array) > 0):
+def _stream(
+    about: Description,
+    name: str,
+    time: ArrayLike | None,
+    value: ArrayLike | None,
+    columns: int = 0,
+) -> Stream:
+    """Return a stream of arrays that a caller gave, an empty one where it gave none.
+
+    Args:
+        about: the run.
+        name: of the values in messages.
+        time: (N,) [s].
+        value: (N, M).
+        columns: M; 0 for any number.
+
+    Raises:
+        EvaluationError: times do not rise, or shapes do not fit.
+    """
+    if time is None or value is None:
+        return _nothing(columns)
+    instants, rows = np.asarray(time, dtype=float), np.asarray(value, dtype=float)
+    if instants.ndim != 1 or len(instants) < 2 or not np.all(np.diff(instants) > 0):
         raise EvaluationError(
-            f"{description.title}: {name} must be two or more rising times, got shape {array.shape}"
+            f"{about.title}: the times of {name} must be two or more rising ones, got shape "
+            f"{instants.shape}"
         )
-    return array
-
-
-def _rows(value: ArrayLike, count: int, name: str, description: Description, columns: int) -> Array:
-    array = np.asarray(value, dtype=float)
-    if array.ndim != 2 or len(array) != count or (columns and array.shape[1] != columns):
-        wanted = f"({count}, {columns or 'M'})"
-        raise EvaluationError(
-            f"{description.title}: {name} must have shape {wanted}, got {array.shape}"
-        )
-    return array
+    if rows.ndim != 2 or len(rows) != len(instants) or columns not in (0, rows.shape[1]):
+        wanted = f"({len(instants)}, {columns or 'M'})"
+        raise EvaluationError(f"{about.title}: {name} must have shape {wanted}, got {rows.shape}")
+    return Stream(instants, rows)

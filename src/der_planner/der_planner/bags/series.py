@@ -72,17 +72,6 @@ def _setpoints(limb: LimbRecord, plan_id: str, segment_count: int) -> _Setpoints
     return _Setpoints(index, rows.stamps()[last], values[last, 1:])
 
 
-def _feedback(limb: LimbRecord, plan: Any, setpoints: _Setpoints) -> dict[str, Any]:
-    """Return what feedback did to a plan's setpoints, by the key of a run's `extra`."""
-    planned = planned_commands(plan)
-    usable = setpoints.index < len(planned)
-    added = setpoints.value[usable] - planned[setpoints.index[usable]]
-    if not len(added):
-        return {}
-    taken = latencies(limb.revisions[plan.plan_id], limb.seen())
-    return {"feedback": described(added, taken)}
-
-
 def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
     """Return the run of one limb of a bag.
 
@@ -106,7 +95,11 @@ def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
         raise EvaluationError(
             f"{where}: the plan '{chosen}' carries no stamp and none of its setpoints was recorded"
         )
-    about = _feedback(limb, plan, setpoints) if limb.revisions[chosen].stamps else {}
+    commands, revisions = _commands(plan, setpoints), limb.revisions[chosen]
+    feedback = {}
+    if revisions.stamps:
+        added = commands - planned_commands(plan)
+        feedback = {"feedback": described(added, latencies(revisions, limb.seen()))}
     end = times[-1]
     played = int(setpoints.index[-1]) if len(setpoints.index) else len(times) - 1
     faults = [text for when, text in limb.faults if 0 <= (when - origin) / NANOSECONDS <= end]
@@ -117,13 +110,13 @@ def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
             f"{_others_seen(record, namespace)}"
         )
     return RunSeries(
-        description=_describe(plan, record, namespace, about),
+        description=_describe(plan, record, namespace, feedback),
         reference=Stream(times, np.array(plan.tip_reference).reshape(-1, 2)),
         predicted=Stream(times, np.array(plan.tip_predicted).reshape(-1, 2)),
         tip=tip,
         bend_angle=stream(limb.angles, segment_count, origin),
         tip_covariance=stream(limb.covariance, 4, origin),
-        setpoints=Stream(times, _commands(plan, setpoints)),
+        setpoints=Stream(times, commands),
         commanded=stream(limb.commanded, segment_count, origin),
         measured=stream(limb.measured, segment_count, origin),
         truth=stream(limb.truth, 2, origin) if len(limb.truth) else None,
@@ -136,8 +129,7 @@ def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
 
 def _commands(plan: Any, setpoints: _Setpoints) -> Array:
     """Return the commands (K, M) [Pa] as they were sent; as planned where none was recorded."""
-    command = np.array(plan.differential_pressure, dtype=float)
-    command = command.reshape(len(plan.time), -1).copy()
+    command = planned_commands(plan)
     known = setpoints.index < len(command)
     known &= np.isfinite(setpoints.value).all(axis=1)
     command[setpoints.index[known]] = setpoints.value[known]

@@ -118,11 +118,6 @@ class BagWriter:
             raise BagWriteError(f"cannot write a bag into {self.folder}: {error}") from error
 
     @property
-    def topics(self) -> Mapping[str, TopicSpec]:
-        """The topics added so far, by name."""
-        return self._topics
-
-    @property
     def message_count(self) -> int:
         """Messages written, repeated latched ones included."""
         return sum(self._counts.values())

@@ -220,7 +220,3 @@ class LimbTwinNode(Node):
 def main() -> None:
     """Entry point."""
     sys.exit(run_node(LimbTwinNode))
-
-
-if __name__ == "__main__":
-    main()

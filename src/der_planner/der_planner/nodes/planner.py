@@ -452,7 +452,3 @@ class PlannerNode(Node):
 def main() -> None:
     """Entry point of `ros2 run der_planner planner`."""
     sys.exit(run_node(PlannerNode))
-
-
-if __name__ == "__main__":
-    main()

@@ -70,7 +70,6 @@ class Player:
     Args:
         now: returns the present time [ns].
         send: called with schedule and index for every setpoint, in order, from the player's thread.
-        finished: called with the schedule after its last setpoint, from the player's thread.
         lead: [ns].
     """
 
@@ -78,12 +77,10 @@ class Player:
         self,
         now: Callable[[], int],
         send: Callable[[Schedule, int], None],
-        finished: Callable[[Schedule], None],
         lead: int,
     ) -> None:
         self._now = now
         self._send = send
-        self._finished = finished
         self.lead = lead
         self._wake = threading.Condition()
         self._schedule: Schedule | None = None
@@ -138,12 +135,9 @@ class Player:
                     self._wake.wait(wait * 1e-9)
                     continue
                 self._index += 1
-                over = self._index >= schedule.count
-                if over:
+                if self._index >= schedule.count:
                     self._schedule, self._index = None, 0
             self._send(schedule, index)
-            if over:
-                self._finished(schedule)
 
     def _take_over(self) -> None:
         """Switch to the waiting schedule once the present one has reached its first stamp."""

@@ -128,7 +128,7 @@ class RunImages:
                 continue
             for tag in message.detections:
                 if tag.on_limb and tag.pose_valid:
-                    pixels.append(_centre(np.asarray(tag.corners).reshape(4, 2)))
+                    pixels.append(np.asarray(tag.corners).reshape(4, 2).mean(axis=0))
                     plane.append((tag.pose.x, tag.pose.y))
         if info is None or len(pixels) < MINIMUM_TAGS:
             return None
@@ -218,14 +218,6 @@ def _limb_marker(message: Any) -> Any:
 def _points(points: Sequence[Any]) -> Array:
     """Return messages' points as (N, 2)."""
     return np.array([[point.x, point.y] for point in points]).reshape(-1, 2)
-
-
-def _centre(corners: Array) -> tuple[float, float]:
-    """Return the image of a square's centre: where its diagonals cross."""
-    first, second = corners[2] - corners[0], corners[3] - corners[1]
-    share = np.linalg.solve(np.column_stack([first, -second]), corners[1] - corners[0])[0]
-    x, y = corners[0] + share * first
-    return float(x), float(y)
 
 
 def gray(image: Any) -> Picture | None:
@@ -333,15 +325,12 @@ def _draw_shot(
         side.set_visible(False)
 
 
-def write_video(
-    run: RunSeries, path: Path, progress: Callable[[float], None] | None = None
-) -> Path:
+def write_video(run: RunSeries, path: Path) -> Path:
     """Write an MP4 of the camera's frames with the measured curve, tip and reference tip drawn in.
 
     Args:
         run: of a bag with images.
         path: of the film; its folder exists.
-        progress: called with the fraction done.
 
     Raises:
         EvaluationError: the bag has no images, calibration or tags, or the film cannot be written.
@@ -356,8 +345,6 @@ def write_video(
         for time, picture, curve in images.pictures():
             film = film or _open_film(path, run, picture)
             film.write(_film_frame(picture, time, curve, run, project))
-            if progress is not None:
-                progress(min(1.0, max(0.0, time / float(run.reference.time[-1]))))
     if film is None:
         raise EvaluationError(
             f"{path_of_bag}: no images of a known encoding; record them with record_images:=true"
