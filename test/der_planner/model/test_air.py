@@ -42,15 +42,6 @@ def test_a_vented_chamber_falls_by_the_law(exponent, sign):
     np.testing.assert_allclose(pressure[high], exact[high], rtol=1e-9)
 
 
-def test_the_default_exponent_vents_a_step_as_the_real_limb_does():
-    """2.5 s from 90 to 10 % of 7 kPa, and slower by the cube root where the pressure is higher."""
-    air = slow(vent_time_constant=0.01, vent_rate=5340.0).pneumatics
-    for step, expected in ((7000.0, 2.5), (14_000.0, 2.5 * 2 ** (1 / 3))):
-        pressure = Air(air).follow(np.zeros((120, 1)), 0.05, 5, [step]).differential.ravel()
-        between = (pressure < 0.9 * step) & (pressure > 0.1 * step)
-        assert np.count_nonzero(between) * 0.01 == pytest.approx(expected, rel=0.02)
-
-
 @pytest.mark.parametrize("delay", [0.0, 0.037])
 @pytest.mark.parametrize(("exponent", "valve"), [(2 / 3, 0.0), (1.0, 0.0), (0.5, 0.6)])
 def test_derivatives_by_commands_against_finite_differences(delay, exponent, valve):

@@ -87,24 +87,6 @@ def test_inertia_is_that_of_the_kinetic_energy(model):
         assert 0.5 * v @ inertia(model, q, v) @ v == pytest.approx(kinetic, rel=1e-5)
 
 
-def test_coriolis_terms_are_christoffel_symbols(model):
-    n, h = model.segment_count, 1e-5
-    for q, v in configurations(model, count=2):
-        slopes = np.array(
-            [
-                (inertia(model, q + h * e, v) - inertia(model, q - h * e, v)) / (2 * h)
-                for e in np.eye(n)
-            ]
-        )  # slopes[k, i, j] = ∂M_ij/∂q_k
-        symbols = 0.5 * (
-            np.einsum("kij,k->ij", slopes, v)
-            + np.einsum("jik,k->ij", slopes, v)
-            - np.einsum("ijk,k->ij", slopes, v)
-        )
-        coriolis = kernels.inertia(q, v, model.arcs)[1]
-        np.testing.assert_allclose(coriolis, symbols, atol=1e-8 * np.abs(symbols).max() + 1e-14)
-
-
 @pytest.mark.parametrize("order", [0, 1, 2, 3])
 def test_arc_functions_are_smooth_where_series_and_quotient_meet(order):
     z = arc_kernel.SERIES_BELOW

@@ -77,19 +77,6 @@ def test_a_parameter_that_another_needs_may_not_be_zero():
         changed(Segment, creep_stiffness=1e-3)
 
 
-@pytest.mark.parametrize(("kind", "name"), DECLARED)
-def test_unit_and_meaning_stand_behind_every_key(kind, name, tmp_path):
-    LIMB.to_yaml(tmp_path / "limb.yaml")
-    declared = declarations(kind)[name]
-    lines = [
-        line
-        for line in (tmp_path / "limb.yaml").read_text(encoding="utf-8").splitlines()
-        if line.lstrip("- ").startswith(f"{name}:")
-    ]
-    assert len(lines) == (1 if kind is Pneumatics else LIMB.segment_count)
-    assert all(line.endswith(f"  # [{declared.unit}] {declared.text}") for line in lines)
-
-
 def test_free_text_of_a_limb_file_takes_no_comments(tmp_path):
     text = {"length": "tape measure", "note": "two lines\nlength: 3\ngravity: none"}
     limb = replace(LIMB, provenance=text, name="gravity: 3\nsegments:\n- length: 1")

@@ -48,10 +48,6 @@ def test_differential_and_effective_pressure_are_inverse():
     assert np.abs(given - WANTED).max() > 300.0
 
 
-def test_a_plain_limb_feels_what_its_chambers_hold():
-    np.testing.assert_array_equal(felt(Limb.default(), WANTED, BEND), WANTED)
-
-
 def test_friction_saturates_closes_its_loops_and_does_not_depend_on_rate():
     angle = np.concatenate(
         [np.linspace(0, 2, 400), np.linspace(2, -2, 800), np.linspace(-2, 2, 800)]

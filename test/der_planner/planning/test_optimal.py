@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 from der_planner.limb import Limb
 from der_planner.model import CONTROL_PERIOD, RodModel
 from der_planner.model.air import Air
-from der_planner.planning import Motion, Workspace, plan, planner
+from der_planner.planning import Motion, Workspace, planner
 from der_planner.planning.configuration import configure
 from der_planner.planning.optimal import Optimiser, OptimiserSettings, solve_limited
 
@@ -27,26 +27,6 @@ def solver_for(limb, motion, **settings):
 @pytest.fixture(scope="module")
 def fast():
     return solver_for(LIMB, Motion.named("asynchronous", period=4.0, cycles=1))
-
-
-def test_sensitivities_against_finite_differences(fast):
-    command = fast.warm.copy()
-    first, last = 0, 40
-    state = fast.start
-    quadratic = fast._linearise(fast.drive.window(command[:last], first), state, 0.0)
-    rng = np.random.default_rng(0)
-    for _ in range(3):
-        direction = rng.normal(size=(last - first, 2))
-        step = 1.0
-        ahead, behind = command.copy(), command.copy()
-        ahead[first:last] += step * direction
-        behind[first:last] -= step * direction
-        slope = (
-            fast._evaluate(ahead, state, first, last)[1]
-            - fast._evaluate(behind, state, first, last)[1]
-        ) / (2 * step)
-        exact = (quadratic.jacobian @ direction.ravel()).reshape(-1, 2)
-        assert np.abs(exact - slope).max() < 1e-5 * np.abs(slope).max()
 
 
 def test_gradient_of_the_cost_against_finite_differences(fast):
@@ -74,14 +54,6 @@ def test_windows_agree_with_one_window():
     assert len(windows.commands) > 1.2 * OptimiserSettings().window
     assert np.abs(whole.tip - windows.tip).max() < 5e-5
     assert np.abs(whole.commands - windows.commands).max() < 60.0
-
-
-def test_predicted_tip_is_the_one_the_rod_gives_again():
-    motion = Motion.named("asynchronous", period=5.0, cycles=2)
-    result = plan(LIMB, motion, "der", "optimal")
-    configuration = configure(RodModel(LIMB), result.reference)
-    again = planner.tip_under(configuration, result.differential_pressure)
-    np.testing.assert_allclose(result.tip_predicted, again, atol=1e-10)
 
 
 def test_limited_programme_against_a_general_solver():

@@ -175,21 +175,17 @@ def stays_behind(time: Array, tip: Array, wanted: Array) -> float | None:
         behind = (missed > _BEHIND_SHARE * distance) & (distance > _BEHIND_DISTANCE)
     needed = max(2, round(_BEHIND_TIME / float(time[1] - time[0])))
     # A gap in between neither ends such a stretch nor makes it longer.
-    run, begin = 0, 0
-    seen = [int(k) for k in np.nonzero(np.isfinite(missed))[0]]
-    for k in seen:
-        if not behind[k]:
-            run = 0
-            continue
-        begin = k if run == 0 else begin
-        run += 1
-        if run >= needed:
-            # It began when the error left what it had been until then.
-            before = missed[:begin][np.isfinite(missed[:begin])]
-            usual = _USUAL_ERROR * float(np.median(before)) if len(before) else 0.0
-            well = [j for j in seen if j < begin and missed[j] <= usual]
-            return float(time[well[-1]] if well else time[0])
-    return None
+    seen = np.flatnonzero(np.isfinite(missed))
+    if len(seen) < needed:
+        return None
+    whole = np.convolve(behind[seen], np.ones(needed), "valid") > needed - 0.5
+    if not whole.any():
+        return None
+    # It began when the error left what it had been until then.
+    before = missed[seen[: int(np.argmax(whole))]]
+    usual = _USUAL_ERROR * float(np.median(before)) if len(before) else 0.0
+    well = np.flatnonzero(before <= usual)
+    return float(time[seen[well[-1]]] if len(well) else time[0])
 
 
 def moves_with(tip: Array, expected: Array) -> str:

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from der_planner.arrays import Array
-from der_planner.control.estimation import Estimator, EstimatorSettings
+from der_planner.control.estimation import Estimator
+from der_planner.control.knowledge import EstimatorSettings
 from der_planner.control.nominal import STEP, ChamberLog, Nominal
 from der_planner.model import CONTROL_PERIOD, STEPS
 from der_planner.planning.plan_file import Plan

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from der_planner.arrays import Array
-from der_planner.control.estimation import Knowledge
+from der_planner.control.knowledge import Knowledge
 from der_planner.control.nominal import ChamberLog, Nominal
 from der_planner.model import CONTROL_PERIOD, STEPS
 from der_planner.model.air import Chambers

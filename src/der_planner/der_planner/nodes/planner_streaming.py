@@ -16,7 +16,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from der_msgs.msg import LimbEstimate, PressurePlan, PressureSetpoint, PressureState
 from der_planner.arrays import Array
-from der_planner.control.estimation import Estimate
+from der_planner.control.knowledge import Estimate
 from der_planner.planning.plan_file import Plan
 from der_planner.planning.streaming import GRID, Player, Schedule, first_stamp
 from limb_interfaces import qos, topics

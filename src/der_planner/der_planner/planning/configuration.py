@@ -242,28 +242,15 @@ class LoadedConfiguration(RodConfiguration):
     def __init__(self, model: RodModel, time: Array, poses: Poses, start: Start | None) -> None:
         super().__init__(model, _through(time, poses.bend_angles, start), start)
         self._time, self._poses = time, poses
-        q = np.array([state.q for state in poses.states])[:, model.rod.free]
-        self._shape = _through(time, q, start)
+        self._shape = _through(time, np.array([state.q for state in poses.states]), start)
 
     @property
     def begin(self) -> RodState:
         """State in which the motion begins."""
         if self.start is None:
             return self.model.rest
-        q, v, _ = self._sample(np.array(0.0))
+        q, v, _ = sample_spline(self._shape, 0.0)
         return self.model.rod.state(q, v, like=self._poses.states[0])
-
-    def _sample(self, time: Array) -> tuple[Array, Array, Array]:
-        """Return q, its rate and acceleration (…, 4N-1) at instants [s]."""
-        rod = self.model.rod
-        straight, result = rod.straight_state().q, []
-        for order, part in enumerate(sample_spline(self._shape, time)):
-            full = np.zeros((*part.shape[:-1], len(straight)))
-            if order == 0:
-                full[...] = straight
-            full[..., rod.free] = part
-            result.append(full)
-        return result[0], result[1], result[2]
 
     @cached_property
     def _forces(self) -> tuple[Array, Array]:
@@ -272,7 +259,7 @@ class LoadedConfiguration(RodConfiguration):
         A pose rests under its own pressures: −F_int − F_ext is B Λ times these.
         """
         rod, free = self.model.rod, self.model.rod.free
-        q, v, a = self._sample(self._time)
+        q, v, a = sample_spline(self._shape, self._time)
         forces, inputs = [], []
         for k, state in enumerate(self._poses.states):
             inputs.append(rod.input_matrix(state)[free])
@@ -293,7 +280,7 @@ class LoadedConfiguration(RodConfiguration):
         found = (inverse @ forces[..., None])[..., 0]
         pressures = interpolate_smoothly(time, self._time, found)
         nearest = np.rint(np.interp(time, self._time, np.arange(len(self._time)))).astype(int)
-        position, velocity, _ = self._sample(time)
+        position, velocity, _ = sample_spline(self._shape, time)
         return self._beside_the_model(pressures, inverse[nearest], position, velocity, time)
 
 
