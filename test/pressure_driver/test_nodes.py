@@ -117,7 +117,7 @@ def test_two_publishers_of_a_running_graph_are_not_mixed(bench):
     def both_heard():
         run.publisher.publish(PressureSetpoint(differential_pressure=[3000.0, 0.0]))
         run.client.spin(0.02)
-        if run.mode == PressureState.TRACKING:
+        if run.states[-1].setpoints_accepted > 20:  # far ahead: the two never count in step
             other.publish(PressureSetpoint(differential_pressure=[-3000.0, 0.0]))
         run.client.spin(0.02)
         told = run.client.diagnostic_values("pressure_driver")

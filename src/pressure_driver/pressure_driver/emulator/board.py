@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pressure_driver.emulator.pneumatics import BoardPneumatics
+from pressure_driver.emulator.pneumatics import SUPPLY_PRESSURE, BoardPneumatics
 from pressure_driver.protocols.base import BoardCommand, BoardProtocol, BoardReading
 
 SENSOR_OFFSET = 200.0
@@ -175,9 +175,7 @@ class EmulatedBoard:
             air.stuck[chamber] = True
         for chamber, rate in faults.leaks.items():
             air.leak[chamber] = rate
-        air.supply_pressure = (
-            air.parameters.supply_pressure if faults.supply is None else faults.supply
-        )
+        air.supply_pressure = SUPPLY_PRESSURE if faults.supply is None else faults.supply
         self._apply()
 
     def receive(self, data: bytes, stamp: int) -> tuple[list[ReceivedCommand], bytes]:

@@ -9,7 +9,6 @@ is vented, a neighbour that rises by up to a quarter of the change and is back a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -24,33 +23,27 @@ VENT_EXPONENT = 2.0 / 3.0
 """Outflow grows with this power of the gauge pressure: between an orifice (1/2) and a tube (1)."""
 
 REFERENCE_STEP = 7000.0
-"""[Pa] The vented step whose 90-to-10-% time is `PneumaticsParameters.vent_time`."""
-
-
-@dataclass(frozen=True)
-class PneumaticsParameters:
-    """Nominal values; `BoardPneumatics` draws each chamber's own around them."""
-
-    fill_rate: float = 9000.0
-    """[Pa/s] of the inlet valve, wide open, at nominal supply."""
-    vent_time: float = 2.5
-    """[s] from 90 to 10 % of a step of `REFERENCE_STEP`."""
-    regulator_time: float = 0.08
-    """[s] time constant of the regulator close to its target."""
-    dead_time: float = 0.03
-    """[s] from a command to the first motion of a valve."""
-    vent_deadband: float = 80.0
-    """[Pa] above target before the outlet valve opens."""
-    fill_coupling: float = 0.45
-    """Share of the rate of a filling chamber that its neighbour sees."""
-    vent_coupling: float = 0.06
-    """Share of the rate of a venting chamber that its neighbour sees."""
-    coupling_time: float = 0.45
-    """[s] in which the neighbour's disturbance decays."""
-    supply_pressure: float = 140e3
-    """[Pa] absolute, of the reservoir."""
-    variation: float = 0.05
-    """Relative standard deviation between chambers, cut at two of them."""
+"""[Pa] The vented step whose 90-to-10-% time is `VENT_TIME`."""
+FILL_RATE = 9000.0
+"""[Pa/s] of the inlet valve, wide open, at nominal supply."""
+VENT_TIME = 2.5
+"""[s] from 90 to 10 % of a step of `REFERENCE_STEP`."""
+REGULATOR_TIME = 0.08
+"""[s] time constant of the regulator close to its target."""
+DEAD_TIME = 0.03
+"""[s] from a command to the first motion of a valve."""
+VENT_DEADBAND = 80.0
+"""[Pa] above target before the outlet valve opens."""
+FILL_COUPLING = 0.45
+"""Share of the rate of a filling chamber that its neighbour sees."""
+VENT_COUPLING = 0.06
+"""Share of the rate of a venting chamber that its neighbour sees."""
+COUPLING_TIME = 0.45
+"""[s] in which the neighbour's disturbance decays."""
+SUPPLY_PRESSURE = 140e3
+"""[Pa] absolute, of the reservoir."""
+VARIATION = 0.05
+"""Relative standard deviation between chambers, cut at two of them."""
 
 
 class BoardPneumatics:
@@ -63,27 +56,19 @@ class BoardPneumatics:
     Args:
         segment_count: M, number of segments; there are 2M chambers.
         seed: of the drawn variations.
-        parameters: nominal values.
 
     Raises:
         ValueError: ``segment_count`` is less than one.
     """
 
-    def __init__(
-        self,
-        segment_count: int = 2,
-        seed: int = 0,
-        parameters: PneumaticsParameters | None = None,
-    ) -> None:
+    def __init__(self, segment_count: int = 2, seed: int = 0) -> None:
         if segment_count < 1:
             raise ValueError(f"segment_count must be 1 or more, got {segment_count}")
-        self.parameters = parameters or PneumaticsParameters()
-        self.segment_count = segment_count
         self.chamber_count = 2 * segment_count
         generator = np.random.default_rng([seed, 0x9A1B])
         self.atmosphere = float(101_325.0 + generator.uniform(-700.0, 1500.0))
         """[Pa] absolute pressure of the room."""
-        self.supply_pressure = self.parameters.supply_pressure
+        self.supply_pressure = SUPPLY_PRESSURE
         """[Pa] absolute pressure of the reservoir; may be changed while running."""
         self.stuck = np.zeros(self.chamber_count, dtype=bool)
         """(2M,) chambers whose valves have stopped moving: neither filled nor vented."""
@@ -92,16 +77,16 @@ class BoardPneumatics:
 
         def vary(nominal: float) -> FloatArray:
             spread = np.clip(generator.normal(size=self.chamber_count), -2.0, 2.0)
-            return nominal * (1.0 + self.parameters.variation * spread)
+            return nominal * (1.0 + VARIATION * spread)
 
-        self._fill_rate = vary(self.parameters.fill_rate)
-        self._vent_coefficient = _vent_coefficient(vary(self.parameters.vent_time))
-        self._regulator_time = vary(self.parameters.regulator_time)
-        self._vent_deadband = vary(self.parameters.vent_deadband)
-        self._fill_coupling = vary(self.parameters.fill_coupling)
-        self._vent_coupling = vary(self.parameters.vent_coupling)
-        self._coupling_time = vary(self.parameters.coupling_time)
-        self._dead_time = float(self.parameters.dead_time * generator.uniform(0.7, 1.3))
+        self._fill_rate = vary(FILL_RATE)
+        self._vent_coefficient = _vent_coefficient(vary(VENT_TIME))
+        self._regulator_time = vary(REGULATOR_TIME)
+        self._vent_deadband = vary(VENT_DEADBAND)
+        self._fill_coupling = vary(FILL_COUPLING)
+        self._vent_coupling = vary(VENT_COUPLING)
+        self._coupling_time = vary(COUPLING_TIME)
+        self._dead_time = float(DEAD_TIME * generator.uniform(0.7, 1.3))
         self._neighbour = np.arange(self.chamber_count).reshape(-1, 2)[:, ::-1].ravel()
 
         self._gauge = np.zeros(self.chamber_count)
@@ -114,11 +99,6 @@ class BoardPneumatics:
     def pressure(self) -> FloatArray:
         """(2M,) [Pa] absolute chamber pressures now."""
         return self.atmosphere + self._gauge + self._disturbance
-
-    @property
-    def target(self) -> FloatArray:
-        """(2M,) [Pa] absolute pressures the regulators work toward now."""
-        return self.atmosphere + self._target
 
     @property
     def valve_opening(self) -> FloatArray:
@@ -174,7 +154,7 @@ class BoardPneumatics:
         error = self._target - self._gauge
         demand = error / self._regulator_time
         headroom = self.supply_pressure - self.atmosphere - self._gauge
-        nominal_head = 0.25 * (self.parameters.supply_pressure - self.atmosphere)
+        nominal_head = 0.25 * (SUPPLY_PRESSURE - self.atmosphere)
         # Three times as fast as np.clip on a few numbers.
         inflow = self._fill_rate * np.minimum(np.maximum(headroom / nominal_head, 0.0), 1.0)
         outflow = self._vent_coefficient * np.maximum(self._gauge, 0.0) ** VENT_EXPONENT

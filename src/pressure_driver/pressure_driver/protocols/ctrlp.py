@@ -189,7 +189,6 @@ class CtrlpBoard(BoardProtocol):
         self._lines = LineSplitter()
         self._malformed = 0
         self._reports = False
-        self._echoes = True
         self._unit = PASCAL_PER_PSI
         self._setpoint = (0.0,) * chamber_count
 
@@ -198,7 +197,6 @@ class CtrlpBoard(BoardProtocol):
         self._unit = PASCAL_PER_PSI
         self._setpoint = (0.0,) * self.chamber_count
         self._reports = False
-        self._echoes = True
         return b"_pressure controller\n"
 
     def decode(self, data: bytes) -> list[BoardCommand]:
@@ -216,8 +214,7 @@ class CtrlpBoard(BoardProtocol):
             if word in ("ON", "OFF"):
                 self._reports = word == "ON"
                 return BoardCommand("outputs", place, text=line)
-            if word == "ECHO" and numbers:
-                self._echoes = numbers[0] != 0.0
+            if word == "ECHO":
                 return BoardCommand("echo", place, text=line)
             if word == "UNITS" and numbers and numbers[0] in UNITS:
                 self._unit = UNITS[int(numbers[0])]
@@ -246,8 +243,6 @@ class CtrlpBoard(BoardProtocol):
 
     def reply(self, command: BoardCommand, reading: BoardReading) -> bytes:  # noqa: ARG002
         """The echo."""
-        if not self._echoes:
-            return b""
         if command.kind == "unknown":
             return b"_UNREC: Unrecognized Command\r\n"
         new = "NEW " if command.kind in ("setpoint", "setting") else ""
