@@ -120,8 +120,7 @@ class Supervisor:
         self.reason = ""
         self.warnings: list[Warned] = []
         self._latched = False
-        self._strange_since: float | None = None
-        self._limited_since: float | None = None
+        self._since: dict[str, float] = {}
         self._late = 0.0
         self._astray_at = -math.inf
         self._recent: deque[tuple[Array, float]] = deque(
@@ -141,13 +140,8 @@ class Supervisor:
             strange: squared distance of measurements per coordinate, smoothed.
         """
         limits = self.limits
-        if strange > limits.inconsistent:
-            if self._strange_since is None:
-                self._strange_since = time
-            if time - self._strange_since > limits.patience:
-                self.stop(time, "inconsistent", strange)
-        else:
-            self._strange_since = None
+        if self._lasts("strange", strange > limits.inconsistent, time) > limits.patience:
+            self.stop(time, "inconsistent", strange)
         seen = age <= limits.blind
         if not seen and not self._latched and self.share > 0.0:
             self._warn(time, "tags lost", age)
@@ -173,17 +167,20 @@ class Supervisor:
         if astray:
             self._astray_at = time
         limited = np.abs(correction).max() > 0.98 * self.authority * self.share
-        if self.share > 0.0 and limited and astray:
-            if self._limited_since is None:
-                self._limited_since = time
-            if time - self._limited_since > limits.saturated:
-                self.stop(time, "saturation", self.authority)
-        else:
-            self._limited_since = None
+        in_vain = bool(self.share > 0.0 and limited and astray)
+        if self._lasts("in vain", in_vain, time) > limits.saturated:
+            self.stop(time, "saturation", self.authority)
         self._recent.append((correction, swing))
         distance = self._oscillation()
         if distance > 0.0 and time - self._astray_at <= limits.window:
             self.stop(time, "oscillation", distance)
+
+    def _lasts(self, what: str, now: bool, time: float) -> float:
+        """Return for how long something has been so at an instant, without a break [s]."""
+        if not now:
+            self._since.pop(what, None)
+            return 0.0
+        return time - self._since.setdefault(what, time)
 
     def _oscillation(self) -> float:
         """Return how far a correction swings [Pa] if it and the limb swing on and on; else 0.
