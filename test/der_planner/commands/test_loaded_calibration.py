@@ -4,8 +4,8 @@ import re
 import sys
 
 import pytest
-from chain_calibration import write_csv
 from link_chain import LinkChain
+from log_table import write_csv
 
 from der_planner.commands import calibrate_limb, check_limb
 from der_planner.identification.excitation import waves

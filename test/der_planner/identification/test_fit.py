@@ -155,10 +155,6 @@ def test_a_slow_log_does_not_tell_stiffness_from_gain():
     assert limb.segments[0].bending_stiffness == Limb.default().segments[0].bending_stiffness
 
 
-def changed(log: CalibrationLog, **values) -> CalibrationLog:
-    return replace(log, **values)
-
-
 def test_bad_logs_are_refused_by_what_is_wrong(log):
     limb, u, q = Limb.default(), log.measured_differential, log.bend_angles
     still = u.copy()
@@ -166,14 +162,14 @@ def test_bad_logs_are_refused_by_what_is_wrong(log):
     blind = q.copy()
     blind[: int(0.7 * len(q))] = np.nan
     cases = {
-        "input 1 was not excited": changed(
+        "input 1 was not excited": replace(
             log, measured_differential=still, commanded_differential=still
         ),
-        "tags were seen": changed(log, bend_angles=blind),
-        "swapped": changed(log, bend_angles=q[:, ::-1]),
-        "wrong way": changed(log, bend_angles=-q),
-        "follow its command": changed(log, commanded_differential=u[::-1].copy()),
-        "units": changed(log, measured_differential=u * 1e-4),
+        "tags were seen": replace(log, bend_angles=blind),
+        "swapped": replace(log, bend_angles=q[:, ::-1]),
+        "wrong way": replace(log, bend_angles=-q),
+        "follow its command": replace(log, commanded_differential=u[::-1].copy()),
+        "units": replace(log, measured_differential=u * 1e-4),
     }
     for match, bad in cases.items():
         with pytest.raises(LogError, match=match):

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from chain_calibration import write_csv
+from log_table import write_csv
 
 from der_planner.commands import check_limb
 from der_planner.identification import (

@@ -156,16 +156,6 @@ def test_a_step_that_does_not_converge_raises_and_says_where(plane):
     np.testing.assert_allclose(caught.value.state.q, good.q, atol=1e-12)
 
 
-def test_halving_is_the_callers_choice():
-    rod = Rod.from_limb(Limb.default())
-    state, jolt = rod.straight_state(), [1e5, -1e5]
-    with pytest.raises(ConvergenceError):
-        rod.step(state, jolt, 0.1, "backward_euler")
-    halved = rod.step(state, jolt, 0.1, "backward_euler", halvings=4)
-    assert np.isfinite(halved.q).all()
-    assert np.abs(bend_angles(rod, halved.q)).max() > 1.0
-
-
 def test_fixed_degrees_of_freedom_do_not_move():
     rod = Rod.uniform(
         length=0.2, nodes=11, EI=0.02, EA=1e3, GJ=0.02, mass_per_length=1.0, gravity=(0, 0, -9.81),

@@ -9,7 +9,7 @@ from plain_hardware import plain
 from der_planner.limb import PointMass, gravity_of
 from der_planner.twin import LimbTwin, TwinError
 from der_planner.twin.hardware import RANGES, draw
-from der_planner.twin.limb_twin import ATMOSPHERE, TIME_STEP
+from der_planner.twin.limb_twin import ATMOSPHERE
 
 REST = np.full(4, ATMOSPHERE)
 
@@ -192,10 +192,3 @@ def test_drawn_limbs_agree_with_logs_of_real_ones():
 def test_impossible_pressures_are_refused(pressure):
     with pytest.raises(TwinError, match="chamber pressures"):
         LimbTwin(0, hardware=plain()).step(pressure, 0.1)
-
-
-def test_time_shorter_than_a_step_is_kept():
-    twin = LimbTwin(0, hardware=plain())
-    for _ in range(10):
-        twin.step(REST, 1e-4)
-    assert 1e-3 - TIME_STEP < twin.time <= 1e-3 + 1e-12

@@ -59,15 +59,6 @@ def test_catches_up_a_bounded_backlog_only():
     assert not loop.behind
 
 
-def test_publishes_once_after_a_pause_not_a_burst():
-    world, loop = build()
-    world.run(loop, 0.5)
-    count = len(world.published)
-    world.now += 3.0
-    loop.tick(world.now)
-    assert len(world.published) == count + 1
-
-
 def test_a_simulation_that_is_too_slow_says_so():
     world, loop = build(cost=2.0)
     world.run(loop, 20.0)

@@ -318,10 +318,8 @@ class Limb:
     def to_mapping(self) -> dict[str, Any]:
         """Return the content of a limb file, which `from_mapping` makes an equal limb of."""
         body: dict[str, Any] = {"schema_version": SCHEMA_VERSION, **dataclasses.asdict(self)}
-        body["gravity"] = list(self.gravity)
-        body["segments"] = list(body["segments"])
-        body["pcc_segments"] = list(body["pcc_segments"])
-        body["masses"] = list(body["masses"])
+        for key in ("gravity", "segments", "pcc_segments", "masses"):
+            body[key] = list(body[key])
         body["calibrated"] = {key: list(value) for key, value in body["calibrated"].items()}
         body["provenance"] = dict(self.provenance)
         return body

@@ -1,26 +1,13 @@
-"""What is known of a `LinkChain` before it is calibrated, and its log as a table."""
+"""A log as a table with its map of columns, as a lab might write it."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import yaml
-from link_chain import Mass
 
 from der_planner.identification import CalibrationLog
-from der_planner.limb import Limb
-
-Gravity = tuple[float, float, float]
-
-
-def prior(gravity: Gravity = (0.0, 0.0, 0.0), masses: tuple[Mass, ...] = ()) -> Limb:
-    """Return what is known of a chain before it is calibrated: the default limb, its loads."""
-    limb = replace(Limb.default(), gravity=gravity)
-    for at, mass in masses:
-        limb = limb.carrying(mass, at)
-    return limb
 
 
 def write_csv(log: CalibrationLog, table: Path, columns: Path) -> None:
