@@ -61,14 +61,12 @@ class GraphRun:
         bag: folder of the bag.
         cpu_percent: CPU use of each process while the motion played, in per cent of one core.
         real_time_factor: simulated over real seconds of the twin; NaN on hardware.
-        duration: of the played motion [s].
         plan_id: of the plan that was played; empty for pressures without a plan.
     """
 
     bag: Path
     cpu_percent: dict[str, float]
     real_time_factor: float
-    duration: float
     plan_id: str = ""
 
 
@@ -156,7 +154,7 @@ class GraphPlayer(ABC):
         factor = client.diagnostic_values("limb_twin").get("real_time_factor", "nan")
         self._vent(client)
         client.call("recorder/stop", timeout=60.0)
-        return GraphRun(bag, cpu, float(factor), playing.length, playing.plan_id)
+        return GraphRun(bag, cpu, float(factor), playing.plan_id)
 
     def _arm(self, client: GraphClient) -> None:
         """Arm the driver; what forbids it for a moment, as a late report of the board, may pass."""

@@ -77,21 +77,15 @@ class Hardware:
         except (OSError, yaml.YAMLError) as error:
             raise OptionError(f"cannot read hardware file {path}: {error}") from error
         known = [item.name for item in dataclasses.fields(cls)]
-        if not isinstance(content, dict):
-            raise OptionError(f"hardware file {path}: expected the keys {', '.join(known)}")
-        for key in content:
+        for key in content if isinstance(content, dict) else ["not a mapping"]:
             if key not in known:
                 raise OptionError(f"hardware file {path}: unknown key '{key}'; known: {known}")
         hardware = cls(**{key: value for key, value in content.items() if value is not None})
-        port = hardware.driver.get("port")
-        if not port:
+        port = str(hardware.driver.get("port", ""))
+        if not port or not Path(port).exists():
             raise OptionError(
-                f"hardware file {path}: driver.port is missing; `ls /dev/serial/by-id` shows ports"
-            )
-        if not Path(port).exists():
-            raise OptionError(
-                f"hardware file {path}: no serial device {port}; is the valve board plugged in? "
-                "`ls /dev/serial/by-id` shows what is there"
+                f"hardware file {path}: no serial device '{port}' (driver.port); is the valve "
+                "board plugged in? `ls /dev/serial/by-id` shows what is there"
             )
         return hardware
 
