@@ -162,11 +162,10 @@ def _write_run(path: Path, seconds: float) -> None:
 
     def write(topic: str, message: object, when: float) -> None:
         kind = f"der_msgs/msg/{type(message).__name__}"
-        if topic not in bag.topics:
-            bag.add_topic(TopicSpec.installed(topic, kind, (OfferedQos(),)))
         stamp = origin + round(when * 1e9)
         message.header.stamp = stamp_from_nanoseconds(stamp)  # type: ignore[attr-defined]
-        bag.write(topic, stamp, stamp, serialize_message(message))
+        spec = TopicSpec.installed(topic, kind, (OfferedQos(),))
+        bag.write(spec, stamp, stamp, serialize_message(message))
 
     times = np.arange(0.0, seconds, 0.05)
     tip = np.column_stack([0.2 + 0.02 * np.cos(times), 0.06 * np.sin(times)])

@@ -195,12 +195,11 @@ def test_replay_publishes_the_recorded_bytes_and_waits_for_answers(graph, tmp_pa
     from limb_interfaces import stamps
 
     bag = BagWriter(tmp_path / "run")
-    for name, kind in (("/limb/asked", "der_msgs/msg/LimbState"), ("/limb/talk", TEXT)):
-        bag.add_topic(spec(name, kind))
+    asked, talk = spec("/limb/asked", "der_msgs/msg/LimbState"), spec("/limb/talk", TEXT)
     for index in range(20):
         message = LimbState(header=Header(stamp=stamps.stamp_from_nanoseconds(START + index)))
-        bag.write("/limb/asked", START + index, START, serialize_message(message))
-        bag.write("/limb/talk", START + index, START, string(f"word {index}"))
+        bag.write(asked, START + index, START, serialize_message(message))
+        bag.write(talk, START + index, START, string(f"word {index}"))
     bag.close()
     events: list[tuple[str, int]] = []
     heard: list[str] = []

@@ -25,9 +25,9 @@ KILLED = """
     from bags import START, SECOND, TEXT, spec, string
     from der_planner.bags.writer import BagWriter
     bag = BagWriter(Path({folder!r}), {{"run": '{{"seed": 4}}'}}, compression={compression!r})
-    bag.add_topic(spec("/talk", TEXT))
     for index in range(100):
-        bag.write("/talk", START + index * SECOND // 10, START, string(f"word {{index}}"))
+        stamp = START + index * SECOND // 10
+        bag.write(spec("/talk", TEXT), stamp, START, string(f"word {{index}}"))
         if index % 10 == 9 and index < 90:
             bag.flush()
     os.kill(os.getpid(), signal.SIGKILL)
@@ -63,10 +63,9 @@ def write_chunks(folder: Path, count: int, padding: int = 0) -> list[int]:
     """Write chunks of five numbers each; return where each chunk ends."""
     noise = np.random.default_rng(1).integers(65, 90, padding, dtype=np.uint8).tobytes().decode()
     bag = BagWriter(folder, {RUN_KEY: '{"seed": 4}'}, compression="none")
-    bag.add_topic(spec("/talk", TEXT))
     ends = []
     for index in range(5 * count):
-        bag.write("/talk", START + index * SECOND, START, string(f"{index} {noise}"))
+        bag.write(spec("/talk", TEXT), START + index * SECOND, START, string(f"{index} {noise}"))
         if index % 5 == 4:
             bag.flush()
             ends.append(bag.byte_count)

@@ -34,12 +34,10 @@ class Stage:
 @pytest.fixture
 def bag(tmp_path: Path) -> Path:
     writer = BagWriter(tmp_path / "run", split_seconds=1.0)
-    for name in ("/a", "/b"):
-        writer.add_topic(spec(name, TEXT))
     for index in range(20):
         when = START + index * SECOND // 10
-        writer.write("/a", when, when, string(f"a{index}"))
-        writer.write("/b", when + 5, when, string(f"b{index}"))
+        writer.write(spec("/a", TEXT), when, when, string(f"a{index}"))
+        writer.write(spec("/b", TEXT), when + 5, when, string(f"b{index}"))
     return writer.close()
 
 

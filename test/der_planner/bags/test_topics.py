@@ -1,7 +1,5 @@
 """Definitions of installed messages against rosbags' own knowledge of them."""
 
-from pathlib import Path
-
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -47,22 +45,6 @@ def test_every_message_of_ours_is_complete_and_hashes_right():
         types = get_typestore(Stores.EMPTY)
         types.register(get_types_from_msg(definition.text, name))
         assert types.hash_rihs01(name) == definition.type_hash
-
-
-def test_fields_with_bounds_arrays_defaults_and_constants(tmp_path: Path, monkeypatch):
-    messages = tmp_path / "share" / "odd_msgs" / "msg"
-    messages.mkdir(parents=True)
-    (messages / "Inner.msg").write_text("float64 x\n")
-    (messages / "Outer.msg").write_text(
-        "# Inner in a comment\nuint8 KIND=3\nstring NAME='Inner x'\nstring<=8 label\n"
-        "Inner[<=4] few # other_msgs/Missing\nodd_msgs/Inner[3] three\nint32 count 7\n"
-    )
-    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
-    definition = find_definition("odd_msgs/msg/Outer")
-    assert definition.text.count("MSG: odd_msgs/Inner\n") == 1
-    types = get_types_from_msg(definition.text, "odd_msgs/msg/Outer")
-    assert set(types) == {"odd_msgs/msg/Outer", "odd_msgs/msg/Inner"}
-    assert "# Inner in a comment" in definition.text
 
 
 @pytest.mark.parametrize("name", ["no_msgs/msg/None", "std_srvs/srv/Trigger", "nonsense"])

@@ -17,11 +17,12 @@ from rosbags.rosbag2 import Reader
 from der_planner.bags.reader import BagReader
 from der_planner.bags.writer import METADATA_FILE, RUN_KEY, BagWriteError, BagWriter
 
+TALK = spec("/talk", TEXT)
+
 
 def fill(bag: BagWriter, count: int, step: int = SECOND // 10, first: int = 0) -> None:
-    bag.add_topic(spec("/talk", TEXT))
     for index in range(first, first + count):
-        bag.write("/talk", START + index * step, START + index * step - 5, string(f"word {index}"))
+        bag.write(TALK, START + index * step, START + index * step - 5, string(f"word {index}"))
         if index % 30 == 29:
             bag.flush()
 
@@ -46,8 +47,7 @@ def test_rosbags_and_mcap_read_what_was_written(tmp_path: Path):
 def test_metadata_says_what_rosbag2_needs(tmp_path: Path):
     bag = BagWriter(tmp_path / "run", {RUN_KEY: "{}"})
     fill(bag, 11)
-    bag.add_topic(spec("/plan", TEXT, latched=True))
-    bag.write("/plan", START + 3 * SECOND, START, string("plan"))
+    bag.write(spec("/plan", TEXT, latched=True), START + 3 * SECOND, START, string("plan"))
     bag.close()
     document = yaml.safe_load((tmp_path / "run" / METADATA_FILE).read_text())
     info = document["rosbag2_bagfile_information"]
@@ -72,9 +72,8 @@ def test_metadata_says_what_rosbag2_needs(tmp_path: Path):
 def test_bytes_behind_the_content_are_no_damage_but_missing_ones_are(tmp_path: Path):
     """As rclpy's serialize_message leaves them after empty sequences of doubles."""
     bag = BagWriter(tmp_path / "run")
-    bag.add_topic(spec("/talk", TEXT))
-    bag.write("/talk", START, START, string("whole") + bytes(8))
-    bag.write("/talk", START + 1, START, string("cut short")[:-4])
+    bag.write(TALK, START, START, string("whole") + bytes(8))
+    bag.write(TALK, START + 1, START, string("cut short")[:-4])
     with BagReader(bag.close()) as reader:
         messages = reader.messages()
         assert next(messages)[2].data == "whole"
@@ -86,8 +85,7 @@ def test_bytes_behind_the_content_are_no_damage_but_missing_ones_are(tmp_path: P
 def test_split_repeats_latched_messages(tmp_path: Path, how: str):
     options = {"split_bytes": 20_000} if how == "size" else {"split_seconds": 2.0}
     bag = BagWriter(tmp_path / "run", compression="none", **options)
-    bag.add_topic(spec("/plan", TEXT, latched=True))
-    bag.write("/plan", START, START, string("the plan"))
+    bag.write(spec("/plan", TEXT, latched=True), START, START, string("the plan"))
     fill(bag, 60 if how == "time" else 900)
     bag.close()
     files = sorted((tmp_path / "run").glob("*.mcap"))
@@ -107,12 +105,10 @@ def test_split_repeats_latched_messages(tmp_path: Path, how: str):
 
 def test_small_messages_do_not_share_chunks_with_large_ones(tmp_path: Path):
     bag = BagWriter(tmp_path / "run", compression="none")
-    for name in ("/talk", "/image"):
-        bag.add_topic(spec(name, TEXT))
     for index in range(60):
         when = START + index * SECOND // 30
-        bag.write("/talk", when, when, string(f"word {index}"))
-        bag.write("/image", when + 5, when, string("x" * 200_000))
+        bag.write(TALK, when, when, string(f"word {index}"))
+        bag.write(spec("/image", TEXT), when + 5, when, string("x" * 200_000))
         if index % 30 == 29:
             bag.flush()
     bag.close()
@@ -142,10 +138,10 @@ FULL_DISK = """
     from der_planner.bags.writer import BagWriter, BagWriteError
     resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, resource.RLIM_INFINITY))
     bag = BagWriter(Path({folder!r}), compression="none")
-    bag.add_topic(spec("/talk", TEXT))
+    talk = spec("/talk", TEXT)
     try:
         for index in range(10_000):
-            bag.write("/talk", START + index, START, string(f"word {{index}}"))
+            bag.write(talk, START + index, START, string(f"word {{index}}"))
             if index % 20 == 19:
                 bag.flush()
     except BagWriteError as error:

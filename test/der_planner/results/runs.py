@@ -78,10 +78,11 @@ class BagOfRun:
         topic = topic.replace("/limb", self.namespace, 1)
         name = name if "/" in name else f"der_msgs/msg/{name}"
         made = self.make(name, header=self.header(seconds), **fields)
-        self.bag.add_topic(spec(topic, name, latched))
         data = bytes(self.types.serialize_cdr(made, name))
         # A message arrives some time after its stamp; the evaluation must go by the stamp.
-        self.bag.write(topic, self.stamp(seconds + 0.03), self.stamp(seconds + 0.02), data)
+        self.bag.write(
+            spec(topic, name, latched), self.stamp(seconds + 0.03), self.stamp(seconds + 0.02), data
+        )
 
     def plan(self, plan_id="p", model="der", stamp=0.0, gravity=(0.0, 0.0, 0.0)) -> None:
         self.write(

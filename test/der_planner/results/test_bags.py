@@ -9,7 +9,6 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from runs import FRAMES, TIMES, BagOfRun, reference
 
-from der_planner.bags.writer import RUN_KEY, BagWriter
 from der_planner.identification import LogError, read_bag
 from der_planner.results import (
     EvaluationError,
@@ -75,18 +74,6 @@ def test_times_come_from_the_setpoints_not_from_arrival_or_plan(tmp_path: Path):
     write_run(bag, first_setpoint=-3.0)  # the plan's own stamp is off by 3 s
     bag.bag.close()
     assert evaluate_bag(tmp_path / "run").mean_error_m == pytest.approx(0.005, abs=3e-5)
-
-
-def test_split_bag_evaluates_the_same(folder: Path, tmp_path: Path):
-    writer = BagWriter(tmp_path / "run", {RUN_KEY: "{}"}, split_seconds=2.0)
-    bag = BagOfRun(tmp_path / "run", writer)
-    write_run(bag)
-    writer.close()
-    assert writer.file_count >= 4
-    whole, split = evaluate_bag(folder), evaluate_bag(tmp_path / "run")
-    assert split.mean_error_m == whole.mean_error_m
-    assert split.frames == whole.frames
-    assert split.checks == whole.checks
 
 
 @pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])

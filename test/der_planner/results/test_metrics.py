@@ -10,7 +10,6 @@ from der_planner.results import (
     EvaluationError,
     EvaluationSettings,
     RunSeries,
-    error_series,
     evaluate_run,
     split_error,
 )
@@ -122,13 +121,6 @@ def test_without_any_valid_image_there_is_no_error():
     tip = np.full((len(FRAMES), 2), np.nan)
     with pytest.raises(EvaluationError, match="no valid limb state"):
         evaluate_run(series(tip))
-
-
-def test_error_series_and_metrics_agree():
-    run = series(reference(FRAMES - 0.1))
-    found, result = error_series(run), evaluate_run(run)
-    assert result.mean_error_m == pytest.approx(np.linalg.norm(found.error, axis=1).mean())
-    assert np.allclose(found.measured - found.reference, found.error)
 
 
 @pytest.mark.parametrize(

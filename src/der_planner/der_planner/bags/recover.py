@@ -215,6 +215,5 @@ def recover_bag(
     bag = BagWriter(folder, custom, compression=files[0].compression)
     for file in files:
         for spec, message in file.messages(progress):
-            bag.add_topic(spec)
-            bag.write(spec.name, message.log_time, message.publish_time, message.data)
+            bag.write(spec, message.log_time, message.publish_time, message.data)
     return replace(found, folder=bag.close())

@@ -104,8 +104,7 @@ class RecordingSession:
                 spec, log_time, publish_time, data = item
                 with self._count_lock:
                     self.queued_bytes -= len(data)
-                self.writer.add_topic(spec)
-                self.writer.write(spec.name, log_time, publish_time, data)
+                self.writer.write(spec, log_time, publish_time, data)
             except queue.Empty:
                 pass
             if time.monotonic() >= due:

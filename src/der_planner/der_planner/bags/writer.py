@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -95,7 +96,7 @@ class BagWriter:
         self._split_time = round(split_seconds * 1e9)
         self._minimum_free = minimum_free
         self._topics: dict[str, TopicSpec] = {}
-        self._counts: dict[str, int] = {}
+        self._counts: Counter[str] = Counter()
         self._latched: dict[str, tuple[int, bytes]] = {}
         self._files: list[FileSummary] = []
         self._small: list[tuple[TopicSpec, int, int, bytes]] = []
@@ -120,24 +121,18 @@ class BagWriter:
     @property
     def message_count(self) -> int:
         """Messages written, repeated latched ones included."""
-        return sum(self._counts.values())
+        return self._counts.total()
 
     @property
     def file_count(self) -> int:
         """Number of files of the bag."""
         return len(self._files)
 
-    def add_topic(self, spec: TopicSpec) -> None:
-        """Announce a topic; a second announcement of the same name changes nothing."""
-        if spec.name not in self._topics:
-            self._topics[spec.name] = spec
-            self._counts[spec.name] = 0
-
-    def write(self, topic: str, log_time: int, publish_time: int, data: bytes) -> None:
+    def write(self, spec: TopicSpec, log_time: int, publish_time: int, data: bytes) -> None:
         """Append one message.
 
         Args:
-            topic: added before.
+            spec: its topic; of topics of one name the first counts.
             log_time: when it arrived [ns].
             publish_time: when it was sent [ns].
             data: serialized CDR with its four-byte header.
@@ -145,9 +140,9 @@ class BagWriter:
         Raises:
             BagWriteError: the storage refused; the bag stays as it is, without an index.
         """
-        spec = self._topics[topic]
+        spec = self._topics.setdefault(spec.name, spec)
         if spec.latched:
-            self._latched[topic] = (publish_time, data)
+            self._latched[spec.name] = (publish_time, data)
         if self._is_full(log_time):
             self._split(log_time)
             if spec.latched:

@@ -115,8 +115,7 @@ class Recorder(Node):
         declare(
             "exclude",
             ".*/image_annotated|.*/_.*",
-            "regular expression of full topic names to leave out, such as ROS's hidden ones; "
-            "empty: none",
+            "regular expression of full topic names to leave out; empty: none",
         )
         declare(
             "compression",
@@ -128,12 +127,7 @@ class Recorder(Node):
         declare("split_duration", 0.0, "begin a new file after so many s; 0: never", at_least=0.0)
         declare("flush_interval", 1.0, "time between flushes [s]", at_least=0.05, at_most=60.0)
         declare("queue_size", 256 << 20, "bytes that may wait for the disk", at_least=1 << 20)
-        declare(
-            "minimum_free",
-            64 << 20,
-            "stop below so many free bytes on the disk; 0: never",
-            at_least=0,
-        )
+        declare("minimum_free", 64 << 20, "stop below so many free bytes; 0: never", at_least=0)
         self._wanted = self._pattern("topics")
         self._unwanted = self._pattern("exclude")
 

@@ -80,8 +80,6 @@ class ErrorSeries:
 
     time: Array
     error: Array
-    measured: Array
-    reference: Array
 
     @property
     def distance(self) -> Array:
@@ -104,9 +102,8 @@ def error_series(run: RunSeries, settings: EvaluationSettings | None = None) -> 
         raise EvaluationError(
             f"{run.description.title}: no valid limb state between the first and the last setpoint"
         )
-    reference = interpolate(run.reference, time[inside])
-    measured = run.tip.value[inside]
-    return ErrorSeries(time[inside], measured - reference, measured, reference)
+    asked = interpolate(run.reference, time[inside])
+    return ErrorSeries(time[inside], run.tip.value[inside] - asked)
 
 
 def window(run: RunSeries, settings: EvaluationSettings) -> tuple[float, float]:
