@@ -57,6 +57,7 @@ _PATIENCE = 3
 """Runs that bring nothing before learning stops."""
 _NOTHING = 0.05
 """Share of the error that a run must take away to have brought something."""
+_UNSEEN = np.full(1, np.nan)
 _FIRST = "the first run"
 _ADAPTED = (
     ", far from what the limb file expects: gains and rest angles of the model were taken from it; "
@@ -161,30 +162,19 @@ class Learner:
             LearningError: the arrays do not fit together or to the plan.
         """
         measured = Measured.build(time, tip, covariance)
-        played, mean, largest, astray = self._played(measured, commands)
+        played, missed, astray = self._played(measured, commands)
         seen = float(played.shown.seen.mean())
         beyond = None
         if chambers is not None:
             beyond = chambers_beyond(played.expected.pressure, self._plan.time, *chambers)
-        accepted, said = False, _refusal(seen, astray)
-        if said:
-            said = f"refused: {said}"
-        else:
-            accepted, said = self._accept(played)
+        refusal = _refusal(seen, astray)
+        accepted, said = (False, refusal) if refusal else self._accept(played)
         if accepted and beyond is not None:
             self._beyond = beyond
-        self.history.append(
-            LearningRun(
-                len(self.history) + 1,
-                mean,
-                largest,
-                seen,
-                accepted,
-                self._step,
-                self.repeatability,
-                said,
-            )
-        )
+        number, mean, largest = len(self.history) + 1, float(missed.mean()), float(missed.max())
+        repeats = self.repeatability
+        run = LearningRun(number, mean, largest, seen, accepted, self._step, repeats, said)
+        self.history.append(run)
 
     def next(self) -> Plan:
         """Return the plan to play next; the best one so far if nothing new was learned.
@@ -214,8 +204,12 @@ class Learner:
 
     def _played(
         self, measured: Measured, commands: ArrayLike | None
-    ) -> tuple[PlayedRun, float, float, str]:
-        """Return a run, its mean and largest error [m], and why its limb does not move, if so."""
+    ) -> tuple[PlayedRun, Array, str]:
+        """Return a run, its distances from r̄ where it was seen [m], and why its limb does not move.
+
+        Distances of a run that was never seen are one NaN; the reason is empty for a limb that
+        moves.
+        """
         plan = self._plan
         given = plan.differential_pressure
         if commands is not None:
@@ -240,11 +234,8 @@ class Learner:
         wanted = np.column_stack(
             [np.interp(measured.time[inside], plan.time, axis) for axis in plan.tip_reference.T]
         )
-        distance = np.linalg.norm(measured.tip[inside] - wanted, axis=1)
-        played = PlayedRun(given, expected, shown)
-        if not len(distance):
-            return played, float("nan"), float("nan"), astray
-        return played, float(distance.mean()), float(distance.max()), astray
+        missed = np.linalg.norm(measured.tip[inside] - wanted, axis=1)
+        return PlayedRun(given, expected, shown), missed if len(missed) else _UNSEEN, astray
 
     def _accept(self, run: PlayedRun) -> tuple[bool, str]:
         """Use a run; return whether it was used, and what was done and why."""
@@ -363,17 +354,16 @@ def _refusal(seen: float, astray: str) -> str:
         seen: share of the setpoints at which the tip was seen following.
         astray: why the limb is not said to move with its commands, if it does not.
     """
-    said = []
+    said = [astray] if astray else []
     if seen < _LEAST_SEEN:
-        said.append(
+        said.insert(
+            0,
             f"the tip was seen following its reference at {seen:.0%} of the setpoints, "
-            f"{_LEAST_SEEN:.0%} are needed"
+            f"{_LEAST_SEEN:.0%} are needed",
         )
-    if astray:
-        said.append(astray)
     if not said:
         return ""
     return (
-        "; ".join(said)
-        + ": see to the tags and to the air, is it the limb of the plan?, and play it again"
+        f"refused: {'; '.join(said)}: see to the tags and to the air, is it the limb of the plan?, "
+        "and play it again"
     )

@@ -41,33 +41,16 @@ _DEVIATIONS = np.geomspace(3e-6, 3e-2, 81)
 
 
 @dataclass(frozen=True)
-class Pair:
-    """Two runs compared.
-
-    Attributes:
-        difference: mean square of the difference of their disturbances, a coordinate [m²].
-        noise: share of it that the camera's noise explains [m²].
-        movement: Δ², a coordinate [m²].
-    """
-
-    difference: float
-    noise: float
-    movement: float
-
-
-@dataclass(frozen=True)
 class Repeatability:
     """How well a limb repeats.
 
     Attributes:
         deviation: √N, of a tip's coordinate from run to run [m]; 0 before two runs were compared.
         share: ε.
-        pairs: number of pairs that were compared.
     """
 
     deviation: float = 0.0
     share: float = _PRIOR_SHARE
-    pairs: int = 0
 
     @property
     def distance(self) -> float:
@@ -79,8 +62,13 @@ class Repeatability:
         return self.deviation**2 + (self.share**2) * movement
 
 
-def estimate(pairs: list[Pair]) -> Repeatability:
-    """Return N and ε of the largest likelihood; see the module."""
+def estimate(pairs: list[tuple[float, float, float]]) -> Repeatability:
+    """Return N and ε of the largest likelihood; see the module.
+
+    Args:
+        pairs: of two runs each, the mean square of the difference of their disturbances, the part
+            of it that the camera's noise explains, and Δ², a coordinate [m²].
+    """
     if not pairs:
         return Repeatability()
     least = _DEVIATIONS[0] ** 2
@@ -89,12 +77,12 @@ def estimate(pairs: list[Pair]) -> Repeatability:
     # Each run takes part in many pairs, which together tell no more than as many runs do.
     runs = 0.5 + np.sqrt(0.25 + 2 * len(pairs))
     weight = (runs - 1) / len(pairs)
-    for pair in pairs:
-        expected = 2 * deviation**2 + share**2 * pair.movement + pair.noise + least
-        ratio = (pair.difference + least) / expected
+    for difference, noise, movement in pairs:
+        expected = 2 * deviation**2 + share**2 * movement + noise + least
+        ratio = (difference + least) / expected
         likelihood += weight * 0.5 * _DEGREES * (np.log(ratio) - ratio)
     best = np.unravel_index(int(np.argmax(likelihood)), likelihood.shape)
-    return Repeatability(float(deviation[best]), float(share[best]), len(pairs))
+    return Repeatability(float(deviation[best]), float(share[best]))
 
 
 # The runs themselves ---------------------------------------------------------------------------
@@ -212,7 +200,8 @@ class Runs:
         change = one.expected.pressure - other.expected.pressure
         return float((change**2).sum(axis=1).mean()) / 2 * self._tip_per_pressure**2
 
-    def _pairs(self) -> list[Pair]:
+    def _pairs(self) -> list[tuple[float, float, float]]:
+        """Return what `estimate` compares of every two runs."""
         result = []
         for place, one in enumerate(self._all):
             for other in self._all[:place]:
@@ -220,7 +209,7 @@ class Runs:
                 if both.any():
                     apart = one.shown.value[both] - other.shown.value[both]
                     noise = one.shown.variance[both].mean() + other.shown.variance[both].mean()
-                    result.append(Pair(_rms(apart) ** 2, float(noise), self._movement(one, other)))
+                    result.append((_rms(apart) ** 2, float(noise), self._movement(one, other)))
         return result
 
 

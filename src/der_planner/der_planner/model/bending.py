@@ -151,10 +151,7 @@ class PolylineKinematics:
 
     def configuration(self, bend_angles: ArrayLike) -> Array:
         """Return q (..., 4N-1) of the evenly bent rod for bend angles (..., M) [rad]."""
-        nodes = self.nodes(bend_angles)
-        q = np.zeros((*nodes.shape[:-2], 4 * nodes.shape[-2] - 1))
-        q[..., 0::4], q[..., 1::4] = nodes[..., 0], nodes[..., 1]
-        return q
+        return coordinates(self.nodes(bend_angles))
 
     def _placed(self, edges: NDArray[np.complex128]) -> Array:
         """Return the nodes (..., N, 2) [m] of edges (..., N-1) from the base on."""
@@ -187,6 +184,13 @@ class PolylineKinematics:
             _points(1j * spin * edges),
             _points((1j * twirl - spin**2) * edges),
         )
+
+
+def coordinates(nodes: Array) -> Array:
+    """Return (..., 4N-1) of a rod whose nodes (..., N, 2) move in the plane without twist."""
+    q = np.zeros((*nodes.shape[:-2], 4 * nodes.shape[-2] - 1))
+    q[..., 0::4], q[..., 1::4] = nodes[..., 0], nodes[..., 1]
+    return q
 
 
 def _points(edges: NDArray[np.complex128]) -> Array:

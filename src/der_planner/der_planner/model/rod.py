@@ -26,7 +26,13 @@ from numpy.typing import ArrayLike
 
 from der_planner.arrays import Array
 from der_planner.limb import Limb
-from der_planner.model.bending import PolylineKinematics, bend_angles, bend_change, bend_outputs
+from der_planner.model.bending import (
+    PolylineKinematics,
+    bend_angles,
+    bend_change,
+    bend_outputs,
+    coordinates,
+)
 from der_planner.model.model import NODES, Model, Outputs, Rollout, State
 from der_planner.rod import ConvergenceError, Rod, RodState
 from der_planner.rod.trajectory import Linearisation
@@ -106,11 +112,7 @@ class RodModel(Model):
     def state(self, angles: ArrayLike, rates: ArrayLike) -> RodState:
         """Return the rod evenly bent, at bend angles and rates (M,) [rad], [rad/s]."""
         position, velocity, _ = self.kinematics.motion(angles, rates, np.zeros(np.shape(rates)))
-        q = self.rod.straight_state().q
-        v = np.zeros_like(q)
-        for axis in range(2):
-            q[axis::4], v[axis::4] = position[:, axis], velocity[:, axis]
-        return self.rod.state(q, v, like=self.rest)
+        return self.rod.state(coordinates(position), coordinates(velocity), like=self.rest)
 
     def run(
         self, start: State, effective: Array, period: float, linearise: Outputs = ""

@@ -26,7 +26,7 @@ from scipy.interpolate import BSpline, make_interp_spline
 
 from der_planner.arrays import Array
 from der_planner.model import ArcModel, Initial, Model, RodModel, State
-from der_planner.model.bending import inverse_kinematics
+from der_planner.model.bending import coordinates, inverse_kinematics
 from der_planner.model.rod import PoseFinder, Poses
 from der_planner.planning.loads import (
     BucklingError,
@@ -178,15 +178,12 @@ class RodConfiguration(Configuration):
     def pressures(self, method: str, time: Array) -> Array:
         """Return effective pressures (K, M) [Pa], see `Configuration.pressures`."""
         q, v, a = sample_spline(self.bend, time)
-        balance, nodes = self.model.balance, self.model.rod.nodes
+        balance = self.model.balance
         if method != "paper":
             return balance.projected(q, v, a)
         # (B Λ)† (M q̄̈ + D q̄̇ − F_int − F_ext)
         placed, moving, _ = self.model.kinematics.motion(q, v, a)
-        columns = np.array([4 * node + axis for node in range(nodes) for axis in (0, 1)])
-        position, velocity = (np.zeros((len(q), 4 * nodes - 1)) for _ in range(2))
-        position[:, columns] = placed.reshape(len(q), -1)
-        velocity[:, columns] = moving.reshape(len(q), -1)
+        position, velocity = coordinates(placed), coordinates(moving)
         inverse, pressures = balance.inverse_inputs(q), balance.paper(q, v, a)
         return self._beside_the_model(pressures, inverse, position, velocity, time)
 

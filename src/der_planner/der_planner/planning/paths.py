@@ -57,15 +57,6 @@ class TipPath:
         points = checked_points(tip)
         if time is None:
             return time_path(points, limits or PathLimits())
-        return cls.timed(time, points)
-
-    @classmethod
-    def timed(cls, time: ArrayLike, points: Array) -> TipPath:
-        """Check the times of checked points (P, 2) [m].
-
-        Raises:
-            PlanningError: what was expected and what came.
-        """
         instants = np.asarray(time, dtype=float)
         if instants.shape != (len(points),):
             raise PlanningError(
