@@ -402,20 +402,6 @@ def test_ports_that_do_not_open_are_named_with_the_remedy(rig, tmp_path):
         PortProcess(Settings(port=missing), lambda: None).start()
 
 
-def test_a_pty_of_the_system_is_a_port():
-    """Without an emulator: raw bytes at the other end of a pseudo-terminal."""
-    master, slave = os.openpty()
-    try:
-        device = open_port(os.ttyname(slave), 115_200)
-        device.write(b"<1013.00>\n")
-        assert select.select([master], [], [], 60.0)[0]
-        assert os.read(master, 100) == b"<1013.00>\n"
-        device.close()
-    finally:
-        os.close(master)
-        os.close(slave)
-
-
 def test_a_port_is_kept_by_its_stable_name(tmp_path, monkeypatch):
     (tmp_path / "by-id").mkdir()
     device, other = tmp_path / "ttyACM0", tmp_path / "ttyACM1"

@@ -221,7 +221,7 @@ class BoardProcess:
             self._send("alive")
         silent = isinstance(self._channel, Channel) and now - self._heard_at > NODE_PATIENCE
         if silent:
-            self.core.drop_setpoints()
+            self.core.machine.schedule.clear()
             if not self._node_is_silent:
                 self._log(f"the node said nothing for {NODE_PATIENCE:g} s", True)
         self._node_is_silent = silent

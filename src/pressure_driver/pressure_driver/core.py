@@ -189,10 +189,6 @@ class DriverCore:
         """
         return self.machine.offer(setpoint, wall, self.clock(), origin)
 
-    def drop_setpoints(self) -> None:
-        """Forget those that wait: the stream counts as ended."""
-        self.machine.schedule.clear()
-
     def obstacles(self) -> list[str]:
         """Return what forbids arming now."""
         return self.machine.obstacles(self.clock())

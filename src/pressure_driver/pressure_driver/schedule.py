@@ -74,7 +74,8 @@ class SetpointSchedule:
         self.reason = ""
         """Why the last setpoint that was not accepted was not."""
         self._waiting: list[Setpoint] = []
-        self._current: Setpoint | None = None
+        self.current: Setpoint | None = None
+        """The setpoint in force."""
         self._last_tick = -(2**62)
         self._replaced: deque[str] = deque(maxlen=REMEMBERED_PLANS)
 
@@ -83,15 +84,10 @@ class SetpointSchedule:
         """How many setpoints have not come into force yet."""
         return len(self._waiting)
 
-    @property
-    def current(self) -> Setpoint | None:
-        """The setpoint in force."""
-        return self._current
-
     def clear(self) -> None:
         """Forget everything that waits and what is in force."""
         self._waiting.clear()
-        self._current = None
+        self.current = None
         self._replaced.clear()
 
     def offer(self, setpoint: Setpoint, now: int, held: Sequence[float]) -> Verdict:
@@ -153,7 +149,7 @@ class SetpointSchedule:
         waiting = self._waiting
         place = bisect.bisect_left(waiting, setpoint.stamp, key=lambda item: item.stamp)
         same_stamp = place < len(waiting) and waiting[place].stamp == setpoint.stamp
-        newest = waiting[-1] if waiting else self._current
+        newest = waiting[-1] if waiting else self.current
         replaces = newest is not None and newest.plan_id != setpoint.plan_id
         revises = False
         if same_stamp and not replaces and not untimed:
@@ -185,8 +181,8 @@ class SetpointSchedule:
     def _slew_problem(self, before: Setpoint | None, after: Setpoint, held: Sequence[float]) -> str:
         if before is None:
             reference, gap = held, self.period
-            if self._current is not None:
-                gap = min(after.stamp - self._current.stamp, 2 * self.period)
+            if self.current is not None:
+                gap = min(after.stamp - self.current.stamp, 2 * self.period)
         else:
             reference, gap = before.differential, after.stamp - before.stamp
         slew = max(abs(a - b) for a, b in zip(after.differential, reference, strict=True))
@@ -214,11 +210,11 @@ class SetpointSchedule:
         self._last_tick = max(self._last_tick, tick)
         due = bisect.bisect_right(self._waiting, tick, key=lambda item: item.stamp)
         if due:
-            self._current = self._waiting[due - 1]
+            self.current = self._waiting[due - 1]
             del self._waiting[:due]
             self.counts["executed"] += 1
             self.counts["superseded"] += due - 1
-        current = self._current
+        current = self.current
         if current is None:
             return None
         if self.settings.interpolation == "hold" or not self._waiting:

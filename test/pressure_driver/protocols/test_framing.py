@@ -1,5 +1,6 @@
 """Frames of the native protocol: damage is found, splits and garbage do no harm."""
 
+import crcmod.predefined
 import pytest
 
 from pressure_driver.protocols.native import (
@@ -13,8 +14,12 @@ from pressure_driver.protocols.native import (
 )
 
 
-def test_the_checksum_is_the_one_of_the_page():
+def test_the_checksum_is_that_of_an_independent_implementation():
+    independent = crcmod.predefined.mkCrcFun("crc-ccitt-false")
     assert crc16(b"123456789") == 0x29B1
+    for length in (0, 1, 255, 256, 600):
+        data = bytes(place * 7 % 256 for place in range(length))
+        assert crc16(data) == independent(data)
 
 
 def test_every_single_bit_error_is_found():

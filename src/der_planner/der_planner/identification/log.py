@@ -191,13 +191,13 @@ def prepare(
                 "needs the board's telemetry"
             )
     pressure, bend = bridge(grid.measured_differential), bridge(grid.bend_angles)
+    swinging = _still_swinging(grid.time, pressure, bend, limb)
     if to_fit:
         _check_units(pressure, limb)
         _check_tips(grid, limb)
         _check_commands(grid)
-        _check_excitation(pressure[valid])
+        _check_excitation(pressure[valid & ~swinging])
         _check_match(pressure, bend, warnings)
-    swinging = _still_swinging(grid.time, pressure, bend, limb)
     if swinging.any():
         unseen = swinging[:, None]
         grid = replace(

@@ -326,8 +326,7 @@ class Limb:
 
     def to_yaml(self, path: str | Path) -> None:
         """Write a limb file that `from_yaml` reads back as an equal limb, whole or not at all."""
-        body = self.to_mapping()
-        text = yaml.safe_dump(body, sort_keys=False, allow_unicode=True)
+        text = yaml.safe_dump(self.to_mapping(), sort_keys=False, allow_unicode=True)
         head = "# A limb, in SI units. How to choose each: src/der_planner/doc/limb_parameters.md\n"
         file = Path(path)
         unfinished = file.with_name(f".{file.name}.part")

@@ -122,11 +122,8 @@ class Outcome(NamedTuple):
 def _write_whole(path: Path, data: bytes) -> None:
     """Write a file whole or not at all."""
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        unfinished.write_bytes(data)
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    unfinished.write_bytes(data)
+    os.replace(unfinished, path)
 
 
 class Store:

@@ -52,7 +52,8 @@ class LineTap:
     """
 
     def __init__(self, device: str) -> None:
-        self._descriptor = -1
+        self.descriptor = -1
+        """Becomes readable with a write; −1 where there is none."""
         library = ctypes.CDLL(None, use_errno=True)
         descriptor = library.inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC)
         if descriptor < 0:
@@ -60,26 +61,21 @@ class LineTap:
         if library.inotify_add_watch(descriptor, os.fsencode(device), _IN_MODIFY) < 0:
             os.close(descriptor)
             return
-        self._descriptor = descriptor
-
-    @property
-    def descriptor(self) -> int:
-        """File descriptor that becomes readable with a write; −1 where there is none."""
-        return self._descriptor
+        self.descriptor = descriptor
 
     def take(self) -> bool:
         """Return whether there has been a write since the last call."""
-        if self._descriptor < 0:
+        if self.descriptor < 0:
             return False
         with contextlib.suppress(BlockingIOError):
-            return bool(os.read(self._descriptor, 4096))
+            return bool(os.read(self.descriptor, 4096))
         return False
 
     def close(self) -> None:
         """Stop watching."""
-        if self._descriptor >= 0:
-            os.close(self._descriptor)
-            self._descriptor = -1
+        if self.descriptor >= 0:
+            os.close(self.descriptor)
+            self.descriptor = -1
 
 
 class EmulatedPort:

@@ -1,9 +1,9 @@
-"""Tables of any lab, through a map of columns."""
+"""Tables of any lab: runs through a map of columns, and pressures that are to be played."""
 
 import numpy as np
 import pytest
 
-from der_planner.identification import ColumnMap, LogError, read_csv
+from der_planner.identification import ColumnMap, LogError, read_csv, read_excitation
 
 COLUMNS = {
     "time": "t",
@@ -174,3 +174,17 @@ def test_each_log_finds_its_own_rest_even_if_it_is_not_exactly_zero(tmp_path, re
     wrong = ColumnMap("t", ("u",), ("a", "b"), ("u",), rest_until="soon")
     with pytest.raises(LogError, match="rest_until is 'soon'"):
         read_csv(tmp_path / "first.csv", wrong)
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        ("time_s,a,b\n0,0,0\n0.1,0,0\n", "must be 0, 0.05, 0.1"),
+        ("time_s,a\n0,0\n0.05,0\n", "expected time_s and 2 pressures"),
+    ],
+)
+def test_a_table_of_another_grid_or_limb_is_refused(tmp_path, rows, said):
+    path = tmp_path / "excitation.csv"
+    path.write_text(rows)
+    with pytest.raises(ValueError, match=said):
+        read_excitation(path, 2)
