@@ -160,6 +160,7 @@ def test_mounting_without_fixed_tags_names_the_cause(tags, model):
         calibrate_mounting(blank, tags, model.intrinsics)
 
 
+@pytest.mark.slow
 def test_the_script_calibrates_a_folder_of_pictures(tmp_path):
     for k, image in enumerate(board_pictures(12)):
         cv2.imwrite(str(tmp_path / f"{k:02d}.png"), image)

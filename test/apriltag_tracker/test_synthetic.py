@@ -55,6 +55,7 @@ def test_noise_has_its_size_everywhere(model, tags):
     assert np.median(spread[y - 8 : y + 8, x - 8 : x + 8]) == pytest.approx(4.0, rel=0.15)
 
 
+@pytest.mark.slow
 def test_motion_blur_is_the_mean_of_sharp_pictures(model, tags):
     shape = constant_curvature(tags.segment_lengths, [0.3, 0.3])
     still = np.zeros_like(shape.heading)

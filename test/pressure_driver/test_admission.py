@@ -173,6 +173,7 @@ def test_interpolation_goes_on_from_what_is_commanded_and_not_from_the_last_setp
     assert commanded[-1] == 0.0
 
 
+@pytest.mark.slow
 def test_random_setpoints_never_step_the_output(simulate):
     generator = np.random.default_rng(5)
     for interpolation in ("hold", "linear"):

@@ -174,6 +174,7 @@ def test_a_report_of_the_board_is_a_fault(simulate):
     assert sim.is_vent(sim.sent[-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("protocol", NAMES)
 def test_no_false_alarm_on_full_steps_and_fast_swings(simulate, protocol, seed):

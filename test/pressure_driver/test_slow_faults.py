@@ -112,6 +112,7 @@ def test_a_steady_command_to_a_sound_board_is_never_changed(simulate):
     assert np.abs(pairs[:, :, 0] - pairs[:, :, 1] - steady(0)).max() < 10.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("protocol", NAMES)
 @pytest.mark.parametrize(("seed", "period"), [(5, 3.0), (6, 20.0)])
 def test_no_motion_of_a_sound_limb_is_taken_for_a_leak(noisy, protocol, seed, period):

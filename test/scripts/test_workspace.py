@@ -78,6 +78,7 @@ def test_a_package_that_is_gone_is_built_again(tmp_path: Path, monkeypatch: pyte
     assert len(building.build_jobs()) == 1
 
 
+@pytest.mark.slow
 def test_jobs_run_beside_each_other_and_a_failed_one_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

@@ -54,6 +54,7 @@ def test_corners_and_their_covariance_are_honest(scene, limit):
     check(scene, limit, seeds=(40, 41))
 
 
+@pytest.mark.slow
 @EACH
 def test_tags_of_every_family_are_found(each):
     # Of the same paper the outer ring takes a part.

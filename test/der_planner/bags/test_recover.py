@@ -77,6 +77,7 @@ def numbers(path: Path) -> list[int]:
     return [int(text.split()[0]) for text in read_texts(path)]
 
 
+@pytest.mark.slow
 def test_every_cut_keeps_all_whole_chunks(tmp_path: Path):
     ends = write_chunks(tmp_path / "run", 4)
     whole = (tmp_path / "run" / "run_0.mcap").read_bytes()
@@ -94,6 +95,7 @@ def test_every_cut_keeps_all_whole_chunks(tmp_path: Path):
         shutil.rmtree(found.folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fill", [b"\0", b"\xff", None], ids=["zeros", "ones", "noise"])
 @pytest.mark.parametrize("finished", [True, False])
 def test_a_hole_takes_the_chunks_that_it_touches_and_no_other(

@@ -81,6 +81,7 @@ def test_bytes_behind_the_content_are_no_damage_but_missing_ones_are(tmp_path: P
             next(messages)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["size", "time"])
 def test_split_repeats_latched_messages(tmp_path: Path, how: str):
     options = {"split_bytes": 20_000} if how == "size" else {"split_seconds": 2.0}
@@ -150,6 +151,7 @@ FULL_DISK = """
 """
 
 
+@pytest.mark.slow
 def test_a_file_that_cannot_grow_is_reported_and_readable(tmp_path: Path):
     """The kernel's file size limit refuses a write in its middle, as a full disk does."""
     folder = tmp_path / "run"

@@ -68,6 +68,7 @@ def test_mistakes_are_said_before_any_work_is_done(call, module, arguments, code
     assert words in said
 
 
+@pytest.mark.slow
 def test_a_missing_parameter_file_is_named_by_the_node():
     node = str(find_executable("der_planner", "planner"))
     ended = subprocess.run(

@@ -54,6 +54,7 @@ def test_after_a_long_time_the_model_counts_again(nominal):
     assert np.isfinite(log.during(steps)).all()
 
 
+@pytest.mark.slow
 def test_what_a_learned_plan_knows_of_its_chambers_is_not_corrected_again():
     motion = Motion.named("same_direction", amplitude=0.5, period=8.0, cycles=1)
     planned = replace(plan(Limb.default(), motion, method="projected"), method="learned")

@@ -22,6 +22,7 @@ except KeyboardInterrupt as error:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", END_SIGNALS, ids=lambda number: number.name)
 def test_a_second_signal_does_not_cut_the_end_short(number: signal.Signals):
     process = subprocess.Popen(

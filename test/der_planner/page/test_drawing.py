@@ -73,6 +73,7 @@ def test_what_is_no_drawing_is_refused(sent: object) -> None:
         drawn_pixels(sent)
 
 
+@pytest.mark.slow
 def test_a_preview_is_planned_in_another_process() -> None:
     previewer = Previewer(LIMB, PathLimits(), Load())
     turn = np.linspace(0, 2 * np.pi, 40)

@@ -94,6 +94,7 @@ def test_live_data_come_ten_times_a_second_and_tell_their_age(client: TestClient
     assert not answer["sources"]["driver"]["fresh"]
 
 
+@pytest.mark.slow
 def test_a_request_waits_for_the_next_picture(client: TestClient, parts: Parts) -> None:
     with client:
         assert client.get("/picture").status_code == 204

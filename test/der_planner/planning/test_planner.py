@@ -204,6 +204,7 @@ def test_a_plan_takes_over_from_a_moving_limb(model_name, method):
     assert after.largest_error < 4e-3
 
 
+@pytest.mark.slow
 def test_three_segments_with_gravity():
     segment = LIMB.segments[0]
     limb = dataclasses.replace(LIMB, segments=(segment,) * 3, gravity=(0.3, -0.2, 0.0))

@@ -1,6 +1,7 @@
 """Figures are drawn from what was measured, and the same data gives the same file."""
 
 import numpy as np
+import pytest
 from runs import FRAMES, reference, series
 
 from der_planner.results import plot_error, plot_tip
@@ -21,6 +22,7 @@ def test_mean_error_over_trials_ignores_gaps():
     assert np.all(deviation[alone] == 0)
 
 
+@pytest.mark.slow
 def test_figures_are_written_and_repeatable(tmp_path):
     runs = [
         series(reference(FRAMES) + np.array([0.0, error]), model=model)

@@ -90,6 +90,7 @@ class Links(HTMLParser):
         self.text.append(data)
 
 
+@pytest.mark.slow
 def test_report_is_one_page_with_everything_in_it(bag: Path, tmp_path: Path):
     run = load_run(bag)
     other = series(reference(FRAMES) + np.array([0.0, 0.01]), model="pcc", trial=1, seed=1)

@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 from der_planner.limb import Limb
 from der_planner.rod import Rod
 from der_planner.rod.compile import drop_stale_caches
@@ -20,6 +22,7 @@ print(sum(sum(kernel.stats.cache_hits.values()) for kernel in kernels))
 """
 
 
+@pytest.mark.slow
 def test_a_second_process_compiles_nothing():
     for plane in ("xy", None):
         Rod.from_limb(Limb.default(), plane=plane).warm_up()

@@ -32,6 +32,7 @@ def test_the_cantilever_converges_to_the_elastica():
     assert np.log2(first_order[0] / first_order[1]) == pytest.approx(1.0, abs=0.15)
 
 
+@pytest.mark.slow
 def test_the_frequencies_converge_to_the_beams():
     vibration = example("vibration")
     beam = vibration.beam_frequencies(3)

@@ -75,6 +75,7 @@ def test_first_frequency_is_a_cantilevers():
     assert slowest < frequency < slowest * (0.244 / flexible) ** 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mounting", ["horizontal", "hanging", "standing", "sideways"])
 @pytest.mark.parametrize("payload", [0.0, 0.05])
 def test_stable_for_every_admissible_pressure_mounting_and_payload(mounting, payload):
@@ -103,6 +104,7 @@ def test_shape_is_interpolated_along_the_material():
     assert len(nodes.points) == len(nodes.arc_length) == len(nodes.heading)
 
 
+@pytest.mark.slow
 def test_friction_leaves_a_loop_that_an_elastic_limb_has_not():
     def loop(twin: LimbTwin) -> float:
         at_zero, last = [], 0.0
