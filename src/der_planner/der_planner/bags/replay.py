@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from der_planner.bags.reader import BagError, BagReader, RawMessage, RecordedTopic
+from der_planner.bags.record import NANOSECONDS
 
-NANOSECONDS = 1_000_000_000
 CLOCK_PERIOD = NANOSECONDS // 100
 """Recorded time between two messages on ``/clock`` [ns] while nothing else is due."""
 

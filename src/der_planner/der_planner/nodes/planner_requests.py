@@ -97,7 +97,8 @@ def read_parameters(node: Node) -> PlannerOptions:
         ),
         auto_start=read("auto_start", True, "play a plan as soon as it is ready"),
         branch=read(
-            "branch", "", "side of the fold for paths and shapes; empty: the least pressure",
+            "branch", "", "side of the fold for shapes and for paths that are not nearest ones; "
+            "empty: the least pressure",
             choices=("", *BRANCHES)
         ),
         limits=PathLimits(

@@ -16,13 +16,12 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from der_msgs.msg import LimbEstimate, LimbState, PressurePlan, PressureState
 from der_planner.limb import mounting_of
-from limb_interfaces.stamps import nanoseconds
+from limb_interfaces.stamps import NANOSECONDS, nanoseconds
 
 PASCAL_PER_KILOPASCAL = 1000.0
 CENTIMETRES = 100.0
 GRAMS = 1000.0
 PERCENT = 100.0
-NANOSECONDS = 1_000_000_000
 FRESH = {"driver": 0.5, "tracker": 0.5, "camera": 0.7, "estimate": 0.5}
 """The newest message of a source may be this old [s] before the page greys it."""
 LATE = 1.6

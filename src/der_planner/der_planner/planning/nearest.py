@@ -43,10 +43,15 @@ _PLACE = 1e-6
 _STILL = 15
 """Instants of rest before and after a path that begins and ends at rest, 20 ms each."""
 _SAMPLE = 0.05
+"""Time between two instants at which the nearest path is searched for [s]."""
 _MOST_SAMPLES = 20_000
+"""Largest number of these instants."""
 _MOST_AVERAGED = 50
+"""Largest number of drawn points whose mean stands for one instant."""
 _WAYPOINTS = 200
+"""Largest number of points that the coarse search passes."""
 _STATES = 2500
+"""Poses of the limb among which the coarse search chooses at each point."""
 _TRAVEL = 1e-5
 """Weight of (rad/s)² against m² in the coarse search: it keeps the course from jumping."""
 _PRESSURE = 1e-4
@@ -56,6 +61,7 @@ _WEAKEST = 0.08
 _EXCESS = 1.0
 """Weight of what is beyond a limit, relative to it [m]."""
 _ITERATIONS = 60
+"""Largest number of steps of the fine search."""
 
 
 @dataclass(frozen=True)
