@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import signal
@@ -236,6 +237,7 @@ class Talker:
         self.heard: list[str] = []
         self.cancelled = False
         self.released = threading.Event()
+        self._playing = threading.Lock()
         self._kind = PlayMotion
         self._context = Context()
         rclpy.init(context=self._context, domain_id=DOMAIN)
@@ -267,21 +269,27 @@ class Talker:
         return response
 
     def _play(self, goal):
+        """Carry out a goal: ``endless`` until it is cancelled, ``deaf`` until it is released."""
         motion = goal.request.command.motion
-        goal.publish_feedback(self._kind.Feedback(state="streaming", progress=0.5))
-        if motion == "endless":
-            while not goal.is_cancel_requested:
-                time.sleep(0.01)
-            self.cancelled = True
-            goal.canceled()
-        else:
-            if motion == "deaf":
-                self.released.wait(60.0)
-            goal.succeed()
+        ends = {"endless": lambda: goal.is_cancel_requested, "deaf": self.released.is_set}
+        with self._playing:
+            # More than once: the first feedback may be sent before the client's reader is known.
+            for count in itertools.count(1):
+                goal.publish_feedback(self._kind.Feedback(state="streaming", progress=0.5))
+                time.sleep(0.02)
+                if ends.get(motion, lambda count=count: count == 25)():
+                    break
+            if goal.is_cancel_requested and motion == "endless":
+                self.cancelled = True
+                goal.canceled()
+            else:
+                goal.succeed()
         return self._kind.Result(plan_id=motion, tip_error=0.25)
 
     def close(self) -> None:
-        self._executor.shutdown()
+        self.released.set()
+        with self._playing:
+            self._executor.shutdown()
         self._thread.join(5.0)
         self.node.destroy_node()
         self._context.try_shutdown()

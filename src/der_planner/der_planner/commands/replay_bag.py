@@ -24,7 +24,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
 from der_planner.bags.reader import BagError, BagReader, RawMessage, RecordedTopic
-from der_planner.bags.replay import NANOSECONDS, ReplaySettings, choose_topics, replay
+from der_planner.bags.record import NANOSECONDS
+from der_planner.bags.replay import ReplaySettings, choose_topics, replay
 from der_planner.experiment.client import GraphClient
 from der_planner.experiment.console import Progress, interrupt_once, run_command
 from der_planner.experiment.processes import GraphError

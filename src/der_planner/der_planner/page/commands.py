@@ -16,10 +16,10 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from der_msgs.msg import MotionCommand, PressureSetpoint
-from der_planner.page.situation import NANOSECONDS, Situation
+from der_planner.page.situation import Situation
 from der_planner.planning.plan_file import learned_names
 from limb_interfaces import qos, topics
-from limb_interfaces.stamps import stamp_from_nanoseconds
+from limb_interfaces.stamps import NANOSECONDS, stamp_from_nanoseconds
 
 SERVICES = {
     "vent": "pressure_driver/vent",

@@ -18,7 +18,7 @@ from apriltag_tracker.detection import Tag
 from apriltag_tracker.pose.world import WorldPose
 from apriltag_tracker.tag_map import TagMap
 from der_planner.arrays import Array
-from der_planner.page.situation import NANOSECONDS
+from limb_interfaces.stamps import NANOSECONDS
 
 Value = TypeVar("Value")
 
