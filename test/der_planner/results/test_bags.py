@@ -172,7 +172,7 @@ def two_limbs(folder: Path, **offsets) -> None:
 
 def test_two_limbs_in_one_bag_are_evaluated_apart(tmp_path: Path):
     two_limbs(tmp_path / "run", limb=0.002, lab2=0.008)
-    found = evaluate_bags([tmp_path / "run"])
+    found = list(evaluate_bags([tmp_path / "run"]))
     errors = {entry.result.namespace: entry.result.mean_error_m for entry in found}
     assert errors == {
         "/limb": pytest.approx(0.002, abs=5e-5),
