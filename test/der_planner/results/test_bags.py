@@ -11,6 +11,7 @@ from runs import FRAMES, TIMES, BagOfRun, reference
 
 from der_planner.identification import LogError, read_bag
 from der_planner.results import (
+    BagError,
     EvaluationError,
     evaluate_bag,
     evaluate_bags,
@@ -199,11 +200,11 @@ def test_a_plan_never_meets_the_state_of_another_limb(tmp_path: Path):
 
 def test_a_run_among_several_limbs_is_named(tmp_path: Path):
     two_limbs(tmp_path / "run", limb=0.002, lab2=0.008)
-    with pytest.raises(EvaluationError, match=r"several limbs, /lab2, /limb: name one"):
+    with pytest.raises(BagError, match=r"several limbs, /lab2, /limb: name one"):
         load_run(tmp_path / "run")
     assert load_run(tmp_path / "run", namespace="/lab2").description.namespace == "/lab2"
     assert load_run(tmp_path / "run", plan_id="lab2").description.namespace == "/lab2"
-    with pytest.raises(EvaluationError, match=r"no limb /lab3, only /lab2, /limb"):
+    with pytest.raises(BagError, match=r"no limb /lab3, only /lab2, /limb"):
         load_run(tmp_path / "run", namespace="/lab3")
 
 
