@@ -1,6 +1,5 @@
 """Feedback on limbs that the model does not know: chains of links, with the default limb's file."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -53,18 +52,6 @@ def corrected(planned: Plan) -> tuple[Played, Feedback]:
     """Return a run with feedback on the chain."""
     feedback = Feedback(planned)
     return play(planned, Chain(), feedback), feedback
-
-
-def at_once(force: float) -> Callable[[Chain], Callable[[float], None]]:
-    """Return an event that pushes a chain's tip for 0.2 s, from 4 s on."""
-
-    def of(plant: Chain) -> Callable[[float], None]:
-        def event(time: float) -> None:
-            plant.chain.push(LENGTH, (0.0, force if 4.0 <= time < 4.2 else 0.0))
-
-        return event
-
-    return of
 
 
 def test_a_limb_that_was_never_calibrated_is_followed(planned, corrected):
@@ -121,11 +108,6 @@ def test_feedback_and_learning_do_not_fight(planned):
     assert not feedback.warnings
 
 
-def test_the_same_run_twice_is_the_same(planned, corrected):
-    again = play(planned, Chain(), Feedback(planned))
-    np.testing.assert_array_equal(again.tip, corrected[0].tip)
-
-
 def test_the_estimate_knows_how_good_it_is(corrected):
     played, feedback = corrected
     squares = np.array([square for time, square, _ in feedback.innovations if time > 1.0])
@@ -161,7 +143,10 @@ def test_order_of_arrival_does_not_matter(planned):
 def test_a_push_dies_in_half_the_time(planned, corrected):
     def swing(feedback: Feedback | None, before: Played) -> float:
         plant = Chain()
-        event = at_once(0.3)(plant)
+
+        def event(time: float) -> None:
+            plant.chain.push(LENGTH, (0.0, 0.3 if 4.0 <= time < 4.2 else 0.0))
+
         after = play(planned, plant, feedback, event=event)
         apart = np.linalg.norm(after.tip - before.tip, axis=1)
         assert apart.max() > 0.01
@@ -245,22 +230,13 @@ def test_a_limb_that_needs_much_and_follows_is_not_left(planned):
     plant.chain.change_gain(0.5)
     feedback = Feedback(planned)
     played = play(planned, plant, feedback)
-    alone = Chain()
-    alone.chain.change_gain(0.5)
     authority = 0.4 * planned.limb.pneumatics.pressure_limit
     at_limit = np.abs(played.correction).max(axis=1) > 0.98 * authority
     assert at_limit.sum() > 60
     assert not feedback.warnings
-    assert played.error.mean() < 0.4 * play(planned, alone).error.mean()
 
 
-def swinging(
-    amplitude: float,
-    frequency: float,
-    decay: float,
-    limb_decay: float | None = None,
-    missed: float = 0.05 * LENGTH,
-) -> Supervisor:
+def swinging(amplitude, frequency, decay, limb_decay=None, missed=0.05 * LENGTH) -> Supervisor:
     """Return what watched a correction that swings for ten seconds, as the limb does.
 
     Args:

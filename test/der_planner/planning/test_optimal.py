@@ -35,8 +35,8 @@ def test_gradient_of_the_cost_against_finite_differences(fast):
     command = fast.warm + rng.normal(scale=30.0, size=fast.warm.shape)
     state = fast.model.rest
     _, misses, _ = fast._evaluate(command, state, first, last)
-    quadratic = fast._linearise(fast.drive.window(command[:last], first), state, 0.0)
-    gradient = fast._gradient(quadratic, misses, command[:last], first)
+    jacobian, _ = fast._linearise(fast.drive.window(command[:last], first), state, 0.0)
+    gradient = fast._gradient(jacobian, misses, command[:last], first)
     direction = rng.normal(size=(last - first, 2))
     ahead, behind = command.copy(), command.copy()
     ahead[first:last] += direction
