@@ -10,7 +10,6 @@ pytestmark = pytest.mark.graph
 @pytest.fixture
 def planner(graph):
     from geometry_msgs.msg import PointStamped
-    from nav_msgs.msg import Path
     from visualization_msgs.msg import MarkerArray
 
     from der_msgs.msg import MotionCommand, PressurePlan, PressureSetpoint
@@ -32,11 +31,9 @@ def planner(graph):
             )
             node = self.client.node
             self.commands = node.create_publisher(MotionCommand, topics.COMMAND, qos.COMMANDS)
-            self.paths = node.create_publisher(Path, topics.PATH, qos.COMMANDS)
             self.process = graph.start("der_planner", "planner", **parameters)
             self.client.wait_ready(["planner"])
-            for publisher in (self.commands, self.paths):
-                self.client.wait_for(publisher.get_subscription_count, 30.0, "the planner")
+            self.client.wait_for(self.commands.get_subscription_count, 30.0, "the planner")
             self.client.wait_for(
                 lambda: self.client.node.count_publishers(topics.PRESSURE_SETPOINT), 30.0, "it"
             )

@@ -51,16 +51,6 @@ def test_named_motions_follow_the_papers_formulas_after_the_fade(name, second):
     np.testing.assert_allclose(angles[:, 1], second(time), atol=1e-7)
 
 
-def test_a_tip_path_is_followed_in_its_own_time():
-    start = Motion.named("circle", amplitude=0.7, period=8.0, cycles=1).reference(SPACE)
-    middle = slice(60, 160)
-    time, tip = start.time[middle] + 5.0, start.tip[middle]
-    reference = Motion.from_tip_path(time, tip).reference(SPACE)
-    lead = np.argmin(np.linalg.norm(reference.tip - tip[0], axis=1))
-    followed = reference.tip[lead : lead + len(tip)]
-    assert np.linalg.norm(followed - tip, axis=1).max() < 2e-5
-
-
 def test_a_path_without_times_keeps_the_limits():
     turn = np.linspace(0, 2 * np.pi, 60)
     centre = Motion.named("circle").reference(SPACE).tip.mean(axis=0)
