@@ -13,6 +13,8 @@ driver: {{port: {port}, protocol: ezloop}}
 remap: {{camera/image_raw: /overhead/image, camera/camera_info: /overhead/info}}
 limb: {limb}
 """
+SEED = 3
+"""Seed of the twin that stands in for a rig."""
 
 
 @pytest.fixture
@@ -23,10 +25,10 @@ def rig(graph, tmp_path: Path) -> Path:
     hardware.
     """
     port = tmp_path / "board"
-    graph.start("pressure_driver", "board_emulator", port_link=str(port))
-    graph.start("der_planner", "limb_twin")
+    graph.start("pressure_driver", "board_emulator", port_link=str(port), seed=SEED)
+    graph.start("der_planner", "limb_twin", seed=SEED)
     overhead = {"camera/image_raw": "/overhead/image", "camera/camera_info": "/overhead/info"}
-    graph.start("apriltag_tracker", "synthetic_camera", remap=overhead)
+    graph.start("apriltag_tracker", "synthetic_camera", remap=overhead, seed=SEED)
     graph.client.wait_ready(["board_emulator", "limb_twin"])
     path = tmp_path / "rig.yaml"
     path.write_text(RIG.format(port=port, limb=DEFAULT_LIMB_FILE))

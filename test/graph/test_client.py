@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 
 import pytest
@@ -38,6 +39,30 @@ def test_a_waiting_client_notices_a_death_at_once(graph):
     board.signal(signal.SIGKILL)
     with pytest.raises(NodeError, match="killed by SIGKILL"):
         graph.client.wait_for(lambda: False, 60.0, "what never comes")
+
+
+def test_a_second_graph_that_begins_meanwhile_is_named(graph, monkeypatch):
+    from der_planner.experiment.client import GraphClient
+    from der_planner.experiment.console import Progress
+    from der_planner.experiment.graph_run import GraphPlayer
+    from der_planner.experiment.processes import GraphError, GraphSetup
+
+    with contextlib.ExitStack() as others:
+
+        class Player(GraphPlayer):
+            def _start(self, client, specs, port):
+                for _ in range(2):
+                    name = "board_emulator"
+                    others.enter_context(GraphClient(name, domain_id=graph.domain_id))
+                client.wait_for(lambda: client.count_nodes()[name] == 2, 60.0, "both boards")
+
+            def _begin(self, client):
+                raise AssertionError("it was played")
+
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(graph.domain_id))
+        player = Player(GraphSetup(graph.folder / "bag", {}), graph.folder, Progress())
+        with pytest.raises(GraphError, match=r"another graph is running .*'board_emulator'"):
+            player.play()
 
 
 def test_nodes_end_with_zero_on_both_signals(graph):

@@ -29,15 +29,14 @@ from apriltag_tracker.pipeline import (
     Uncertainty,
     warm_up,
 )
-from apriltag_tracker.reports import NO_CALIBRATION, ImageWatch, draw_observation
+from apriltag_tracker.reports import NO_CALIBRATION, ImageWatch, StampGaps, draw_observation
 from apriltag_tracker.tag_map import TagMap
+from apriltag_tracker.transforms import camera_transform, limb_transforms, transform_publisher
 from der_msgs.msg import LimbState, TagDetection, TagDetectionArray
 from limb_interfaces import qos, stamps, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.parameters import check_overrides, declare
 from limb_interfaces.runner import run_node
-from limb_interfaces.stamps import StampGaps
-from limb_interfaces.transforms import TransformPublisher, camera_transform, limb_transforms
 
 ANNOTATED_IMAGE = "camera/image_annotated"
 _MARKER_PERIOD = 0.1
@@ -157,7 +156,7 @@ class TrackerNode(Node):
         self._states = self.create_publisher(LimbState, topics.LIMB_STATE, qos.STATES)
         self._markers = self.create_publisher(MarkerArray, topics.SHAPE_MARKERS, qos.STATES)
         self._annotated = self.create_publisher(Image, ANNOTATED_IMAGE, qos.SENSOR_DATA)
-        self._transforms = TransformPublisher(self)
+        self._publish_on_tf = transform_publisher(self)
 
     def _subscribe(self, needs_info: bool) -> None:
         # A best-effort subscriber hears best-effort and reliable publishers alike.
@@ -282,7 +281,7 @@ class TrackerNode(Node):
 
     def _publish_transforms(self, observation: LimbObservation, stamp: Time) -> None:
         """Tell RViz where clamp, tip and camera are, where tf2 is installed."""
-        if not self._transforms.active or self._tracker is None:
+        if self._publish_on_tf is None or self._tracker is None:
             return
         found = []
         if observation.estimate is not None:
@@ -290,7 +289,8 @@ class TrackerNode(Node):
         pose = self._tracker.world.pose
         if pose is not None:
             found.append(camera_transform(pose.rotation, pose.translation, stamp, self._frame))
-        self._transforms.publish(found)
+        if found:
+            self._publish_on_tf(found)
 
     def _state(self, observation: LimbObservation, stamp: Time) -> LimbState:
         message = LimbState(reason=observation.reason)

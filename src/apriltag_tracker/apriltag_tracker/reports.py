@@ -1,4 +1,4 @@
-"""What the tracker says about itself: diagnostics with their remedy, and what it sees."""
+"""What the tracker says about itself: lost images, diagnostics with their remedy, what it sees."""
 
 from __future__ import annotations
 
@@ -30,6 +30,39 @@ _WORLD = (220, 160, 40)
 _CURVE = (40, 120, 255)
 _TEXT = (40, 40, 230)
 _SHIFT = 4
+
+
+class StampGaps:
+    """Counts what is missing between the stamps of a stream of nearly constant rate.
+
+    The period is the interval below which a tenth of the last `window` ones lie: so even if most
+    messages are lost, the few neighbours that both arrive tell it. A gap of k periods is k − 1
+    missed messages; one longer than ``pause`` is a source that paused, and counts none.
+
+    Args:
+        window: intervals that tell the period.
+        pause: [s].
+    """
+
+    def __init__(self, window: int = 100, pause: float = 5.0) -> None:
+        self._intervals: collections.deque[int] = collections.deque(maxlen=window)
+        self._pause = round(pause * 1e9)
+        self._newest = 0
+        self.missed = 0
+        """Messages that did not arrive between those that did."""
+
+    def take(self, stamp: int) -> None:
+        """Take the stamp [ns] of a message; zero means nothing, one that goes back begins anew."""
+        if stamp <= 0:
+            return
+        before, self._newest = self._newest, stamp
+        interval = stamp - before
+        if before == 0 or not 0 < interval <= self._pause:
+            return
+        self._intervals.append(interval)
+        if len(self._intervals) >= 2:
+            period = sorted(self._intervals)[len(self._intervals) // 10]
+            self.missed += round(interval / period) - 1
 
 
 @dataclass(frozen=True)

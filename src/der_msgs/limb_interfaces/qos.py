@@ -1,29 +1,25 @@
-"""The QoS profiles of the graph, in one place and by the role of the topic."""
+"""The QoS profiles of the graph, in one place and by the role of the topic.
+
+A profile of a depth alone keeps that many messages and is reliable.
+"""
 
 from rclpy.duration import Duration
 from rclpy.qos import (
     DurabilityPolicy,
-    HistoryPolicy,
     LivelinessPolicy,
     QoSProfile,
     ReliabilityPolicy,
     qos_profile_sensor_data,
 )
 
-COMMANDS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.RELIABLE
-)
+COMMANDS = QoSProfile(depth=10)
 """Motion commands and paths: none may be lost, and none may reach a node that starts later."""
 
-SETPOINTS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE
-)
+SETPOINTS = QoSProfile(depth=100)
 """Timed setpoints: deep enough for five seconds at 20 Hz."""
 
 SETPOINT_STREAM = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
     depth=100,
-    reliability=ReliabilityPolicy.RELIABLE,
     deadline=Duration(seconds=0.2),
     liveliness=LivelinessPolicy.AUTOMATIC,
     liveliness_lease_duration=Duration(seconds=1),
@@ -32,27 +28,16 @@ SETPOINT_STREAM = QoSProfile(
 four ticks, and a publisher that has died is known to be gone after a second. It is only offered: a
 subscriber that requested it would match no publisher of plain QoS, such as ``ros2 topic pub``."""
 
-STATES = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=20, reliability=ReliabilityPolicy.RELIABLE
-)
+STATES = QoSProfile(depth=20)
 """Measured and published states, tags and references."""
 
-TRANSFORMS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE
-)
-"""Of `/tf`, as tf2_ros has it."""
-
 LATCHED = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
     depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 """The last one is kept for those who come later: plans, calibration."""
 
-IMAGES = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT
-)
+IMAGES = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """A subscriber of images takes the newest and never queues."""
 
 SENSOR_DATA = qos_profile_sensor_data

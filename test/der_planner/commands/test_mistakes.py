@@ -56,6 +56,7 @@ def call(monkeypatch, capsys, tmp_path):
         ("apriltag_tracker.commands.calibrate_camera", [*LENS, "--bag", __file__], 1, "the bag"),
         ("der_planner.commands.calibrate_limb", ["--offline", "--out", "/proc/x"], 2, "/proc/x"),
         ("der_planner.commands.run_experiment", ["--dry-run", "--out", "BUSY"], 2, "cannot be"),
+        ("der_planner.commands.run_experiment", ["--limb", __file__], 2, "is not valid YAML"),
         ("der_planner.commands.study", ["accuracy", "--out", "BUSY"], 2, "no folder"),
         ("benchmarks.command", ["rod", "--json", "BUSY"], 2, "no folder"),
         ("figures.planning", ["--out", "BUSY"], 2, "no folder"),
@@ -66,6 +67,15 @@ def test_mistakes_are_said_before_any_work_is_done(call, module, arguments, code
     assert found == code
     assert "error: " in said
     assert words in said
+
+
+def test_pressures_beyond_the_limit_start_nothing(call, tmp_path):
+    table, out = tmp_path / "excitation.csv", str(tmp_path / "limb.yaml")
+    table.write_text("time_s,a,b\n0,0,0\n0.05,0,30000\n")
+    words = ("--graph", "--play", str(table), "--folder", str(tmp_path / "run"), "--out", out)
+    found, said = call("der_planner.commands.calibrate_limb", *words)
+    assert (found, (tmp_path / "run").exists()) == (1, False)
+    assert "asks for 30000 Pa, the limit is ±24000 Pa" in said
 
 
 @pytest.mark.slow

@@ -110,7 +110,8 @@ def test_a_vented_step_of_the_emulated_board_is_predicted():
 
 def report_of(air: AirFit) -> FitReport:
     none = np.zeros(0)
-    return FitReport(Limb.default(), "", (), none, (), air, None, none, none, none, none, 1.0, 1)
+    apart = np.zeros((0, 0))
+    return FitReport(Limb.default(), "", (), apart, air, None, none, none, none, none, 1.0, 1)
 
 
 def test_the_report_says_how_fast_chambers_vent_or_that_it_does_not_know():

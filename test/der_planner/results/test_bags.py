@@ -11,9 +11,8 @@ from runs import FRAMES, TIMES, BagOfRun, reference
 
 from der_planner.identification import LogError, read_bag
 from der_planner.results import (
+    BagError,
     EvaluationError,
-    csv_table,
-    error_table,
     evaluate_bag,
     evaluate_bags,
     evaluate_run,
@@ -174,7 +173,7 @@ def two_limbs(folder: Path, **offsets) -> None:
 
 def test_two_limbs_in_one_bag_are_evaluated_apart(tmp_path: Path):
     two_limbs(tmp_path / "run", limb=0.002, lab2=0.008)
-    found = evaluate_bags([tmp_path / "run"])
+    found = list(evaluate_bags([tmp_path / "run"]))
     errors = {entry.result.namespace: entry.result.mean_error_m for entry in found}
     assert errors == {
         "/limb": pytest.approx(0.002, abs=5e-5),
@@ -185,14 +184,9 @@ def test_two_limbs_in_one_bag_are_evaluated_apart(tmp_path: Path):
     assert checks["/lab2"] == pytest.approx(0.008, abs=5e-5)
     rows = summarise([entry.result for entry in found])
     assert [row.trials for row in rows] == [1, 1]
-    for text in (
-        format_table(rows),
-        error_table(rows).markdown(),
-        csv_table(rows),
-        error_table(rows).latex(),
-    ):
-        assert "/limb" in text
-        assert "/lab2" in text.replace("\\_", "_")
+    text = format_table(rows)
+    assert "/limb" in text
+    assert "/lab2" in text
 
 
 def test_a_plan_never_meets_the_state_of_another_limb(tmp_path: Path):
@@ -206,11 +200,11 @@ def test_a_plan_never_meets_the_state_of_another_limb(tmp_path: Path):
 
 def test_a_run_among_several_limbs_is_named(tmp_path: Path):
     two_limbs(tmp_path / "run", limb=0.002, lab2=0.008)
-    with pytest.raises(EvaluationError, match=r"several limbs, /lab2, /limb: name one"):
+    with pytest.raises(BagError, match=r"several limbs, /lab2, /limb: name one"):
         load_run(tmp_path / "run")
     assert load_run(tmp_path / "run", namespace="/lab2").description.namespace == "/lab2"
     assert load_run(tmp_path / "run", plan_id="lab2").description.namespace == "/lab2"
-    with pytest.raises(EvaluationError, match=r"no limb /lab3, only /lab2, /limb"):
+    with pytest.raises(BagError, match=r"no limb /lab3, only /lab2, /limb"):
         load_run(tmp_path / "run", namespace="/lab3")
 
 

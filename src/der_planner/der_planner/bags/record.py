@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from array import array
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -206,6 +206,26 @@ class BagRecord:
     def played(self) -> list[str]:
         """Namespaces of the limbs that have a plan."""
         return [name for name, limb in self.limbs.items() if limb.usable_plans]
+
+    def limb_named(self, namespace: str, among: Collection[str]) -> str:
+        """Return the namespace of the limb that is meant; empty where the bag holds none.
+
+        Args:
+            namespace: as the user names it; empty: the only one of ``among``.
+            among: limbs of this bag that hold what is asked for.
+
+        Raises:
+            BagError: the bag has no such limb, or several are left and none is named.
+        """
+        if namespace and namespace not in self.limbs:
+            known = ", ".join(sorted(self.limbs)) or "none"
+            raise BagError(f"{self.path}: no limb {namespace}, only {known}")
+        if not namespace and len(among) > 1:
+            raise BagError(
+                f"{self.path}: holds several limbs, {', '.join(sorted(among))}: name one with "
+                "--namespace"
+            )
+        return namespace or next(iter(among or self.limbs), "")
 
 
 def read_record(path: str | Path) -> BagRecord:

@@ -46,12 +46,12 @@ def load_run(path: str | Path, *, plan_id: str = "", namespace: str = "") -> Run
         namespace: of the limb, e.g. ``/limb``; needed only where limbs of several have plans.
 
     Raises:
-        EvaluationError: the bag has no plan, or no limb state while it was played, or several
-            limbs have plans and none is named.
-        BagError: the bag cannot be read.
+        EvaluationError: the bag has no plan, or no limb state while it was played.
+        BagError: the bag cannot be read, or several limbs have plans and none is named.
     """
     record = read_record(path)
-    return run_of(record, _choose_limb(record, namespace, plan_id), plan_id)
+    with_plan = [name for name in record.played if plan_id in record.limbs[name].usable_plans]
+    return run_of(record, record.limb_named(namespace, with_plan or record.played), plan_id)
 
 
 @dataclass(frozen=True)
@@ -153,21 +153,6 @@ def _others_seen(record: BagRecord, namespace: str) -> str:
     if not others:
         return ""
     return f" (The states of {', '.join(sorted(others))} are another limb's and do not count.)"
-
-
-def _choose_limb(record: BagRecord, namespace: str, plan_id: str) -> str:
-    if namespace:
-        if namespace not in record.limbs:
-            known = ", ".join(sorted(record.limbs)) or "none"
-            raise EvaluationError(f"{record.path}: no limb {namespace}, only {known}")
-        return namespace
-    named = [name for name in record.played if plan_id in record.limbs[name].usable_plans]
-    found = named or record.played
-    if len(found) > 1:
-        raise EvaluationError(
-            f"{record.path}: holds runs of several limbs, {', '.join(sorted(found))}: name one"
-        )
-    return next(iter(found or record.limbs), "")
 
 
 def _choose_plan(limb: LimbRecord, where: str, plan_id: str) -> str:

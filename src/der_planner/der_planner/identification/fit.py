@@ -47,8 +47,6 @@ from der_planner.planning.loads import nearly_buckling
 UNTOLD = 0.8
 """Share of its prior spread above which the deviation of an unknown means that the log does not
 tell it."""
-STRONG = 0.9
-"""|correlation| above which two unknowns are reported as a pair that the log cannot tell apart."""
 MOST_PASSES = 4
 """Largest number of times that lengths and bend angles are fitted in turn, for a limb that its
 weight bends unevenly."""
@@ -96,14 +94,19 @@ def fit(
         raise LogError(f"unknown model term {sorted(groups - set(known))}: choose {known}")
     recorded = prepare(log, limb, longest_gap)
     warnings = list(recorded.warnings)
-    air = _try_air(recorded, warnings)
+    try:
+        air = fit_air(recorded.log, CONTROL_PERIOD)
+    except LogError as error:
+        air = None
+        warnings.append(f"the chambers' lag keeps its old value: {error}")
     offset = 0.0 if air is None else air.offset
     prepared = replace(recorded, pressure=recorded.pressure - offset)
     fitted = _fit_bends_and_lengths(limb, prepared, groups, geometry)
     if fitted.lengths is not None:
         warnings += filter(None, [lengths_at_their_end(limb, fitted.lengths.limb)])
     unknowns, correlation = _told(fitted)
-    if "dynamics" in groups and _all_untold(unknowns):
+    stiffness = [u.untold for u in unknowns if u.name.startswith("log_stiffness")]
+    if "dynamics" in groups and stiffness and all(stiffness):
         warnings.append(
             "the log is too slow to tell the stiffness apart from the gain: stiffness and damping "
             "keep their old values; steps or a sweep would tell them"
@@ -121,7 +124,6 @@ def fit(
         source=log.source,
         unknowns=unknowns,
         correlation=correlation,
-        strongly_correlated=_pairs(unknowns, correlation),
         air=air,
         geometry=fitted.lengths,
         residual=np.sqrt(np.nanmean(fitted.remaining**2, axis=0)),
@@ -276,11 +278,6 @@ def _told(fitted: _Fitted) -> tuple[tuple[Unknown, ...], Array]:
     return unknowns, covariance / np.outer(deviation, deviation)
 
 
-def _all_untold(unknowns: tuple[Unknown, ...]) -> bool:
-    stiffness = [u.untold for u in unknowns if u.name.startswith("log_stiff")]
-    return bool(stiffness) and all(stiffness)
-
-
 def _with_arcs(found: Limb, prepared: Prepared, warnings: list[str]) -> tuple[Limb, Array]:
     """Return the limb with the PCC model's numbers, and that model's errors (M,) [rad].
 
@@ -303,19 +300,6 @@ def _with_arcs(found: Limb, prepared: Prepared, warnings: list[str]) -> tuple[Li
     values = problem.search.solve()
     residual = np.sqrt(np.nanmean(problem.remaining(values) ** 2, axis=0))
     return replace(found, pcc_segments=free.limb_with(values).segments), residual
-
-
-def _try_air(prepared: Prepared, warnings: list[str]) -> AirFit | None:
-    try:
-        return fit_air(prepared.log, CONTROL_PERIOD)
-    except LogError as error:
-        warnings.append(f"the chambers' lag keeps its old value: {error}")
-        return None
-
-
-def _pairs(unknowns: tuple[Unknown, ...], correlation: Array) -> tuple[tuple[str, str, float], ...]:
-    strong = np.argwhere(np.tril(np.abs(correlation) > STRONG, -1))
-    return tuple((unknowns[i].name, unknowns[j].name, float(correlation[i, j])) for i, j in strong)
 
 
 def _calibrated(fitted: _Fitted, prior: Limb, air: AirFit | None, recorded: Prepared) -> Limb:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from der_planner.arrays import Array
 from der_planner.bags.reader import BagError
-from der_planner.bags.record import PRESSURE_TYPE, STATE_TYPE, BagRecord, LimbRecord, read_record
+from der_planner.bags.record import PRESSURE_TYPE, STATE_TYPE, LimbRecord, read_record
 from der_planner.bags.series import stream
 from der_planner.identification.log import CalibrationLog, LogError, on_grid
 from der_planner.model import CONTROL_PERIOD
@@ -60,9 +60,11 @@ def read_bag(path: str | Path, namespace: str = "") -> CalibrationLog:
     """
     try:
         record = read_record(path)
+        measured_limbs = [name for name, limb in record.limbs.items() if len(limb.measured)]
+        chosen = record.limb_named(namespace, measured_limbs)
     except BagError as error:
         raise LogError(str(error)) from error
-    limb = _choose_limb(record, namespace)
+    limb = record.limbs.get(chosen, LimbRecord())
     if len(limb.measured) < LEAST_MESSAGES:
         raise LogError(
             f"the bag {path} holds no pressures ({PRESSURE_TYPE}): was the driver running?"
@@ -82,21 +84,6 @@ def read_bag(path: str | Path, namespace: str = "") -> CalibrationLog:
     streams = (commanded, measured, angles, tip)
     tables = [on_grid(one.time, one.value, grid, LONGEST_GAP) for one in streams]
     return CalibrationLog(grid - start, tables[0], tables[1], tables[2], tables[3], Path(path).name)
-
-
-def _choose_limb(record: BagRecord, namespace: str) -> LimbRecord:
-    if namespace:
-        if namespace not in record.limbs:
-            known = ", ".join(sorted(record.limbs)) or "none"
-            raise LogError(f"the bag {record.path} has no limb {namespace}, only {known}")
-        return record.limbs[namespace]
-    driven = [name for name, limb in record.limbs.items() if len(limb.measured)]
-    if len(driven) > 1:
-        raise LogError(
-            f"the bag {record.path} holds several limbs, {', '.join(sorted(driven))}: name one "
-            "with --namespace"
-        )
-    return record.limbs[driven[0]] if driven else LimbRecord()
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ import queue
 import sys
 import threading
 import time as clock
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from nav_msgs.msg import Path as PathMessage
@@ -26,15 +25,9 @@ from der_planner.nodes.planner_requests import (
     new_plan_id,
     read_parameters,
 )
-from der_planner.nodes.planner_streaming import (
-    MARGIN,
-    DriverWatch,
-    Ending,
-    PlannerPublishers,
-    Streamer,
-)
+from der_planner.nodes.planner_streaming import DriverWatch, PlannerPublishers
 from der_planner.planning import METHODS, Motion, Plan, plan
-from der_planner.planning.streaming import Schedule, first_stamp
+from der_planner.planning.streaming import MARGIN, Schedule, Streamer, first_stamp
 from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.parameters import check_overrides
@@ -88,10 +81,12 @@ class PlannerNode(Node):
         self._output = PlannerPublishers(self)
         self._diagnostics = DiagnosticsPublisher(self, self._health)
         self._driver = DriverWatch(clock.monotonic, self._options.driver_timeout)
-        self._streamer = Streamer(self, self._driver, self._now, self._options.lead)
+        self._streamer = Streamer(
+            self._now, self._send, self._ended, self._driver.obstacle, self._options.lead
+        )
         self._corrector = Corrector(self._output, self.get_logger().warning, self._now)
         self._action = MotionAction(
-            self, self._refuses, self._on_command, self._stop_plan, self._streamer.find
+            self, self._checked, self._accept, self._stop_plan, self._streamer.find
         )
         self._planning = threading.Thread(target=self._run, name="planning", daemon=True)
         self._planning.start()
@@ -106,51 +101,39 @@ class PlannerNode(Node):
     # What comes in -------------------------------------------------------------------------
 
     def _on_driver(self, message: PressureState) -> None:
-        self._streamer.update(message)
+        ending = self._driver.update(message, self._streamer.begun)
+        if ending is not None:
+            self._streamer.abandon(ending)
         self._corrector.add_pressures(message)
 
     def _on_limb(self, message: LimbState) -> None:
         self._corrector.add_state(message)
         self._action.compare(message)
 
-    def _on_command(
-        self, message: MotionCommand, begin: Callable[[str], None] = lambda _: None
-    ) -> None:
-        """Plan a command or refuse it; ``begin`` is told the plan's id before either."""
+    def _on_command(self, message: MotionCommand) -> None:
+        request = self._checked(message)
+        if request is not None:
+            self._accept(request)
+
+    def _checked(self, message: MotionCommand) -> Request | None:
+        """Return what a command asks for, with the id of its plan; None: refused, and said why."""
         wanted = message.plan_id
         if not wanted or self._is_busy(wanted):
             message.plan_id = new_plan_id()
-        begin(message.plan_id)
         try:
             if wanted and message.plan_id != wanted:
                 raise ValueError(
                     f"plan '{wanted}' is being planned or played: name another, or none"
                 )
-            self._accept(self._checked(message))
+            if self._streamer.is_spent(wanted):
+                raise ValueError(
+                    f"plan '{wanted}' was ended by the driver, which takes no more of it: "
+                    "give the command another plan_id, or none"
+                )
+            return from_command(message, self._current_options(), self._now())
         except ValueError as error:
             self._refuse(message.plan_id, str(error))
-
-    def _refuses(self, message: MotionCommand) -> bool:
-        """Tell whether a goal's command cannot be planned, having said why."""
-        try:
-            self._checked(message)
-        except ValueError as error:
-            self._refuse(message.plan_id or new_plan_id(), str(error))
-            return True
-        return False
-
-    def _checked(self, message: MotionCommand) -> Request:
-        """Return what a command asks for.
-
-        Raises:
-            ValueError: it cannot be planned; says why.
-        """
-        if self._streamer.is_spent(message.plan_id):
-            raise ValueError(
-                f"plan '{message.plan_id}' was ended by the driver, which takes no more of it: "
-                "give the command another plan_id, or none"
-            )
-        return from_command(message, self._current_options(), self._now())
+            return None
 
     def _current_options(self) -> PlannerOptions:
         """Return the parameters with what may be changed while the node runs as it is now."""
@@ -346,21 +329,16 @@ class PlannerNode(Node):
             schedule = self._streamer.play(plan_id, result, start)
             if feedback is not None:
                 self._corrector.follow(schedule, feedback)
-            return schedule
-
-    def scheduled(self, schedule: Schedule) -> None:
-        """A plan has its instant: publish it before its first setpoint."""
-        result = schedule.plan
-        self._status = Status("streaming", schedule.plan_id, "; ".join(result.warnings))
-        self._progress = 0.0
-        self._output.plan(schedule)
+            self._status = Status("streaming", plan_id, "; ".join(result.warnings))
+            self._progress = 0.0
+            self._output.plan(schedule)
         self.get_logger().info(
-            f"plan {schedule.plan_id} planned in {result.solve_time:.2f} s: {schedule.count} "
-            f"setpoints over {result.time[-1]:.1f} s, the first in "
-            f"{self._seconds_until(schedule.start):.2f} s"
+            f"plan {plan_id} planned in {result.solve_time:.2f} s: {schedule.count} setpoints over "
+            f"{result.duration:.1f} s, the first in {self._seconds_until(schedule.start):.2f} s"
         )
+        return schedule
 
-    def send(self, schedule: Schedule, index: int) -> None:
+    def _send(self, schedule: Schedule, index: int) -> None:
         """Publish one setpoint and where the tip should be at its instant."""
         if index == 0:
             self.get_logger().info(f"plan {schedule.plan_id} started")
@@ -379,22 +357,19 @@ class PlannerNode(Node):
             self._action.end(request.plan_id, outcome, reason)
         return request is not None, playing
 
-    def abandoned(self, plan_id: str, ending: Ending) -> None:
-        """Everything was stopped because of the driver: plan nothing to go on with either."""
-        self._end_all(ending.outcome, ending.reason)
-        self._status = Status(ending.outcome, plan_id, ending.reason)
-        self._diagnostics.publish()
-
-    def ended(self, schedule: Schedule, outcome: str, reason: str) -> None:
+    def _ended(self, schedule: Schedule, outcome: str, reason: str) -> None:
         """Log how the playing of a plan ended, and tell who asked for it."""
-        current = self._status[:2] == ("streaming", schedule.plan_id)
-        if outcome == "finished" and current:
-            self._status = Status("done", schedule.plan_id)
         text = f"plan {schedule.plan_id} {outcome} after {self._streamer.share(schedule)}"
         if outcome in ("vented", "fault", "lost"):
+            # The driver takes nothing: plan nothing to go on with either.
             self.get_logger().error(f"{text}: {reason}")
+            self._end_all(outcome, reason)
+            self._status = Status(outcome, schedule.plan_id, reason)
+            self._diagnostics.publish()
         else:
             self.get_logger().info(f"{text}: {reason}" if reason else text)
+            if outcome == "finished" and self._status[:2] == ("streaming", schedule.plan_id):
+                self._status = Status("done", schedule.plan_id)
         self._corrector.forget(schedule)
         self._action.end(schedule.plan_id, outcome, reason)
 

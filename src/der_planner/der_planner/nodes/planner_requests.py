@@ -281,8 +281,8 @@ class MotionAction:
 
     Args:
         node: the planner.
-        refuse: returns whether a command cannot be planned, and has then said why.
-        begin: takes a command; tells the id of its plan before it is planned or refused.
+        check: returns what a command asks for; None: it cannot be planned, and why has been said.
+        begin: plans and plays what is asked for.
         stop: ends the plan of an id.
         schedule: returns the schedule of a plan that is being played, or None.
     """
@@ -290,13 +290,14 @@ class MotionAction:
     def __init__(
         self,
         node: Node,
-        refuse: Callable[[MotionCommand], bool],
-        begin: Callable[[MotionCommand, Callable[[str], None]], None],
+        check: Callable[[MotionCommand], Request | None],
+        begin: Callable[[Request], None],
         stop: Callable[[str], None],
         schedule: Callable[[str], Schedule | None],
     ) -> None:
-        self._refuse, self._begin, self._stop, self._schedule = refuse, begin, stop, schedule
+        self._check, self._begin, self._stop, self._schedule = check, begin, stop, schedule
         self._lock = threading.Lock()
+        self._checked: Request | None = None
         self._goals: dict[str, _Goal] = {}
         self._server = ActionServer(
             node,
@@ -309,14 +310,16 @@ class MotionAction:
         )
 
     def _on_request(self, goal: PlayMotion.Goal) -> GoalResponse:
-        return GoalResponse.REJECT if self._refuse(goal.command) else GoalResponse.ACCEPT
+        self._checked = self._check(goal.command)
+        return GoalResponse.REJECT if self._checked is None else GoalResponse.ACCEPT
 
     def _on_goal(self, handle: ServerGoalHandle) -> None:
-        def keep(plan_id: str) -> None:
+        """Begin what was checked: rclpy calls both in a row."""
+        request, self._checked = self._checked, None
+        if request is not None:
             with self._lock:
-                self._goals[plan_id] = _Goal(handle)
-
-        self._begin(handle.request.command, keep)
+                self._goals[request.plan_id] = _Goal(handle)
+            self._begin(request)
 
     def _on_cancel(self, handle: ServerGoalHandle) -> CancelResponse:
         with self._lock:

@@ -115,19 +115,11 @@ class Rod:
         Raises:
             ValueError: a value is out of range; the message says what was expected and what came.
         """
-        require(
-            isinstance(nodes, (int, np.integer)) and nodes >= 3,
-            "nodes",
-            "an int of 3 or more",
-            nodes,
-        )
+        whole = isinstance(nodes, (int, np.integer))
+        require(whole and nodes >= 3, "nodes", "an int of 3 or more", nodes)
         step = positive(length, "length") / (nodes - 1)
-        for value, name in (
-            (EI, "EI"),
-            (EA, "EA"),
-            (GJ, "GJ"),
-            (mass_per_length, "mass_per_length"),
-        ):
+        positive(mass_per_length, "mass_per_length")
+        for value, name in ((EI, "EI"), (EA, "EA"), (GJ, "GJ")):
             positive(value, name)
         pairs = check_segments(segments, nodes)
         gain = array(moment_gain, (len(pairs),), "moment_gain")
@@ -362,8 +354,7 @@ class Rod:
         run = self._integrator.run(
             state, pressures, positive(dt, "dt"), method, self._load(forces), linearise=True
         )
-        if run.solved is None:
-            raise AssertionError("a linearised run has its solves")
+        assert run.solved is not None  # since it was linearised
         return step_matrices(self._backend, run.solved)
 
     def _load(self, forces: ArrayLike | None) -> Array:
@@ -377,13 +368,10 @@ class Rod:
         return load
 
     def _check_plane(self, value: Array, name: str) -> None:
-        if self.plane is None:
-            return
-        outside = np.delete(value, self._backend.index)
-        if outside.any():
+        if self.plane is not None and np.delete(value, self._backend.index).any():
             raise ValueError(
-                f"{name} must stay in the plane {self.plane} of this rod, got {outside.any()} "
-                "components that leave it: build the rod with plane=None"
+                f"{name} must stay in the plane {self.plane} of this rod: for one that leaves it, "
+                "build the rod with plane=None"
             )
 
     def _as_state(self, state: RodState | ArrayLike) -> RodState:

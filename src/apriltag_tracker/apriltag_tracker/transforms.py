@@ -7,17 +7,17 @@ changes.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 from scipy.spatial.transform import Rotation
 
-from limb_interfaces import qos, topics
+from limb_interfaces import topics
 
 TF = "/tf"
 CLAMP_FRAME = "limb_clamp"
@@ -82,27 +82,12 @@ def camera_transform(
     return transform(frame or CAMERA_FRAME, position.tolist(), rotation.T, stamp)
 
 
-class TransformPublisher:
-    """Publishes transforms on `/tf` if `tf2_msgs` is installed, and otherwise nothing.
-
-    Args:
-        node: that publishes.
-    """
-
-    def __init__(self, node: Node) -> None:
-        self._message: Any = None
-        try:
-            self._message = importlib.import_module("tf2_msgs.msg").TFMessage
-        except ImportError:
-            return
-        self._publisher = node.create_publisher(self._message, TF, qos.TRANSFORMS)
-
-    @property
-    def active(self) -> bool:
-        """Whether `tf2_msgs` is there."""
-        return self._message is not None
-
-    def publish(self, transforms: list[TransformStamped]) -> None:
-        """Publish transforms that belong to one instant."""
-        if self._message is not None and transforms:
-            self._publisher.publish(self._message(transforms=transforms))
+def transform_publisher(node: Node) -> Callable[[list[TransformStamped]], None] | None:
+    """Return what publishes transforms of one instant on `/tf`, or None without `tf2_msgs`."""
+    try:
+        kind = importlib.import_module("tf2_msgs.msg").TFMessage
+    except ImportError:
+        return None
+    # The depth is that of tf2_ros.
+    publisher = node.create_publisher(kind, TF, QoSProfile(depth=100))
+    return lambda transforms: publisher.publish(kind(transforms=transforms))

@@ -4,16 +4,11 @@ import sys
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 from builtin_interfaces.msg import Time
 from scipy.spatial.transform import Rotation
 
 from apriltag_tracker.camera import CameraPose
-from limb_interfaces.transforms import (
-    TransformPublisher,
-    camera_transform,
-    limb_transforms,
-)
+from apriltag_tracker.transforms import camera_transform, limb_transforms, transform_publisher
 
 STAMP = Time(sec=3, nanosec=5)
 
@@ -48,18 +43,16 @@ def test_points_of_the_base_are_seen_where_the_camera_sees_them():
     assert camera_transform(np.eye(3), np.zeros(3), STAMP).child_frame_id == "limb_camera"
 
 
-@pytest.mark.parametrize("installed", [True, False])
-def test_transforms_are_published_where_tf2_is_installed(installed, monkeypatch):
+def test_transforms_are_published_where_tf2_is_installed(monkeypatch):
     sent = []
     publisher = SimpleNamespace(publish=sent.append)
     node = SimpleNamespace(create_publisher=lambda _, topic, __: sent.append(topic) or publisher)
     # A module that is None in sys.modules cannot be imported.
-    message = SimpleNamespace(TFMessage=SimpleNamespace) if installed else None
+    monkeypatch.setitem(sys.modules, "tf2_msgs.msg", None)
+    assert transform_publisher(node) is None
+    message = SimpleNamespace(TFMessage=SimpleNamespace)
     monkeypatch.setitem(sys.modules, "tf2_msgs", message)
     monkeypatch.setitem(sys.modules, "tf2_msgs.msg", message)
     transforms = limb_transforms(np.array([[0.0, 0.0], [0.2, 0.1]]), STAMP)
-    publisher_of_node = TransformPublisher(node)
-    publisher_of_node.publish(transforms)
-    publisher_of_node.publish([])
-    assert publisher_of_node.active == installed
-    assert sent == (["/tf", SimpleNamespace(transforms=transforms)] if installed else [])
+    transform_publisher(node)(transforms)
+    assert sent == ["/tf", SimpleNamespace(transforms=transforms)]
