@@ -13,8 +13,6 @@ from der_planner.identification import LogError, read_bag
 from der_planner.results import (
     BagError,
     EvaluationError,
-    csv_table,
-    error_table,
     evaluate_bag,
     evaluate_bags,
     evaluate_run,
@@ -175,7 +173,7 @@ def two_limbs(folder: Path, **offsets) -> None:
 
 def test_two_limbs_in_one_bag_are_evaluated_apart(tmp_path: Path):
     two_limbs(tmp_path / "run", limb=0.002, lab2=0.008)
-    found = evaluate_bags([tmp_path / "run"])
+    found = list(evaluate_bags([tmp_path / "run"]))
     errors = {entry.result.namespace: entry.result.mean_error_m for entry in found}
     assert errors == {
         "/limb": pytest.approx(0.002, abs=5e-5),
@@ -186,14 +184,9 @@ def test_two_limbs_in_one_bag_are_evaluated_apart(tmp_path: Path):
     assert checks["/lab2"] == pytest.approx(0.008, abs=5e-5)
     rows = summarise([entry.result for entry in found])
     assert [row.trials for row in rows] == [1, 1]
-    for text in (
-        format_table(rows),
-        error_table(rows).markdown(),
-        csv_table(rows),
-        error_table(rows).latex(),
-    ):
-        assert "/limb" in text
-        assert "/lab2" in text.replace("\\_", "_")
+    text = format_table(rows)
+    assert "/limb" in text
+    assert "/lab2" in text
 
 
 def test_a_plan_never_meets_the_state_of_another_limb(tmp_path: Path):

@@ -9,7 +9,7 @@ window from the first to the last setpoint of the plan: E is the mean over the v
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -231,38 +231,31 @@ class Evaluated:
 
 
 def evaluate_bags(
-    paths: Sequence[Path],
-    settings: EvaluationSettings | None = None,
-    progress: Callable[[int, int, Path], None] = lambda *_: None,
-) -> list[Evaluated]:
+    paths: Sequence[Path], settings: EvaluationSettings | None = None
+) -> Iterator[Evaluated]:
     """Evaluate bags one after the other; one that fails does not stop the others.
 
     Args:
         paths: bag folders or files.
         settings: for all of them.
-        progress: called with the number done, the number of bags and the last one's path.
 
-    Returns:
+    Yields:
         One entry per limb that has a plan, in the order of the paths; one with the reason for a
         bag without any.
     """
-    entries = []
-    for count, path in enumerate(paths, start=1):
-        entries += _evaluate(path, settings or EvaluationSettings())
-        progress(count, len(paths), path)
-    return entries
+    for path in paths:
+        yield from _evaluate(path, settings or EvaluationSettings())
 
 
-def _evaluate(path: Path, settings: EvaluationSettings) -> list[Evaluated]:
+def _evaluate(path: Path, settings: EvaluationSettings) -> Iterator[Evaluated]:
     try:
         record = read_record(path)
     except (BagError, OSError) as error:
-        return [Evaluated(path, error=str(error))]
-    found = []
+        yield Evaluated(path, error=str(error))
+        return
     for namespace in sorted(record.played or record.limbs) or [""]:
         try:
             run = run_of(record, namespace)
-            found.append(Evaluated(path, run, evaluate_run(run, settings)))
+            yield Evaluated(path, run, evaluate_run(run, settings))
         except (BagError, EvaluationError, OSError) as error:
-            found.append(Evaluated(path, error=str(error)))
-    return found
+            yield Evaluated(path, error=str(error))
