@@ -51,16 +51,11 @@ class Bench:
         self.client.watch([self.board])
         self.client.wait_ready(["board_emulator"])
         self.parameters = {"port": self.link, "protocol": protocol, **QUICK, **parameters}
-        self.start_driver()
-
-    def start_driver(self, ready=True):
         self.driver = self.graph.start("pressure_driver", "pressure_driver", **self.parameters)
-        if ready:
-            self.client.watch([self.board, self.driver])
-            self.client.diagnostics.pop("pressure_driver", None)
-            self.client.wait_ready(["pressure_driver"])
-            self.wait(self.publisher.get_subscription_count, "the driver's subscription")
-            self.wait(lambda: self.air, "the air")
+        self.client.watch([self.board, self.driver])
+        self.client.wait_ready(["pressure_driver"])
+        self.wait(self.publisher.get_subscription_count, "the driver's subscription")
+        self.wait(lambda: self.air, "the air")
 
     @contextlib.contextmanager
     def other_driver(self, code):
