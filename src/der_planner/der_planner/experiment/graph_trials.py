@@ -49,13 +49,24 @@ def play_on_graph(run: TrialRun, progress: Progress) -> dict[str, Any]:
     }
 
 
+def _bag_folder(out: Path, name: str) -> Path:
+    """Return the folder of a run's bag; the bag of a run that was stopped goes to ``stopped/``."""
+    bag, number = out / "bags" / name, 1
+    while (kept := out / "stopped" / f"{name}_{number}").exists():
+        number += 1
+    if bag.exists():
+        kept.parent.mkdir(exist_ok=True)
+        bag.rename(kept)
+    return bag
+
+
 class GraphTrial(GraphPlayer):
     """Plays one run of a planned motion; use `play_on_graph`."""
 
     def __init__(self, run: TrialRun, progress: Progress) -> None:
         self._run, self._trial, self._options = run, run.trial, run.options
         setup = GraphSetup(
-            run.options.out / "bags" / run.trial.name,
+            _bag_folder(run.options.out, run.trial.name),
             run.metadata,
             seed=run.trial.seed,
             run=run.trial.run - 1,
