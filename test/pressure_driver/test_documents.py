@@ -1,6 +1,5 @@
 """What is written down agrees with the code: parameter files, and the native page's vectors."""
 
-import argparse
 import re
 from pathlib import Path
 
@@ -8,8 +7,9 @@ import pytest
 import yaml
 
 from pressure_driver import settings
-from pressure_driver.protocols.base import Telemetry
-from pressure_driver.protocols.native import NativeBoard, NativeHost, unseal
+from pressure_driver.emulator.firmware import NativeBoard
+from pressure_driver.protocols import Telemetry
+from pressure_driver.protocols.native import NativeHost, unseal
 
 PACKAGE = Path(__file__).resolve().parents[2] / "src" / "pressure_driver"
 README = (PACKAGE / "README.md").read_text(encoding="utf-8")
@@ -27,13 +27,6 @@ def test_the_parameter_file_is_what_the_declaration_says(name):
 
 def test_the_table_of_parameters_is_what_the_declaration_says():
     assert settings.with_table(README) == README
-
-
-def test_options_of_the_command_give_the_settings_back():
-    given = settings.Settings(port="/dev/x", supply_required=False, vent_rate=5_000.0)
-    parser = argparse.ArgumentParser()
-    settings.add_options(parser)
-    assert settings.from_options(parser.parse_args(settings.to_options(given))) == given
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from pressure_driver.emulator.board import EmulatedBoard, FaultError, Faults
+from pressure_driver.emulator.firmware import board_protocol
 from pressure_driver.emulator.pneumatics import BoardPneumatics
 from pressure_driver.emulator.runner import EmulatedPort
-from pressure_driver.protocols import board_protocol, host_protocol
+from pressure_driver.protocols import host_protocol
 
 SEEDS = range(8)
 

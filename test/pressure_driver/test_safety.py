@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pressure_driver.protocols import NAMES
-from pressure_driver.protocols.base import BoardReport
+from pressure_driver.protocols import NAMES, BoardReport
 from pressure_driver.safety import Mode
 from pressure_driver.schedule import Verdict
 
@@ -139,7 +138,7 @@ def test_boards_without_a_watchdog_keep_the_pressure_which_the_diagnostics_say(s
 
 
 def test_a_board_with_other_chambers_or_less_range_cannot_be_armed(simulate):
-    from pressure_driver.protocols.native import NativeBoard
+    from pressure_driver.emulator.firmware import NativeBoard
 
     sim = simulate("native")
     sim.board.protocol = NativeBoard(4, largest_pressure=20_000)

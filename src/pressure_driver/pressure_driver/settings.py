@@ -8,7 +8,6 @@ machine, the files under `config/` and the table in the README. After a change, 
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from dataclasses import MISSING, Field, dataclass, field, fields
 from pathlib import Path
@@ -16,7 +15,6 @@ from typing import Any, NamedTuple, TypeVar
 
 from pressure_driver.protocols import NAMES
 
-NANOSECONDS = 1_000_000_000
 BEGIN, END = "<!-- parameters: begin -->\n", "<!-- parameters: end -->\n"
 """Around the table in the README."""
 
@@ -149,16 +147,6 @@ class Settings:
                 f"({self.rate:g} Hz): a command must stay valid until the next tick"
             )
 
-    @property
-    def period(self) -> int:
-        """[ns] of the ticks."""
-        return round(NANOSECONDS / self.rate)
-
-    @property
-    def largest_step(self) -> float:
-        """[Pa] by which a command may move in one tick; a plan at the limit is not beyond it."""
-        return self.slew_limit * self.period / NANOSECONDS * (1.0 + 1e-9)
-
 
 @dataclass(frozen=True)
 class EmulatorSettings:
@@ -203,30 +191,6 @@ def _check(name: str, value: Any, declaration: Declaration) -> None:
                 f"parameter '{name}' ({declaration.description}) is {value:g}: "
                 f"allowed are {low:g} to {high:g}"
             )
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Give a command one option for each parameter of the driver: ``--pressure-limit 2000``."""
-    for name, declaration, default in declarations(Settings):
-        kind = (lambda text: text.lower() == "true") if isinstance(default, bool) else type(default)
-        parser.add_argument(
-            f"--{name.replace('_', '-')}",
-            type=kind,
-            default=default,
-            metavar="|".join(declaration.choices) or type(default).__name__.upper(),
-            help=f"{declaration.description} (%(default)s)",
-        )
-
-
-def to_options(settings: Settings) -> list[str]:
-    """Return the options of `add_options` that give these settings."""
-    given = vars(settings).items()
-    return [f"--{name.replace('_', '-')}={value}" for name, value in given]
-
-
-def from_options(given: argparse.Namespace) -> Settings:
-    """Return the settings that the options of `add_options` gave."""
-    return Settings(**{name: getattr(given, name) for name, _, _ in declarations(Settings)})
 
 
 def parameter_file(node: str) -> str:

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from der_planner.identification import ColumnMap, LogError, read_csv, read_excitation
+from der_planner.identification import ColumnMap, LogError, read_csv
+from der_planner.identification.excitation import read_excitation
 
 COLUMNS = {
     "time": "t",

@@ -5,16 +5,17 @@ import re
 import numpy as np
 import pytest
 
-from pressure_driver.protocols import NAMES, board_protocol, host_protocol
-from pressure_driver.protocols.base import (
+from pressure_driver.emulator.firmware import BoardReading, NativeBoard, board_protocol
+from pressure_driver.protocols import (
+    NAMES,
     BoardIdentity,
-    BoardReading,
     BoardReport,
     BoardText,
     Echo,
     Telemetry,
+    host_protocol,
 )
-from pressure_driver.protocols.native import FaultCode, FrameType, NativeBoard, encode
+from pressure_driver.protocols.native import FaultCode, FrameType, encode
 
 ATMOSPHERE = 101_812.0
 READING = BoardReading(

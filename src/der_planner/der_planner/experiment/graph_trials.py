@@ -17,7 +17,7 @@ from der_planner.experiment.console import Progress
 from der_planner.experiment.graph_run import running_graph
 from der_planner.experiment.options import TrialRun
 from der_planner.experiment.processes import GraphError, GraphSetup, Hardware
-from der_planner.identification import Excitation
+from der_planner.identification.excitation import Excitation
 from der_planner.limb import Limb
 from der_planner.methods import LEARNED
 from der_planner.planning import paths

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from pressure_driver.emulator.firmware import BoardCommand, BoardProtocol, BoardReading
 from pressure_driver.emulator.pneumatics import SUPPLY_PRESSURE, BoardPneumatics
-from pressure_driver.protocols.base import BoardCommand, BoardProtocol, BoardReading
 
 SENSOR_OFFSET = 200.0
 """[Pa] Sensors read up to this much too high, each its own."""

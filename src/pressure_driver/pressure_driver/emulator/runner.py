@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pressure_driver.emulator.board import EmulatedBoard, Faults, ReceivedCommand
-from pressure_driver.ports import prefer_thread
-from pressure_driver.settings import NANOSECONDS
+from pressure_driver.lines import prefer_thread
+from pressure_driver.schedule import NANOSECONDS
 
 TELEMETRY_PERIOD = 50_000_000
 """[ns] 20 Hz, as boards report."""

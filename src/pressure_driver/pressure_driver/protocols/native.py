@@ -15,11 +15,8 @@ from enum import IntEnum
 
 from cobs import cobs
 
-from pressure_driver.protocols.base import (
-    BoardCommand,
+from pressure_driver.protocols import (
     BoardIdentity,
-    BoardProtocol,
-    BoardReading,
     BoardReport,
     BoardReset,
     Echo,
@@ -265,94 +262,3 @@ class NativeHost(HostProtocol):
         """Forget a half-received frame, and the board's clock."""
         self._frames.reset()
         self._board_time = None
-
-
-class NativeBoard(BoardProtocol):
-    """The firmware's end of ``native``: a reference for authors of firmware."""
-
-    gauge = True
-
-    def __init__(
-        self, chamber_count: int = 4, largest_pressure: int = 30_000, firmware: str = "emulator 1"
-    ) -> None:
-        super().__init__(chamber_count)
-        self._frames = FrameSplitter()
-        self._largest = largest_pressure
-        self._firmware = firmware.encode("ascii")
-        self._sequence = 0
-
-    def decode(self, data: bytes) -> list[BoardCommand]:
-        """Return HELLO, SETPOINT and VENT; a setpoint out of range comes back as ``refused``."""
-        commands = []
-        for place, frame in self._frames.feed(data):
-            command = self._interpret(place, frame)
-            if command is None:
-                self._frames.rejected += 1
-            else:
-                commands.append(command)
-        self.rejected = self._frames.rejected
-        return commands
-
-    def _interpret(self, place: int, frame: Frame) -> BoardCommand | None:
-        number, body = frame.sequence, frame.body
-        if frame.type in (FrameType.HELLO, FrameType.VENT):
-            kind = "hello" if frame.type is FrameType.HELLO else "vent"
-            return None if body else BoardCommand(kind, place, sequence=number)
-        if frame.type is not FrameType.SETPOINT:
-            return None
-        if len(body) != SETPOINT_HEAD.size + 4 * self.chamber_count:
-            return BoardCommand("refused", place, sequence=number, text="wrong length")
-        (milliseconds,) = SETPOINT_HEAD.unpack_from(body)
-        values = struct.unpack_from(f"<{self.chamber_count}i", body, SETPOINT_HEAD.size)
-        if not 0 < milliseconds <= LONGEST_VALIDITY:
-            return BoardCommand("refused", place, sequence=number, text="valid-for out of range")
-        if min(values) < 0 or max(values) > self._largest:
-            return BoardCommand("refused", place, sequence=number, text="pressure out of range")
-        return BoardCommand(
-            "setpoint",
-            place,
-            pressure=tuple(float(value) for value in values),
-            valid_for=milliseconds / 1000.0,
-            sequence=number,
-        )
-
-    def _next(self) -> int:
-        self._sequence = (self._sequence + 1) & 0xFFFF
-        return self._sequence
-
-    def telemetry(self, reading: BoardReading) -> bytes:
-        """One STATUS frame."""
-        flags = StatusFlag.SUPPLY_KNOWN | StatusFlag.VALVES_KNOWN
-        flags |= StatusFlag.VENTED if reading.vented else 0
-        flags |= StatusFlag.EXPIRED if reading.expired else 0
-        atmosphere = round(reading.atmosphere)
-        body = STATUS_HEAD.pack(
-            round(reading.time * 1000.0) & 0xFFFFFFFF,
-            reading.last_sequence,
-            flags,
-            atmosphere,
-            round(reading.supply_pressure),
-        )
-        for pressure in reading.chamber_pressure:
-            body += struct.pack("<i", round(pressure) - atmosphere)
-        body += bytes(round(255 * min(max(v, 0.0), 1.0)) for v in reading.valve_opening)
-        return encode(FrameType.STATUS, self._next(), body)
-
-    def reply(self, command: BoardCommand, reading: BoardReading) -> bytes:
-        """IDENTITY to HELLO, FAULT to what was refused, STATUS to everything else."""
-        if command.kind == "hello":
-            body = HELLO_BODY.pack(
-                self.chamber_count, 0, self._largest, round(reading.atmosphere), len(self._firmware)
-            )
-            return encode(FrameType.IDENTITY, self._next(), body + self._firmware)
-        if command.kind == "refused":
-            return self.fault(FaultCode.REFUSED, command.text)
-        return self.telemetry(reading)
-
-    def fault(self, code: int, text: str) -> bytes:
-        """One FAULT frame."""
-        return encode(FrameType.FAULT, self._next(), bytes([code]) + text.encode("ascii"))
-
-    def expired(self) -> bytes:
-        """What the board says when it has vented since no setpoint came in time."""
-        return self.fault(FaultCode.EXPIRED, "no setpoint in time, vented")
