@@ -11,6 +11,7 @@ from runs import FRAMES, TIMES, BagOfRun, reference
 
 from der_planner.identification import read_bag
 from der_planner.results import (
+    BagError,
     EvaluationError,
     evaluate_bag,
     evaluate_bags,
