@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 import yaml
 
+from figures import driver_parameters
 from pressure_driver import settings
 from pressure_driver.emulator.firmware import NativeBoard
-from pressure_driver.protocols import Telemetry
+from pressure_driver.protocols import BoardFailure, BoardText, Telemetry
 from pressure_driver.protocols.native import NativeHost, unseal
 
 PACKAGE = Path(__file__).resolve().parents[2] / "src" / "pressure_driver"
@@ -20,13 +21,13 @@ VECTOR = re.compile(r"^\| (\w+) \|.*\| `([0-9a-f ]+)` \|$", re.MULTILINE)
 @pytest.mark.parametrize("name", settings.NODES)
 def test_the_parameter_file_is_what_the_declaration_says(name):
     written = (PACKAGE / "config" / f"{name}.yaml").read_text(encoding="utf-8")
-    assert written == settings.parameter_file(name)
+    assert written == driver_parameters.parameter_file(name)
     values = yaml.safe_load(written)[f"/**/{name}"]["ros__parameters"]
     assert settings.NODES[name](**values) == settings.NODES[name]()
 
 
 def test_the_table_of_parameters_is_what_the_declaration_says():
-    assert settings.with_table(README) == README
+    assert driver_parameters.with_table(README) == README
 
 
 @pytest.mark.parametrize(
@@ -78,9 +79,9 @@ def test_the_vectors_of_the_board_are_understood():
     )
     assert echo.sequence == 2
     (fault,) = host.decode(wire["FAULT"])
-    assert fault.fatal
+    assert isinstance(fault, BoardFailure)
     (refused,) = host.decode(wire["REFUSED"])
-    assert not refused.fatal
+    assert isinstance(refused, BoardText)
     assert host.rejected == 0
     assert len(NativeBoard(4).decode(wire["HELLO"] + wire["SETPOINT"] + wire["VENT"])) == 3
 

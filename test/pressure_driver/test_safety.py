@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pressure_driver.protocols import NAMES, BoardReport
+from pressure_driver.protocols import NAMES, BoardFailure
 from pressure_driver.safety import Mode
 from pressure_driver.schedule import Verdict
 
@@ -167,7 +167,7 @@ def test_a_slow_native_board_is_asked_again(simulate):
 def test_a_report_of_the_board_is_a_fault(simulate):
     sim = simulate("native")
     sim.arm()
-    sim.core._serve(BoardReport("sensor: channel 3", fatal=True), sim.steady)
+    sim.core._serve(BoardFailure("sensor: channel 3"), sim.steady)
     assert sim.mode is Mode.FAULT
     sim.tick()
     assert sim.is_vent(sim.sent[-1])

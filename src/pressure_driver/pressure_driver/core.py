@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 from pressure_driver.following import chamber_gauge
 from pressure_driver.protocols import (
     STANDARD_ATMOSPHERE,
+    BoardFailure,
     BoardIdentity,
-    BoardReport,
     BoardReset,
     BoardText,
     Echo,
@@ -319,10 +319,9 @@ class DriverCore:
             self.monitor.receive(event, now, self.machine.mode in (Mode.DISARMED, Mode.FAULT))
         elif isinstance(event, Echo):
             self.board.take_echo(event, now)
-        elif isinstance(event, BoardReport):
+        elif isinstance(event, BoardFailure):
             self._log_text(event.text)
-            if event.fatal:
-                self.machine.fail(f"board reports {event.text}")
+            self.machine.fail(f"board reports {event.text}")
         elif isinstance(event, BoardReset):
             self._set_up_anew(event, now)
         elif isinstance(event, BoardIdentity):

@@ -169,7 +169,6 @@ class CtrlpBoard(BoardProtocol):
     def __init__(self, chamber_count: int = 4) -> None:
         super().__init__(chamber_count)
         self._lines = LineSplitter()
-        self._malformed = 0
         self._reports = False
         self._unit = "psi"
         self._setpoint = (0.0,) * chamber_count
@@ -185,8 +184,10 @@ class CtrlpBoard(BoardProtocol):
         """Return the commands of complete lines; the board understands small letters, too."""
         commands = []
         for place, line in self._lines.feed(data):
-            commands.append(self._parse(place, line.upper()))
-        self.rejected = self._malformed + self._lines.damaged
+            if line is None:
+                self.rejected += 1
+            else:
+                commands.append(self._parse(place, line.upper()))
         return commands
 
     def _parse(self, place: int, line: str) -> BoardCommand:
@@ -206,7 +207,7 @@ class CtrlpBoard(BoardProtocol):
             if word == "SET" and len(numbers) == self.chamber_count + 1:
                 self._setpoint = tuple(value * UNITS[self._unit] for value in numbers[1:])
                 return BoardCommand("setpoint", place, pressure=self._setpoint, text=line)
-        self._malformed += 1
+        self.rejected += 1
         return BoardCommand("unknown", place, text=line)
 
     def telemetry(self, reading: BoardReading) -> bytes:
@@ -253,12 +254,11 @@ class NativeBoard(BoardProtocol):
         """Return HELLO, SETPOINT and VENT; a setpoint out of range comes back as ``refused``."""
         commands = []
         for place, frame in self._frames.feed(data):
-            command = self._interpret(place, frame)
+            command = self._interpret(place, frame) if frame else None
             if command is None:
-                self._frames.rejected += 1
+                self.rejected += 1
             else:
                 commands.append(command)
-        self.rejected = self._frames.rejected
         return commands
 
     def _interpret(self, place: int, frame: Frame) -> BoardCommand | None:

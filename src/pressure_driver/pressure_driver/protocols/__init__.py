@@ -44,11 +44,10 @@ class Echo:
 
 
 @dataclass(frozen=True)
-class BoardReport:
-    """The board says that it is in trouble, or that it has acted on its own."""
+class BoardFailure:
+    """The board says that it is in trouble, or that it has vented on its own."""
 
     text: str
-    fatal: bool
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ class BoardReset:
 
 @dataclass(frozen=True)
 class BoardText:
-    """Free text of the board: boot messages, warnings."""
+    """Free text of the board: boot messages, warnings, commands that it refuses."""
 
     text: str
 
@@ -71,14 +70,12 @@ class BoardIdentity:
     """What the board says of itself when asked."""
 
     chamber_count: int
-    smallest_pressure: float
-    """[Pa] gauge."""
     largest_pressure: float
     """[Pa] gauge."""
     firmware: str
 
 
-Event = Telemetry | Echo | BoardReport | BoardReset | BoardText | BoardIdentity
+Event = Telemetry | Echo | BoardFailure | BoardReset | BoardText | BoardIdentity
 
 
 class StreamCutter:
@@ -128,23 +125,16 @@ class LineSplitter:
 
     def __init__(self) -> None:
         self._pieces = StreamCutter(b"\n", LONGEST_LINE)
-        self.damaged = 0
 
-    def feed(self, data: bytes) -> list[tuple[int, str]]:
-        """Return the lines completed by ``data`` as (place of the first byte, text)."""
-        lines: list[tuple[int, str]] = []
+    def feed(self, data: bytes) -> list[tuple[int, str | None]]:
+        """Return (place of the first byte, text) of the complete lines; None for a damaged one."""
+        lines: list[tuple[int, str | None]] = []
         for start, raw in self._pieces.feed(data):
-            if raw is None:
-                self.damaged += 1
-                continue
-            leading = len(raw) - len(raw.lstrip())
-            text = raw.strip()
-            if not text:
-                continue
-            if any(byte != 9 and not 32 <= byte < 127 for byte in text):
-                self.damaged += 1
-                continue
-            lines.append((start + leading, text.decode("ascii")))
+            text = (raw or b"").strip()
+            if raw is None or any(byte != 9 and not 32 <= byte < 127 for byte in text):
+                lines.append((start, None))
+            elif text:
+                lines.append((start + len(raw) - len(raw.lstrip()), text.decode("ascii")))
         return lines
 
     def reset(self) -> None:
@@ -204,7 +194,7 @@ class HostProtocol(ABC):
         """Encode one command.
 
         Args:
-            differential: (M,) [Pa]; positive fills the even chamber of the pair.
+            differential: (M,) [Pa] within the driver's limits; positive fills the even chamber.
             atmosphere: [Pa] absolute, to add where the wire wants absolute pressures.
             valid_for: [s] after which a board with a watchdog vents by itself.
 
@@ -224,13 +214,6 @@ class HostProtocol(ABC):
     def reset(self) -> None:
         """Forget half-received bytes, as after a reconnect."""
 
-    def _check_segments(self, differential: Sequence[float]) -> None:
-        """Raise ValueError unless there is one difference a pair of chambers."""
-        if 2 * len(differential) != self.chamber_count:
-            raise ValueError(
-                f"expected {self.chamber_count // 2} differences, got {len(differential)}"
-            )
-
 
 class LineHost(HostProtocol):
     """The driver's end of a protocol whose board sends text lines."""
@@ -238,19 +221,17 @@ class LineHost(HostProtocol):
     def __init__(self, chamber_count: int = 4) -> None:
         super().__init__(chamber_count)
         self._lines = LineSplitter()
-        self._malformed = 0
 
     def decode(self, data: bytes) -> list[Event]:
         """Return what complete lines say; damaged lines are counted in ``rejected``."""
         events: list[Event] = []
         for _, line in self._lines.feed(data):
-            event = self._parse(line)
-            if event is None:
-                self._malformed += 1
-                self.last_damaged = line[:LONGEST_SHOWN]
-            else:
+            event = self._parse(line) if line else None
+            if event is not None:
                 events.append(event)
-        self.rejected = self._malformed + self._lines.damaged
+                continue
+            self.rejected += 1
+            self.last_damaged = line[:LONGEST_SHOWN] if line else self.last_damaged
         return events
 
     @abstractmethod

@@ -30,7 +30,6 @@ from collections import deque
 from collections.abc import Sequence
 
 from pressure_driver.protocols import (
-    BoardReport,
     BoardReset,
     BoardText,
     Echo,
@@ -89,17 +88,10 @@ class CtrlpHost(LineHost):
         atmosphere: float,  # noqa: ARG002 - the wire carries gauge pressures
         valid_for: float,  # noqa: ARG002 - the board has no watchdog
     ) -> tuple[bytes, int | None]:
-        """Encode one gauge pressure a channel in kPa, to 1 Pa.
-
-        Raises:
-            ValueError: wrong number of segments, or a value that the wire cannot carry.
-        """
-        self._check_segments(differential)
+        """Encode one gauge pressure a channel in kPa, to 1 Pa."""
         values: list[float] = []
         for difference in differential:
             size = abs(difference) / PASCAL_PER_KILOPASCAL
-            if not size <= LARGEST_GAUGE:
-                raise ValueError(f"a difference of {difference} Pa does not fit a ctrlp command")
             values += [size, 0.0] if difference >= 0.0 else [0.0, size]
         numbers = ";".join(f"{value:.3f}" for value in values)
         return f"SET;{RAMP_TIME:.3f};{numbers}\n".encode(), None
@@ -155,7 +147,7 @@ class CtrlpHost(LineHost):
         if text.startswith("NEW SET"):
             return Echo()
         if text.startswith("UNREC"):
-            return BoardReport("a command was not understood", fatal=False)
+            return BoardText("a command was not understood")
         if _UNITS_ECHO.fullmatch(text):
             self.unsettled = ""
         elif "UNITS" in text:

@@ -16,9 +16,10 @@ from enum import IntEnum
 from cobs import cobs
 
 from pressure_driver.protocols import (
+    BoardFailure,
     BoardIdentity,
-    BoardReport,
     BoardReset,
+    BoardText,
     Echo,
     Event,
     HostProtocol,
@@ -108,36 +109,25 @@ def encode(kind: FrameType, sequence: int, body: bytes = b"") -> bytes:
 
 
 class FrameSplitter:
-    """Cuts a byte stream into sound frames of this version and of known type.
-
-    Attributes:
-        rejected: frames that were damaged or not understood.
-    """
+    """Cuts a byte stream into frames of this version and of known type."""
 
     def __init__(self) -> None:
-        self.rejected = 0
         self._pieces = StreamCutter(b"\0", LONGEST_FRAME)
 
-    def feed(self, data: bytes) -> list[tuple[int, Frame]]:
-        """Return (place of the first byte, frame) of every sound frame."""
-        frames = []
-        for place, coded in self._pieces.feed(data):
-            if coded == b"":
-                continue
-            payload = unseal(coded) if coded else None
-            frame = _read(payload) if payload and len(payload) >= HEADER.size else None
-            if frame is None:
-                self.rejected += 1
-            else:
-                frames.append((place, frame))
-        return frames
+    def feed(self, data: bytes) -> list[tuple[int, Frame | None]]:
+        """Return (place of the first byte, frame); None for one that is damaged or not known."""
+        pieces = self._pieces.feed(data)
+        return [(place, _read(coded)) for place, coded in pieces if coded != b""]
 
     def reset(self) -> None:
         """Forget a half-received frame."""
         self._pieces.reset()
 
 
-def _read(payload: bytes) -> Frame | None:
+def _read(coded: bytes | None) -> Frame | None:
+    payload = unseal(coded) if coded else None
+    if payload is None or len(payload) < HEADER.size:
+        return None
     version, kind, sequence = HEADER.unpack_from(payload)
     if version != VERSION or kind not in set(FrameType):
         return None
@@ -177,19 +167,9 @@ class NativeHost(HostProtocol):
         atmosphere: float,  # noqa: ARG002 - the wire carries gauge pressures
         valid_for: float,
     ) -> tuple[bytes, int | None]:
-        """Encode one gauge pressure a chamber, and how long they hold.
-
-        Raises:
-            ValueError: wrong number of segments, or a value that the frame cannot carry.
-        """
-        self._check_segments(differential)
-        milliseconds = round(valid_for * 1000.0)
-        if not 0 < milliseconds <= LONGEST_VALIDITY:
-            raise ValueError(f"a setpoint cannot stay valid for {valid_for} s")
-        body = SETPOINT_HEAD.pack(milliseconds)
+        """Encode one gauge pressure a chamber, and how long they hold."""
+        body = SETPOINT_HEAD.pack(round(valid_for * 1000.0))
         for difference in differential:
-            if not abs(difference) <= LARGEST_GAUGE:
-                raise ValueError(f"a difference of {difference} Pa does not fit a native frame")
             body += struct.pack("<ii", round(max(difference, 0.0)), round(max(-difference, 0.0)))
         sequence = self._next()
         return encode(FrameType.SETPOINT, sequence, body), sequence
@@ -203,11 +183,9 @@ class NativeHost(HostProtocol):
         """Return what complete and sound frames say."""
         events: list[Event] = []
         for _, frame in self._frames.feed(data):
-            found = self._interpret(frame)
-            if not found:
-                self._frames.rejected += 1
+            found = self._interpret(frame) if frame else []
+            self.rejected += not found
             events += found
-        self.rejected = self._frames.rejected
         return events
 
     def _interpret(self, frame: Frame) -> list[Event]:
@@ -219,7 +197,8 @@ class NativeHost(HostProtocol):
             code = FaultCode(frame.body[0])
             text = frame.body[1:].decode("ascii", "replace")
             name = code.name.lower().replace("_", "-")
-            return [BoardReport(f"{name}: {text}", fatal=code is not FaultCode.REFUSED)]
+            kind = BoardText if code is FaultCode.REFUSED else BoardFailure
+            return [kind(f"{name}: {text}")]
         return []
 
     def _identity(self, body: bytes) -> list[Event]:
@@ -229,7 +208,7 @@ class NativeHost(HostProtocol):
         text = body[HELLO_BODY.size :]
         if len(text) != length or low > high:
             return []
-        return [BoardIdentity(count, float(low), float(high), text.decode("ascii", "replace"))]
+        return [BoardIdentity(count, float(high), text.decode("ascii", "replace"))]
 
     def _status(self, body: bytes) -> list[Event]:
         count = self.chamber_count
