@@ -25,7 +25,7 @@ setup(
         "twin": ["pyelastica"],
         "recording": ["mcap", "rosbags"],
         "evaluation": ["mcap", "rosbags", "matplotlib", "opencv-python-headless"],
-        "studies": ["pyelastica", "distributed", "pyarrow", "matplotlib"],
+        "studies": ["pyelastica", "distributed", "matplotlib"],
         "page": ["nicegui==3.18.*", "opencv-python-headless", "psutil==7.2.*"],
         "test": ["pytest"],
     },

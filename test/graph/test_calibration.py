@@ -13,8 +13,8 @@ import pytest
 from domain import own_domain
 
 from der_planner.bags.reader import BagReader
-from der_planner.identification import Excitation, read_bag, write_excitation
-from der_planner.identification.excitation import PERIOD, waves
+from der_planner.identification import read_bag
+from der_planner.identification.excitation import PERIOD, Excitation, waves, write_excitation
 from der_planner.limb import Limb
 
 ROOT = Path(__file__).resolve().parent.parent.parent

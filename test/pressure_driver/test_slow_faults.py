@@ -9,8 +9,7 @@ import pytest
 from pressure_driver import telemetry
 from pressure_driver.core import BoardWatch
 from pressure_driver.emulator import board as board_module
-from pressure_driver.protocols import NAMES, host_protocol
-from pressure_driver.protocols.base import Echo
+from pressure_driver.protocols import NAMES, Echo, host_protocol
 from pressure_driver.safety import Mode
 from pressure_driver.settings import Settings
 

@@ -12,6 +12,8 @@ from der_planner.bags.topics import OfferedQos, TopicSpec, find_definition
 
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
+TEXT = "std_msgs/msg/String"
+STANDARD = get_typestore(Stores.ROS2_JAZZY)
 
 
 def store(*names: str):
@@ -51,12 +53,7 @@ def spec(name: str, type_name: str, latched: bool = False) -> TopicSpec:
 
 def string(text: str) -> bytes:
     """Return the CDR of a std_msgs/String."""
-    types = get_typestore(Stores.ROS2_JAZZY)
-    message = types.types["std_msgs/msg/String"](data=text)
-    return bytes(types.serialize_cdr(message, "std_msgs/msg/String"))
-
-
-TEXT = "std_msgs/msg/String"
+    return bytes(STANDARD.serialize_cdr(message(STANDARD, TEXT, data=text), TEXT))
 
 
 def read_texts(path: Path) -> list[str]:

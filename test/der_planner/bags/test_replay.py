@@ -1,34 +1,14 @@
-"""Order, pace and choice of a replay, on a clock that does not wait."""
+"""Order, times and choice of a replay."""
 
+import itertools
 from pathlib import Path
 
 import pytest
 from bags import SECOND, START, TEXT, spec, string
 
 from der_planner.bags.reader import BagError, BagReader
-from der_planner.bags.replay import ReplaySettings, replay
+from der_planner.bags.replay import CLOCK_PERIOD, Selection, replay
 from der_planner.bags.writer import BagWriter
-
-
-class Stage:
-    """Collects what is published, on a clock that only its own sleeps move."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-        self.events: list[tuple[float, str, object]] = []
-
-    def sleep(self, seconds: float) -> None:
-        assert seconds >= 0
-        self.now += seconds
-
-    def publish(self, topic, message) -> None:
-        self.events.append((self.now - 100.0, topic, message.data))
-
-    def show_time(self, now: int) -> None:
-        self.events.append((self.now - 100.0, "/clock", now))
-
-    def of(self, topic: str) -> list[tuple[float, object]]:
-        return [(when, what) for when, name, what in self.events if name == topic]
 
 
 @pytest.fixture
@@ -41,59 +21,43 @@ def bag(tmp_path: Path) -> Path:
     return writer.close()
 
 
-def play(path: Path, **settings) -> Stage:
-    stage = Stage()
+def play(path: Path, **wanted):
+    """Return what is published: times [ns] since the start, topics and bytes."""
     with BagReader(path) as reader:
-        replay(
-            reader,
-            ReplaySettings(**settings),
-            stage,
-            clock=lambda: stage.now,
-            sleep=stage.sleep,
-        )
-    return stage
+        return [
+            (when - START, topic, message and message.data)
+            for when, topic, message in replay(reader, Selection(**wanted))
+        ]
 
 
-def test_pace_order_and_clock(bag: Path):
-    stage = play(bag, rate=2.0)
-    assert [data for _, data in stage.of("/a")] == [string(f"a{i}") for i in range(20)]
-    for index, (when, _) in enumerate(stage.of("/a")):
-        assert when == pytest.approx(index * 0.05, abs=1e-6)
-    times = [what for _, what in stage.of("/clock")]
-    assert times == sorted(times)
-    assert len(times) > 150  # 1.9 s at 100 Hz
-    shown = START
-    for _, topic, what in stage.events:
-        if topic == "/clock":
-            shown = what
-        elif topic == "/a":
-            index = [string(f"a{i}") for i in range(20)].index(what)
-            assert shown == START + index * SECOND // 10
-
-
-def test_rate_zero_does_not_wait(bag: Path):
-    stage = play(bag, rate=0.0)
-    assert stage.now == 100.0
-    assert len(stage.of("/b")) == 20
+def test_messages_come_at_their_times_and_the_clock_runs_between(bag: Path):
+    played = play(bag)
+    for offset, topic in ((0, "/a"), (5, "/b")):
+        assert [(when, data) for when, name, data in played if name == topic] == [
+            (index * SECOND // 10 + offset, string(f"{topic[1]}{index}")) for index in range(20)
+        ]
+    times = [when for when, _, _ in played]
+    assert all(0 <= b - a <= CLOCK_PERIOD for a, b in itertools.pairwise(times))
 
 
 def test_part_choice_and_names(bag: Path):
-    stage = play(bag, start=0.5, stop=1.0, topics=["/a"], remap={"/a": "/again"})
-    assert [data for _, data in stage.of("/again")] == [string(f"a{i}") for i in range(5, 10)]
-    assert stage.of("/b") == []
-    assert stage.of("/again")[0][0] == pytest.approx(0.0)
-    assert play(bag, exclude=["/a"]).of("/a") == []
+    played = play(bag, start=0.5, stop=1.0, topics=["/a"], remap={"/a": "/again"})
+    assert played[0] == (SECOND // 2, "", None)
+    assert [entry[1:] for entry in played if entry[1]] == [
+        ("/again", string(f"a{i}")) for i in range(5, 10)
+    ]
+    assert {topic for _, topic, _ in play(bag, exclude=["/a"])} == {"", "/b"}
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"),
+    ("wanted", "message"),
     [
         ({"topics": ["/c"]}, "no topic /c, only /a, /b"),
         ({"remap": {"/a": "/b"}}, "both be played on /b"),
-        ({"rate": -1.0}, "rate must be"),
         ({"start": 2.0, "stop": 1.0}, "nothing lies between"),
+        ({"start": 3.0}, "nothing lies between"),
     ],
 )
-def test_impossible_settings_are_named(bag: Path, settings, message):
+def test_what_cannot_be_played_is_named(bag: Path, wanted, message):
     with pytest.raises(BagError, match=message):
-        play(bag, **settings)
+        play(bag, **wanted)

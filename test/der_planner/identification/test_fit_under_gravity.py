@@ -56,7 +56,7 @@ def test_a_hanging_chain_that_swings_and_carries_a_mass_is_fitted():
     known = report.value("log_stiffness[0]")
     assert known.deviation < 0.06
     assert limb.segments[0].bending_stiffness == pytest.approx(truth, rel=0.12)
-    assert "EI of segment 0" in report.text()
+    assert f"{np.exp(known.value):.3f} × the prior's" in report.text()
     # The lengths do not take up that a heavy limb bends unevenly.
     assert limb.length == pytest.approx(0.244, abs=4e-3)
     assert limb.masses[0].arc_length == pytest.approx(limb.length)
@@ -77,7 +77,7 @@ def test_the_stiffness_of_rest_is_not_that_of_the_swing():
     rest = first.rest_curvature * first.length
     assert np.degrees(rest) == pytest.approx(np.degrees(chain._rest[0]), abs=4.0)
     assert first.swing_inertia < 0.95
-    assert "weight and rest angle bend segment 0, 1 alike" in report.text()
+    assert "cannot tell log_stiffness[0] and rest_angle[0] apart" in report.text()
 
 
 def test_lengths_that_are_far_off_are_named_in_place_of_a_traceback():
@@ -108,7 +108,7 @@ def test_tips_tell_how_much_of_a_bend_is_the_weights():
     other = RodModel(with_lengths(limb, np.array([0.117, 0.125, 0.003, 0.004])), NODES)
     tips = UnevenTips(limb, other, log, finer)
     both = FreeTerms.of(other.limb, {"log_stiffness"})
-    stiffness = replace(both, places=both.places[1:])
+    stiffness = replace(both, places=both.places[1:], terms=both.terms[1:])
 
     def rows(change: float) -> tuple[np.ndarray, np.ndarray]:
         return tips.rows(predicted(stiffness, other, log, np.array([change])))
@@ -132,12 +132,10 @@ def test_a_limb_that_gives_way_in_the_rod_of_more_nodes_is_told_by_the_other_one
 
     none = np.zeros_like(pressure)
     log = logged(time, pressure, none, none)
-    whole, lacking, holds = unevenness(softening(-1.0e-5), log, NODES)
-    assert holds
+    whole, lacking = unevenness(softening(-1.0e-5), log, NODES)
     assert 0.0 < np.abs(lacking).max() < 0.2 * np.abs(whole).max()
     uneven_tip(softening(-1.0e-5), log)
-    whole, lacking, holds = unevenness(softening(-1.6e-5), log, NODES)
-    assert not holds
+    whole, lacking = unevenness(softening(-1.6e-5), log, NODES)
     assert np.isfinite(whole).all()
     assert not lacking.any()
     with pytest.raises(LogError, match=r"gives way .* \(--terms without 'cubic'\)"):
@@ -162,7 +160,6 @@ def test_mass_is_told_where_stiffness_is_given():
     assert limb.moving_mass == pytest.approx(1.066 * 0.244, rel=0.1)
     moment = re.search(r"first moment ([0-9.]+) g·m", report.text())
     assert float(moment[1]) == pytest.approx(1066 * 0.244**2 / 2, rel=0.1)
-    assert "mass of segment 0 = prior" in report.text()
 
 
 def test_a_prior_that_its_rod_cannot_follow_is_refused_by_name():
@@ -170,6 +167,6 @@ def test_a_prior_that_its_rod_cannot_follow_is_refused_by_name():
     rows = log.between(0.0, 6.0)
     heavy = replace(prior((-9.81, 0.0, 0.0)), masses=()).carrying(1e4)
     with pytest.raises(LogError, match="check the prior's gravity, mass"):
-        fit(heavy, rows, terms=(), geometry=False)
+        fit(heavy, rows, terms=())
     with pytest.raises(LogError, match="cannot follow this log"):
         predict(heavy, rows.time, rows.measured_differential)

@@ -8,11 +8,7 @@ import pytest
 from log_table import write_csv
 
 from der_planner.commands import check_limb
-from der_planner.identification import (
-    CalibrationLog,
-    LogError,
-    update,
-)
+from der_planner.identification import CalibrationLog, LogError, update
 from der_planner.limb import Limb
 from der_planner.model import simulate
 
@@ -69,7 +65,7 @@ def test_gain_rest_angle_and_friction_of_another_day_are_found():
     assert numbers(found)[:, 2] == pytest.approx(numbers(today)[:, 2], rel=0.3)
     assert np.degrees(said.error_before).min() > 4.0
     assert np.degrees(said.error_after).max() < 0.3
-    assert all(change.told and change.deviation < change.spread for change in said.changes)
+    assert all(change.told and change.deviation < change.term.spread for change in said.changes)
     distance = [
         abs(c.after - n) / c.deviation for c, n in zip(said.changes, days(today), strict=True)
     ]
@@ -82,16 +78,16 @@ def days(limb):
     for s in limb.segments:
         yield s.moment_gain * s.length / s.bending_stiffness
         yield s.rest_curvature * s.length
-        yield s.friction_moment
+        yield s.friction_moment / s.moment_gain
 
 
 def test_what_a_run_does_not_tell_stays():
     today = another_day(RUBBING, (0.7, 0.7))
     found, said = update(RUBBING, filmed(today, *motion(moves=(1.0, 0.0))))
-    told = {(c.segment, c.name): c.told for c in said.changes}
+    told = {(c.segment, c.term.name): c.told for c in said.changes}
     assert told[0, "gain"]
     assert not told[1, "gain"]
-    assert not told[1, "friction"]
+    assert not told[1, "friction_pressure"]
     assert numbers(found)[0, 0] == pytest.approx(0.7 * numbers(RUBBING)[0, 0], rel=0.02)
     assert numbers(found)[1, 0] == numbers(RUBBING)[1, 0]
     assert numbers(found)[1, 2] == numbers(RUBBING)[1, 2]

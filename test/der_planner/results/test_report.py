@@ -2,7 +2,7 @@
 
 import csv
 import json
-from html.parser import HTMLParser
+import re
 from pathlib import Path
 
 import cv2
@@ -15,7 +15,6 @@ from der_planner.bags.reader import BagReader
 from der_planner.results import (
     EvaluationError,
     compare,
-    evaluate_bags,
     evaluate_run,
     load_run,
     write_report,
@@ -69,27 +68,6 @@ def test_colour_images_become_gray():
     assert gray(Message) is None
 
 
-class Links(HTMLParser):
-    """Collects what a page would load, and checks that tags are balanced."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.sources: list[str] = []
-        self.open: list[str] = []
-        self.text: list[str] = []
-
-    def handle_starttag(self, tag, attributes):
-        self.sources += [v for k, v in attributes if k in ("src", "href", "srcset") and v]
-        if tag not in ("meta", "img", "br"):
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        self.text.append(data)
-
-
 @pytest.mark.slow
 def test_report_is_one_page_with_everything_in_it(bag: Path, tmp_path: Path):
     run = load_run(bag)
@@ -99,17 +77,15 @@ def test_report_is_one_page_with_everything_in_it(bag: Path, tmp_path: Path):
     names = {path.name for path in tmp_path.iterdir()}
     assert names >= {"results.json", "table.md", "table.csv", "table.tex", "report.html"}
     assert names >= {f"{n}.{e}" for n in ("tip", "error", "shapes") for e in ("png", "pdf")}
-    page = Links()
-    text = written.read_text()
-    page.feed(text)
-    assert page.open == []
-    assert page.sources
-    assert all(source.startswith("data:image/png;base64,") for source in page.sources)
-    assert "url(" not in text
-    assert "Errors <of a lab>" in page.text
-    assert "c0ffee" in "".join(page.text)
+    page = written.read_text()
+    sources = re.findall(r'(?:src|href|srcset)="([^"]*)"', page)
+    assert sources
+    assert all(source.startswith("data:image/png;base64,") for source in sources)
+    assert "url(" not in page
+    assert "Errors &lt;of a lab&gt;" in page
+    assert "c0ffee" in page
     (found,) = compare(results)
-    assert f"{found.difference_m * 100:.2f} cm less error" in "".join(page.text)
+    assert f"{found.difference_m * 100:.2f} cm less error" in page
     with (tmp_path / "table.csv").open() as file:
         rows = {row["model"]: float(row["mean_error_m"]) for row in csv.DictReader(file)}
     assert rows["der"] == pytest.approx(0.002, abs=5e-5)
@@ -126,25 +102,8 @@ def test_film_has_every_frame(bag: Path, tmp_path: Path):
 
 
 def test_bag_without_images_has_shapes_but_no_film(tmp_path: Path):
-    run = BagOfRun(tmp_path / "plain")
-    run.plan()
-    for when in FRAMES:
-        run.state(when, reference(when)[0])
-    run.setpoint(0, [0.0, 0.0])
-    run.setpoint(len(TIMES) - 1, [0.0, 0.0])
-    run.bag.close()
-    loaded = load_run(tmp_path / "plain")
+    loaded = load_run(BagOfRun(tmp_path / "plain").still_run())
     assert len(plot_shapes([loaded], tmp_path)) == 2
     with pytest.raises(EvaluationError, match="no camera calibration"):
         write_video(loaded, tmp_path / "film.mp4")
     assert plot_shapes([series(reference(FRAMES))], tmp_path) == []
-
-
-def test_bags_keep_their_order_and_their_errors(bag: Path, tmp_path: Path):
-    missing = tmp_path / "missing"
-    seen = []
-    found = evaluate_bags([bag, missing, bag], None, lambda *told: seen.append(told[:2]))
-    assert [entry.path for entry in found] == [bag, missing, bag]
-    assert f"no bag at {missing}" in found[1].error
-    assert found[0].result == found[2].result
-    assert seen == [(1, 3), (2, 3), (3, 3)]

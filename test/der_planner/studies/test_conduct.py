@@ -1,5 +1,6 @@
 """A study is played: on processes of this machine, on a cluster that breaks, and after a stop."""
 
+import json
 import os
 import signal
 import subprocess
@@ -8,7 +9,6 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import pyarrow.parquet
 import pytest
 from distributed import LocalCluster
 
@@ -65,11 +65,11 @@ def write(folder: Path, text: str) -> Path:
 
 
 def by_key(folder: Path) -> dict[str, dict]:
-    """Return the record of every file by its name, which is its key."""
-    return {
-        path.stem: pyarrow.parquet.read_table(path).to_pylist()[0]
-        for path in (folder / "rows").glob("*.parquet")
-    }
+    """Return the record of every whole line by its key."""
+    file = folder / "rows.jsonl"
+    text = file.read_text() if file.exists() else ""
+    lines = [line for line in text.splitlines() if line.endswith("}")]
+    return {record["key"]: record for record in map(json.loads, lines)}
 
 
 def test_one_or_two_workers_and_rows_that_fail(tmp_path, monkeypatch):
@@ -111,44 +111,43 @@ class Breaking(Progress):
             self._cluster.close()
 
 
-def test_a_cluster_that_breaks(tmp_path, monkeypatch):
+def test_a_cluster_that_breaks(tmp_path):
     """A worker is killed, then the scheduler is gone: nothing is lost, nothing is done again."""
-    monkeypatch.setattr(conducting, "_PAUSE", 0.0)
     study, out = Study.read(write(tmp_path, TWINS.format(count=14))), tmp_path / "out"
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
         settings = PlaySettings(out, cluster.scheduler_address)
         with pytest.raises(StudyError, match=r"scheduler is gone.*same command goes on from here"):
             conduct(study, settings, Breaking(cluster))
-    kept = {path: path.stat().st_mtime_ns for path in (out / "rows").iterdir()}
-    assert 5 <= len(kept) < len(study.rows)
+    kept = (out / "rows.jsonl").read_text()
+    assert 5 <= len(by_key(out)) < len(study.rows)
     found = conduct(study, PlaySettings(out), Progress())
     assert list(found) == [row.key for row in study.rows]
     assert {record["error"] for record in found.values()} == {None}
-    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    text = (out / "rows.jsonl").read_text()
+    assert text.startswith(kept)
+    assert text.count("{") == len(study.rows)
 
 
 def test_a_stopped_study_goes_on(tmp_path):
-    """SIGTERM ends it in order, SIGKILL does not; both go on, with the digits of a run at once."""
-    path = write(tmp_path, TWINS.format(count=8))
+    """With the digits of a run at once; and SIGTERM ends it in order."""
+    path = write(tmp_path, TWINS.format(count=6))
     study, out = Study.read(path), tmp_path / "out"
     command = [sys.executable, str(SCRIPT), str(path), "--out", str(out), "--workers", "1"]
-    for number, code in ((signal.SIGTERM, 130), (signal.SIGKILL, -signal.SIGKILL)):
-        least = len(by_key(out)) + 2
-        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as running:
-            while len(by_key(out)) < least:
-                assert running.poll() is None, running.communicate()
-                time.sleep(0.02)
-            running.send_signal(number)
-            _, said = running.communicate(timeout=300)
-        assert running.returncode == code, said
-        assert code < 0 or "stopped by SIGTERM; what was done is kept" in said
-    # As a loss of power leaves it: a file without its content.
-    some = sorted((out / "rows").iterdir())[0]
-    some.write_bytes(some.read_bytes()[:100])
-    subprocess.run([*command, "--limit", "6"], check=True, timeout=600)
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as running:
+        while len(by_key(out)) < 2:
+            assert running.poll() is None, running.communicate()
+            time.sleep(0.02)
+        running.send_signal(signal.SIGTERM)
+        _, said = running.communicate(timeout=300)
+    assert running.returncode == 130, said
+    assert "stopped by SIGTERM; what was done is kept" in said
+    # As a kill or a loss of power leaves it: a line without its end.
+    rows = out / "rows.jsonl"
+    rows.write_bytes(rows.read_bytes()[:-30])
+    subprocess.run([*command, "--limit", "5"], check=True, timeout=600)
     stopped = by_key(out)
-    assert {row.key for row in study.rows[:6]} <= set(stopped)
-    for row in study.rows[:6:2]:
+    assert {row.key for row in study.rows[:5]} <= set(stopped)
+    for row in study.rows[:5:2]:
         outcome = compute("run", row.values, "")
         for column in study.keep:
             assert stopped[row.key][column] == outcome.results[column]
@@ -160,17 +159,10 @@ def test_a_twin_is_calibrated_once(tmp_path, monkeypatch):
     monkeypatch.setenv("DER_LIMB_CACHE", str(tmp_path / "cache"))
     fitted = []
     monkeypatch.setattr(Twin, "fit", lambda twin, prior: (fitted.append(twin) or prior, None))
-    text = "task: run\nfactors: {seed: 5, period: 1, cycles: 1, amplitude: 0.1, model: [der, pcc]}"
-    study = Study.read(write(tmp_path, text))
-    with LocalCluster(n_workers=2, processes=False, dashboard_address=None) as cluster:
-        settings = PlaySettings(tmp_path / "out", cluster.scheduler_address)
-        kept = conduct(study, settings, Progress())
-    assert [record["error"] for record in kept.values()] == [None, None]
-    twin = study.task.twin(study.rows[0].values)
     with ThreadPoolExecutor() as threads:
-        found = list(threads.map(lambda seed: calibrated(Twin(seed), ""), [5, 6, 6]))
-    assert found[1] == found[2]
-    assert fitted == [twin, Twin(6)]
+        found = set(threads.map(lambda seed: calibrated(Twin(seed), ""), [6, 6]))
+    assert {calibrated(Twin(6), "")} == found
+    assert fitted == [Twin(6)]
 
 
 def test_what_cannot_be_written_is_named(tmp_path):

@@ -38,24 +38,26 @@ from der_planner.experiment.console import (
 )
 from der_planner.experiment.processes import GraphError, Hardware, NodeError
 from der_planner.identification import (
-    GROUPS,
     CalibrationLog,
-    Excitation,
     FitReport,
     LogError,
-    calibration_run,
     fit,
-    plot_prediction,
     predict,
-    prepare,
     read_bag,
-    read_excitation,
     read_log,
     record_twin,
+)
+from der_planner.identification.bends import GROUPS
+from der_planner.identification.excitation import (
+    AMPLITUDE,
+    Excitation,
+    calibration_run,
+    read_excitation,
     within_limits,
     write_excitation,
 )
-from der_planner.identification.excitation import AMPLITUDE
+from der_planner.identification.log import prepare
+from der_planner.identification.report import plot_prediction
 from der_planner.limb import Limb, LimbError
 from der_planner.planning.loads import nearly_buckling
 from der_planner.results.outputs import check_file, check_folder
@@ -269,37 +271,16 @@ def _obtain(prior: Limb, given: argparse.Namespace) -> CalibrationLog:
 def _play_on_graph(prior: Limb, given: argparse.Namespace) -> Path:
     """Play the calibration on the twin's nodes or the hardware; return the bag."""
     # ROS is imported only by who needs it.
-    from der_planner.experiment.graph_trials import GraphCalibration  # noqa: PLC0415
+    from der_planner.experiment.graph_trials import play_calibration  # noqa: PLC0415
 
     interrupt_once()
-    progress = Progress()
     hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
-    driver = hardware.driver if hardware else {}
-    defaults = Settings()
-    limit = min(
-        prior.pneumatics.pressure_limit,
-        float(driver.get("pressure_limit", defaults.pressure_limit)),
-    )
+    driver = {**dataclasses.asdict(Settings()), **(hardware.driver if hardware else {})}
+    limit = min(prior.pneumatics.pressure_limit, float(driver["pressure_limit"]))
     # Steps may be faster than the limb's own slew_limit, which is for plans: they show how the air
     # follows. The driver's limit holds for every setpoint.
-    slew = float(driver.get("slew_limit", defaults.slew_limit))
-    run = within_limits(_excitation(prior, limit, given), limit, slew)
-    stage = f"the hardware at {driver['port']}" if hardware else f"the twin of seed {given.seed}"
-    progress.say(f"playing {run.duration:.0f} s on {stage}, into {given.folder}")
-    metadata = {
-        "motion": "calibration",
-        "stage": stage,
-        "seed": None if hardware else given.seed,
-        "largest_pressure_Pa": float(np.abs(run.differential_pressure).max()),
-        "parts": [list(part) for part in run.parts],
-        "prior": prior.name,
-    }
-    player = GraphCalibration(
-        run, given.folder, metadata, progress, limb=prior, seed=given.seed, hardware=hardware
-    )
-    bag = player.play().bag
-    progress.say(f"bag: {bag}")
-    return bag
+    run = within_limits(_excitation(prior, limit, given), limit, float(driver["slew_limit"]))
+    return play_calibration(run, given.folder, Progress(), prior, given.seed, hardware)
 
 
 def _held_out_text(limb: Limb, log: CalibrationLog, longest_gap: float) -> str:

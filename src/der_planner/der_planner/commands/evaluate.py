@@ -10,7 +10,6 @@ A bag of several limbs gives a row for each: every limb is evaluated within its 
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 from der_planner.experiment.console import Progress, run_command
@@ -82,15 +81,12 @@ def _evaluate(given: argparse.Namespace) -> int:
     if given.video is not None:
         check_file(given.video, "--video")
     settings = EvaluationSettings(window=given.window, remove_lag=given.remove_lag)
-    progress = Progress()
-    found = evaluate_bags(
-        expand(given.bags),
-        settings,
-        lambda done, total, path: progress.bar(done, total, path.name, unit="bags read"),
-    )
-    for entry in found:
+    progress, bags, found = Progress(), expand(given.bags), []
+    for entry in evaluate_bags(bags, settings):
+        found.append(entry)
+        progress.bar(bags.index(entry.path) + 1, len(bags), entry.path.name, unit="bags read")
         if entry.error:
-            print(f"error: {entry.error}", file=sys.stderr)
+            progress.say(f"error: {entry.error}")
     runs = [entry.run for entry in found if entry.run is not None]
     results = [entry.result for entry in found if entry.result is not None]
     if not results:

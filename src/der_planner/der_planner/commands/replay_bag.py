@@ -25,9 +25,9 @@ from rosgraph_msgs.msg import Clock
 
 from der_planner.bags.reader import BagError, BagReader, RawMessage, RecordedTopic
 from der_planner.bags.record import NANOSECONDS
-from der_planner.bags.replay import ReplaySettings, choose_topics, replay
+from der_planner.bags.replay import Selection, choose_topics, replay
 from der_planner.experiment.client import GraphClient
-from der_planner.experiment.console import Progress, interrupt_once, run_command
+from der_planner.experiment.console import OptionError, Progress, interrupt_once, run_command
 from der_planner.experiment.processes import GraphError
 
 ATTEMPTS = 3
@@ -182,39 +182,39 @@ def _arguments() -> argparse.Namespace:
 def _pairs(values: list[str], what: str) -> dict[str, str]:
     for value in values:
         if value.count("=") != 1:
-            raise BagError(f"{what} '{value}' is not of the form A=B")
+            raise OptionError(f"{what} '{value}' is not of the form A=B")
     return dict(value.split("=") for value in values)
 
 
 def _replay(given: argparse.Namespace) -> int:
-    settings = ReplaySettings(
-        rate=given.rate,
-        start=given.start,
-        stop=given.stop,
-        topics=given.topics,
-        exclude=given.exclude,
-        remap=_pairs(given.remap, "--remap"),
+    if given.rate < 0:
+        raise OptionError(f"--rate is {given.rate}: choose 0 or more")
+    wanted = Selection(
+        given.start, given.stop, given.topics, given.exclude, _pairs(given.remap, "--remap")
     )
     stepping = _pairs([given.step_by] if given.step_by else [], "--step-by")
     step_by, answer = next(iter(stepping.items()), ("", ""))
-    progress = Progress()
+    progress, count = Progress(), 0
     with BagReader(given.bag) as bag, GraphClient("replay_bag") as client:
-        topics = choose_topics(bag, settings)
+        topics = choose_topics(bag, wanted)
+        first, last = wanted.window(bag)
         output = GraphOutput(client, topics, not given.no_clock, step_by, answer)
         output.wait_for_receivers(given.wait)
-        count = replay(
-            bag,
-            settings,
-            output,
-            progress=lambda played, length: progress.bar(played, length, "played"),
-        )
+        begin = time.monotonic()
+        for when, topic, message in replay(bag, wanted):
+            since = (when - first) / NANOSECONDS
+            if given.rate:
+                time.sleep(max(0.0, begin + since / given.rate - time.monotonic()))
+            output.show_time(when)
+            if message is not None:
+                output.publish(topic, message)
+                count += 1
+            progress.bar(since, (last - first) / NANOSECONDS, "played")
         time.sleep(0.2)  # the last messages leave the process
     print(f"published {count} messages of {len(topics)} topics")
     if count == 0:
         print(
-            "error: nothing was published: no message of the chosen topics lies between --from and "
-            "--to (seconds from the bag's first message)",
-            file=sys.stderr,
+            "error: no message of the chosen topics lies between --from and --to", file=sys.stderr
         )
     if output.unanswered:
         print(f"error: {output.unanswered} messages got no answer", file=sys.stderr)

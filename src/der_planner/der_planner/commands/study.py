@@ -5,7 +5,7 @@
     python3 scripts/study.py my.yaml --scheduler tcp://host:8786
     python3 scripts/study.py --list                            shipped studies, factors and columns
 
-Rows go to OUT/rows/*.parquet as they finish; a study that was stopped, killed or cut off goes on
+Rows go to OUT/rows.jsonl as they finish; a study that was stopped, killed or cut off goes on
 where it was with the same --out. At the end: OUT/rows.csv, figures, OUT/report/report.html.
 """
 
@@ -95,7 +95,7 @@ def _play(given: argparse.Namespace) -> int:
     progress.say(f"{len(kept)} of {len(study.rows)} rows are done, {failed} of them failed")
     if failed:
         progress.say("failed rows are in the report; --retry-failed does them again")
-    progress.say(f"rows: {out}/rows.csv, {out}/rows/*.parquet")
+    progress.say(f"rows: {out}/rows.csv, {out}/rows.jsonl")
     progress.say(f"report: {page}")
     return 0
 

@@ -1,4 +1,4 @@
-"""One run of the graph: start the nodes, play something, vent, stop, keep the bag."""
+"""The graph of a run: nodes started, recording and armed, and left vented and stopped."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ import contextlib
 import os
 import tempfile
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from der_msgs.msg import PressureState
@@ -35,203 +34,176 @@ VENTED_PRESSURE = 1000.0
 """A limb counts as vented below this differential pressure [Pa]."""
 
 
-@dataclass(frozen=True)
-class Playing:
-    """What the graph plays, from when to when.
-
-    Attributes:
-        begin: ROS time at which the first setpoint takes effect [s].
-        length: from the first setpoint to the last [s].
-        feed: called at least every 50 ms until the end; publishes what is due, if the orchestrator
-            is the one who publishes, or shows what is told of the plan meanwhile.
-        plan_id: of the plan, if there is one.
-    """
-
-    begin: float
-    length: float
-    feed: Callable[[], None] = lambda: None
-    plan_id: str = ""
-
-
-@dataclass(frozen=True)
-class GraphRun:
-    """What a run left behind.
-
-    Attributes:
-        bag: folder of the bag.
-        cpu_percent: CPU use of each process while the motion played, in per cent of one core.
-        real_time_factor: simulated over real seconds of the twin; NaN on hardware.
-        plan_id: of the plan that was played; empty for pressures without a plan.
-    """
-
-    bag: Path
-    cpu_percent: dict[str, float]
-    real_time_factor: float
-    plan_id: str = ""
-
-
-class GraphPlayer(ABC):
-    """Plays something on the graph; whatever happens, the limb is vented and every node stopped.
+@contextlib.contextmanager
+def running_graph(
+    client: GraphClient, setup: GraphSetup, logs: Path, progress: Progress
+) -> Iterator[RunningGraph]:
+    """Start the nodes of a run, record and arm; whatever happens then, vent and stop every node.
 
     Args:
+        client: has subscribed and advertised already what the run needs: the recorder knows all
+            topics when it begins to record.
         setup: the nodes.
         logs: folder of the nodes' logs.
         progress: shows what happens.
+
+    Raises:
+        GraphError: a node is not ready, or the driver cannot be armed.
+        NodeError: a node cannot be started, has died, or did not end in order.
+    """
+    graph = RunningGraph(client, progress)
+    client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES)
+    with tempfile.TemporaryDirectory(prefix="der_limb_") as folder:
+        port = str(Path(folder) / "board")
+        specs = setup.nodes(port)
+        client.spin(DISCOVERY)
+        _refuse_second_graph(client, specs)
+        try:
+            graph.start(specs, port, logs, setup.hardware.remap if setup.hardware else {})
+            # A graph that was not seen at once, or that began meanwhile, is known by now.
+            _refuse_second_graph(client, specs, own=1)
+            graph.bag = Path(client.call("recorder/start"))
+            graph.arm()
+            yield graph
+        except BaseException:
+            graph.vent_after_error()
+            graph.stop()
+            raise
+        client.watch(())
+        failed = {name: code for name, code in graph.stop().items() if code != 0}
+    for name, code in failed.items():
+        process = graph.processes[name]
+        raise NodeError(
+            f"node '{name}' ended with exit code {code}. Its last words:\n"
+            f"{process.last_words()}\nThe whole log: {process.log}"
+        )
+
+
+def _refuse_second_graph(client: GraphClient, specs: list[NodeSpec], own: int = 0) -> None:
+    """Raise `GraphError` if nodes of another graph are seen beside ``own`` of each name."""
+    count = client.count_nodes()
+    others = [spec.executable for spec in specs if count[spec.executable] > own]
+    if others:
+        raise GraphError(
+            f"another graph is running in this ROS domain (node '{min(others)}'): stop it, or "
+            "set ROS_DOMAIN_ID to another number for one of them"
+        )
+
+
+@dataclass
+class RunningGraph:
+    """The nodes of a run, and what the run left behind; made by `running_graph`.
+
+    Attributes:
+        client: of the graph.
+        progress: shows what happens.
+        processes: of the nodes, by executable.
+        bag: folder of the bag.
+        cpu_percent: CPU use of each process while the motion played, in per cent of one core.
+        real_time_factor: simulated over real seconds of the twin; NaN on hardware.
     """
 
-    def __init__(self, setup: GraphSetup, logs: Path, progress: Progress) -> None:
-        self._setup, self._logs, self._progress = setup, logs, progress
-        self._processes: dict[str, NodeProcess] = {}
+    client: GraphClient
+    progress: Progress
+    processes: dict[str, NodeProcess] = field(default_factory=dict)
+    bag: Path = Path()
+    cpu_percent: dict[str, float] = field(default_factory=dict)
+    real_time_factor: float = float("nan")
 
-    @abstractmethod
-    def _begin(self, client: GraphClient) -> Playing:
-        """Arrange what is played; the recorder runs and the driver is armed."""
-
-    def play(self) -> GraphRun:
-        """Start the graph, play and stop everything, whatever happens on the way.
-
-        Raises:
-            GraphError: a node is not ready, the planner refuses, the driver reports a fault.
-            NodeError: a node cannot be started or has died.
-        """
-        with tempfile.TemporaryDirectory(prefix="der_limb_") as folder, GraphClient() as client:
-            port = str(Path(folder) / "board")
-            specs = self._setup.nodes(port)
-            client.spin(DISCOVERY)
-            self._refuse_second_graph(client, specs)
-            self._join(client)
-            with self._everything_stops(client):
-                self._start(client, specs, port)
-                # A graph that was not seen at once, or that began meanwhile, is known by now.
-                self._refuse_second_graph(client, specs, own=1)
-                return self._record(client)
-
-    def _join(self, client: GraphClient) -> None:
-        """Subscribe and advertise, before the nodes start."""
-        client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES)
-
-    def _refuse_second_graph(
-        self, client: GraphClient, specs: list[NodeSpec], own: int = 0
-    ) -> None:
-        """Raise `GraphError` if nodes of another graph are seen beside ``own`` of each name."""
-        count = client.count_nodes()
-        others = [spec.executable for spec in specs if count[spec.executable] > own]
-        if others:
-            raise GraphError(
-                f"another graph is running in this ROS domain (node '{min(others)}'): stop it, or "
-                "set ROS_DOMAIN_ID to another number for one of them"
-            )
-
-    def _start(self, client: GraphClient, specs: list[NodeSpec], port: str) -> None:
+    def start(self, specs: list[NodeSpec], port: str, logs: Path, remap: dict[str, str]) -> None:
+        """Start every node and wait until all are ready; the emulated board is at ``port``."""
         begin = time.monotonic()
-        self._progress.say(f"  starting {', '.join(spec.executable for spec in specs)}")
-        remap = self._setup.hardware.remap if self._setup.hardware is not None else None
+        self.progress.say(f"  starting {', '.join(spec.executable for spec in specs)}")
         for spec in specs:
-            self._processes[spec.executable] = NodeProcess(
-                spec.package, spec.executable, spec.parameters, self._logs, remap
+            self.processes[spec.executable] = NodeProcess(
+                spec.package, spec.executable, spec.parameters, logs, remap
             )
-            client.watch(self._processes.values())
+            self.client.watch(self.processes.values())
             if spec.executable == "board_emulator":
-                client.wait_for(lambda: os.path.exists(port), 60.0, "the emulated board's port")
-        client.wait_ready(self._processes)
-        self._progress.say(f"  ready after {time.monotonic() - begin:.1f} s")
-        if "page" in self._processes:
-            address = client.diagnostic_values("page").get("url", "unknown")
-            self._progress.say(f"  the operator's page is at {address}?token={PAGE_TOKEN}")
+                self.client.wait_for(lambda: os.path.exists(port), 60.0, "the port of the board")
+        self.client.wait_ready(self.processes)
+        self.progress.say(f"  ready after {time.monotonic() - begin:.1f} s")
+        if "page" in self.processes:
+            address = self.client.diagnostic_values("page").get("url", "unknown")
+            self.progress.say(f"  the operator's page is at {address}?token={PAGE_TOKEN}")
 
-    def _record(self, client: GraphClient) -> GraphRun:
-        bag = Path(client.call("recorder/start"))
-        self._arm(client)
-        playing = self._begin(client)
-        before = {name: process.measure_cpu() for name, process in self._processes.items()}
-        begin = time.monotonic()
-        self._await_end(client, playing)
-        wall = time.monotonic() - begin
-        cpu = {
-            name: 100.0 * (process.measure_cpu() - before[name]) / wall
-            for name, process in self._processes.items()
-        }
-        factor = client.diagnostic_values("limb_twin").get("real_time_factor", "nan")
-        self._vent(client)
-        client.call("recorder/stop", timeout=60.0)
-        return GraphRun(bag, cpu, float(factor), playing.plan_id)
-
-    def _arm(self, client: GraphClient) -> None:
+    def arm(self) -> None:
         """Arm the driver; what forbids it for a moment, as a late report of the board, may pass."""
         end = time.monotonic() + ARMING
         while True:
             try:
-                client.call("pressure_driver/arm")
+                self.client.call("pressure_driver/arm")
                 return
             except GraphError:
                 if time.monotonic() > end:
                     raise
-            client.spin(0.2)
+            self.client.spin(0.2)
 
-    def _await_end(self, client: GraphClient, playing: Playing) -> None:
-        length = playing.length
+    def play(self, begin: float, length: float, feed: Callable[[], None]) -> None:
+        """Wait until a motion was played, then vent the limb and close the bag.
 
-        def played() -> float:
-            return float(client.node.get_clock().now().nanoseconds * 1e-9 - playing.begin)
+        Args:
+            begin: ROS time at which the first setpoint takes effect [s].
+            length: from the first setpoint to the last [s].
+            feed: called at least every 50 ms until the end; publishes what is due, or shows what is
+                told of the plan meanwhile.
+
+        Raises:
+            GraphError: the driver reports a fault, or the chambers do not vent.
+            NodeError: a node has died.
+        """
 
         def finished() -> bool:
-            state = client.newest.get(topics.PRESSURE_STATE)
+            state = self.client.newest.get(topics.PRESSURE_STATE)
             if state is not None and state.mode == PressureState.FAULT:
                 raise GraphError(f"the driver vented: {'; '.join(state.faults) or 'fault'}")
-            playing.feed()
-            self._progress.bar(min(played(), length), length, "played")
-            return played() >= length
+            feed()
+            played = self.client.node.get_clock().now().nanoseconds * 1e-9 - begin
+            self.progress.bar(min(played, length), length, "played")
+            return bool(played >= length)
 
-        client.wait_for(finished, length + 30.0, "the end of the motion")
+        started = time.monotonic()
+        before = {name: process.measure_cpu() for name, process in self.processes.items()}
+        self.client.wait_for(finished, length + 30.0, "the end of the motion")
+        wall = time.monotonic() - started
+        self.cpu_percent = {
+            name: 100.0 * (process.measure_cpu() - before[name]) / wall
+            for name, process in self.processes.items()
+        }
+        told = self.client.diagnostic_values("limb_twin")
+        self.real_time_factor = float(told.get("real_time_factor", "nan"))
+        self._vent()
+        self.client.call("recorder/stop", timeout=60.0)
 
-    def _vent(self, client: GraphClient) -> None:
-        client.call("pressure_driver/vent")
-        client.newest.pop(topics.PRESSURE_STATE, None)
+    def _vent(self) -> None:
+        self.client.call("pressure_driver/vent")
+        self.client.newest.pop(topics.PRESSURE_STATE, None)
 
         def vented() -> bool:
-            state = client.newest.get(topics.PRESSURE_STATE)
+            state = self.client.newest.get(topics.PRESSURE_STATE)
             measured = state.measured_differential if state is not None else []
             return bool(measured) and all(abs(value) < VENTED_PRESSURE for value in measured)
 
-        client.wait_for(vented, 30.0, "the chambers to vent")
+        self.client.wait_for(vented, 30.0, "the chambers to vent")
 
-    def _vent_after_error(self, client: GraphClient) -> None:
+    def vent_after_error(self) -> None:
         """Vent; where the driver has died, the process of its port does it by itself."""
-        driver = self._processes.get("pressure_driver")
+        driver = self.processes.get("pressure_driver")
         if driver is None:
             return
-        self._progress.say("  venting the limb")
-        client.watch(())
+        self.progress.say("  venting the limb")
+        self.client.watch(())
         try:
             if driver.alive:
-                self._vent(client)
+                self._vent()
             else:
-                client.spin(PORT_VENTS)
+                self.client.spin(PORT_VENTS)
         except GraphError as error:
-            self._progress.say(
+            self.progress.say(
                 f"  WARNING: the limb may still be under pressure ({error}); close its air supply"
             )
 
-    @contextlib.contextmanager
-    def _everything_stops(self, client: GraphClient) -> Iterator[None]:
-        """Stop every node at the end; after an error or an interrupt, vent first."""
-        try:
-            yield
-        except BaseException:
-            self._vent_after_error(client)
-            self._stop_all()
-            raise
-        client.watch(())
-        codes = self._stop_all()
-        failed = {name: code for name, code in codes.items() if code != 0}
-        if failed:
-            name, code = next(iter(failed.items()))
-            process = self._processes[name]
-            raise NodeError(
-                f"node '{name}' ended with exit code {code}. Its last words:\n"
-                f"{process.last_words()}\nThe whole log: {process.log}"
-            )
-
-    def _stop_all(self) -> dict[str, int]:
-        order = [name for name in STOP_ORDER if name in self._processes]
-        return {name: self._processes[name].stop() for name in order}
+    def stop(self) -> dict[str, int]:
+        """Stop every node; return the exit codes by name."""
+        order = [name for name in STOP_ORDER if name in self.processes]
+        return {name: self.processes[name].stop() for name in order}

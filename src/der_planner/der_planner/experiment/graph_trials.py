@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import math
 import uuid
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path as PathMessage
 
-from der_msgs.msg import MotionCommand, PressurePlan, PressureSetpoint, PressureState
+from der_msgs.msg import MotionCommand, PressurePlan, PressureSetpoint
 from der_planner.experiment.client import GraphClient
 from der_planner.experiment.console import Progress
-from der_planner.experiment.graph_run import GraphPlayer, GraphRun, Playing
+from der_planner.experiment.graph_run import running_graph
 from der_planner.experiment.options import TrialRun
 from der_planner.experiment.processes import GraphError, GraphSetup, Hardware
-from der_planner.identification import Excitation
+from der_planner.identification.excitation import Excitation
 from der_planner.limb import Limb
 from der_planner.methods import LEARNED
 from der_planner.planning import paths
@@ -32,6 +32,9 @@ PAUSE = 50_000_000
 """What is due is looked for again after this time [ns] at the latest."""
 
 
+# A trial -----------------------------------------------------------------------------------------
+
+
 def play_on_graph(run: TrialRun, progress: Progress) -> dict[str, Any]:
     """Play a run on the graph; return what is kept of it beside its bag.
 
@@ -39,12 +42,55 @@ def play_on_graph(run: TrialRun, progress: Progress) -> dict[str, Any]:
         GraphError: a node is not ready, the planner refuses, the driver reports a fault.
         NodeError: a node cannot be started or has died.
     """
-    played = GraphTrial(run, progress).play()
-    factor = played.real_time_factor
+    options, name = run.options, run.trial.name
+    setup = GraphSetup(
+        _bag_folder(options.out, name),
+        run.metadata,
+        seed=run.trial.seed,
+        run=run.trial.run - 1,
+        limb=run.limb,
+        hardware=options.hardware,
+        planner=_planner_parameters(run),
+        record_images=options.record_images,
+        page=options.page,
+    )
+    drawn = options.path if run.learned is None else None
+    asked = _path(drawn) if drawn is not None else _command(run)
+    with GraphClient() as client:
+        client.subscribe(PressurePlan, topics.PLAN, qos.LATCHED)
+        topic = topics.PATH if drawn is not None else topics.COMMAND
+        publisher = client.node.create_publisher(type(asked), topic, qos.COMMANDS)
+
+        def planner_listens() -> bool:
+            # The recorder may listen, too.
+            found = client.node.get_subscriptions_info_by_topic(publisher.topic_name)
+            return any(info.node_name == "planner" for info in found)
+
+        with running_graph(client, setup, options.out / "logs" / name, progress) as graph:
+            client.wait_for(planner_listens, 30.0, "the planner to listen")
+            client.newest.pop(topics.PLAN, None)
+            publisher.publish(asked)
+            plan = client.wait_for(lambda: _plan_of(run, client), PLAN_TIMEOUT, "the plan")
+            progress.say(
+                f"  planned in {plan.solve_time:.2f} s, "
+                f"predicted error {plan.predicted_error * 100:.2f} cm"
+            )
+            shown: list[str] = []
+
+            def show_warnings() -> None:
+                told = client.diagnostic_values("planner")
+                played = (told.get("plan_id"), told.get("state")) == (plan.plan_id, "streaming")
+                if played and not shown:
+                    shown.append(told.get("reason", ""))
+                    if shown[0]:
+                        progress.say(f"  warning: {shown[0]}")
+
+            graph.play(stamps.seconds(plan.header.stamp), float(plan.time[-1]), show_warnings)
+    factor = graph.real_time_factor
     return {
-        "bag": str(played.bag.relative_to(run.options.out)),
-        "plan_id": played.plan_id,
-        "cpu_percent": {name: round(value, 1) for name, value in played.cpu_percent.items()},
+        "bag": str(graph.bag.relative_to(options.out)),
+        "plan_id": plan.plan_id,
+        "cpu_percent": {name: round(value, 1) for name, value in graph.cpu_percent.items()},
         "twin_real_time_factor": None if math.isnan(factor) else round(factor, 3),
     }
 
@@ -60,205 +106,144 @@ def _bag_folder(out: Path, name: str) -> Path:
     return bag
 
 
-class GraphTrial(GraphPlayer):
-    """Plays one run of a planned motion; use `play_on_graph`."""
-
-    def __init__(self, run: TrialRun, progress: Progress) -> None:
-        self._run, self._trial, self._options = run, run.trial, run.options
-        setup = GraphSetup(
-            _bag_folder(run.options.out, run.trial.name),
-            run.metadata,
-            seed=run.trial.seed,
-            run=run.trial.run - 1,
-            limb=run.limb,
-            hardware=run.options.hardware,
-            planner=self._planner_parameters(),
-            record_images=run.options.record_images,
-            page=run.options.page,
-        )
-        super().__init__(setup, run.options.out / "logs" / run.trial.name, progress)
-        self._publisher: Any = None
-
-    def _planner_parameters(self) -> dict[str, Any]:
-        parameters: dict[str, Any] = {
-            "limb_file": str(self._run.limb_file or ""),
-            "mounting": self._options.loads.mounting,
-            "payload": self._options.loads.payload,
-            "payload_at": self._options.loads.payload_at or 0.0,
-            "feedback": self._trial.feedback,
-        }
-        if self._run.learned is not None:
-            parameters["learned_plans"] = str(self._run.learned.parent)
-        elif self._options.path is not None:
-            # A path names no model: it gets the planner's defaults.
-            parameters["default_model"] = self._trial.model
-            parameters["nearest_path"] = self._options.nearest
-            if self._trial.model == "der":
-                parameters["default_method"] = self._trial.method
-        return parameters
-
-    def _join(self, client: GraphClient) -> None:
-        super()._join(client)
-        client.subscribe(PressurePlan, topics.PLAN, qos.LATCHED)
-        # Before the nodes start, so that the planner knows of it when it is ready.
-        drawn = self._options.path is not None and self._run.learned is None
-        kind, topic = (PathMessage, topics.PATH) if drawn else (MotionCommand, topics.COMMAND)
-        self._publisher = client.node.create_publisher(kind, topic, qos.COMMANDS)
-
-    def _begin(self, client: GraphClient) -> Playing:
-        drawn = self._options.path if self._run.learned is None else None
-        client.wait_for(lambda: self._planner_listens(client), 30.0, "the planner to listen")
-        client.newest.pop(topics.PLAN, None)
-        self._publisher.publish(self._path(drawn) if drawn else self._command())
-        plan = client.wait_for(lambda: self._plan_or_refusal(client), PLAN_TIMEOUT, "the plan")
-        self._progress.say(
-            f"  planned in {plan.solve_time:.2f} s, "
-            f"predicted error {plan.predicted_error * 100:.2f} cm"
-        )
-        return Playing(
-            stamps.seconds(plan.header.stamp),
-            float(plan.time[-1]),
-            feed=self._warnings_of(client, plan.plan_id),
-            plan_id=plan.plan_id,
-        )
-
-    def _warnings_of(self, client: GraphClient, plan_id: str) -> Callable[[], None]:
-        """Return what shows the warnings of a plan once the planner's diagnostics have them."""
-        shown: list[str] = []
-
-        def show() -> None:
-            said = client.diagnostic_values("planner")
-            played = said.get("plan_id") == plan_id and said.get("state") == "streaming"
-            if played and not shown:
-                shown.append(said.get("reason", ""))
-                if shown[0]:
-                    self._progress.say(f"  warning: {shown[0]}")
-
-        return show
-
-    def _planner_listens(self, client: GraphClient) -> bool:
-        # The recorder may listen, too.
-        found = client.node.get_subscriptions_info_by_topic(self._publisher.topic_name)
-        return any(info.node_name == "planner" for info in found)
-
-    def _path(self, file: Path) -> PathMessage:
-        """Return the path in a file; stamps are relative, all zero for a path without times."""
-        time, tip = paths.read_csv(file)
-        message = PathMessage()
-        message.header.frame_id = topics.BASE_FRAME
-        for index, (x, y) in enumerate(tip):
-            pose = PoseStamped()
-            pose.header.frame_id = topics.BASE_FRAME
-            if time is not None:
-                since = round((float(time[index]) - float(time[0])) * stamps.NANOSECONDS)
-                pose.header.stamp = stamps.stamp_from_nanoseconds(since)
-            pose.pose.position.x, pose.pose.position.y = float(x), float(y)
-            message.poses.append(pose)
-        return message
-
-    def _command(self) -> MotionCommand:
-        learned = self._run.learned
-        return MotionCommand(
-            # A learned plan's name stands in place of the motion's.
-            motion=self._trial.motion if learned is None else learned.stem,
-            model=self._trial.model,
-            method=self._trial.method if learned is None else LEARNED,
-            amplitude=self._options.amplitude,
-            period=self._options.period,
-            cycles=self._options.cycles,
-            plan_id=self._trial.name,
-        )
-
-    def _plan_or_refusal(self, client: GraphClient) -> PressurePlan | None:
-        plan = client.newest.get(topics.PLAN)
-        named = self._options.path is None
-        if plan is not None and (plan.plan_id == self._trial.name or not named):
-            return plan
-        said = client.diagnostic_values("planner")
-        if said.get("state") == "refused":
-            raise GraphError(f"the planner refused: {said.get('reason', 'no reason given')}")
-        return None
+def _planner_parameters(run: TrialRun) -> dict[str, Any]:
+    trial, options = run.trial, run.options
+    parameters: dict[str, Any] = {
+        "limb_file": str(run.limb_file or ""),
+        "mounting": options.loads.mounting,
+        "payload": options.loads.payload,
+        "payload_at": options.loads.payload_at or 0.0,
+        "feedback": trial.feedback,
+    }
+    if run.learned is not None:
+        parameters["learned_plans"] = str(run.learned.parent)
+    elif options.path is not None:
+        # A path names no model: it gets the planner's defaults.
+        parameters["default_model"] = trial.model
+        parameters["nearest_path"] = options.nearest
+        if trial.model == "der":
+            parameters["default_method"] = trial.method
+    return parameters
 
 
-class GraphCalibration(GraphPlayer):
-    """Plays the pressures of a calibration; use `play`.
+def _path(file: Path) -> PathMessage:
+    """Return the path in a file; stamps are relative, all zero for a path without times."""
+    time, tip = paths.read_csv(file)
+    message = PathMessage()
+    message.header.frame_id = topics.BASE_FRAME
+    for index, (x, y) in enumerate(tip):
+        pose = PoseStamped()
+        pose.header.frame_id = topics.BASE_FRAME
+        if time is not None:
+            since = round((float(time[index]) - float(time[0])) * stamps.NANOSECONDS)
+            pose.header.stamp = stamps.stamp_from_nanoseconds(since)
+        pose.pose.position.x, pose.pose.position.y = float(x), float(y)
+        message.poses.append(pose)
+    return message
+
+
+def _command(run: TrialRun) -> MotionCommand:
+    trial, options, learned = run.trial, run.options, run.learned
+    return MotionCommand(
+        # A learned plan's name stands in place of the motion's.
+        motion=trial.motion if learned is None else learned.stem,
+        model=trial.model,
+        method=trial.method if learned is None else LEARNED,
+        amplitude=options.amplitude,
+        period=options.period,
+        cycles=options.cycles,
+        plan_id=trial.name,
+    )
+
+
+def _plan_of(run: TrialRun, client: GraphClient) -> PressurePlan | None:
+    """Return the planner's answer; None while it plans.
+
+    Raises:
+        GraphError: the planner has refused.
+    """
+    plan = client.newest.get(topics.PLAN)
+    named = run.options.path is None
+    if plan is not None and (plan.plan_id == run.trial.name or not named):
+        return plan
+    told = client.diagnostic_values("planner")
+    if told.get("state") == "refused":
+        raise GraphError(f"the planner refused: {told.get('reason', 'no reason given')}")
+    return None
+
+
+# A calibration -----------------------------------------------------------------------------------
+
+
+def play_calibration(
+    excitation: Excitation,
+    folder: Path,
+    progress: Progress,
+    prior: Limb,
+    seed: int = 0,
+    hardware: Hardware | None = None,
+) -> Path:
+    """Play the pressures of a calibration; say when the driver did not take all of them.
 
     Args:
         excitation: pressures to play, on the grid of 50 ms.
         folder: gets the bag (``bag``) and the nodes' logs (``logs``).
-        metadata: stored in the bag.
         progress: shows what happens.
-        limb: whose gravity and masses the twin gets; None: no loads.
+        prior: whose gravity and masses the twin gets.
         seed: of the twin.
         hardware: in place of the twin.
+
+    Returns:
+        The bag.
+
+    Raises:
+        GraphError, NodeError: as `play_on_graph`.
     """
-
-    def __init__(
-        self,
-        excitation: Excitation,
-        folder: Path,
-        metadata: dict[str, Any],
-        progress: Progress,
-        *,
-        limb: Limb | None = None,
-        seed: int = 0,
-        hardware: Hardware | None = None,
-    ) -> None:
-        setup = GraphSetup(folder / "bag", metadata, seed=seed, limb=limb, hardware=hardware)
-        super().__init__(setup, folder / "logs", progress)
-        self._excitation = excitation
-        # The driver refuses a plan that it has heard before an arming: each run has its own.
-        self._plan_id = f"calibration-{uuid.uuid4().hex[:8]}"
-        self._start_stamp = 0
-        self._next = 0
-        self._publisher: Any = None
-        self._last_state: PressureState | None = None
-
-    def play(self) -> GraphRun:
-        """Play the calibration; see `GraphPlayer.play`. Says when setpoints were not executed."""
-        run = super().play()
-        state = self._last_state
-        lost = state.setpoints_late + state.setpoints_refused if state is not None else 0
-        if lost:
-            self._progress.say(
-                f"  WARNING: the driver did not take {lost} of {len(self._excitation.time)} "
-                f"setpoints; its log in {self._logs} says why"
-            )
-        return run
-
-    def _join(self, client: GraphClient) -> None:
-        client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES, self._keep_state)
-        # Before the nodes start, so that the recorder knows the topic when it begins to record.
-        self._publisher = client.node.create_publisher(
+    count = len(excitation.time)
+    stage = f"the hardware at {hardware.driver['port']}" if hardware else f"the twin of seed {seed}"
+    progress.say(f"playing {excitation.duration:.0f} s on {stage}, into {folder}")
+    metadata = {
+        "motion": "calibration",
+        "stage": stage,
+        "seed": None if hardware else seed,
+        "largest_pressure_Pa": float(np.abs(excitation.differential_pressure).max()),
+        "parts": [list(part) for part in excitation.parts],
+        "prior": prior.name,
+    }
+    setup = GraphSetup(folder / "bag", metadata, seed=seed, limb=prior, hardware=hardware)
+    # The driver refuses a plan that it has heard before an arming: each run has its own.
+    plan_id = f"calibration-{uuid.uuid4().hex[:8]}"
+    sent = 0
+    with GraphClient() as client:
+        publisher = client.node.create_publisher(
             PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS
         )
+        with running_graph(client, setup, folder / "logs", progress) as graph:
+            client.wait_for(publisher.get_subscription_count, 30.0, "the driver to listen")
+            first = first_stamp(_now(client) + 2 * PAUSE, LEAD)
 
-    def _keep_state(self, state: PressureState) -> None:
-        self._last_state = state
+            def send_due() -> None:
+                """Publish every setpoint that must be under way before the next look."""
+                nonlocal sent
+                while sent < count and first + sent * GRID - _now(client) <= LEAD + PAUSE:
+                    setpoint = PressureSetpoint(plan_id=plan_id, index=sent)
+                    setpoint.header.stamp = stamps.stamp_from_nanoseconds(first + sent * GRID)
+                    setpoint.header.frame_id = topics.BASE_FRAME
+                    values = excitation.differential_pressure[sent]
+                    setpoint.differential_pressure = values.tolist()
+                    publisher.publish(setpoint)
+                    sent += 1
 
-    def _begin(self, client: GraphClient) -> Playing:
-        client.wait_for(self._publisher.get_subscription_count, 30.0, "the driver to listen")
-        self._start_stamp = first_stamp(_now(client) + 2 * PAUSE, LEAD)
-        self._next = 0
-        return Playing(
-            self._start_stamp / stamps.NANOSECONDS,
-            float(self._excitation.time[-1]),
-            lambda: self._send_due(_now(client)),
+            graph.play(first / stamps.NANOSECONDS, float(excitation.time[-1]), send_due)
+        state = client.newest[topics.PRESSURE_STATE]
+    lost = state.setpoints_late + state.setpoints_refused
+    if lost:
+        progress.say(
+            f"  WARNING: the driver did not take {lost} of {count} setpoints; its log in "
+            f"{folder / 'logs'} says why"
         )
-
-    def _send_due(self, now: int) -> None:
-        """Publish every setpoint that must be under way before the next look."""
-        while self._next < len(self._excitation.time):
-            stamp = self._start_stamp + self._next * GRID
-            if stamp - now > LEAD + PAUSE:
-                return
-            setpoint = PressureSetpoint(plan_id=self._plan_id, index=self._next)
-            setpoint.header.stamp = stamps.stamp_from_nanoseconds(stamp)
-            setpoint.header.frame_id = topics.BASE_FRAME
-            values = self._excitation.differential_pressure[self._next]
-            setpoint.differential_pressure = values.tolist()
-            self._publisher.publish(setpoint)
-            self._next += 1
+    progress.say(f"bag: {graph.bag}")
+    return graph.bag
 
 
 def _now(client: GraphClient) -> int:

@@ -13,7 +13,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -68,17 +68,6 @@ _OF_THE_BODY = (
 """Parameters of a segment that change the body which moves, not only what drives it."""
 
 
-class FreeNumbers(Protocol):
-    """Numbers of a limb that a fit may change."""
-
-    @property
-    def unknowns(self) -> Unknowns:
-        """What is known of them."""
-
-    def limb_with(self, values: Array) -> Limb:
-        """Return the limb with values (P,) put in place."""
-
-
 @dataclass(frozen=True)
 class FreeTerms:
     """The terms of a limb that a fit may change.
@@ -87,14 +76,16 @@ class FreeTerms:
         limb: with the numbers that are known before.
         values: (M, T) values of all terms.
         places: P pairs of segment and term that are free; a shared term stands in segment 0.
+        terms: (P,) the free terms, with what is known of them.
     """
 
     limb: Limb
     values: Array
     places: tuple[tuple[int, int], ...]
+    terms: tuple[Term, ...]
 
     @classmethod
-    def of(cls, limb: Limb, names: Collection[str], values: Array | None = None) -> FreeTerms:
+    def of(cls, limb: Limb, names: Collection[str], values: Array | None = None) -> Self:
         """Return the terms of these names in all segments that have them.
 
         Args:
@@ -110,24 +101,14 @@ class FreeTerms:
             and (segment == 0 or not term.shared)
             and 0 <= segment + term.neighbour < limb.segment_count
         )
-        return cls(limb, values_of(limb) if values is None else values, places)
-
-    @property
-    def terms(self) -> tuple[Term, ...]:
-        """(P,) the free terms."""
-        return tuple(TERMS[index] for _, index in self.places)
+        terms = tuple(TERMS[index] for _, index in places)
+        return cls(limb, values_of(limb) if values is None else values, places, terms)
 
     @property
     def unknowns(self) -> Unknowns:
         """What is known of the free terms."""
-        terms = self.terms
-        return Unknowns(
-            prior=self.at_places(self.values),
-            spread=np.array([term.spread for term in terms]),
-            low=np.array([term.low for term in terms]),
-            high=np.array([term.high for term in terms]),
-            scale=np.array([term.scale for term in terms]),
-        )
+        known = [(term.spread, term.low, term.high, term.scale) for term in self.terms]
+        return Unknowns(self.at_places(self.values), *np.reshape(known, (-1, 4)).T)
 
     def at_places(self, table: Array) -> Array:
         """Return the values (P,) of the free terms in a table (M, T)."""
@@ -189,6 +170,9 @@ def _segment(prior: Segment, value: dict[str, float]) -> Segment:
     for key, declared in _DECLARED.items():
         term = declared.fit
         assert term is not None
+        same_unit = all(found[other] == getattr(prior, other) for other in term.per)
+        if same_unit and value[term.name] == _value(prior, term, starts=False):
+            continue  # so that the number of the limb file stays to the last digit
         if term.relative:
             found[key] *= math.exp(value[term.name])
             continue
@@ -225,7 +209,7 @@ def follow(model: Model, log: Prepared, *, linearise: bool = False) -> Response:
     return simulate(model, log.time, pressures=log.pressure, steps=steps, linearise=linearise)
 
 
-def predicted(free: FreeNumbers, model: Model, log: Prepared, values: Array) -> Predicted:
+def predicted(free: FreeTerms, model: Model, log: Prepared, values: Array) -> Predicted:
     """Return bend angles and tips along a log with their derivatives by P unknowns.
 
     What drives the limb goes through the model's exact tangent; stiffness, damping and mass, which
@@ -292,7 +276,7 @@ class BendFit:
 
     def __init__(
         self,
-        free: FreeNumbers,
+        free: FreeTerms,
         model: Model,
         logs: Sequence[Prepared],
         more_rows: Callable[[Predicted], Rows] | None = None,

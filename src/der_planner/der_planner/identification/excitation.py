@@ -16,6 +16,7 @@ from der_planner.identification.log import CalibrationLog, LogError
 from der_planner.identification.report import FitReport
 from der_planner.limb import Limb
 from der_planner.model import CONTROL_PERIOD as PERIOD
+from der_planner.model.commands import limit_slew
 
 ANGLE_NOISE = np.deg2rad(0.1)
 """Standard deviation of a bend angle from tags [rad]."""
@@ -97,15 +98,8 @@ def within_limits(excitation: Excitation, pressure_limit: float, slew_limit: flo
         raise LogError(
             f"the excitation asks for {largest:.0f} Pa, the limit is ±{pressure_limit:.0f} Pa"
         )
-    step = slew_limit * PERIOD
-    if np.abs(np.diff(wanted, axis=0, prepend=np.zeros((1, wanted.shape[1])))).max() <= step:
-        return excitation
-    pressure = np.empty_like(wanted)
-    held = np.zeros(wanted.shape[1])
-    for row, target in enumerate(wanted):
-        held = held + np.clip(target - held, -step, step)
-        pressure[row] = held
-    return replace(excitation, differential_pressure=pressure)
+    ramps = limit_slew(wanted, np.zeros(wanted.shape[1]), slew_limit * PERIOD)
+    return replace(excitation, differential_pressure=ramps)
 
 
 def staircase(amplitude: float, segment_count: int = 2) -> Array:
@@ -140,14 +134,8 @@ def waves(amplitude: float, segment_count: int = 2, duration: float = 64.0) -> A
 
 def steps(amplitude: float, segment_count: int = 2) -> Array:
     """Return one step of 4 s up and down of each input in turn (K, M) [Pa], for air and swing."""
-    count = round(4.0 / PERIOD)
-    blocks = []
-    for index in range(segment_count):
-        for height in (amplitude, 0.0):
-            block = np.zeros((count, segment_count))
-            block[:, index] = height
-            blocks.append(block)
-    return np.concatenate(blocks)
+    up_and_down = np.kron(np.eye(segment_count), [[amplitude], [0.0]])
+    return np.repeat(up_and_down, round(4.0 / PERIOD), axis=0)
 
 
 def sweep(amplitude: float, segment_count: int = 2, duration: float = 16.0) -> Array:

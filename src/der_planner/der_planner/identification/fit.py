@@ -24,7 +24,6 @@ from der_planner.identification.bends import (
 )
 from der_planner.identification.lengths import (
     GeometryFit,
-    Unevenness,
     UnevenTips,
     fit_geometry,
     lengths_at_their_end,
@@ -41,14 +40,12 @@ from der_planner.identification.log import (
 )
 from der_planner.identification.report import FitReport, Unknown
 from der_planner.limb import CalibratedRange, Limb
-from der_planner.model import CONTROL_PERIOD, ArcModel, Material, RodModel
+from der_planner.model import ArcModel, Material, RodModel
 from der_planner.planning.loads import nearly_buckling
 
 UNTOLD = 0.8
 """Share of its prior spread above which the deviation of an unknown means that the log does not
 tell it."""
-STRONG = 0.9
-"""|correlation| above which two unknowns are reported as a pair that the log cannot tell apart."""
 MOST_PASSES = 4
 """Largest number of times that lengths and bend angles are fitted in turn, for a limb that its
 weight bends unevenly."""
@@ -70,7 +67,6 @@ def fit(
     log: CalibrationLog,
     *,
     terms: Iterable[str] = GROUPS,
-    geometry: bool = True,
     longest_gap: float = LONGEST_GAP,
 ) -> tuple[Limb, FitReport]:
     """Identify a limb from a calibration run.
@@ -81,7 +77,6 @@ def fit(
         terms: model terms to fit beside gain and rest angle, of `GROUPS`; with ``mass`` (of
             `OPTIONAL`) the mass of each segment is fitted and its stiffness is the prior's. A log
             shows the mass only under gravity or in fast motion.
-        geometry: fit the lengths to the tips as well.
         longest_gap: between two rows of the log that a straight line may bridge [s].
 
     Returns:
@@ -96,14 +91,19 @@ def fit(
         raise LogError(f"unknown model term {sorted(groups - set(known))}: choose {known}")
     recorded = prepare(log, limb, longest_gap)
     warnings = list(recorded.warnings)
-    air = _try_air(recorded, warnings)
+    try:
+        air = fit_air(recorded.log)
+    except LogError as error:
+        air = None
+        warnings.append(f"the chambers' lag keeps its old value: {error}")
     offset = 0.0 if air is None else air.offset
     prepared = replace(recorded, pressure=recorded.pressure - offset)
-    fitted = _fit_bends_and_lengths(limb, prepared, groups, geometry)
+    fitted = _fit_bends_and_lengths(limb, prepared, groups)
     if fitted.lengths is not None:
         warnings += filter(None, [lengths_at_their_end(limb, fitted.lengths.limb)])
     unknowns, correlation = _told(fitted)
-    if "dynamics" in groups and _all_untold(unknowns):
+    stiffness = [u.untold for u in unknowns if u.name.startswith("log_stiffness")]
+    if "dynamics" in groups and stiffness and all(stiffness):
         warnings.append(
             "the log is too slow to tell the stiffness apart from the gain: stiffness and damping "
             "keep their old values; steps or a sweep would tell them"
@@ -121,7 +121,6 @@ def fit(
         source=log.source,
         unknowns=unknowns,
         correlation=correlation,
-        strongly_correlated=_pairs(unknowns, correlation),
         air=air,
         geometry=fitted.lengths,
         residual=np.sqrt(np.nanmean(fitted.remaining**2, axis=0)),
@@ -149,9 +148,7 @@ class _Fitted(NamedTuple):
         return self.problem.free.limb_with(self.values)
 
 
-def _fit_bends_and_lengths(
-    prior: Limb, prepared: Prepared, groups: Collection[str], geometry: bool
-) -> _Fitted:
+def _fit_bends_and_lengths(prior: Limb, prepared: Prepared, groups: Collection[str]) -> _Fitted:
     """Fit the lengths first, or in turn with the bend angles where weight bends the limb unevenly.
 
     The lengths follow from tips and bend angles only if it is known how unevenly each segment
@@ -159,21 +156,20 @@ def _fit_bends_and_lengths(
     in turn until the lengths stay the same. How unevenly it bends also tells the stiffness.
     """
     loaded = prior.weighs_in_plane
-    lengths = fit_geometry(prior, prepared.log) if geometry and not loaded else None
+    lengths = fit_geometry(prior, prepared.log) if not loaded else None
     fitted = _fit_bends(lengths.limb if lengths else prior, prepared, groups, lengths)
-    bent: Unevenness | None = None
-    for _ in range(MOST_PASSES if geometry and loaded else 0):
-        bent = unevenness(fitted.limb, prepared, NODES)
-        lengths = fit_geometry(prior, prepared.log, uneven=bent.tip)
+    for _ in range(MOST_PASSES if loaded else 0):
+        uneven, lacking = unevenness(fitted.limb, prepared, NODES)
+        lengths = fit_geometry(prior, prepared.log, uneven)
         if lengths is None:
             break
-        tips = UnevenTips(prior, RodModel(lengths.limb, NODES), prepared, bent.lacking)
+        tips = UnevenTips(prior, RodModel(lengths.limb, NODES), prepared, lacking)
         change = np.abs(lengths_of(lengths.limb) - lengths_of(fitted.known))
         fitted = _fit_bends(lengths.limb, prepared, groups, lengths, fitted.values, tips)
         if change[: prior.segment_count + 1].max() < SAME_LENGTH:
             break
-    if bent is not None and not bent.holds:
-        uneven_tip(fitted.limb, prepared)
+    if loaded:
+        uneven_tip(fitted.limb, prepared)  # that the rod of the planners follows the log, too
     return fitted
 
 
@@ -276,11 +272,6 @@ def _told(fitted: _Fitted) -> tuple[tuple[Unknown, ...], Array]:
     return unknowns, covariance / np.outer(deviation, deviation)
 
 
-def _all_untold(unknowns: tuple[Unknown, ...]) -> bool:
-    stiffness = [u.untold for u in unknowns if u.name.startswith("log_stiff")]
-    return bool(stiffness) and all(stiffness)
-
-
 def _with_arcs(found: Limb, prepared: Prepared, warnings: list[str]) -> tuple[Limb, Array]:
     """Return the limb with the PCC model's numbers, and that model's errors (M,) [rad].
 
@@ -303,19 +294,6 @@ def _with_arcs(found: Limb, prepared: Prepared, warnings: list[str]) -> tuple[Li
     values = problem.search.solve()
     residual = np.sqrt(np.nanmean(problem.remaining(values) ** 2, axis=0))
     return replace(found, pcc_segments=free.limb_with(values).segments), residual
-
-
-def _try_air(prepared: Prepared, warnings: list[str]) -> AirFit | None:
-    try:
-        return fit_air(prepared.log, CONTROL_PERIOD)
-    except LogError as error:
-        warnings.append(f"the chambers' lag keeps its old value: {error}")
-        return None
-
-
-def _pairs(unknowns: tuple[Unknown, ...], correlation: Array) -> tuple[tuple[str, str, float], ...]:
-    strong = np.argwhere(np.tril(np.abs(correlation) > STRONG, -1))
-    return tuple((unknowns[i].name, unknowns[j].name, float(correlation[i, j])) for i, j in strong)
 
 
 def _calibrated(fitted: _Fitted, prior: Limb, air: AirFit | None, recorded: Prepared) -> Limb:

@@ -25,6 +25,8 @@ ERROR_GROWTH = 2.5
 """Error over the calibration's own error above which the limb must be calibrated again."""
 LEAST_ERROR = math.radians(0.4)
 """Least error of a calibration that `ERROR_GROWTH` multiplies [rad]."""
+STRONG = 0.9
+"""|correlation| above which two unknowns are reported as a pair that the log cannot tell apart."""
 LEAST_MOTION = math.radians(3.0)
 """Predicted range of motion above which the gain is checked [rad]."""
 
@@ -59,7 +61,6 @@ class FitReport:
         source: of the log.
         unknowns: (P,) with standard deviations.
         correlation: (P, P) of the unknowns.
-        strongly_correlated: pairs that the log cannot tell apart.
         air: fit of the chambers; None if the log has no smooth commands.
         geometry: fit of the lengths; None if the log has no tips.
         residual, largest: (M,) root mean square and largest bend angle error of the rod [rad].
@@ -75,7 +76,6 @@ class FitReport:
     source: str
     unknowns: tuple[Unknown, ...]
     correlation: Array
-    strongly_correlated: tuple[tuple[str, str, float], ...]
     air: AirFit | None
     geometry: GeometryFit | None
     residual: Array
@@ -92,10 +92,7 @@ class FitReport:
         Raises:
             KeyError: it was not fitted.
         """
-        for unknown in self.unknowns:
-            if unknown.name == name:
-                return unknown
-        raise KeyError(name)
+        return {unknown.name: unknown for unknown in self.unknowns}[name]
 
     def text(self) -> str:
         """Return the report as text for people."""
@@ -105,9 +102,12 @@ class FitReport:
             f"{'unknown':26s} {'value':>12s} {'std':>10s}  unit",
         ]
         for item in self.unknowns:
-            value, deviation, unit = _readable(item)
+            factor, unit = readable(item.unit)
             note = "  the data hardly tell it" if item.untold else ""
             note += "  at its bound" if item.at_bound else ""
+            if item.name.startswith("log_"):
+                note = f"  {math.exp(item.value):.3f} × the prior's{note}"
+            value, deviation = factor * item.value, factor * item.deviation
             lines.append(f"{item.name:26s} {value:12.4g} {deviation:10.2g}  {unit}{note}")
         lines.append("")
         for index, (error, largest, pcc, span) in enumerate(
@@ -120,9 +120,10 @@ class FitReport:
                 f"its range{other}"
             )
         lines += self._air_lines() + self._geometry_lines() + self._load_lines()
-        for first, second, value in self.strongly_correlated:
+        for i, j in np.argwhere(np.tril(np.abs(self.correlation) > STRONG, -1)):
             lines.append(
-                f"the log cannot tell {first} and {second} apart (correlation {value:+.2f})"
+                f"the log cannot tell {self.unknowns[i].name} and {self.unknowns[j].name} apart "
+                f"(correlation {self.correlation[i, j]:+.2f})"
             )
         lines += [f"warning: {warning}" for warning in self.warnings]
         return "\n".join(lines)
@@ -177,64 +178,24 @@ class FitReport:
             f"{1e3 * limb.moving_mass:.0f} g beyond the base, first moment {1e3 * moment:.1f} g·m "
             "about the clamp"
         )
-        known = {u.name: u for u in self.unknowns}
-        kept = "the mass" if "log_stiffness[0]" in known else "the stiffness"
-        told = []
-        for index, segment in enumerate(limb.segments):
-            if f"log_stiffness[{index}]" in known:
-                share = known[f"log_stiffness[{index}]"].deviation
-                stiffness = f"{segment.bending_stiffness:.4f} N·m² ± {100 * share:.1f} %"
-                told.append(f"EI of segment {index} = {stiffness}")
-            if f"log_mass[{index}]" in known:
-                found = known[f"log_mass[{index}]"]
-                told.append(
-                    f"mass of segment {index} = prior × {math.exp(found.value):.3f} ± "
-                    f"{100 * found.deviation:.1f} %"
-                )
-        if not told:
-            return [line]
         return [
             line,
-            f"loads: weight tells stiffness from gain: {', '.join(told)}",
-            f"loads: stiffness, gain and mass scale together, {kept} was given; condition of "
-            f"gains, rest angles and stiffness or mass: {self.condition:.0f}",
-            *self._made_straight(),
+            "loads: stiffness, gain and mass scale together, so that one of them was given",
+            f"loads: the limb was made straight, its rest angles are 0 ± "
+            f"{math.degrees(REST_SPREAD):.0f}° but for what the log tells",
         ]
 
-    def _made_straight(self) -> list[str]:
-        """Say of which segments the stiffness rests on what is known of rest angles beforehand."""
-        alike = {frozenset(pair[:2]) for pair in self.strongly_correlated}
-        found = [
-            str(index)
-            for index in range(len(self.residual))
-            if {f"log_stiffness[{index}]", f"rest_angle[{index}]"} in alike
-        ]
-        if not found:
-            return []
-        return [
-            f"loads: weight and rest angle bend segment {', '.join(found)} alike here: the "
-            f"stiffness holds for a limb that was made straight, ± {math.degrees(REST_SPREAD):.0f}°"
-        ]
 
-    @property
-    def condition(self) -> float:
-        """Of the correlation of gains, rest angles and stiffnesses or masses: 1 is all apart."""
-        names = ("gain[", "rest_angle[", "log_stiffness[", "log_mass[")
-        rows = [i for i, u in enumerate(self.unknowns) if u.name.startswith(names)]
-        return float(np.linalg.cond(self.correlation[np.ix_(rows, rows)]))
-
-
-def _readable(item: Unknown) -> tuple[float, float, str]:
-    """Return value, deviation and unit as people read them: degrees and hPa."""
-    factor, unit = {
+def readable(unit: str) -> tuple[float, str]:
+    """Return the factor to a unit as people read it, degrees and hPa, and its name."""
+    return {
         "rad/Pa": (math.degrees(1.0) * 100.0, "deg/hPa"),
         "rad": (math.degrees(1.0), "deg"),
         "1/Pa": (1e6, "% per 10 kPa"),
         "1/rad²": (100.0 * math.radians(45.0) ** 2, "% at 45 deg"),
         "Pa": (0.01, "hPa"),
         "Pa/rad": (0.01 * math.radians(45.0), "hPa at 45 deg"),
-    }.get(item.unit, (1.0, item.unit))
-    return item.value * factor, item.deviation * factor, unit
+    }.get(unit, (1.0, unit))
 
 
 def predict(

@@ -13,46 +13,53 @@ import datetime
 import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
+from numpy.typing import NDArray
 
 from der_planner.arrays import Array
-from der_planner.identification.bends import CORRELATION, NODES, BendFit
+from der_planner.identification.bends import (
+    COLUMN,
+    CORRELATION,
+    NODES,
+    BendFit,
+    FreeTerms,
+    to_limb,
+    values_of,
+)
 from der_planner.identification.fit import UNTOLD
 from der_planner.identification.least_squares import (
     LeastSquares,
     Rows,
-    Unknowns,
     with_differences,
 )
 from der_planner.identification.log import CalibrationLog, LogError, Prepared, prepare
-from der_planner.identification.report import LEAST_MOTION
-from der_planner.limb import Limb, Segment
+from der_planner.identification.report import LEAST_MOTION, readable
+from der_planner.limb import Limb, Term
 from der_planner.limb.parameters import REST_SPREAD
 from der_planner.model import RodModel
 from der_planner.rod import ConvergenceError
 
 GAIN_SPREAD = 0.35
 """Share of a gain by which it changes from day to day: a real limb's changed by up to a half."""
-LARGEST_GAIN_CHANGE = 4.0
+MOST_GAIN = 4.0
 """Largest factor by which a fit may change a gain."""
-LARGEST_REST_CHANGE = math.radians(35.0)
+MOST_REST_CHANGE = math.radians(35.0)
 """Largest change of a rest angle in a fit [rad]."""
 FRICTION_SPREAD = 0.5
 """Share of a friction by which it changes from day to day."""
 LEAST_FRICTION_SPREAD = 100.0
 """Least change of a friction from day to day, as a pressure [Pa]."""
-LARGEST_FRICTION_CHANGE = 20.0
+MOST_FRICTION_CHANGE = 20.0
 """Largest change of a friction in a fit, in spreads of a day."""
-FRICTION_ANGLE = 0.1
-"""Bend over which friction turns round, for a limb file without friction [rad]."""
 WRONG_WAY = -0.5
 """Correlation of predicted and measured bend below which pressure and bend have other signs."""
 LEAST_DURATION = 5.0
 """Least duration of all runs together [s]."""
 CALIBRATE_AGAIN = math.radians(3.0)
 """Root mean square error that a limb file should not leave [rad]."""
-MOST_PASSES = 3
+MOST_FITS = 3
 """Largest number of fits, each with the weights and without the untold unknowns of the last."""
 
 FAR = 3e-3
@@ -65,91 +72,55 @@ _NUDGE = 1e-3
 """Change of an unknown in its spread, for a difference of two simulations."""
 
 
-NUMBERS = {
-    "gain": "moment_gain",
-    "rest angle": "rest_curvature",
-    "friction": "friction_moment",
-}
-"""Field of `Segment` of each number that changes from day to day."""
+DAY_TERMS = ("gain", "rest_angle", "friction_pressure")
+"""Terms that change from day to day."""
 
 
-@dataclass(frozen=True)
-class DayNumbers:
-    """The numbers of a limb that change from day to day: `NUMBERS` of each segment.
-
-    Attributes:
-        limb: with the numbers of its file.
-        free: (P,) places of those that may change among all (3 M).
-    """
-
-    limb: Limb
-    free: list[int]
+class DayTerms(FreeTerms):
+    """Terms of a limb that change from day to day; its arcs change alike."""
 
     @classmethod
-    def of(cls, limb: Limb, names: Collection[str] = tuple(NUMBERS)) -> DayNumbers:
-        """Return the numbers of these names in all segments."""
-        free = [name in names for name in NUMBERS] * limb.segment_count
-        return cls(limb, np.flatnonzero(free).tolist())
+    def known(cls, limb: Limb, names: Collection[str] = DAY_TERMS) -> DayTerms:
+        """Return the terms of these names in all segments, with the spread of days."""
+        values, angle = values_of(limb), COLUMN["friction_angle"]
+        # A limb file without friction does not say over which bend it turns round.
+        values[:, angle] = values_of(limb, starts=True)[:, angle]
+        free = cls.of(limb, names, values)
+        return replace(
+            free, terms=tuple(map(_of_days, free.terms, free.at_places(values).tolist()))
+        )
 
-    @property
-    def unknowns(self) -> Unknowns:
-        """What is known of the free numbers: those of the file, with the spread of days."""
-        prior, spread, low, high = self._known[self.free].T
-        return Unknowns(prior, spread, low, high, scale=spread)
+    def only(self, chosen: NDArray[np.bool_]) -> DayTerms:
+        """Return those of the terms that are chosen (P,)."""
+        places, terms = compress(self.places, chosen), compress(self.terms, chosen)
+        return replace(self, places=tuple(places), terms=tuple(terms))
 
-    @property
-    def _known(self) -> Array:
-        """Prior, spread, least and largest value of all numbers (3 M, 4)."""
-        return np.array([row for segment in self.limb.segments for row in _day(segment)])
+    def limb_with(self, free: Array) -> Limb:
+        """Return the limb with values (P,) of the free terms put in place.
 
-    def limb_with(self, values: Array) -> Limb:
-        """Return the limb with the free numbers (P,) put in place, its arcs changed alike."""
-        numbers = self._known[:, 0]
-        numbers[self.free] = values
-        rows = numbers.reshape(self.limb.segment_count, -1).tolist()
-        segments = tuple(map(_changed, self.limb.segments, rows))
-        pairs = zip(self.limb.pcc_segments, self.limb.segments, segments, strict=False)
-        return replace(self.limb, segments=segments, pcc_segments=tuple(_alike(*p) for p in pairs))
-
-
-def _day(segment: Segment) -> list[tuple[float, float, float, float]]:
-    """Return prior, spread, least and largest value of a segment's `NUMBERS`."""
-    gain, rest, friction = segment.moment_gain, segment.rest_curvature, segment.friction_moment
-    turned = LARGEST_REST_CHANGE / segment.length
-    rubs = max(FRICTION_SPREAD * friction, LEAST_FRICTION_SPREAD * gain)
-    return [
-        (gain, GAIN_SPREAD * gain, gain / LARGEST_GAIN_CHANGE, gain * LARGEST_GAIN_CHANGE),
-        (rest, REST_SPREAD / segment.length, rest - turned, rest + turned),
-        (friction, rubs, 0.0, friction + LARGEST_FRICTION_CHANGE * rubs),
-    ]
+        Gain and friction of an arc change by the factors of its segment, its rest angle by as much.
+        """
+        found = super().limb_with(free)
+        if not self.limb.pcc_segments:
+            return found
+        arcs = replace(self.limb, segments=self.limb.pcc_segments)
+        of_arcs, before = values_of(arcs), values_of(self.limb)
+        share = np.divide(of_arcs, before, out=np.ones_like(before), where=before != 0.0)
+        share[:, COLUMN["rest_angle"]] = 1.0
+        changed = of_arcs + share * (values_of(found) - before)
+        return replace(found, pcc_segments=to_limb(arcs, changed).segments)
 
 
-def _sizes(segment: Segment) -> tuple[float, float, float]:
-    """Return gain, rest angle and friction of a `Change` over the fields that hold them."""
-    return segment.length / segment.bending_stiffness, segment.length, 1.0
-
-
-def _changed(segment: Segment, numbers: Sequence[float]) -> Segment:
-    """Return a segment with other `NUMBERS`."""
-    changes = dict(zip(NUMBERS.values(), numbers, strict=True))
-    if changes["friction_moment"] and not segment.friction_curvature:
-        changes["friction_curvature"] = FRICTION_ANGLE / segment.length
-    return replace(segment, **changes)
-
-
-def _alike(arc: Segment, before: Segment, after: Segment) -> Segment:
-    """Return an arc changed as its segment was: gain and friction by factors, rest by a shift."""
-    gain = arc.moment_gain * after.moment_gain / before.moment_gain
-    friction = after.friction_moment
-    if before.friction_moment:
-        friction *= arc.friction_moment / before.friction_moment
-    return replace(
-        arc,
-        moment_gain=gain,
-        rest_curvature=arc.rest_curvature + after.rest_curvature - before.rest_curvature,
-        friction_moment=friction,
-        friction_curvature=arc.friction_curvature or after.friction_curvature,
-    )
+def _of_days(term: Term, value: float) -> Term:
+    """Return one of `DAY_TERMS` with what is known of it in a limb whose file gives a value."""
+    if term.name == "gain":
+        spread, low, high = GAIN_SPREAD * value, value / MOST_GAIN, value * MOST_GAIN
+    elif term.name == "rest_angle":
+        spread, low, high = REST_SPREAD, value - MOST_REST_CHANGE, value + MOST_REST_CHANGE
+    else:
+        spread = max(FRICTION_SPREAD * value, LEAST_FRICTION_SPREAD)
+        low, high = 0.0, value + MOST_FRICTION_CHANGE * spread
+    return replace(term, spread=spread, scale=spread, low=low, high=high)
 
 
 @dataclass(frozen=True)
@@ -158,39 +129,34 @@ class Change:
 
     Attributes:
         segment: from 0.
-        name: ``gain`` [rad/Pa], ``rest angle`` [rad] or ``friction`` [N·m].
+        term: of `DAY_TERMS`, with its unit and the spread of days.
         before, after: values.
-        spread: standard deviation before, that of days.
-        deviation: standard deviation after.
+        deviation: standard deviation after; the spread of days where the runs do not tell it.
     """
 
     segment: int
-    name: str
+    term: Term
     before: float
     after: float
-    spread: float
     deviation: float
 
     @property
     def told(self) -> bool:
         """Whether the runs tell it; if not, it keeps its value."""
-        return self.deviation < self.spread
+        return self.deviation < self.term.spread
 
     def text(self) -> str:
         """Return the line for people."""
-        factor, unit = {
-            "gain": (math.degrees(100.0), "°/hPa"),
-            "rest angle": (math.degrees(1.0), "°"),
-            "friction": (1e3, "mN·m"),
-        }[self.name]
+        factor, unit = readable(self.term.unit)
         before, after, spread, deviation = (
-            factor * value for value in (self.before, self.after, self.spread, self.deviation)
+            factor * value for value in (self.before, self.after, self.term.spread, self.deviation)
         )
-        line = f"segment {self.segment}, {self.name}: {before:.3g} ± {spread:.2g} {unit}"
+        name = self.term.name.replace("_", " ")
+        line = f"segment {self.segment}, {name}: {before:.3g} ± {spread:.2g} {unit}"
         if not self.told:
             return f"{line} stays: not told by these runs"
         line += f" -> {after:.3g} ± {deviation:.2g} {unit}"
-        if self.name == "gain":
+        if self.term.name == "gain":
             return f"{line} ({100 * (after / before - 1):+.1f} %)"
         return f"{line} ({after - before:+.2g} {unit})"
 
@@ -257,22 +223,19 @@ def update(limb: Limb, logs: CalibrationLog | Sequence[CalibrationLog]) -> tuple
             f"the runs last {duration:.1f} s altogether: an update needs {LEAST_DURATION:.0f} s, "
             "and half a minute in which all segments move to tell all of it"
         )
-    every = DayNumbers.of(limb)
-    known = every.unknowns.prior
+    every = DayTerms.known(limb)
+    whole, known = BendFit(every, RodModel(limb, NODES), runs), every.unknowns.prior
     try:
-        remaining = BendFit(every, RodModel(limb, NODES), runs).remaining(known)
+        remaining = whole.remaining(known)
     except ConvergenceError as error:
         raise LogError(
             f"the rod of the limb '{limb.name}' cannot follow these runs: check that they are of "
             "this limb, with its mounting and what it carries"
         ) from error
     _refuse_wrong_way(runs, remaining)
-    values, deviations = _solve(every, runs)
-    told = replace(every, free=list(deviations))
-    found = told.limb_with(values[told.free])
+    values, deviation = _solve(every, runs)
     before, after = (
-        np.sqrt(np.nanmean(left**2, axis=0))
-        for left in (remaining, BendFit(every, RodModel(limb, NODES), runs).remaining(values))
+        np.sqrt(np.nanmean(left**2, axis=0)) for left in (remaining, whole.remaining(values))
     )
     warnings = [warning for run in runs for warning in run.warnings]
     if not np.all(after < CALIBRATE_AGAIN):
@@ -280,37 +243,32 @@ def update(limb: Limb, logs: CalibrationLog | Sequence[CalibrationLog]) -> tuple
             f"gain, rest angle and friction leave {math.degrees(after.max()):.1f}°: something else "
             "changed, calibrate again"
         )
-    spread = every.unknowns.spread
-    deviation = np.array([deviations.get(place, spread[place]) for place in every.free])
-    sizes = np.array([_sizes(segment) for segment in limb.segments]).ravel()
-    sized = (sizes * np.stack([known, values, spread, deviation])).T
-    changes = []
-    for place, numbers in zip(every.free, sized.tolist(), strict=True):
-        index, kind = divmod(place, len(NUMBERS))
-        changes.append(Change(index, tuple(NUMBERS)[kind], *numbers))
-    found = _with_provenance(found, limb, changes, after, given)
-    return found, Update(tuple(changes), before, after, duration, tuple(warnings))
+    changes = tuple(
+        Change(segment, term, *numbers)
+        for (segment, _), term, *numbers in zip(
+            every.places, every.terms, known, values, deviation, strict=True
+        )
+    )
+    found = _with_provenance(every.limb_with(values), limb, changes, after, given)
+    return found, Update(changes, before, after, duration, tuple(warnings))
 
 
-def _solve(every: DayNumbers, runs: Sequence[Prepared]) -> tuple[Array, dict[int, float]]:
-    """Return the best numbers (3 M,), and by place the deviations of those that the runs tell."""
-    numbers, factor, deviations = every, 1.0, dict[int, float]()
-    values = every.unknowns.prior
-    for _ in range(MOST_PASSES):
-        problem = BendFit(numbers, RodModel(every.limb, NODES), runs)
-        free = problem.search.solve(values[numbers.free], factor)
-        values = every.unknowns.prior.copy()
-        values[numbers.free] = free
-        factor = max(1.0, problem.excess(problem.remaining(free)))
-        deviation = np.sqrt(np.diag(problem.search.covariance(free, factor)))
-        told = deviation <= UNTOLD * numbers.unknowns.spread
-        deviations = {
-            p: float(d) for p, d, t in zip(numbers.free, deviation, told, strict=True) if t
-        }
-        if not deviations:
-            return every.unknowns.prior, {}
-        numbers = replace(numbers, free=list(deviations))
-    return values, deviations
+def _solve(every: DayTerms, runs: Sequence[Prepared]) -> tuple[Array, Array]:
+    """Return the values (P,) and their deviations (P,), both as known before where not told."""
+    known, factor = every.unknowns, 1.0
+    values, deviation, told = known.prior, known.spread, np.ones(len(known.prior), dtype=bool)
+    for _ in range(MOST_FITS):
+        problem = BendFit(every.only(told), RodModel(every.limb, NODES), runs)
+        found = problem.search.solve(values[told], factor)
+        factor = max(1.0, problem.excess(problem.remaining(found)))
+        of_found = np.sqrt(np.diag(problem.search.covariance(found, factor)))
+        better = of_found <= UNTOLD * known.spread[told]
+        told[told] = better
+        values, deviation = known.prior.copy(), known.spread.copy()
+        values[told], deviation[told] = found[better], of_found[better]
+        if not told.any():
+            break
+    return values, deviation
 
 
 def _refuse_wrong_way(runs: Sequence[Prepared], remaining: Array) -> None:
@@ -323,19 +281,17 @@ def _refuse_wrong_way(runs: Sequence[Prepared], remaining: Array) -> None:
     Raises:
         LogError: a segment does.
     """
-    ends = np.cumsum([len(run.time) for run in runs])[:-1]
-    for run, left in zip(runs, np.split(remaining, ends), strict=True):
-        measured = run.log.bend_angles[run.usable]
-        expected = measured - left[run.usable]
-        for m, (seen, told) in enumerate(zip(measured.T, expected.T, strict=True)):
-            if min(np.ptp(seen), np.ptp(told)) < LEAST_MOTION:
-                continue
-            if np.corrcoef(seen, told)[0, 1] < WRONG_WAY:
-                raise LogError(
-                    f"segment {m} bends the wrong way in these runs: check that they are of this "
-                    "limb, that no tubes, signs or columns are swapped, and that what it carries "
-                    "is named; else calibrate again"
-                )
+    measured = np.concatenate([run.log.bend_angles for run in runs])
+    rows = np.isfinite(remaining).all(axis=1)
+    expected = measured - remaining
+    for m, (seen, told) in enumerate(zip(measured[rows].T, expected[rows].T, strict=True)):
+        moved = min(np.ptp(seen), np.ptp(told)) >= LEAST_MOTION
+        if moved and np.corrcoef(seen, told)[0, 1] < WRONG_WAY:
+            raise LogError(
+                f"segment {m} bends the wrong way in these runs: check that they are of this limb, "
+                "that no tubes, signs or columns are swapped, and that what it carries is named; "
+                "else calibrate again"
+            )
 
 
 def adapted(limb: Limb, tip_of: Callable[[Limb], Array | None], tip: Array) -> Limb | None:
@@ -355,7 +311,7 @@ def adapted(limb: Limb, tip_of: Callable[[Limb], Array | None], tip: Array) -> L
         None where the limb is near the run already, or nothing much is gained.
     """
     seen = np.isfinite(tip).all(axis=1)
-    numbers = DayNumbers.of(limb, ("gain", "rest angle"))
+    numbers = DayTerms.known(limb, ("gain", "rest_angle"))
     unknowns = numbers.unknowns
 
     def missed(values: Array) -> Array:

@@ -49,7 +49,7 @@ def _drawn_out(air: Air, command: Array, period: float, time: Array, pressure: A
     step = air.pneumatics.slew_limit * period
     best, least = command, np.full(command.shape[1], np.inf)
     for share in _SHARES_BEFORE:
-        ramps = _limit_slew(_advanced(command, step, share), command[0], step)
+        ramps = limit_slew(_advanced(command, step, share), command[0], step)
         reached = air.follow(ramps, period, 2, pressure[0]).differential.mean(axis=1)
         missed = ((reached - wanted) ** 2).sum(axis=0)
         best, least = np.where(missed < least, ramps, best), np.minimum(missed, least)
@@ -83,12 +83,19 @@ def within_limits(
     wanted = np.asarray(pressures, dtype=float)
     start = np.zeros(wanted.shape[1]) if initial is None else np.array(initial, dtype=float)
     limit, step = air.pneumatics.pressure_limit, air.pneumatics.slew_limit * period
-    kept = _limit_slew(np.clip(wanted, -limit, limit), start, step)
+    kept = limit_slew(np.clip(wanted, -limit, limit), start, step)
     return kept, float(np.abs(kept - wanted).max(initial=0.0))
 
 
 @njit(cache=True, nogil=True)
-def _limit_slew(wanted: Array, start: Array, step: float) -> Array:
+def limit_slew(wanted: Array, start: Array, step: float) -> Array:
+    """Return commands (K, M) [Pa] that follow the wanted ones by at most a step [Pa] each.
+
+    Args:
+        wanted: (K, M) [Pa].
+        start: (M,) command before the first one [Pa].
+        step: largest change from one to the next [Pa].
+    """
     result = np.empty_like(wanted)
     for m in range(wanted.shape[1]):
         last = start[m]

@@ -39,6 +39,7 @@ from der_planner.planning.motions import Reference
 from der_planner.planning.timing import Start, resting_spline, sample_spline
 from der_planner.planning.workspace import (
     NEAREST_TOLERANCE,
+    POSE_PERIOD,
     TOLERANCE,
     UnreachableError,
     Workspace,
@@ -57,8 +58,6 @@ far than the arcs: the pull keeps its angles smooth where the reference touches 
 0.03 mm."""
 _FALLEN = 1.0
 """Arcs that rest this far from the rod have buckled [rad]."""
-_POSE_PERIOD = 0.1
-"""Time between two poses of a loaded rod [s]."""
 _POSE_TOLERANCE = 0.01
 """Share of the length by which a pose may miss: near its fold a loaded limb reaches less far than
 the arcs of a named motion."""
@@ -118,11 +117,20 @@ def configure(model: Model, reference: Reference) -> Configuration:
         OverloadError: gravity's load takes more than the pressure limit.
         BucklingError: the model does not stay at a pose on the way, or does not rest.
     """
-    if isinstance(model, ArcModel):
-        return _arcs_along(model, reference)
-    if not isinstance(model, RodModel):
+    if isinstance(model, RodModel):
+        along = _poses_along if model.is_loaded else _evenly_along
+        return along(model, reference)
+    if not isinstance(model, ArcModel):
         raise TypeError(f"expected a rod or arcs, got {type(model).__name__}")
-    return _poses_along(model, reference) if model.is_loaded else _evenly_along(model, reference)
+    try:
+        return _arcs_along(model, reference)
+    except PlanningError as error:
+        if not model.limb.gravity[2]:
+            raise
+        raise PlanningError(
+            f"{error}. Arcs know nothing of the sag out of their plane that this gravity brings: "
+            "plan with the rod (der)"
+        ) from error
 
 
 # Arcs ------------------------------------------------------------------------------------------
@@ -316,7 +324,7 @@ def _through(time: Array, values: Array, start: Start | None) -> BSpline:
 
 def _poses_along(model: RodModel, reference: Reference) -> LoadedConfiguration:
     """Return the poses of a loaded rod along a reference."""
-    count = max(8, int(np.ceil(reference.duration / _POSE_PERIOD)) + 1)
+    count = max(8, int(np.ceil(reference.duration / POSE_PERIOD)) + 1)
     time = np.linspace(0.0, reference.duration, count)
     tip = interpolate_smoothly(time, reference.time, reference.tip)
     # The rod's own bend angles where it rests: there the poses begin and end without pressure.

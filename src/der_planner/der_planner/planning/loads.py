@@ -1,27 +1,20 @@
 """A limb under its loads: whether it stays where it rests, how it sags, what pressures can hold.
 
 Errors stand beside what raises them: of loads here, of reach in `workspace`.
-
-A level limb that is free to sag under gravity along −z comes less far out than arcs of its length
-say. Its reference is therefore the tip of the rod in space, held by pressures so that its segments
-bend by the motion's angles, as seen along z (`sagging_tips`).
 """
 
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from scipy.interpolate import make_interp_spline
 
-from der_planner.arrays import Array, interpolate
+from der_planner.arrays import Array
 from der_planner.limb import PAYLOAD, Limb
 from der_planner.model import Model, RodModel
-from der_planner.model.rod import PoseFinder
 from der_planner.rod import ConvergenceError, Rod, RodState
 
 AnyModel = TypeVar("AnyModel", bound=Model)
@@ -30,8 +23,6 @@ NEAR = 1.1
 """A standing limb that would buckle under less than this multiple of its load is near that [-]."""
 _APART = 1e-3
 """Two resting shapes that are this far apart are two [m]."""
-_POSE_PERIOD = 0.1
-"""Time between two poses of a limb that sags [s]."""
 _HALVINGS = 8
 """Steps of the bisection for the mass that could be carried."""
 
@@ -158,36 +149,6 @@ def critical_share(limb: Limb) -> float:
         else:
             high = share
     return high
-
-
-def sagging_tips(model: RodModel, time: Array, angles: Array, rest: Array) -> Array:
-    """Return the tips (K, 2) [m] of the rod in space that bends by angles (K, M) [rad].
-
-    Args:
-        model: rod of a limb whose gravity leaves the plane.
-        time: (K,) for messages [s].
-        angles: of the motion; where they are ``rest`` the rod rests.
-        rest: (M,) bend angles of the arcs at rest [rad].
-
-    Raises:
-        BucklingError: the rod does not stay on the way.
-    """
-    state = stable_rest(model)
-    home = model.bend_of(state)
-    count = max(8, math.ceil((time[-1] - time[0]) / _POSE_PERIOD) + 1)
-    instants = np.linspace(time[0], time[-1], count)
-    wanted = interpolate(instants, time, angles) + (home - rest)
-    holder = PoseFinder(model, prior=1.0, tip_weight=0.0)
-    try:
-        poses = holder.along(state, np.tile(state.q[-3:-1], (count, 1)), wanted)
-    except ConvergenceError as error:
-        raise BucklingError(
-            f"the limb cannot be held at t = {instants[error.step]:.2f} s: under its load it would "
-            "snap through. Shrink the motion, or mount the limb otherwise"
-        ) from error
-    tips = np.array([state.q[-3:-1] for state in poses.states])
-    smooth: Array = make_interp_spline(instants, tips, k=5)(time)
-    return smooth
 
 
 def check_load(

@@ -37,7 +37,9 @@ from der_planner.planning.timing import (
     LONGEST,
     PathLimits,
     Start,
+    at_rest,
     fine_grid,
+    in_turn,
     led_in,
     on_grid,
     quintic,
@@ -231,8 +233,7 @@ class Motion:
         if self.name in JOINT_MOTIONS and self.path is None:
             time, angles = self._joint_motion(workspace)
             if start is None and np.any(angles[0] != rest.bend_angles):
-                zero = np.zeros_like(rest.bend_angles)
-                time, angles = led_in(fastest, (rest.bend_angles, zero, zero), time, angles)
+                time, angles = led_in(fastest, at_rest(rest.bend_angles), time, angles)
         else:
             time, angles, deviation = self._tip_motion(workspace)
         if start is not None:
@@ -265,9 +266,8 @@ class Motion:
             0.5 * self.amplitude * sign * rate**2 * np.cos(last),
         )
         closing = fine_grid(on_grid(self.period / 4))
-        zero = np.zeros(segments)
-        back = quintic(closing, *state, rest.bend_angles, zero, zero)
-        return np.append(time, total + closing[1:]), np.concatenate([angles, back[1:]])
+        back = quintic(closing, state, at_rest(rest.bend_angles))
+        return in_turn((time, angles), (closing, back))
 
     def _tip_motion(self, workspace: Workspace) -> tuple[Array, Array, Deviation | None]:
         rest, path = workspace.rest, self.path

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import piqp
@@ -69,18 +68,6 @@ class OptimiserSettings:
     iterations: int = 6
     tolerance: float = 1e-5
     reuse: float = 0.7
-
-
-class Quadratic(NamedTuple):
-    """The cost of a window around a linearisation: ½ δᵀHδ + gradientᵀδ.
-
-    Attributes:
-        jacobian: (2W, W·M) ∂tip/∂command [m/Pa].
-        hessian: (W·M, W·M) with smoothness and nearness [m²/Pa²].
-    """
-
-    jacobian: Array
-    hessian: Array
 
 
 @dataclass(frozen=True)
@@ -181,29 +168,29 @@ class Optimiser:
         """Improve ``command[first:last]`` in place; return the steps and if a limit was met."""
         settings, air = self.settings, self.model.air
         met, damping = False, 0.0
-        quadratic: Quadratic | None = None
+        jacobian: Array | None = None
         cost, misses, window = self._evaluate(command, state, first, last)
         before = command[first - 1] if first else self.before
         for step in range(settings.iterations):
             rms = _rms(misses)
             if rms < settings.tolerance:
                 return step, met
-            if quadratic is None:
-                quadratic = self._linearise(window, state, damping)
-                factor = cho_factor(quadratic.hessian, lower=True)
-            gradient = self._gradient(quadratic, misses, command[:last], first)
+            if jacobian is None:
+                jacobian, hessian = self._linearise(window, state, damping)
+                factor = cho_factor(hessian, lower=True)
+            gradient = self._gradient(jacobian, misses, command[:last], first)
             present, trial = command[first:last], command[:last].copy()
             wanted = present - cho_solve(factor, gradient).reshape(present.shape)
             trial[first:], cut = within_limits(wanted, air, CONTROL_PERIOD, before)
             if cut > 0:
                 met = True
-                trial[first:] = solve_limited(quadratic.hessian, gradient, present, before, air)
+                trial[first:] = solve_limited(hessian, gradient, present, before, air)
             try:
                 new = self._evaluate(trial, state, first, last)
             except ConvergenceError:
                 new = np.inf, misses, window
             if new[0] > cost:
-                damping, quadratic = max(10 * damping, 1e-7), None
+                damping, jacobian = max(10 * damping, 1e-7), None
                 continue
             gained = rms - _rms(new[1])
             command[:last] = trial
@@ -211,7 +198,7 @@ class Optimiser:
             if gained < max(settings.tolerance / 5, 0.02 * rms):
                 return step + 1, met
             if gained < settings.reuse * rms:
-                quadratic = None
+                jacobian = None
         return settings.iterations, met
 
     def _evaluate(
@@ -224,11 +211,11 @@ class Optimiser:
         pulled = self._weights(last - first) @ self._deviation(command[:last], first)
         return float((misses**2).sum() + (pulled**2).sum()), misses, window
 
-    def _gradient(self, quadratic: Quadratic, misses: Array, command: Array, first: int) -> Array:
+    def _gradient(self, jacobian: Array, misses: Array, command: Array, first: int) -> Array:
         """Return half the gradient (W·M,) of the cost at commands (first + W, M)."""
         weights = self._weights(len(command) - first)
         pull = weights[:, 2:].T @ (weights @ self._deviation(command, first))
-        gradient: Array = quadratic.jacobian.T @ misses.ravel() + pull.ravel()
+        gradient: Array = jacobian.T @ misses.ravel() + pull.ravel()
         return gradient
 
     def _weights(self, size: int) -> Array:
@@ -247,8 +234,12 @@ class Optimiser:
         deviation[2 - (first - begin) :] = command[begin:] - self.warm[begin : len(command)]
         return deviation
 
-    def _linearise(self, window: Window, state: State, damping: float) -> Quadratic:
-        """Return the quadratic model of the cost around the commands of a window."""
+    def _linearise(self, window: Window, state: State, damping: float) -> tuple[Array, Array]:
+        """Return the quadratic model of the cost around the commands of a window.
+
+        It is ∂tip/∂command (2W, W·M) [m/Pa], and the Hessian (W·M, W·M) with smoothness and
+        nearness [m²/Pa²].
+        """
         linear = self.model.run(state, window.effective, CONTROL_PERIOD, "tip").linear
         if linear is None:
             raise AssertionError("a linearised motion has its sensitivity")
@@ -266,7 +257,7 @@ class Optimiser:
         J = sensitivity.reshape(2 * size, size * inputs)
         weights = self._weights(size)[:, 2:]
         pull = weights.T @ weights + damping**2 * np.eye(size)
-        return Quadratic(J, J.T @ J + np.kron(pull, np.eye(inputs)))
+        return J, J.T @ J + np.kron(pull, np.eye(inputs))
 
 
 def _rms(misses: Array) -> float:

@@ -7,8 +7,9 @@ nor the motion; model and kinematics are built anew from them.
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -263,22 +264,25 @@ def learned_plan(folder: str | Path | None, name: str, limb: Limb) -> Plan:
     return plan
 
 
-def difference(one: Any, other: Any, where: str = "") -> str:
+def difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
     """Return the name of the first number of two limbs that differs; empty if they are one."""
-    if isinstance(one, Mapping) and isinstance(other, Mapping):
-        for key in {**one, **other}:
-            if key in ("name", "provenance", "calibrated", "pcc_segments"):
-                continue
-            found = difference(one.get(key), other.get(key), f"{where}.{key}".strip("."))
-            if found:
-                return found
-        return ""
-    if isinstance(one, list | tuple) and isinstance(other, list | tuple):
-        if len(one) != len(other):
-            return where
-        pairs = enumerate(zip(one, other, strict=True))
-        found_each = (difference(a, b, f"{where}[{n}]") for n, (a, b) in pairs)
-        return next((found for found in found_each if found), "")
-    if isinstance(one, int | float) and isinstance(other, int | float):
-        return "" if abs(one - other) <= _SAME * max(abs(one), abs(other)) else where
-    return "" if one == other else where
+    ours, theirs = dict(_leaves(one)), dict(_leaves(other))
+    for name in {**ours, **theirs}:
+        a, b = ours.get(name), theirs.get(name)
+        near = isinstance(a, float) and isinstance(b, float) and math.isclose(a, b, rel_tol=_SAME)
+        if a != b and not near:
+            return name
+    return ""
+
+
+def _leaves(content: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield what moves a limb of its mapping, each number by its whole name."""
+    if isinstance(content, Mapping):
+        for key, value in content.items():
+            if key not in ("name", "provenance", "calibrated", "pcc_segments"):
+                yield from _leaves(value, f"{name}.{key}".strip("."))
+    elif isinstance(content, list | tuple):
+        for place, entry in enumerate(content):
+            yield from _leaves(entry, f"{name}[{place}]")
+    else:
+        yield name, content

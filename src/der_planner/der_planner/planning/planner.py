@@ -74,7 +74,7 @@ def plan(
         rod = RodModel(limb, nodes)
         body = rod if model == "der" else Model.of(limb, model)
         reference = motion.reference(Workspace(rod), start)
-        configuration = _configured(body, reference)
+        configuration = configure(body, reference)
         report(0.3)
         try:
             # The optimum begins from the projected balance.
@@ -112,19 +112,6 @@ def plan(
         warnings=tuple(filter(None, said)),
         details=found.details if method == "optimal" else {},
     )
-
-
-def _configured(model: Model, reference: Reference) -> Configuration:
-    """Return the configuration; a refusal of arcs that sag out of their plane advises the rod."""
-    try:
-        return configure(model, reference)
-    except PlanningError as error:
-        if model.name == "pcc" and model.limb.gravity[2]:
-            raise PlanningError(
-                f"{error}. Arcs know nothing of the sag out of their plane that this gravity "
-                "brings: plan with the rod (der)"
-            ) from error
-        raise
 
 
 def _solve(

@@ -34,6 +34,10 @@ RISE = 0.5
 """Time in which bend angles reach their greatest rate [s]."""
 
 
+Moving = tuple[Array, Array, Array]
+"""Bend angles (M,) [rad], their rates [rad/s] and accelerations [rad/s²]."""
+
+
 @dataclass(frozen=True)
 class PathLimits:
     """How fast the tip may go along a path that comes without times.
@@ -99,20 +103,31 @@ def with_transitions(
         home: (M,) where the limb rests [rad].
     """
     inner = make_interp_spline(time, angles, k=5)
-    ends = [(inner(t), inner(t, 1), inner(t, 2)) for t in (time[0], time[-1])]
-    zero = np.zeros_like(home)
-    lead = _travel_time(fastest, ends[0], home)
-    tail = _travel_time(fastest, ends[1], home)
-    approach = quintic(fine_grid(lead), home, zero, zero, *ends[0])
-    back = quintic(fine_grid(tail), *ends[1], home, zero, zero)
+    first, last = ((inner(t), inner(t, 1), inner(t, 2)) for t in (time[0], time[-1]))
     between = fine_grid(on_grid(time[-1] - time[0]))
-    middle = inner(np.minimum(time[0] + between, time[-1]))
-    instants = [
-        fine_grid(lead),
-        lead + between[1:],
-        lead + between[-1] + fine_grid(tail)[1:],
-    ]
-    return np.concatenate(instants), np.concatenate([approach, middle[1:], back[1:]])
+    middle = between, inner(np.minimum(time[0] + between, time[-1]))
+    rest = at_rest(home)
+    approach, back = _transition(fastest, rest, first), _transition(fastest, last, rest)
+    return in_turn(in_turn(approach, middle), back)
+
+
+def led_in(fastest: Array, state: Moving, time: Array, angles: Array) -> tuple[Array, Array]:
+    """Return time and angles with the transition from a state to their first pose before them.
+
+    The first pose is at rest. The other arguments are those of `with_transitions`.
+    """
+    return in_turn(_transition(fastest, state, at_rest(angles[0])), (time, angles))
+
+
+def at_rest(angles: Array) -> Moving:
+    """Return the state of a limb that rests at angles (M,) [rad]."""
+    return angles, np.zeros_like(angles), np.zeros_like(angles)
+
+
+def in_turn(one: tuple[Array, Array], following: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Return times and angles of two sequences, of which one begins where the other ends."""
+    time = np.append(one[0], one[0][-1] + following[0][1:])
+    return time, np.concatenate([one[1], following[1][1:]])
 
 
 def smooth_step(x: ArrayLike) -> Array:
@@ -122,34 +137,18 @@ def smooth_step(x: ArrayLike) -> Array:
     return step
 
 
-def quintic(time: Array, x0: Array, v0: Array, a0: Array, x1: Array, v1: Array, a1: Array) -> Array:
+def quintic(time: Array, begin: Moving, end: Moving) -> Array:
     """Return (K, M) samples of the quintic between two states over the span of ``time`` (K,)."""
     span = float(time[-1])
     t = (time / span)[:, None]
-    start = (x0, span * v0, span**2 * a0)
-    end = (x1, span * v1, span**2 * a1)
-    difference = end[0] - start[0] - start[1] - 0.5 * start[2]
-    slope = end[1] - start[1] - start[2]
-    bow = end[2] - start[2]
+    x0, v0, a0 = begin[0], span * begin[1], span**2 * begin[2]
+    x1, v1, a1 = end[0], span * end[1], span**2 * end[2]
+    difference, slope, bow = x1 - x0 - v0 - 0.5 * a0, v1 - v0 - a0, a1 - a0
     c3 = 10 * difference - 4 * slope + 0.5 * bow
     c4 = -15 * difference + 7 * slope - bow
     c5 = 6 * difference - 3 * slope + 0.5 * bow
-    result: Array = start[0] + t * (start[1] + t * (0.5 * start[2] + t * (c3 + t * (c4 + t * c5))))
+    result: Array = x0 + t * (v0 + t * (0.5 * a0 + t * (c3 + t * (c4 + t * c5))))
     return result
-
-
-def led_in(
-    fastest: Array, state: tuple[Array, Array, Array], time: Array, angles: Array
-) -> tuple[Array, Array]:
-    """Return time and angles with the transition from a state to their first pose before them.
-
-    The state is angle [rad], rate [rad/s] and acceleration [rad/s²], each (M,); the first pose is
-    at rest. The other arguments are those of `with_transitions`.
-    """
-    zero = np.zeros_like(fastest)
-    lead = fine_grid(_travel_time(fastest, state, angles[0]))
-    approach = quintic(lead, *state, angles[0], zero, zero)
-    return np.append(lead, lead[-1] + time[1:]), np.concatenate([approach, angles[1:]])
 
 
 def on_grid(span: float) -> float:
@@ -162,17 +161,14 @@ def fine_grid(span: float) -> Array:
     return np.linspace(0.0, span, max(2, round(span / FINE_PERIOD) + 1))
 
 
-def _travel_time(fastest: Array, state: tuple[Array, Array, Array], home: Array) -> float:
-    """Return how long the limb takes between rest at home and a state, at half of its slew limit.
-
-    Angles (M,) in rad, the result in s.
-    """
+def _transition(fastest: Array, begin: Moving, end: Moving) -> tuple[Array, Array]:
+    """Return times and angles of the quintic between two states, at half of the slew limit."""
     half = 0.5 * fastest
-    angle, rate, acceleration = (np.abs(p) for p in (state[0] - home, state[1], state[2]))
-    by_angle = np.max(1.875 * angle / half)
-    by_rate = np.max(2 * rate / half)
+    rate, acceleration = (np.maximum(*np.abs([begin[n], end[n]])) for n in (1, 2))
+    by_angle = np.max(1.875 * np.abs(end[0] - begin[0]) / half)
     by_acceleration = np.max(np.sqrt(acceleration / half))
-    return on_grid(max(1.0, by_angle, by_rate, by_acceleration))
+    time = fine_grid(on_grid(max(1.0, by_angle, np.max(2 * rate / half), by_acceleration)))
+    return time, quintic(time, begin, end)
 
 
 # How fast a course is gone through --------------------------------------------------------------

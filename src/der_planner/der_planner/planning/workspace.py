@@ -14,12 +14,15 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.interpolate import make_interp_spline
 from scipy.optimize import least_squares
 
 from der_planner.arrays import Array, interpolate
 from der_planner.model import NODES, ArcModel, Model, RodModel
 from der_planner.model.bending import Kinematics, inverse_kinematics
-from der_planner.planning.loads import PlanningError, sagging_tips, stable_rest
+from der_planner.model.rod import PoseFinder
+from der_planner.planning.loads import BucklingError, PlanningError, stable_rest
+from der_planner.rod import ConvergenceError
 
 TOLERANCE = 1e-3
 """Points missed by less than this [m] count as reached (the models' reach differs by less)."""
@@ -28,6 +31,8 @@ NEAREST_TOLERANCE = 5e-3
 by 1 to 2 mm."""
 BRANCHES = ("counter_clockwise", "clockwise")
 """Names of the two ways in which two segments reach a point."""
+POSE_PERIOD = 0.1
+"""Time between two poses of a loaded rod [s]."""
 _STRAIGHT = 1e-3
 """A limb that rests within this bend of straight starts there [rad]."""
 _LARGEST_STRIDE = 0.15
@@ -151,10 +156,33 @@ class Workspace:
     def sagging_tips(self, time: Array, angles: Array) -> Array:
         """Return the tips (K, 2) [m] of the rod in space that bends by angles (K, M) [rad].
 
+        A level limb that is free to sag under gravity along −z comes less far out than arcs of its
+        length say. Its reference is the tip of the rod in space, held by pressures so that its
+        segments bend by the motion's angles, as seen along z.
+
+        Args:
+            time: (K,) for messages [s].
+            angles: of the motion; the rod rests where the arcs do.
+
         Raises:
             BucklingError: the rod does not stay on the way.
         """
-        return sagging_tips(self.rod, time, angles, self.rest.bend_angles)
+        state = stable_rest(self.rod)
+        count = max(8, math.ceil((time[-1] - time[0]) / POSE_PERIOD) + 1)
+        instants = np.linspace(time[0], time[-1], count)
+        beside = self.rod.bend_of(state) - self.rest.bend_angles
+        wanted = interpolate(instants, time, angles) + beside
+        holder = PoseFinder(self.rod, prior=1.0, tip_weight=0.0)
+        try:
+            poses = holder.along(state, np.tile(state.q[-3:-1], (count, 1)), wanted)
+        except ConvergenceError as error:
+            raise BucklingError(
+                f"the limb cannot be held at t = {instants[error.step]:.2f} s: under its load it "
+                "would snap through. Shrink the motion, or mount the limb otherwise"
+            ) from error
+        tips = np.array([state.q[-3:-1] for state in poses.states])
+        smooth: Array = make_interp_spline(instants, tips, k=5)(time)
+        return smooth
 
     def _angle_limits(self) -> tuple[Array, Array]:
         bounds = []

@@ -9,7 +9,7 @@ window from the first to the last setpoint of the plan: E is the mean over the v
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from der_planner.bags.series import load_run, run_of
 from der_planner.limb import mounting_of
 from der_planner.results.errors import (
     EvaluationSettings,
+    Split,
     check_board,
     check_tracker,
     error_series,
@@ -40,7 +41,7 @@ REFERENCE_POINTS = 25
 
 
 @dataclass(frozen=True)
-class RunResult:
+class RunResult(Split):
     """The figures of one run; field names carry their units, as in ``results.json``.
 
     ``valid_fraction`` is the share of the images in the window whose limb state is valid;
@@ -75,14 +76,6 @@ class RunResult:
     gravity_m_s2: tuple[float, float, float] = (0.0, 0.0, 0.0)
     payload_kg: float = 0.0
     payload_at_m: float = 0.0
-    lag_s: float = float("nan")
-    gain_x: float = float("nan")
-    gain_y: float = float("nan")
-    bias_x_m: float = float("nan")
-    bias_y_m: float = float("nan")
-    rms_without_lag_m: float = float("nan")
-    rms_without_bias_m: float = float("nan")
-    rms_without_gain_m: float = float("nan")
     pressure_rms_error_pa: tuple[float, ...] = ()
     removed_lag_s: float = 0.0
     problems: tuple[str, ...] = ()
@@ -202,11 +195,9 @@ def _pressure_errors(run: RunSeries, first: float, last: float) -> tuple[float, 
         return ()
     inside = (run.measured.time >= first) & (run.measured.time <= last)
     difference = run.measured.value[inside] - run.commanded.value[inside]
-    known = np.isfinite(difference)
-    if not known.any(axis=0).all():
+    if not np.isfinite(difference).any(axis=0).all():
         return ()
-    squares = np.where(known, difference, 0.0) ** 2
-    return tuple(float(v) for v in np.sqrt(squares.sum(axis=0) / known.sum(axis=0)))
+    return tuple(np.sqrt(np.nanmean(difference**2, axis=0)).tolist())
 
 
 def _problems(run: RunSeries, valid: float, longest: float) -> tuple[str, ...]:
@@ -231,38 +222,31 @@ class Evaluated:
 
 
 def evaluate_bags(
-    paths: Sequence[Path],
-    settings: EvaluationSettings | None = None,
-    progress: Callable[[int, int, Path], None] = lambda *_: None,
-) -> list[Evaluated]:
+    paths: Sequence[Path], settings: EvaluationSettings | None = None
+) -> Iterator[Evaluated]:
     """Evaluate bags one after the other; one that fails does not stop the others.
 
     Args:
         paths: bag folders or files.
         settings: for all of them.
-        progress: called with the number done, the number of bags and the last one's path.
 
-    Returns:
+    Yields:
         One entry per limb that has a plan, in the order of the paths; one with the reason for a
         bag without any.
     """
-    entries = []
-    for count, path in enumerate(paths, start=1):
-        entries += _evaluate(path, settings or EvaluationSettings())
-        progress(count, len(paths), path)
-    return entries
+    for path in paths:
+        yield from _evaluate(path, settings or EvaluationSettings())
 
 
-def _evaluate(path: Path, settings: EvaluationSettings) -> list[Evaluated]:
+def _evaluate(path: Path, settings: EvaluationSettings) -> Iterator[Evaluated]:
     try:
         record = read_record(path)
     except (BagError, OSError) as error:
-        return [Evaluated(path, error=str(error))]
-    found = []
+        yield Evaluated(path, error=str(error))
+        return
     for namespace in sorted(record.played or record.limbs) or [""]:
         try:
             run = run_of(record, namespace)
-            found.append(Evaluated(path, run, evaluate_run(run, settings)))
+            yield Evaluated(path, run, evaluate_run(run, settings))
         except (BagError, EvaluationError, OSError) as error:
-            found.append(Evaluated(path, error=str(error)))
-    return found
+            yield Evaluated(path, error=str(error))

@@ -210,14 +210,13 @@ def mean_error(runs: Sequence[RunSeries], rate: float = 20.0) -> tuple[Array, Ar
             np.abs(grid - series.time[nearest - 1]), np.abs(series.time[nearest] - grid)
         )
         row[away > 0.1] = np.nan
-    known = np.isfinite(rows)
-    count = known.sum(axis=0)
-    keep = count > 0
-    filled = np.where(known, rows, 0.0)[:, keep]
-    mean = filled.sum(axis=0) / count[keep]
-    squares = np.where(known[:, keep], (filled - mean) ** 2, 0.0).sum(axis=0)
-    deviation = np.sqrt(squares / np.maximum(1, count[keep] - 1))
-    return grid[keep], mean, deviation
+    known = np.ma.masked_invalid(rows[:, np.isfinite(rows).any(axis=0)])
+    deviation = known.std(axis=0, ddof=1) if len(runs) > 1 else np.zeros(known.shape[1])
+    return (
+        grid[np.isfinite(rows).any(axis=0)],
+        np.asarray(known.mean(axis=0)),
+        np.ma.filled(deviation, 0.0),
+    )
 
 
 def plot_pressures(runs: Sequence[RunSeries], folder: Path) -> list[Path]:

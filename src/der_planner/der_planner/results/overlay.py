@@ -145,28 +145,24 @@ class RunImages:
         Args:
             time: [s] since the first setpoint.
         """
-        when, near = self._origin + round(time * NANOSECONDS), round(NEAR * NANOSECONDS)
-        nearest: dict[str, tuple[int, Any]] = {}
-        wanted = [
-            name for kind in (STATE_TYPE, IMAGE_TYPE, MARKERS_TYPE) for name in self._topics[kind]
-        ]
-        for topic, _, message in self._bag.messages(wanted, when - near, when + near):
-            marker = _limb_marker(message)
-            if marker is None:
-                continue
-            away = abs(header_stamp(marker) - when)
-            if topic not in nearest or away < nearest[topic][0]:
-                nearest[topic] = (away, marker)
-
-        def found(kind: str) -> Any:
-            return next((nearest[name][1] for name in self._topics[kind] if name in nearest), None)
-
-        state, image, limb = found(STATE_TYPE), found(IMAGE_TYPE), found(MARKERS_TYPE)
+        state = self._nearest(STATE_TYPE, time)
+        image = self._nearest(IMAGE_TYPE, time)
+        limb = self._nearest(MARKERS_TYPE, time)
         return Snapshot(
             None if image is None else gray(image),
             _NOTHING if state is None or not state.valid else _points(state.curve),
             _NOTHING if limb is None else _points(limb.points),
         )
+
+    def _nearest(self, kind: str, time: float) -> Any:
+        """Return the message of a type nearest to an instant; of markers, that of the limb."""
+        when, near = self._origin + round(time * NANOSECONDS), round(NEAR * NANOSECONDS)
+        read = self._bag.messages(self._topics[kind], when - near, when + near)
+        found = [message for _, _, message in read]
+        if kind == MARKERS_TYPE:
+            markers = [marker for message in found for marker in message.markers]
+            found = [marker for marker in markers if marker.ns == LIMB_MARKER]
+        return min(found, key=lambda each: abs(header_stamp(each) - when), default=None)
 
     def pictures(self) -> Iterator[tuple[float, Picture, Array]]:
         """Yield each picture: its time [s] since the first setpoint, gray values, measured curve.
@@ -206,13 +202,6 @@ def _topics_of(bag: BagReader, type_name: str, namespace: str) -> list[str]:
 
     own = [name for name in named if lies_in(name, namespace)]
     return own or [name for name in named if not any(lies_in(name, limb) for limb in limbs)]
-
-
-def _limb_marker(message: Any) -> Any:
-    """Return the limb's line of a `MarkerArray`, None where it has none; another message itself."""
-    if not hasattr(message, "markers"):
-        return message
-    return next((marker for marker in message.markers if marker.ns == LIMB_MARKER), None)
 
 
 def _points(points: Sequence[Any]) -> Array:

@@ -3,8 +3,7 @@
 Workers are processes of this machine, or of a Dask cluster that runs already. They import this
 module: they need the package, its dependencies and nothing of the study's folder.
 
-A row is kept as a small Parquet file, whole or not there: it is written beside its place and moved
-there. Its name is the row's key, so no row is there twice. A study that was stopped goes on where
+A row is kept as a line of JSON as soon as it comes back, so a study that was stopped goes on where
 it was, whatever stopped it.
 """
 
@@ -13,20 +12,17 @@ from __future__ import annotations
 import contextlib
 import csv
 import errno
-import io
+import json
 import logging
 import math
 import os
 import queue
 import time
-from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import timedelta
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import pyarrow as pa
-import pyarrow.parquet
 from distributed import Client, Future, LocalCluster
 from threadpoolctl import threadpool_limits
 
@@ -37,12 +33,8 @@ from der_planner.studies.tasks import TASKS, Twin, calibrated, digest
 
 Kept = dict[str, Any]
 """A row as it is kept: key, factors, results, error and sources by column."""
-_AHEAD = 20
-"""Rows under way for each thread of the cluster, so that none waits for its next."""
-_LEAST_AHEAD = 200
-"""Rows under way in any case."""
 _PAUSE = 0.5
-"""The cluster is looked at again after this time [s] at the latest."""
+"""Workers are counted again when no row came back for this time [s]."""
 PATIENCE = 10.0
 """A scheduler that should be there is waited for this long [s]."""
 ALONE = 30.0
@@ -119,15 +111,8 @@ class Outcome(NamedTuple):
     sources: str = ""
 
 
-def _write_whole(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all."""
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
-    unfinished.write_bytes(data)
-    os.replace(unfinished, path)
-
-
 class Store:
-    """The folder of a study: ``study.yaml``, ``rows/*.parquet``, at its end ``rows.csv``.
+    """The folder of a study: ``study.yaml``, ``rows.jsonl``, at its end ``rows.csv``.
 
     Args:
         folder: made if missing.
@@ -139,14 +124,11 @@ class Store:
 
     def __init__(self, folder: Path, study: Study) -> None:
         self.folder, self._study = folder, study
-        kinds = {float: pa.float64(), int: pa.int64(), str: pa.string()}
-        columns = [("key", pa.string())]
-        columns += [(name, kinds[type(each.default)]) for name, each in study.factors.items()]
-        columns += [(name, pa.float64()) for name in study.keep]
-        self._schema = pa.schema([*columns, ("error", pa.string()), ("sources", pa.string())])
+        self._rows = folder / "rows.jsonl"
         with self._written():
-            (folder / "rows").mkdir(parents=True, exist_ok=True)
-            _write_whole(folder / "study.yaml", study.text.encode())
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / "study.yaml").write_text(study.text, encoding="utf-8")
+            self._rows.touch()
 
     @contextlib.contextmanager
     def _written(self) -> Iterator[None]:
@@ -160,44 +142,38 @@ class Store:
             ) from error
 
     def keep(self, row: Row, outcome: Outcome) -> None:
-        """Write a finished row, whole or not at all.
+        """Append a finished row; of lines with one key the last counts.
 
         Raises:
             StudyError: the disk is full, or the folder cannot be written any more.
         """
         results = {name: outcome.results.get(name) for name in self._study.keep}
         ended = {"error": outcome.error or None, "sources": outcome.sources}
-        record = {"key": row.key, **row.values, **results, **ended}
-        buffer = io.BytesIO()
-        pyarrow.parquet.write_table(pa.Table.from_pylist([record], self._schema), buffer)
-        with self._written():
-            _write_whole(self.folder / "rows" / f"{row.key}.parquet", buffer.getvalue())
+        line = json.dumps({"key": row.key, **row.values, **results, **ended}, allow_nan=False)
+        with self._written(), self._rows.open("a", encoding="utf-8") as file:
+            file.write(f"\n{line}")  # the line break comes first: it ends a line that was cut off
 
     def load(self) -> dict[str, Kept]:
         """Return the rows of the study that are done, by key, in the order of the table.
 
-        A file that is not whole, as after a loss of power, is removed. A row that was kept without
-        a column that the study now asks for counts as not done.
+        A line that is not whole, as after a kill, is passed over. A row that was kept without a
+        column that the study now asks for counts as not done.
         """
         found: dict[str, Kept] = {}
-        for path in sorted((self.folder / "rows").glob("*.parquet")):
-            try:
-                table = pyarrow.parquet.read_table(path)
-            except (pa.ArrowInvalid, OSError):
-                path.unlink(missing_ok=True)
-                continue
-            if set(self._study.keep) <= set(table.column_names):
-                found |= {record["key"]: record for record in table.to_pylist()}
+        for line in self._rows.read_text(encoding="utf-8", errors="replace").splitlines():
+            with contextlib.suppress(json.JSONDecodeError):
+                record = json.loads(line)
+                if record.keys() >= set(self._study.keep):
+                    found[record["key"]] = record
         return {row.key: found[row.key] for row in self._study.rows if row.key in found}
 
     def write_table(self, kept: Mapping[str, Kept]) -> None:
         """Write all rows as one table, ``rows.csv``, in the order of the study."""
-        text = io.StringIO()
-        table = csv.DictWriter(text, self._schema.names, extrasaction="ignore")
-        table.writeheader()
-        table.writerows(kept.values())
-        with self._written():
-            _write_whole(self.folder / "rows.csv", text.getvalue().encode())
+        columns = ["key", *self._study.factors, *self._study.keep, "error", "sources"]
+        with self._written(), (self.folder / "rows.csv").open("w", newline="") as file:
+            table = csv.DictWriter(file, columns, extrasaction="ignore")
+            table.writeheader()
+            table.writerows(kept.values())
 
 
 # On the workers ----------------------------------------------------------------------------------
@@ -216,7 +192,7 @@ def compute(task: str, values: Mapping[str, Value], limb: str) -> Outcome:
             found = TASKS[task].compute(limb, values)
     except Exception as error:
         return Outcome({}, _words(error), digest())
-    # Parquet tells NaN from nothing, people and JSON do not.
+    # JSON has no NaN: what is not known is left out.
     told = {name: value for name, value in found.items() if not math.isnan(value)}
     return Outcome(told, sources=digest())
 
@@ -274,9 +250,8 @@ class _Conductor:
         self._sent: dict[str, tuple[Future, Row]] = {}
         self._twins: dict[Twin, Future] = {}
         self._back: queue.SimpleQueue[Future] = queue.SimpleQueue()
-        self._begun = self._manned = time.monotonic()
-        self._seen, self._threads = 0.0, 0
-        self._made = self._failed = 0
+        self._begun, self._alone = time.monotonic(), 0.0
+        self._threads = self._made = self._failed = 0
 
     def play(self, client: Client, rows: Sequence[Row]) -> None:
         """Play rows.
@@ -286,40 +261,39 @@ class _Conductor:
         """
         where = self._scheduler or "this machine"
         workers = client.nthreads()
+        self._threads = sum(workers.values())
         self._progress.say(f"{len(workers)} workers at {where}; dashboard: {client.dashboard_link}")
         if not workers:
             self._progress.say(f"no worker has joined yet: {_JOIN.format(where)}")
-        left = deque(enumerate(rows))
         try:
-            while left or self._sent:
-                self._look(client, len(rows))
-                while left and len(self._sent) < max(_LEAST_AHEAD, _AHEAD * self._threads):
-                    self._send(client, *left.popleft())
-                with contextlib.suppress(queue.Empty):
+            for place, row in enumerate(rows):
+                self._send(client, place, row)
+            while self._sent:
+                try:
                     self._keep(self._back.get(timeout=_PAUSE))
+                except queue.Empty:
+                    self._check_workers(client)
+                self._show(len(rows))
         finally:
             futures = [*(future for future, _ in self._sent.values()), *self._twins.values()]
             if futures and client.status == "running":
                 client.cancel(futures, force=True)
-        self._show(len(rows))
 
-    def _look(self, client: Client, total: int) -> None:
-        """See now and then whether the cluster is there, and show how far the study is."""
-        now = time.monotonic()
-        if now - self._seen < _PAUSE:
-            return
+    def _check_workers(self, client: Client) -> None:
+        """Count the workers, after a pause in which no row came back.
+
+        Raises:
+            StudyError: the scheduler is gone, or every process of this machine.
+        """
         try:
             if client.status != "running":
                 raise OSError(client.status)
             self._threads = sum(client.nthreads().values())
         except (OSError, TimeoutError, RuntimeError, ValueError) as error:
             raise StudyError(f"the scheduler is gone ({error}). {_KEPT}") from error
-        self._seen = now
-        if self._threads or self._scheduler:
-            self._manned = now
-        elif now - self._manned > ALONE:
+        self._alone = 0.0 if self._threads or self._scheduler else self._alone + _PAUSE
+        if self._alone > ALONE:
             raise StudyError(f"no worker process of this machine is left. {_KEPT}")
-        self._show(total)
 
     def _send(self, client: Client, place: int, row: Row) -> None:
         """Send a row out; the one with the lowest place is begun first."""
