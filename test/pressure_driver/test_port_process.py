@@ -384,6 +384,7 @@ def test_an_end_that_may_not_have_vented_says_so(rig, in_thread, fault, told):
     process, thread, channel = in_thread(rig.settings)
     rig.send, rig.ask = channel.send, lambda _: process.core.arm()[0]
     rig.pressurise()
+    wait_for(lambda: process.core.highest_pressure() > 1000.0, "the reading")
     rig.have(fault)
     wait_for(lambda: rig.board.faults.deaf or not rig.port.host_present, "the fault")
     rig.send("end")
