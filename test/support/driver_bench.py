@@ -51,7 +51,11 @@ class Bench:
         self.client.watch([self.board])
         self.client.wait_ready(["board_emulator"])
         self.parameters = {"port": self.link, "protocol": protocol, **bounds, **parameters}
+        self.start_driver()
+
+    def start_driver(self):
         self.driver = self.graph.start("pressure_driver", "pressure_driver", **self.parameters)
+        self.client.diagnostics.pop("pressure_driver", None)
         self.client.watch([self.board, self.driver])
         self.client.wait_ready(["pressure_driver"])
         self.wait(self.publisher.get_subscription_count, "the driver's subscription")
