@@ -11,17 +11,9 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.identification import (
-    GROUPS,
-    CalibrationLog,
-    Excitation,
-    FitReport,
-    calibration_run,
-    fit,
-    predict,
-    record_twin,
-)
-from der_planner.identification.excitation import PERIOD
+from der_planner.identification import CalibrationLog, FitReport, fit, predict, record_twin
+from der_planner.identification.bends import GROUPS
+from der_planner.identification.excitation import PERIOD, Excitation, calibration_run
 from der_planner.limb import Limb
 
 Figures = dict[str, float | str]

@@ -28,7 +28,7 @@ setup(
     entry_points={
         "console_scripts": [
             "pressure_driver = pressure_driver.entry:pressure_driver",
-            "board = pressure_driver.board:main",
+            "board = pressure_driver.entry:board",
             "board_emulator = pressure_driver.entry:board_emulator",
         ],
     },

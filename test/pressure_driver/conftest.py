@@ -5,8 +5,9 @@ import pytest
 
 from pressure_driver.core import DriverCore
 from pressure_driver.emulator.board import EmulatedBoard, Faults
+from pressure_driver.emulator.firmware import board_protocol
 from pressure_driver.emulator.pneumatics import BoardPneumatics
-from pressure_driver.protocols import board_protocol, host_protocol
+from pressure_driver.protocols import host_protocol
 from pressure_driver.safety import Mode
 from pressure_driver.schedule import Setpoint, Verdict
 from pressure_driver.settings import Settings

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pressure_driver.protocols import NAMES
-from pressure_driver.protocols.base import BoardReport
+from pressure_driver.protocols import NAMES, BoardFailure
 from pressure_driver.safety import Mode
 from pressure_driver.schedule import Verdict
 
@@ -139,7 +138,7 @@ def test_boards_without_a_watchdog_keep_the_pressure_which_the_diagnostics_say(s
 
 
 def test_a_board_with_other_chambers_or_less_range_cannot_be_armed(simulate):
-    from pressure_driver.protocols.native import NativeBoard
+    from pressure_driver.emulator.firmware import NativeBoard
 
     sim = simulate("native")
     sim.board.protocol = NativeBoard(4, largest_pressure=20_000)
@@ -168,7 +167,7 @@ def test_a_slow_native_board_is_asked_again(simulate):
 def test_a_report_of_the_board_is_a_fault(simulate):
     sim = simulate("native")
     sim.arm()
-    sim.core._serve(BoardReport("sensor: channel 3", fatal=True), sim.steady)
+    sim.core._serve(BoardFailure("sensor: channel 3"), sim.steady)
     assert sim.mode is Mode.FAULT
     sim.tick()
     assert sim.is_vent(sim.sent[-1])

@@ -1,39 +1,35 @@
 """The process that owns the port of a valve board: it ticks, plays, watches and vents.
 
 The ROS node starts it and talks with it over a socket; it has no ROS, no threads and one `select`
-loop, so that nothing which holds up the node holds up the limb. It can also be started alone, to
-try a board without ROS:
-
-    ros2 run pressure_driver board --port /dev/ttyACM0 --protocol ezloop --hold-time 60
-
-Then it takes lines: ``arm``, ``vent``, or one differential pressure [Pa] for each segment.
+loop, so that nothing which holds up the node holds up the limb. `ros2 run pressure_driver board`
+starts it by hand, in a terminal in the place of the node.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import gc
+import json
 import os
 import select
 import signal
 import socket
 import sys
 import time
-from collections import deque
-from collections.abc import Sequence
-from typing import Any
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
 
 import serial
 
-from pressure_driver import ports
-from pressure_driver.channel import Channel, Terminal
+from pressure_driver import lines
 from pressure_driver.core import DriverCore
 from pressure_driver.following import Duration
-from pressure_driver.ports import PortError
+from pressure_driver.lines import Channel
 from pressure_driver.protocols import host_protocol
 from pressure_driver.schedule import Origin, Setpoint, TickGrid, Verdict
-from pressure_driver.settings import NANOSECONDS, SettingError, Settings, add_options, from_options
+
+if TYPE_CHECKING:
+    from pressure_driver.settings import Settings
 
 RETRY_TIME = 0.2
 """[s] between two attempts to open a port that was lost."""
@@ -42,10 +38,7 @@ LONGEST_WAIT = 0.03
 UNREAD_TIME = 1.0
 """[s] that bytes may wait in the port's output queue until the board counts as not reading."""
 NODE_PATIENCE = 1.0
-"""[s] without a message from the node, after which setpoints that wait are dropped: nobody could
-stop them. The limb is then held and let down as when setpoints stop."""
-DIAGNOSTICS_PERIOD = 0.5
-"""[s] between two messages with the diagnostics."""
+"""[s] for which the node may say nothing."""
 REFUSAL_PERIOD = 1.0
 """[s] between two lines of the log about refused setpoints."""
 MOST_MESSAGES = 100
@@ -64,16 +57,19 @@ class BoardProcess:
     Args:
         settings: the parameters.
         channel: to the node, or the terminal.
+        patience: [s] without a message from there, after which setpoints that wait are dropped:
+            nobody could stop them. The limb is then held and let down as when setpoints stop.
     """
 
-    def __init__(self, settings: Settings, channel: Channel | Terminal) -> None:
+    def __init__(self, settings: Settings, channel: Channel, patience: float) -> None:
         protocol = host_protocol(settings.protocol, 2 * settings.segment_count)
         self.core = DriverCore(protocol, settings, log=self._log)
-        self.grid = TickGrid(settings.period)
+        self.grid = TickGrid(self.core.machine.schedule.period)
         self.ending = False
         """Set to end in order."""
         self._channel = channel
-        self._port = ports.stable_name(settings.port)
+        self._patience = patience
+        self._port = settings.port
         self._baud_rate = settings.baud_rate or protocol.baud_rate
         self._device: serial.Serial | None = None
         self._bytes_waiting: select.epoll | None = None
@@ -83,17 +79,20 @@ class BoardProcess:
         self._was_venting = True
         self._retry_at = 0.0
         self._heard_at = self._said_at = self.core.clock()
-        self._diagnosed_at = self._refused_at = 0.0
+        self._refused_at = 0.0
         self._node_is_silent = False
-        self._late: deque[float] = deque(maxlen=1200)
-        self._real_time = ports.prefer_thread(settings.real_time_priority)
+        self._real_time = lines.prefer_thread(settings.real_time_priority)
+
+    def end(self, *_: object) -> None:
+        """End in order, after the present turn of the loop: a handler of signals."""
+        self.ending = True
 
     def run(self) -> int:
         """Serve the port until the end; return the exit code."""
         try:
-            self._device = ports.open_port_when_free(self._port, self._baud_rate)
-        except PortError as error:
-            self._send("failed", str(error))
+            self._device = lines.open_port(self._port, self._baud_rate, lines.RELEASE_TIME)
+        except (OSError, ValueError) as error:
+            self._send("failed", getattr(error, "errno", None), str(error))
             return 1
         problem, duration, node_has_ended = "", LAST_WORDS_TIME, False
         try:
@@ -104,14 +103,14 @@ class BoardProcess:
                 self._turn()
             problem = self._empty()
         except EOFError:
-            duration, node_has_ended = ports.VENT_TIME, True
+            duration, node_has_ended = lines.VENT_TIME, True
         finally:
             unreached = self._send_last_words(duration)
         if unreached:
             alone = " (a board with a watchdog vents by itself)"
             problem = (
                 f"the board on {self._port} cannot be reached and may hold its pressures"
-                f"{alone if self.core.protocol.has_watchdog else ''}: {ports.ADVICE}"
+                f"{alone if self.core.protocol.has_watchdog else ''}: {lines.ADVICE}"
             )
         self._send("ended", problem)
         if node_has_ended:
@@ -158,26 +157,14 @@ class BoardProcess:
         self._was_venting = venting
         self._watch_queue()
         self._write(data)
-        self._late.append((time.time_ns() - instant) / NANOSECONDS)
+        written = time.time_ns()
         self.core.sent()
-        self._send("state", self.core.state(), self._bytes_sent, self._bytes_received)
-        now = self.core.clock()
-        if now - self._diagnosed_at >= DIAGNOSTICS_PERIOD:
-            self._diagnosed_at = now
-            self._diagnose()
-
-    def _diagnose(self) -> None:
-        level, text, values = self.core.diagnostics()
-        values |= {
-            "ticks_missed": self.grid.missed,
-            "reconnects": self._reconnects,
-            "real_time_priority": self._real_time,
-        }
-        late = sorted(self._late)
-        for label, share in {"p50": 0.5, "p99": 0.99, "max": 1.0}.items():
-            value = late[round(share * (len(late) - 1))]
-            values[f"tick_to_write_{label}_ms"] = f"{1000.0 * value:.3f}"
-        self._send("diagnostics", level, text, values)
+        state = self.core.state()
+        state["bytes_sent"], state["bytes_received"] = self._bytes_sent, self._bytes_received
+        state["tick_to_write"] = written - instant
+        state["ticks_missed"], state["reconnects"] = self.grid.missed, self._reconnects
+        state["real_time_priority"] = self._real_time
+        self._send("state", state)
 
     # ------------------------------------------------------------------------------ the node
 
@@ -198,7 +185,7 @@ class BoardProcess:
         elif word == "vent":
             self._send("answer", *self._vent_now())
         elif word == "end":
-            self.ending = True
+            self.end()
 
     def _offer(self, setpoint: Setpoint, origin: Origin) -> None:
         verdict = self.core.offer(setpoint, time.time_ns(), origin)
@@ -219,11 +206,11 @@ class BoardProcess:
         now = self.core.clock()
         if now - self._said_at >= LONGEST_WAIT:
             self._send("alive")
-        silent = isinstance(self._channel, Channel) and now - self._heard_at > NODE_PATIENCE
+        silent = now - self._heard_at > self._patience
         if silent:
             self.core.machine.schedule.clear()
             if not self._node_is_silent:
-                self._log(f"the node said nothing for {NODE_PATIENCE:g} s", True)
+                self._log(f"the node said nothing for {self._patience:g} s", True)
         self._node_is_silent = silent
 
     # ------------------------------------------------------------------------------ the port
@@ -246,8 +233,8 @@ class BoardProcess:
             return
         if os.path.exists(self._port):
             self._retry_at = time.monotonic() + RETRY_TIME
-            with contextlib.suppress(PortError):
-                self._device = ports.open_port(self._port, self._baud_rate)
+            with contextlib.suppress(OSError, ValueError):
+                self._device = lines.open_port(self._port, self._baud_rate)
                 self._reconnects += 1
                 self._log(f"{self._port} is back", True)
                 self._opened()
@@ -321,7 +308,7 @@ class BoardProcess:
         if self._bytes_waiting is not None:
             self._bytes_waiting.close()
         if self._device is not None:
-            ports.release_port(self._device, drop)
+            lines.release_port(self._device, drop)
         self._bytes_waiting = self._device = None
 
     # ------------------------------------------------------------------------------- the end
@@ -333,46 +320,32 @@ class BoardProcess:
         while self.core.highest_pressure() > EMPTYING_SHARE * before:
             if self.core.clock() > deadline:
                 left = self.core.highest_pressure()
-                return f"the chambers on {self._port} keep {left:.0f} Pa: {ports.ADVICE}"
+                return f"the chambers on {self._port} keep {left:.0f} Pa: {lines.ADVICE}"
             self._turn()
         return ""
 
     def _send_last_words(self, duration: float) -> str:
         """Repeat the vent command and leave the port; return what is left to be done."""
         if self._device is None and os.path.exists(self._port):
-            with contextlib.suppress(PortError):
-                self._device = ports.open_port(self._port, self._baud_rate)
+            with contextlib.suppress(OSError, ValueError):
+                self._device = lines.open_port(self._port, self._baud_rate)
         descriptor = -1 if self._device is None else self._device.fileno()
-        problem = ports.vent_port(descriptor, self.core.emergency(), duration)
+        problem = lines.vent_port(descriptor, self.core.emergency(), duration)
         self._release(drop=bool(problem))
         return problem
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the process: started by the node, or by hand in a terminal."""
-    parser = argparse.ArgumentParser(
-        prog="board", description="Drive a valve board: arm, vent, or one pressure [Pa] a segment."
-    )
-    add_options(parser)
-    parser.add_argument("--socket", type=int, help="of the node that starts this process")
-    given = parser.parse_args(arguments)
-    try:
-        settings = from_options(given)
-    except SettingError as error:
-        parser.error(str(error))
-    channel: Channel | Terminal = Terminal()
-    if given.socket is not None:
-        channel = Channel(socket.socket(fileno=given.socket))
-        channel.socket.setblocking(False)
-    process = BoardProcess(settings, channel)
-
-    def end(*_: object) -> None:
-        process.ending = True
-
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
-        # What ends the node must not end the process before it: the node says when.
-        by_hand = given.socket is None or number == signal.SIGTERM
-        signal.signal(number, end if by_hand else signal.SIG_IGN)
+def main() -> int:
+    """Run for the node; the arguments are the descriptor of its socket and the parameters."""
+    descriptor, values = sys.argv[1:]
+    near = socket.socket(fileno=int(descriptor))
+    near.setblocking(False)
+    settings = cast("Settings", SimpleNamespace(**json.loads(values)))
+    process = BoardProcess(settings, Channel(near), NODE_PATIENCE)
+    # What ends the node must not end the process before it: the node says when.
+    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
+        signal.signal(number, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, process.end)
     return process.run()
 
 

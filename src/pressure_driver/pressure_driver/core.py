@@ -8,13 +8,13 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pressure_driver.following import chamber_gauge
-from pressure_driver.protocols.base import (
+from pressure_driver.protocols import (
     STANDARD_ATMOSPHERE,
+    BoardFailure,
     BoardIdentity,
-    BoardReport,
     BoardReset,
     BoardText,
     Echo,
@@ -23,9 +23,11 @@ from pressure_driver.protocols.base import (
     Telemetry,
 )
 from pressure_driver.safety import LIVE, Mode, SafetyMachine
-from pressure_driver.schedule import Origin, RunningClock, Setpoint, Verdict
-from pressure_driver.settings import NANOSECONDS, Settings
+from pressure_driver.schedule import NANOSECONDS, Origin, RunningClock, Setpoint, Verdict
 from pressure_driver.telemetry import Condition, TelemetryMonitor
+
+if TYPE_CHECKING:
+    from pressure_driver.settings import Settings
 
 LARGEST_CLOCK_STEP = 0.3
 """[s] between two ticks, above slewing and late wakes, that means the wall clock was set."""
@@ -137,7 +139,7 @@ class DriverCore:
         """Texts of the board that came too fast for the log."""
         self.last_text = ""
         """What the board has said last in plain words."""
-        self.clock = RunningClock(2.0 * settings.period / NANOSECONDS, steady)
+        self.clock = RunningClock(2.0 / settings.rate, steady)
         """Counts the seconds of every patience."""
         self.monitor = TelemetryMonitor(protocol, settings)
         self.machine = SafetyMachine(settings, self.monitor, self._conditions)
@@ -201,7 +203,7 @@ class DriverCore:
         return pressure if pressure > self._settings.vented_tolerance else 0.0
 
     def state(self) -> dict[str, Any]:
-        """Return the driver at this tick, by the names of `der_msgs/PressureState`."""
+        """Return the driver at this tick, by the names of `der_msgs/PressureState`, and more."""
         monitor, machine = self.monitor, self.machine
         gauge, base = monitor.gauge, self._wire_atmosphere()
         current = machine.schedule.current or Setpoint(0, ())
@@ -223,42 +225,19 @@ class DriverCore:
             "round_trip": self.board.round_trip,
             **{
                 f"setpoints_{name}": counts[name]
-                for name in ("accepted", "executed", "late", "duplicate", "refused")
+                for name in ("accepted", "executed", "late", "duplicate", "refused", "superseded")
             },
-        }
-
-    def diagnostics(self) -> tuple[str, str, dict[str, Any]]:
-        """Return the level, a sentence and the values for the diagnostics."""
-        machine, protocol, monitor = self.machine, self.protocol, self.monitor
-        obstacles = self.obstacles()
-        values = {
-            "mode": machine.mode.name,
-            "faults": "; ".join(machine.faults) or "none",
-            "obstacles_to_arming": "; ".join(obstacles) or "none",
-            "last_refusal": machine.schedule.reason or "none",
-            "protocol": protocol.name,
-            "protocol_weaknesses": "; ".join(protocol.weaknesses) or "none",
-            "board": self.board.identity.firmware if self.board.identity else self.last_text,
-            "atmosphere_pa": f"{monitor.rest.mean:.0f}",
-            "telemetry_age_s": f"{monitor.telemetry_age(self.clock()):.3f}",
-            "round_trip_s": f"{self.board.round_trip:.4f}",
-            "damaged_frames": protocol.rejected,
-            "last_damaged_line": protocol.last_damaged or "none",
             "setpoints_waiting": machine.schedule.waiting,
-            "setpoints_superseded": machine.schedule.counts["superseded"],
             "setpoints_of_other_publishers": machine.publishers.refused,
+            "last_refusal": machine.schedule.reason,
+            "obstacles_to_arming": self.obstacles(),
+            "board": self.board.identity.firmware if self.board.identity else self.last_text,
+            "atmosphere_pa": monitor.rest.mean,
+            "damaged_frames": self.protocol.rejected,
+            "last_damaged_line": self.protocol.last_damaged,
             "ticks_held_back_by_slew_limit": machine.limited_ticks,
             "board_texts_not_logged": self.unlogged_texts,
         }
-        if machine.mode is Mode.FAULT:
-            return "error", "FAULT: " + "; ".join(machine.faults), values
-        if machine.mode is Mode.DISARMED and obstacles:
-            level = "error" if monitor.rest.known else "stale"
-            return level, "waiting for: " + "; ".join(obstacles), values
-        if protocol.weaknesses:
-            weakness = f"{machine.mode.name}; {protocol.name}: {protocol.weaknesses[0]}"
-            return "warning", weakness, values
-        return "ok", machine.mode.name, values
 
     # ----------------------------------------------------------------------- to the board
 
@@ -340,10 +319,9 @@ class DriverCore:
             self.monitor.receive(event, now, self.machine.mode in (Mode.DISARMED, Mode.FAULT))
         elif isinstance(event, Echo):
             self.board.take_echo(event, now)
-        elif isinstance(event, BoardReport):
+        elif isinstance(event, BoardFailure):
             self._log_text(event.text)
-            if event.fatal:
-                self.machine.fail(f"board reports {event.text}")
+            self.machine.fail(f"board reports {event.text}")
         elif isinstance(event, BoardReset):
             self._set_up_anew(event, now)
         elif isinstance(event, BoardIdentity):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
@@ -16,7 +18,9 @@ from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.parameters import ParameterError, check_overrides, declare
 from limb_interfaces.runner import run_node
 from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
-from pressure_driver.channel import PortProcess
+from pressure_driver.port_process import PortProcess
+from pressure_driver.protocols import host_protocol
+from pressure_driver.safety import Mode
 from pressure_driver.settings import Declared, Settings, declarations
 
 PASCAL_PER_HECTOPASCAL = 100.0
@@ -29,6 +33,10 @@ CALLS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=1000, reliability=ReliabilityPolicy.RELIABLE
 )
 """Of `arm` and `vent`: the middleware's depth of 10 loses requests that come at once."""
+STATE_FIELDS = set(PressureState.get_fields_and_field_types()) - {"header", "setpoint_stamp"}
+"""Of the message, by the names of the state; what else the state has is for the diagnostics."""
+LATE_TICKS = 1200
+"""Ticks over which it is told how late their bytes are written: a minute."""
 
 
 def read_settings(node: Node, settings: type[Declared]) -> Declared:
@@ -66,6 +74,9 @@ class PressureDriver(Node):
                 "parameter 'use_sim_time' is true: the driver moves air in real time; leave it out"
             )
         settings = read_settings(self, Settings)
+        self._protocol = host_protocol(settings.protocol, 2 * settings.segment_count)
+        self._state: dict[str, Any] = {}
+        self._late: deque[float] = deque(maxlen=LATE_TICKS)
         self._state_publisher = self.create_publisher(
             PressureState, topics.PRESSURE_STATE, qos.STATES
         )
@@ -131,12 +142,12 @@ class PressureDriver(Node):
         """Publish and log what the port's process has said."""
         self._write_log()
         for _ in range(len(self._port.states)):
-            state, sent, received = self._port.states.popleft()
-            tick, setpoint_stamp = state.pop("tick"), state.pop("setpoint_stamp")
-            message = PressureState(bytes_sent=sent, bytes_received=received, **state)
-            message.header.stamp = stamp_from_nanoseconds(tick)
+            state = self._state = self._port.states.popleft()
+            self._late.append(state["tick_to_write"] / 1e6)
+            message = PressureState(**{name: state[name] for name in STATE_FIELDS})
+            message.header.stamp = stamp_from_nanoseconds(state["tick"])
             message.header.frame_id = topics.BASE_FRAME
-            message.setpoint_stamp = stamp_from_nanoseconds(setpoint_stamp)
+            message.setpoint_stamp = stamp_from_nanoseconds(state["setpoint_stamp"])
             self._state_publisher.publish(message)
 
     def _write_log(self) -> None:
@@ -149,8 +160,35 @@ class PressureDriver(Node):
                 self.get_logger().info(text)
 
     def _report(self) -> Health:
-        level, text, values = self._port.diagnostics
-        return Health(level, text, {**values, "port_process": self._port.process_id})
+        """Tell what the state has beside the message, and how late ticks are."""
+        state, weaknesses = self._state, self._protocol.weaknesses
+        if not state:
+            return Health("stale", "starting")
+        mode = Mode(state["mode"]).name
+        late = sorted(self._late)
+        percentiles = {"p50": 0.5, "p99": 0.99, "max": 1.0}
+        values = {
+            **{name: _written(value) for name, value in state.items() if name not in STATE_FIELDS},
+            "faults": _written(state["faults"]),
+            "telemetry_age_s": _written(state["telemetry_age"]),
+            "round_trip_s": _written(state["round_trip"]),
+            "mode": mode,
+            "protocol": self._protocol.name,
+            "protocol_weaknesses": _written(weaknesses),
+            "port_process": self._port.process_id,
+            **{
+                f"tick_to_write_{label}_ms": _written(late[round(share * (len(late) - 1))])
+                for label, share in percentiles.items()
+            },
+        }
+        if state["faults"]:
+            return Health("error", f"FAULT: {_written(state['faults'])}", values)
+        if mode == "DISARMED" and state["obstacles_to_arming"]:
+            level = "error" if math.isfinite(state["atmosphere_pa"]) else "stale"
+            return Health(level, f"waiting for: {_written(state['obstacles_to_arming'])}", values)
+        if weaknesses:
+            return Health("warning", f"{mode}; {self._protocol.name}: {weaknesses[0]}", values)
+        return Health("ok", mode, values)
 
     def close(self) -> None:
         """Vent the board and release the port."""
@@ -159,6 +197,15 @@ class PressureDriver(Node):
         if problem:
             raise RuntimeError(problem)
         self.get_logger().info("vented and closed")
+
+
+def _written(value: object) -> str:
+    """Return a value of the diagnostics as people read it."""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list | tuple):
+        return "; ".join(value) or "none"
+    return str(value) or "none"
 
 
 def main() -> int:

@@ -19,8 +19,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
 from pressure_driver.schedule import (
+    NANOSECONDS,
     Origin,
     PublisherGate,
     Sample,
@@ -29,8 +31,10 @@ from pressure_driver.schedule import (
     SpentPlans,
     Verdict,
 )
-from pressure_driver.settings import NANOSECONDS, Settings
 from pressure_driver.telemetry import Condition, TelemetryMonitor
+
+if TYPE_CHECKING:
+    from pressure_driver.settings import Settings
 
 
 class Mode(IntEnum):
@@ -74,6 +78,7 @@ class SafetyMachine:
         self.limited_ticks = 0
         """Ticks at which the output was held back by the slew limit."""
         self._settings = settings
+        self._period = self.schedule.period / NANOSECONDS
         self._conditions = conditions
         self._zero = (0.0,) * settings.segment_count
         self.differential = self._zero
@@ -215,7 +220,8 @@ class SafetyMachine:
 
         The step is taken from what was commanded last, whatever brought it there.
         """
-        step = self._settings.largest_step
+        # A plan at the limit is not beyond it, whatever its numbers are rounded to.
+        step = self._settings.slew_limit * self._period * (1.0 + 1e-9)
         moved = tuple(
             min(max(wanted, last - step), last + step)
             for wanted, last in zip(self._target, self.differential, strict=True)
@@ -227,7 +233,7 @@ class SafetyMachine:
     def _ramp_down(self) -> None:
         """One step of the ramp; all segments arrive together, so that the limb keeps its shape."""
         largest = max(abs(value) for value in self.differential)
-        step = self._settings.vent_rate * self.schedule.period / NANOSECONDS
+        step = self._settings.vent_rate * self._period
         if largest <= step:
             self.command_nothing()
             if not self.schedule.waiting:

@@ -12,10 +12,12 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from pressure_driver.settings import NANOSECONDS, Settings
+if TYPE_CHECKING:
+    from pressure_driver.settings import Settings
 
+NANOSECONDS = 1_000_000_000
 CAPACITY = 4096
 """Setpoints that may wait."""
 REMEMBERED_PLANS = 256
@@ -67,7 +69,8 @@ class SetpointSchedule:
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
-        self.period = settings.period
+        self.period = round(NANOSECONDS / settings.rate)
+        """[ns] of the ticks."""
         self.counts: Counter[str] = Counter()
         """Setpoints since the start by verdict; also those ``executed``, and ``superseded`` by a
         new plan, by a revision or by a later one in the same tick."""

@@ -3,22 +3,16 @@
 From here come what the nodes declare, the options of the `board` command, the limits of the state
 machine, the files under `config/` and the table in the README. After a change, write the last two:
 
-    python3 -m pressure_driver.settings
+    python3 scripts/write_driver_parameters.py
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from dataclasses import MISSING, Field, dataclass, field, fields
-from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from pressure_driver.protocols import NAMES
-
-NANOSECONDS = 1_000_000_000
-BEGIN, END = "<!-- parameters: begin -->\n", "<!-- parameters: end -->\n"
-"""Around the table in the README."""
 
 
 class SettingError(ValueError):
@@ -149,16 +143,6 @@ class Settings:
                 f"({self.rate:g} Hz): a command must stay valid until the next tick"
             )
 
-    @property
-    def period(self) -> int:
-        """[ns] of the ticks."""
-        return round(NANOSECONDS / self.rate)
-
-    @property
-    def largest_step(self) -> float:
-        """[Pa] by which a command may move in one tick; a plan at the limit is not beyond it."""
-        return self.slew_limit * self.period / NANOSECONDS * (1.0 + 1e-9)
-
 
 @dataclass(frozen=True)
 class EmulatorSettings:
@@ -203,77 +187,3 @@ def _check(name: str, value: Any, declaration: Declaration) -> None:
                 f"parameter '{name}' ({declaration.description}) is {value:g}: "
                 f"allowed are {low:g} to {high:g}"
             )
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Give a command one option for each parameter of the driver: ``--pressure-limit 2000``."""
-    for name, declaration, default in declarations(Settings):
-        kind = (lambda text: text.lower() == "true") if isinstance(default, bool) else type(default)
-        parser.add_argument(
-            f"--{name.replace('_', '-')}",
-            type=kind,
-            default=default,
-            metavar="|".join(declaration.choices) or type(default).__name__.upper(),
-            help=f"{declaration.description} (%(default)s)",
-        )
-
-
-def to_options(settings: Settings) -> list[str]:
-    """Return the options of `add_options` that give these settings."""
-    given = vars(settings).items()
-    return [f"--{name.replace('_', '-')}={value}" for name, value in given]
-
-
-def from_options(given: argparse.Namespace) -> Settings:
-    """Return the settings that the options of `add_options` gave."""
-    return Settings(**{name: getattr(given, name) for name, _, _ in declarations(Settings)})
-
-
-def parameter_file(node: str) -> str:
-    """Return the text of a node's parameter file, which holds the defaults."""
-    lines = [
-        f"# Parameters of {node} with their defaults, as pressure_driver/settings.py writes them.",
-        f"# `ros2 param describe /limb/{node} NAME` tells the range of each.",
-        f"/**/{node}:",
-        "  ros__parameters:",
-    ]
-    for name, declaration, default in declarations(NODES[node]):
-        lines.append(f"    # {declaration.description}")
-        lines.append(f"    {name}: {_written(default)}")
-    return "\n".join(lines) + "\n"
-
-
-def table() -> str:
-    """Return the README's table of the driver's parameters."""
-    lines = ["| parameter | default | range | meaning |", "|---|---|---|---|"]
-    for name, declaration, default in declarations(Settings):
-        limits = ", ".join(declaration.choices)
-        if declaration.range is not None:
-            limits = " to ".join(f"{limit:,g}".replace(",", " ") for limit in declaration.range)
-        shown = f"{_written(default)} {declaration.unit}".strip()
-        lines.append(f"| `{name}` | {shown} | {limits} | {declaration.text} |")
-    return "\n".join(lines) + "\n"
-
-
-def with_table(readme: str) -> str:
-    """Return the text of the README with its table as it should be."""
-    before, _, rest = readme.partition(BEGIN)
-    return before + BEGIN + table() + END + rest.partition(END)[2]
-
-
-def _written(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    return value or '""' if isinstance(value, str) else str(value)
-
-
-def write(package: Path) -> None:
-    """Write the parameter files and the README's table of the package in a folder."""
-    for node in NODES:
-        (package / "config" / f"{node}.yaml").write_text(parameter_file(node), encoding="utf-8")
-    readme = package / "README.md"
-    readme.write_text(with_table(readme.read_text(encoding="utf-8")), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    write(Path(__file__).resolve().parents[1])

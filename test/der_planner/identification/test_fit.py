@@ -79,7 +79,7 @@ def log() -> CalibrationLog:
 
 @pytest.fixture(scope="module")
 def fitted(log):
-    return fit(Limb.default(), log, geometry=False)
+    return fit(Limb.default(), log)
 
 
 def test_derivatives_agree_with_differences(log):
@@ -150,7 +150,7 @@ def test_a_slow_log_does_not_tell_stiffness_from_gain():
     predicted = predict(Limb.default(), time, pressure)
     noise = NOISE * np.random.default_rng(0).standard_normal(pressure.shape)
     slow = CalibrationLog(time, pressure, pressure, predicted.bend_angles + noise, predicted.tip)
-    limb, report = fit(Limb.default(), slow, geometry=False, terms=("dynamics",))
+    limb, report = fit(Limb.default(), slow, terms=("dynamics",))
     assert any("too slow" in warning for warning in report.warnings)
     assert limb.segments[0].bending_stiffness == Limb.default().segments[0].bending_stiffness
 

@@ -29,7 +29,7 @@ def prior(gravity, masses=()) -> Limb:
 
 
 def chain_log(
-    gravity, masses=(), swing=(0.0, 0.0), seed=5, amplitude=14_000.0, duration=20.0
+    gravity, masses=(), swing=(0.0, 0.0), seed=5, amplitude=14_000.0, duration=15.0
 ) -> CalibrationLog:
     pressure = np.concatenate([waves(amplitude, 2, duration), sweep(3500.0, 2, 6.0)])
     time = 0.05 * np.arange(len(pressure))
@@ -46,7 +46,7 @@ def logged(time, pressure, bend_angles, tip) -> Prepared:
 def test_a_hanging_chain_that_swings_and_carries_a_mass_is_fitted():
     gravity, masses = gravity_of("hanging"), ((0.244, 0.02),)
     chain = LinkChain(5, gravity, masses)
-    log = chain_log(gravity, masses, swing=(3.0, -5.0), duration=30.0)
+    log = chain_log(gravity, masses, swing=(3.0, -5.0), duration=25.0)
     limb, report = fit(prior(gravity, masses), log, terms=TERMS)
     assert any("begins while the limb swings" in warning for warning in report.warnings)
     assert np.degrees(report.residual).max() < 0.7
@@ -56,7 +56,7 @@ def test_a_hanging_chain_that_swings_and_carries_a_mass_is_fitted():
     known = report.value("log_stiffness[0]")
     assert known.deviation < 0.06
     assert limb.segments[0].bending_stiffness == pytest.approx(truth, rel=0.12)
-    assert "EI of segment 0" in report.text()
+    assert f"{np.exp(known.value):.3f} × the prior's" in report.text()
     # The lengths do not take up that a heavy limb bends unevenly.
     assert limb.length == pytest.approx(0.244, abs=4e-3)
     assert limb.masses[0].arc_length == pytest.approx(limb.length)
@@ -132,12 +132,10 @@ def test_a_limb_that_gives_way_in_the_rod_of_more_nodes_is_told_by_the_other_one
 
     none = np.zeros_like(pressure)
     log = logged(time, pressure, none, none)
-    whole, lacking, holds = unevenness(softening(-1.0e-5), log, NODES)
-    assert holds
+    whole, lacking = unevenness(softening(-1.0e-5), log, NODES)
     assert 0.0 < np.abs(lacking).max() < 0.2 * np.abs(whole).max()
     uneven_tip(softening(-1.0e-5), log)
-    whole, lacking, holds = unevenness(softening(-1.6e-5), log, NODES)
-    assert not holds
+    whole, lacking = unevenness(softening(-1.6e-5), log, NODES)
     assert np.isfinite(whole).all()
     assert not lacking.any()
     with pytest.raises(LogError, match=r"gives way .* \(--terms without 'cubic'\)"):
@@ -162,7 +160,6 @@ def test_mass_is_told_where_stiffness_is_given():
     assert limb.moving_mass == pytest.approx(1.066 * 0.244, rel=0.1)
     moment = re.search(r"first moment ([0-9.]+) g·m", report.text())
     assert float(moment[1]) == pytest.approx(1066 * 0.244**2 / 2, rel=0.1)
-    assert "mass of segment 0 = prior" in report.text()
 
 
 def test_a_prior_that_its_rod_cannot_follow_is_refused_by_name():
@@ -170,6 +167,6 @@ def test_a_prior_that_its_rod_cannot_follow_is_refused_by_name():
     rows = log.between(0.0, 6.0)
     heavy = replace(prior((-9.81, 0.0, 0.0)), masses=()).carrying(1e4)
     with pytest.raises(LogError, match="check the prior's gravity, mass"):
-        fit(heavy, rows, terms=(), geometry=False)
+        fit(heavy, rows, terms=())
     with pytest.raises(LogError, match="cannot follow this log"):
         predict(heavy, rows.time, rows.measured_differential)

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from der_planner.identification import ColumnMap, LogError, read_csv, read_excitation
+from der_planner.identification import ColumnMap, LogError, read_csv
+from der_planner.identification.excitation import read_excitation
 
 COLUMNS = {
     "time": "t",
@@ -41,13 +42,9 @@ def test_units_zeros_factors_and_lost_tags(table):
     assert np.isnan(log.tip).all()
 
 
-def test_stretches_are_left_out(table):
+def test_stretches_are_left_out_and_gaps_are_bridged_up_to_a_length(table):
     log = read_csv(table, ColumnMap(**{**COLUMNS, "ignore": ((0.05, 0.15),)}))
     np.testing.assert_allclose(log.time, [0.0, 0.2, 0.3, 0.4])
-
-
-def test_gaps_are_bridged_up_to_a_length(table):
-    log = read_csv(table, ColumnMap(**COLUMNS))
     assert np.isfinite(log.resampled(0.05, 0.5).bend_angles).all()
     assert np.isnan(log.resampled(0.05, 0.15).bend_angles).any()
 
@@ -66,32 +63,26 @@ def test_wrong_maps_are_named(table, change, match):
         read_csv(table, ColumnMap(**{**COLUMNS, **change}))
 
 
-def test_map_files(tmp_path):
-    path = tmp_path / "columns.yaml"
-    path.write_text("time: t\ncommanded: [u]\nchambers: [a, b]\nangles: [theta]\n")
-    assert ColumnMap.from_yaml(path).chambers == ("a", "b")
-    path.write_text("time: t\ncolour: red\n")
-    with pytest.raises(LogError, match="colour"):
-        ColumnMap.from_yaml(path)
-    with pytest.raises(LogError, match="cannot read"):
-        ColumnMap.from_yaml(tmp_path / "nothing.yaml")
-
-
 @pytest.mark.parametrize(
     ("line", "named"),
     [
         ("chambers: a", "chambers is 'a', give a list"),
         ("angle_factor: two", "angle_factor is 'two', give a number"),
         ("ignore: [1, 2]", "ignore is .* pairs of times"),
+        ("colour: red", "colour is unknown"),
     ],
 )
-def test_values_of_another_kind_in_a_map_are_named(tmp_path, line, named):
+def test_map_files_are_read_and_wrong_keys_and_values_are_named(tmp_path, line, named):
     path = tmp_path / "columns.yaml"
-    keys = {"time": "t", "commanded": "[u]", "chambers": "[a, b]", "angles": "[theta]"}
-    key, value = line.split(": ", 1)
-    path.write_text("".join(f"{k}: {v}\n" for k, v in {**keys, key: value}.items()))
+    given = {"time": "t", "commanded": "[u]", "chambers": "[a, b]", "angles": "[theta]"}
+    path.write_text("".join(f"{key}: {value}\n" for key, value in given.items()))
+    assert ColumnMap.from_yaml(path).chambers == ("a", "b")
+    key, value = line.split(": ")
+    path.write_text("".join(f"{k}: {v}\n" for k, v in {**given, key: value}.items()))
     with pytest.raises(LogError, match=named):
         ColumnMap.from_yaml(path)
+    with pytest.raises(LogError, match="cannot read"):
+        ColumnMap.from_yaml(tmp_path / "nothing.yaml")
 
 
 @pytest.mark.parametrize(
@@ -176,15 +167,12 @@ def test_each_log_finds_its_own_rest_even_if_it_is_not_exactly_zero(tmp_path, re
         read_csv(tmp_path / "first.csv", wrong)
 
 
-@pytest.mark.parametrize(
-    ("rows", "said"),
-    [
+def test_an_excitation_of_another_grid_or_limb_is_refused(tmp_path):
+    path = tmp_path / "excitation.csv"
+    for rows, said in (
         ("time_s,a,b\n0,0,0\n0.1,0,0\n", "must be 0, 0.05, 0.1"),
         ("time_s,a\n0,0\n0.05,0\n", "expected time_s and 2 pressures"),
-    ],
-)
-def test_a_table_of_another_grid_or_limb_is_refused(tmp_path, rows, said):
-    path = tmp_path / "excitation.csv"
-    path.write_text(rows)
-    with pytest.raises(ValueError, match=said):
-        read_excitation(path, 2)
+    ):
+        path.write_text(rows)
+        with pytest.raises(LogError, match=said):
+            read_excitation(path, 2)

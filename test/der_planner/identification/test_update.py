@@ -8,11 +8,7 @@ import pytest
 from log_table import write_csv
 
 from der_planner.commands import check_limb
-from der_planner.identification import (
-    CalibrationLog,
-    LogError,
-    update,
-)
+from der_planner.identification import CalibrationLog, LogError, update
 from der_planner.limb import Limb
 from der_planner.model import simulate
 

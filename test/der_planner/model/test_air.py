@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from der_planner.limb import VENT_REFERENCE, Limb
-from der_planner.model import Model, RodModel, commands
+from der_planner.model import Model, commands
 from der_planner.model.air import Air
-from der_planner.planning import METHODS, Motion, Workspace, plan, planner
+from der_planner.planning import METHODS, Motion, plan, planner
 from der_planner.planning.configuration import configure
-from der_planner.planning.optimal import Optimiser
 
 LIMB = Limb.default()
 EVERY = [(model, method) for model, methods in METHODS.items() for method in methods]
@@ -139,24 +138,3 @@ def test_optimal_makes_more_of_slow_chambers_than_a_balance(name):
     assert balance.predicted_error < 0.75 * unknown
     steps = np.diff(best.differential_pressure, axis=0, prepend=0.0)
     assert np.abs(steps).max() <= LIMB.pneumatics.slew_limit * 0.05 + 1e-6
-
-
-def test_gauss_newton_agrees_with_finite_differences_where_chambers_are_limited():
-    limb = slow()
-    model = RodModel(limb)
-    motion = Motion.named("asynchronous", period=6.0, cycles=1)
-    configuration = configure(model, motion.reference(Workspace(model)))
-    warm, _ = planner.balance(configuration, motion.reference(Workspace(model)), "projected")
-    solver = Optimiser(configuration, motion.reference(Workspace(model)), warm)
-    jacobian, _ = solver._linearise(solver.drive.window(warm[:100]), solver.start, 0.0)
-    time = np.arange(100) * 0.05
-    for direction in (np.column_stack([np.sin(time), np.cos(2 * time)]), np.ones((100, 2))):
-        ends = []
-        for step in (0.1, -0.1):
-            moved = warm.copy()
-            moved[:100] += step * direction
-            ends.append(solver._evaluate(moved, solver.start, 0, 100)[1])
-        slope = (ends[0] - ends[1]) / 0.2
-        exact = (jacobian @ direction.ravel()).reshape(-1, 2)
-        # What a pressure does within a period is averaged, which the rod's higher modes notice.
-        assert np.linalg.norm(exact - slope) < 0.05 * np.linalg.norm(slope)

@@ -215,29 +215,6 @@ def test_a_stiff_limb_is_not_stepped_over_its_fastest_mode():
     np.testing.assert_allclose(coarse, fine, atol=0.15 * np.abs(fine).max())
 
 
-@pytest.mark.parametrize("count", [1, 2, 3])
-def test_force_slopes_against_finite_differences(count):
-    model = ArcModel(loaded(count))
-    rng = np.random.default_rng(SEED)
-    arcs = model.arcs
-
-    def force(q, v, a):
-        M, C, D, weight = kernels.inertia(q, v, arcs)
-        elastic = model.elastic_torque(q) + model.stiffness * model.material_damping * v
-        return M @ a + (C + D) @ v + elastic - weight
-
-    for _ in range(3):
-        q, v, a = rng.normal(size=(3, count))
-        q *= 0.8
-        by_angle, by_rate = kernels.force_slopes(q, v, a, arcs)
-        h = 1e-5
-        for i, step in enumerate(h * np.eye(count)):
-            column = (force(q + step, v, a) - force(q - step, v, a)) / (2 * h)
-            np.testing.assert_allclose(by_angle[:, i], column, rtol=1e-6, atol=1e-8)
-            column = (force(q, v + step, a) - force(q, v - step, a)) / (2 * h)
-            np.testing.assert_allclose(by_rate[:, i], column, rtol=1e-6, atol=1e-8)
-
-
 def test_linearisation_against_the_simulation():
     model = ArcModel(loaded(2))
     rng = np.random.default_rng(SEED)

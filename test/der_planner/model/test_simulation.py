@@ -12,8 +12,6 @@ import pytest
 from der_planner.limb import VENT_REFERENCE, Limb
 from der_planner.model import CONTROL_PERIOD, STEPS, Initial, Material, Model, RodModel, simulate
 from der_planner.model.bending import bend_angles
-from der_planner.planning import Motion, plan
-from der_planner.planning.configuration import configure
 
 
 def everything() -> Limb:
@@ -109,19 +107,6 @@ def test_commands_become_pressures_and_shape_by_the_laws():
     )
     np.testing.assert_allclose(response.tip, moved.tip[:, :2], atol=1e-10)
     np.testing.assert_allclose(response.bend_angles, bend_angles(model.rod, moved.q), atol=1e-9)
-
-
-def test_the_optimal_planner_expects_what_the_laws_say():
-    result = plan(LIMB, Motion.named("asynchronous", 0.5, 6.0, 1), "der", "optimal")
-    configuration = configure(RodModel(LIMB), result.reference)
-    middle = (np.arange(len(result.time) * STEPS) + 0.5) * 0.01
-    chambers = simulate(LIMB, result.time, commands=result.differential_pressure)
-    differential = chambers.differential_pressure.reshape(-1, 2)
-    effective = felt(differential, middle, configuration.bend_at(middle))
-    moved = configuration.model.rod.simulate(
-        configuration.begin, effective.reshape(-1, STEPS, 2), CONTROL_PERIOD, substeps=STEPS
-    )
-    np.testing.assert_allclose(result.tip_predicted, moved.tip[:-1, :2], atol=1e-8)
 
 
 LOADED = LIMB.mounted("25").carrying(0.02)

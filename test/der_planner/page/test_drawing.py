@@ -99,17 +99,11 @@ def test_a_drawing_that_cannot_be_planned_says_why() -> None:
     assert "the longest is 3600 s" in summary(found)
 
 
-@pytest.mark.parametrize(
-    "name", ["../up", "a/b", "..", ".hidden", "/etc/passwd", "star\x00", "x.csv"]
-)
+@pytest.mark.parametrize("name", ["../up", "a/b", ".hidden", "/etc/passwd", "star\x00", "Über 1"])
 def test_a_name_stays_in_its_folder(tmp_path: Path, name: str) -> None:
     drawings = DrawingFolder(tmp_path / "kept")
     points = np.array([[0.1, 0.2], [0.12, 0.21]])
-    try:
-        kept = drawings.save(name, points).stem
-    except DrawingError:
-        assert name == ".."
-        return
+    kept = drawings.save(name, points).stem
     assert drawings.names() == [kept]
     assert [path.parent for path in tmp_path.rglob("*.csv")] == [tmp_path / "kept"]
     np.testing.assert_allclose(drawings.load(kept), points, atol=1e-6)
@@ -117,16 +111,12 @@ def test_a_name_stays_in_its_folder(tmp_path: Path, name: str) -> None:
         drawings.save(name, points)
 
 
-def test_names_of_any_language_and_files_put_there_by_hand_are_found(tmp_path: Path) -> None:
-    drawings = DrawingFolder(tmp_path)
-    points = np.array([[0.1, 0.2], [0.12, 0.21]])
-    assert drawings.save("Über 円", points).stem == "Über_円"
+def test_files_put_there_by_hand_are_found_and_missing_ones_named(tmp_path: Path) -> None:
     (tmp_path / "by hand.csv").write_text("x [cm], y [cm]\n10, 20\n12, 21\n")
-    assert drawings.names() == ["by hand", "Über_円"]
-    for name in drawings.names():
-        np.testing.assert_allclose(drawings.load(name), points, atol=1e-6)
-
-
-def test_a_missing_drawing_is_named(tmp_path: Path) -> None:
+    drawings = DrawingFolder(tmp_path)
+    assert drawings.names() == ["by hand"]
+    np.testing.assert_allclose(drawings.load("by hand"), [[0.1, 0.2], [0.12, 0.21]], atol=1e-6)
     with pytest.raises(DrawingError, match="no drawing 'none'"):
-        DrawingFolder(tmp_path).load("none")
+        drawings.load("none")
+    with pytest.raises(DrawingError):
+        drawings.save("..", np.zeros((2, 2)))

@@ -70,14 +70,11 @@ def test_nothing_within_the_limits_is_better_than_the_limited_programme():
     # No command within the limits lies downhill from the optimum of a convex programme.
     slope = H @ (found - command).ravel() + gradient
     steps = np.eye(size * inputs) - np.eye(size * inputs, k=-inputs)
-    within = {
-        "A_ub": np.vstack([steps, -steps]),
-        "b_ub": np.full(4 * size, 450.0),
-        "bounds": (-1500, 1500),
-    }
-    lowest = linprog(slope / np.abs(slope).max(), **within)
+    most = np.full(4 * size, 450.0)
+    slope /= np.abs(slope).max()
+    lowest = linprog(slope, A_ub=np.vstack([steps, -steps]), b_ub=most, bounds=(-1500, 1500))
     assert lowest.success
-    assert slope @ found.ravel() / np.abs(slope).max() == pytest.approx(lowest.fun, rel=1e-3)
+    assert slope @ found.ravel() == pytest.approx(lowest.fun, rel=1e-3)
 
 
 def test_each_window_begins_within_the_limits(monkeypatch):

@@ -108,6 +108,15 @@ class BagOfRun:
             tip_predicted=reference(TIMES).ravel(),
         )
 
+    def still_run(self, offset=(0.0, 0.0), **plan) -> Path:
+        """Write a run without pressure whose tip is off by a constant, and close the bag."""
+        self.plan(**plan)
+        for index in range(len(TIMES)):
+            self.setpoint(index, [0.0, 0.0])
+        for when in FRAMES:
+            self.state(when, reference(when)[0] + offset)
+        return self.bag.close()
+
     def setpoint(self, index: int, value, plan_id="p", revision=0) -> None:
         self.write(
             "/limb/pressure_setpoint",

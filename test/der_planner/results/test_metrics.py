@@ -11,8 +11,8 @@ from der_planner.results import (
     EvaluationSettings,
     RunSeries,
     evaluate_run,
-    split_error,
 )
+from der_planner.results.errors import split_error
 
 
 def test_constant_offset_is_the_error_and_the_bias():

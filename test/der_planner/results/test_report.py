@@ -102,14 +102,7 @@ def test_film_has_every_frame(bag: Path, tmp_path: Path):
 
 
 def test_bag_without_images_has_shapes_but_no_film(tmp_path: Path):
-    run = BagOfRun(tmp_path / "plain")
-    run.plan()
-    for when in FRAMES:
-        run.state(when, reference(when)[0])
-    run.setpoint(0, [0.0, 0.0])
-    run.setpoint(len(TIMES) - 1, [0.0, 0.0])
-    run.bag.close()
-    loaded = load_run(tmp_path / "plain")
+    loaded = load_run(BagOfRun(tmp_path / "plain").still_run())
     assert len(plot_shapes([loaded], tmp_path)) == 2
     with pytest.raises(EvaluationError, match="no camera calibration"):
         write_video(loaded, tmp_path / "film.mp4")

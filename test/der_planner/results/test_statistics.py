@@ -11,14 +11,13 @@ from runs import FRAMES, reference, series
 from der_planner.bags.run import BoardLog
 from der_planner.results import (
     compare,
-    csv_table,
-    error_table,
     evaluate_run,
     format_table,
     summarise,
     write_results,
 )
 from der_planner.results.errors import check_board
+from der_planner.results.tables import csv_table, error_table
 
 
 def result(error: float, model="der", trial=0, **changes):

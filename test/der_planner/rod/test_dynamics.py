@@ -1,7 +1,5 @@
 """Time steps against known motions, frequencies, orders and conserved quantities."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
@@ -81,15 +79,9 @@ def test_order_in_the_time_step(method, order, tau):
         u = np.full((count, 1), 2e3)
         return rod.simulate(start, u, dt, method=method).final.q
 
-    steps = 1e-3 / 2 ** np.arange(3 if method != "backward_euler" else 4)
-    reference = end(1e-3 / 64) if method != "backward_euler" else None
-    values = [end(dt) for dt in steps]
-    if reference is None:  # first order: compare successive differences
-        differences = [np.abs(b - a).max() for a, b in pairwise(values)]
-        measured = np.log2(differences[-2] / differences[-1])
-    else:
-        errors = [np.abs(value - reference).max() for value in values]
-        measured = np.log2(errors[-2] / errors[-1])
+    reference = end(1e-3 / 64)
+    errors = [np.abs(end(dt) - reference).max() for dt in (0.5e-3, 0.25e-3)]
+    measured = np.log2(errors[0] / errors[1])
     assert measured == pytest.approx(order, abs=0.2)
 
 
@@ -153,12 +145,3 @@ def test_step_by_step_is_the_same_as_a_simulation():
     np.testing.assert_allclose(run.q[-1], run.final.q)
     assert run.positions.shape == (21, 21, 3)
     np.testing.assert_array_equal(run.positions[-1], rod.positions(run.final))
-
-
-def test_the_default_method_stays_bounded_where_the_midpoint_rule_does_not():
-    """Fast large bending, stretching unresolved: why the default is not the midpoint rule."""
-    rod = Rod.from_limb(Limb.default())
-    time = np.arange(400)[:, None] * 0.05
-    u = 15e3 * np.sin(2 * np.pi * time / 3 + [0.0, 1.0])
-    run = rod.simulate(rod.straight_state(), u, 0.05, substeps=4)
-    assert np.abs(run.v[:, -3:]).max() < 3.0

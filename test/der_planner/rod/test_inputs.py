@@ -59,19 +59,6 @@ def test_input_matrix_is_the_direction_against_bending():
     assert not matrix[3::4].any()
 
 
-def test_couples_balance_an_even_bend_exactly():
-    """The pressure of Theorem 1 holds the even bend: the whole force vanishes."""
-    rod = segment_rod(segments=((0, 6), (6, 6)))
-    angles = np.array([0.5, -0.8])
-    q = PolylineKinematics.of_rod(rod).configuration(angles)
-    turn = angles / 4
-    step = rod.rest_lengths[0]
-    moment = EI / step * 2 * np.tan(turn / 2) * (1 + np.tan(turn / 2) ** 2)
-    pressure = moment / step / rod.input_gain
-    residual = rod.internal_force(q) + rod.input_matrix(q) @ pressure
-    np.testing.assert_allclose(residual, 0.0, atol=1e-10 * np.abs(rod.internal_force(q)).max())
-
-
 def test_pressure_bends_as_the_continuum_does():
     """The couples span N_j − 2 edges, the gain makes up for it: angle = G u L / EI if small."""
     for count in (5, 9, 20):

@@ -35,15 +35,6 @@ def test_mesh_covers_the_limb(nodes, connector):
     assert rod.mass_diagonal[0::4].sum() == pytest.approx(1.066 * limb.length)
 
 
-def test_three_segments():
-    limb = Limb.default()
-    limb = dataclasses.replace(limb, segments=limb.segments[:1] * 3)
-    rod = Rod.from_limb(limb, 32)
-    state = rod.equilibrium([3e3, -2e3, 1e3])
-    expected = limb.static_gain * [3e3, -2e3, 1e3]
-    np.testing.assert_allclose(bend_angles(rod, state.q), expected, rtol=1e-3)
-
-
 @pytest.mark.parametrize("connector", [0.0, 0.015])
 def test_static_bend_angles_are_those_of_the_segments(connector):
     limb = changed(

@@ -34,22 +34,20 @@ def elastica(tip_mass, gravity):
     """Tip of the heavy elastica with an end mass: EI ψ'' = −n × t, n the force beyond s."""
     length, density = BEAM["length"], BEAM["mass_per_length"]
 
-    def slopes(s, y):
+    def slopes(s, y, pull):
         beyond = density * (length - s) + tip_mass
-        fx, fy = beyond * gravity[0], beyond * gravity[1]
+        fx, fy = beyond * pull[0], beyond * pull[1]
         moment = np.cos(y[0]) * fy - np.sin(y[0]) * fx
         return np.stack([y[1], -moment / BEAM["EI"], np.cos(y[0]), np.sin(y[0])])
 
     grid = np.linspace(0.0, length, 200)
     guess = np.zeros((4, grid.size))
     for share in np.linspace(0.1, 1.0, 10):
-        gravity_now = gravity
-        gravity = np.asarray(gravity_now) * share
         solved = solve_bvp(
-            slopes, lambda a, b: np.array([a[0], b[1], a[2], a[3]]), grid, guess, tol=1e-9,
-            max_nodes=20000,
+            lambda s, y, pull=share * gravity: slopes(s, y, pull),
+            lambda a, b: np.array([a[0], b[1], a[2], a[3]]),
+            grid, guess, tol=1e-9, max_nodes=20000,
         )  # fmt: skip
-        gravity = gravity_now
         assert solved.success
         grid, guess = solved.x, solved.y
     return solved.y[2:, -1]

@@ -159,17 +159,10 @@ def test_a_twin_is_calibrated_once(tmp_path, monkeypatch):
     monkeypatch.setenv("DER_LIMB_CACHE", str(tmp_path / "cache"))
     fitted = []
     monkeypatch.setattr(Twin, "fit", lambda twin, prior: (fitted.append(twin) or prior, None))
-    text = "task: run\nfactors: {seed: 5, period: 1, cycles: 1, amplitude: 0.1, model: [der, pcc]}"
-    study = Study.read(write(tmp_path, text))
-    with LocalCluster(n_workers=2, processes=False, dashboard_address=None) as cluster:
-        settings = PlaySettings(tmp_path / "out", cluster.scheduler_address)
-        kept = conduct(study, settings, Progress())
-    assert [record["error"] for record in kept.values()] == [None, None]
-    twin = study.task.twin(study.rows[0].values)
     with ThreadPoolExecutor() as threads:
-        found = list(threads.map(lambda seed: calibrated(Twin(seed), ""), [5, 6, 6]))
-    assert found[1] == found[2]
-    assert fitted == [twin, Twin(6)]
+        found = set(threads.map(lambda seed: calibrated(Twin(seed), ""), [6, 6]))
+    assert {calibrated(Twin(6), "")} == found
+    assert fitted == [Twin(6)]
 
 
 def test_what_cannot_be_written_is_named(tmp_path):

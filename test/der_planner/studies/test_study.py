@@ -65,19 +65,13 @@ def test_names_that_yaml_takes_for_something_else(tmp_path):
         ({"factors": "{sead: 1}"}, r"factors.sead is unknown .*known: seed"),
         ({"factors": "{period: [2, fast]}"}, r"factors.period\[1\] must be a number .*'fast'"),
         ({"factors": "{period: 0.1}"}, "factors.period must be a number from 0.5 to 600, got 0.1"),
-        ({"factors": "{seed: 1.5}"}, "factors.seed must be a whole number"),
         ({"factors": "{motion: waltz}"}, "factors.motion must be one of asynchronous"),
         ({"factors": "{period: {low: 3, high: 2}}", "draw": "{count: 2}"}, "period.low must be"),
-        ({"factors": "{period: {low: 2}}"}, "factors.period must be a value, a list"),
         ({"factors": "{period: {low: 2, high: 3}}"}, "draw.count is missing: period"),
-        ({"factors": "{motion: {low: 2, high: 3}}", "draw": "{count: 2}"}, "names cannot be drawn"),
+        ({"factors": "{seed: {low: 2, high: 3}}", "draw": "{count: 2}"}, "only numbers are drawn"),
         ({"factors": "{period: {low: 2, high: 3}}", "draw": "{count: 3}"}, "power of two.*choose"),
-        ({"factors": "{error.mass: 0.1}"}, "no such parameter of a limb.*mass_per_length"),
         ({"factors": "{'error.vent_rate[0]': 0.1}"}, "vent_rate is one for the limb"),
-        ({"draw": "{count: 4}"}, "draw is given, but no factor"),
-        ({"factors": "{}"}, "factors is missing"),
         ({"keep": "[error_cm]"}, "keep: unknown column 'error_cm'; known: mean_error_m"),
-        ({"plots": "[{kind: pie}]"}, r"plots\[0\].kind must be one of lines"),
         ({"plots": "[{kind: lines, x: period}]"}, r"plots\[0\].y is missing"),
         ({"plots": "[{kind: scatter, x: age, y: max_error_m}]"}, r"plots\[0\].x: no column 'age'"),
         ({"plots": "[{kind: indices, of: max_error_m}]"}, "indices need draw.method saltelli"),
@@ -104,7 +98,6 @@ def test_draws_fill_the_ranges_and_repeat(method):
         "even": Spread(-1.0, 3.0),
         "log": Spread(0.1, 10.0, "log"),
         "normal": Spread(5.0, 2.0, "normal"),
-        "whole": Spread(1, 4, whole=True),
     }
     draw = Draw(method, 256, seed=3)
     table = rows({"name": ["a", "b"]}, spreads, draw)
@@ -117,9 +110,6 @@ def test_draws_fill_the_ranges_and_repeat(method):
     assert np.log10(values["log"]).mean() == pytest.approx(0.0, abs=0.1)
     assert values["normal"].mean() == pytest.approx(5.0, abs=0.3)
     assert values["normal"].std() == pytest.approx(2.0, abs=0.3)
-    counts = np.bincount(values["whole"])[1:]
-    assert len(counts) == 4
-    assert counts.min() > 90
 
 
 def test_indices_of_a_function_whose_indices_are_known(tmp_path):

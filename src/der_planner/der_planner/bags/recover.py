@@ -12,7 +12,7 @@ import mmap
 import re
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
@@ -97,15 +97,13 @@ class _File:
         self.message_count = sum(counts[number] for number in self._topics)
         self.unnamed = counts.total() - self.message_count
 
-    def messages(
-        self, progress: Callable[[float], None] | None
-    ) -> Iterator[tuple[TopicSpec, Message]]:
+    def messages(self) -> Iterator[tuple[TopicSpec, Message]]:
         """Yield the messages whose topic is known, in the order of the file."""
-        for record in self._records(progress):
+        for record in self._records():
             if isinstance(record, Message) and record.channel_id in self._topics:
                 yield self._topics[record.channel_id], record
 
-    def _records(self, progress: Callable[[float], None] | None = None) -> Iterator[McapRecord]:
+    def _records(self) -> Iterator[McapRecord]:
         """Yield what is whole, in chunks and outside; count the bytes of what is not.
 
         Where the bytes are no record, the next chunk is looked for.
@@ -122,8 +120,6 @@ class _File:
                 after = found.start() if found else end
                 self.lost_bytes += after - place
             place = after
-            if progress is not None:
-                progress(place / len(self._data))
 
     def _read(self, place: int) -> tuple[list[McapRecord], int]:
         """Return the records that begin at a byte, several for a chunk, and where they end."""
@@ -176,15 +172,12 @@ def _file_number(path: Path) -> tuple[int, str]:
     return (int(tail) if tail.isdigit() else 0, path.name)
 
 
-def recover_bag(
-    path: Path, folder: Path | None = None, progress: Callable[[float], None] | None = None
-) -> Recovery:
+def recover_bag(path: Path, folder: Path | None = None) -> Recovery:
     """Write every message of a bag that can be read into a new bag.
 
     Args:
         path: folder of the bag or an MCAP file; it is only read.
         folder: of the new bag; if None, PATH_recovered, and nothing is written for a whole bag.
-        progress: called with the fraction of the present file.
 
     Raises:
         RecoverError: there is no MCAP file, or no message whose topic is known.
@@ -214,6 +207,6 @@ def recover_bag(
     custom = {key: text for file in files for key, text in file.custom_data.items()}
     bag = BagWriter(folder, custom, compression=files[0].compression)
     for file in files:
-        for spec, message in file.messages(progress):
+        for spec, message in file.messages():
             bag.write(spec, message.log_time, message.publish_time, message.data)
     return replace(found, folder=bag.close())

@@ -38,24 +38,26 @@ from der_planner.experiment.console import (
 )
 from der_planner.experiment.processes import GraphError, Hardware, NodeError
 from der_planner.identification import (
-    GROUPS,
     CalibrationLog,
-    Excitation,
     FitReport,
     LogError,
-    calibration_run,
     fit,
-    plot_prediction,
     predict,
-    prepare,
     read_bag,
-    read_excitation,
     read_log,
     record_twin,
+)
+from der_planner.identification.bends import GROUPS
+from der_planner.identification.excitation import (
+    AMPLITUDE,
+    Excitation,
+    calibration_run,
+    read_excitation,
     within_limits,
     write_excitation,
 )
-from der_planner.identification.excitation import AMPLITUDE
+from der_planner.identification.log import prepare
+from der_planner.identification.report import plot_prediction
 from der_planner.limb import Limb, LimbError
 from der_planner.planning.loads import nearly_buckling
 from der_planner.results.outputs import check_file, check_folder

@@ -16,11 +16,6 @@ from pathlib import Path
 from der_planner.bags.recover import RecoverError, Recovery, recover_bag
 
 
-def _show(fraction: float) -> None:
-    if sys.stderr.isatty():
-        print(f"\r  {fraction:4.0%}", end="", file=sys.stderr, flush=True)
-
-
 def describe(found: Recovery) -> str:
     """Return a sentence on what was found and done."""
     held = f"{found.source}: {found.message_count} messages"
@@ -43,10 +38,8 @@ def main() -> int:
     failed = 0
     for path in options.bags:
         try:
-            found = recover_bag(path, options.out, _show)
+            print(describe(recover_bag(path, options.out)))
         except (RecoverError, OSError) as error:
             print(f"error: {error}", file=sys.stderr)
             failed += 1
-            continue
-        print(("\r" if sys.stderr.isatty() else "") + describe(found))
     return 1 if failed else 0

@@ -54,6 +54,7 @@ from der_planner.results import (
     write_results,
 )
 from der_planner.results.outputs import check_folder
+from der_planner.results.report import instrument_table
 
 Kept = list[tuple[Trial, dict[str, Any]]]
 """Finished runs, each with what the ledger holds of it."""
@@ -380,14 +381,11 @@ def _load(folder: Path, trial: Trial, entry: dict[str, Any]) -> RunSeries:
 
 def _print_instruments(found: list[RunResult], kept: Kept) -> None:
     """Say how well the instruments worked, where that can be known: in the twin's bags."""
-    for result, (trial, entry) in zip(found, kept, strict=True):
-        if "cpu_percent" not in entry:
-            continue
-        print(f"\n{trial.name}")
-        for name, value in result.checks.items():
-            if value is not None:
-                print(f"  {name.replace('_', ' '):<36} {value:.4g}")
-        if entry.get("twin_real_time_factor") is not None:
-            print(f"  {'twin, simulated over real seconds':<36} {entry['twin_real_time_factor']}")
-        cpu = ", ".join(f"{name} {value:.0f}" for name, value in entry["cpu_percent"].items())
-        print(f"  CPU in % of one core: {cpu}")
+    if (instruments := instrument_table(found)).rows:
+        print(f"\n{instruments.text()}")
+    for trial, entry in kept:
+        if "cpu_percent" in entry:
+            cpu = ", ".join(f"{name} {value:.0f}" for name, value in entry["cpu_percent"].items())
+            speed = entry["twin_real_time_factor"]
+            twin = f"the twin ran at {speed} of real time; " if speed is not None else ""
+            print(f"{trial.name}: {twin}CPU in % of one core: {cpu}")

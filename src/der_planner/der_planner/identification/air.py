@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from der_planner.identification.least_squares import (
 )
 from der_planner.identification.log import CalibrationLog, LogError
 from der_planner.limb import Limb, Pneumatics
+from der_planner.model import CONTROL_PERIOD as PERIOD
 from der_planner.model.air import Air
 
 SMOOTH_RATE = 6000.0
@@ -32,27 +32,21 @@ BETTER = 0.7
 """Share of the residual of lags alone that slow venting may leave to be believed."""
 VALVE_BETTER = 0.85
 """Share of the residual of one lag that a lag which changes with the pressure may leave."""
+_NUDGE = 0.02
+"""Change of a number for a slope, in its scale."""
 SOFTNESS = 50.0
 """Errors beyond this count less than their square [Pa]."""
 
 
-class _Number(NamedTuple):
-    start: float
-    low: float
-    high: float
-    scale: float
-    nudge: float
-
-
 _NUMBERS = {
-    "time_constant": _Number(0.2, 0.005, 1.5, 0.1, 2e-3),
-    "vent_time_constant": _Number(0.2, 0.005, 1.5, 0.1, 2e-3),
-    "delay": _Number(0.05, 0.0, 1.9, 0.1, 2e-3),
-    "vent_rate": _Number(5000.0, 300.0, 60e3, 1000.0, 20.0),
-    "vent_exponent": _Number(0.7, 0.3, 1.0, 0.1, 2e-3),
-    "vent_lag_exponent": _Number(0.5, 0.0, 1.0, 0.1, 2e-3),
+    "time_constant": (0.2, 0.005, 1.5, 0.1),
+    "vent_time_constant": (0.2, 0.005, 1.5, 0.1),
+    "delay": (0.05, 0.0, 1.9, 0.1),
+    "vent_rate": (5000.0, 300.0, 60e3, 1000.0),
+    "vent_exponent": (0.7, 0.3, 1.0, 0.1),
+    "vent_lag_exponent": (0.5, 0.0, 1.0, 0.1),
 }
-"""Numbers of `Pneumatics` that are fitted: start, bounds, scale and change for a slope. Lags are
+"""Numbers of `Pneumatics` that are fitted: start, least and largest value, scale. Lags are
 the first three, slow venting adds two, a valve that opens in proportion to its error the last."""
 _LAGS, _VENTING, _VALVE = (tuple(_NUMBERS)[:count] for count in (3, 5, 6))
 
@@ -81,8 +75,8 @@ class AirFit:
         return replace(prior, **self.numbers)
 
 
-def fit_air(log: CalibrationLog, period: float) -> AirFit:
-    """Fit the chambers' lag and venting to a log on a regular grid of ``period`` [s].
+def fit_air(log: CalibrationLog) -> AirFit:
+    """Fit the chambers' lag and venting to a log on the grid of the control period.
 
     The law is that of `der_planner.model.air`. A log whose chambers always follow their
     commands shows the lag alone; venting is then left open.
@@ -91,20 +85,20 @@ def fit_air(log: CalibrationLog, period: float) -> AirFit:
         LogError: the commands hold no smooth motion, or pressures were not measured.
     """
     command, measured = log.commanded_differential, log.measured_differential
-    vented = np.all(np.abs(command[: max(2, round(1.0 / period))]) < 1.0, axis=1)
+    vented = np.all(np.abs(command[: max(2, round(1.0 / PERIOD))]) < 1.0, axis=1)
     rest = measured[: vented.size][vented]
     offset = np.nanmean(rest, axis=0) if len(rest) else np.zeros(command.shape[1])
     offset = np.nan_to_num(offset)
     known = np.isfinite(measured) & (np.abs(measured - offset) > 0.0)
-    smooth = known & _after_no_step(command, period)
-    moving = np.abs(np.gradient(command, period, axis=0)) > 200.0
-    if np.count_nonzero(smooth & moving) < 3.0 / period:
+    smooth = known & _after_no_step(command)
+    moving = np.abs(np.gradient(command, PERIOD, axis=0)) > 200.0
+    if np.count_nonzero(smooth & moving) < 3.0 / PERIOD:
         raise LogError(
             "the commands hold less than 3 s of smooth motion: the chambers' lag cannot be told; "
             "record the calibration run, or a plan"
         )
-    falling = known & _after_no_step(np.abs(command), period, rising=True)
-    lags = _Chambers(command, measured - offset, smooth, period)
+    falling = known & _after_no_step(np.abs(command), rising=True)
+    lags = _Chambers(command, measured - offset, smooth)
     venting = replace(lags, rows=falling)
     found, slow = lags.fit(_LAGS), venting.fit(_VENTING)
     alone = float(np.sqrt(np.mean(venting.residual(found.numbers) ** 2)))
@@ -113,28 +107,27 @@ def fit_air(log: CalibrationLog, period: float) -> AirFit:
         by_degrees = _shown(valve) and valve.residual < VALVE_BETTER * slow.residual
         found = valve if by_degrees else slow
         found = replace(found, numbers={"vent_lag_exponent": 0.0, **found.numbers})
-    return replace(found, fill_rate=_fill_rate(command, measured, period), offset=offset)
+    return replace(found, fill_rate=_fill_rate(command, measured), offset=offset)
 
 
 @dataclass(frozen=True)
 class _Chambers:
-    """Commands and measured pressures (K, M) [Pa], rows (K, M) to fit to, and their period [s]."""
+    """Commands and measured pressures (K, M) [Pa], and rows (K, M) to fit to."""
 
     command: Array
     measured: Array
     rows: NDArray[np.bool_]
-    period: float
 
     def residual(self, numbers: Mapping[str, float]) -> Array:
         """Return predicted less measured pressures of the rows [Pa]."""
         law = replace(Limb.default().pneumatics, **{"vent_rate": 0.0, **numbers})
-        predicted = Air(law).pressures_at_commands(self.command, self.period)
+        predicted = Air(law).pressures_at_commands(self.command, PERIOD)
         return np.asarray((predicted - self.measured)[self.rows])
 
     def fit(self, names: tuple[str, ...], start: Mapping[str, float] | None = None) -> AirFit:
         """Fit the numbers of these names, from other starts where they are given."""
         fitted = [_NUMBERS[name] for name in names]
-        begin, low, high, scale, nudge = np.array(fitted).T
+        begin, low, high, scale = np.array(fitted).T
         begin = np.array([(start or {}).get(n, v) for n, v in zip(names, begin, strict=True)])
 
         def of(values: Array) -> dict[str, float]:
@@ -142,7 +135,7 @@ class _Chambers:
 
         def rows(values: Array) -> Rows:
             # Of a size of their own: a relative change of a dead time near zero would be none.
-            steps = np.where(values + nudge <= high, nudge, -nudge)
+            steps = np.where(values + _NUDGE * scale <= high, _NUDGE * scale, -_NUDGE * scale)
             return with_differences(lambda v: self.residual(of(v)) / SOFTNESS, values, steps)
 
         nothing = np.full(len(names), np.inf)
@@ -151,34 +144,34 @@ class _Chambers:
         )
         values = search.solve()
         left = float(np.sqrt(np.mean(self.residual(of(values)) ** 2)))
-        covariance = search.covariance(values, (left / SOFTNESS) ** 2 / self.period)
+        covariance = search.covariance(values, (left / SOFTNESS) ** 2 / PERIOD)
         return AirFit(of(values), of(np.sqrt(np.diag(covariance))), left)
 
 
 def _shown(found: AirFit) -> bool:
     """Tell whether rate and exponent of venting are known well, the rate inside its bounds."""
-    rate, number = found.numbers["vent_rate"], _NUMBERS["vent_rate"]
+    rate, (_, low, high, _) = found.numbers["vent_rate"], _NUMBERS["vent_rate"]
     of_rate, of_exponent = (found.deviations[name] for name in SHOWN)
     known = 0.0 < of_rate < SHOWN["vent_rate"] * rate and 0.0 < of_exponent < SHOWN["vent_exponent"]
-    return known and number.low < 0.9 * rate < 0.8 * number.high
+    return known and low < 0.9 * rate < 0.8 * high
 
 
-def _after_no_step(command: Array, period: float, rising: bool = False) -> NDArray[np.bool_]:
+def _after_no_step(command: Array, rising: bool = False) -> NDArray[np.bool_]:
     """Tell rows (K, M) with no step just before them; ``rising`` counts only steps up."""
     change = np.diff(command, axis=0, prepend=command[:1])
-    jump = (change if rising else np.abs(change)) > SMOOTH_RATE * period
-    count = round(STEP_MEMORY / period)
+    jump = (change if rising else np.abs(change)) > SMOOTH_RATE * PERIOD
+    count = round(STEP_MEMORY / PERIOD)
     recent = np.cumsum(jump, axis=0)
     before = np.concatenate([np.zeros((count, command.shape[1])), recent])[: len(recent)]
     smooth: NDArray[np.bool_] = (recent - before) < 0.5
     return smooth
 
 
-def _fill_rate(command: Array, measured: Array, period: float) -> float:
+def _fill_rate(command: Array, measured: Array) -> float:
     jump = np.abs(np.diff(command, axis=0, prepend=command[:1])) > 3000.0
     if not jump.any():
         return float("nan")
-    span = max(2, round(0.3 / period))
-    rate = np.abs(measured[span:] - measured[:-span]) / (span * period)
+    span = max(2, round(0.3 / PERIOD))
+    rate = np.abs(measured[span:] - measured[:-span]) / (span * PERIOD)
     rate = rate[np.isfinite(rate) & (np.abs(measured[span:]) > np.abs(measured[:-span]))]
     return float(np.quantile(rate, 0.995)) if rate.size else float("nan")

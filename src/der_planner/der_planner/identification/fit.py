@@ -24,7 +24,6 @@ from der_planner.identification.bends import (
 )
 from der_planner.identification.lengths import (
     GeometryFit,
-    Unevenness,
     UnevenTips,
     fit_geometry,
     lengths_at_their_end,
@@ -41,7 +40,7 @@ from der_planner.identification.log import (
 )
 from der_planner.identification.report import FitReport, Unknown
 from der_planner.limb import CalibratedRange, Limb
-from der_planner.model import CONTROL_PERIOD, ArcModel, Material, RodModel
+from der_planner.model import ArcModel, Material, RodModel
 from der_planner.planning.loads import nearly_buckling
 
 UNTOLD = 0.8
@@ -68,7 +67,6 @@ def fit(
     log: CalibrationLog,
     *,
     terms: Iterable[str] = GROUPS,
-    geometry: bool = True,
     longest_gap: float = LONGEST_GAP,
 ) -> tuple[Limb, FitReport]:
     """Identify a limb from a calibration run.
@@ -79,7 +77,6 @@ def fit(
         terms: model terms to fit beside gain and rest angle, of `GROUPS`; with ``mass`` (of
             `OPTIONAL`) the mass of each segment is fitted and its stiffness is the prior's. A log
             shows the mass only under gravity or in fast motion.
-        geometry: fit the lengths to the tips as well.
         longest_gap: between two rows of the log that a straight line may bridge [s].
 
     Returns:
@@ -95,13 +92,13 @@ def fit(
     recorded = prepare(log, limb, longest_gap)
     warnings = list(recorded.warnings)
     try:
-        air = fit_air(recorded.log, CONTROL_PERIOD)
+        air = fit_air(recorded.log)
     except LogError as error:
         air = None
         warnings.append(f"the chambers' lag keeps its old value: {error}")
     offset = 0.0 if air is None else air.offset
     prepared = replace(recorded, pressure=recorded.pressure - offset)
-    fitted = _fit_bends_and_lengths(limb, prepared, groups, geometry)
+    fitted = _fit_bends_and_lengths(limb, prepared, groups)
     if fitted.lengths is not None:
         warnings += filter(None, [lengths_at_their_end(limb, fitted.lengths.limb)])
     unknowns, correlation = _told(fitted)
@@ -151,9 +148,7 @@ class _Fitted(NamedTuple):
         return self.problem.free.limb_with(self.values)
 
 
-def _fit_bends_and_lengths(
-    prior: Limb, prepared: Prepared, groups: Collection[str], geometry: bool
-) -> _Fitted:
+def _fit_bends_and_lengths(prior: Limb, prepared: Prepared, groups: Collection[str]) -> _Fitted:
     """Fit the lengths first, or in turn with the bend angles where weight bends the limb unevenly.
 
     The lengths follow from tips and bend angles only if it is known how unevenly each segment
@@ -161,21 +156,20 @@ def _fit_bends_and_lengths(
     in turn until the lengths stay the same. How unevenly it bends also tells the stiffness.
     """
     loaded = prior.weighs_in_plane
-    lengths = fit_geometry(prior, prepared.log) if geometry and not loaded else None
+    lengths = fit_geometry(prior, prepared.log) if not loaded else None
     fitted = _fit_bends(lengths.limb if lengths else prior, prepared, groups, lengths)
-    bent: Unevenness | None = None
-    for _ in range(MOST_PASSES if geometry and loaded else 0):
-        bent = unevenness(fitted.limb, prepared, NODES)
-        lengths = fit_geometry(prior, prepared.log, uneven=bent.tip)
+    for _ in range(MOST_PASSES if loaded else 0):
+        uneven, lacking = unevenness(fitted.limb, prepared, NODES)
+        lengths = fit_geometry(prior, prepared.log, uneven)
         if lengths is None:
             break
-        tips = UnevenTips(prior, RodModel(lengths.limb, NODES), prepared, bent.lacking)
+        tips = UnevenTips(prior, RodModel(lengths.limb, NODES), prepared, lacking)
         change = np.abs(lengths_of(lengths.limb) - lengths_of(fitted.known))
         fitted = _fit_bends(lengths.limb, prepared, groups, lengths, fitted.values, tips)
         if change[: prior.segment_count + 1].max() < SAME_LENGTH:
             break
-    if bent is not None and not bent.holds:
-        uneven_tip(fitted.limb, prepared)
+    if loaded:
+        uneven_tip(fitted.limb, prepared)  # that the rod of the planners follows the log, too
     return fitted
 
 

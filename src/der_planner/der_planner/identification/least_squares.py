@@ -185,15 +185,9 @@ def correlation_length(remaining: Array) -> float:
     lengths, longest = [1.0], len(remaining) // 3
     for error in remaining.T:
         known = error[np.isfinite(error)]
-        known = known - known.mean()
-        power = float(known @ known)
-        if power == 0 or known.size < 2:
-            continue
-        total = 1.0
-        for lag in range(1, min(longest, known.size - 1)):
-            value = float(known[lag:] @ known[:-lag]) / power
-            if value <= 0:
-                break
-            total += 2.0 * value
-        lengths.append(total)
+        known = known - known.sum() / max(known.size, 1)
+        if longest and known.any():
+            products = np.correlate(known, known, "full")[known.size - 1 :][:longest]
+            end = np.argmax(np.append(products, 0.0) <= 0.0)
+            lengths.append(2.0 * float(products[:end].sum() / products[0]) - 1.0)
     return max(lengths)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +44,6 @@ FEWEST_TIPS = 20
 """Rows with tips that a log needs to tell lengths."""
 MOST_TIPS = 800
 """Rows with tips, evenly chosen, to which lengths are fitted."""
-_AT_END = 1e-3
 _NUDGE = 1e-6
 """Change of a length for the slope of the tip [m]."""
 GIVES_WAY = (
@@ -120,22 +118,8 @@ def fit_geometry(
     )
 
 
-class Unevenness(NamedTuple):
-    """How unevenly its weight bends a limb along a log, as its tip shows it.
-
-    Attributes:
-        tip: (K, 2) less that of evenly bent segments [m].
-        lacking: (K, 2) what the rod of the fit lacks of it [m].
-        holds: whether the rod of the planners follows the log.
-    """
-
-    tip: Array
-    lacking: Array
-    holds: bool
-
-
-def unevenness(limb: Limb, log: Prepared, nodes: int) -> Unevenness:
-    """Return how unevenly a fitted limb bends along a log.
+def unevenness(limb: Limb, log: Prepared, nodes: int) -> tuple[Array, Array]:
+    """Return how unevenly its weight bends a limb along a log, as its tip shows it.
 
     A limb whose stiffness falls as it bends may give way in the rod of the planners, whose many
     nodes see a sharper bend at the clamp, although the rod of the fit follows the log. Then the rod
@@ -147,6 +131,9 @@ def unevenness(limb: Limb, log: Prepared, nodes: int) -> Unevenness:
         log: with the differential pressures inside the chambers.
         nodes: of the rod in the fit.
 
+    Returns:
+        Tip (K, 2) less that of evenly bent segments, and what the rod of the fit lacks of it [m].
+
     Raises:
         LogError: not even the rod of the fit follows the log.
     """
@@ -154,8 +141,8 @@ def unevenness(limb: Limb, log: Prepared, nodes: int) -> Unevenness:
     try:
         whole = uneven_tip(limb, log)
     except LogError:
-        return Unevenness(coarse, np.zeros_like(coarse), holds=False)
-    return Unevenness(whole, whole - coarse, holds=True)
+        whole = coarse
+    return whole, whole - coarse
 
 
 def uneven_tip(limb: Limb, log: Prepared, nodes: int = NODES) -> Array:
@@ -184,7 +171,7 @@ class UnevenTips:
         prior: with the lengths that are known before.
         model: of the limb with the lengths that were fitted last.
         log: with tips and bend angles.
-        lacking: (K, 2) as of `Unevenness` [m].
+        lacking: (K, 2) of the tip, as `unevenness` gives it [m].
     """
 
     def __init__(self, prior: Limb, model: RodModel, log: Prepared, lacking: Array) -> None:
@@ -239,15 +226,14 @@ def _known(prior: Limb) -> Unknowns:
 
 def lengths_at_their_end(prior: Limb, found: Limb) -> str:
     """Return a sentence where the lengths of segments went as far as they may; else empty."""
-    ends = []
-    for index, (given, fitted) in enumerate(zip(prior.segments, found.segments, strict=True)):
-        share = fitted.length / given.length
-        if LENGTH_RANGE[0] + _AT_END < share < LENGTH_RANGE[1] - _AT_END:
-            continue
-        ends.append(
-            f"segment {index} is given as {1e3 * given.length:.0f} mm and was found to be "
-            f"{1e3 * fitted.length:.0f} mm or {'less' if share < 1 else 'more'}"
-        )
+    found_lengths = lengths_of(found)
+    at_end = _known(prior).at_bound(found_lengths)
+    ends = [
+        f"segment {index} is given as {1e3 * given.length:.0f} mm and was found to be "
+        f"{1e3 * length:.0f} mm or {'less' if length < given.length else 'more'}"
+        for index, (given, length) in enumerate(zip(prior.segments, found_lengths, strict=False))
+        if at_end[index]
+    ]
     if not ends:
         return ""
     return (

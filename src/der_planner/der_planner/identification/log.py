@@ -12,8 +12,6 @@ from der_planner.arrays import Array
 from der_planner.limb import Limb
 from der_planner.model import CONTROL_PERIOD
 
-SMOOTHING = 11
-"""Rows of the filter that takes the tags' noise off the bend (0.5 s)."""
 LONGEST_GAP = 1.0
 """Gap in the tags that a straight line may bridge [s]; rows in longer ones are not fitted to."""
 LEAST_EXCITATION = 1000.0
@@ -56,8 +54,13 @@ class CalibrationLog:
         rows = self.time.shape
         if self.time.ndim != 1 or self.time.size < 2:
             raise LogError(f"a log needs two instants or more, time has shape {rows}")
-        if not np.all(np.diff(self.time) > 0):
-            raise LogError("the time of a log must rise from row to row")
+        falls = np.flatnonzero(~(np.diff(self.time) > 0))
+        if falls.size:
+            before, after = self.time[falls[0] : falls[0] + 2]
+            raise LogError(
+                f"the time of {self.source or 'a log'} falls from {before:.6g} s to {after:.6g} s: "
+                "is it more than one run, or has a clock been set? Keep one run a table"
+            )
         inputs = self.commanded_differential.shape
         for name in ("commanded_differential", "measured_differential", "bend_angles"):
             if getattr(self, name).shape != inputs:
@@ -70,7 +73,7 @@ class CalibrationLog:
         """M."""
         return int(self.bend_angles.shape[1])
 
-    def resampled(self, period: float, longest_gap: float = 1.0) -> CalibrationLog:
+    def resampled(self, period: float, longest_gap: float = LONGEST_GAP) -> CalibrationLog:
         """Return the log on a regular grid, NaN in gaps longer than ``longest_gap`` [s].
 
         Args:
@@ -134,7 +137,7 @@ class Prepared:
     Attributes:
         log: on the grid, NaN where nothing was measured.
         pressure: (K, M) measured, without gaps [Pa].
-        bend: (K, M) smoothed bend angles without gaps [rad].
+        bend: (K, M) bend angles without gaps [rad].
         usable: (K,) rows to fit to.
         warnings: sentences for the report.
     """
@@ -210,16 +213,7 @@ def prepare(
             f"{CONTROL_PERIOD * swinging.sum():.1f} s are not used, since no pressure tells that "
             "motion"
         )
-    return Prepared(grid, pressure, _smoothed(bend), valid & ~swinging, tuple(warnings))
-
-
-def _smoothed(bend: Array) -> Array:
-    """Return bend angles (K, M) without the tags' noise."""
-    # It takes half a second to import: only who has a log pays for it.
-    from scipy.signal import savgol_filter  # noqa: PLC0415
-
-    count = min(SMOOTHING, len(bend) - (len(bend) + 1) % 2)
-    return np.asarray(savgol_filter(bend, count, 2, axis=0))
+    return Prepared(grid, pressure, bend, valid & ~swinging, tuple(warnings))
 
 
 def _still_swinging(time: Array, pressure: Array, bend: Array, limb: Limb) -> NDArray[np.bool_]:

@@ -21,7 +21,7 @@ from der_planner.bags.series import stream
 from der_planner.identification.log import CalibrationLog, LogError, on_grid
 from der_planner.model import CONTROL_PERIOD
 
-LONGEST_GAP = 0.25
+LONGEST_SILENCE = 0.25
 """Time between two messages of a bag that a straight line may bridge [s]."""
 LEAST_MESSAGES = 10
 """Messages of pressures, and of valid limb states, that a bag must hold."""
@@ -82,7 +82,7 @@ def read_bag(path: str | Path, namespace: str = "") -> CalibrationLog:
     grid = np.arange(start, end, CONTROL_PERIOD)
     commanded, tip = stream(limb.commanded, count, origin), stream(limb.tip, 2, origin)
     streams = (commanded, measured, angles, tip)
-    tables = [on_grid(one.time, one.value, grid, LONGEST_GAP) for one in streams]
+    tables = [on_grid(one.time, one.value, grid, LONGEST_SILENCE) for one in streams]
     return CalibrationLog(grid - start, tables[0], tables[1], tables[2], tables[3], Path(path).name)
 
 
@@ -132,16 +132,13 @@ class ColumnMap:
             raise LogError(f"cannot read the column map {path}: {error}") from error
         if not isinstance(content, Mapping):
             raise LogError(f"the column map {path} must hold keys and values")
-        known = {item.name for item in fields(cls)}
-        unknown = sorted(set(content) - known)
-        missing = sorted({"time", "commanded", "chambers", "angles"} - set(content))
-        if unknown or missing:
-            raise LogError(
-                f"column map {path}: "
-                + (f"unknown key {unknown[0]}; " if unknown else "")
-                + (f"{missing[0]} is missing; " if missing else "")
-                + f"the keys are {', '.join(sorted(known))}"
-            )
+        known, given = {item.name for item in fields(cls)}, set(content)
+        missing = {"time", "commanded", "chambers", "angles"} - given
+        wrong = sorted(given - known) + sorted(missing)
+        if wrong:
+            said = "missing" if wrong[0] in missing else "unknown"
+            keys = ", ".join(sorted(known))
+            raise LogError(f"column map {path}: {wrong[0]} is {said}; the keys are {keys}")
         values: dict[str, Any] = {}
         for key, value in content.items():
             reading, expected = _KINDS.get(key, (str, "one word or name"))
@@ -232,7 +229,8 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
         tags = pick(columns.tags)
         lost = np.all(np.diff(tags, axis=0, prepend=np.nan) == 0, axis=1)
         angles[lost], tip[lost] = np.nan, np.nan
-    keep = _timed(time, path)
+    keep = np.isfinite(time)
+    keep[keep] = np.diff(time[keep], prepend=-math.inf) != 0  # of rows at one time the first
     for first, last in columns.ignore:
         keep &= (time < first) | (time > last)
     return CalibrationLog(
@@ -256,26 +254,6 @@ def read_log(path: Path, columns: Path | None, namespace: str = "") -> Calibrati
     if columns is None:
         raise LogError(f"{path} needs --columns FILE")
     return read_csv(path, ColumnMap.from_yaml(columns))
-
-
-def _timed(time: Array, path: str | Path) -> NDArray[np.bool_]:
-    """Return which rows have a time of their own (K,); of rows at one time the first.
-
-    Raises:
-        LogError: the time falls from one row to the next.
-    """
-    known = np.flatnonzero(np.isfinite(time))
-    step = np.diff(time[known])
-    if (step < 0).any():
-        row = int(np.argmax(step < 0))
-        raise LogError(
-            f"the time of {path} falls from {time[known[row]]:.6g} s to "
-            f"{time[known[row + 1]]:.6g} s: is it more than one run, or has a clock been set? Keep "
-            "one run a table"
-        )
-    keep = np.zeros(len(time), dtype=bool)
-    keep[known[np.append(True, step > 0)[: len(known)]]] = True
-    return keep
 
 
 def _rest(time: Array, command: Array, rest_until: float | str) -> NDArray[np.bool_]:

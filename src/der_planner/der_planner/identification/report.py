@@ -92,10 +92,7 @@ class FitReport:
         Raises:
             KeyError: it was not fitted.
         """
-        for unknown in self.unknowns:
-            if unknown.name == name:
-                return unknown
-        raise KeyError(name)
+        return {unknown.name: unknown for unknown in self.unknowns}[name]
 
     def text(self) -> str:
         """Return the report as text for people."""
@@ -108,6 +105,8 @@ class FitReport:
             factor, unit = readable(item.unit)
             note = "  the data hardly tell it" if item.untold else ""
             note += "  at its bound" if item.at_bound else ""
+            if item.name.startswith("log_"):
+                note = f"  {math.exp(item.value):.3f} × the prior's{note}"
             value, deviation = factor * item.value, factor * item.deviation
             lines.append(f"{item.name:26s} {value:12.4g} {deviation:10.2g}  {unit}{note}")
         lines.append("")
@@ -179,27 +178,11 @@ class FitReport:
             f"{1e3 * limb.moving_mass:.0f} g beyond the base, first moment {1e3 * moment:.1f} g·m "
             "about the clamp"
         )
-        known = {u.name: u for u in self.unknowns}
-        kept = "the mass" if "log_stiffness[0]" in known else "the stiffness"
-        told = []
-        for index, segment in enumerate(limb.segments):
-            if f"log_stiffness[{index}]" in known:
-                share = known[f"log_stiffness[{index}]"].deviation
-                stiffness = f"{segment.bending_stiffness:.4f} N·m² ± {100 * share:.1f} %"
-                told.append(f"EI of segment {index} = {stiffness}")
-            if f"log_mass[{index}]" in known:
-                found = known[f"log_mass[{index}]"]
-                told.append(
-                    f"mass of segment {index} = prior × {math.exp(found.value):.3f} ± "
-                    f"{100 * found.deviation:.1f} %"
-                )
-        if not told:
-            return [line]
         return [
             line,
-            f"loads: weight tells stiffness from gain: {', '.join(told)}",
-            f"loads: stiffness, gain and mass scale together, {kept} was given; a rest angle is "
-            f"taken for 0 ± {math.degrees(REST_SPREAD):.0f}°, as of a limb that was made straight",
+            "loads: stiffness, gain and mass scale together, so that one of them was given",
+            f"loads: the limb was made straight, its rest angles are 0 ± "
+            f"{math.degrees(REST_SPREAD):.0f}° but for what the log tells",
         ]
 
 

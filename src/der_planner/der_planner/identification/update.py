@@ -281,19 +281,17 @@ def _refuse_wrong_way(runs: Sequence[Prepared], remaining: Array) -> None:
     Raises:
         LogError: a segment does.
     """
-    ends = np.cumsum([len(run.time) for run in runs])[:-1]
-    for run, left in zip(runs, np.split(remaining, ends), strict=True):
-        measured = run.log.bend_angles[run.usable]
-        expected = measured - left[run.usable]
-        for m, (seen, told) in enumerate(zip(measured.T, expected.T, strict=True)):
-            if min(np.ptp(seen), np.ptp(told)) < LEAST_MOTION:
-                continue
-            if np.corrcoef(seen, told)[0, 1] < WRONG_WAY:
-                raise LogError(
-                    f"segment {m} bends the wrong way in these runs: check that they are of this "
-                    "limb, that no tubes, signs or columns are swapped, and that what it carries "
-                    "is named; else calibrate again"
-                )
+    measured = np.concatenate([run.log.bend_angles for run in runs])
+    rows = np.isfinite(remaining).all(axis=1)
+    expected = measured - remaining
+    for m, (seen, told) in enumerate(zip(measured[rows].T, expected[rows].T, strict=True)):
+        moved = min(np.ptp(seen), np.ptp(told)) >= LEAST_MOTION
+        if moved and np.corrcoef(seen, told)[0, 1] < WRONG_WAY:
+            raise LogError(
+                f"segment {m} bends the wrong way in these runs: check that they are of this limb, "
+                "that no tubes, signs or columns are swapped, and that what it carries is named; "
+                "else calibrate again"
+            )
 
 
 def adapted(limb: Limb, tip_of: Callable[[Limb], Array | None], tip: Array) -> Limb | None:

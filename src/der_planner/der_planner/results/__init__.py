@@ -11,40 +11,32 @@ Example::
 """
 
 from der_planner.bags.reader import BagError
-from der_planner.bags.run import Description, EvaluationError, RunSeries, Stream
+from der_planner.bags.run import Description, EvaluationError, RunSeries
 from der_planner.bags.series import load_run
-from der_planner.results.errors import EvaluationSettings, error_series, split_error
+from der_planner.results.errors import EvaluationSettings
 from der_planner.results.evaluation import RunResult, evaluate_bag, evaluate_bags, evaluate_run
 from der_planner.results.figures import plot_error, plot_learning, plot_pressures, plot_tip
 from der_planner.results.report import write_report, write_results
-from der_planner.results.statistics import Comparison, Summary, compare, summarise
-from der_planner.results.tables import csv_table, error_table, format_comparison, format_table
+from der_planner.results.statistics import compare, summarise
+from der_planner.results.tables import format_table
 
 __all__ = [
     "BagError",
-    "Comparison",
     "Description",
     "EvaluationError",
     "EvaluationSettings",
     "RunResult",
     "RunSeries",
-    "Stream",
-    "Summary",
     "compare",
-    "csv_table",
-    "error_series",
-    "error_table",
     "evaluate_bag",
     "evaluate_bags",
     "evaluate_run",
-    "format_comparison",
     "format_table",
     "load_run",
     "plot_error",
     "plot_learning",
     "plot_pressures",
     "plot_tip",
-    "split_error",
     "summarise",
     "write_report",
     "write_results",

@@ -24,6 +24,7 @@ from der_planner.bags.series import load_run, run_of
 from der_planner.limb import mounting_of
 from der_planner.results.errors import (
     EvaluationSettings,
+    Split,
     check_board,
     check_tracker,
     error_series,
@@ -40,7 +41,7 @@ REFERENCE_POINTS = 25
 
 
 @dataclass(frozen=True)
-class RunResult:
+class RunResult(Split):
     """The figures of one run; field names carry their units, as in ``results.json``.
 
     ``valid_fraction`` is the share of the images in the window whose limb state is valid;
@@ -75,14 +76,6 @@ class RunResult:
     gravity_m_s2: tuple[float, float, float] = (0.0, 0.0, 0.0)
     payload_kg: float = 0.0
     payload_at_m: float = 0.0
-    lag_s: float = float("nan")
-    gain_x: float = float("nan")
-    gain_y: float = float("nan")
-    bias_x_m: float = float("nan")
-    bias_y_m: float = float("nan")
-    rms_without_lag_m: float = float("nan")
-    rms_without_bias_m: float = float("nan")
-    rms_without_gain_m: float = float("nan")
     pressure_rms_error_pa: tuple[float, ...] = ()
     removed_lag_s: float = 0.0
     problems: tuple[str, ...] = ()
@@ -202,11 +195,9 @@ def _pressure_errors(run: RunSeries, first: float, last: float) -> tuple[float, 
         return ()
     inside = (run.measured.time >= first) & (run.measured.time <= last)
     difference = run.measured.value[inside] - run.commanded.value[inside]
-    known = np.isfinite(difference)
-    if not known.any(axis=0).all():
+    if not np.isfinite(difference).any(axis=0).all():
         return ()
-    squares = np.where(known, difference, 0.0) ** 2
-    return tuple(float(v) for v in np.sqrt(squares.sum(axis=0) / known.sum(axis=0)))
+    return tuple(np.sqrt(np.nanmean(difference**2, axis=0)).tolist())
 
 
 def _problems(run: RunSeries, valid: float, longest: float) -> tuple[str, ...]:

@@ -172,7 +172,7 @@ def _sections(results: Sequence[RunResult], figures: Sequence[str]) -> list[str]
         *figures,
         section("Every run", _run_table(results)),
         section("What feedback added", _feedback_table(results)),
-        section("Instruments", _instrument_table(results)),
+        section("Instruments", instrument_table(results)),
         "<h2>Definitions</h2>",
         _DEFINITIONS,
         section("Where the numbers come from", _provenance(results)),
@@ -247,7 +247,9 @@ def _feedback_table(results: Sequence[RunResult]) -> Table:
     return Table.of(corrected, _first_columns(results) | columns)
 
 
-def _instrument_table(results: Sequence[RunResult]) -> Table:
+def instrument_table(results: Sequence[RunResult]) -> Table:
+    """Return how well tracker and board worked, a row for each run of the twin."""
+
     def show(key: str, scale: float = 1.0, digits: int = 0) -> Callable[[RunResult], str]:
         return lambda run: number(run.checks.get(key), scale, digits)
 

@@ -6,7 +6,7 @@ import html
 import itertools
 import math
 import platform
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,7 +35,6 @@ _MOST_ERRORS = 50
 _UNITS = {"_m": ("cm", 100.0), "_pa": ("kPa", 1e-3), "_rad": ("°", 180.0 / np.pi)}
 _CAPTIONS = {
     "lines": "{y} over {x}: mean over all other factors, shaded one standard deviation.",
-    "map": "{value} over {x} and {y}: mean over all other factors.",
     "scatter": "{y} against {x}, one point a row.",
     "histogram": "How often {x} came out so large.",
     "indices": "Sobol indices of {of}: the share of its variance that each factor explains, with "
@@ -86,7 +85,7 @@ def draw_all(study: Study, kept: Mapping[str, Kept], folder: Path) -> list[str]:
     good = [each for each in kept.values() if each["error"] is None]
     pictures = []
     for plot in study.plots:
-        used = {key: plot[key] for key in ("x", "y", "value", "of") if key in plot}
+        used = {key: plot[key] for key in ("x", "y", "of") if key in plot}
         rows = [row for row in good if all(row[name] is not None for name in used.values())]
         with style.paper_style():
             if plot["kind"] == "indices":
@@ -105,15 +104,14 @@ def draw_all(study: Study, kept: Mapping[str, Kept], folder: Path) -> list[str]:
 def _panels(study: Study, plot: Mapping[str, str], rows: Records) -> Figure:
     """Return a figure with one panel for each value of the factor ``panels``."""
     panels, log = list(_groups(plot.get("panels"), rows)), plot.get("log", "")
-    is_map = plot["kind"] == "map"
     drawn = style.new_figure(style.PAGE if len(panels) > 1 else style.COLUMN, _HEIGHT)
-    axes = drawn.subplots(1, len(panels), squeeze=False, sharey=not is_map)[0]
+    axes = drawn.subplots(1, len(panels), squeeze=False, sharey=True)[0]
     for place, ((value, mine), panel) in enumerate(zip(panels, axes, strict=True)):
-        _KINDS[plot["kind"]](study, plot, mine, panel)
+        (_histogram if plot["kind"] == "histogram" else _lines)(study, plot, mine, panel)
         if "panels" in plot:
             label, scale = quantity(plot["panels"], study)
             panel.set_title(value if isinstance(value, str) else f"{label}: {value * scale:.3g}")
-        if place and not is_map:
+        if place:
             panel.set_ylabel("")
             if panel.get_legend() is not None:
                 panel.get_legend().remove()
@@ -180,38 +178,6 @@ def _histogram(study: Study, plot: Mapping[str, str], rows: Records, panel: Axes
     values = _column(rows, plot["x"]) * scale
     panel.hist(values, bins="auto", color=style.OTHER[3], edgecolor="white", lw=0.4)
     panel.set(xlabel=label, ylabel="rows")
-
-
-def _map(study: Study, plot: Mapping[str, str], rows: Records, panel: Axes) -> None:
-    """Draw the mean of a value over two factors; with ``per``, as a ratio of its two values."""
-    label, scale = quantity(plot["value"], study)
-    xs, ys = (sorted({row[plot[key]] for row in rows}) for key in ("x", "y"))
-    sides = list(_groups(plot.get("per"), rows))[:2]
-    tables = [np.full((len(ys), len(xs)), np.nan) for _ in sides]
-    for table, (_, side) in zip(tables, sides, strict=True):
-        for x, column in _groups(plot["x"], side):
-            for y, cell in _groups(plot["y"], column):
-                table[ys.index(y), xs.index(x)] = _column(cell, plot["value"]).mean() * scale
-    shown = tables[0]
-    if len(tables) == 2:
-        shown, label = tables[1] / tables[0], f"{sides[1][0]} over {sides[0][0]}"
-    image = panel.imshow(shown, origin="lower", aspect="auto", cmap="cividis")
-    for row, column in np.ndindex(shown.shape):
-        if np.isfinite(shown[row, column]):
-            panel.text(column, row, f"{shown[row, column]:.2f}", ha="center", va="center", size=6,
-                       color="white", bbox={"fc": "#00000066", "lw": 0, "pad": 1})  # fmt: skip
-    panel.set_xticks(range(len(xs)), [_value(plot["x"], each, study) for each in xs])
-    panel.set_yticks(range(len(ys)), [_value(plot["y"], each, study) for each in ys])
-    panel.set(xlabel=quantity(plot["x"], study)[0], ylabel=quantity(plot["y"], study)[0])
-    panel.figure.colorbar(image, ax=panel, label=label)
-
-
-_KINDS: dict[str, Callable[[Study, Mapping[str, str], Records, Axes], None]] = {
-    "lines": _lines,
-    "map": _map,
-    "scatter": _lines,
-    "histogram": _histogram,
-}
 
 
 def _column(rows: Records, name: str) -> Array:

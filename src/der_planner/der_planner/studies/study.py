@@ -29,13 +29,12 @@ METHODS = ("random", "sobol", "saltelli")
 """Independent draws; a Sobol sequence; one arranged for Sobol indices (see `saltelli`)."""
 PLOTS = {
     "lines": ("x", "y"),
-    "map": ("x", "y", "value"),
     "scatter": ("x", "y"),
     "histogram": ("x",),
     "indices": ("of",),
 }
 """The kinds of figures, and what each needs."""
-_FACTORS_OF_PLOTS = ("lines", "panels", "per")
+_FACTORS_OF_PLOTS = ("lines", "panels")
 _MORE_OF_PLOTS = ("kind", "name", "title", "log")
 
 
@@ -46,13 +45,11 @@ class Spread:
     Attributes:
         scale: "even" or "log" between low and high, or "normal" with mean ``low`` and standard
             deviation ``high``.
-        whole: rounded down to whole numbers.
     """
 
     low: float
     high: float
     scale: str = "even"
-    whole: bool = False
 
     def value(self, share: float) -> Value:
         """Return the value below which ``share`` (0 … 1) of the draws lie."""
@@ -62,8 +59,6 @@ class Spread:
             return float(norm.ppf(share, self.low, self.high))
         if self.scale == "log":
             return float(self.low * math.exp(share * math.log(self.high / self.low)))
-        if self.whole:
-            return min(int(self.low) + int(share * (self.high - self.low + 1)), int(self.high))
         return float(self.low + share * (self.high - self.low))
 
 
@@ -292,8 +287,8 @@ def _values(content: Any, declared: Factor, name: str) -> list[Value] | Spread:
 
 
 def _spread(content: Mapping[str, Any], declared: Factor, where: str) -> Spread:
-    if declared.choices:
-        raise StudyError(f"{where}: names cannot be drawn from a range: list them")
+    if not isinstance(declared.default, float):
+        raise StudyError(f"{where}: only numbers are drawn from a range: list the values")
     if set(content) == {"mean", "deviation"}:
         deviation = content["deviation"]
         if not isinstance(deviation, (int, float)) or not deviation > 0:
@@ -312,7 +307,7 @@ def _spread(content: Mapping[str, Any], declared: Factor, where: str) -> Spread:
         raise StudyError(f"{where}.scale must be even, or log above 0, got {scale!r}")
     if not low < high:
         raise StudyError(f"{where}.low must be below {where}.high, got {low:g} and {high:g}")
-    return Spread(low, high, scale, isinstance(declared.default, int))
+    return Spread(low, high, scale)
 
 
 def _draw(content: object, spreads: Mapping[str, Spread], combinations: int) -> Draw:

@@ -24,14 +24,8 @@ from threadpoolctl import threadpool_limits
 import der_planner
 from der_planner.arrays import Array
 from der_planner.control import Feedback, Learner, lockstep
-from der_planner.identification import (
-    Excitation,
-    FitReport,
-    calibrate_twin,
-    predict,
-    record_twin,
-)
-from der_planner.identification.excitation import TIP_NOISE
+from der_planner.identification import FitReport, calibrate_twin, predict, record_twin
+from der_planner.identification.excitation import TIP_NOISE, Excitation
 from der_planner.limb import Limb, Pneumatics, declarations
 from der_planner.model import simulate
 from der_planner.planning import Motion, Plan, plan

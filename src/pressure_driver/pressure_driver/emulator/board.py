@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -10,8 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from pressure_driver.emulator.firmware import BoardCommand, BoardProtocol, BoardReading
 from pressure_driver.emulator.pneumatics import SUPPLY_PRESSURE, BoardPneumatics
-from pressure_driver.protocols.base import BoardCommand, BoardProtocol, BoardReading
 
 SENSOR_OFFSET = 200.0
 """[Pa] Sensors read up to this much too high, each its own."""
@@ -34,6 +35,10 @@ WORDS = {
     "unplug": ("unplug[:SECONDS] (the port disappears, and comes back after SECONDS)", 0, 1),
 }
 """Of every fault: its usage, the fewest and the most numbers behind its word."""
+LEAK_RATE = 3.0
+"""[1/s] of a hole for which no rate is given."""
+DEFAULTS = {"reset": 0.2, "unplug": math.inf}
+"""[s] for which these last if no time is given."""
 USAGE = ", ".join(usage for usage, _, _ in WORDS.values())
 
 
@@ -52,12 +57,11 @@ class Faults:
     deaf: bool = False
     echoless: bool = False
     reset: float | None = None
-    stuck: list[int] = field(default_factory=list)
-    leaks: dict[int, float] = field(default_factory=dict)
+    stick: list[int] = field(default_factory=list)
+    leak: dict[int, float] = field(default_factory=dict)
     runaway: list[int] = field(default_factory=list)
-    supply: float | None = None
-    unplugged: bool = False
-    replug_after: float | None = None
+    supply: float = SUPPLY_PRESSURE
+    unplug: float | None = None
 
     @classmethod
     def parse(cls, texts: Iterable[str], chamber_count: int) -> Faults:
@@ -84,19 +88,13 @@ class Faults:
         return faults
 
     def _set(self, word: str, numbers: list[float]) -> None:
-        if word == "stick":
-            self.stuck.append(int(numbers[0]))
-        elif word == "runaway":
-            self.runaway.append(int(numbers[0]))
+        chambers = getattr(self, word)
+        if isinstance(chambers, list):
+            chambers.append(int(numbers[0]))
         elif word == "leak":
-            self.leaks[int(numbers[0])] = numbers[1] if len(numbers) > 1 else 3.0
-        elif word == "unplug":
-            self.unplugged = True
-            self.replug_after = numbers[0] if numbers else None
-        elif word == "reset":
-            self.reset = numbers[0] if numbers else 0.2
+            self.leak[int(numbers[0])] = (numbers[1:] or [LEAK_RATE])[0]
         else:
-            setattr(self, word, numbers[0] if numbers else True)
+            setattr(self, word, (numbers or [DEFAULTS.get(word, True)])[0])
 
     def damage(self, data: bytes, generator: np.random.Generator) -> bytes:
         """Return ``data`` with bits flipped as `corrupt` says."""
@@ -171,11 +169,11 @@ class EmulatedBoard:
         air = self.pneumatics
         air.stuck[:] = False
         air.leak[:] = 0.0
-        for chamber in faults.stuck:
+        for chamber in faults.stick:
             air.stuck[chamber] = True
-        for chamber, rate in faults.leaks.items():
+        for chamber, rate in faults.leak.items():
             air.leak[chamber] = rate
-        air.supply_pressure = SUPPLY_PRESSURE if faults.supply is None else faults.supply
+        air.supply_pressure = faults.supply
         self._apply()
 
     def receive(self, data: bytes, stamp: int) -> tuple[list[ReceivedCommand], bytes]:

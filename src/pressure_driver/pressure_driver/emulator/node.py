@@ -14,10 +14,10 @@ from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.runner import run_node
 from limb_interfaces.stamps import stamp_from_nanoseconds
 from pressure_driver.emulator.board import EmulatedBoard, FaultError, Faults, ReceivedCommand
+from pressure_driver.emulator.firmware import board_protocol
 from pressure_driver.emulator.pneumatics import BoardPneumatics
 from pressure_driver.emulator.runner import BoardRunner, EmulatedPort
 from pressure_driver.node import read_settings
-from pressure_driver.protocols import board_protocol
 from pressure_driver.settings import EmulatorSettings
 
 

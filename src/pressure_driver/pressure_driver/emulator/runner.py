@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import fcntl
+import math
 import os
 import pty
 import select
@@ -22,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pressure_driver.emulator.board import EmulatedBoard, Faults, ReceivedCommand
-from pressure_driver.ports import prefer_thread
-from pressure_driver.settings import NANOSECONDS
+from pressure_driver.lines import prefer_thread
+from pressure_driver.schedule import NANOSECONDS
 
 TELEMETRY_PERIOD = 50_000_000
 """[ns] 20 Hz, as boards report."""
@@ -279,7 +280,7 @@ class BoardRunner:
         self._reset_on_open = reset_on_open
         self._requests: deque[Faults] = deque()
         self._delayed: deque[tuple[int, bytes]] = deque()
-        self._replug_at: int | None = None
+        self._replug_at = math.inf
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="board", daemon=True)
 
@@ -317,8 +318,8 @@ class BoardRunner:
             self._serve_line(now)
             while self._requests:
                 self._apply(self._requests.popleft(), now)
-            if self._replug_at is not None and now >= self._replug_at:
-                self._replug_at = None
+            if now >= self._replug_at:
+                self._replug_at = math.inf
                 self.port.plug()
             if now >= next_air or now >= next_telemetry:
                 elapsed = (now - air_time) / NANOSECONDS
@@ -349,13 +350,11 @@ class BoardRunner:
         self.board.set_faults(faults)
         if faults.reset is not None:
             self.board.restart(faults.reset)
-        if faults.unplugged:
-            self.port.unplug()
-            self._replug_at = None
-            if faults.replug_after is not None:
-                self._replug_at = now + round(faults.replug_after * NANOSECONDS)
-        else:
+        if faults.unplug is None:
             self.port.plug()
+        else:
+            self.port.unplug()
+            self._replug_at = now + faults.unplug * NANOSECONDS
 
 
 def _following(due: int, now: int, period: int) -> int:

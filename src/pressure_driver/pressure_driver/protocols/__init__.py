@@ -1,27 +1,245 @@
-"""The languages of valve boards."""
+"""The languages of valve boards: what the driver's end of each offers.
+
+Decoders take any split of the byte stream, throw nothing, and count what they had to reject.
+Pressures are in Pa on this side of a protocol, whatever unit the wire carries. The boards' own ends
+are those of the emulator.
+"""
 
 from __future__ import annotations
 
-from pressure_driver.protocols.base import BoardProtocol, HostProtocol
-from pressure_driver.protocols.ctrlp import CtrlpBoard, CtrlpHost
-from pressure_driver.protocols.ezloop import EzloopBoard, EzloopHost
-from pressure_driver.protocols.native import NativeBoard, NativeHost
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from typing import ClassVar
 
-PROTOCOLS: dict[str, tuple[type[HostProtocol], type[BoardProtocol]]] = {
-    "ezloop": (EzloopHost, EzloopBoard),
-    "ctrlp": (CtrlpHost, CtrlpBoard),
-    "native": (NativeHost, NativeBoard),
-}
-"""Both ends of each."""
-NAMES = tuple(PROTOCOLS)
-"""The protocols that can be chosen."""
+NAMES = ("ezloop", "ctrlp", "native")
+"""The protocols that can be chosen, which are the names of their modules."""
+STANDARD_ATMOSPHERE = 101_325.0
+"""[Pa]"""
+LONGEST_LINE = 512
+"""[bytes] A longer line is garbage: its bytes are dropped up to the next line end."""
+LONGEST_SHOWN = 80
+"""[characters] of a damaged line that are kept to be shown."""
+
+
+@dataclass(frozen=True)
+class Telemetry:
+    """What a board has measured; None where this message says nothing about it."""
+
+    chamber_pressure: tuple[float, ...] | None = None
+    """(2M,) [Pa] absolute, as the board's sensors read."""
+    valve_opening: tuple[float, ...] | None = None
+    """(2M,) 0 … 1."""
+    supply_pressure: float | None = None
+    """[Pa] absolute, of the reservoir."""
+
+
+@dataclass(frozen=True)
+class Echo:
+    """The board repeats that it has received a command."""
+
+    sequence: int | None = None
+    """Number of the command; None where the protocol has none: the newest command."""
+
+
+@dataclass(frozen=True)
+class BoardFailure:
+    """The board says that it is in trouble, or that it has vented on its own."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class BoardReset:
+    """The board has started again: it is vented and has forgotten its settings."""
+
+    sign: str
+    """From what this is concluded; of a few fixed texts."""
+
+
+@dataclass(frozen=True)
+class BoardText:
+    """Free text of the board: boot messages, warnings, commands that it refuses."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class BoardIdentity:
+    """What the board says of itself when asked."""
+
+    chamber_count: int
+    largest_pressure: float
+    """[Pa] gauge."""
+    firmware: str
+
+
+Event = Telemetry | Echo | BoardFailure | BoardReset | BoardText | BoardIdentity
+
+
+class StreamCutter:
+    """Collects bytes and returns complete pieces with the place of their first byte.
+
+    Args:
+        end: the byte after each piece.
+        longest: bytes; of a longer piece everything up to its end is dropped.
+    """
+
+    def __init__(self, end: bytes, longest: int) -> None:
+        self._end = end
+        self._longest = longest
+        self._buffer = bytearray()
+        self._position = 0
+        self._overlong = False
+
+    def feed(self, data: bytes) -> list[tuple[int, bytes | None]]:
+        """Return (place of the first byte, piece without its end); None for one too long."""
+        pieces: list[tuple[int, bytes | None]] = []
+        self._buffer += data
+        while (end := self._buffer.find(self._end)) >= 0:
+            too_long = self._overlong or end > self._longest
+            pieces.append((self._position, None if too_long else bytes(self._buffer[:end])))
+            del self._buffer[: end + 1]
+            self._position += end + 1
+            self._overlong = False
+        if len(self._buffer) > self._longest:
+            self._position += len(self._buffer)
+            self._buffer.clear()
+            self._overlong = True
+        return pieces
+
+    def reset(self) -> None:
+        """Forget a half-received piece."""
+        self._position += len(self._buffer)
+        self._buffer.clear()
+        self._overlong = False
+
+
+class LineSplitter:
+    """Collects bytes and returns complete lines with the place of their first byte.
+
+    Lines end with a line feed; carriage returns and blanks at either end are dropped, and so are
+    empty lines. Bytes outside printable ASCII (and tab) make a line damaged.
+    """
+
+    def __init__(self) -> None:
+        self._pieces = StreamCutter(b"\n", LONGEST_LINE)
+
+    def feed(self, data: bytes) -> list[tuple[int, str | None]]:
+        """Return (place of the first byte, text) of the complete lines; None for a damaged one."""
+        lines: list[tuple[int, str | None]] = []
+        for start, raw in self._pieces.feed(data):
+            text = (raw or b"").strip()
+            if raw is None or any(byte != 9 and not 32 <= byte < 127 for byte in text):
+                lines.append((start, None))
+            elif text:
+                lines.append((start + len(raw) - len(raw.lstrip()), text.decode("ascii")))
+        return lines
+
+    def reset(self) -> None:
+        """Forget a half-received line."""
+        self._pieces.reset()
+
+
+class HostProtocol(ABC):
+    """The driver's end: encodes commands, decodes what the board says.
+
+    Args:
+        chamber_count: 2M, at most 32.
+    """
+
+    name: ClassVar[str]
+    baud_rate: ClassVar[int] = 115200
+    weaknesses: ClassVar[tuple[str, ...]] = ()
+    """What the protocol cannot protect from; shown in the diagnostics."""
+    reports_supply: ClassVar[bool] = False
+    has_watchdog: ClassVar[bool] = False
+    introduces_itself: ClassVar[bool] = False
+    """Whether the board answers `start` with a `BoardIdentity`."""
+    separator: ClassVar[bytes] = b"\n"
+    """What makes the board drop or finish whatever was sent by halves."""
+    echoes: ClassVar[bool] = False
+    """Whether the board repeats every command (`Echo`)."""
+    tells_pascals: ClassVar[bool] = False
+    """Whether pressures are told finely enough that those of a working sensor always tremble."""
+    assumed_atmosphere: float = STANDARD_ATMOSPHERE
+    """[Pa] added to the reports of boards that only know gauge pressures."""
+
+    def __init__(self, chamber_count: int = 4) -> None:
+        self.chamber_count = chamber_count
+        self.rejected = 0
+        """Frames or lines that were damaged and thrown away."""
+        self.last_damaged = ""
+        """The newest of them, where the protocol has lines."""
+        self.unsettled = ""
+        """Why no pressure may be commanded yet, though the board talks; empty if it may."""
+
+    def doubt(self) -> None:  # noqa: B027 - most boards have no settings
+        """Trust no setting of the board any more, as after it has been silent."""
+
+    @abstractmethod
+    def start(self) -> bytes:
+        """Return what a board must be sent after the port has opened."""
+
+    @abstractmethod
+    def setpoint(
+        self, differential: Sequence[float], atmosphere: float, valid_for: float
+    ) -> tuple[bytes, int | None]:
+        """Encode one command.
+
+        Args:
+            differential: (M,) [Pa] within the driver's limits; positive fills the even chamber.
+            atmosphere: [Pa] absolute, to add where the wire wants absolute pressures.
+            valid_for: [s] after which a board with a watchdog vents by itself.
+
+        Returns:
+            The bytes, and the number that the board's echo will carry (None: it has no numbers).
+        """
+
+    @abstractmethod
+    def vent(self, atmosphere: float) -> tuple[bytes, int | None]:
+        """Encode the command that opens every chamber to the atmosphere."""
+
+    @abstractmethod
+    def decode(self, data: bytes) -> list[Event]:
+        """Take the next bytes of the stream and return what became complete. Never raises."""
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Forget half-received bytes, as after a reconnect."""
+
+
+class LineHost(HostProtocol):
+    """The driver's end of a protocol whose board sends text lines."""
+
+    def __init__(self, chamber_count: int = 4) -> None:
+        super().__init__(chamber_count)
+        self._lines = LineSplitter()
+
+    def decode(self, data: bytes) -> list[Event]:
+        """Return what complete lines say; damaged lines are counted in ``rejected``."""
+        events: list[Event] = []
+        for _, line in self._lines.feed(data):
+            event = self._parse(line) if line else None
+            if event is not None:
+                events.append(event)
+                continue
+            self.rejected += 1
+            self.last_damaged = line[:LONGEST_SHOWN] if line else self.last_damaged
+        return events
+
+    @abstractmethod
+    def _parse(self, line: str) -> Event | None:
+        """Return what a line says; None: it is damaged."""
+
+    def reset(self) -> None:
+        """Forget a half-received line."""
+        self._lines.reset()
 
 
 def host_protocol(name: str, chamber_count: int = 4) -> HostProtocol:
-    """Return the driver's end of one of the `PROTOCOLS`."""
-    return PROTOCOLS[name][0](chamber_count)
-
-
-def board_protocol(name: str, chamber_count: int = 4) -> BoardProtocol:
-    """Return the firmware's end of one of the `PROTOCOLS`."""
-    return PROTOCOLS[name][1](chamber_count)
+    """Return the driver's end of one of the `NAMES`; only its module is loaded."""
+    module = import_module(f"pressure_driver.protocols.{name}")
+    host: type[HostProtocol] = getattr(module, f"{name.capitalize()}Host")
+    return host(chamber_count)

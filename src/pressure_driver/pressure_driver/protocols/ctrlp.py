@@ -29,25 +29,16 @@ import re
 from collections import deque
 from collections.abc import Sequence
 
-from pressure_driver.protocols.base import (
-    BoardCommand,
-    BoardProtocol,
-    BoardReading,
-    BoardReport,
+from pressure_driver.protocols import (
     BoardReset,
     BoardText,
     Echo,
     Event,
     LineHost,
-    LineSplitter,
     Telemetry,
 )
 
 PASCAL_PER_KILOPASCAL = 1000.0
-PASCAL_PER_PSI = 6894.757
-UNITS = {0: PASCAL_PER_PSI, 1: PASCAL_PER_KILOPASCAL}
-"""[Pa] by the number of the command UNITS; a board starts with 0."""
-NAMES = {PASCAL_PER_PSI: "psi", PASCAL_PER_KILOPASCAL: "kPa"}
 LARGEST_GAUGE = 500.0
 """[kPa] More is a damaged line."""
 RAMP_TIME = 0.05
@@ -59,7 +50,6 @@ _REPORT = re.compile(r"\d{1,10}\t[012]" + _NUMBERS)
 _ECHO = re.compile(r"(?:NEW )?(?:SET|UNITS|MODE|TIME|ECHO|ON|OFF)\b")
 _UNITS_ECHO = re.compile(r"(?:NEW )?UNITS:?(?:\s+(?:1(?:\.0*)?|kPa)){1,2}\s*", re.IGNORECASE)
 _UNITS_UNKNOWN = "the board has not confirmed that it works in kPa"
-_COMMAND = re.compile(r"[A-Z]{2,12}(?:;-?\d{1,6}(?:\.\d{1,6})?)*")
 
 
 class CtrlpHost(LineHost):
@@ -98,17 +88,10 @@ class CtrlpHost(LineHost):
         atmosphere: float,  # noqa: ARG002 - the wire carries gauge pressures
         valid_for: float,  # noqa: ARG002 - the board has no watchdog
     ) -> tuple[bytes, int | None]:
-        """Encode one gauge pressure a channel in kPa, to 1 Pa.
-
-        Raises:
-            ValueError: wrong number of segments, or a value that the wire cannot carry.
-        """
-        self._check_segments(differential)
+        """Encode one gauge pressure a channel in kPa, to 1 Pa."""
         values: list[float] = []
         for difference in differential:
             size = abs(difference) / PASCAL_PER_KILOPASCAL
-            if not size <= LARGEST_GAUGE:
-                raise ValueError(f"a difference of {difference} Pa does not fit a ctrlp command")
             values += [size, 0.0] if difference >= 0.0 else [0.0, size]
         numbers = ";".join(f"{value:.3f}" for value in values)
         return f"SET;{RAMP_TIME:.3f};{numbers}\n".encode(), None
@@ -164,7 +147,7 @@ class CtrlpHost(LineHost):
         if text.startswith("NEW SET"):
             return Echo()
         if text.startswith("UNREC"):
-            return BoardReport("a command was not understood", fatal=False)
+            return BoardText("a command was not understood")
         if _UNITS_ECHO.fullmatch(text):
             self.unsettled = ""
         elif "UNITS" in text:
@@ -177,78 +160,3 @@ class CtrlpHost(LineHost):
             return BoardText(text)
         self.doubt()
         return BoardReset("it sends words, as it does while it boots")
-
-
-class CtrlpBoard(BoardProtocol):
-    """The firmware's end of ``ctrlp``."""
-
-    gauge = True
-
-    def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count)
-        self._lines = LineSplitter()
-        self._malformed = 0
-        self._reports = False
-        self._unit = PASCAL_PER_PSI
-        self._setpoint = (0.0,) * chamber_count
-
-    def boot(self, atmosphere: float) -> bytes:  # noqa: ARG002 - it measures gauge pressure
-        """Reports are off until asked for, and pressures are in psi."""
-        self._unit = PASCAL_PER_PSI
-        self._setpoint = (0.0,) * self.chamber_count
-        self._reports = False
-        return b"_pressure controller\n"
-
-    def decode(self, data: bytes) -> list[BoardCommand]:
-        """Return the commands of complete lines; the board understands small letters, too."""
-        commands = []
-        for place, line in self._lines.feed(data):
-            commands.append(self._parse(place, line.upper()))
-        self.rejected = self._malformed + self._lines.damaged
-        return commands
-
-    def _parse(self, place: int, line: str) -> BoardCommand:
-        if _COMMAND.fullmatch(line):
-            word, *arguments = line.split(";")
-            numbers = [float(argument) for argument in arguments]
-            if word in ("ON", "OFF"):
-                self._reports = word == "ON"
-                return BoardCommand("outputs", place, text=line)
-            if word == "ECHO":
-                return BoardCommand("echo", place, text=line)
-            if word == "UNITS" and numbers and numbers[0] in UNITS:
-                self._unit = UNITS[int(numbers[0])]
-                return BoardCommand("setting", place, text=line)
-            if word in ("MODE", "TIME") and numbers:
-                return BoardCommand("setting", place, text=line)
-            if word == "SET" and len(numbers) == self.chamber_count + 1:
-                pressure = tuple(value * self._unit for value in numbers[1:])
-                self._setpoint = pressure
-                return BoardCommand("setpoint", place, pressure=pressure, text=line)
-        self._malformed += 1
-        return BoardCommand("unknown", place, text=line)
-
-    def telemetry(self, reading: BoardReading) -> bytes:
-        """The lines of one report, if reports are on: setpoints and measured pressures."""
-        if not self._reports:
-            return b""
-        time = round(reading.time * 1000.0)
-        gauge = [p - reading.atmosphere for p in reading.chamber_pressure]
-        return (
-            f"{time}\t0\t{self._in_units(self._setpoint)}\r\n{time}\t1\t{self._in_units(gauge)}\r\n"
-        ).encode()
-
-    def _in_units(self, pressure: Sequence[float]) -> str:
-        return "\t".join(f"{value / self._unit:.2f}" for value in pressure)
-
-    def reply(self, command: BoardCommand, reading: BoardReading) -> bytes:  # noqa: ARG002
-        """The echo."""
-        if command.kind == "unknown":
-            return b"_UNREC: Unrecognized Command\r\n"
-        new = "NEW " if command.kind in ("setpoint", "setting") else ""
-        word, _, rest = command.text.partition(";")
-        if command.pressure is not None:
-            rest = f"{float(rest.partition(';')[0]):.2f}\t{self._in_units(command.pressure)}"
-        elif word == "UNITS":
-            rest = f"{NAMES[self._unit]}\t{NAMES[self._unit]}"
-        return f"_{new}{word}: {rest}\r\n".replace(";", "\t").encode()

@@ -22,10 +22,7 @@ import math
 import re
 from collections.abc import Sequence
 
-from pressure_driver.protocols.base import (
-    BoardCommand,
-    BoardProtocol,
-    BoardReading,
+from pressure_driver.protocols import (
     BoardReset,
     BoardText,
     Event,
@@ -42,7 +39,7 @@ _NUMBER = re.compile(r"-?\d{1,6}(?:\.\d{1,6})?|-?nan|-?inf", re.IGNORECASE)
 """A plain decimal, or what firmware prints for a sensor that is broken: the driver judges that."""
 
 
-def _numbers(text: str, separator: str | None) -> list[float] | None:
+def numbers_of(text: str, separator: str | None) -> list[float] | None:
     """Return the numbers of a list, or None if one of them is not a plain decimal."""
     parts = text.split(separator)
     if not all(_NUMBER.fullmatch(part) for part in parts):
@@ -78,16 +75,10 @@ class EzloopHost(LineHost):
         """Encode differences as pairs of absolute pressures, to 1 Pa.
 
         A pair that would pass 1250 hPa is sent lower as a pair: the board only reads differences.
-
-        Raises:
-            ValueError: wrong number of segments, or a difference that the wire cannot carry.
         """
-        self._check_segments(differential)
         values: list[float] = []
         for difference in differential:
             size = abs(difference) / PASCAL_PER_HECTOPASCAL
-            if not size < LARGEST_WIRE_VALUE / 2:
-                raise ValueError(f"a difference of {difference} Pa does not fit an ezloop command")
             low = min(atmosphere / PASCAL_PER_HECTOPASCAL, LARGEST_WIRE_VALUE - size)
             low = math.floor(low * 100.0) / 100.0
             high = low + round(size, 2)
@@ -104,7 +95,7 @@ class EzloopHost(LineHost):
             # A line with a bracket, or of digits only, is the rest of a damaged report.
             damaged = "[" in line or "]" in line or not any(c.isalpha() for c in line)
             return None if damaged else self._parse_words(line)
-        values = _numbers(rest.strip(), None)
+        values = numbers_of(rest.strip(), None)
         expected = 1 if tag == "[RPR]" else self.chamber_count
         if values is None or len(values) != expected:
             return None
@@ -129,62 +120,3 @@ class EzloopHost(LineHost):
         """Forget a half-received line, and that the board was running."""
         super().reset()
         self._reporting = False
-
-
-class EzloopBoard(BoardProtocol):
-    """The firmware's end of ``ezloop``."""
-
-    pairwise = True
-    _BUFFER = 200
-
-    def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count)
-        self._position = 0
-        self._start = 0
-        self._body: bytearray | None = None
-
-    def boot(self, atmosphere: float) -> bytes:
-        """Free text, as boards print it while they start."""
-        return (
-            f"valve board, {self.chamber_count} chambers\r\n"
-            f"room pressure {atmosphere / PASCAL_PER_HECTOPASCAL:.2f} hPa\r\nready\r\n"
-        ).encode()
-
-    def decode(self, data: bytes) -> list[BoardCommand]:
-        """Return what stands between ``<`` and ``>``, if it is a list of admissible numbers."""
-        commands: list[BoardCommand] = []
-        for byte in data:
-            if byte == ord("<"):
-                if self._body is not None:
-                    self.rejected += 1
-                self._start, self._body = self._position, bytearray()
-            elif byte == ord(">") and self._body is not None:
-                command = self._parse(self._body.decode("latin-1"))
-                if command is None:
-                    self.rejected += 1
-                else:
-                    commands.append(command)
-                self._body = None
-            elif self._body is not None:
-                self._body.append(byte)
-                if len(self._body) > self._BUFFER:
-                    self.rejected += 1
-                    self._body = None
-            self._position += 1
-        return commands
-
-    def _parse(self, body: str) -> BoardCommand | None:
-        values = _numbers(body, ",")
-        if values is None or len(values) != self.chamber_count:
-            return None
-        if not all(math.isfinite(value) and value <= LARGEST_WIRE_VALUE for value in values):
-            return None
-        pressure = tuple(value * PASCAL_PER_HECTOPASCAL for value in values)
-        return BoardCommand("setpoint", self._start, pressure=pressure)
-
-    def telemetry(self, reading: BoardReading) -> bytes:
-        """Three lines: chambers, reservoir, valves."""
-        chambers = " ".join(f"{p / PASCAL_PER_HECTOPASCAL:.2f}" for p in reading.chamber_pressure)
-        valves = " ".join(f"{v:.2f}" for v in reading.valve_opening)
-        supply = reading.supply_pressure / PASCAL_PER_HECTOPASCAL
-        return f"[MPR]: {chambers}\r\n[RPR]: {supply:.2f}\r\n[VAL]: {valves}\r\n".encode()

@@ -15,13 +15,11 @@ from enum import IntEnum
 
 from cobs import cobs
 
-from pressure_driver.protocols.base import (
-    BoardCommand,
+from pressure_driver.protocols import (
+    BoardFailure,
     BoardIdentity,
-    BoardProtocol,
-    BoardReading,
-    BoardReport,
     BoardReset,
+    BoardText,
     Echo,
     Event,
     HostProtocol,
@@ -111,36 +109,25 @@ def encode(kind: FrameType, sequence: int, body: bytes = b"") -> bytes:
 
 
 class FrameSplitter:
-    """Cuts a byte stream into sound frames of this version and of known type.
-
-    Attributes:
-        rejected: frames that were damaged or not understood.
-    """
+    """Cuts a byte stream into frames of this version and of known type."""
 
     def __init__(self) -> None:
-        self.rejected = 0
         self._pieces = StreamCutter(b"\0", LONGEST_FRAME)
 
-    def feed(self, data: bytes) -> list[tuple[int, Frame]]:
-        """Return (place of the first byte, frame) of every sound frame."""
-        frames = []
-        for place, coded in self._pieces.feed(data):
-            if coded == b"":
-                continue
-            payload = unseal(coded) if coded else None
-            frame = _read(payload) if payload and len(payload) >= HEADER.size else None
-            if frame is None:
-                self.rejected += 1
-            else:
-                frames.append((place, frame))
-        return frames
+    def feed(self, data: bytes) -> list[tuple[int, Frame | None]]:
+        """Return (place of the first byte, frame); None for one that is damaged or not known."""
+        pieces = self._pieces.feed(data)
+        return [(place, _read(coded)) for place, coded in pieces if coded != b""]
 
     def reset(self) -> None:
         """Forget a half-received frame."""
         self._pieces.reset()
 
 
-def _read(payload: bytes) -> Frame | None:
+def _read(coded: bytes | None) -> Frame | None:
+    payload = unseal(coded) if coded else None
+    if payload is None or len(payload) < HEADER.size:
+        return None
     version, kind, sequence = HEADER.unpack_from(payload)
     if version != VERSION or kind not in set(FrameType):
         return None
@@ -160,8 +147,6 @@ class NativeHost(HostProtocol):
 
     def __init__(self, chamber_count: int = 4) -> None:
         super().__init__(chamber_count)
-        if chamber_count > 32:
-            raise ValueError(f"a native frame carries at most 32 chambers, got {chamber_count}")
         self._frames = FrameSplitter()
         self._sequence = 0
         self._board_time: int | None = None
@@ -180,19 +165,9 @@ class NativeHost(HostProtocol):
         atmosphere: float,  # noqa: ARG002 - the wire carries gauge pressures
         valid_for: float,
     ) -> tuple[bytes, int | None]:
-        """Encode one gauge pressure a chamber, and how long they hold.
-
-        Raises:
-            ValueError: wrong number of segments, or a value that the frame cannot carry.
-        """
-        self._check_segments(differential)
-        milliseconds = round(valid_for * 1000.0)
-        if not 0 < milliseconds <= LONGEST_VALIDITY:
-            raise ValueError(f"a setpoint cannot stay valid for {valid_for} s")
-        body = SETPOINT_HEAD.pack(milliseconds)
+        """Encode one gauge pressure a chamber, and how long they hold."""
+        body = SETPOINT_HEAD.pack(round(valid_for * 1000.0))
         for difference in differential:
-            if not abs(difference) <= LARGEST_GAUGE:
-                raise ValueError(f"a difference of {difference} Pa does not fit a native frame")
             body += struct.pack("<ii", round(max(difference, 0.0)), round(max(-difference, 0.0)))
         sequence = self._next()
         return encode(FrameType.SETPOINT, sequence, body), sequence
@@ -206,11 +181,9 @@ class NativeHost(HostProtocol):
         """Return what complete and sound frames say."""
         events: list[Event] = []
         for _, frame in self._frames.feed(data):
-            found = self._interpret(frame)
-            if not found:
-                self._frames.rejected += 1
+            found = self._interpret(frame) if frame else []
+            self.rejected += not found
             events += found
-        self.rejected = self._frames.rejected
         return events
 
     def _interpret(self, frame: Frame) -> list[Event]:
@@ -222,7 +195,8 @@ class NativeHost(HostProtocol):
             code = FaultCode(frame.body[0])
             text = frame.body[1:].decode("ascii", "replace")
             name = code.name.lower().replace("_", "-")
-            return [BoardReport(f"{name}: {text}", fatal=code is not FaultCode.REFUSED)]
+            kind = BoardText if code is FaultCode.REFUSED else BoardFailure
+            return [kind(f"{name}: {text}")]
         return []
 
     def _identity(self, body: bytes) -> list[Event]:
@@ -232,7 +206,7 @@ class NativeHost(HostProtocol):
         text = body[HELLO_BODY.size :]
         if len(text) != length or low > high:
             return []
-        return [BoardIdentity(count, float(low), float(high), text.decode("ascii", "replace"))]
+        return [BoardIdentity(count, float(high), text.decode("ascii", "replace"))]
 
     def _status(self, body: bytes) -> list[Event]:
         count = self.chamber_count
@@ -265,94 +239,3 @@ class NativeHost(HostProtocol):
         """Forget a half-received frame, and the board's clock."""
         self._frames.reset()
         self._board_time = None
-
-
-class NativeBoard(BoardProtocol):
-    """The firmware's end of ``native``: a reference for authors of firmware."""
-
-    gauge = True
-
-    def __init__(
-        self, chamber_count: int = 4, largest_pressure: int = 30_000, firmware: str = "emulator 1"
-    ) -> None:
-        super().__init__(chamber_count)
-        self._frames = FrameSplitter()
-        self._largest = largest_pressure
-        self._firmware = firmware.encode("ascii")
-        self._sequence = 0
-
-    def decode(self, data: bytes) -> list[BoardCommand]:
-        """Return HELLO, SETPOINT and VENT; a setpoint out of range comes back as ``refused``."""
-        commands = []
-        for place, frame in self._frames.feed(data):
-            command = self._interpret(place, frame)
-            if command is None:
-                self._frames.rejected += 1
-            else:
-                commands.append(command)
-        self.rejected = self._frames.rejected
-        return commands
-
-    def _interpret(self, place: int, frame: Frame) -> BoardCommand | None:
-        number, body = frame.sequence, frame.body
-        if frame.type in (FrameType.HELLO, FrameType.VENT):
-            kind = "hello" if frame.type is FrameType.HELLO else "vent"
-            return None if body else BoardCommand(kind, place, sequence=number)
-        if frame.type is not FrameType.SETPOINT:
-            return None
-        if len(body) != SETPOINT_HEAD.size + 4 * self.chamber_count:
-            return BoardCommand("refused", place, sequence=number, text="wrong length")
-        (milliseconds,) = SETPOINT_HEAD.unpack_from(body)
-        values = struct.unpack_from(f"<{self.chamber_count}i", body, SETPOINT_HEAD.size)
-        if not 0 < milliseconds <= LONGEST_VALIDITY:
-            return BoardCommand("refused", place, sequence=number, text="valid-for out of range")
-        if min(values) < 0 or max(values) > self._largest:
-            return BoardCommand("refused", place, sequence=number, text="pressure out of range")
-        return BoardCommand(
-            "setpoint",
-            place,
-            pressure=tuple(float(value) for value in values),
-            valid_for=milliseconds / 1000.0,
-            sequence=number,
-        )
-
-    def _next(self) -> int:
-        self._sequence = (self._sequence + 1) & 0xFFFF
-        return self._sequence
-
-    def telemetry(self, reading: BoardReading) -> bytes:
-        """One STATUS frame."""
-        flags = StatusFlag.SUPPLY_KNOWN | StatusFlag.VALVES_KNOWN
-        flags |= StatusFlag.VENTED if reading.vented else 0
-        flags |= StatusFlag.EXPIRED if reading.expired else 0
-        atmosphere = round(reading.atmosphere)
-        body = STATUS_HEAD.pack(
-            round(reading.time * 1000.0) & 0xFFFFFFFF,
-            reading.last_sequence,
-            flags,
-            atmosphere,
-            round(reading.supply_pressure),
-        )
-        for pressure in reading.chamber_pressure:
-            body += struct.pack("<i", round(pressure) - atmosphere)
-        body += bytes(round(255 * min(max(v, 0.0), 1.0)) for v in reading.valve_opening)
-        return encode(FrameType.STATUS, self._next(), body)
-
-    def reply(self, command: BoardCommand, reading: BoardReading) -> bytes:
-        """IDENTITY to HELLO, FAULT to what was refused, STATUS to everything else."""
-        if command.kind == "hello":
-            body = HELLO_BODY.pack(
-                self.chamber_count, 0, self._largest, round(reading.atmosphere), len(self._firmware)
-            )
-            return encode(FrameType.IDENTITY, self._next(), body + self._firmware)
-        if command.kind == "refused":
-            return self.fault(FaultCode.REFUSED, command.text)
-        return self.telemetry(reading)
-
-    def fault(self, code: int, text: str) -> bytes:
-        """One FAULT frame."""
-        return encode(FrameType.FAULT, self._next(), bytes([code]) + text.encode("ascii"))
-
-    def expired(self) -> bytes:
-        """What the board says when it has vented since no setpoint came in time."""
-        return self.fault(FaultCode.EXPIRED, "no setpoint in time, vented")

@@ -1,41 +1,45 @@
-"""What passes between the node and the process of the port, and the node's end of it.
+"""The node's end of the process of the port: it starts it, talks with it, and vents if it dies.
 
 Messages are JSON lists that begin with a word. From the node: ``setpoint``, ``arm``, ``vent``,
 ``alive``, ``end``. To the node:
 
-=============== ==============================================================================
-``port``        the port has been opened: vent command (hexadecimal), with the port's descriptor
-``lost``        the port is gone
-``failed``      the port cannot be opened: a sentence
-``state``       the state at each tick, bytes sent, bytes received
-``diagnostics`` level, sentence, values
-``log``         sentence, whether it is a warning
-``answer``      to ``arm`` and ``vent``: whether it was done, a sentence
-``alive``       nothing else was to be said
-``ended``       after ``end``: what is left to be done about the limb; empty if it is vented
-=============== ==============================================================================
+=========== ==================================================================================
+``port``    the port has been opened: vent command (hexadecimal), with the port's descriptor
+``lost``    the port is gone
+``failed``  the port cannot be opened: the number of the error or null, its text
+``state``   the state at each tick, by names
+``log``     sentence, whether it is a warning
+``answer``  to ``arm`` and ``vent``: whether it was done, a sentence
+``alive``   nothing else was to be said
+``ended``   after ``end``: what is left to be done about the limb; empty if it is vented
+=========== ==================================================================================
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import queue
-import select
 import socket
 import subprocess
 import sys
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
-from pressure_driver import ports
-from pressure_driver.safety import Mode
-from pressure_driver.settings import Settings, to_options
+from serial.tools import list_ports
 
+from pressure_driver import lines
+from pressure_driver.lines import Channel
+from pressure_driver.settings import Settings
+
+STABLE_NAMES = Path("/dev/serial/by-id")
+"""Where the system keeps names of ports that survive re-plugging."""
 LOOK = 0.05
 """[s] that one look for a message lasts; the process says something every 0.03 s."""
 MOST_LOOKS = 20
@@ -49,81 +53,47 @@ END_TIME = 6.0
 """[s] for the process to vent, see that the board obeys, and end."""
 
 
-class Channel:
-    """One end of the socket between the node and the process of the port; it never waits to send.
-
-    Args:
-        end: of a socket pair that keeps the bounds of messages (SOCK_SEQPACKET).
-    """
-
-    def __init__(self, end: socket.socket) -> None:
-        self.socket = end
-
-    def fileno(self) -> int:
-        """Return the descriptor to wait for."""
-        return self.socket.fileno()
-
-    def send(self, *message: Any, descriptor: int | None = None) -> None:
-        """Send a message, or drop it if the other end has gone or does not read."""
-        descriptors = [] if descriptor is None else [descriptor]
-        data = [json.dumps(message).encode()]
-        with contextlib.suppress(OSError):
-            socket.send_fds(self.socket, data, descriptors, socket.MSG_DONTWAIT)
-
-    def receive(self) -> tuple[list[Any], int | None]:
-        """Return the next message and the descriptor that came along, if any.
-
-        Raises:
-            EOFError: the other end has gone.
-            BlockingIOError, TimeoutError: there is no message.
-        """
-        try:
-            data, descriptors, _, _ = socket.recv_fds(self.socket, 1 << 16, 1)
-        except ConnectionError:
-            data, descriptors = b"", []
-        if not data:
-            raise EOFError
-        return json.loads(data), descriptors[0] if descriptors else None
+class PortError(RuntimeError):
+    """The serial port cannot be used; the message names it, the cause and the remedy."""
 
 
-class Terminal:
-    """Takes the place of the node when the process is started by hand."""
+def available_ports() -> list[str]:
+    """Return the serial ports of this machine, by their stable names where there are any."""
+    by_id = sorted(map(str, STABLE_NAMES.iterdir())) if STABLE_NAMES.is_dir() else []
+    known = {os.path.realpath(path) for path in by_id}
+    others = [port.device for port in list_ports.comports() if port.device not in known]
+    links = [path for path in Path("/tmp").glob("der_limb_board_*") if path.is_symlink()]
+    return by_id + sorted(others) + sorted(map(str, links))
 
-    def __init__(self) -> None:
-        self._lines: deque[str] = deque()
-        self._shown_at = 0.0
 
-    def fileno(self) -> int:
-        """Return the descriptor to wait for."""
-        return sys.stdin.fileno()
+def stable_name(port: str) -> str:
+    """Return the by-id name of a port, which survives re-plugging, or the name itself."""
+    if STABLE_NAMES.is_dir():
+        for path in sorted(STABLE_NAMES.iterdir()):
+            if os.path.realpath(path) == os.path.realpath(port):
+                return str(path)
+    return port
 
-    def send(self, word: str, *content: Any, descriptor: int | None = None) -> None:  # noqa: ARG002
-        """Print a message; the state once a second."""
-        if word == "state" and time.monotonic() - self._shown_at >= 1.0:
-            self._shown_at = time.monotonic()
-            state = content[0]
-            measured = [round(value, 0) for value in state["measured_chamber"]]
-            commanded = state["commanded_differential"]
-            mode = Mode(state["mode"]).name
-            print(mode, "commanded", commanded, "measured", measured, flush=True)
-        elif word in ("log", "answer", "failed", "ended"):
-            print(content[1] if word == "answer" else content[0], flush=True)
 
-    def receive(self) -> tuple[list[Any], int | None]:
-        """Return the next line as a message; the end of the lines ends the process.
-
-        Raises:
-            BlockingIOError: there is no line.
-        """
-        if not self._lines:
-            if not select.select([self], [], [], 0.0)[0]:
-                raise BlockingIOError
-            text = os.read(self.fileno(), 4096).decode()
-            self._lines += text.splitlines() if text else ["end"]
-        words = self._lines.popleft().split() or ["alive"]
-        with contextlib.suppress(ValueError):
-            return ["setpoint", 0, [float(word) for word in words], "", 0, 0, "", 0, True], None
-        return words[:1], None
+def explain(port: str, error: OSError) -> str:
+    """Return a sentence with the cause and the remedy of a port that does not open."""
+    number = error.errno
+    ports = ", ".join(available_ports()) or "none"
+    if not Path(port).exists() or number == errno.ENOENT:
+        return (
+            f"no serial device {port}; ports that exist: {ports}. Plug the board in, or set the "
+            "parameter 'port'"
+        )
+    if number in lines.IN_USE:
+        return (
+            f"serial port {port} is in use by another program; find it with 'fuser -v {port}', "
+            f"close it, or set the parameter 'port' (ports that exist: {ports})"
+        )
+    if number in (errno.EISDIR, errno.ENOTTY, errno.EINVAL) or "ioctl" in str(error):
+        return f"{port} is no serial port; ports that exist: {ports}: set the parameter 'port'"
+    if number in (errno.EACCES, errno.EPERM):
+        return f"no permission to open {port}: sudo usermod -a -G dialout $USER, then log in again"
+    return f"cannot open serial port {port}: {error}; ports that exist: {ports}"
 
 
 class PortProcess:
@@ -135,15 +105,13 @@ class PortProcess:
     """
 
     def __init__(self, settings: Settings, on_message: Callable[[], None]) -> None:
-        self.states: deque[tuple[dict[str, Any], int, int]] = deque(maxlen=100)
-        """State by names, bytes sent, bytes received: of each tick, until they are taken."""
+        self.states: deque[dict[str, Any]] = deque(maxlen=100)
+        """State by names, of each tick, until they are taken."""
         self.log: deque[tuple[str, bool]] = deque(maxlen=200)
         """Sentences for the log, and whether they are warnings, until they are taken."""
-        self.diagnostics: tuple[str, str, dict[str, Any]] = ("stale", "starting", {})
-        """Level, sentence and values."""
         self.error = ""
         """Why the process had to be replaced, and whether the board was vented; empty before."""
-        self._settings = settings
+        self._settings = replace(settings, port=stable_name(settings.port))
         self._on_message = on_message
         self._answers: queue.Queue[tuple[bool, str]] = queue.Queue()
         self._vent_command = b""
@@ -160,8 +128,8 @@ class PortProcess:
         near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._process = subprocess.Popen(
             [
-                *(sys.executable, "-m", "pressure_driver.board", f"--socket={far.fileno()}"),
-                *to_options(self._settings),
+                *(sys.executable, "-m", "pressure_driver.board"),
+                *(str(far.fileno()), json.dumps(vars(self._settings))),
             ],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
@@ -177,10 +145,10 @@ class PortProcess:
             message, descriptor = self._channel.receive()
         except (EOFError, TimeoutError) as error:
             self._process.kill()
-            raise ports.PortError("the process of the port does not start") from error
+            raise PortError("the process of the port does not start") from error
         if message[0] == "failed":
             self._process.wait()
-            raise ports.PortError(message[1])
+            raise PortError(explain(self._settings.port, OSError(*message[1:])))
         self._serve(message, descriptor)
         near.settimeout(LOOK)
         self._thread.start()
@@ -202,7 +170,7 @@ class PortProcess:
             self._answers.get_nowait()  # it came too late for whoever asked
         self.send(word)
         with contextlib.suppress(queue.Empty):
-            return self._answers.get(timeout=ANSWER_TIME)
+            return self._answers.get(timeout=0.0 if self.error else ANSWER_TIME)
         return False, self.error or "the process of the port does not answer: it is replaced"
 
     def close(self) -> str:
@@ -238,10 +206,10 @@ class PortProcess:
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(LOOK)
         if self._outcome is None:
-            problem = ports.vent_port(self._descriptor, self._vent_command, ports.VENT_TIME)
-            told = f"the vent command was sent for {ports.VENT_TIME:g} s; see that it has vented"
+            problem = lines.vent_port(self._descriptor, self._vent_command, lines.VENT_TIME)
+            told = f"the vent command was sent for {lines.VENT_TIME:g} s; see that it has vented"
             self.error = f"{reason}: {problem or told}"
-        ports.release_descriptor(self._descriptor)
+        lines.release_descriptor(self._descriptor)
         self._on_message()
 
     def _serve(self, message: list[Any], descriptor: int | None) -> None:
@@ -253,13 +221,11 @@ class PortProcess:
         if word == "port":
             self._vent_command = bytes.fromhex(content[0])
         elif word == "state":
-            self.states.append((content[0], content[1], content[2]))
+            self.states.append(content[0])
         elif word == "log":
             self.log.append((content[0], content[1]))
         elif word == "answer":
             self._answers.put((content[0], content[1]))
-        elif word == "diagnostics":
-            self.diagnostics = (content[0], content[1], content[2])
         elif word == "ended":
             self._outcome = content[0]
         if word in ("state", "log"):

@@ -1,0 +1,9 @@
+#!/usr/bin/env python3
+"""Write the driver's parameter files and its README's table from their declaration."""
+
+import sys
+
+import workspace
+
+if __name__ == "__main__":
+    sys.exit(workspace.run("figures.driver_parameters"))

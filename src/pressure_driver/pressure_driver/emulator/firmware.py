@@ -1,0 +1,339 @@
+"""The boards' own ends of the protocols: for the emulator, and a reference for firmware."""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+from pressure_driver.protocols import LineSplitter
+from pressure_driver.protocols.ctrlp import PASCAL_PER_KILOPASCAL
+from pressure_driver.protocols.ezloop import (
+    LARGEST_WIRE_VALUE,
+    PASCAL_PER_HECTOPASCAL,
+    numbers_of,
+)
+from pressure_driver.protocols.native import (
+    HELLO_BODY,
+    LONGEST_VALIDITY,
+    SETPOINT_HEAD,
+    STATUS_HEAD,
+    FaultCode,
+    Frame,
+    FrameSplitter,
+    FrameType,
+    StatusFlag,
+    encode,
+)
+
+UNITS = {"psi": 6894.757, "kPa": PASCAL_PER_KILOPASCAL}
+"""[Pa] Units of a ctrlp board by the number of the command UNITS; it starts with psi."""
+_COMMAND = re.compile(r"[A-Z]{2,12}(?:;-?\d{1,6}(?:\.\d{1,6})?)*")
+
+
+@dataclass(frozen=True)
+class BoardCommand:
+    """A command as the board understood it."""
+
+    kind: str
+    """``setpoint``, ``vent``, ``hello`` or another word of the protocol."""
+    first_byte: int
+    """Place of its first byte in the stream, counted from 0."""
+    pressure: tuple[float, ...] | None = None
+    """(2M,) [Pa] as sent: absolute or gauge after the protocol's ``gauge``."""
+    valid_for: float | None = None
+    """[s] after which the board vents by itself."""
+    sequence: int | None = None
+    text: str = ""
+
+
+@dataclass(frozen=True)
+class BoardReading:
+    """What the firmware tells at one instant."""
+
+    time: float
+    """[s] since boot."""
+    chamber_pressure: tuple[float, ...]
+    """(2M,) [Pa] absolute, with the sensors' errors."""
+    atmosphere: float
+    """[Pa] that the board took for the room's when it booted."""
+    valve_opening: tuple[float, ...]
+    supply_pressure: float
+    last_sequence: int = 0
+    vented: bool = True
+    expired: bool = False
+    """The board has vented since no setpoint came in time."""
+
+
+class BoardProtocol(ABC):
+    """The firmware's end, for emulators and tests of firmware."""
+
+    gauge: ClassVar[bool] = False
+    """Whether the wire carries pressures above the atmosphere."""
+    pairwise: ClassVar[bool] = False
+    """Whether the board reads a pair of pressures as a difference."""
+
+    def __init__(self, chamber_count: int = 4) -> None:
+        self.chamber_count = chamber_count
+        self.rejected = 0
+
+    def boot(self, atmosphere: float) -> bytes:  # noqa: ARG002 - most boards say nothing
+        """Return what the board says after power-up."""
+        return b""
+
+    @abstractmethod
+    def decode(self, data: bytes) -> list[BoardCommand]:
+        """Take the next bytes from the host and return the commands that became complete."""
+
+    @abstractmethod
+    def telemetry(self, reading: BoardReading) -> bytes:
+        """Return the bytes of one telemetry report."""
+
+    def reply(self, command: BoardCommand, reading: BoardReading) -> bytes:  # noqa: ARG002
+        """Return what the board answers to a command at once."""
+        return b""
+
+    def expired(self) -> bytes:
+        """Return what the board says when it has vented since no setpoint came in time."""
+        return b""
+
+
+class EzloopBoard(BoardProtocol):
+    """The firmware's end of ``ezloop``."""
+
+    pairwise = True
+    _BUFFER = 200
+
+    def __init__(self, chamber_count: int = 4) -> None:
+        super().__init__(chamber_count)
+        self._position = 0
+        self._start = 0
+        self._body: bytearray | None = None
+
+    def boot(self, atmosphere: float) -> bytes:
+        """Free text, as boards print it while they start."""
+        return (
+            f"valve board, {self.chamber_count} chambers\r\n"
+            f"room pressure {atmosphere / PASCAL_PER_HECTOPASCAL:.2f} hPa\r\nready\r\n"
+        ).encode()
+
+    def decode(self, data: bytes) -> list[BoardCommand]:
+        """Return what stands between ``<`` and ``>``, if it is a list of admissible numbers."""
+        commands: list[BoardCommand] = []
+        for byte in data:
+            if byte == ord("<"):
+                if self._body is not None:
+                    self.rejected += 1
+                self._start, self._body = self._position, bytearray()
+            elif byte == ord(">") and self._body is not None:
+                command = self._parse(self._body.decode("latin-1"))
+                if command is None:
+                    self.rejected += 1
+                else:
+                    commands.append(command)
+                self._body = None
+            elif self._body is not None:
+                self._body.append(byte)
+                if len(self._body) > self._BUFFER:
+                    self.rejected += 1
+                    self._body = None
+            self._position += 1
+        return commands
+
+    def _parse(self, body: str) -> BoardCommand | None:
+        values = numbers_of(body, ",")
+        if values is None or len(values) != self.chamber_count:
+            return None
+        if not all(math.isfinite(value) and value <= LARGEST_WIRE_VALUE for value in values):
+            return None
+        pressure = tuple(value * PASCAL_PER_HECTOPASCAL for value in values)
+        return BoardCommand("setpoint", self._start, pressure=pressure)
+
+    def telemetry(self, reading: BoardReading) -> bytes:
+        """Three lines: chambers, reservoir, valves."""
+        chambers = " ".join(f"{p / PASCAL_PER_HECTOPASCAL:.2f}" for p in reading.chamber_pressure)
+        valves = " ".join(f"{v:.2f}" for v in reading.valve_opening)
+        supply = reading.supply_pressure / PASCAL_PER_HECTOPASCAL
+        return f"[MPR]: {chambers}\r\n[RPR]: {supply:.2f}\r\n[VAL]: {valves}\r\n".encode()
+
+
+class CtrlpBoard(BoardProtocol):
+    """The firmware's end of ``ctrlp``."""
+
+    gauge = True
+
+    def __init__(self, chamber_count: int = 4) -> None:
+        super().__init__(chamber_count)
+        self._lines = LineSplitter()
+        self._reports = False
+        self._unit = "psi"
+        self._setpoint = (0.0,) * chamber_count
+
+    def boot(self, atmosphere: float) -> bytes:  # noqa: ARG002 - it measures gauge pressure
+        """Reports are off until asked for, and pressures are in psi."""
+        self._unit = "psi"
+        self._setpoint = (0.0,) * self.chamber_count
+        self._reports = False
+        return b"_pressure controller\n"
+
+    def decode(self, data: bytes) -> list[BoardCommand]:
+        """Return the commands of complete lines; the board understands small letters, too."""
+        commands = []
+        for place, line in self._lines.feed(data):
+            if line is None:
+                self.rejected += 1
+            else:
+                commands.append(self._parse(place, line.upper()))
+        return commands
+
+    def _parse(self, place: int, line: str) -> BoardCommand:
+        if _COMMAND.fullmatch(line):
+            word, *arguments = line.split(";")
+            numbers = [float(argument) for argument in arguments]
+            if word in ("ON", "OFF"):
+                self._reports = word == "ON"
+                return BoardCommand("outputs", place, text=line)
+            if word == "ECHO":
+                return BoardCommand("echo", place, text=line)
+            if word in ("MODE", "TIME") and numbers:
+                return BoardCommand("setting", place, text=line)
+            if word == "UNITS" and numbers and numbers[0] in range(len(UNITS)):
+                self._unit = list(UNITS)[int(numbers[0])]
+                return BoardCommand("setting", place, text=line)
+            if word == "SET" and len(numbers) == self.chamber_count + 1:
+                self._setpoint = tuple(value * UNITS[self._unit] for value in numbers[1:])
+                return BoardCommand("setpoint", place, pressure=self._setpoint, text=line)
+        self.rejected += 1
+        return BoardCommand("unknown", place, text=line)
+
+    def telemetry(self, reading: BoardReading) -> bytes:
+        """The lines of one report, if reports are on: setpoints and measured pressures."""
+        if not self._reports:
+            return b""
+        time = round(reading.time * 1000.0)
+        gauge = [p - reading.atmosphere for p in reading.chamber_pressure]
+        return (
+            f"{time}\t0\t{self._in_units(self._setpoint)}\r\n{time}\t1\t{self._in_units(gauge)}\r\n"
+        ).encode()
+
+    def _in_units(self, pressure: Sequence[float]) -> str:
+        return "\t".join(f"{value / UNITS[self._unit]:.2f}" for value in pressure)
+
+    def reply(self, command: BoardCommand, reading: BoardReading) -> bytes:  # noqa: ARG002
+        """The echo."""
+        if command.kind == "unknown":
+            return b"_UNREC: Unrecognized Command\r\n"
+        new = "NEW " if command.kind in ("setpoint", "setting") else ""
+        word, _, rest = command.text.partition(";")
+        if command.pressure is not None:
+            rest = f"{float(rest.partition(';')[0]):.2f}\t{self._in_units(command.pressure)}"
+        elif word == "UNITS":
+            rest = f"{self._unit}\t{self._unit}"
+        return f"_{new}{word}: {rest}\r\n".replace(";", "\t").encode()
+
+
+class NativeBoard(BoardProtocol):
+    """The firmware's end of ``native``: a reference for authors of firmware."""
+
+    gauge = True
+
+    def __init__(
+        self, chamber_count: int = 4, largest_pressure: int = 30_000, firmware: str = "emulator 1"
+    ) -> None:
+        super().__init__(chamber_count)
+        self._frames = FrameSplitter()
+        self._largest = largest_pressure
+        self._firmware = firmware.encode("ascii")
+        self._sequence = 0
+
+    def decode(self, data: bytes) -> list[BoardCommand]:
+        """Return HELLO, SETPOINT and VENT; a setpoint out of range comes back as ``refused``."""
+        commands = []
+        for place, frame in self._frames.feed(data):
+            command = self._interpret(place, frame) if frame else None
+            if command is None:
+                self.rejected += 1
+            else:
+                commands.append(command)
+        return commands
+
+    def _interpret(self, place: int, frame: Frame) -> BoardCommand | None:
+        number, body = frame.sequence, frame.body
+        if frame.type in (FrameType.HELLO, FrameType.VENT):
+            kind = "hello" if frame.type is FrameType.HELLO else "vent"
+            return None if body else BoardCommand(kind, place, sequence=number)
+        if frame.type is not FrameType.SETPOINT:
+            return None
+        if len(body) != SETPOINT_HEAD.size + 4 * self.chamber_count:
+            return BoardCommand("refused", place, sequence=number, text="wrong length")
+        (milliseconds,) = SETPOINT_HEAD.unpack_from(body)
+        values = struct.unpack_from(f"<{self.chamber_count}i", body, SETPOINT_HEAD.size)
+        if not 0 < milliseconds <= LONGEST_VALIDITY:
+            return BoardCommand("refused", place, sequence=number, text="valid-for out of range")
+        if min(values) < 0 or max(values) > self._largest:
+            return BoardCommand("refused", place, sequence=number, text="pressure out of range")
+        return BoardCommand(
+            "setpoint",
+            place,
+            pressure=tuple(float(value) for value in values),
+            valid_for=milliseconds / 1000.0,
+            sequence=number,
+        )
+
+    def _next(self) -> int:
+        self._sequence = (self._sequence + 1) & 0xFFFF
+        return self._sequence
+
+    def telemetry(self, reading: BoardReading) -> bytes:
+        """One STATUS frame."""
+        flags = StatusFlag.SUPPLY_KNOWN | StatusFlag.VALVES_KNOWN
+        flags |= StatusFlag.VENTED if reading.vented else 0
+        flags |= StatusFlag.EXPIRED if reading.expired else 0
+        atmosphere = round(reading.atmosphere)
+        body = STATUS_HEAD.pack(
+            round(reading.time * 1000.0) & 0xFFFFFFFF,
+            reading.last_sequence,
+            flags,
+            atmosphere,
+            round(reading.supply_pressure),
+        )
+        for pressure in reading.chamber_pressure:
+            body += struct.pack("<i", round(pressure) - atmosphere)
+        body += bytes(round(255 * min(max(v, 0.0), 1.0)) for v in reading.valve_opening)
+        return encode(FrameType.STATUS, self._next(), body)
+
+    def reply(self, command: BoardCommand, reading: BoardReading) -> bytes:
+        """IDENTITY to HELLO, FAULT to what was refused, STATUS to everything else."""
+        if command.kind == "hello":
+            body = HELLO_BODY.pack(
+                self.chamber_count, 0, self._largest, round(reading.atmosphere), len(self._firmware)
+            )
+            return encode(FrameType.IDENTITY, self._next(), body + self._firmware)
+        if command.kind == "refused":
+            return self.fault(FaultCode.REFUSED, command.text)
+        return self.telemetry(reading)
+
+    def fault(self, code: int, text: str) -> bytes:
+        """One FAULT frame."""
+        return encode(FrameType.FAULT, self._next(), bytes([code]) + text.encode("ascii"))
+
+    def expired(self) -> bytes:
+        """What the board says when it has vented since no setpoint came in time."""
+        return self.fault(FaultCode.EXPIRED, "no setpoint in time, vented")
+
+
+BOARDS: dict[str, type[BoardProtocol]] = {
+    "ezloop": EzloopBoard,
+    "ctrlp": CtrlpBoard,
+    "native": NativeBoard,
+}
+"""The board's end of each protocol."""
+
+
+def board_protocol(name: str, chamber_count: int = 4) -> BoardProtocol:
+    """Return the board's end of one of the `BOARDS`."""
+    return BOARDS[name](chamber_count)
