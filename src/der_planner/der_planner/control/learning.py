@@ -278,7 +278,7 @@ class Learner:
             except (PlanningError, LimbError):
                 return None
 
-        nearer = adapted(self._of_file.limb, tip_of, tip)
+        nearer = adapted(self._of_file.model.limb, tip_of, tip)
         if nearer is None:
             return self._seen_by_model(first), ""
         self._correction = self._of_file.of(nearer)

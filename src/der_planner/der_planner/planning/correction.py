@@ -94,11 +94,6 @@ class Correction:
         return self._configuration.model
 
     @property
-    def limb(self) -> Limb:
-        """The limb whose model it is."""
-        return self.model.limb
-
-    @property
     def tip_per_pressure(self) -> float:
         """Largest movement of the tip per differential pressure of a segment at rest [m/Pa]."""
         limb = self.model.limb
