@@ -19,7 +19,7 @@ sys.path.insert(0, str(ROOT / "test" / "support"))
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
-WHOLE_GRAPH = ("test_calibration", "test_experiment", "test_feedback", "test_page_drawing")
+WHOLE_GRAPH = ("test_calibration", "test_experiment", "test_page_drawing")
 """Files of test/graph that run the whole graph, where each node is timed by the others."""
 
 
@@ -102,15 +102,5 @@ class Graph:
 def graph(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Graph]:
     """Return a `Graph` whose processes end with the test."""
     running = Graph(tmp_path, request.path)
-    yield running
-    running.close()
-
-
-@pytest.fixture(scope="module")
-def lasting_graph(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Graph]:
-    """Return a `Graph` that all tests of a module share."""
-    running = Graph(tmp_path_factory.mktemp("graph"), request.path)
     yield running
     running.close()

@@ -91,16 +91,6 @@ def test_set_up_errors_are_drawn_only_when_asked_for(model, tags):
     assert max(shifts) < 15.0
 
 
-def test_covers_hide_what_is_below(camera, tags):
-    shape = constant_curvature(tags.segment_lengths, [0.0, 0.0])
-    corners = camera.frame(shape).corners[2]
-    low, high = corners.min(axis=0) - 5, corners.max(axis=0) + 5
-    cover = [low, (high[0], low[1]), high, (low[0], high[1])]
-    image = camera.frame(shape, covers=[cover]).image
-    x, y = np.round(corners.mean(axis=0)).astype(int)
-    assert np.ptp(image[y - 10 : y + 10, x - 10 : x + 10].astype(int)) == 0
-
-
 def test_shapes_are_interpolated_and_continued(tags):
     shape = constant_curvature(tags.segment_lengths, [0.6, -0.4], points=9)
     exact = constant_curvature(tags.segment_lengths, [0.6, -0.4], points=1001)

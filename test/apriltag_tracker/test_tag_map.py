@@ -19,8 +19,6 @@ def test_default_map(tags):
     assert tags.length == pytest.approx(0.244)
     assert len(tags.limb) == 5
     assert all(tag.height == 0.030 for tag in tags.limb)
-    assert tags.limb_tag(0) is not None
-    assert tags.limb_tag(100) is None
     assert tags.world_tag(100) is not None
 
 

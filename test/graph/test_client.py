@@ -7,12 +7,15 @@ import signal
 
 import pytest
 
+from der_planner.experiment.client import GraphClient
+from der_planner.experiment.console import Progress
+from der_planner.experiment.graph_run import RunningGraph, running_graph
+from der_planner.experiment.processes import GraphError, GraphSetup, NodeError
+
 pytestmark = pytest.mark.graph
 
 
 def test_a_tracker_without_camera_is_named_with_the_cure(graph):
-    from der_planner.experiment.processes import GraphError
-
     graph.start("apriltag_tracker", "apriltag_tracker")
     graph.client.wait_for(lambda: "apriltag_tracker" in graph.client.diagnostics, 60, "its word")
     with pytest.raises(GraphError, match=r"'apriltag_tracker' was not ready.*start the camera"):
@@ -20,8 +23,6 @@ def test_a_tracker_without_camera_is_named_with_the_cure(graph):
 
 
 def test_a_driver_without_its_board_ends_with_the_port_and_the_remedy(graph):
-    from der_planner.experiment.processes import NodeError
-
     port = str(graph.folder / "no_such_board")
     driver = graph.start("pressure_driver", "pressure_driver", port=port)
     graph.client.watch([driver])
@@ -31,8 +32,6 @@ def test_a_driver_without_its_board_ends_with_the_port_and_the_remedy(graph):
 
 
 def test_a_waiting_client_notices_a_death_at_once(graph):
-    from der_planner.experiment.processes import NodeError
-
     board = graph.start("pressure_driver", "board_emulator", port_link=str(graph.folder / "board"))
     graph.client.watch([board])
     graph.client.wait_ready(["board_emulator"])
@@ -42,27 +41,22 @@ def test_a_waiting_client_notices_a_death_at_once(graph):
 
 
 def test_a_second_graph_that_begins_meanwhile_is_named(graph, monkeypatch):
-    from der_planner.experiment.client import GraphClient
-    from der_planner.experiment.console import Progress
-    from der_planner.experiment.graph_run import GraphPlayer
-    from der_planner.experiment.processes import GraphError, GraphSetup
-
     with contextlib.ExitStack() as others:
 
-        class Player(GraphPlayer):
-            def _start(self, client, specs, port):
-                for _ in range(2):
-                    name = "board_emulator"
-                    others.enter_context(GraphClient(name, domain_id=graph.domain_id))
-                client.wait_for(lambda: client.count_nodes()[name] == 2, 60.0, "both boards")
+        def start(running, specs, port, logs, remap):
+            for _ in range(2):
+                others.enter_context(GraphClient("board_emulator", domain_id=graph.domain_id))
+            graph.client.wait_for(
+                lambda: graph.client.count_nodes()["board_emulator"] == 2, 60.0, "both boards"
+            )
 
-            def _begin(self, client):
-                raise AssertionError("it was played")
-
-        monkeypatch.setenv("ROS_DOMAIN_ID", str(graph.domain_id))
-        player = Player(GraphSetup(graph.folder / "bag", {}), graph.folder, Progress())
-        with pytest.raises(GraphError, match=r"another graph is running .*'board_emulator'"):
-            player.play()
+        monkeypatch.setattr(RunningGraph, "start", start)
+        setup = GraphSetup(graph.folder / "bag", {})
+        with (
+            pytest.raises(GraphError, match=r"another graph is running .*'board_emulator'"),
+            running_graph(graph.client, setup, graph.folder, Progress()),
+        ):
+            raise AssertionError("it was recorded")
 
 
 def test_nodes_end_with_zero_on_both_signals(graph):

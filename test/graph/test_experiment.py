@@ -54,7 +54,8 @@ class Experiment:
         self.errors = ""
 
     def finish(self, timeout: float = 400.0) -> int:
-        self.output, self.errors = self._process.communicate(timeout=timeout)
+        self.output, rest = self._process.communicate(timeout=timeout)
+        self.errors += rest
         return self._process.returncode
 
     def signal(self, number: int) -> None:
@@ -109,20 +110,29 @@ def last_board_command(bag: Path) -> np.ndarray:
     return pressure[0::2] - pressure[1::2]
 
 
-def test_a_tilted_limb_carries_a_payload_with_both_models_and_is_corrected(experiment, tmp_path):
+def test_an_interrupted_experiment_with_loads_and_feedback_vents_and_goes_on(experiment, tmp_path):
     known = CalibratedRange((2e4, 2e4), (1.5, 1.5))
     dataclasses.replace(Limb.default(), calibrated=known).to_yaml(tmp_path / "level.yaml")
     words = (
-        *("--models", "der", "pcc", "--feedback", "--limb", tmp_path / "level.yaml"),
+        *("--models", "der", "--feedback", "--limb", tmp_path / "level.yaml"),
         *("--mounting", "20", "--payload", "0.02", "--amplitude", "0.3"),
     )
     run = experiment(*words)
-    assert run.finish() == 0, run.errors
+    run.wait_for_line("planned in")
+    run.wait_for_line("planned in")
+    run.signal(signal.SIGINT)
+    assert run.finish() == 130
     assert "warning: the mounting is 20°, the limb was calibrated as horizontal" in run.errors
-    assert "20°, 20 g" in run.output
+    assert "the same --out goes on" in run.errors
+    assert_vented_and_closed(run, "same_direction_der_paper_feedback_trial1")
+
+    again = experiment(*words)
+    assert again.finish() == 0, again.errors
+    assert "1 of 2 trials to play" in again.errors
+    assert (run.out / "stopped" / "same_direction_der_paper_feedback_trial1_1").exists()
+    assert "20°, 20 g" in again.output
     entries = json.loads((run.out / "results.json").read_text())["runs"]
-    methods = [(entry["model"], entry["method"]) for entry in entries]
-    assert methods == [("der", "paper"), ("der", "paper + feedback"), ("pcc", "paper")]
+    assert [entry["method"] for entry in entries] == ["paper", "paper + feedback"]
     for entry in entries:
         assert entry["mounting"] == "20°"
         np.testing.assert_allclose(entry["gravity_m_s2"], gravity_of("20"))
@@ -130,9 +140,8 @@ def test_a_tilted_limb_carries_a_payload_with_both_models_and_is_corrected(exper
         assert entry["valid_fraction"] > 0.9
         assert 0.0 < entry["mean_error_m"] <= entry["max_error_m"] < 0.1
         assert entry["checks"]["tracker_rms_m"] < 1e-3
-        assert entry["checks"]["board_lost"] == 0
         assert entry["checks"]["board_out_of_order"] == 0
-        np.testing.assert_allclose(last_board_command(run.out / entry["bag"]), 0.0, atol=1.0)
+    assert entries[0]["checks"]["board_lost"] == 0
     feedback = entries[1]["extra"]["feedback"]
     assert feedback["latency_median_s"] > 0.0
     assert max(feedback["correction_rms_pa"]) > 10.0
@@ -143,11 +152,7 @@ def test_a_tilted_limb_carries_a_payload_with_both_models_and_is_corrected(exper
     assert np.linalg.norm(played.reference.value[0] - rest) < 0.03
     for name in ("tip.png", "error.png", "pressures.png", "report/report.html"):
         assert (run.out / name).stat().st_size > 5000
-    assert run.processes() == {}
-
-    again = experiment(*words, "--no-report")
-    assert again.finish() == 0, again.errors
-    assert "0 of 3 trials to play" in again.errors
+    assert_vented_and_closed(run, "same_direction_der_paper_trial1")
 
 
 def test_a_rig_file_takes_the_place_of_the_twin_and_a_path_of_a_file_is_learned(
@@ -180,7 +185,7 @@ def test_a_rig_file_takes_the_place_of_the_twin_and_a_path_of_a_file_is_learned(
 
 
 def test_a_killed_driver_is_named_and_the_limb_vents(experiment):
-    run = experiment("--models", "der", "--period", "30")
+    run = experiment("--models", "pcc", "--period", "30")
     run.wait_for_line("planned in")
     nodes = run.processes()
     assert set(nodes) == TWIN_NODES
@@ -188,21 +193,11 @@ def test_a_killed_driver_is_named_and_the_limb_vents(experiment):
     assert run.finish() == 1
     assert "node 'pressure_driver' died (killed by SIGKILL)" in run.errors
     assert "may still be under pressure" not in run.errors
-    assert_vented_and_closed(run)
+    assert_vented_and_closed(run, "same_direction_pcc_paper_trial1")
 
 
-def test_an_interrupted_run_vents_closes_the_bag_and_can_go_on(experiment):
-    run = experiment("--models", "der", "--period", "30")
-    run.wait_for_line("planned in")
-    run.signal(signal.SIGINT)
-    assert run.finish() == 130
-    assert "the same --out goes on" in run.errors
-    assert not (run.out / "trials").exists()
-    assert_vented_and_closed(run)
-
-
-def assert_vented_and_closed(run: Experiment) -> None:
+def assert_vented_and_closed(run: Experiment, name: str) -> None:
     assert run.processes() == {}
-    bag = run.out / "bags" / "same_direction_der_paper_trial1"
+    bag = run.out / "bags" / name
     assert (bag / "metadata.yaml").exists()
     np.testing.assert_allclose(last_board_command(bag), 0.0, atol=1.0)

@@ -29,7 +29,7 @@ QUICK = {
 class Bench:
     """A driver and an emulated board in the test's graph, seen through their topics only."""
 
-    def __init__(self, graph, protocol="ezloop", **parameters):
+    def __init__(self, graph, protocol="ezloop", bounds=QUICK, **parameters):
         self.graph = graph
         self.client = graph.client
         self.link = f"/tmp/der_limb_board_test_{uuid.uuid4().hex[:8]}"
@@ -50,17 +50,16 @@ class Bench:
         )
         self.client.watch([self.board])
         self.client.wait_ready(["board_emulator"])
-        self.parameters = {"port": self.link, "protocol": protocol, **QUICK, **parameters}
+        self.parameters = {"port": self.link, "protocol": protocol, **bounds, **parameters}
         self.start_driver()
 
-    def start_driver(self, ready=True):
+    def start_driver(self):
         self.driver = self.graph.start("pressure_driver", "pressure_driver", **self.parameters)
-        if ready:
-            self.client.watch([self.board, self.driver])
-            self.client.diagnostics.pop("pressure_driver", None)
-            self.client.wait_ready(["pressure_driver"])
-            self.wait(self.publisher.get_subscription_count, "the driver's subscription")
-            self.wait(lambda: self.air, "the air")
+        self.client.diagnostics.pop("pressure_driver", None)
+        self.client.watch([self.board, self.driver])
+        self.client.wait_ready(["pressure_driver"])
+        self.wait(self.publisher.get_subscription_count, "the driver's subscription")
+        self.wait(lambda: self.air, "the air")
 
     @contextlib.contextmanager
     def other_driver(self, code):

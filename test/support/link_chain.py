@@ -24,6 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from link_chain_kernel import Air, Links, State, advance
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import eigvalsh
 
 from der_planner.identification import CalibrationLog
 
@@ -301,11 +302,10 @@ class LinkChain:
 
 def _first_frequency(links: Links) -> float:
     """Return the first natural frequency of the straight chain without loads [rad/s]."""
-    count = len(links.length)
-    mass = np.diag(links.second + links.length**2 * links.outboard)
-    for i in range(count):
-        for j in range(i):
-            mass[i, j] = mass[j, i] = links.length[j] * links.first[i]
-    turn = np.eye(count) - np.eye(count, k=-1)
-    squares = np.linalg.eigvals(np.linalg.solve(mass, turn.T @ np.diag(links.stiffness) @ turn))
-    return float(np.sqrt(np.min(squares.real)))
+    index = np.arange(len(links.length))
+    low, high = np.minimum.outer(index, index), np.maximum.outer(index, index)
+    mass = links.length[low] * links.first[high]
+    np.fill_diagonal(mass, links.second + links.length**2 * links.outboard)
+    turn = np.eye(len(index)) - np.eye(len(index), k=-1)
+    squares = eigvalsh(turn.T @ np.diag(links.stiffness) @ turn, mass)
+    return float(np.sqrt(squares[0]))

@@ -96,27 +96,6 @@ def curved_torques(heading, stuck, pressure, links):
 
 
 @njit(cache=True)
-def solve(matrix, right):
-    """Solve a symmetric positive definite system in place by Cholesky's method."""
-    count = right.shape[0]
-    for j in range(count):
-        for k in range(j):
-            for i in range(j, count):
-                matrix[i, j] -= matrix[i, k] * matrix[j, k]
-        root = np.sqrt(matrix[j, j])
-        for i in range(j, count):
-            matrix[i, j] /= root
-    for i in range(count):
-        for k in range(i):
-            right[i] -= matrix[i, k] * right[k]
-        right[i] /= matrix[i, i]
-    for i in range(count - 1, -1, -1):
-        for k in range(i + 1, count):
-            right[i] -= matrix[k, i] * right[k]
-        right[i] /= matrix[i, i]
-
-
-@njit(cache=True)
 def slide(stuck, heading, change, links, share, out):
     """Write the friction elements' stored bend after ``share`` of a change of the headings."""
     for m in range(stuck.shape[0]):
@@ -156,8 +135,7 @@ def move(state, h, push, links):
             coupled = links.length[low] * links.first[high]
             turn = middle[i] - middle[j]
             force -= coupled * np.sin(turn) * rate[j] ** 2
-            if j < i:
-                matrix[i, j] = coupled * np.cos(turn)
+            matrix[i, j] = coupled * np.cos(turn)
         right[i] = h * force
     for i in range(count):
         bent = middle[i] - (middle[i - 1] if i > 0 else 0.0) - links.rest[i]
@@ -167,7 +145,8 @@ def move(state, h, push, links):
         if i > 0:
             matrix[i - 1, i - 1] += held
             matrix[i, i - 1] -= held
-    solve(matrix, right)
+            matrix[i - 1, i] -= held
+    right = np.linalg.solve(matrix, right)
     change = h * (rate + 0.5 * right)
     slide(state.stuck, state.heading, change, links, 1.0, state.stuck)
     state.heading[:] += change

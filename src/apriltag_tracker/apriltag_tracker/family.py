@@ -136,15 +136,6 @@ class Family:
         cells[mask] = self.codes()[tag]
         return np.pad(cells, beyond, constant_values=1)
 
-    def seen_cells(self, tag: int) -> NDArray[np.uint8]:
-        """Return one tag with its rim as it is read: with a black border, in the negative or not.
-
-        Raises:
-            ValueError: no such tag in the family.
-        """
-        cells = self.printed_cells(tag)
-        return 1 - cells if self.outer_ring else cells
-
     def draw_tag(
         self, canvas: NDArray[np.uint8], tag: int, scale: int, left: int, top: int
     ) -> None:

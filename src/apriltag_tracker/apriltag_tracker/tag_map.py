@@ -98,10 +98,6 @@ class TagMap:
         """Arc length of the tip at rest [m]."""
         return sum(self.segment_lengths)
 
-    def limb_tag(self, tag: int) -> LimbTag | None:
-        """Return the limb tag with this id, or None."""
-        return next((entry for entry in self.limb if entry.id == tag), None)
-
     def world_tag(self, tag: int) -> WorldTag | None:
         """Return the world tag with this id, or None."""
         return next((entry for entry in self.world if entry.id == tag), None)

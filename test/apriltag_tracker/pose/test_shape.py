@@ -63,16 +63,6 @@ def test_derivatives_agree_with_finite_differences(tags):
         assert np.allclose(jacobian[:, :, k], (after - before) / 2e-6, atol=1e-8)
 
 
-def test_stiff_stretches_keep_their_heading(tags):
-    curve = Curve(tags.segment_lengths, 2, ((0.0, 0.004), (0.1175, 0.1265), (0.24, 0.244)))
-    parameters = np.random.default_rng(1).normal(0.0, 2.0, curve.size)
-    heading = curve.heading_basis(np.array([0.0, 0.004, 0.1175, 0.1265, 0.24, 0.244])) @ parameters
-    assert heading[0] == pytest.approx(heading[1])
-    assert heading[2] == pytest.approx(heading[3])
-    assert heading[4] == pytest.approx(heading[5])
-    assert curve.active == pytest.approx([0.1135, 0.1135])
-
-
 def test_stiff_ends_are_extrapolated_straight(tags):
     """The limb bends between its fittings only; the tag before the tip does not mislead the fit."""
     fine = np.linspace(0.0, tags.length, 2441)

@@ -180,19 +180,13 @@ class SyntheticCamera:
         self._prepared = image
         return image
 
-    def frame(
-        self,
-        shape: Shape | None,
-        velocity: Shape | None = None,
-        covers: Sequence[Sequence[tuple[float, float]]] = (),
-    ) -> RenderedPicture:
+    def frame(self, shape: Shape | None, velocity: Shape | None = None) -> RenderedPicture:
         """Render one picture, into what was prepared for it.
 
         Args:
             shape: the limb at mid-exposure; None leaves it out.
             velocity: the shape one second later at the present velocity minus the shape itself, in
                 the same arrays; blurs what moves.
-            covers: polygons (px) that hide what is below them, drawn last.
         """
         image = self.prepare() if self._prepared is None else self._prepared
         self._prepared = None
@@ -200,14 +194,7 @@ class SyntheticCamera:
         if shape is not None:
             self._draw_body(image, shape)
             result.corners.update(self._draw_limb_tags(image, shape, velocity))
-        for polygon in covers:
-            points = np.round(np.array(polygon) * 16).astype(np.int32)
-            cv2.fillPoly(image, [points], 70, cv2.LINE_AA, 4)
         return result
-
-    def still(self) -> NDArray[np.uint8]:
-        """Return what does not move, without noise."""
-        return self._background.copy()
 
     def _draw_limb_tags(
         self, image: NDArray[np.uint8], shape: Shape, velocity: Shape | None

@@ -44,7 +44,7 @@ def play_on_graph(run: TrialRun, progress: Progress) -> dict[str, Any]:
     """
     options, name = run.options, run.trial.name
     setup = GraphSetup(
-        options.out / "bags" / name,
+        _bag_folder(options.out, name),
         run.metadata,
         seed=run.trial.seed,
         run=run.trial.run - 1,
@@ -93,6 +93,17 @@ def play_on_graph(run: TrialRun, progress: Progress) -> dict[str, Any]:
         "cpu_percent": {name: round(value, 1) for name, value in graph.cpu_percent.items()},
         "twin_real_time_factor": None if math.isnan(factor) else round(factor, 3),
     }
+
+
+def _bag_folder(out: Path, name: str) -> Path:
+    """Return the folder of a run's bag; the bag of a run that was stopped goes to ``stopped/``."""
+    bag, number = out / "bags" / name, 1
+    while (kept := out / "stopped" / f"{name}_{number}").exists():
+        number += 1
+    if bag.exists():
+        kept.parent.mkdir(exist_ok=True)
+        bag.rename(kept)
+    return bag
 
 
 def _planner_parameters(run: TrialRun) -> dict[str, Any]:
