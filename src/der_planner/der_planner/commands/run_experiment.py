@@ -389,8 +389,5 @@ def _print_instruments(found: list[RunResult], kept: Kept) -> None:
     if (instruments := instrument_table(found)).rows:
         print(f"\n{instruments.text()}")
     for trial, entry in kept:
-        if "cpu_percent" in entry:
-            cpu = ", ".join(f"{name} {value:.0f}" for name, value in entry["cpu_percent"].items())
-            speed = entry["twin_real_time_factor"]
-            twin = f"the twin ran at {speed} of real time; " if speed is not None else ""
-            print(f"{trial.name}: {twin}CPU in % of one core: {cpu}")
+        if (speed := entry.get("twin_real_time_factor")) is not None:
+            print(f"{trial.name}: the twin ran at {speed} of real time")
