@@ -29,7 +29,7 @@ def prior(gravity, masses=()) -> Limb:
 
 
 def chain_log(
-    gravity, masses=(), swing=(0.0, 0.0), seed=5, amplitude=14_000.0, duration=20.0
+    gravity, masses=(), swing=(0.0, 0.0), seed=5, amplitude=14_000.0, duration=15.0
 ) -> CalibrationLog:
     pressure = np.concatenate([waves(amplitude, 2, duration), sweep(3500.0, 2, 6.0)])
     time = 0.05 * np.arange(len(pressure))
@@ -46,7 +46,7 @@ def logged(time, pressure, bend_angles, tip) -> Prepared:
 def test_a_hanging_chain_that_swings_and_carries_a_mass_is_fitted():
     gravity, masses = gravity_of("hanging"), ((0.244, 0.02),)
     chain = LinkChain(5, gravity, masses)
-    log = chain_log(gravity, masses, swing=(3.0, -5.0), duration=30.0)
+    log = chain_log(gravity, masses, swing=(3.0, -5.0), duration=25.0)
     limb, report = fit(prior(gravity, masses), log, terms=TERMS)
     assert any("begins while the limb swings" in warning for warning in report.warnings)
     assert np.degrees(report.residual).max() < 0.7
