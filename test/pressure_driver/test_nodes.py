@@ -1,9 +1,12 @@
-"""The driver and the emulated board as running nodes: runs, callers, what is refused."""
+"""The driver and the emulated board as running nodes: runs, callers, refusals, how they end."""
 
+import contextlib
 import os
 import signal
+import subprocess
 import time
 import uuid
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,54 +16,32 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
 from der_msgs.msg import PressureSetpoint, PressureState
+from der_planner.experiment.processes import find_executable
 from limb_interfaces import qos, topics
 from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
 
 pytestmark = pytest.mark.graph
 
 
-@pytest.mark.parametrize("protocol", ["ezloop", "native"])
-def test_a_run_from_arming_to_the_end_of_the_process(bench, protocol):
-    run = bench(protocol)
-    assert run.mode in (-1, PressureState.DISARMED)
+def test_a_run_from_arming_to_the_end_of_the_process(bench):
+    run = bench("native")
     run.arm()
-    wanted = run.play(24, lambda k: (200.0 * (k + 1), -100.0 * (k + 1)))
+    count = len(run.play(24, lambda k: (200.0 * (k + 1), -100.0 * (k + 1))))
     # Setpoints stop: hold, ramp down, vented.
-    run.wait_mode(PressureState.HOLDING)
-    run.wait_mode(PressureState.VENTING)
-    run.wait_mode(PressureState.ARMED)
+    for mode in (PressureState.HOLDING, PressureState.VENTING, PressureState.ARMED):
+        run.wait_mode(mode)
     run.wait(run.vented, "vented chambers")
-    assert nanoseconds(run.air[-1].header.stamp) - max(wanted) < 20_000_000_000
     state = run.states[-1]
-    counters = (
-        state.setpoints_accepted,
-        state.setpoints_late + state.setpoints_duplicate + state.setpoints_refused,
-    )
-    received = {}
-    for command in run.commands:
-        key = tuple(np.round(difference(command), -1))
-        received.setdefault(key, nanoseconds(command.header.stamp))
-    # A machine that stalls for seconds may make setpoints late; none may then be played.
-    assert sum(counters) == len(wanted)
-    in_time = [
-        received[key] - stamp
-        for stamp, u in wanted.items()
-        if (key := tuple(np.round(u, -1))) in received
-    ]
-    assert len(in_time) >= 1
-    assert min(in_time) >= 0
+    refused = state.setpoints_late + state.setpoints_duplicate + state.setpoints_refused
+    assert state.setpoints_accepted + refused == count
     assert state.bytes_sent > 1000
     assert state.bytes_received > 1000
-    if protocol == "ezloop":
-        assert np.isnan(state.round_trip)
-    else:
-        run.wait(lambda: run.states[-1].round_trip > 0.0, "the echo of a command")
-    assert np.isfinite(state.supply_pressure) == (protocol != "ctrlp")
+    assert np.isfinite(state.supply_pressure)
+    run.wait(lambda: run.states[-1].round_trip > 0.0, "the echo of a command")
     assert run.client.call("pressure_driver/vent")
     run.wait_mode(PressureState.DISARMED)
-    assert run.vented()
     ticks = [nanoseconds(s.header.stamp) for s in run.states]
-    assert all(tick % PERIOD == 0 for tick in ticks if tick)
+    assert all(tick % PERIOD == 0 for tick in ticks)
     assert ticks == sorted(ticks)
     assert run.driver.stop() == 0
     assert run.board.stop() == 0
@@ -153,6 +134,8 @@ class Hanging(PressureDriver):
         super()._on_setpoint(message, info)
         if message.plan_id == "hang":
             ctypes.PyDLL(None).usleep(900_000)  # it holds Python's lock
+        if message.plan_id == "crash":
+            raise RuntimeError("a callback failed")
 
 raise SystemExit(run_node(Hanging))
 """
@@ -188,3 +171,70 @@ def test_a_node_that_hangs_in_a_publication_delays_no_setpoint_that_has_arrived(
         assert PressureState.FAULT not in modes
         process.send_signal(signal.SIGINT)
         assert process.wait(60.0) == 0
+
+
+# ------------------------------------------------------------------------------- how nodes end
+
+
+def test_every_exit_vents(bench):
+    """Also that with a closed terminal, where SIGHUP comes and nothing can be written any more."""
+    run = bench()
+    for end in (signal.SIGTERM, signal.SIGHUP, "crash"):
+        with run.other_driver(HANGING) as process:
+            run.pressurise()
+            if end == "crash":
+                run.publisher.publish(PressureSetpoint(plan_id="crash"))
+            else:
+                process.send_signal(end)
+            if end == signal.SIGHUP:
+                process.stderr.close()
+            run.wait(lambda process=process: process.poll() is not None, "the end of the driver")
+            assert process.returncode == (end == "crash")
+            assert end != "crash" or b"a callback failed" in process.stderr.read()
+            run.wait(run.vented, "vented chambers")
+            assert np.ptp(difference(run.commands[-1])) == 0.0
+
+
+def test_a_signal_while_a_node_is_being_loaded_ends_it_without_a_word(graph):
+    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
+        node = graph.start("pressure_driver", "board_emulator", name=f"board_{number}")
+        deadline = time.monotonic() + 90.0
+
+        def caught(status=Path(f"/proc/{node.pid}/status")):
+            with contextlib.suppress(OSError):
+                masks = dict(line.split(":", 1) for line in status.read_text().splitlines())
+                return int(masks["SigCgt"], 16) & 1 << signal.SIGHUP - 1
+
+        # Python itself catches SIGINT from the start; SIGHUP only once the node's entry runs.
+        while not caught():
+            assert time.monotonic() < deadline
+            time.sleep(0.001)
+        node.signal(number)
+        while node.alive:
+            assert time.monotonic() < deadline, "it does not end"
+            time.sleep(0.01)
+        assert node.exit_code == 0, node.last_words()
+        assert "Traceback" not in node.log.read_text()
+
+
+def test_signals_that_come_again_change_nothing_and_nohup_is_respected(graph):
+    command = ["nohup", str(find_executable("pressure_driver", "board_emulator")), "--ros-args"]
+    process = subprocess.Popen(
+        [*command, "-p", f"port_link:=/tmp/der_limb_board_test_{uuid.uuid4().hex[:8]}"],
+        env={**os.environ, "ROS_DOMAIN_ID": str(graph.domain_id)},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        graph.client.wait_ready(["board_emulator"])
+        process.send_signal(signal.SIGHUP)
+        graph.client.spin(1.0)
+        assert process.poll() is None
+        while process.poll() is None:
+            process.send_signal(signal.SIGINT)
+            time.sleep(0.002)
+        assert process.returncode == 0
+    finally:
+        process.kill()
+        process.wait()

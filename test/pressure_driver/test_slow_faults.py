@@ -6,25 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pressure_driver import telemetry
 from pressure_driver.core import BoardWatch
-from pressure_driver.emulator import board as board_module
 from pressure_driver.protocols import NAMES, Echo, host_protocol
 from pressure_driver.safety import Mode
 from pressure_driver.settings import Settings
-
-
-@pytest.fixture
-def noisy(monkeypatch, simulate):
-    """Return a function that simulates a board with noisy sensors and lets it be armed."""
-
-    def start(protocol, seed, noise):
-        monkeypatch.setattr(board_module, "SENSOR_NOISE", noise)
-        monkeypatch.setattr(telemetry, "REST_SPREAD", 2_000.0)
-        monkeypatch.setattr(telemetry, "REST_DRIFT", 500.0)
-        return simulate(protocol, seed, vented_tolerance=1_500.0)
-
-    return start
 
 
 def steady(_):
@@ -72,17 +57,6 @@ def test_a_chamber_that_stays_a_little_below_its_command_is_a_leak(simulate, pro
     assert "below its command" in sim.faults[0]
 
 
-def test_a_chamber_that_falls_slowly_is_found_before_it_is_far_away(simulate):
-    sim = simulate("ctrlp")
-    rise_to_steady(sim)
-    sim.board.pneumatics.stuck[0] = True  # its valves no longer feed a small hole
-    sim.board.pneumatics.leak[0] = 0.03
-    took = stream_until_fault(sim, 60.0)
-    assert took is not None
-    assert "loses air" in sim.faults[0]
-    assert 8_000.0 - sim.gauge[0] < 3_000.0
-
-
 @pytest.mark.parametrize("protocol", NAMES)
 def test_telemetry_that_repeats_itself_is_a_fault_under_a_steady_command(simulate, protocol):
     """The readings stand still; on a board that tells them in coarse steps, its clock does, too."""
@@ -102,20 +76,11 @@ def test_telemetry_that_repeats_itself_is_a_fault_under_a_steady_command(simulat
     assert sim.vented
 
 
-def test_a_steady_command_to_a_sound_board_is_never_changed(simulate):
-    sim = simulate("ezloop")
-    rise_to_steady(sim)
-    before = len(sim.received)
-    assert stream_until_fault(sim, 60.0) is None, sim.faults
-    pairs = np.array([np.reshape(c.pressure, (-1, 2)) for c in sim.received[before:]])
-    assert np.abs(pairs[:, :, 0] - pairs[:, :, 1] - steady(0)).max() < 10.0
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("protocol", NAMES)
 @pytest.mark.parametrize(("seed", "period"), [(5, 3.0), (6, 20.0)])
-def test_no_motion_of_a_sound_limb_is_taken_for_a_leak(noisy, protocol, seed, period):
-    sim = noisy(protocol, seed, 200.0)
+def test_no_motion_of_a_sound_limb_is_taken_for_a_leak(simulate, protocol, seed, period):
+    sim = simulate(protocol, seed)
     sim.arm()
     rate = 2.0 * np.pi / period
 

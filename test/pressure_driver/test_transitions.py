@@ -162,19 +162,6 @@ def test_rest_pressures_are_the_sensors_own(simulate, seed):
     assert sim.core.monitor.rest.pressure == pytest.approx(reading, abs=8.0)
 
 
-def test_rest_pressures_are_not_taken_from_chambers_under_pressure(simulate):
-    sim = simulate()
-    # The board still holds what an earlier program told it, and does not listen yet.
-    sim.board.receive(b"<1013.00,1013.00,1113.00,1013.00>\n", sim.wall)
-    sim.board.step(3.0)
-    sim.have("deaf")
-    sim.run(3.0)
-    assert not sim.core.arm()[0]
-    sim.have()
-    sim.run_until(lambda: sim.core.arm()[0], 8.0)
-    assert sim.core.monitor.rest.mean == pytest.approx(sim.board.pneumatics.atmosphere, abs=250.0)
-
-
 @pytest.mark.parametrize("given", [False, True])
 def test_a_driver_that_finds_the_limb_under_pressure_vents_it_without_a_false_alarm(
     simulate, given

@@ -53,14 +53,13 @@ class Bench:
         self.parameters = {"port": self.link, "protocol": protocol, **bounds, **parameters}
         self.start_driver()
 
-    def start_driver(self, ready=True):
+    def start_driver(self):
         self.driver = self.graph.start("pressure_driver", "pressure_driver", **self.parameters)
-        if ready:
-            self.client.watch([self.board, self.driver])
-            self.client.diagnostics.pop("pressure_driver", None)
-            self.client.wait_ready(["pressure_driver"])
-            self.wait(self.publisher.get_subscription_count, "the driver's subscription")
-            self.wait(lambda: self.air, "the air")
+        self.client.diagnostics.pop("pressure_driver", None)
+        self.client.watch([self.board, self.driver])
+        self.client.wait_ready(["pressure_driver"])
+        self.wait(self.publisher.get_subscription_count, "the driver's subscription")
+        self.wait(lambda: self.air, "the air")
 
     @contextlib.contextmanager
     def other_driver(self, code):

@@ -170,7 +170,7 @@ class PortProcess:
             self._answers.get_nowait()  # it came too late for whoever asked
         self.send(word)
         with contextlib.suppress(queue.Empty):
-            return self._answers.get(timeout=ANSWER_TIME)
+            return self._answers.get(timeout=0.0 if self.error else ANSWER_TIME)
         return False, self.error or "the process of the port does not answer: it is replaced"
 
     def close(self) -> str:

@@ -1,7 +1,5 @@
 """Both ends of every board protocol: bytes, splits, garbage, limits, and a million random bytes."""
 
-import re
-
 import numpy as np
 import pytest
 
@@ -11,11 +9,10 @@ from pressure_driver.protocols import (
     BoardFailure,
     BoardIdentity,
     BoardText,
-    Echo,
     Telemetry,
     host_protocol,
 )
-from pressure_driver.protocols.native import FaultCode, FrameType, encode
+from pressure_driver.protocols.native import FrameType, encode
 
 ATMOSPHERE = 101_812.0
 READING = BoardReading(
@@ -133,31 +130,12 @@ def test_telemetry_arrives_as_it_was_measured(name, split):
         assert merged["valve_opening"] == pytest.approx(READING.valve_opening, abs=0.005)
 
 
-def test_echoes():
-    host, board = host_protocol("native"), board_protocol("native")
-    data, number = host.setpoint([1000.0, 0.0], ATMOSPHERE, 0.25)
-    (command,) = board.decode(data)
-    reading = BoardReading(**{**vars(READING), "last_sequence": command.sequence})
-    assert Echo(number) in host.decode(board.reply(command, reading))
-    host, board = host_protocol("ctrlp"), board_protocol("ctrlp")
-    (command,) = board.decode(host.setpoint([1000.0, 0.0], ATMOSPHERE, 0.25)[0])
-    assert host.decode(board.reply(command, READING)) == [Echo(None)]
-    (command,) = board.decode(b"JUMP;3\n")
-    assert host.decode(board.reply(command, READING)) == [BoardText("a command was not understood")]
-
-
-def test_native_identity_faults_and_refusals():
-    host, board = host_protocol("native"), NativeBoard(4, 30_000, "lab 2.1")
-    (hello,) = board.decode(host.start())
-    assert host.decode(board.reply(hello, READING)) == [BoardIdentity(4, 30_000.0, "lab 2.1")]
+def test_a_native_board_refuses_more_than_it_reaches():
+    host, board = host_protocol("native"), NativeBoard(4, 30_000)
     (command,) = board.decode(host.setpoint([31_000.0, 0.0], 0.0, 0.25)[0])
     assert command.kind == "refused"
     (report,) = host.decode(board.reply(command, READING))
-    assert isinstance(report, BoardText)
-    assert "pressure out of range" in report.text
-    (report,) = host.decode(board.fault(FaultCode.OVER_PRESSURE, "chamber 2"))
-    assert isinstance(report, BoardFailure)
-    assert report.text == "over-pressure: chamber 2"
+    assert report == BoardText("refused: pressure out of range")
 
 
 @pytest.mark.parametrize(
@@ -178,11 +156,6 @@ def test_frames_of_another_version_or_type_are_rejected():
     assert host.decode(seal(bytes([2, FrameType.STATUS, 0, 0]))) == []
     assert host.decode(seal(bytes([1, 0x44, 0, 0]))) == []
     assert host.rejected == 2
-
-
-def test_chambers_come_in_pairs():
-    with pytest.raises(ValueError, match="even"):
-        host_protocol("ezloop", 3)
 
 
 # ---------------------------------------------------------------------------------- fuzzing
@@ -224,27 +197,6 @@ def board_stream(name):
     return stream
 
 
-NUMBER = rb"-?[0-9]{1,6}(?:\.[0-9]{1,6})?"
-
-
-def reference_telemetry(name, stream):
-    """Chamber pressures in hPa or kPa by a regular expression over the whole stream."""
-    found = []
-    for raw in stream.split(b"\n"):
-        line = raw.strip()
-        if name == "ezloop":
-            match = re.fullmatch(rb"\[MPR\]:\s*(" + NUMBER + rb"(?:\s+" + NUMBER + rb"){3})", line)
-            values = [float(v) for v in match[1].split()] if match else []
-        else:
-            match = re.fullmatch(rb"[0-9]{1,10}\t1((?:\t-?[0-9]{1,4}(?:\.[0-9]{1,6})?){4})", line)
-            values = [float(v) for v in match[1].split()] if match else []
-            if not all(abs(v) <= 500.0 for v in values):
-                continue
-        if values and len(raw) <= 512:
-            found.append(values)
-    return found
-
-
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("kind", ["random", "mutated"])
 def test_a_million_bytes_into_the_hosts_decoder(name, kind):
@@ -263,10 +215,6 @@ def test_a_million_bytes_into_the_hosts_decoder(name, kind):
         }
         assert set(pressures) <= truth
         assert not [e for e in events if isinstance(e, BoardText | BoardIdentity | BoardFailure)]
-    else:
-        scale, base = (100.0, 0.0) if name == "ezloop" else (1000.0, host.assumed_atmosphere)
-        expected = [[base + v * scale for v in row] for row in reference_telemetry(name, stream)]
-        assert np.allclose(pressures, expected) if expected else not pressures
     assert host.rejected > 1000
     assert (len(pressures) > 1000) == (kind == "mutated")
     # After all that, a sound report is read at once.

@@ -147,8 +147,6 @@ class NativeHost(HostProtocol):
 
     def __init__(self, chamber_count: int = 4) -> None:
         super().__init__(chamber_count)
-        if chamber_count > 32:
-            raise ValueError(f"a native frame carries at most 32 chambers, got {chamber_count}")
         self._frames = FrameSplitter()
         self._sequence = 0
         self._board_time: int | None = None
