@@ -174,14 +174,6 @@ def test_another_limb_is_set_aside_once_and_then_learned_from_the_start(learned_
     assert mean_error(after, play(after, swapped)) < mean_error(again, tip) / 2
 
 
-def test_one_strange_run_is_forgotten(learned_twice):
-    learner, planned, _ = learned_twice
-    learner.add(planned.time, play(planned, other_limb(rest=-0.1)))
-    again = learner.next()
-    learner.add(again.time, play(again, other_limb()))
-    assert [run.accepted for run in learner.history] == [True, True, False, True]
-
-
 def test_a_worse_plan_is_left_for_the_best_with_a_smaller_step(first, learned_twice):
     learner, planned, errors = learned_twice
     best = planned.differential_pressure

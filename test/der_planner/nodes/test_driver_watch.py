@@ -3,7 +3,7 @@
 import pytest
 
 from der_msgs.msg import PressureState
-from der_planner.nodes.planner_streaming import DriverWatch
+from der_planner.nodes.planner_topics import DriverWatch
 
 DISARMED, ARMED, TRACKING = PressureState.DISARMED, PressureState.ARMED, PressureState.TRACKING
 HOLDING, VENTING, FAULT = PressureState.HOLDING, PressureState.VENTING, PressureState.FAULT

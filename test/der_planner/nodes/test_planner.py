@@ -10,7 +10,6 @@ pytestmark = pytest.mark.graph
 @pytest.fixture
 def planner(graph):
     from geometry_msgs.msg import PointStamped
-    from nav_msgs.msg import Path
     from visualization_msgs.msg import MarkerArray
 
     from der_msgs.msg import MotionCommand, PressurePlan, PressureSetpoint
@@ -32,11 +31,9 @@ def planner(graph):
             )
             node = self.client.node
             self.commands = node.create_publisher(MotionCommand, topics.COMMAND, qos.COMMANDS)
-            self.paths = node.create_publisher(Path, topics.PATH, qos.COMMANDS)
             self.process = graph.start("der_planner", "planner", **parameters)
             self.client.wait_ready(["planner"])
-            for publisher in (self.commands, self.paths):
-                self.client.wait_for(publisher.get_subscription_count, 30.0, "the planner")
+            self.client.wait_for(self.commands.get_subscription_count, 30.0, "the planner")
             self.client.wait_for(
                 lambda: self.client.node.count_publishers(topics.PRESSURE_SETPOINT), 30.0, "it"
             )
@@ -95,11 +92,9 @@ def test_a_command_becomes_a_plan_and_timed_setpoints(planner):
     np.testing.assert_array_equal(tips.ravel(), plan.tip_reference)
     names = {marker.ns for message in node.markers for marker in message.markers}
     assert names == {"planner/reference_path", "planner/predicted_path", "planner/limb"}
-    said = node.wait_state("done")
-    assert said["plan_id"] == "first"
+    assert node.wait_state("done")["plan_id"] == "first"
     (offered,) = node.client.node.get_publishers_info_by_topic("/limb/pressure_setpoint")
     assert offered.qos_profile.liveliness_lease_duration == Duration(seconds=1)
-    assert node.process.stop() == 0
 
 
 def test_start_and_stop(planner):
@@ -134,10 +129,7 @@ def test_a_bad_command_leaves_the_plan_that_plays_alone(planner):
     node.command(plan_id="whole", period=1.0)
     node.wait_plan("whole")
     assert node.wait_state("done")["plan_id"] == "whole"
-    node.process.stop()
-    log = node.process.log.read_text()
-    for words in ("plan good accepted", "plan good started", "plan whole finished after"):
-        assert words in log
+    assert node.process.stop() == 0
 
 
 def test_the_action_tells_how_it_goes_and_how_it_ended(planner):
@@ -188,9 +180,3 @@ def test_the_action_tells_how_it_goes_and_how_it_ended(planner):
     handle.cancel_goal_async()
     assert result_of(cut).result.outcome == "stopped"
     assert len(node.received("cut")) < len(node.wait_plan("cut").time)
-
-    _, old = play(plan_id="old", period=30.0)
-    node.client.wait_for(lambda: node.received("old"), 60.0, "setpoints")
-    _, new = play("same_direction", plan_id="new")
-    assert result_of(old).result.outcome == "replaced"
-    assert result_of(new).result.outcome == "finished"

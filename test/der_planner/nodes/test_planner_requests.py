@@ -15,17 +15,24 @@ from der_planner.planning import Motion, PathLimits, plan
 from der_planner.planning.plan_file import write_plan
 from limb_interfaces.stamps import NANOSECONDS
 
+LIMB = Limb.default()
+
+
+def options(limb=LIMB, **changes):
+    """Return the parameters that requests are read with."""
+    given = {
+        "payload": 0.0, "payload_at": 0.0, "learned_plans": "", "model": "der", "method": "",
+        "branch": "", "feedback": False, "limits": PathLimits(), "nearest_path": False,
+    }  # fmt: skip
+    return SimpleNamespace(limb=limb, **{**given, **changes})
+
 
 def test_a_learned_plan_is_named_in_place_of_the_motion(tmp_path):
-    limb = Limb.default()
     motion = Motion.named("asynchronous", amplitude=0.3, period=3.0, cycles=1)
-    kept = plan(limb, motion, method="projected")
+    kept = plan(LIMB, motion, method="projected")
     write_plan(kept, tmp_path / "mine.yaml")
-    options = SimpleNamespace(
-        limb=limb, payload=0.0, payload_at=0.0, learned_plans=str(tmp_path),
-        model="der", method="", branch="", feedback=False,
-    )  # fmt: skip
-    request = from_command(MotionCommand(motion="mine", method="learned"), options, 0)
+    given = options(learned_plans=str(tmp_path))
+    request = from_command(MotionCommand(motion="mine", method="learned"), given, 0)
     assert (request.method, request.motion.name) == ("learned", "asynchronous")
     assert np.array_equal(request.learned.differential_pressure, kept.differential_pressure)
     for fields, said in (
@@ -33,21 +40,17 @@ def test_a_learned_plan_is_named_in_place_of_the_motion(tmp_path):
         ({"motion": "mine", "payload": 0.02}, "another masses"),
     ):
         with pytest.raises(ValueError, match=said):
-            from_command(MotionCommand(method="learned", **fields), options, 0)
+            from_command(MotionCommand(method="learned", **fields), given, 0)
 
 
 def test_a_command_may_carry_a_path_with_a_load_of_its_own():
-    options = SimpleNamespace(
-        limb=Limb.default(), payload=0.0, payload_at=0.0, model="der", method="", branch="",
-        feedback=False, limits=PathLimits(), nearest_path=False,
-    )  # fmt: skip
     path = [Point(x=0.2, y=0.08), Point(x=0.22, y=0.05)]
     command = MotionCommand(path=path, model="pcc", payload=0.02, mounting="hanging")
-    request = from_command(command, options, 0)
-    assert request.limb == options.limb.mounted("hanging").carrying(0.02)
+    request = from_command(command, options(), 0)
+    assert request.limb == LIMB.mounted("hanging").carrying(0.02)
     assert (request.motion.name, request.model, request.motion.nearest) == ("path", "pcc", False)
     command.nearest_path = True
-    assert from_command(command, options, 0).motion.nearest
+    assert from_command(command, options(), 0).motion.nearest
     for fields, said in (
         ({"motion": "asynchronous"}, "give one of them"),
         ({"method": "learned"}, "give one of them"),
@@ -55,18 +58,16 @@ def test_a_command_may_carry_a_path_with_a_load_of_its_own():
         ({"path": [Point(x=math.nan), path[0]]}, "not finite"),
     ):
         with pytest.raises(ValueError, match=said):
-            from_command(MotionCommand(**{"path": path, **fields}), options, 0)
+            from_command(MotionCommand(**{"path": path, **fields}), options(), 0)
 
 
 def test_each_command_has_the_loads_of_its_time():
     """Those that it names, else those of the parameters."""
-    limb = Limb.default().mounted("hanging")
-    options = SimpleNamespace(
-        limb=limb, payload=0.02, payload_at=0.0, model="pcc", method="", branch="", feedback=False
-    )  # fmt: skip
+    limb = LIMB.mounted("hanging")
+    given = options(limb, payload=0.02, model="pcc")
 
     def loaded(**fields) -> Limb:
-        return from_command(MotionCommand(motion="asynchronous", **fields), options, 0).limb
+        return from_command(MotionCommand(motion="asynchronous", **fields), given, 0).limb
 
     assert loaded() == limb.carrying(0.02)
     assert loaded(payload=0.05, payload_at=0.2) == limb.carrying(0.05, 0.2)
@@ -91,8 +92,7 @@ def test_a_start_in_another_epoch_is_refused(ahead, said):
 
 
 def test_a_path_in_another_frame_is_refused():
-    options = SimpleNamespace(limb=Limb.default())
     message = Path()
     message.header.frame_id = "map"
     with pytest.raises(ValueError, match="frame 'map'"):
-        from_path(message, "path", options, 0)
+        from_path(message, "path", options(), 0)

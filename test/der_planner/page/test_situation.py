@@ -56,12 +56,6 @@ def status(name: str, message: str, level: bytes = b"\0", process: str = "") -> 
     return DiagnosticStatus(name=name, level=level, message=message, values=values)
 
 
-def test_nothing_is_known_before_anything_came(situation: Situation) -> None:
-    known = situation.snapshot()
-    assert known["driver"] is None
-    assert all(not entry["fresh"] and entry["age"] is None for entry in known["sources"].values())
-
-
 def test_data_grow_old(situation: Situation, clock: Clock) -> None:
     situation.put_driver(driver())
     assert situation.snapshot()["sources"]["driver"]["fresh"]

@@ -13,7 +13,6 @@ from der_planner.planning import (
     Motion,
     OverloadError,
     PlanningError,
-    Start,
     plan,
 )
 
@@ -33,11 +32,6 @@ def stiffer(limb, factor):
         for s in limb.segments
     )
     return dataclasses.replace(limb, segments=segments)
-
-
-def rest_tip(limb):
-    model = RodModel(limb)
-    return model.rest.q[-3:-1]
 
 
 MOUNTED = {
@@ -60,7 +54,9 @@ def test_plans_begin_and_end_at_rest_and_reach_their_reference(mounting, name, a
     assert result.largest_error < (1.2e-3 if result.details["limited_windows"] else 5e-4)
     assert result.warnings == ()
     for end in (0, -1):
-        np.testing.assert_allclose(result.tip_reference[end], rest_tip(limb), atol=1e-9)
+        np.testing.assert_allclose(
+            result.tip_reference[end], RodModel(limb).rest.q[-3:-1], atol=1e-9
+        )
     assert np.abs(result.differential_pressure[[0, -1]]).max() < 60.0
 
 
@@ -84,21 +80,6 @@ def test_every_method_knows_the_load(model, method):
     light = plan(unloaded, Motion.named("opposite_direction", 0.4, 10.0, 1), model, method)
     most = [np.abs(p.differential_pressure[:, 0]).max() for p in (result, light)]
     assert most[0] > 1.5 * most[1]
-
-
-def test_a_plan_takes_over_from_a_moving_hanging_limb():
-    limb = LIMB.mounted("hanging")
-    first = Motion.named("asynchronous", 0.5, 8.0, 1)
-    before = plan(limb, first)
-    k = 70
-    angles, rates, accelerations = before.reference.sample(before.time[k])
-    start = Start(angles, rates, accelerations, before.differential_pressure[k - 1])
-    after = plan(limb, Motion.named("same_direction", 0.4, 8.0, 1), start=start)
-    np.testing.assert_allclose(after.tip_reference[0], before.tip_reference[k], atol=1e-9)
-    step = np.abs(after.differential_pressure[0] - before.differential_pressure[k - 1])
-    assert step.max() <= limb.pneumatics.slew_limit * 0.05 + 1e-6
-    assert after.predicted_error < 3e-4
-    assert after.largest_error < 2e-3
 
 
 # What pressure cannot do ---------------------------------------------------------------------

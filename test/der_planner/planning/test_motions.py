@@ -15,7 +15,6 @@ from der_planner.planning import (
     UnreachableError,
     Workspace,
 )
-from der_planner.planning.motions import JOINT_MOTIONS
 from der_planner.planning.paths import TipPath
 
 LIMB = Limb.default()
@@ -50,35 +49,6 @@ def test_named_motions_follow_the_papers_formulas_after_the_fade(name, second):
         angles[:, 0], 0.5 * 0.7 * (1 - np.cos(2 * np.pi * time / 8)), atol=1e-7
     )
     np.testing.assert_allclose(angles[:, 1], second(time), atol=1e-7)
-
-
-def test_reference_is_the_tip_of_the_arcs():
-    for name in NAMES:
-        reference = Motion.named(name, amplitude=0.6, period=5.0).reference(SPACE)
-        tip = ArcModel(LIMB).tip(reference.bend_angles)
-        np.testing.assert_allclose(reference.tip, tip, atol=1e-12)
-
-
-@pytest.mark.parametrize("name", JOINT_MOTIONS)
-def test_motions_work_for_any_number_of_segments(name):
-    content = LIMB.segments[0]
-    for count in (1, 3, 4):
-        limb = Limb("many", (content,) * count, LIMB.pneumatics)
-        reference = Motion.named(name, amplitude=0.5, period=4.0, cycles=1).reference(
-            Workspace(RodModel(limb))
-        )
-        assert reference.bend_angles.shape == (len(reference.time), count)
-        assert np.abs(reference.bend_angles).max() == pytest.approx(0.5, rel=0.02)
-
-
-def test_a_tip_path_is_followed_in_its_own_time():
-    start = Motion.named("circle", amplitude=0.7, period=8.0, cycles=1).reference(SPACE)
-    middle = slice(60, 160)
-    time, tip = start.time[middle] + 5.0, start.tip[middle]
-    reference = Motion.from_tip_path(time, tip).reference(SPACE)
-    lead = np.argmin(np.linalg.norm(reference.tip - tip[0], axis=1))
-    followed = reference.tip[lead : lead + len(tip)]
-    assert np.linalg.norm(followed - tip, axis=1).max() < 2e-5
 
 
 def test_a_path_without_times_keeps_the_limits():
@@ -117,25 +87,21 @@ def test_csv_paths(tmp_path):
     [
         ("a,b\n1,2\n", "no column 'x'"),
         ("x,y\n0.2,0.1\n0.2,high\n", "line 3: column 'y' is not a number: 'high'"),
-        ("x,y\n0.2,0.1\n0.2\n", "line 3: column 'y' is not a number"),
         ("time,x,y\n0,0.2,0.1\n0,0.2,0.11\n", "times of a tip path must increase: point 1"),
         ("x,y\n0.2,0.1\n", "two or more points"),
         ("x,y\n0.2,0.1\nnan,0.1\n", "line 3: column 'x' is not a number: 'nan'; correct or remove"),
         ("x [inch],y\n0.2,0.1\n", r"line 1: column 'x \[inch\]' has the unit inch: use m, cm, mm"),
         ("x,y\n0.2,0.1\n0.2,0.1\n", "all points of the tip path coincide"),
         ("", "no column 'x'"),
+        (None, r"cannot read tip path .*bad\.csv"),
     ],
 )
 def test_bad_csv_is_named(tmp_path, text, message):
     file = tmp_path / "bad.csv"
-    file.write_text(text)
+    if text is not None:
+        file.write_text(text)
     with pytest.raises(PlanningError, match=message):
         Motion.from_csv(file)
-
-
-def test_missing_csv_is_named(tmp_path):
-    with pytest.raises(PlanningError, match=r"cannot read tip path .*none\.csv"):
-        Motion.from_csv(tmp_path / "none.csv")
 
 
 @pytest.mark.parametrize(
@@ -143,7 +109,6 @@ def test_missing_csv_is_named(tmp_path):
     [
         ({"name": "jump"}, "motion 'jump' is unknown: choose asynchronous"),
         ({"amplitude": -1.0}, "amplitude must be positive"),
-        ({"amplitude": math.nan}, "amplitude must be positive"),
         ({"amplitude": 45.0}, "is it in radians"),
         ({"period": 0.0}, "period must be positive"),
         ({"period": 0.1}, "the shortest is"),

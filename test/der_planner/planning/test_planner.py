@@ -6,22 +6,19 @@ import numpy as np
 import pytest
 
 from der_planner.limb import CalibratedRange, Limb
-from der_planner.model import RodModel, commands
-from der_planner.model.air import Air
+from der_planner.model import RodModel
 from der_planner.planning import (
     METHODS,
     Motion,
     PlanningError,
     Start,
     UnreachableError,
-    Workspace,
     plan,
 )
 from der_planner.planning.configuration import RodConfiguration
 from der_planner.planning.timing import resting_spline
 
 LIMB = Limb.default()
-SPACE = Workspace(RodModel(LIMB))
 CASES = ("asynchronous", "same_direction", "opposite_direction")
 EVERY = [(model, method) for model, methods in METHODS.items() for method in methods]
 
@@ -188,18 +185,19 @@ def test_all_models_get_the_same_reference():
     assert {(p.model, p.method) for p in plans} == set(EVERY)
 
 
-@pytest.mark.parametrize(("model_name", "method"), EVERY)
-def test_a_plan_takes_over_from_a_moving_limb(model_name, method):
+@pytest.mark.parametrize(
+    ("mounting", "model_name", "method"),
+    [*(("horizontal", *each) for each in EVERY), ("hanging", "der", "optimal")],
+)
+def test_a_plan_takes_over_from_a_moving_limb(mounting, model_name, method):
+    limb, k = LIMB.mounted(mounting), 70
     first = Motion.named("asynchronous", amplitude=0.5, period=8.0, cycles=1)
-    before = plan(LIMB, first, model_name, method)
-    reference = first.reference(SPACE)
-    k = 70
-    angles, rates, accelerations = reference.sample(reference.time[k])
-    start = Start(angles, rates, accelerations, before.differential_pressure[k - 1])
+    before = plan(limb, first, model_name, method)
+    start = Start(*before.reference.sample(before.time[k]), before.differential_pressure[k - 1])
     motion = Motion.named("same_direction", amplitude=0.4, period=6.0, cycles=1)
-    after = plan(LIMB, motion, model_name, method, start=start)
+    after = plan(limb, motion, model_name, method, start=start)
     joined = np.vstack([before.differential_pressure[:k], after.differential_pressure])
-    assert np.abs(np.diff(joined, axis=0)).max() <= LIMB.pneumatics.slew_limit * 0.05 + 1e-6
+    assert np.abs(np.diff(joined, axis=0)).max() <= limb.pneumatics.slew_limit * 0.05 + 1e-6
     np.testing.assert_allclose(after.tip_reference[0], before.tip_reference[k], atol=1e-9)
     assert after.largest_error < 4e-3
 
@@ -254,7 +252,6 @@ def test_pcc_uses_its_own_identified_segments():
     ("model_name", "method", "message"),
     [
         ("fem", "", "model 'fem' is unknown: choose der or pcc"),
-        ("der", "magic", "no method 'magic': choose paper, projected, optimal"),
         ("pcc", "magic", "the model 'pcc' has no method 'magic': choose paper, projected, optimal"),
     ],
 )
@@ -279,17 +276,6 @@ def test_cancelling_by_progress_ends_the_planning():
 
     with pytest.raises(StopError):
         plan(LIMB, Motion.named("asynchronous"), "der", "optimal", progress=progress)
-
-
-def test_commands_invert_hold_lag_and_delay():
-    limb = changed(LIMB, {"delay": 0.03})
-    fine = np.arange(401) * 0.025
-    wanted = np.column_stack([4e3 * (1 - np.cos(fine)), 2e3 * np.sin(0.7 * fine) ** 2])
-    command = commands.commands(Air(limb.pneumatics), fine, wanted, 0.05)
-    chambers = Air(limb.pneumatics).follow(command, 0.05, 5).differential
-    middle = (np.arange(len(command) * 5) + 0.5) * 0.01
-    exact = np.column_stack([np.interp(middle, fine, column) for column in wanted.T])
-    assert np.abs(chambers.reshape(-1, 2) - exact)[50:].max() < 60.0
 
 
 @pytest.mark.parametrize(("name", "period"), [("asynchronous", 6.0), ("opposite_direction", 3.0)])

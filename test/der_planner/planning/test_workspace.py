@@ -8,7 +8,7 @@ import pytest
 from der_planner.limb import Limb
 from der_planner.model import ArcModel, RodModel
 from der_planner.model.bending import PolylineKinematics, bend_angles, inverse_kinematics
-from der_planner.planning import Workspace, workspace
+from der_planner.planning import PlanningError, Workspace, workspace
 from der_planner.rod import Rod
 
 LIMB = Limb.default()
@@ -113,6 +113,8 @@ def test_a_path_stays_on_the_branch_it_was_given(branch):
     assert {workspace.branch_of(ARCS, q) for q in angles} == {branch}
     np.testing.assert_allclose(ARCS.tip(angles), tip, atol=1e-8)
     assert np.abs(np.diff(angles, axis=0)).max() < 0.1
+    with pytest.raises(PlanningError, match="branch 'left' is unknown"):
+        SPACE.follow(turn, tip, "left")
 
 
 def test_a_path_through_the_straight_pose_is_smooth():

@@ -268,5 +268,4 @@ def chambers_beyond(
     order = np.argsort(instants[whole], kind="stable")
     instants, values = instants[whole][order], values[whole][order]
     middle = setpoints + 0.5 * (setpoints[1] - setpoints[0])
-    beyond: Array = interpolate(middle, instants, values) - expected
-    return beyond
+    return interpolate(middle, instants, values) - expected

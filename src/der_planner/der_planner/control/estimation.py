@@ -80,7 +80,6 @@ class Estimator:
         self.newest = -math.inf
         self._measurements: dict[int, list[_Measurement]] = {}
         self._known: dict[int, Knowledge] = {}
-        self._first: int | None = None
         self._last = 0
         self._fresh: set[int] = set()
         self._moves, self._noises = self._prepare()
@@ -89,10 +88,9 @@ class Estimator:
 
     def begin(self, time: float) -> None:
         """Start a second before an instant [s], if not started; older measurements are not used."""
-        time = max(time - _WAITED_FOR, -EARLIEST)
-        if self._first is None:
-            self._first = self._last = math.floor(time / STEP)
-            self._known[self._first] = self.beginning(self._first)
+        if not self._known:
+            self._last = math.floor(max(time - _WAITED_FOR, -EARLIEST) / STEP)
+            self._known[self._last] = self.beginning(self._last)
 
     def take_over(self, other: Estimator, time: float) -> None:
         """Begin at 0 s with what the estimator of another plan of this limb knows then.
@@ -106,7 +104,7 @@ class Estimator:
         bend, rate, _ = self.nominal.at(0.0)
         mean[:inputs], mean[inputs : 2 * inputs] = told.bend_angle - bend, told.bend_rate - rate
         slow = known.slow + other.nominal.at(time)[0] - bend
-        self._first = self._last = 0
+        self._last = 0
         self._known = {0: replace(known, mean=mean, slow=slow)}
         self._measurements.clear()
         self.newest = other.newest - time
@@ -129,7 +127,7 @@ class Estimator:
             return
         self.begin(time)
         j = round(time / STEP)
-        if self._first is None or j < max(self._first, self._last - self._kept):
+        if j < self._oldest:
             return
         entry = _Measurement(time, value, self._noise(covariance))
         self._measurements.setdefault(j, []).append(entry)
@@ -156,20 +154,16 @@ class Estimator:
     def at(self, time: float) -> Knowledge:
         """Return the state at an instant [s]; after the newest measurement it is predicted."""
         self.begin(time)
-        j = round(time / STEP)
-        if self._first is None:
-            raise AssertionError("the filter has begun")
-        self._run(max(j, self._first))
-        oldest = next(iter(self._known))
-        known = self._known[min(max(j, oldest), self._last)]
-        return self._updated(max(j, oldest), known)
+        j = max(round(time / STEP), self._oldest)
+        self._run(j)
+        return self._updated(j, self._known[min(j, self._last)])
 
     def estimate(self, time: float) -> Estimate:
         """Return bend, rates, tip and what the model lacks at an instant [s]."""
         known = self.at(time)
         bend, rate, tip = self.nominal.at(time)
         change, speed, missing, gain, offset = known.parts
-        rows = self.tip_rows(bend, change)
+        rows = self.output(bend, change)[self.inputs :]
         return Estimate(
             time=time,
             bend_angle=bend + change,
@@ -209,11 +203,12 @@ class Estimator:
         move[:swing, swing + inputs : swing + 2 * inputs] = self.nominal.fine_input[k] * felt
         return move
 
-    def tip_rows(self, bend: Array, change: Array) -> Array:
-        """Return ∂tip/∂x (2, 4M + 2) where the bend deviates by (M,) from the model's [rad]."""
-        return self._output(bend, change)[self.inputs :]
-
     # The filter ----------------------------------------------------------------------------
+
+    @property
+    def _oldest(self) -> int:
+        """The first fine step that is kept; measurements before it come too late."""
+        return next(iter(self._known))
 
     def beginning(self, first: int) -> Knowledge:
         """Return the prior state at fine step ``first``, before anything was measured."""
@@ -230,12 +225,11 @@ class Estimator:
 
     def _forget(self, j: int) -> None:
         """Compute again from boundary ``j`` on."""
-        if self._first is None or j >= self._last:
-            return
-        j = max(j, next(iter(self._known)))
-        for later in range(j + 1, self._last + 1):
-            del self._known[later]
-        self._last = j
+        if self._known and j < self._last:
+            j = max(j, self._oldest)
+            for later in range(j + 1, self._last + 1):
+                del self._known[later]
+            self._last = j
 
     def _run(self, last: int) -> None:
         if last <= self._last:
@@ -324,8 +318,8 @@ class Estimator:
         )
         return history.at(-1), material.pressure_taken(history)[-1]
 
-    def _output(self, bend: Array, change: Array) -> Array:
-        """Return ∂(bend angles, tip)/∂x (M + 2, 4M + 2)."""
+    def output(self, bend: Array, change: Array) -> Array:
+        """Return ∂(bend angles, tip)/∂x (M + 2, 4M + 2) at a change (M,) of bend angles [rad]."""
         inputs = self.inputs
         rows = np.zeros((inputs + 2, 4 * inputs + 2))
         rows[:inputs, :inputs] = np.eye(inputs)
@@ -340,7 +334,7 @@ class Estimator:
         moved = self.nominal.moved_tip(bend, change) + known.mean[-2:]
         seen = np.isfinite(entry.value)
         gap = (entry.value - np.concatenate([bend + change, tip + moved]))[seen]
-        rows = self._output(bend, change)[seen]
+        rows = self.output(bend, change)[seen]
         noise = entry.covariance[np.ix_(seen, seen)]
         spread = known.covariance
         expected = rows @ spread @ rows.T + noise

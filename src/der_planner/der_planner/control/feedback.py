@@ -48,41 +48,33 @@ _GOES_ON = 0.7
 """Share of its largest swing below which something that swings begins or dies out."""
 
 
-@dataclass(frozen=True)
-class Limits:
-    """When feedback is taken back.
-
-    Attributes:
-        authority: largest correction, as a share of the limb's pressure limit.
-        ramp: time in which feedback comes in [s].
-        fade: time in which it is taken back [s].
-        blind: without a measurement for longer, the tags are lost [s].
-        kept: time after that in which the last disturbances are still made up for [s].
-        inconsistent: squared distance of measurements per coordinate, smoothed; 1 is expected.
-        patience: for which measurements may be inconsistent [s].
-        saturated: for which a correction may be at its limit [s].
-        astray: neither a correction at its limit nor an oscillation ends feedback while the tip
-            stays within this share of the limb's length from r̄: a limb that needs much, and
-            follows, is not left to a plan that may be further off.
-        swing: from one turn of a swinging correction to the next, as a share of the authority.
-        turns: so many of them within the window are an oscillation, unless it begins or dies out.
-        window: time in which the turns are counted [s].
-        late: commands that come too late; one in time makes up for half of one.
-    """
-
-    authority: float = 0.4
-    ramp: float = 1.0
-    fade: float = 1.5
-    blind: float = 0.5
-    kept: float = 1.0
-    inconsistent: float = 20.0
-    patience: float = 2.0
-    saturated: float = 3.0
-    astray: float = 0.03
-    swing: float = 0.1
-    turns: int = 6
-    window: float = 4.0
-    late: float = 4.0
+_AUTHORITY = 0.4
+"""Largest correction, as a share of the limb's pressure limit."""
+_RAMP = 1.0
+"""Time in which feedback comes in [s]."""
+_FADE = 1.5
+"""Time in which feedback is taken back [s]."""
+_BLIND = 0.5
+"""Time without a measurement after which the tags are lost [s]."""
+_KEPT = 1.0
+"""Time after that in which the last disturbances are still made up for [s]."""
+_INCONSISTENT = 20.0
+"""Squared distance of measurements per coordinate, smoothed, that is too large; 1 is expected."""
+_PATIENCE = 2.0
+"""Time for which measurements may be inconsistent [s]."""
+_SATURATED = 3.0
+"""Time for which a correction may be at its limit [s]."""
+_ASTRAY = 0.03
+"""Distance of the tip from r̄, over the limb's length, up to which neither a correction at its limit
+nor one that swings ends feedback: a limb that follows is not left to a plan that may be worse."""
+_SWING = 0.1
+"""Way from one turn of a swinging correction to the next, as a share of the authority."""
+_TURNS = 6
+"""Number of turns within the window that are an oscillation, unless it begins or dies out."""
+_WINDOW = 4.0
+"""Time in which the turns are counted [s]."""
+_LATE = 4.0
+"""Number of commands that may come too late; one in time makes up for half of one."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +96,6 @@ class Supervisor:
     """Decides on the share of the corrections that is sent; see the module.
 
     Args:
-        limits: when feedback is taken back.
         authority: largest correction [Pa].
         length: of the limb [m].
 
@@ -114,8 +105,8 @@ class Supervisor:
         warnings: all that were given.
     """
 
-    def __init__(self, limits: Limits, authority: float, length: float = 1.0) -> None:
-        self.limits, self.authority, self.length = limits, authority, length
+    def __init__(self, authority: float, length: float) -> None:
+        self.authority, self.length = authority, length
         self.share = 0.0
         self.reason = ""
         self.warnings: list[Warned] = []
@@ -123,13 +114,7 @@ class Supervisor:
         self._since: dict[str, float] = {}
         self._late = 0.0
         self._astray_at = -math.inf
-        self._recent: deque[tuple[Array, float]] = deque(
-            maxlen=round(limits.window / CONTROL_PERIOD)
-        )
-
-    def take_over(self, other: Supervisor) -> None:
-        """Go on with the share of another plan's feedback; what ended it does not count here."""
-        self.share = other.share
+        self._recent: deque[tuple[Array, float]] = deque(maxlen=round(_WINDOW / CONTROL_PERIOD))
 
     def advance(self, time: float, age: float, strange: float) -> float:
         """Return the share of a command's correction.
@@ -139,18 +124,17 @@ class Supervisor:
             age: of the newest measurement then [s].
             strange: squared distance of measurements per coordinate, smoothed.
         """
-        limits = self.limits
-        if self._lasts("strange", strange > limits.inconsistent, time) > limits.patience:
+        if self._lasts("strange", strange > _INCONSISTENT, time) > _PATIENCE:
             self.stop(time, "inconsistent", strange)
-        seen = age <= limits.blind
+        seen = age <= _BLIND
         if not seen and not self._latched and self.share > 0.0:
             self._warn(time, "tags lost", age)
         if seen and self.reason == "tags lost":
             self.reason = ""
-        if self._latched or age > limits.blind + limits.kept:
-            self.share = max(0.0, self.share - CONTROL_PERIOD / limits.fade)
+        if self._latched or age > _BLIND + _KEPT:
+            self.share = max(0.0, self.share - CONTROL_PERIOD / _FADE)
         elif seen:
-            self.share = min(1.0, self.share + CONTROL_PERIOD / limits.ramp)
+            self.share = min(1.0, self.share + CONTROL_PERIOD / _RAMP)
         return self.share
 
     def sent(self, time: float, correction: Array, swing: float, missed: float = math.inf) -> None:
@@ -162,17 +146,16 @@ class Supervisor:
             swing: rate at which the limb deviates from the model's motion then [rad/s].
             missed: distance of the tip from r̄ then [m]; if nobody tells, it is far.
         """
-        limits = self.limits
-        astray = missed > limits.astray * self.length
+        astray = missed > _ASTRAY * self.length
         if astray:
             self._astray_at = time
         limited = np.abs(correction).max() > 0.98 * self.authority * self.share
         in_vain = bool(self.share > 0.0 and limited and astray)
-        if self._lasts("in vain", in_vain, time) > limits.saturated:
+        if self._lasts("in vain", in_vain, time) > _SATURATED:
             self.stop(time, "saturation", self.authority)
         self._recent.append((correction, swing))
         distance = self._oscillation()
-        if distance > 0.0 and time - self._astray_at <= limits.window:
+        if distance > 0.0 and time - self._astray_at <= _WINDOW:
             self.stop(time, "oscillation", distance)
 
     def _lasts(self, what: str, now: bool, time: float) -> float:
@@ -188,11 +171,10 @@ class Supervisor:
         After a push they swing more than before, and later less. A correction that is cut at its
         limit swings as far as before while the limb's swing dies out.
         """
-        limits = self.limits
         if len(self._recent) < (self._recent.maxlen or 0):
             return 0.0
         corrections, swings = (np.array(each) for each in zip(*self._recent, strict=True))
-        third, least = len(swings) // 3, limits.swing * self.authority
+        third, least = len(swings) // 3, _SWING * self.authority
         if min(swings[:third].max(), swings[-third:].max()) < _GOES_ON * swings.max():
             return 0.0
         for series in corrections.T:
@@ -200,14 +182,14 @@ class Supervisor:
             away = series - (series.max() + series.min()) / 2
             sides = np.sign(away[np.abs(away) > least / 2])
             goes_on = min(np.ptp(series[:third]), np.ptp(series[-third:])) >= _GOES_ON * distance
-            if goes_on and np.count_nonzero(np.diff(sides)) >= limits.turns:
+            if goes_on and np.count_nonzero(np.diff(sides)) >= _TURNS:
                 return distance
         return 0.0
 
     def late(self, time: float, by: float) -> None:
         """Note that a command came after its instant [s], and by how much [s]."""
         self._late += 1.0
-        if self._late >= self.limits.late:
+        if self._late >= _LATE:
             self.stop(time, "late", by)
 
     def in_time(self) -> None:
@@ -233,23 +215,22 @@ class Feedback:
 
     Args:
         plan: what is played; its limb, reference and commands are used.
-        limits: when feedback is taken back, and how much it may add.
 
     Attributes:
         plan: as given.
     """
 
-    def __init__(self, plan: Plan, limits: Limits | None = None) -> None:
+    def __init__(self, plan: Plan) -> None:
         self.plan = plan
-        self._nominal = Nominal(plan)
-        limits = limits or Limits()
-        authority = limits.authority * plan.limb.pneumatics.pressure_limit
+        authority = _AUTHORITY * plan.limb.pneumatics.pressure_limit
         length = sum(segment.length for segment in plan.limb.segments)
-        self._supervisor = Supervisor(limits, authority, length)
-        self._chambers = ChamberLog(self._nominal)
-        self._estimator = Estimator(self._nominal, self._chambers)
-        self._horizon = Horizon(self._nominal, self._chambers, authority)
-        self._horizon.warm_up(self._estimator.beginning(0))
+        self._supervisor = Supervisor(authority, length)
+        with _THREADS.limit(limits=1, user_api="blas"):
+            self._nominal = Nominal(plan)
+            self._chambers = ChamberLog(self._nominal)
+            self._estimator = Estimator(self._nominal, self._chambers)
+            self._horizon = Horizon(self._nominal, self._chambers, authority)
+            self._horizon.warm_up(self._estimator.beginning(0))
 
     @property
     def reason(self) -> str:
@@ -284,7 +265,8 @@ class Feedback:
         self._chambers.take_over(other._chambers, round(time / CONTROL_PERIOD))
         with _THREADS.limit(limits=1, user_api="blas"):
             self._estimator.take_over(other._estimator, time)
-        self._supervisor.take_over(other._supervisor)
+        # What ended the other's feedback does not count here.
+        self._supervisor.share = other.share
 
     def pressures(self, time: float, differential: ArrayLike) -> None:
         """Take in the chambers' differential pressures (M,) [Pa], as measured at an instant [s].

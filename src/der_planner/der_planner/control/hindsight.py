@@ -136,7 +136,7 @@ def _backward(estimator: Estimator, last: int) -> Smoothed:
     inputs = estimator.inputs
     change, speed, missing, gains, offset = np.split(means, np.arange(1, 5) * inputs, axis=1)
     bend, rate, tip = nominal.at(time)
-    outputs = [estimator.tip_rows(b, c) for b, c in zip(bend, change, strict=True)]
+    outputs = [estimator.output(b, c)[inputs:] for b, c in zip(bend, change, strict=True)]
     squares = [(square, count) for when, square, count in estimator.innovations if when >= 0]
     return Smoothed(
         time=time,

@@ -141,8 +141,7 @@ class Horizon:
         wanted = here.correction + change
         if np.abs(self._kept(here.first, wanted) - wanted).max() < _ROUNDING:
             return change
-        within: Array = self._hats @ self._limited(hessian, gradient, here).reshape(-1, inputs)
-        return within
+        return self._hats @ self._limited(hessian, gradient, here).reshape(-1, inputs)
 
     def _limited(self, hessian: Array, gradient: Array, here: _Rolled) -> Array:
         """Return the change (knots·M,) of the knots [Pa] that is best within all limits."""
@@ -216,8 +215,7 @@ class Horizon:
         commands, _ = within_limits(
             wanted, self._air, CONTROL_PERIOD, self._chambers.sent(first - 1)
         )
-        kept: Array = commands - planned
-        return kept
+        return commands - planned
 
     def _begin(self, first: int, last: Array) -> Array:
         """Return the last solution, moved to begin now, (W, M) [Pa]."""

@@ -182,23 +182,27 @@ class Learner:
         Raises:
             PlanningError: the optimiser found no plan.
         """
-        if self._best is None:
+        best = self._best
+        if best is None:
             return self._plan
-        self._plan = self._next(self._best)
+        known = self._runs.known(best)
+        if self._fresh and not self.stopped:
+            self._fresh = False
+            target = known.value - (1.0 - self._step) * self._runs.error(best)
+            following = self._correction.plan(best.commands, target, self._pull)
+            # What is expected is the disturbance itself, whatever share of the error is to go.
+            tip = following.tip_predicted - target + known.value
+            self._plan = dataclasses.replace(following, tip_predicted=tip)
+        elif not np.array_equal(best.commands, self._plan.differential_pressure):
+            self._plan = dataclasses.replace(
+                self._plan,
+                differential_pressure=best.commands,
+                tip_predicted=best.expected.tip + known.value,
+                method=LEARNED,
+            )
         if self._beyond is not None:
             self._plan = dataclasses.replace(self._plan, chambers_beyond=self._beyond)
         return self._plan
-
-    def _next(self, best: PlayedRun) -> Plan:
-        if self.stopped or not self._fresh:
-            return self._as_plan(best)
-        self._fresh = False
-        known, error = self._runs.known(best), self._runs.error(best)
-        target = known.value - (1.0 - self._step) * error
-        following = self._correction.plan(best.commands, target, self._pull)
-        # What is expected is the disturbance itself, whatever share of the error was asked to go.
-        tip = following.tip_predicted - target + known.value
-        return dataclasses.replace(following, tip_predicted=tip)
 
     # One run ---------------------------------------------------------------------------------
 
@@ -334,17 +338,6 @@ class Learner:
                     "limits, reach or what does not repeat"
                 )
         return ""
-
-    def _as_plan(self, run: PlayedRun) -> Plan:
-        """Return the plan of a run's commands, with the tip that all runs let expect."""
-        if np.array_equal(run.commands, self._plan.differential_pressure):
-            return self._plan
-        return dataclasses.replace(
-            self._plan,
-            differential_pressure=run.commands,
-            tip_predicted=run.expected.tip + self._runs.known(run).value,
-            method=LEARNED,
-        )
 
 
 def _refusal(seen: float, astray: str) -> str:

@@ -72,8 +72,7 @@ class Sensors:
     def covariance(self, segments: int) -> Array:
         """Return the stated covariance of bend angles and tip (M + 2, M + 2)."""
         deviation = np.repeat([self.bend_noise, self.tip_noise], [segments, 2])
-        covariance: Array = np.diag(np.maximum(deviation, _SMALLEST) ** 2)
-        return covariance
+        return np.diag(np.maximum(deviation, _SMALLEST) ** 2)
 
 
 @dataclass(frozen=True)

@@ -141,13 +141,11 @@ class Nominal:
 
     def periods(self, k: int | Whole) -> Whole:
         """Return control periods cut to those with tables."""
-        cut: Whole = np.clip(k, 0, self.count - 1)
-        return cut
+        return np.clip(k, 0, self.count - 1)
 
     def steps(self, j: int | Whole) -> Whole:
         """Return fine steps cut to those with tables."""
-        cut: Whole = np.clip(j, 0, self.count * STEPS - 1)
-        return cut
+        return np.clip(j, 0, self.count * STEPS - 1)
 
     def command(self, k: int) -> Array:
         """Return the plan's command (M,) of a control period [Pa]."""
@@ -156,13 +154,11 @@ class Nominal:
     def chambers_beyond(self, time: Array) -> Array:
         """Return what the chambers are known to hold beyond their model (n, M) at instants [s]."""
         middle = (np.arange(len(self._beyond)) + 0.5) * CONTROL_PERIOD
-        beyond: Array = interpolate(time, middle, self._beyond)
-        return beyond
+        return interpolate(time, middle, self._beyond)
 
     def moved_tip(self, bend: Array, change: Array) -> Array:
         """Return by how much the tip moves (…, 2) [m] if bend angles (…, M) change [rad]."""
-        moved: Array = self.kinematics.tip(bend + change) - self.kinematics.tip(bend)
-        return moved
+        return self.kinematics.tip(bend + change) - self.kinematics.tip(bend)
 
     def _known_disturbance(self, plan: Plan, model_tip: Array) -> Array:
         """Return what a learned plan expects beyond the model (K', 2) [m]; the last of it stays."""
@@ -180,8 +176,7 @@ class Nominal:
         square = np.einsum("kai,kaj->kij", jacobian, jacobian)
         square += _SEGMENTS_KNOWN**2 * np.eye(bend.shape[1])
         load = np.einsum("kai,ka->ki", jacobian, moved)
-        change: Array = np.linalg.solve(square, load[..., None])[..., 0]
-        return change
+        return np.linalg.solve(square, load[..., None])[..., 0]
 
     def _linearise(self, time: Array) -> None:
         balance, q = self.model.balance.projected, self._bend_spline(time)
@@ -356,8 +351,7 @@ class ChamberLog:
         gap, growth = self._gap
         ahead = (time - self._times[-1])[:, None]
         grown = _GROWTH_TIME * (1.0 - np.exp(-ahead / _GROWTH_TIME))
-        expected: Array = np.exp(-ahead / _GAP_TIME) * gap + grown * growth
-        return expected
+        return np.exp(-ahead / _GAP_TIME) * gap + grown * growth
 
     def _last_gap(self) -> tuple[Array, Array]:
         """Return the last reading less the model (M,) [Pa], and how fast that grows [Pa/s]."""

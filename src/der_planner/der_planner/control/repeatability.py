@@ -164,8 +164,7 @@ class Runs:
 
     def error(self, run: PlayedRun) -> Array:
         """Return what all runs say that the commands of one leave: tip less r̄ (K, 2) [m]."""
-        error: Array = run.expected.tip + self.known(run).value - self._reference
-        return error
+        return run.expected.tip + self.known(run).value - self._reference
 
     def level(self, run: PlayedRun) -> float:
         """Return the mean distance from r̄ that all runs say the commands of one leave [m]."""

@@ -12,9 +12,7 @@ from typing import Any
 import numpy as np
 import rclpy
 from geometry_msgs.msg import Point
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from std_msgs.msg import Header
 
 from der_msgs.msg import ChamberPressures, LimbPush, LimbShape, LimbState
@@ -48,7 +46,6 @@ class LimbTwinNode(Node):
             at_least=0.0, at_most=2.0, read_only=False,
         )  # fmt: skip
         check_overrides(self)
-        self._twin.gain = float(self.get_parameter("gain").value)
         self._lock = threading.Lock()
         self._pressures: np.ndarray | None = None
         self._received_at = math.nan
@@ -60,7 +57,6 @@ class LimbTwinNode(Node):
             ChamberPressures, topics.TWIN_CHAMBER_PRESSURES, self._on_pressures, qos.STATES
         )
         self.create_subscription(LimbPush, topics.TWIN_PUSH, self._on_push, qos.COMMANDS)
-        self.add_on_set_parameters_callback(self._on_parameters)
         self._loop = RealTimeLoop(self._advance, self._publish, 1.0 / rate)
         self._diagnostics = DiagnosticsPublisher(self, self._report)
         self._stop = threading.Event()
@@ -134,14 +130,6 @@ class LimbTwinNode(Node):
         except TwinError as error:
             self.get_logger().error(f"{topics.TWIN_PUSH} was not taken: {error}")
 
-    def _on_parameters(self, changed: list[Parameter]) -> SetParametersResult:
-        """Take a gain from the next step on; rclpy has checked its range."""
-        for parameter in changed:
-            if parameter.name == "gain":
-                with self._lock:
-                    self._twin.gain = float(parameter.value)
-        return SetParametersResult(successful=True)
-
     def _work(self) -> None:
         try:
             while not self._stop.is_set():
@@ -154,6 +142,7 @@ class LimbTwinNode(Node):
 
     def _advance(self, duration: float) -> None:
         with self._lock:
+            self._twin.gain = float(self.get_parameter("gain").value)
             pressures = self._pressures
             if pressures is None:
                 pressures = np.full(2 * self._twin.segment_count, self._twin.atmosphere)

@@ -7,7 +7,7 @@ import queue
 import sys
 import threading
 import time as clock
-from typing import Any, NamedTuple
+from typing import Any
 
 from nav_msgs.msg import Path as PathMessage
 from rclpy.node import Node
@@ -25,7 +25,7 @@ from der_planner.nodes.planner_requests import (
     new_plan_id,
     read_parameters,
 )
-from der_planner.nodes.planner_streaming import DriverWatch, PlannerPublishers
+from der_planner.nodes.planner_topics import DriverWatch, PlannerPublishers, Status
 from der_planner.planning import METHODS, Motion, Plan, plan
 from der_planner.planning.streaming import MARGIN, Schedule, Streamer, first_stamp
 from limb_interfaces import qos, topics
@@ -44,26 +44,6 @@ class Cancelled(Exception):  # noqa: N818 - not an error
     """A newer command or `stop` made this plan useless."""
 
 
-class Status(NamedTuple):
-    """The node's state, the plan that it is about, and why.
-
-    States: starting, idle, planning, streaming, done, refused, error, and the outcomes of a plan
-    that the driver ended (vented, fault, lost).
-    """
-
-    state: str = "starting"
-    plan_id: str = ""
-    reason: str = ""
-
-
-_LEVELS = {
-    "starting": "stale",
-    **dict.fromkeys(("error", "failed", "fault", "lost"), "error"),
-    **dict.fromkeys(("refused", "vented"), "warning"),
-}
-"""Levels of the diagnostics in states that say it all."""
-
-
 class PlannerNode(Node):
     """Plans in a thread of its own, streams from another, answers from the executor's."""
 
@@ -71,7 +51,6 @@ class PlannerNode(Node):
         super().__init__("planner", namespace=topics.NAMESPACE)
         self._options = read_parameters(self)
         check_overrides(self)
-        self._lock = threading.Lock()
         self._status = Status()
         self._progress = 0.0  # share of the planning or of the playing that is done
         self._last_refusal = ""
@@ -157,9 +136,7 @@ class PlannerNode(Node):
 
     def _on_start(self, _: Any, response: Any) -> Any:
         """Play the newest plan, again if it was played before."""
-        with self._lock:
-            newest = self._newest
-        position = self._streamer.position
+        newest, position = self._newest, self._streamer.position
         obstacle = self._driver.obstacle()
         if newest is None:
             response.message = "no plan yet: ask for a motion first"
@@ -182,8 +159,7 @@ class PlannerNode(Node):
 
     def _on_stop(self, _: Any, response: Any) -> Any:
         """Cancel planning and streaming; the driver holds, then vents."""
-        planning, playing = self._end_all("stopped", "it was asked to stop")
-        self._status = Status("idle", self._status.plan_id, "stopped as asked")
+        planning, playing = self._end_all("stopped", "stopped as asked")
         ended = ["cancelled the plan in the making"] * planning + ["stopped streaming"] * playing
         response.success = True
         response.message = " and ".join(ended) or "nothing was running"
@@ -194,21 +170,18 @@ class PlannerNode(Node):
         with self._streamer.lock:
             if self._is_busy(plan_id):
                 self._end_all("stopped", "the action was cancelled")
-                self._status = Status("idle", plan_id, "stopped by a cancelled action")
 
     # Planning ------------------------------------------------------------------------------
 
     def _accept(self, request: Request) -> None:
-        with self._lock:
+        with self._streamer.lock:
             replaced, self._request = self._request, request
         self._last_refusal = ""
         if replaced is not None:
             replaced.cancelled.set()
             self._action.end(replaced.plan_id, "replaced", f"by plan {request.plan_id}")
-        self.get_logger().info(
-            f"plan {request.plan_id} accepted: {request.motion.name}, {request.model} "
-            f"{request.method}"
-        )
+        asked = f"{request.motion.name}, {request.model} {request.method}"
+        self.get_logger().info(f"plan {request.plan_id} accepted: {asked}")
         self._status = Status("planning", request.plan_id)
         self._work.put(request)
 
@@ -216,8 +189,8 @@ class PlannerNode(Node):
         """Refuse a plan; what is being planned or played meanwhile stays the state of the node."""
         self.get_logger().warning(f"plan {plan_id} refused: {reason}")
         self._last_refusal = f"plan {plan_id}: {reason}"
-        with self._lock:
-            planned = self._request is not None and self._request.plan_id != plan_id
+        request = self._request
+        planned = request is not None and request.plan_id != plan_id
         if not planned and not self._streamer.busy:
             self._status = Status("refused", plan_id, reason)
         self._action.end(plan_id, "refused", reason)
@@ -235,12 +208,12 @@ class PlannerNode(Node):
         while (request := self._work.get()) is not None:
             failure = ""
             try:
-                failure = self._plan(request)
+                self._plan(request)
             except Cancelled:
                 self.get_logger().info(f"plan {request.plan_id} was cancelled")
             except Exception as error:
                 failure = str(error) or type(error).__name__
-            with self._lock:
+            with self._streamer.lock:
                 if self._request is request:
                     self._request = None
             if failure and not request.cancelled.is_set():
@@ -255,8 +228,12 @@ class PlannerNode(Node):
         # The last of them has compiled whatever feedback calls as well.
         Feedback(found)
 
-    def _plan(self, request: Request) -> str:
-        """Plan what was asked for and play it; return why it cannot be played, or nothing."""
+    def _plan(self, request: Request) -> None:
+        """Plan what was asked for and play it.
+
+        Raises:
+            ValueError: it cannot be planned, or not be played; says why.
+        """
         self._status = Status("planning", request.plan_id)
         stamp, result = self._make(request)
         feedback = Feedback(result) if request.feedback else None
@@ -264,16 +241,14 @@ class PlannerNode(Node):
             result = dataclasses.replace(result, method=f"{result.method} + feedback")
         for warning in result.warnings:
             self.get_logger().warning(f"plan {request.plan_id}: {warning}")
-        with self._lock:
-            self._newest = (request.plan_id, result, request.feedback)
+        self._newest = (request.plan_id, result, request.feedback)
         if not self._options.auto_start:
             self._output.plan(Schedule(request.plan_id, result, 0))
             self._status = Status("done", request.plan_id, "waits to be started")
-        elif (obstacle := self._driver.wait(_ARMING_PATIENCE)) is not None:
-            return f"planned, but not played: {obstacle.reason}"
-        else:
-            self._play(request.plan_id, result, stamp, feedback, request.cancelled)
-        return ""
+            return
+        if (obstacle := self._driver.wait(_ARMING_PATIENCE)) is not None:
+            raise ValueError(f"planned, but not played: {obstacle.reason}")
+        self._play(request.plan_id, result, stamp, feedback, request.cancelled)
 
     def _make(self, request: Request) -> tuple[int, Plan]:
         """Return when a plan can begin [ns], and the plan.
@@ -347,7 +322,7 @@ class PlannerNode(Node):
         self._progress = (index + 1) / schedule.count
 
     def _end_all(self, outcome: str, reason: str) -> tuple[bool, bool]:
-        """Cancel planning, stop streaming; tell whether there was either."""
+        """Cancel planning, stop streaming, say so; tell whether there was either."""
         with self._streamer.lock:
             request = self._request
             if request is not None:
@@ -355,6 +330,8 @@ class PlannerNode(Node):
             playing = self._streamer.stop(outcome, reason)
         if request is not None:
             self._action.end(request.plan_id, outcome, reason)
+        if outcome == "stopped":
+            self._status = Status("idle", self._status.plan_id, reason)
         return request is not None, playing
 
     def _ended(self, schedule: Schedule, outcome: str, reason: str) -> None:
@@ -382,31 +359,22 @@ class PlannerNode(Node):
     # What it says of itself ----------------------------------------------------------------
 
     def _health(self) -> Health:
-        with self._lock:
-            newest = None if self._newest is None else self._newest[1]
-        (state, plan_id, reason), refusal = self._status, self._last_refusal
-        values = {
-            "state": state,
-            "plan_id": plan_id,
-            "reason": reason,
-            "last_refusal": refusal,
+        values: dict[str, object] = {
+            **self._status._asdict(),
+            "last_refusal": self._last_refusal,
             "progress": f"{self._progress:.3f}",
             "limb": self._options.limb.name,
             "driver": self._driver.mode or "not heard",
             "feedback": self._corrector.reason,
             "learned_plans": self._options.learned_plans,
         }
-        if newest is not None:
+        if self._newest is not None:
+            newest = self._newest[1]
             values["predicted_error_m"] = f"{newest.predicted_error:.6f}"
             values["pressure_margin_pa"] = f"{newest.pressure_margin:.0f}"
             values["slew_margin_pa_per_s"] = f"{newest.slew_margin:.0f}"
             values["solve_time_s"] = f"{newest.solve_time:.3f}"
-        if state in _LEVELS:
-            return Health(_LEVELS[state], f"{state}: {reason or 'kernels compile'}", values)
-        if refusal:
-            return Health("warning", f"{state}; refused {refusal}", values)
-        warned = state == "streaming" and reason
-        return Health("warning" if warned else "ok", reason or state, values)
+        return self._status.health(self._last_refusal, values)
 
     def _show(self) -> None:
         """Ten times a second: end what is over, tell who asked, show the reference limb."""

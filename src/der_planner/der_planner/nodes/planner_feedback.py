@@ -17,7 +17,7 @@ import numpy as np
 from der_msgs.msg import LimbState, PressureState
 from der_planner.arrays import Array
 from der_planner.control.feedback import Feedback
-from der_planner.nodes.planner_streaming import PlannerPublishers
+from der_planner.nodes.planner_topics import PlannerPublishers
 from der_planner.planning.streaming import GRID, Schedule
 from limb_interfaces.stamps import NANOSECONDS, nanoseconds
 
@@ -83,8 +83,7 @@ class _Corrected:
         """Return the pressures (M,) [Pa] of a setpoint with the newest correction for it."""
         planned = self.schedule.plan.differential_pressure[index]
         limit = self.schedule.plan.limb.pneumatics.pressure_limit
-        cut: Array = np.clip(planned + self._correction(index), -limit, limit)
-        return cut
+        return np.clip(planned + self._correction(index), -limit, limit)
 
     def _correction(self, index: int) -> Array:
         if self._left is not None:
@@ -96,8 +95,7 @@ class _Corrected:
         if ahead < 0:
             return np.zeros_like(corrections[0])
         fade = max(0.0, 1.0 - max(0, ahead - _STALE) / _STALE)
-        correction: Array = fade * corrections[min(ahead, len(corrections) - 1)]
-        return correction
+        return fade * corrections[min(ahead, len(corrections) - 1)]
 
 
 class Corrector:

@@ -264,13 +264,12 @@ class _Goal:
     """One goal, and how far the tracked tip was from the reference so far."""
 
     handle: ServerGoalHandle
-    errors_sum: float = 0.0
-    errors: int = 0
+    errors: list[float] = field(default_factory=list)
 
     @property
     def tip_error(self) -> float:
         """Mean distance [m]; NaN while no tip was tracked."""
-        return self.errors_sum / self.errors if self.errors else math.nan
+        return float(np.mean(self.errors)) if self.errors else math.nan
 
 
 class MotionAction:
@@ -303,7 +302,7 @@ class MotionAction:
             node,
             PlayMotion,
             "~/play_motion",
-            execute_callback=self._conclude_unknown,
+            execute_callback=ServerGoalHandle.abort,  # never called: a goal ends as it ends
             goal_callback=self._on_request,
             handle_accepted_callback=self._on_goal,
             cancel_callback=self._on_cancel,
@@ -342,8 +341,7 @@ class MotionAction:
             if schedule is not None and 0 <= at <= schedule.count - 1:
                 rows, tips = np.arange(schedule.count), schedule.plan.tip_reference.T
                 x, y = (np.interp(at, rows, tip) for tip in tips)
-                goal.errors_sum += math.hypot(state.tip.x - x, state.tip.y - y)
-                goal.errors += 1
+                goal.errors.append(math.hypot(state.tip.x - x, state.tip.y - y))
 
     def tell(self, plan_id: str, state: str, progress: float) -> None:
         """Publish feedback to who asked for a plan, if anybody did."""
@@ -374,7 +372,3 @@ class MotionAction:
             return result
 
         goal.handle.execute(conclude)
-
-    def _conclude_unknown(self, handle: ServerGoalHandle) -> Any:
-        handle.abort()
-        return PlayMotion.Result(outcome="failed", reason="the goal was executed by nobody")

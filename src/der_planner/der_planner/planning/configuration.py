@@ -18,7 +18,6 @@ import copy
 import dataclasses
 import math
 from abc import ABC, abstractmethod
-from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -257,25 +256,18 @@ class LoadedConfiguration(RodConfiguration):
         q, v, _ = sample_spline(self._shape, 0.0)
         return self.model.rod.state(q, v, like=self._poses.states[0])
 
-    @cached_property
-    def _forces(self) -> tuple[Array, Array]:
-        """M q̄̈ + D q̄̇ − F_int − F_ext (K, F) [N] and B Λ (K, F, M) [N/Pa] at the poses.
+    def pressures(self, method: str, time: Array) -> Array:
+        """Return effective pressures (K, M) [Pa] along the poses, see the module.
 
         A pose rests under its own pressures: −F_int − F_ext is B Λ times these.
         """
         rod, free = self.model.rod, self.model.rod.free
         q, v, a = sample_spline(self._shape, self._time)
-        forces, inputs = [], []
-        for k, state in enumerate(self._poses.states):
-            inputs.append(rod.input_matrix(state)[free])
-            moved = rod.mass_diagonal * a[k] + rod.damping_diagonal * v[k]
-            moved += _viscous_force(rod, q[k], v[k])
-            forces.append(inputs[-1] @ self._poses.pressures[k] + moved[free])
-        return np.array(forces), np.array(inputs)
-
-    def pressures(self, method: str, time: Array) -> Array:
-        """Return effective pressures (K, M) [Pa] along the poses, see the module."""
-        forces, inputs = self._forces
+        # M q̄̈ + D q̄̇ − F_int − F_ext (K, F) [N] and B Λ (K, F, M) [N/Pa] at the poses.
+        inputs = np.array([rod.input_matrix(state)[free] for state in self._poses.states])
+        moved = rod.mass_diagonal * a + rod.damping_diagonal * v
+        moved += np.array([_viscous_force(rod, *each) for each in zip(q, v, strict=True)])
+        forces = np.einsum("kfm,km->kf", inputs, self._poses.pressures) + moved[:, free]
         if method != "paper":
             work = np.einsum("kfm,kf->km", self._poses.tangents, forces)
             by_pressure = np.einsum("kfm,kfn->kmn", self._poses.tangents, inputs)
@@ -304,8 +296,7 @@ def _viscous_force(rod: Rod, q: Array, v: Array) -> Array:
     turn = np.diff(np.unwrap(np.arctan2(dy, dx)), prepend=0.0)
     growth = 1.0 + np.tan(0.5 * turn) ** 2
     curving = growth[:, None] * np.diff(heading, axis=0, prepend=0.0)
-    force: Array = curving.T @ (mesh.viscous[:-1] * (curving @ v))
-    return force
+    return curving.T @ (mesh.viscous[:-1] * (curving @ v))
 
 
 def interpolate_smoothly(time: Array, instants: Array, values: Array) -> Array:

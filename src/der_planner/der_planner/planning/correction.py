@@ -203,8 +203,7 @@ class Correction:
         angles, _ = inverse_kinematics(
             self.model.kinematics, wanted, self._plan.bend_angles, _PRIOR
         )
-        reached: Array = self.model.kinematics.tip(angles)
-        return reached
+        return self.model.kinematics.tip(angles)
 
 
 def _not_followed(error: ConvergenceError) -> PlanningError:

@@ -183,8 +183,7 @@ def _smoothed(points: Array, step: float, wave: float) -> Array:
     weight = (wave / (2 * np.pi * step)) ** 4
     band = _second_differences(len(points)) * weight
     band[0] += 1.0
-    smooth: Array = solveh_banded(band, points, lower=True)
-    return smooth
+    return solveh_banded(band, points, lower=True)
 
 
 def _second_differences(count: int) -> Array:
@@ -238,8 +237,7 @@ class _Search:
         course[-1] = int(np.argmin(total))
         for k in range(len(target) - 1, 0, -1):
             course[k - 1] = origins[k, course[k]]
-        chosen: Array = states[course]
-        return chosen
+        return states[course]
 
     def _price(self, states: Array) -> Array:
         """Return what a state (G, M) costs wherever the tip should be [m²]."""
@@ -330,8 +328,7 @@ def _free_step(band: Array, slope: Array, tied: NDArray[np.bool_], damping: floa
         matrix[below, : len(either)][either] = 0.0
     matrix[0][still] = 1.0
     right = np.where(still, 0.0, -slope.ravel())
-    step: Array = solveh_banded(matrix, right, lower=True).reshape(slope.shape)
-    return step
+    return solveh_banded(matrix, right, lower=True).reshape(slope.shape)
 
 
 def _deviation(drawn: Array, tip: Array, when: Array, slowed: float) -> Deviation:

@@ -215,8 +215,7 @@ class Optimiser:
         """Return half the gradient (W·M,) of the cost at commands (first + W, M)."""
         weights = self._weights(len(command) - first)
         pull = weights[:, 2:].T @ (weights @ self._deviation(command, first))
-        gradient: Array = jacobian.T @ misses.ravel() + pull.ravel()
-        return gradient
+        return jacobian.T @ misses.ravel() + pull.ravel()
 
     def _weights(self, size: int) -> Array:
         """Return smoothness and nearness as rows (2W, W + 2) on the deviations from u⁰ [m/Pa].

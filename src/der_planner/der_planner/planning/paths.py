@@ -18,9 +18,9 @@ from der_planner.planning.loads import PlanningError
 from der_planner.planning.timing import (
     LONGEST,
     PathLimits,
-    evenly_in_time,
-    keep_acceleration,
+    paced,
     smooth_step,
+    tip_rates,
 )
 
 SHAPES = ("circle", "figure_eight", "line", "star")
@@ -112,9 +112,7 @@ def checked_points(tip: ArrayLike) -> Array:
 def time_path(points: Array, limits: PathLimits) -> TipPath:
     """Time a path: rest at both ends, no faster than the limits along and across it.
 
-    The curve is a spline over its chord length; the speed profile is the largest that keeps the
-    centripetal acceleration v²/r and the acceleration along the path below the limit, found by a
-    forward and a backward pass over the curve.
+    The curve is a spline over its chord length.
 
     Raises:
         PlanningError: limits that are not positive, or a path of no length.
@@ -122,25 +120,13 @@ def time_path(points: Array, limits: PathLimits) -> TipPath:
     if not (limits.speed > 0 and limits.acceleration > 0):
         raise PlanningError(f"speed and acceleration limits must be positive, got {limits}")
     chords = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    kept = np.concatenate([[True], chords > 1e-9])
-    points = points[kept]
-    chord = np.concatenate([[0.0], np.cumsum(chords[chords > 1e-9])])
+    points = points[np.append(True, chords > 1e-9)]
     if len(points) < 2:
         raise PlanningError("all points of the tip path coincide: it has no length")
+    chord = np.append(0.0, np.cumsum(chords[chords > 1e-9]))
     spline = make_interp_spline(chord, points, k=min(3, len(points) - 1))
-    count = int(np.clip(chord[-1] / 2e-4, 200, 20000))
-    s = np.linspace(0.0, chord[-1], count)
-    curve = spline(s)
-    first, second = spline(s, 1), spline(s, 2)
-    stretch = np.linalg.norm(first, axis=1)
-    cross = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
-    bend = cross / np.maximum(stretch, 1e-9) ** 3
-    speed = np.minimum(limits.speed, np.sqrt(limits.acceleration / np.maximum(bend, 1e-9)))
-    steps = np.linalg.norm(np.diff(curve, axis=0), axis=1)
-    speed[0] = speed[-1] = 0.0
-    keep_acceleration(speed, 2 * limits.acceleration * steps)
-    durations = 2 * steps / np.maximum(speed[1:] + speed[:-1], 1e-9)
-    instants, along = evenly_in_time(durations, s)
+    place = np.linspace(0.0, chord[-1], int(np.clip(chord[-1] / 2e-4, 200, 20000)))
+    instants, along = paced(place, *tip_rates(spline(place), place, limits), rest=True)
     return TipPath(instants, spline(along))
 
 
@@ -215,8 +201,7 @@ def _faded_phase(turns: Array, cycles: int) -> Array:
 
     def ramp(x: Array) -> Array:
         t = np.clip(x / fade, 0.0, 1.0)
-        area: Array = fade * (2.5 * t**4 - 3 * t**5 + t**6)
-        return area
+        return fade * (2.5 * t**4 - 3 * t**5 + t**6)
 
     start = np.where(turns < fade, ramp(turns), fade / 2 + (turns - fade))
     end = fade / 2 + (total - fade - fade) + fade / 2 - ramp(total - turns)

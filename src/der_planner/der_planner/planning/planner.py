@@ -9,7 +9,7 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from der_planner.arrays import Array
-from der_planner.limb import Limb, Pneumatics
+from der_planner.limb import Limb
 from der_planner.model import CONTROL_PERIOD, NODES, Model, RodModel, simulate
 from der_planner.model.commands import SlowVenting, slow_venting, within_limits
 from der_planner.model.commands import commands as commands_for
@@ -189,7 +189,7 @@ def _limit_warnings(
     """Say where slow chambers and limits keep commands from what a balance wants (K, M) [Pa]."""
     missed = float(np.linalg.norm(found.tip - reference.tip, axis=1).mean())
     left = f"mean error of {missed * 1000:.1f} mm on the model itself"
-    said, excess = [], _excess(configuration.model.air.pneumatics, wanted)
+    said = []
     if slow is not None and slow.opposite > _NOTABLE_OPPOSITE:
         effect = f", which leaves a {left}" if missed > _NOTABLE_ERROR else ""
         said.append(
@@ -198,25 +198,23 @@ def _limit_warnings(
             f"filled by up to {slow.opposite:.0f} Pa to make up for it{effect}; a longer period or "
             "a smaller amplitude needs less"
         )
-    if excess and found.limited and method != "optimal":
-        cut = np.abs(found.commands - wanted).max()
-        said.insert(0, f"limits cut the wanted pressures by up to {cut:.0f} Pa: {excess}")
-    elif excess and found.limited and missed > _NOTABLE_ERROR and not said:
-        said.append(f"the limits leave a {left}: {excess}")
-    return said
-
-
-def _excess(air: Pneumatics, wanted: Array) -> str:
-    """Say what commands (K, M) [Pa] want beyond the limits; empty if nothing."""
-    fastest = np.abs(np.diff(wanted, axis=0)).max(initial=0.0) / CONTROL_PERIOD
-    largest = np.abs(wanted).max()
-    if largest <= air.pressure_limit and fastest <= air.slew_limit:
-        return ""
-    return (
-        f"the motion wants {largest:.0f} Pa and {fastest:.0f} Pa/s, allowed are "
-        f"{air.pressure_limit:.0f} Pa and {air.slew_limit:.0f} Pa/s; a longer period or a smaller "
-        "amplitude keeps them"
+    air, fastest = (
+        configuration.model.air.pneumatics,
+        np.abs(np.diff(wanted, axis=0)).max(initial=0),
     )
+    largest, per_second = np.abs(wanted).max(), fastest / CONTROL_PERIOD
+    if found.limited and (largest > air.pressure_limit or per_second > air.slew_limit):
+        excess = (
+            f"the motion wants {largest:.0f} Pa and {per_second:.0f} Pa/s, allowed are "
+            f"{air.pressure_limit:.0f} Pa and {air.slew_limit:.0f} Pa/s; a longer period or a "
+            "smaller amplitude keeps them"
+        )
+        if method != "optimal":
+            cut = np.abs(found.commands - wanted).max()
+            said.insert(0, f"limits cut the wanted pressures by up to {cut:.0f} Pa: {excess}")
+        elif missed > _NOTABLE_ERROR and not said:
+            said.append(f"the limits leave a {left}: {excess}")
+    return said
 
 
 def _error_warning(tip: Array, reference: Reference, method: str) -> str:

@@ -28,6 +28,8 @@ _GRID = 0.02
 """Time between two samples of a path that gets its timing from limits [s]."""
 _SOFTNESS = 0.2
 """Half width of the mean that rounds the corners of a speed profile [s]."""
+_TINY = 1e-9
+"""Rates are divided by this at least [rad/s], [m/s]."""
 SLEW_SHARE = 0.8
 """Share of the slew limit for changing the static pressures; the rest is for the inertia."""
 RISE = 0.5
@@ -147,8 +149,7 @@ def quintic(time: Array, begin: Moving, end: Moving) -> Array:
     c3 = 10 * difference - 4 * slope + 0.5 * bow
     c4 = -15 * difference + 7 * slope - bow
     c5 = 6 * difference - 3 * slope + 0.5 * bow
-    result: Array = x0 + t * (v0 + t * (0.5 * a0 + t * (c3 + t * (c4 + t * c5))))
-    return result
+    return x0 + t * (v0 + t * (0.5 * a0 + t * (c3 + t * (c4 + t * c5))))
 
 
 def on_grid(span: float) -> float:
@@ -199,65 +200,60 @@ def retimed(
     """
     count = int(np.clip(span / 0.01, 200, 40000))
     place = np.linspace(0.0, span, count)
-    rate, greatest = _rates(workspace, course, place, limits)
-    if limits is None and not rest and np.all(rate >= 1.0):
+    rate, greatest = _slew_rates(workspace.fastest, course, place)
+    if limits is not None:
+        by_tip = tip_rates(workspace.arcs.tip(course(place)), place, limits)
+        rate, greatest = np.minimum(rate, by_tip[0]), np.minimum(greatest, by_tip[1])
+    elif np.all(rate >= 1.0) and not rest:
         samples = max(20, round(span / _GRID) + 1)
         return np.linspace(0.0, span, samples), np.linspace(0.0, span, samples)
-    if limits is not None or rest:
-        rate[0] = rate[-1] = 0.0
-    step = float(place[1])
-    keep_acceleration(rate, 2 * np.minimum(greatest[1:], greatest[:-1]) * step)
-    time, along = evenly_in_time(2 * step / np.maximum(rate[1:] + rate[:-1], 1e-6), place)
+    else:
+        rate = np.minimum(rate, 1.0)
+    time, along = paced(place, rate, greatest, limits is not None or rest)
     return time, np.clip(along, 0.0, span)
 
 
-def _rates(
-    workspace: Workspace,
-    course: PchipInterpolator,
-    place: Array,
-    limits: PathLimits | None,
-) -> tuple[Array, Array]:
-    """Return the largest rate of the parameter [1] and of its rate [1/s] at places (K,)."""
-    fastest = SLEW_SHARE * workspace.fastest
-    bend, turn = np.abs(course(place, 1)), np.abs(course(place, 2))
-    tiny = 1e-9
-    rate = (fastest / np.maximum(bend, tiny)).min(axis=1)
-    rate = np.minimum(rate, np.sqrt(fastest / RISE / np.maximum(turn, tiny)).min(axis=1))
-    greatest = (fastest / RISE / np.maximum(bend, tiny)).min(axis=1)
-    if limits is None:
-        return np.minimum(rate, 1.0), greatest
-    tip = workspace.arcs.tip(course(place))
+def _slew_rates(fastest: Array, course: PchipInterpolator, place: Array) -> tuple[Array, Array]:
+    """Return what the slew limit allows at places (K,), see `paced`."""
+    most = SLEW_SHARE * fastest
+    bend, turn = (np.maximum(np.abs(course(place, n)), _TINY) for n in (1, 2))
+    rate = np.minimum((most / bend).min(axis=1), np.sqrt(most / RISE / turn).min(axis=1))
+    return rate, (most / RISE / bend).min(axis=1)
+
+
+def tip_rates(tip: Array, place: Array, limits: PathLimits) -> tuple[Array, Array]:
+    """Return what limits of the tip (K, 2) [m] allow at places (K,), see `paced`."""
     first = np.gradient(tip, place, axis=0)
     second = np.linalg.norm(np.gradient(first, place, axis=0), axis=1)
-    speed = np.maximum(np.linalg.norm(first, axis=1), tiny)
-    rate = np.minimum(rate, limits.speed / speed)
-    rate = np.minimum(rate, np.sqrt(limits.acceleration / np.maximum(second, tiny)))
-    return rate, np.minimum(greatest, limits.acceleration / speed)
+    speed = np.maximum(np.linalg.norm(first, axis=1), _TINY)
+    across = np.sqrt(limits.acceleration / np.maximum(second, _TINY))
+    return np.minimum(limits.speed / speed, across), limits.acceleration / speed
 
 
-def keep_acceleration(speed: Array, gain: Array) -> None:
-    """Lower the speeds (K,) until none changes faster than it may, forward and backward.
-
-    Args:
-        speed: largest ones, changed in place.
-        gain: (K − 1,) largest change of the squared speed from one place to the next.
-    """
-    for k in range(len(gain)):
-        speed[k + 1] = min(speed[k + 1], math.sqrt(speed[k] ** 2 + gain[k]))
-    for k in range(len(gain) - 1, -1, -1):
-        speed[k] = min(speed[k], math.sqrt(speed[k + 1] ** 2 + gain[k]))
-
-
-def evenly_in_time(durations: Array, place: Array) -> tuple[Array, Array]:
+def paced(place: Array, rate: Array, greatest: Array, rest: bool) -> tuple[Array, Array]:
     """Return evenly spaced instants from 0 on [s], and the places then, with rounded corners.
 
+    The rates are those of the fastest course that keeps its limits, found by a pass forward and one
+    backward.
+
     Args:
-        durations: (K − 1,) times from one place to the next [s].
-        place: (K,) along a course.
+        place: (K,) evenly spaced, along a course.
+        rate: (K,) largest change of the place [1/s].
+        greatest: (K,) largest change of that rate [1/s²].
+        rest: begin and end at rest.
 
     Raises:
         PlanningError: it would last too long.
     """
+    step = float(place[1] - place[0])
+    if rest:
+        rate[0] = rate[-1] = 0.0
+    gain = 2 * np.minimum(greatest[1:], greatest[:-1]) * step
+    for k in range(len(gain)):
+        rate[k + 1] = min(rate[k + 1], math.sqrt(rate[k] ** 2 + gain[k]))
+    for k in range(len(gain) - 1, -1, -1):
+        rate[k] = min(rate[k], math.sqrt(rate[k + 1] ** 2 + gain[k]))
+    durations = 2 * step / np.maximum(rate[1:] + rate[:-1], 1e-6)
     time = np.concatenate([[0.0], np.cumsum(durations)])
     if time[-1] > LONGEST:
         raise PlanningError(

@@ -181,8 +181,7 @@ class Workspace:
                 "would snap through. Shrink the motion, or mount the limb otherwise"
             ) from error
         tips = np.array([state.q[-3:-1] for state in poses.states])
-        smooth: Array = make_interp_spline(instants, tips, k=5)(time)
-        return smooth
+        return make_interp_spline(instants, tips, k=5)(time)
 
     def _angle_limits(self) -> tuple[Array, Array]:
         bounds = []
@@ -284,8 +283,7 @@ class Workspace:
         if count <= most:
             mesh = np.meshgrid(*([shares] * count))
             table = np.stack([part.ravel() for part in mesh], axis=-1)
-        angles: Array = self.low + (self.high - self.low) * table
-        return angles
+        return self.low + (self.high - self.low) * table
 
     def solutions(self, point: ArrayLike) -> list[Solution]:
         """Return every way found to reach one point within the limit, least pressure first.

@@ -1,9 +1,10 @@
-"""What goes out of the planner, and what it hears of the driver that it goes to."""
+"""What the planner publishes, what it says of itself, and what it concludes of the driver."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from geometry_msgs.msg import Point, PointStamped
@@ -16,6 +17,7 @@ from der_planner.arrays import Array
 from der_planner.control.knowledge import Estimate
 from der_planner.planning.streaming import GRID, Ending, Schedule
 from limb_interfaces import qos, topics
+from limb_interfaces.diagnostics import Health
 from limb_interfaces.stamps import stamp_from_nanoseconds
 
 REFERENCE = ColorRGBA(r=0.1, g=0.6, b=0.2, a=1.0)
@@ -127,6 +129,38 @@ def _header(instant: int) -> Header:
 
 def _points(places: Array | Sequence[Array]) -> list[Point]:
     return [Point(x=float(x), y=float(y)) for x, y in places]
+
+
+# What it says of itself --------------------------------------------------------------------------
+
+_LEVELS = {
+    "starting": "stale",
+    **dict.fromkeys(("error", "failed", "fault", "lost"), "error"),
+    **dict.fromkeys(("refused", "vented"), "warning"),
+}
+"""Levels of the diagnostics in states that say it all."""
+
+
+class Status(NamedTuple):
+    """The planner's state, the plan that it is about, and why.
+
+    States: starting, idle, planning, streaming, done, refused, error, and the outcomes of a plan
+    that the driver ended (vented, fault, lost).
+    """
+
+    state: str = "starting"
+    plan_id: str = ""
+    reason: str = ""
+
+    def health(self, refusal: str, values: dict[str, object]) -> Health:
+        """Return the diagnostics with values, after a refusal if there was one."""
+        state, _, reason = self
+        if state in _LEVELS:
+            return Health(_LEVELS[state], f"{state}: {reason or 'kernels compile'}", values)
+        if refusal:
+            return Health("warning", f"{state}; refused {refusal}", values)
+        warned = state == "streaming" and reason
+        return Health("warning" if warned else "ok", reason or state, values)
 
 
 # The driver --------------------------------------------------------------------------------------
