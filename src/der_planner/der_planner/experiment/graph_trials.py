@@ -206,7 +206,6 @@ def play_calibration(
         "stage": stage,
         "seed": None if hardware else seed,
         "largest_pressure_Pa": float(np.abs(excitation.differential_pressure).max()),
-        "parts": [list(part) for part in excitation.parts],
         "prior": prior.name,
     }
     setup = GraphSetup(folder / "bag", metadata, seed=seed, limb=prior, hardware=hardware)
