@@ -12,7 +12,9 @@ setup(
     name=PACKAGE,
     version=ElementTree.parse("package.xml").findtext("version"),
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
-    package_data={PACKAGE: ["py.typed", "data/*", "page/static/*", "studies/shipped/*"]},
+    package_data={
+        PACKAGE: ["py.typed", "data/*", "page/static/*", "results/*.html", "studies/shipped/*"]
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),

@@ -59,22 +59,13 @@ def test_brightness_is_kept_and_padding_dropped(picture, encoding, rows, big_end
     assert np.array_equal(to_grey(data.tobytes(), 48, 64, row, encoding, big_endian), picture)
 
 
-@pytest.mark.parametrize(("bits", "shift"), [(10, 2), (12, 4), (14, 6)])
-def test_cameras_of_fewer_bits_than_their_words_are_as_bright(picture, bits, shift):
+@pytest.mark.parametrize("shift", [2, 4, 6])
+def test_cameras_of_fewer_bits_than_their_words_are_as_bright_and_stay_so(picture, shift):
     picture[0, 0] = 255
-    words = picture.astype("<u2") << shift
-    assert int(words.max()) < 1 << bits
-    assert np.array_equal(to_grey(words.tobytes(), 48, 64, 128, "mono16"), picture)
-
-
-def test_a_darker_image_of_the_same_camera_stays_dark(picture):
-    picture[0, 0] = 255
-    reader = ImageReader()
-    words = picture.astype("<u2") << 4
+    reader, words = ImageReader(), picture.astype("<u2") << shift
+    darker = (words >> 3).tobytes()
     assert np.array_equal(reader.to_grey(words.tobytes(), 48, 64, 128, "mono16"), picture)
-    assert np.array_equal(
-        reader.to_grey((words >> 3).tobytes(), 48, 64, 128, "mono16"), picture >> 3
-    )
+    assert np.array_equal(reader.to_grey(darker, 48, 64, 128, "mono16"), picture >> 3)
 
 
 @pytest.mark.parametrize("wide", [False, True])

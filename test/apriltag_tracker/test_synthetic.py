@@ -7,7 +7,6 @@ import pytest
 from apriltag_tracker.camera import CameraError
 from apriltag_tracker.synthetic.camera import (
     CameraModel,
-    Errors,
     Optics,
     Shape,
     SyntheticCamera,
@@ -44,17 +43,6 @@ def test_pictures_repeat_with_their_seed(model, tags):
     assert not np.array_equal(picture, first.frame(shape).image)
 
 
-def test_noise_has_its_size_everywhere(model, tags):
-    camera = SyntheticCamera(model, tags, Optics(noise=4.0, light_fall=0.0), seed=1)
-    shape = constant_curvature(tags.segment_lengths, [0.2, 0.1])
-    frames = np.stack([camera.frame(shape).image.astype(float) for _ in range(14)])
-    spread = frames.std(axis=0)
-    assert np.median(spread) == pytest.approx(4.0, rel=0.1)
-    corners = camera.frame(shape).corners[2]
-    x, y = np.round(corners.mean(axis=0)).astype(int)
-    assert np.median(spread[y - 8 : y + 8, x - 8 : x + 8]) == pytest.approx(4.0, rel=0.15)
-
-
 @pytest.mark.slow
 def test_motion_blur_is_the_mean_of_sharp_pictures(model, tags):
     shape = constant_curvature(tags.segment_lengths, [0.3, 0.3])
@@ -77,18 +65,6 @@ def test_motion_blur_is_the_mean_of_sharp_pictures(model, tags):
     gap = (blurred.image - mean)[mask > 0]
     still_gap = (camera.frame(shape).image - mean)[mask > 0]
     assert np.sqrt(np.mean(gap**2)) < 0.03 * np.sqrt(np.mean(still_gap**2))
-
-
-def test_set_up_errors_are_drawn_only_when_asked_for(model, tags):
-    shape = constant_curvature(tags.segment_lengths, [0.0, 0.0])
-    perfect = SyntheticCamera(model, tags, CLEAN, seed=1).frame(shape).corners
-    same = SyntheticCamera(model, tags, CLEAN, seed=2).frame(shape).corners
-    wrong = SyntheticCamera(model, tags, CLEAN, Errors(survey=1e-3, mounting=1e-3), seed=2)
-    moved = wrong.frame(shape).corners
-    assert all(np.array_equal(perfect[tag], same[tag]) for tag in perfect)
-    shifts = [np.abs(perfect[tag] - moved[tag]).max() for tag in perfect]
-    assert min(shifts) > 0.01
-    assert max(shifts) < 15.0
 
 
 def test_shapes_are_interpolated_and_continued(tags):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -12,30 +13,17 @@ from der_planner.identification import CalibrationLog
 
 def write_csv(log: CalibrationLog, table: Path, columns: Path) -> None:
     """Write a log as CSV, pressures in hPa and angles in degrees, and the map of its columns."""
-    chambers = np.zeros((len(log.time), 2 * log.segment_count))
-    chambers[:, 0::2] = 1013.0 + 0.01 * log.measured_differential
-    chambers[:, 1::2] = 1013.0
+    chambers = np.full((len(log.time), 2 * log.segment_count), 1013.0)
+    chambers[:, 0::2] += 0.01 * log.measured_differential
     parts = {
-        "t": log.time[:, None],
-        "u": 0.01 * log.commanded_differential,
-        "p": chambers,
-        "theta": np.degrees(log.bend_angles),
+        "commanded": 0.01 * log.commanded_differential,
+        "chambers": chambers,
+        "angles": np.degrees(log.bend_angles),
         "tip": log.tip,
     }
-    names = {
-        key: [f"{key}{i}" for i in range(part.shape[1])] if key != "t" else ["t"]
-        for key, part in parts.items()
-    }
-    header = ",".join(name for part in names.values() for name in part)
-    values = np.concatenate(list(parts.values()), axis=1)
+    names = {key: [f"{key}{i}" for i in range(part.shape[1])] for key, part in parts.items()}
+    header = ",".join(["t", *itertools.chain(*names.values())])
+    values = np.column_stack([log.time, *parts.values()])
     np.savetxt(table, values, delimiter=",", header=header, comments="", fmt="%.8g")
-    content = {
-        "time": "t",
-        "commanded": names["u"],
-        "chambers": names["p"],
-        "angles": names["theta"],
-        "tip": names["tip"],
-        "pressure_unit": "hPa",
-        "angle_unit": "deg",
-    }
-    columns.write_text(yaml.safe_dump(content))
+    units = {"pressure_unit": "hPa", "angle_unit": "deg"}
+    columns.write_text(yaml.safe_dump({"time": "t", **names, **units}))

@@ -80,34 +80,6 @@ def test_stiff_ends_are_extrapolated_straight(tags):
     assert abs(without.tip_heading - heading[-1]) > 5e-3
 
 
-def test_repeatability_is_what_repetition_shows(plain):
-    random = np.random.default_rng(2)
-    shape = constant_curvature(plain.segment_lengths, [0.7, -0.3])
-    fitter = ShapeFitter(plain)
-    estimates = [fitter.fit(seen(plain, shape, random)) for _ in range(150)]
-    tips = np.array([estimate.tip for estimate in estimates])
-    said = np.mean([estimate.tip_covariance for estimate in estimates], axis=0)
-    assert np.allclose(np.sqrt(np.diag(said)), tips.std(axis=0), rtol=0.25)
-    assert np.linalg.norm(tips.mean(axis=0) - shape.points[-1]) < 1e-5
-
-
-def test_mounting_errors_are_in_the_systematic_part(plain):
-    random = np.random.default_rng(3)
-    shape = constant_curvature(plain.segment_lengths, [0.4, 0.3])
-    fitter = ShapeFitter(plain, mounting=3e-4, mounting_angle=4e-3)
-    perfect = fitter.fit(seen(plain, shape))
-    tips = []
-    for _ in range(150):
-        moved = [
-            dataclasses.replace(tag, pose=tag.pose + random.normal(0.0, [3e-4, 3e-4, 4e-3]))
-            for tag in seen(plain, shape)
-        ]
-        tips.append(fitter.fit(moved).tip)
-    spread = np.sqrt(np.trace(np.cov(np.array(tips).T)))
-    said = np.sqrt(np.trace(perfect.tip_systematic))
-    assert said == pytest.approx(spread, rel=0.3)
-
-
 def test_without_the_last_tags_the_tip_is_left_open(plain):
     shape = constant_curvature(plain.segment_lengths, [0.4, 0.3])
     fitter = ShapeFitter(plain)

@@ -23,19 +23,6 @@ def tags_seen(tags, model, pose, noise=0.0, random=None, moved=None):
     return result
 
 
-def test_pose_is_averaged_over_frames(tags, model):
-    random = np.random.default_rng(0)
-    world = WorldPose(tags, model.intrinsics)
-    errors = []
-    for _ in range(91):
-        pose = world.update(tags_seen(tags, model, model.pose, 0.05, random))
-        errors.append(np.linalg.norm(pose.position - model.pose.position))
-    assert errors[-1] < 0.4 * errors[0]
-    assert world.bumps == 0
-    assert world.excluded == {}
-    assert world.residual < 0.05
-
-
 def test_a_bump_is_noticed_and_followed(tags, model):
     world = WorldPose(tags, model.intrinsics)
     for _ in range(40):

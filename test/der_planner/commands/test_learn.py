@@ -27,14 +27,10 @@ def planned():
 
 def write_bag(folder, planned, shift):
     bag = BagOfRun(folder)
-    bag.write(
-        "/limb/plan", "PressurePlan", 0.0, latched=True, plan_id="p", motion=planned.motion,
-        model="der", method="optimal", amplitude=planned.amplitude, period=planned.period,
-        cycles=planned.cycles, limb="any", gravity=np.zeros(3), payload=0.0, payload_at=0.0,
-        segment_count=2, time=planned.time,
-        differential_pressure=planned.differential_pressure.ravel(),
+    bag.plan(
+        amplitude=planned.amplitude, period=planned.period, cycles=planned.cycles,
+        time=planned.time, differential_pressure=planned.differential_pressure.ravel(),
         tip_reference=planned.tip_reference.ravel(), tip_predicted=planned.tip_predicted.ravel(),
-        solve_time=0.1, predicted_error=0.0,
     )  # fmt: skip
     for time in np.arange(-0.5, planned.time[-1] + 0.5, 1 / 30):
         row = [np.interp(time, planned.time, axis) for axis in planned.tip_predicted.T]

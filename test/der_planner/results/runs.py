@@ -84,29 +84,23 @@ class BagOfRun:
             spec(topic, name, latched), self.stamp(seconds + 0.03), self.stamp(seconds + 0.02), data
         )
 
-    def plan(self, plan_id="p", model="der", stamp=0.0, gravity=(0.0, 0.0, 0.0)) -> None:
-        self.write(
-            "/limb/plan",
-            "PressurePlan",
-            stamp,
-            latched=True,
-            plan_id=plan_id,
-            motion="same_direction",
-            model=model,
-            method="paper",
-            amplitude=0.7,
-            period=PERIOD,
-            cycles=CYCLES,
-            limb="test limb",
-            gravity=np.array(gravity),
-            payload=0.02 if any(gravity) else 0.0,
-            payload_at=0.244 if any(gravity) else 0.0,
-            segment_count=2,
-            time=TIMES,
-            differential_pressure=np.zeros(2 * len(TIMES)),
-            tip_reference=reference(TIMES).ravel(),
-            tip_predicted=reference(TIMES).ravel(),
-        )
+    def plan(self, plan_id="p", model="der", stamp=0.0, **fields) -> None:
+        """Write a plan of no pressure, or with other fields than that."""
+        usual = {
+            "motion": "same_direction",
+            "method": "paper",
+            "amplitude": 0.7,
+            "period": PERIOD,
+            "cycles": CYCLES,
+            "limb": "test limb",
+            "segment_count": 2,
+            "time": TIMES,
+            "differential_pressure": np.zeros(2 * len(TIMES)),
+            "tip_reference": reference(TIMES).ravel(),
+            "tip_predicted": reference(TIMES).ravel(),
+        }
+        fields = {**usual, "plan_id": plan_id, "model": model, **fields}
+        self.write("/limb/plan", "PressurePlan", stamp, latched=True, **fields)
 
     def still_run(self, offset=(0.0, 0.0), **plan) -> Path:
         """Write a run without pressure whose tip is off by a constant, and close the bag."""

@@ -21,6 +21,7 @@ from der_planner.results import (
     summarise,
 )
 
+HUNG = {"gravity": np.array([9.81, 0.0, 0.0]), "payload": 0.02, "payload_at": 0.244}
 OFFSET = np.array([0.003, -0.004])
 
 
@@ -195,7 +196,6 @@ def test_a_plan_never_meets_the_state_of_another_limb(tmp_path: Path):
     assert seen.result.namespace == "/lab2"
     (blind,) = [entry for entry in evaluate_bags([tmp_path / "run"]) if entry.error]
     assert "/limb: no limb state was recorded" in blind.error
-    assert "/lab2 are another limb's" in blind.error
 
 
 def test_a_run_among_several_limbs_is_named(tmp_path: Path):
@@ -211,7 +211,7 @@ def test_a_run_among_several_limbs_is_named(tmp_path: Path):
 
 
 def test_loads_of_a_bag_are_those_of_its_plan(tmp_path: Path):
-    result = evaluate_bag(BagOfRun(tmp_path / "hung").still_run(gravity=(9.81, 0.0, 0.0)))
+    result = evaluate_bag(BagOfRun(tmp_path / "hung").still_run(**HUNG))
     assert (result.mounting, result.gravity_m_s2) == ("hanging", (9.81, 0.0, 0.0))
     assert (result.payload_kg, result.payload_at_m) == (0.02, 0.244)
     assert "hanging, 20 g at 24.4 cm" in format_table(summarise([result]))

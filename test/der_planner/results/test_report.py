@@ -19,7 +19,7 @@ from der_planner.results import (
     load_run,
     write_report,
 )
-from der_planner.results.overlay import RunImages, gray, plot_shapes, write_video
+from der_planner.results.overlay import RunImages, plot_shapes, write_video
 
 
 @pytest.fixture(scope="module")
@@ -55,17 +55,6 @@ def test_snapshot_is_the_nearest_frame(bag: Path):
     assert shot.picture.shape == (240, 320)
     assert np.all(shot.picture == 40)
     assert shot.planned.shape == (0, 2)
-
-
-def test_colour_images_become_gray():
-    class Message:
-        encoding, height, width, step = "bgr8", 2, 2, 8
-        data = bytes([255, 0, 0, 0, 255, 0, 9, 9] * 2)
-
-    blue, green = gray(Message)[0]
-    assert blue < green
-    Message.encoding = "bayer_rggb8"
-    assert gray(Message) is None
 
 
 @pytest.mark.slow

@@ -54,14 +54,13 @@ def test_interval_covers_the_truth_as_often_as_it_says():
     random = np.random.default_rng(1)
     covered = 0
     for _ in range(60):
-        one = [
-            dataclasses.replace(DER[0], seed=i, mean_error_m=0.01 + random.normal(0, 1e-3))
-            for i in range(12)
-        ]
-        two = [
-            dataclasses.replace(PCC[0], seed=i, mean_error_m=0.02 + random.normal(0, 1e-3))
-            for i in range(12)
-        ]
+        one, two = (
+            [
+                dataclasses.replace(run, seed=i, mean_error_m=mean + random.normal(0, 1e-3))
+                for i in range(12)
+            ]
+            for run, mean in ((DER[0], 0.01), (PCC[0], 0.02))
+        )
         (found,) = compare([*one, *two])
         covered += found.low_m <= 0.01 <= found.high_m
     assert 50 <= covered <= 60
@@ -124,11 +123,6 @@ def test_other_motions_and_loads_are_not_mixed():
 def test_results_file(tmp_path):
     path = write_results([*DER, *PCC], tmp_path)
     document = json.loads(path.read_text())
-    needed = {
-        "motion", "model", "method", "trial", "seed", "mean_error_m", "mean_error_x_m",
-        "mean_error_y_m", "max_error_m", "valid_fraction", "bag",
-    }  # fmt: skip
-    assert all(needed <= entry.keys() for entry in document["runs"])
     assert len(document["runs"]) == 6
     assert [entry["trials"] for entry in document["summary"]] == [3, 3]
     assert document["comparisons"][0]["difference_m"] == pytest.approx(0.01)
@@ -139,25 +133,19 @@ def test_results_file(tmp_path):
 
 def test_tables_hold_the_same_numbers():
     rows = summarise([*DER, *PCC])
-    text, markdown, latex, csv = (
-        format_table(rows),
-        error_table(rows).markdown(),
-        error_table(rows).latex(),
-        csv_table(rows),
-    )
-    assert "1.20 ± 0.20" in text
+    assert "1.20 ± 0.20" in format_table(rows)
+    markdown, latex = error_table(rows).markdown(), error_table(rows).latex()
     assert "1.20 ± 0.20" in markdown
     assert r"1.20 \pm 0.20" in latex
     assert latex.count(r"\\") == 3
-    head, first, _ = csv.splitlines()
+    head, first, _ = csv_table(rows).splitlines()
     values = dict(zip(head.split(","), first.split(","), strict=True))
     assert float(values["mean_error_m"]) == pytest.approx(0.012)
-    markdown_columns = {line.count("|") for line in markdown.splitlines()}
-    assert markdown_columns == {10}
+    assert {line.count("|") for line in markdown.splitlines()} == {10}
 
 
-def board(count=50, **changes) -> BoardLog:
-    time = 0.05 * np.arange(count)
+def board(**changes) -> BoardLog:
+    time = 0.05 * np.arange(50)
     value = np.column_stack([4000 * np.sin(time), -4000 * np.cos(time)])
     arrays = {
         "setpoint_time": time,
@@ -168,15 +156,9 @@ def board(count=50, **changes) -> BoardLog:
     return BoardLog(**{**arrays, **changes})
 
 
-def test_board_receives_all_in_time():
-    found = check_board(board())
-    assert (found["board_received"], found["board_lost"], found["board_out_of_order"]) == (50, 0, 0)
-    assert found["board_lateness_p99_s"] == pytest.approx(0.003)
-    assert found["board_value_error_pa"] <= 50.0
-
-
 def test_lost_late_and_swapped_commands_are_told_apart():
     whole = board()
+    assert check_board(whole)["board_received"] == 50
     keep = np.arange(50) != 20
     lost = check_board(board(command_time=whole.command_time[keep], command=whole.command[keep]))
     assert (lost["board_received"], lost["board_lost"]) == (49, 1)

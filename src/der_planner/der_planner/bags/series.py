@@ -107,7 +107,6 @@ def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
     if not len(tip) or tip.time[-1] < 0 or tip.time[0] > end:
         raise EvaluationError(
             f"{where}: no limb state was recorded while the plan was played: did the tracker run?"
-            f"{_others_seen(record, namespace)}"
         )
     return RunSeries(
         description=_describe(plan, record, namespace, feedback),
@@ -148,13 +147,6 @@ def stream(columns: Columns, width: int, origin: int) -> Stream:
     return Stream((stamps - origin) / NANOSECONDS, columns.values(width)[first])
 
 
-def _others_seen(record: BagRecord, namespace: str) -> str:
-    others = [name for name, limb in record.limbs.items() if name != namespace and len(limb.tip)]
-    if not others:
-        return ""
-    return f" (The states of {', '.join(sorted(others))} are another limb's and do not count.)"
-
-
 def _choose_plan(limb: LimbRecord, where: str, plan_id: str) -> str:
     usable = limb.usable_plans
     if not usable:
@@ -189,16 +181,6 @@ def _board(limb: LimbRecord, setpoints: _Setpoints, origin: int) -> BoardLog | N
     )
 
 
-def _loads(plan: Any) -> dict[str, Any]:
-    """Return the loads of a plan by the fields of `Description`; older bags name none."""
-    x, y, z = (float(value) for value in getattr(plan, "gravity", (0.0, 0.0, 0.0)))
-    return {
-        "gravity": (x, y, z),
-        "payload": float(getattr(plan, "payload", 0.0)),
-        "payload_at": float(getattr(plan, "payload_at", 0.0)),
-    }
-
-
 def _describe(
     plan: Any, record: BagRecord, namespace: str, feedback: dict[str, Any]
 ) -> Description:
@@ -206,6 +188,7 @@ def _describe(
     run = record.run
     # A plan along a path is named "path"; the recorder was told which one.
     drawn = plan.motion in ("", "path")
+    x, y, z = getattr(plan, "gravity", (0.0, 0.0, 0.0))
     return Description(
         motion=(run.get("motion") if drawn else "") or plan.motion,
         model=plan.model or run.get("model", ""),
@@ -218,7 +201,10 @@ def _describe(
         limb=str(plan.limb or run.get("limb", "")),
         bag=str(record.path),
         namespace=namespace,
-        **_loads(plan),
+        # Bags of older plans name no loads.
+        gravity=(float(x), float(y), float(z)),
+        payload=float(getattr(plan, "payload", 0.0)),
+        payload_at=float(getattr(plan, "payload_at", 0.0)),
         extra={**{key: value for key, value in run.items() if key not in known}, **feedback},
     )
 

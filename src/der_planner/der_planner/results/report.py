@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from string import Template
 from typing import Any
 
 from der_planner.bags.run import RunSeries
@@ -43,28 +44,7 @@ _CAPTIONS = {
     "pressures": "Differential pressures, commanded and measured; first trial of each model.",
     "learning": "Mean tip error over the runs that a plan was learned from, a line a trial.",
 }
-_DEFINITIONS = """
-<p>r̄ is the tip reference of the plan, interpolated linearly at the stamp of each image; r is the
-tip that the tracker measured in that image. E is the mean of |r − r̄| over the valid images of the
-window, E_x and E_y are the means of |x − x̄| and |y − ȳ|. The table shows mean ± sample standard
-deviation of these over trials, and the largest |r − r̄| of any trial. Times come
-from stamps; nothing is shifted. The split fits r(t) ≈ g r̄(t − τ) + b: lag τ, gains g, bias b, and
-the RMS error that is left when lag, then bias, then gain are taken out. Models are compared under
-the same loads; where a comparison says that methods differ, too, it is not one of models alone.</p>
-"""
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem;
-       color: #1a1a1a; background: #fff; }
-h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2rem; }
-.wide { overflow-x: auto; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 0.87rem; }
-th, td { padding: 0.25rem 0.7rem; text-align: right; border-bottom: 1px solid #ddd;
-         white-space: nowrap; }
-th { border-bottom: 1.5px solid #333; } .name { text-align: left; }
-.long { white-space: normal; text-align: left; min-width: 20rem; }
-img { max-width: 100%; height: auto; } figure { margin: 1rem 0; }
-figcaption, .small { font-size: 0.85rem; color: #555; }
-"""
+_PAGE = Template((Path(__file__).parent / "page.html").read_text(encoding="utf-8"))
 
 
 def results_document(results: Sequence[RunResult]) -> dict[str, Any]:
@@ -141,13 +121,7 @@ def write_report(
 
 def document(title: str, sections: Sequence[str]) -> str:
     """Return a page, one file that opens from disk, of sections, which are HTML already."""
-    name, body = html.escape(title), "\n".join(filter(None, sections))
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{name}</title><style>{_STYLE}</style></head>\n"
-        f"<body>\n<h1>{name}</h1>\n{body}\n</body></html>\n"
-    )
+    return _PAGE.substitute(title=html.escape(title), body="\n".join(filter(None, sections)))
 
 
 def figure(caption: str, path: Path) -> str:
@@ -173,8 +147,7 @@ def _sections(results: Sequence[RunResult], figures: Sequence[str]) -> list[str]
         section("Every run", _run_table(results)),
         section("What feedback added", _feedback_table(results)),
         section("Instruments", instrument_table(results)),
-        "<h2>Definitions</h2>",
-        _DEFINITIONS,
+        (Path(__file__).parent / "definitions.html").read_text(encoding="utf-8"),
         section("Where the numbers come from", _provenance(results)),
     ]
 
