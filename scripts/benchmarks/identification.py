@@ -37,7 +37,7 @@ LADDER: tuple[tuple[str, ...], ...] = (
 def _unseen() -> Excitation:
     instants = np.arange(0.0, 40.0, PERIOD)
     waves = [1.0 - np.cos(instants / 3.0), np.sin(instants / 2.0)]
-    return Excitation(instants, 9000.0 * np.stack(waves, axis=1), ())
+    return Excitation(instants, 9000.0 * np.stack(waves, axis=1))
 
 
 def _fitted(log: CalibrationLog, terms: Iterable[str] = GROUPS) -> tuple[Limb, FitReport, float]:

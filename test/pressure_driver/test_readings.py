@@ -108,16 +108,18 @@ def test_air_that_leaves_slowly_is_not_taken_for_rest(simulate):
     sim.run_until(lambda: sim.core.arm()[0], 4.0)
 
 
-def test_chambers_that_disagree_are_not_at_rest(simulate):
-    sim = simulate()
+@pytest.mark.parametrize("protocol", NAMES)
+def test_chambers_that_disagree_are_not_at_rest(simulate, protocol):
+    sim = simulate(protocol)
     sim.board.pneumatics._gauge[2] = 1_800.0
     sim.have("stick:2")
     sim.run(6.0)
     assert "agree within" in sim.core.arm()[1]
 
 
-def test_rest_is_not_taken_again_from_chambers_that_rest_higher_than_before(simulate):
-    sim = simulate(seed=2)
+@pytest.mark.parametrize("protocol", NAMES)
+def test_rest_is_not_taken_again_from_chambers_that_rest_higher_than_before(simulate, protocol):
+    sim = simulate(protocol, seed=2)
     sim.arm()
     sim.core.vent()
     sim.run_until(lambda: sim.mode is Mode.DISARMED)
@@ -128,16 +130,18 @@ def test_rest_is_not_taken_again_from_chambers_that_rest_higher_than_before(simu
     assert "not vented yet" in sim.core.arm()[1]
 
 
-def test_a_zero_that_was_trapped_air_shows_as_soon_as_it_escapes(simulate):
+@pytest.mark.parametrize("protocol", NAMES)
+def test_a_zero_that_was_trapped_air_shows_as_soon_as_it_escapes(simulate, protocol):
     """Too little to be implausible: the limb must not be played on with a wrong zero."""
-    sim = simulate(seed=2)
+    sim = simulate(protocol, seed=2)
     trap(sim, 2_000.0)
     sim.run_until(lambda: sim.core.arm()[0], 5.0)
     sim.have()
     sim.run_until(lambda: sim.mode is Mode.FAULT, 5.0)
     assert "below its rest pressure" in sim.faults[0]
     sim.run_until(lambda: sim.core.arm()[0], 8.0)
-    assert sim.core.monitor.rest.mean == pytest.approx(sim.board.pneumatics.atmosphere, abs=250.0)
+    assert sim.vented
+    assert np.abs(sim.core.monitor.gauge).max() < 250.0
 
 
 # ------------------------------------------------------------------- numbers that are none

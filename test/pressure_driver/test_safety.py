@@ -200,8 +200,9 @@ def test_corrupt_lines_do_not_end_a_run(simulate):
 
 
 @pytest.mark.parametrize("step", [-3600, -2, 2, 3600])
-def test_a_wall_clock_that_is_set_drops_the_schedule_and_ends_vented(simulate, step):
-    sim = simulate(horizon=60.0)
+@pytest.mark.parametrize("protocol", NAMES)
+def test_a_wall_clock_that_is_set_drops_the_schedule_and_ends_vented(simulate, protocol, step):
+    sim = simulate(protocol, horizon=60.0)
     sim.track()
     held = sim.core.state()["commanded_differential"]
     for index in range(100):

@@ -49,8 +49,9 @@ def test_each_setpoint_is_on_the_wire_at_its_stamp(simulate, protocol):
         assert pressure[0::2] - pressure[1::2] == pytest.approx(u, abs=1.1)
 
 
-def test_holding_keeps_the_last_pressures_for_the_hold_time(simulate):
-    sim = simulate(setpoint_timeout=0.2, hold_time=1.0)
+@pytest.mark.parametrize("protocol", NAMES)
+def test_holding_keeps_the_last_pressures_for_the_hold_time(simulate, protocol):
+    sim = simulate(protocol, setpoint_timeout=0.2, hold_time=1.0)
     sim.track()
     last = None
     silence = 0
@@ -64,8 +65,9 @@ def test_holding_keeps_the_last_pressures_for_the_hold_time(simulate):
     assert silence * 0.05 == pytest.approx(1.2, abs=0.06)
 
 
-def test_the_ramp_down_is_as_fast_as_it_says_and_keeps_the_shape(simulate):
-    sim = simulate(vent_rate=8_000.0)
+@pytest.mark.parametrize("protocol", NAMES)
+def test_the_ramp_down_is_as_fast_as_it_says_and_keeps_the_shape(simulate, protocol):
+    sim = simulate(protocol, vent_rate=8_000.0)
     sim.track()
     sim.run_until(lambda: sim.mode is Mode.VENTING)
     commanded = [sim.core.state()["commanded_differential"]]
@@ -126,8 +128,9 @@ def test_vent_while_disarmed_or_in_fault_vents_and_changes_nothing(simulate):
     assert sim.faults == ("pulled",)
 
 
-def test_a_vent_that_does_not_empty_the_chambers_is_a_fault(simulate):
-    sim = simulate(vent_timeout=1.0)
+@pytest.mark.parametrize("protocol", NAMES)
+def test_a_vent_that_does_not_empty_the_chambers_is_a_fault(simulate, protocol):
+    sim = simulate(protocol, vent_timeout=1.0)
     sim.track()
     sim.have("stick:0")
     sim.core.vent()

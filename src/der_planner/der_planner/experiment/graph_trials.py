@@ -90,7 +90,6 @@ def play_on_graph(run: TrialRun, progress: Progress) -> dict[str, Any]:
     return {
         "bag": str(graph.bag.relative_to(options.out)),
         "plan_id": plan.plan_id,
-        "cpu_percent": {name: round(value, 1) for name, value in graph.cpu_percent.items()},
         "twin_real_time_factor": None if math.isnan(factor) else round(factor, 3),
     }
 
@@ -207,7 +206,6 @@ def play_calibration(
         "stage": stage,
         "seed": None if hardware else seed,
         "largest_pressure_Pa": float(np.abs(excitation.differential_pressure).max()),
-        "parts": [list(part) for part in excitation.parts],
         "prior": prior.name,
     }
     setup = GraphSetup(folder / "bag", metadata, seed=seed, limb=prior, hardware=hardware)

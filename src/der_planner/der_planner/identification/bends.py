@@ -206,7 +206,7 @@ def follow(model: Model, log: Prepared, *, linearise: bool = False) -> Response:
         RuntimeError: it cannot follow, or does not come to rest.
     """
     steps = _STEPS[model.name]
-    return simulate(model, log.time, pressures=log.pressure, steps=steps, linearise=linearise)
+    return simulate(model, log.log.time, pressures=log.pressure, steps=steps, linearise=linearise)
 
 
 def predicted(free: FreeTerms, model: Model, log: Prepared, values: Array) -> Predicted:
@@ -253,7 +253,7 @@ def _same_body(limb: Limb, other: Limb) -> bool:
 
 def _moments(limb: Limb, log: Prepared, angles: Array) -> Array:
     """Return the moments (K, M) that drive the limb, less the elastic ones of its bend [N·m]."""
-    driving = _gain(limb) * Material(limb).slow_effective_pressure(log.time, log.pressure)
+    driving = _gain(limb) * Material(limb).slow_effective_pressure(log.log.time, log.pressure)
     lengths = np.array([segment.length for segment in limb.segments])
     rest, linear, cubic = np.array(
         [[s.rest_curvature, s.bending_stiffness, s.cubic_stiffness] for s in limb.segments]

@@ -37,12 +37,10 @@ class Excitation:
     Attributes:
         time: (K,) [s].
         differential_pressure: (K, M) [Pa].
-        parts: (name, first instant, last instant) of each part [s].
     """
 
     time: Array
     differential_pressure: Array
-    parts: tuple[tuple[str, float, float], ...]
 
     @property
     def duration(self) -> float:
@@ -74,11 +72,13 @@ def read_excitation(path: Path, segment_count: int) -> Excitation:
             f"the excitation {path} has {table.shape[0]} rows of {table.shape[1]} columns, "
             f"expected time_s and {segment_count} pressures below one line of names"
         )
-    if not np.all(np.isfinite(table)):
-        raise LogError(f"the excitation {path} holds numbers that are not finite")
-    if np.abs(table[:, 0] - PERIOD * np.arange(len(table))).max() > 1e-6:
-        raise LogError(f"the times of the excitation {path} must be 0, {PERIOD}, {2 * PERIOD} … s")
-    return Excitation(table[:, 0], table[:, 1:], (("table", 0.0, float(table[-1, 0])),))
+    regular = np.abs(table[:, 0] - PERIOD * np.arange(len(table))).max() <= 1e-6
+    if not (regular and np.isfinite(table).all()):
+        raise LogError(
+            f"the excitation {path}: times must be 0, {PERIOD}, {2 * PERIOD} … s, and all numbers "
+            "finite"
+        )
+    return Excitation(table[:, 0], table[:, 1:])
 
 
 def within_limits(excitation: Excitation, pressure_limit: float, slew_limit: float) -> Excitation:
@@ -156,33 +156,25 @@ def calibration_run(amplitude: float, segment_count: int = 2, quick: bool = Fals
         quick: leave out the staircase and the steps: a minute and a half.
     """
     pause = np.zeros((round(2.0 / PERIOD), segment_count))
-    named = [
-        ("rest", pause),
-        ("waves", waves(amplitude, segment_count)),
-        ("rest", pause),
-        ("staircase", staircase(amplitude, segment_count)),
-        ("steps", steps(0.4 * amplitude, segment_count)),
-        ("sweep", sweep(0.25 * amplitude, segment_count)),
-        ("rest", pause),
-    ]
-    if quick:
-        named = [part for part in named if part[0] not in ("staircase", "steps")]
-    ends = np.cumsum([len(block) for _, block in named])
-    parts = tuple(
-        (name, (end - len(block)) * PERIOD, (end - 1) * PERIOD)
-        for (name, block), end in zip(named, ends, strict=True)
+    stairs_and_steps = [staircase(amplitude, segment_count), steps(0.4 * amplitude, segment_count)]
+    pressure = np.concatenate(
+        [
+            pause,
+            waves(amplitude, segment_count),
+            pause,
+            *([] if quick else stairs_and_steps),
+            sweep(0.25 * amplitude, segment_count),
+            pause,
+        ]
     )
-    pressure = np.concatenate([block for _, block in named])
-    return Excitation(np.arange(len(pressure), dtype=np.float64) * PERIOD, pressure, parts)
+    return Excitation(PERIOD * np.arange(len(pressure), dtype=float), pressure)
 
 
 def _fade(wave: Array, duration: float) -> Array:
-    count = round(duration / PERIOD)
-    ramp = 0.5 - 0.5 * np.cos(np.pi * np.arange(count) / count)
-    shape = np.ones(len(wave))
-    shape[:count] *= ramp
-    shape[-count:] *= ramp[::-1]
-    faded: Array = wave * shape[:, None]
+    """Return a wave (K, M) that begins and ends gently, over a duration [s] each."""
+    rows = np.arange(len(wave))
+    near = np.minimum(rows, rows[::-1]) / round(duration / PERIOD)
+    faded: Array = wave * (0.5 - 0.5 * np.cos(np.pi * np.minimum(near, 1.0)))[:, None]
     return faded
 
 

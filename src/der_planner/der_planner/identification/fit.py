@@ -99,8 +99,7 @@ def fit(
     offset = 0.0 if air is None else air.offset
     prepared = replace(recorded, pressure=recorded.pressure - offset)
     fitted = _fit_bends_and_lengths(limb, prepared, groups)
-    if fitted.lengths is not None:
-        warnings += filter(None, [lengths_at_their_end(limb, fitted.lengths.limb)])
+    warnings += filter(None, [lengths_at_their_end(limb, fitted.known)])
     unknowns, correlation = _told(fitted)
     stiffness = [u.untold for u in unknowns if u.name.startswith("log_stiffness")]
     if "dynamics" in groups and stiffness and all(stiffness):
@@ -127,25 +126,21 @@ def fit(
         largest=np.nanmax(np.abs(fitted.remaining), axis=0),
         pcc_residual=pcc_residual,
         span=np.ptp(prepared.bend[prepared.usable], axis=0),
-        duration=float(prepared.time[-1] - prepared.time[0]),
+        duration=float(np.ptp(prepared.log.time)),
         rows=int(prepared.usable.sum()),
         warnings=tuple(warnings),
     )
 
 
 class _Fitted(NamedTuple):
-    """A limb with its lengths, the problem that was solved on it, its solution and what it left."""
+    """A limb with its lengths, the problem solved on it, what it left, and the limb found."""
 
     known: Limb
     lengths: GeometryFit | None
     problem: BendFit
     values: Array
     remaining: Array
-
-    @property
-    def limb(self) -> Limb:
-        """The limb that was found."""
-        return self.problem.free.limb_with(self.values)
+    limb: Limb
 
 
 def _fit_bends_and_lengths(prior: Limb, prepared: Prepared, groups: Collection[str]) -> _Fitted:
@@ -202,7 +197,9 @@ def _fit_bends(
     if start is None:
         start = free.at_places(_static_start(free, prepared))
     values = problem.search.solve(_followed(problem, free, start))
-    return _Fitted(known, lengths, problem, values, problem.remaining(values))
+    return _Fitted(
+        known, lengths, problem, values, problem.remaining(values), free.limb_with(values)
+    )
 
 
 def _static_start(free: FreeTerms, prepared: Prepared) -> Array:
@@ -252,7 +249,6 @@ def _followed(problem: BendFit, free: FreeTerms, start: Array) -> Array:
 def _told(fitted: _Fitted) -> tuple[tuple[Unknown, ...], Array]:
     """Return the unknowns with standard deviations, and their correlation (P, P)."""
     problem, free = fitted.problem, fitted.problem.free
-    assert isinstance(free, FreeTerms)
     covariance = problem.search.covariance(fitted.values, problem.excess(fitted.remaining))
     deviation = np.sqrt(np.diag(covariance))
     at_bound = free.unknowns.at_bound(fitted.values)

@@ -85,8 +85,6 @@ class LeastSquares:
     ) -> None:
         self.unknowns = unknowns
         self._cheap = cheap
-        self._tolerance = 1e-4 * TOLERANCE if cheap else TOLERANCE
-        self._most = 10 * MOST_EVALUATIONS if cheap else MOST_EVALUATIONS
         self._rows, self._softness = rows, softness
         self._last: tuple[bytes, Rows | None] = (b"", None)
 
@@ -123,6 +121,7 @@ class LeastSquares:
             assert found is not None  # the search never stays where the model is not followed
             return np.concatenate([found[1] * unknowns.scale / inflated, np.diag(tightness)[known]])
 
+        tolerance = 1e-4 * TOLERANCE if self._cheap else TOLERANCE
         solution = least_squares(
             residual,
             begin / unknowns.scale,
@@ -131,9 +130,9 @@ class LeastSquares:
             loss="linear" if self._softness is None else "soft_l1",
             f_scale=self._softness or 1.0,
             x_scale=1.0 if self._cheap else "jac",
-            xtol=10.0 * self._tolerance,
-            ftol=self._tolerance,
-            max_nfev=self._most,
+            xtol=10.0 * tolerance,
+            ftol=tolerance,
+            max_nfev=10 * MOST_EVALUATIONS if self._cheap else MOST_EVALUATIONS,
         )
         return np.asarray(solution.x * unknowns.scale)
 

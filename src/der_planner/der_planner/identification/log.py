@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,12 +61,11 @@ class CalibrationLog:
                 f"the time of {self.source or 'a log'} falls from {before:.6g} s to {after:.6g} s: "
                 "is it more than one run, or has a clock been set? Keep one run a table"
             )
-        inputs = self.commanded_differential.shape
-        for name in ("commanded_differential", "measured_differential", "bend_angles"):
-            if getattr(self, name).shape != inputs:
-                raise LogError(f"{name} has shape {getattr(self, name).shape}, expected {inputs}")
-        if len(inputs) != 2 or inputs[0] != rows[0] or self.tip.shape != (rows[0], 2):
-            raise LogError(f"pressures {inputs} and tip {self.tip.shape} do not fit time {rows}")
+        inputs, points = (len(self.time), self.bend_angles.shape[-1]), (len(self.time), 2)
+        for name in ("commanded_differential", "measured_differential", "bend_angles", "tip"):
+            found, expected = getattr(self, name).shape, points if name == "tip" else inputs
+            if found != expected:
+                raise LogError(f"{name} has shape {found}, expected {expected}")
 
     @property
     def segment_count(self) -> int:
@@ -148,11 +147,6 @@ class Prepared:
     usable: NDArray[np.bool_]
     warnings: tuple[str, ...]
 
-    @property
-    def time(self) -> Array:
-        """(K,) [s]."""
-        return self.log.time
-
 
 def prepare(
     log: CalibrationLog, limb: Limb, longest_gap: float = LONGEST_GAP, *, to_fit: bool = True
@@ -196,18 +190,12 @@ def prepare(
     pressure, bend = bridge(grid.measured_differential), bridge(grid.bend_angles)
     swinging = _still_swinging(grid.time, pressure, bend, limb)
     if to_fit:
-        _check_units(pressure, limb)
         _check_tips(grid, limb)
         _check_commands(grid)
-        _check_excitation(pressure[valid & ~swinging])
+        _check_excitation(pressure[valid & ~swinging], limb)
         _check_match(pressure, bend, warnings)
     if swinging.any():
-        unseen = swinging[:, None]
-        grid = replace(
-            grid,
-            bend_angles=np.where(unseen, np.nan, grid.bend_angles),
-            tip=np.where(unseen, np.nan, grid.tip),
-        )
+        grid.bend_angles[swinging], grid.tip[swinging] = np.nan, np.nan
         warnings.append(
             "the log begins while the limb swings: its first "
             f"{CONTROL_PERIOD * swinging.sum():.1f} s are not used, since no pressure tells that "
@@ -231,15 +219,6 @@ def _still_swinging(time: Array, pressure: Array, bend: Array, limb: Limb) -> ND
     decay = 0.5 * max(float(np.mean([s.damping for s in limb.segments])), 0.2)
     swing = min(float(np.log(amplitude / SWING)) / decay, LONGEST_SWING, 0.2 * elapsed[-1])
     return np.asarray(elapsed < swing)
-
-
-def _check_units(pressure: Array, limb: Limb) -> None:
-    largest = np.nanmax(np.abs(pressure))
-    if largest > 20.0 * limb.pneumatics.pressure_limit or largest < 100.0:
-        raise LogError(
-            f"the largest measured differential pressure is {largest:.3g} Pa, the limb's limit "
-            f"{limb.pneumatics.pressure_limit:.0f} Pa: check the units of the log"
-        )
 
 
 def _check_tips(log: CalibrationLog, limb: Limb) -> None:
@@ -270,7 +249,13 @@ def _check_commands(log: CalibrationLog) -> None:
             )
 
 
-def _check_excitation(pressure: Array) -> None:
+def _check_excitation(pressure: Array, limb: Limb) -> None:
+    largest, limit = np.abs(pressure).max(), limb.pneumatics.pressure_limit
+    if not 100.0 < largest < 20.0 * limit:
+        raise LogError(
+            f"the largest measured differential pressure is {largest:.3g} Pa, the limb's limit "
+            f"{limit:.0f} Pa: check the units of the log"
+        )
     for index, value in enumerate(np.std(pressure, axis=0)):
         if value < LEAST_EXCITATION:
             raise LogError(

@@ -7,6 +7,7 @@ import csv
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from itertools import dropwhile
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +28,7 @@ LEAST_MESSAGES = 10
 """Messages of pressures, and of valid limb states, that a bag must hold."""
 UNITS = {
     "time_unit": {"s": 1.0, "ms": 1e-3, "us": 1e-6},
-    "pressure_unit": {
-        "Pa": 1.0,
-        "hPa": 100.0,
-        "mbar": 100.0,
-        "kPa": 1e3,
-        "bar": 1e5,
-        "psi": 6894.757,
-    },
+    "pressure_unit": {"Pa": 1.0, "hPa": 1e2, "mbar": 1e2, "kPa": 1e3, "bar": 1e5, "psi": 6894.757},
     "angle_unit": {"rad": 1.0, "deg": np.pi / 180.0},
     "length_unit": {"m": 1.0, "mm": 1e-3, "cm": 1e-2},
 }
@@ -265,12 +259,7 @@ def _rest(time: Array, command: Array, rest_until: float | str) -> NDArray[np.bo
         time: (K,) [s].
         command: (K, M) in any unit.
         rest_until: [s], or ``auto`` for the longest rest.
-
-    Raises:
-        LogError: it is neither.
     """
-    if isinstance(rest_until, str) and rest_until != "auto":
-        raise LogError(f"rest_until is '{rest_until}': give a time in s, or auto")
     size = np.abs(command).max(axis=1)
     near: NDArray[np.bool_] = size <= REST_SHARE * np.nanmax(size)
     if not isinstance(rest_until, str) and (near & (time < rest_until)).any():
@@ -330,17 +319,14 @@ def _lines(path: Path) -> list[str]:
         content = path.read_bytes()
     except OSError as error:
         raise LogError(f"cannot read the log {path}: {error.strerror}") from error
-    encoding = "utf-8-sig"
-    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        encoding = "utf-16"
+    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:
-        text = content.decode(encoding)
+        text = content.decode("utf-16" if wide else "utf-8-sig")
     except UnicodeDecodeError:
         # Names of columns may hold a degree sign of an older program.
         text = content.decode("cp1252", errors="replace")
-    lines = [line for line in text.splitlines() if line.strip()]
-    while lines and lines[0].lstrip().startswith("#"):
-        lines.pop(0)
+    written = (line for line in text.splitlines() if line.strip())
+    lines = list(dropwhile(lambda line: line.lstrip().startswith("#"), written))
     if not lines:
         raise LogError(f"the log {path} is empty")
     return lines

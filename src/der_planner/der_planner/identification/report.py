@@ -198,12 +198,7 @@ def readable(unit: str) -> tuple[float, str]:
     }.get(unit, (1.0, unit))
 
 
-def predict(
-    limb: Limb,
-    time: Array,
-    differential_pressure: Array,
-    model: str = "der",
-) -> Response:
+def predict(limb: Limb, time: Array, differential_pressure: Array, model: str = "der") -> Response:
     """Predict the bend of a limb from the pressures in its chambers.
 
     Args:
@@ -280,37 +275,29 @@ def check(limb: Limb, log: CalibrationLog) -> Check:
     predicted = predict(limb, prepared.log.time, prepared.pressure)
     measured = prepared.log.bend_angles
     error = np.sqrt(np.nanmean((measured - predicted.bend_angles) ** 2, axis=0))
-    gains, rests = np.empty(len(error)), np.empty(len(error))
-    for index in range(len(error)):
-        expected, seen = predicted.bend_angles[rows, index], measured[rows, index]
-        if np.ptp(expected) < LEAST_MOTION:
-            gains[index], rests[index] = math.nan, np.mean(seen - expected)
-            continue
-        slope, offset = np.polyfit(expected, seen, 1)
-        gains[index], rests[index] = slope - 1.0, offset
-    distance = np.linalg.norm(prepared.log.tip - predicted.tip, axis=1)
-    tip_error = float(np.nanmean(distance)) if np.isfinite(distance).any() else math.nan
-    drift = _drift(limb, error, gains, rests)
-    return Check(not drift, (*prepared.warnings, *drift), error, tip_error, gains, rests)
-
-
-def _drift(limb: Limb, error: Array, gains: Array, rests: Array) -> list[str]:
-    found = []
+    gains, rests, drift = np.full(len(error), math.nan), np.empty(len(error)), list[str]()
     before = limb.provenance.get("residual_deg") or [0.0] * len(error)
     for index in range(len(error)):
+        expected, seen = predicted.bend_angles[rows, index], measured[rows, index]
+        rests[index] = np.mean(seen - expected)
+        if np.ptp(expected) >= LEAST_MOTION:
+            slope, rests[index] = np.polyfit(expected, seen, 1)
+            gains[index] = slope - 1.0
         if abs(gains[index]) > GAIN_DRIFT:
-            found.append(f"the gain of segment {index} changed by {100 * gains[index]:+.0f} %")
+            drift.append(f"the gain of segment {index} changed by {100 * gains[index]:+.0f} %")
         if abs(rests[index]) > REST_DRIFT:
-            found.append(
+            drift.append(
                 f"the rest angle of segment {index} moved by {math.degrees(rests[index]):+.1f}°"
             )
         usual = max(LEAST_ERROR, math.radians(float(before[index])))
         if error[index] > ERROR_GROWTH * usual:
-            found.append(
+            drift.append(
                 f"the error of segment {index} is {math.degrees(error[index]):.2f}°, at its "
                 f"calibration it was {math.degrees(usual):.2f}°"
             )
-    return found
+    distance = np.linalg.norm(prepared.log.tip - predicted.tip, axis=1)
+    tip_error = float(np.nanmean(distance)) if np.isfinite(distance).any() else math.nan
+    return Check(not drift, (*prepared.warnings, *drift), error, tip_error, gains, rests)
 
 
 def plot_prediction(
@@ -324,12 +311,10 @@ def plot_prediction(
         path: of the PNG.
         held_out: a log that the fit has not seen.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     logs = [("fitted", log)] + ([("not seen by the fit", held_out)] if held_out else [])
     figure = Figure(figsize=(5.2 * len(logs), 4.2), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(2, len(logs), sharex="col", squeeze=False, height_ratios=(2, 1))
     for column, (title, one) in enumerate(logs):
         grid = one.resampled(CONTROL_PERIOD)

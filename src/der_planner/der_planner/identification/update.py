@@ -29,11 +29,7 @@ from der_planner.identification.bends import (
     values_of,
 )
 from der_planner.identification.fit import UNTOLD
-from der_planner.identification.least_squares import (
-    LeastSquares,
-    Rows,
-    with_differences,
-)
+from der_planner.identification.least_squares import LeastSquares, Rows, with_differences
 from der_planner.identification.log import CalibrationLog, LogError, Prepared, prepare
 from der_planner.identification.report import LEAST_MOTION, readable
 from der_planner.limb import Limb, Term
@@ -148,9 +144,8 @@ class Change:
     def text(self) -> str:
         """Return the line for people."""
         factor, unit = readable(self.term.unit)
-        before, after, spread, deviation = (
-            factor * value for value in (self.before, self.after, self.term.spread, self.deviation)
-        )
+        before, after = factor * self.before, factor * self.after
+        spread, deviation = factor * self.term.spread, factor * self.deviation
         name = self.term.name.replace("_", " ")
         line = f"segment {self.segment}, {name}: {before:.3g} ± {spread:.2g} {unit}"
         if not self.told:
@@ -168,14 +163,12 @@ class Update:
     Attributes:
         changes: three a segment, in the order gain, rest angle, friction.
         error_before, error_after: (M,) root mean square open-loop error of the bend angles [rad].
-        duration: of all runs [s].
         warnings: sentences.
     """
 
     changes: tuple[Change, ...]
     error_before: Array
     error_after: Array
-    duration: float
     warnings: tuple[str, ...]
 
     @property
@@ -217,7 +210,7 @@ def update(limb: Limb, logs: CalibrationLog | Sequence[CalibrationLog]) -> tuple
     """
     given = [logs] if isinstance(logs, CalibrationLog) else list(logs)
     runs = [prepare(log, limb, to_fit=False) for log in given]
-    duration = sum(float(run.time[-1] - run.time[0]) for run in runs)
+    duration = sum(float(np.ptp(run.log.time)) for run in runs)
     if duration < LEAST_DURATION:
         raise LogError(
             f"the runs last {duration:.1f} s altogether: an update needs {LEAST_DURATION:.0f} s, "
@@ -249,8 +242,16 @@ def update(limb: Limb, logs: CalibrationLog | Sequence[CalibrationLog]) -> tuple
             every.places, every.terms, known, values, deviation, strict=True
         )
     )
-    found = _with_provenance(every.limb_with(values), limb, changes, after, given)
-    return found, Update(changes, before, after, duration, tuple(warnings))
+    note = {
+        "source": [log.source for log in given],
+        "date": datetime.datetime.now(datetime.timezone.utc).date().isoformat(),
+        "changes": [change.text() for change in changes if change.told],
+        "residual_deg_before": limb.provenance.get("residual_deg"),
+    }
+    residual = [round(float(value), 3) for value in np.degrees(after)]
+    provenance = {**limb.provenance, "residual_deg": residual, "update": note}
+    found = replace(every.limb_with(values), provenance=provenance)
+    return found, Update(changes, before, after, tuple(warnings))
 
 
 def _solve(every: DayTerms, runs: Sequence[Prepared]) -> tuple[Array, Array]:
@@ -333,22 +334,3 @@ def adapted(limb: Limb, tip_of: Callable[[Limb], Array | None], tip: Array) -> L
         return None
     found = LeastSquares(unknowns, rows).solve()
     return numbers.limb_with(found) if far(found) < BETTER * before else None
-
-
-def _with_provenance(
-    found: Limb,
-    before: Limb,
-    changes: Sequence[Change],
-    error: Array,
-    logs: Sequence[CalibrationLog],
-) -> Limb:
-    """Return the limb with a note of what the update changed and from what."""
-    note = {
-        "source": [log.source for log in logs],
-        "date": datetime.datetime.now(datetime.timezone.utc).date().isoformat(),
-        "changes": [change.text() for change in changes if change.told],
-        "residual_deg_before": before.provenance.get("residual_deg"),
-    }
-    residual = [round(math.degrees(float(value)), 3) for value in error]
-    provenance = {**before.provenance, "residual_deg": residual, "update": note}
-    return replace(found, provenance=provenance)

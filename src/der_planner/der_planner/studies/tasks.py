@@ -299,7 +299,7 @@ def _identify(limb: str, row: Mapping[str, Any]) -> Result:
     together = np.abs(np.concatenate(list(distances.values())))
     instants = np.arange(0.0, 40.0, 0.05)
     waves = [1.0 - np.cos(instants / 3.0), np.sin(instants / 2.0)]
-    unseen = Excitation(instants, 9000.0 * np.stack(waves, axis=1), ())
+    unseen = Excitation(instants, 9000.0 * np.stack(waves, axis=1))
     log = record_twin(row["seed"], unseen, run=_UNSEEN_RUN, noise=0.0, limb=found)
     tip = predict(found, log.time, log.measured_differential).tip
     error = np.linalg.norm(tip - log.tip, axis=1)
