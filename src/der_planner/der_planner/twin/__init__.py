@@ -1,6 +1,6 @@
 """The simulated limb that stands in for the hardware."""
 
-from der_planner.twin.body import Push
-from der_planner.twin.limb_twin import LimbTwin, TwinError, TwinShape
+from der_planner.twin.body import Push, TwinError
+from der_planner.twin.limb_twin import LimbTwin, TwinShape
 
 __all__ = ["LimbTwin", "Push", "TwinError", "TwinShape"]

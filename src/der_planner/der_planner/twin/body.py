@@ -178,8 +178,8 @@ def _arrays(rod: CosseratRod) -> RodArrays:
     )
 
 
-class LoadError(ValueError):
-    """A load is impossible; the message says which and why."""
+class TwinError(RuntimeError):
+    """The simulated limb was asked for something impossible, or left the range of its physics."""
 
 
 @dataclass(frozen=True)
@@ -223,14 +223,14 @@ class NodeLoads:
         gravity: (3,) acceleration in `limb_base` [m/s²].
 
     Raises:
-        LoadError: gravity is not three finite numbers.
+        TwinError: gravity is not three finite numbers.
     """
 
     def __init__(
         self, node_arc: Array, mass: Array, force: Array, gravity: Sequence[float]
     ) -> None:
         if len(gravity) != 3 or not np.all(np.isfinite(gravity)):
-            raise LoadError(f"gravity must be three finite numbers in m/s², got {gravity}")
+            raise TwinError(f"gravity must be three finite numbers in m/s², got {gravity}")
         self._node_arc = node_arc
         self._own_mass = mass.copy()
         self._mass = mass
@@ -248,19 +248,19 @@ class NodeLoads:
         """Take a push into the schedule; `update` puts it on the nodes when it is time.
 
         Raises:
-            LoadError: the place is not on the limb, a number is not finite, or more mass is taken
+            TwinError: the place is not on the limb, a number is not finite, or more mass is taken
                 off than there is.
         """
         if not np.all(np.isfinite([*push.force, push.mass])) or len(push.force) != 3:
-            raise LoadError(f"force and mass of a push must be finite, got {push}")
+            raise TwinError(f"force and mass of a push must be finite, got {push}")
         if math.isnan(push.instant) or not push.duration > 0:
-            raise LoadError(f"a push needs an instant and a duration above 0 s, got {push}")
+            raise TwinError(f"a push needs an instant and a duration above 0 s, got {push}")
         shares = self._shares(push.arc_length)
         total = self._own_mass + push.mass * shares
         for other, other_shares in self._pushes:
             total = total + other.mass * other_shares
         if np.any(total <= 0.0):
-            raise LoadError(f"there is no mass of {-push.mass} kg at {push.arc_length} m to take")
+            raise TwinError(f"there is no mass of {-push.mass} kg at {push.arc_length} m to take")
         self._pushes.append((push, shares))
 
     def next_change(self, time: float) -> float:
@@ -287,7 +287,7 @@ class NodeLoads:
         """Return what each node (E+1,) bears of a load at an arc length [m]."""
         end = float(self._node_arc[-1])
         if not -1e-9 <= arc_length <= end + BEYOND_THE_TIP:
-            raise LoadError(
+            raise TwinError(
                 f"a load at {arc_length} m is not on the limb: its arc length is 0 to {end:.3f} m"
             )
         place = min(max(arc_length, 0.0), end)

@@ -11,7 +11,7 @@ import numpy as np
 
 from der_planner.arrays import Array
 from der_planner.limb import PointMass
-from der_planner.twin.body import LoadError, NodeLoads, Push, build
+from der_planner.twin.body import NodeLoads, Push, TwinError, build
 from der_planner.twin.hardware import DrawnHardware, draw
 from der_planner.twin.kernel import Ramp, advance
 
@@ -34,10 +34,6 @@ TICKS_PER_PERIOD = 4
 """A real-time loop simulates this often in each period of publishing."""
 _LONGEST_SETTLING = 30.0
 """Simulated time [s] after which a limb that still creeps toward its rest is left to the run."""
-
-
-class TwinError(RuntimeError):
-    """The simulated limb was asked for something impossible, or left the range of its physics."""
 
 
 @dataclass(frozen=True)
@@ -98,10 +94,7 @@ class LimbTwin:
         self._node_arc = body.node_arc
         self._element_segment, self._vertex_segment = body.element_segment, body.vertex_segment
         self._rigid_elements = np.nonzero(self._element_segment < 0)[0]
-        try:
-            self._loads = NodeLoads(self._node_arc, rod.mass, rod.external_forces, gravity)
-        except LoadError as error:
-            raise TwinError(str(error)) from error
+        self._loads = NodeLoads(self._node_arc, rod.mass, rod.external_forces, gravity)
         for item in masses:
             self.push(Push(-math.inf, item.arc_length, mass=item.mass))
         self._wander = np.array([s.wander for s in self._hardware.segments])
@@ -118,15 +111,12 @@ class LimbTwin:
     @property
     def tip(self) -> Array:
         """(2,) position of the tip [m]."""
-        tip: Array = self._rod.position_collection[:2, -1].copy()
-        return tip
+        return np.array(self._rod.position_collection[:2, -1])
 
     @property
     def bend_angles(self) -> Array:
         """(M,) heading at the end of each segment less the heading at its start [rad]."""
-        heading = self._element_headings()
-        angles: Array = np.diff(heading[self._rigid_elements])
-        return angles
+        return np.array(np.diff(self._element_headings()[self._rigid_elements]))
 
     def step(self, chamber_pressure: Array, duration: float) -> None:
         """Advance the limb under constant chamber pressures, which it feels after `RAMP`.
@@ -166,10 +156,7 @@ class LimbTwin:
         Raises:
             TwinError: the place is not on the limb, or a number is not finite.
         """
-        try:
-            self._loads.add(push)
-        except LoadError as error:
-            raise TwinError(str(error)) from error
+        self._loads.add(push)
         self._loads.update(self.time)
 
     def shape(self, points: int = 0) -> TwinShape:
@@ -257,9 +244,7 @@ class LimbTwin:
         steps = int(2.0 / TIME_STEP)
         ramp = self._ramp(self._target(rest, 0.0), steps // 4)
         advance(self._arrays, self._material, ramp, steps, TIME_STEP, _SETTLING_DRAG)
-        self._rod.velocity_collection[:] = 0.0
-        self._rod.omega_collection[:] = 0.0
-        self._material.creep[:] = 0.0
+        self._stop()
 
     def _settle_under_loads(self) -> None:
         """Bring the limb to the pose in which its loads leave it.
@@ -279,10 +264,14 @@ class LimbTwin:
             advance(self._arrays, calm, ramp, steps, TIME_STEP, _SETTLING_DRAG)
             if np.abs(self._rod.velocity_collection).max() < _SETTLED_SPEED:
                 break
+        self._stop()
+        material.friction[:] = 0.0
+
+    def _stop(self) -> None:
+        """Take all speed from the limb, and relax its creep."""
         self._rod.velocity_collection[:] = 0.0
         self._rod.omega_collection[:] = 0.0
-        material.creep[:] = 0.0
-        material.friction[:] = 0.0
+        self._material.creep[:] = 0.0
 
     def _steps_to(self, instant: float) -> int:
         """Return how many steps lead to an instant [s], at least one."""
@@ -316,6 +305,7 @@ class RealTimeLoop:
         capacity: simulated time per time spent in `advance`, smoothed; the margin over real time.
         busy: share of one core spent in `advance` and `publish`, smoothed.
         lag: how late the last tick was [s].
+        simulated_until: steady time up to which was simulated [s].
         dropped: time that was never simulated [s].
         behind: time was dropped within the last seconds.
     """
@@ -325,51 +315,43 @@ class RealTimeLoop:
         advance: Callable[[float], None],
         publish: Callable[[float], None],
         period: float,
-        clock: Callable[[], float] | None = None,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._advance = advance
         self._publish = publish
         self._period = period
-        self._clock = clock or time.monotonic
-        self._begin = self._simulated_until = 0.0
+        self._clock = clock
+        self._begin = self.simulated_until = 0.0
         self._next_publish = 0.0
         self._started = False
         self._spent = self._covered = 0.0
         self._last_drop = -1e9
-        self.capacity = 0.0
-        self.busy = 0.0
-        self.lag = 0.0
-        self.dropped = 0.0
+        self.capacity = self.busy = self.lag = self.dropped = 0.0
         self.behind = False
-
-    @property
-    def simulated_until(self) -> float:
-        """Steady time up to which was simulated [s]."""
-        return self._simulated_until
 
     @property
     def real_time_factor(self) -> float:
         """Simulated over passed time since the start; 1 when nothing was dropped."""
-        passed = self._simulated_until - self._begin
+        passed = self.simulated_until - self._begin
         return 1.0 - self.dropped / passed if passed > 0 else 1.0
 
     def tick(self, now: float) -> float:
         """Simulate up to ``now`` [s, steady], publish if due, return the time to sleep [s]."""
         if not self._started:
-            self._begin = self._simulated_until = self._next_publish = now
+            self._begin = self.simulated_until = self._next_publish = now
             self._started = True
-        passed = now - self._simulated_until
+        passed = now - self.simulated_until
         self.lag = max(0.0, passed - self._period / TICKS_PER_PERIOD)
         if passed > BACKLOG:
             self.dropped += passed - BACKLOG
-            self._simulated_until = now - BACKLOG
+            self.simulated_until = now - BACKLOG
             self._last_drop = now
             passed = BACKLOG
         self.behind = now - self._last_drop < 5.0
         begin = self._clock()
         if passed > 0:
             self._advance(passed)
-            self._simulated_until = now
+            self.simulated_until = now
         spent = self._clock() - begin
         if now >= self._next_publish:
             self._publish(self._clock() - begin)

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 from der_planner.arrays import Array
 from der_planner.limb import PointMass
 from der_planner.model.air import pair_of
-from der_planner.twin.body import Push
-from der_planner.twin.limb_twin import LimbTwin, TwinError
+from der_planner.twin.body import Push, TwinError
+from der_planner.twin.limb_twin import LimbTwin
 from pressure_driver.emulator.pneumatics import BoardPneumatics
 
 FINE_STEP = 0.01
