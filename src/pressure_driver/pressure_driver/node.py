@@ -140,11 +140,11 @@ class PressureDriver(Node):
         self._write_log()
         for _ in range(len(self._port.states)):
             state = self._state = self._port.states.popleft()
-            self._late.append(state["tick_to_write"] / 1e6)
+            self._late.append(state.pop("tick_to_write") / 1e6)
             message = PressureState(**{name: state[name] for name in STATE_FIELDS})
-            message.header.stamp = stamp_from_nanoseconds(state["tick"])
+            message.header.stamp = stamp_from_nanoseconds(state.pop("tick"))
             message.header.frame_id = topics.BASE_FRAME
-            message.setpoint_stamp = stamp_from_nanoseconds(state["setpoint_stamp"])
+            message.setpoint_stamp = stamp_from_nanoseconds(state.pop("setpoint_stamp"))
             self._state_publisher.publish(message)
 
     def _write_log(self) -> None:
@@ -199,7 +199,7 @@ class PressureDriver(Node):
 def _written(value: object) -> str:
     """Return a value of the diagnostics as people read it."""
     if isinstance(value, float):
-        return f"{value:.4g}"
+        return f"{value:.6g}"
     if isinstance(value, list | tuple):
         return "; ".join(value) or "none"
     return str(value) or "none"
