@@ -195,7 +195,7 @@ def _plan_of(content: Any) -> Plan:
     body = Model.of(limb, str(content["model"]))
     beside = within_limits(command, body.air, CONTROL_PERIOD, command[0])[1]
     if beside > _SAME * limb.pneumatics.pressure_limit:
-        raise ValueError(f"its pressures leave the limb's limits by {beside:.0f} Pa")
+        raise ValueError("its pressures or their changes are beyond the limb's limits")
     time: Array = np.arange(count, dtype=np.float64) * CONTROL_PERIOD
     rest = np.array(content["rest_bend_angles_rad"], dtype=float)
     reference = Reference(time, tip, angles, resting_spline(time, angles, start), rest, start)
