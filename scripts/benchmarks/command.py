@@ -14,7 +14,7 @@ import platform
 import time
 from pathlib import Path
 
-from der_planner.results.outputs import OutputError, check_file
+from der_planner.experiment.console import OptionError, check_file
 
 PARTS = {
     "rod": "rod",
@@ -63,7 +63,7 @@ def main() -> int:
     if options.json is not None:
         try:
             check_file(options.json, "--json")
-        except OutputError as error:
+        except OptionError as error:
             parser.error(str(error))
         options.json.parent.mkdir(parents=True, exist_ok=True)
     parts = list(PARTS) if "all" in options.parts else options.parts

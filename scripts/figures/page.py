@@ -13,7 +13,7 @@ from urllib.parse import urljoin
 
 from benchmarks.page import PageGraph, page_graph
 from der_msgs.msg import PressureState
-from der_planner.results.outputs import folder_argument
+from der_planner.experiment.console import folder_argument
 from workspace_setup.basics import ROOT
 
 DOC = ROOT / "src" / "der_planner" / "doc"

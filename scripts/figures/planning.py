@@ -14,10 +14,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
+from der_planner.experiment.console import folder_argument
 from der_planner.limb import Limb
 from der_planner.model import ArcModel
 from der_planner.planning import Motion, Plan, Workspace, plan
-from der_planner.results.outputs import folder_argument
 from workspace_setup.basics import ROOT
 
 matplotlib.use("Agg")

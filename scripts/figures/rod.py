@@ -13,8 +13,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from benchmarks.rod import cantilever, run_elastica
+from der_planner.experiment.console import folder_argument
 from der_planner.limb import Limb
-from der_planner.results.outputs import folder_argument
 from der_planner.rod import Rod
 from workspace_setup.basics import ROOT
 

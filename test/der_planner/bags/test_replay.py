@@ -7,8 +7,8 @@ import pytest
 from bags import SECOND, START, TEXT, spec, string
 
 from der_planner.bags.reader import BagError, BagReader
-from der_planner.bags.replay import CLOCK_PERIOD, Selection, replay
 from der_planner.bags.writer import BagWriter
+from der_planner.commands.replay_bag import CLOCK_PERIOD, Selection, replay
 
 
 @pytest.fixture

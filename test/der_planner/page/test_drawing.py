@@ -73,15 +73,10 @@ def test_what_is_no_drawing_is_refused(sent: object) -> None:
         drawn_pixels(sent)
 
 
-@pytest.mark.slow
-def test_a_preview_is_planned_in_another_process() -> None:
-    previewer = Previewer(LIMB, PathLimits(), Load())
+def test_a_preview_says_what_would_be_played_or_why_not() -> None:
     turn = np.linspace(0, 2 * np.pi, 40)
     ring = ARCS.tip([0.9, 0.9]) + 0.03 * np.column_stack([np.cos(turn), np.sin(turn)])
-    try:
-        found = previewer.ask(LIMB, ring, "pcc", "paper").result(timeout=120)
-    finally:
-        previewer.close()
+    found = preview(LIMB, ring, PathLimits(), "pcc", "paper")
     assert not found.problem
     assert 0 < found.largest_pressure <= LIMB.pneumatics.pressure_limit
     assert 0.005 < found.deviation_largest < 0.03
@@ -89,14 +84,8 @@ def test_a_preview_is_planned_in_another_process() -> None:
     assert "leaves what the limb reaches" in text
     assert f"{found.duration:.1f} s" in text
     json.dumps([pose.tolist() for pose in found.poses])
-
-
-def test_a_drawing_that_cannot_be_planned_says_why() -> None:
-    fast = PathLimits(speed=1e-6)
-    turn = np.linspace(0, 2 * np.pi, 40)
-    ring = ARCS.tip([0.9, 0.9]) + 0.01 * np.column_stack([np.cos(turn), np.sin(turn)])
-    found = preview(LIMB, ring, fast, "pcc", "paper")
-    assert "the longest is 3600 s" in summary(found)
+    slow = preview(LIMB, ring, PathLimits(speed=1e-6), "pcc", "paper")
+    assert "the longest is 3600 s" in summary(slow)
 
 
 @pytest.mark.parametrize("name", ["../up", "a/b", ".hidden", "/etc/passwd", "star\x00", "Über 1"])

@@ -54,14 +54,13 @@ def test_interval_covers_the_truth_as_often_as_it_says():
     random = np.random.default_rng(1)
     covered = 0
     for _ in range(60):
-        one = [
-            dataclasses.replace(DER[0], seed=i, mean_error_m=0.01 + random.normal(0, 1e-3))
-            for i in range(12)
-        ]
-        two = [
-            dataclasses.replace(PCC[0], seed=i, mean_error_m=0.02 + random.normal(0, 1e-3))
-            for i in range(12)
-        ]
+        one, two = (
+            [
+                dataclasses.replace(run, seed=i, mean_error_m=mean + random.normal(0, 1e-3))
+                for i in range(12)
+            ]
+            for run, mean in ((DER[0], 0.01), (PCC[0], 0.02))
+        )
         (found,) = compare([*one, *two])
         covered += found.low_m <= 0.01 <= found.high_m
     assert 50 <= covered <= 60
@@ -145,8 +144,8 @@ def test_tables_hold_the_same_numbers():
     assert {line.count("|") for line in markdown.splitlines()} == {10}
 
 
-def board(count=50, **changes) -> BoardLog:
-    time = 0.05 * np.arange(count)
+def board(**changes) -> BoardLog:
+    time = 0.05 * np.arange(50)
     value = np.column_stack([4000 * np.sin(time), -4000 * np.cos(time)])
     arrays = {
         "setpoint_time": time,
@@ -159,6 +158,7 @@ def board(count=50, **changes) -> BoardLog:
 
 def test_lost_late_and_swapped_commands_are_told_apart():
     whole = board()
+    assert check_board(whole)["board_received"] == 50
     keep = np.arange(50) != 20
     lost = check_board(board(command_time=whole.command_time[keep], command=whole.command[keep]))
     assert (lost["board_received"], lost["board_lost"]) == (49, 1)

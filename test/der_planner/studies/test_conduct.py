@@ -165,15 +165,11 @@ def test_a_twin_is_calibrated_once(tmp_path, monkeypatch):
     assert fitted == [Twin(6)]
 
 
-def test_what_cannot_be_written_is_named(tmp_path):
+def test_what_cannot_be_written_or_reached_is_named(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
-    with pytest.raises(StudyError, match=f"cannot write into {tmp_path / 'file'}: .* kept"):
-        Store(tmp_path / "file", Study.read(write(tmp_path, RODS)))
-
-
-def test_no_scheduler(tmp_path, monkeypatch):
-    monkeypatch.setattr(conducting, "PATIENCE", 0.5)
-    address = "tcp://127.0.0.1:1"
     study = Study.read(write(tmp_path, RODS))
-    with pytest.raises(StudyError, match=f"no Dask scheduler answers at {address}"):
-        conduct(study, PlaySettings(tmp_path / "out", address), Progress())
+    with pytest.raises(StudyError, match=f"cannot write into {tmp_path / 'file'}: .* kept"):
+        Store(tmp_path / "file", study)
+    monkeypatch.setattr(conducting, "PATIENCE", 0.5)
+    with pytest.raises(StudyError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:1"):
+        conduct(study, PlaySettings(tmp_path / "out", "tcp://127.0.0.1:1"), Progress())

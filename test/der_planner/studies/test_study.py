@@ -112,8 +112,8 @@ def test_draws_fill_the_ranges_and_repeat(method):
 
 def test_indices_of_a_function_whose_indices_are_known(tmp_path):
     """Ishigami's function, sin a + 7 sin² b + 0.1 c⁴ sin a on (−π, π)³ (Saltelli 2000)."""
-    factors = ", ".join(f"error.{name}: {{low: -0.5, high: 0.5}}" for name in
-                        ("moment_gain", "length", "damping"))  # fmt: skip
+    names = ("moment_gain", "length", "damping")
+    factors = ", ".join(f"error.{name}: {{low: -0.5, high: 0.5}}" for name in names)
     found = study(
         tmp_path,
         task="model",
@@ -127,15 +127,11 @@ def test_indices_of_a_function_whose_indices_are_known(tmp_path):
         result = np.sin(a) + 7 * np.sin(b) ** 2 + 0.1 * c**4 * np.sin(a)
         kept[row.key] = {**row.values, "mean_error_m": result, "error": None}
     indices = {each.factor: each for each in sobol_indices(found, kept, "mean_error_m")}
-    for name, first, total in (
-        ("error.moment_gain", 0.314, 0.558),
-        ("error.length", 0.442, 0.442),
-        ("error.damping", 0.0, 0.244),
-    ):
-        assert indices[name].first == pytest.approx(first, abs=0.03)
-        assert indices[name].total == pytest.approx(total, abs=0.03)
-        low, high = indices[name].total_range
-        assert low < indices[name].total < high
+    known = {"moment_gain": (0.314, 0.558), "length": (0.442, 0.442), "damping": (0.0, 0.244)}
+    for name, (first, total) in known.items():
+        index = indices[f"error.{name}"]
+        assert (index.first, index.total) == pytest.approx((first, total), abs=0.03)
+        assert index.total_range[0] < index.total < index.total_range[1]
     kept[found.rows[7].key]["mean_error_m"] = None
     assert sobol_indices(found, kept, "mean_error_m") == ()
 

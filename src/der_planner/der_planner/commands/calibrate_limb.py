@@ -32,6 +32,8 @@ from der_planner.experiment.console import (
     OptionError,
     Progress,
     add_load_options,
+    check_file,
+    check_folder,
     check_kilograms,
     interrupt_once,
     run_command,
@@ -60,7 +62,6 @@ from der_planner.identification.log import prepare
 from der_planner.identification.report import plot_prediction
 from der_planner.limb import Limb, LimbError
 from der_planner.planning.loads import nearly_buckling
-from der_planner.results.outputs import check_file, check_folder
 from pressure_driver.settings import Settings
 
 LIGHTEST = 1e-3
@@ -179,7 +180,7 @@ def _check(given: argparse.Namespace) -> None:
     """Refuse options that do not go together, and results that cannot be written.
 
     Raises:
-        OptionError, OutputError: names the option and what it may be.
+        OptionError: names the option and what it may be.
     """
     for wrong, said in (
         (given.csv and not given.columns, "--csv needs --columns FILE"),

@@ -20,10 +20,15 @@ import dataclasses
 import sys
 from pathlib import Path
 
-from der_planner.experiment.console import Loads, OptionError, add_load_options, run_command
+from der_planner.experiment.console import (
+    Loads,
+    OptionError,
+    add_load_options,
+    check_file,
+    run_command,
+)
 from der_planner.identification import CalibrationLog, LogError, check, read_log, update
 from der_planner.limb import Limb, LimbError
-from der_planner.results.outputs import check_file
 
 
 def main() -> int:

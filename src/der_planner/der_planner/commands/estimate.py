@@ -19,10 +19,9 @@ import numpy as np
 from der_planner.arrays import Array
 from der_planner.commands.learn import FAILURES, add_plan_options, check_same, plan_of
 from der_planner.control.hindsight import Filmed, Smoothed, smooth
-from der_planner.experiment.console import run_command
+from der_planner.experiment.console import check_file, run_command
 from der_planner.planning import Plan
 from der_planner.results import EvaluationError, RunSeries, load_run
-from der_planner.results.outputs import check_file
 
 
 def main() -> int:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from der_planner.experiment.console import Progress, run_command
+from der_planner.experiment.console import Progress, check_file, check_folder, run_command
 from der_planner.results import (
     BagError,
     EvaluationError,
@@ -25,7 +25,6 @@ from der_planner.results import (
     write_results,
 )
 from der_planner.results.errors import WINDOWS
-from der_planner.results.outputs import check_file, check_folder
 from der_planner.results.overlay import write_video
 
 

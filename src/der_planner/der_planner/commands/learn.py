@@ -19,13 +19,12 @@ from typing import Any
 import numpy as np
 
 from der_planner.control import Learner, LearningError
-from der_planner.experiment.console import run_command
+from der_planner.experiment.console import check_file, run_command
 from der_planner.limb import Limb, LimbError
 from der_planner.planning import Motion, Plan, PlanningError, plan
 from der_planner.planning.motions import NAMES
 from der_planner.planning.plan_file import read_plan, write_plan
 from der_planner.results import BagError, EvaluationError, RunSeries, load_run
-from der_planner.results.outputs import check_file
 
 FAILURES = (BagError, EvaluationError, LearningError, LimbError, PlanningError)
 """What a bag, a limb file or a plan may be lacking."""

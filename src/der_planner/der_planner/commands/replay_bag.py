@@ -15,6 +15,8 @@ import contextlib
 import importlib
 import sys
 import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +27,12 @@ from rosgraph_msgs.msg import Clock
 
 from der_planner.bags.reader import BagError, BagReader, RawMessage, RecordedTopic
 from der_planner.bags.record import NANOSECONDS
-from der_planner.bags.replay import Selection, choose_topics, replay
 from der_planner.experiment.client import GraphClient
 from der_planner.experiment.console import OptionError, Progress, interrupt_once, run_command
 from der_planner.experiment.processes import GraphError
 
+CLOCK_PERIOD = NANOSECONDS // 100
+"""Recorded time between two messages on ``/clock`` [ns] while nothing else is due."""
 ATTEMPTS = 3
 PATIENCE = 3.0
 """Longest wait for one answer [s]; then the message is sent again."""
@@ -42,6 +45,91 @@ def main() -> int:
     given = _arguments()
     interrupt_once()
     return run_command(lambda: _replay(given), BagError, GraphError)
+
+
+# What is played ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What of a bag is played.
+
+    Attributes:
+        start: seconds after the bag's first message at which to begin.
+        stop: seconds after it at which to end; None = the bag's end.
+        topics: only these recorded names; all if empty.
+        exclude: recorded names to leave out.
+        remap: recorded name to the name to publish on.
+    """
+
+    start: float = 0.0
+    stop: float | None = None
+    topics: Sequence[str] = ()
+    exclude: Sequence[str] = ()
+    remap: Mapping[str, str] = field(default_factory=dict)
+
+    def window(self, bag: BagReader) -> tuple[int, int]:
+        """Return the first log time that is played, and the one before which to stop [ns].
+
+        Raises:
+            BagError: nothing lies between them.
+        """
+        first, last = bag.start + round(self.start * NANOSECONDS), bag.end + 1
+        if self.stop is not None:
+            last = min(last, bag.start + round(self.stop * NANOSECONDS))
+        if last <= first:
+            raise BagError(
+                f"nothing lies between {self.start} s and {(last - bag.start) / NANOSECONDS:g} s "
+                "from the bag's first message"
+            )
+        return first, last
+
+
+def choose_topics(bag: BagReader, wanted: Selection) -> dict[str, RecordedTopic]:
+    """Return the topics to play by the name to publish on.
+
+    Raises:
+        BagError: a name that is asked for or remapped is not in the bag, or two share a name.
+    """
+    known = bag.topics
+    for name in (*wanted.topics, *wanted.exclude, *wanted.remap):
+        if name not in known:
+            raise BagError(f"{bag.path} has no topic {name}, only {', '.join(sorted(known))}")
+    chosen: dict[str, RecordedTopic] = {}
+    for name in wanted.topics or known:
+        if name in wanted.exclude:
+            continue
+        target = wanted.remap.get(name, name)
+        if target in chosen:
+            raise BagError(f"{chosen[target].name} and {name} would both be played on {target}")
+        chosen[target] = known[name]
+    return chosen
+
+
+def replay(bag: BagReader, wanted: Selection) -> Iterator[tuple[int, str, RawMessage | None]]:
+    """Yield what is published, in recorded order: recorded time [ns], topic, message.
+
+    At the beginning, and every `CLOCK_PERIOD` between messages, there is the time alone.
+
+    Args:
+        bag: open.
+        wanted: what to play.
+
+    Raises:
+        BagError: as `choose_topics` and `Selection.window`.
+    """
+    names = {topic.name: target for target, topic in choose_topics(bag, wanted).items()}
+    shown, last = wanted.window(bag)
+    yield shown, "", None
+    for message in bag.raw(list(names), shown, last):
+        while shown + CLOCK_PERIOD < message.log_time:
+            shown += CLOCK_PERIOD
+            yield shown, "", None
+        shown = message.log_time
+        yield shown, names[message.topic], message
+
+
+# Onto the graph ----------------------------------------------------------------------------------
 
 
 def _stamp(data: bytes) -> bytes:
@@ -71,7 +159,6 @@ class GraphOutput:
     Args:
         client: whose node publishes.
         topics: recorded topics by the name to publish on.
-        show_clock: publish /clock.
         step_by: name to publish on that waits for answers, or empty.
         answer: topic of the answers.
 
@@ -84,7 +171,6 @@ class GraphOutput:
         self,
         client: GraphClient,
         topics: dict[str, RecordedTopic],
-        show_clock: bool,
         step_by: str = "",
         answer: str = "",
     ) -> None:
@@ -97,7 +183,7 @@ class GraphOutput:
             name: node.create_publisher(message_class(topic.type_name), name, _profile(topic))
             for name, topic in topics.items()
         }
-        self._clock = node.create_publisher(Clock, "/clock", 10) if show_clock else None
+        self._clock = node.create_publisher(Clock, "/clock", 10)
         if step_by:
             kind = client.wait_for(
                 lambda: dict(node.get_topic_names_and_types()).get(answer),
@@ -144,10 +230,9 @@ class GraphOutput:
 
     def show_time(self, now: int) -> None:
         """Publish recorded time."""
-        if self._clock is not None:
-            message = Clock()
-            message.clock.sec, message.clock.nanosec = divmod(now, NANOSECONDS)
-            self._clock.publish(message)
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = divmod(now, NANOSECONDS)
+        self._clock.publish(message)
 
 
 def _profile(topic: RecordedTopic) -> QoSProfile:
@@ -171,7 +256,6 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--topics", nargs="+", default=[], metavar="TOPIC", help="only these")
     parser.add_argument("--exclude", nargs="+", default=[], metavar="TOPIC")
     parser.add_argument("--remap", nargs="+", default=[], metavar="OLD=NEW")
-    parser.add_argument("--no-clock", action="store_true", help="do not publish /clock")
     parser.add_argument("--step-by", default="", metavar="TOPIC=ANSWER", help="wait for answers")
     parser.add_argument(
         "--wait", type=float, default=3.0, metavar="S", help="for subscribers before the start"
@@ -198,7 +282,7 @@ def _replay(given: argparse.Namespace) -> int:
     with BagReader(given.bag) as bag, GraphClient("replay_bag") as client:
         topics = choose_topics(bag, wanted)
         first, last = wanted.window(bag)
-        output = GraphOutput(client, topics, not given.no_clock, step_by, answer)
+        output = GraphOutput(client, topics, step_by, answer)
         output.wait_for_receivers(given.wait)
         begin = time.monotonic()
         for when, topic, message in replay(bag, wanted):

@@ -25,7 +25,13 @@ from typing import Any
 
 from der_planner.commands.learn import add_run, learning_summary
 from der_planner.control import Learner, LearningError
-from der_planner.experiment.console import OptionError, Progress, interrupt_once, run_command
+from der_planner.experiment.console import (
+    OptionError,
+    Progress,
+    check_folder,
+    interrupt_once,
+    run_command,
+)
 from der_planner.experiment.offline_run import load_arrays, play_offline
 from der_planner.experiment.options import Options, Trial, TrialRun, parse
 from der_planner.experiment.processes import GraphError, NodeError
@@ -53,7 +59,6 @@ from der_planner.results import (
     write_report,
     write_results,
 )
-from der_planner.results.outputs import check_folder
 from der_planner.results.report import instrument_table
 
 Kept = list[tuple[Trial, dict[str, Any]]]
@@ -82,7 +87,7 @@ def run(options: Options) -> None:
 
     Raises:
         OptionError: the limb file is not usable, or the folder holds another experiment.
-        OutputError: the folder cannot be written.
+        OptionError: the folder cannot be written.
         PlanningError, LearningError: a motion cannot be planned, or cannot be learned.
         GraphError, NodeError: a trial failed; finished trials stay finished.
     """
@@ -384,8 +389,5 @@ def _print_instruments(found: list[RunResult], kept: Kept) -> None:
     if (instruments := instrument_table(found)).rows:
         print(f"\n{instruments.text()}")
     for trial, entry in kept:
-        if "cpu_percent" in entry:
-            cpu = ", ".join(f"{name} {value:.0f}" for name, value in entry["cpu_percent"].items())
-            speed = entry["twin_real_time_factor"]
-            twin = f"the twin ran at {speed} of real time; " if speed is not None else ""
-            print(f"{trial.name}: {twin}CPU in % of one core: {cpu}")
+        if (speed := entry.get("twin_real_time_factor")) is not None:
+            print(f"{trial.name}: the twin ran at {speed} of real time")

@@ -14,8 +14,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from der_planner.experiment.console import OptionError, Progress, interrupt_once, run_command
-from der_planner.results.outputs import check_folder
+from der_planner.experiment.console import (
+    OptionError,
+    Progress,
+    check_folder,
+    interrupt_once,
+    run_command,
+)
 from der_planner.studies.conduct import PlaySettings, Store, conduct
 from der_planner.studies.factors import ERROR, PLANNED, StudyError, limb_parameters, of_task
 from der_planner.studies.report import means_table, summarise

@@ -89,8 +89,7 @@ class Nominal:
         model = plan.body if isinstance(plan.body, RodModel) else RodModel(plan.limb)
         self.model = model
         self.kinematics = model.kinematics
-        last = np.repeat(plan.differential_pressure[-1:], _HOLD, axis=0)
-        self.commands = np.concatenate([plan.differential_pressure, last])
+        self.commands = _held(plan.differential_pressure)
         count = len(self.commands)
         time = np.arange(count, dtype=np.float64) * CONTROL_PERIOD
         start = plan.reference.start
@@ -105,9 +104,7 @@ class Nominal:
                 None if start is None else model.state(spline(0.0), spline(0.0, 1)), self.before
             ),
         )
-        self.reference = np.concatenate(
-            [plan.tip_reference, np.repeat(plan.tip_reference[-1:], _HOLD, axis=0)]
-        )
+        self.reference = _held(plan.tip_reference)
         known = self._known_disturbance(plan, response.tip[: len(plan.time)])
         tip, bend = response.tip[:-1] + known, response.bend_angles[:-1]
         bend = bend + self._bend_of(bend, known)
@@ -164,8 +161,7 @@ class Nominal:
         """Return what a learned plan expects beyond the model (K', 2) [m]; the last of it stays."""
         if plan.model != "der":
             return np.zeros_like(self.reference)
-        known = plan.tip_predicted - model_tip
-        return np.concatenate([known, np.repeat(known[-1:], _HOLD, axis=0)])
+        return _held(plan.tip_predicted - model_tip)
 
     def _bend_of(self, bend: Array, moved: Array) -> Array:
         """Return changes of bend (K', M) [rad] that move the tip by (K', 2) [m].
@@ -203,6 +199,11 @@ class Nominal:
         fine, whole = expm(system * STEP), expm(system * CONTROL_PERIOD)
         self.fine_transition, self.fine_input = fine[:, :both, :both], fine[:, :both, both:]
         self.transition, self.input = whole[:, :both, :both], whole[:, :both, both:]
+
+
+def _held(rows: Array) -> Array:
+    """Return the rows (K, n) of a plan's setpoints with the last of them held (K', n)."""
+    return np.concatenate([rows, np.repeat(rows[-1:], _HOLD, axis=0)])
 
 
 class ChamberLog:

@@ -1,19 +1,21 @@
-"""What the commands share: steps and bars on a terminal, exit codes, options of loads."""
+"""What the commands share: steps and bars, exit codes, places of results, options of loads."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
 import math
+import os
 import signal
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from types import FrameType
 
 from der_planner.limb import HEAVIEST, Limb, LimbError, gravity_of
-from der_planner.results.outputs import OutputError
 
 
 class OptionError(ValueError):
@@ -89,7 +91,7 @@ def run_command(
     """
     try:
         return work()
-    except (OptionError, OutputError) as error:
+    except OptionError as error:
         code, said = 2, f"error: {error}"
     except failures as error:
         said = f"error: {error}"
@@ -97,6 +99,62 @@ def run_command(
         code, said = 130, f"stopped by {error or 'SIGINT'}{stopped and '; '}{stopped}"
     print(said, file=sys.stderr)
     return code
+
+
+# Places of results: known to be writable before hours of work, not after -----------------------
+
+
+def check_file(path: Path, option: str = "--out") -> None:
+    """Refuse a path at which no file can be written; nothing is left behind.
+
+    Raises:
+        OptionError: it is a folder, or its folder cannot be made or written.
+    """
+    try:
+        if path.is_dir():
+            raise OptionError(f"{option} {path} is a folder: name a file")
+        if path.exists():
+            path.open("ab").close()
+            return
+    except OSError as error:
+        raise OptionError(f"{option} {path} cannot be written: {error.strerror}") from error
+    _try_folder(Path(os.path.realpath(path)).parent, f"{option} {path}")
+
+
+def check_folder(path: Path, option: str = "--out") -> None:
+    """Refuse a path at which no folder can be made or written; nothing is left behind.
+
+    Raises:
+        OptionError: a file is in the way, or no file can be made there.
+    """
+    _try_folder(path.absolute(), f"{option} {path}")
+
+
+def _try_folder(path: Path, named: str) -> None:
+    """Make a file in a folder, or in what is there of it, and remove it again."""
+    present = path
+    try:
+        while not present.exists() and present != present.parent:
+            present = present.parent
+        if not present.is_dir():
+            raise OptionError(f"{named} cannot be made: {present} is no folder")
+        with tempfile.TemporaryFile(dir=present):
+            pass  # as root, and on read-only disks, only a trial tells
+    except OSError as error:
+        raise OptionError(f"{named} cannot be written: {error.strerror} in {present}") from error
+
+
+def folder_argument(text: str) -> Path:
+    """Return a folder of the command line that can be written; for the ``type`` of argparse.
+
+    Raises:
+        argparse.ArgumentTypeError: it cannot.
+    """
+    try:
+        check_folder(Path(text), "the folder")
+    except OptionError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+    return Path(text)
 
 
 # Loads -------------------------------------------------------------------------------------------

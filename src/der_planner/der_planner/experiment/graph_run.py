@@ -99,7 +99,6 @@ class RunningGraph:
         progress: shows what happens.
         processes: of the nodes, by executable.
         bag: folder of the bag.
-        cpu_percent: CPU use of each process while the motion played, in per cent of one core.
         real_time_factor: simulated over real seconds of the twin; NaN on hardware.
     """
 
@@ -107,7 +106,6 @@ class RunningGraph:
     progress: Progress
     processes: dict[str, NodeProcess] = field(default_factory=dict)
     bag: Path = Path()
-    cpu_percent: dict[str, float] = field(default_factory=dict)
     real_time_factor: float = float("nan")
 
     def start(self, specs: list[NodeSpec], port: str, logs: Path, remap: dict[str, str]) -> None:
@@ -162,14 +160,7 @@ class RunningGraph:
             self.progress.bar(min(played, length), length, "played")
             return bool(played >= length)
 
-        started = time.monotonic()
-        before = {name: process.measure_cpu() for name, process in self.processes.items()}
         self.client.wait_for(finished, length + 30.0, "the end of the motion")
-        wall = time.monotonic() - started
-        self.cpu_percent = {
-            name: 100.0 * (process.measure_cpu() - before[name]) / wall
-            for name, process in self.processes.items()
-        }
         told = self.client.diagnostic_values("limb_twin")
         self.real_time_factor = float(told.get("real_time_factor", "nan"))
         self._vent()

@@ -90,7 +90,6 @@ def play_on_graph(run: TrialRun, progress: Progress) -> dict[str, Any]:
     return {
         "bag": str(graph.bag.relative_to(options.out)),
         "plan_id": plan.plan_id,
-        "cpu_percent": {name: round(value, 1) for name, value in graph.cpu_percent.items()},
         "twin_real_time_factor": None if math.isnan(factor) else round(factor, 3),
     }
 
