@@ -1,7 +1,7 @@
 """Feedback on the graph: revises setpoints that are still to come, whenever something is seen.
 
 A thread of its own works on what came since, in the order in which it came, and revises the next
-setpoint that can still be reached. The player goes on sending every setpoint a lead before its
+setpoint that can still be reached. The streamer goes on sending every setpoint a lead before its
 stamp, with the newest corrections there are for it; it never waits for this thread.
 """
 
