@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import signal
-import uuid
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import pytest
 from browsers import (
     NEEDS_CHROMIUM,
     open_browser,
-    requested_hosts,
     signal_browser,
     start_page,
     webdriver,
 )
+from driver_bench import Bench
 
 from der_msgs.msg import PressurePlan, PressureState
 from limb_interfaces import qos, topics
@@ -39,19 +37,16 @@ field.select();
 
 
 @pytest.fixture
-def url(graph: Any, tmp_path: Path) -> str:
-    """Start a twin with everything, and return the page's address."""
-    link = f"/tmp/der_limb_page_test_{uuid.uuid4().hex[:8]}"
-    graph.start("pressure_driver", "board_emulator", port_link=link)
-    graph.client.wait_ready(["board_emulator"])
-    graph.start("pressure_driver", "pressure_driver", port=link)
+def rig(graph: Any, tmp_path: Path) -> tuple[Bench, str]:
+    """Start a twin with everything; return the driver's bench and the page's address."""
+    bench = Bench(graph, bounds={})
     graph.start("der_planner", "limb_twin")
     graph.start("apriltag_tracker", "synthetic_camera")
     graph.start("apriltag_tracker", "apriltag_tracker")
     graph.start("der_planner", "planner", default_method="projected")
     _, url = start_page(graph, drawings=str(tmp_path / "drawings"), on_lost_operator="stop")
     graph.client.wait_ready([process.executable for process in graph.processes])
-    return url
+    return bench, url
 
 
 @pytest.fixture
@@ -63,10 +58,9 @@ def browser(tmp_path: Path) -> Any:
 
 
 def test_a_drawing_is_previewed_played_and_kept(
-    graph: Any, url: str, browser: Any, tmp_path: Path
+    rig: tuple[Bench, str], browser: Any, tmp_path: Path
 ) -> None:
-    client = graph.client
-    client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES)
+    (bench, url), client = rig, rig[0].client
     client.subscribe(PressurePlan, topics.PLAN, qos.LATCHED)
     browser.get(url)
 
@@ -83,7 +77,7 @@ def test_a_drawing_is_previewed_played_and_kept(
     def armed() -> bool:  # it may refuse at first: a board's report that is late, for instance
         browser.execute_script("document.getElementById('arm').click()")
         client.spin(0.5)
-        return bool(client.newest[topics.PRESSURE_STATE].mode == PressureState.ARMED)
+        return bool(bench.mode == PressureState.ARMED)
 
     client.wait_for(armed, 60.0, "the driver to be armed")
     press("draw")
@@ -111,12 +105,7 @@ def test_a_drawing_is_previewed_played_and_kept(
     press("play-drawing")  # once it is planned anew
     client.wait_for(lambda: topics.PLAN in client.newest, 60.0, "the plan")
     assert client.newest[topics.PLAN].payload == pytest.approx(0.02)
-    client.wait_for(
-        lambda: client.newest[topics.PRESSURE_STATE].mode == PressureState.TRACKING,
-        60.0,
-        "the driver to follow the drawing",
-    )
-    assert requested_hosts(browser) == {urlsplit(url).netloc}
+    bench.wait_mode(PressureState.TRACKING)
 
     slow = {"offline": False, "latency": 600, "downloadThroughput": 5000, "uploadThroughput": 5000}
     browser.execute_cdp_cmd("Network.emulateNetworkConditions", slow)

@@ -10,13 +10,11 @@ import socket
 import subprocess
 import sys
 import termios
-import threading
 import time
 
 import pytest
 from serial import SerialException
 
-from pressure_driver import board as board_module
 from pressure_driver import port_process
 from pressure_driver.emulator.board import EmulatedBoard, Faults
 from pressure_driver.emulator.firmware import board_protocol
@@ -26,7 +24,6 @@ from pressure_driver.lines import Channel, open_port
 from pressure_driver.port_process import PortError, PortProcess, explain
 from pressure_driver.protocols import NAMES
 from pressure_driver.safety import Mode
-from pressure_driver.schedule import TickGrid
 from pressure_driver.settings import Settings
 
 pytestmark = pytest.mark.slow
@@ -325,73 +322,38 @@ def test_a_port_that_takes_no_bytes_is_a_fault_and_old_setpoints_are_not_sent_af
     rig.wait_vented()
 
 
-@pytest.fixture
-def in_thread(monkeypatch):
-    """Return a function that runs the process of the port in a thread of this one."""
-    monkeypatch.setattr(board_module.gc, "freeze", lambda: None)
-    monkeypatch.setattr(board_module, "EMPTYING_TIME", 0.5)
-    running = []
-
-    def start(settings, **parts):
-        near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        far.setblocking(False)
-        process = board_module.BoardProcess(settings, Channel(far), board_module.NODE_PATIENCE)
-        vars(process).update(parts)
-        thread = threading.Thread(target=process.run, daemon=True)
-        thread.start()
-        running.append((process, thread, near))
-        return process, thread, Channel(near)
-
-    yield start
-    for process, thread, near in running:
-        process.ending = True
-        thread.join(30.0)
-        near.close()
-
-
-def test_a_board_that_takes_no_bytes_does_not_stop_the_ticks(in_thread):
+def test_a_board_that_takes_no_bytes_does_not_stop_the_ticks():
     """The other end is open but never read: the process must not hang in a write."""
     master, slave = os.openpty()
+    settings = Settings(port=os.ttyname(slave), rate=100.0, segment_count=16)
+    driver = PortProcess(settings, lambda: None)
+    driver.start()
     try:
-        settings = Settings(port=os.ttyname(slave), real_time_priority=0)
-        process, thread, _ = in_thread(settings, grid=TickGrid(1_000_000))
-        wait_for(lambda: "takes no bytes" in process.core.obstacles()[0], "the fault")
-        process.ending = True
-        thread.join(30.0)
-        assert not thread.is_alive()
+        wait_for(lambda: "takes no bytes" in str(list(driver.log)), "the fault")
+        driver.close()
+        assert not driver.error
     finally:
         os.close(master)
         os.close(slave)
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_an_exception_in_the_process_vents(rig, in_thread):
-    rig.driver.close()
-    process, thread, _ = in_thread(rig.settings)
-    wait_for(lambda: process.core.arm()[0], "the driver to be armed")
-    process.core.machine._follow = lambda *_: 1 / 0
-    thread.join(30.0)
-    assert not thread.is_alive()
-    wait_for(lambda: rig.vents()[-3:] == [True] * 3, "the last commands")
+def test_an_exception_in_the_process_vents(rig):
+    rig.pressurise()
+    rig.send("setpoint", "nonsense")
+    wait_for(lambda: rig.driver.error, "the end of the process")
+    rig.wait_vented()
 
 
 @pytest.mark.parametrize(
     ("fault", "told"), [("unplug", "cannot be reached"), ("deaf", r"chambers .* keep \d+ Pa")]
 )
-def test_an_end_that_may_not_have_vented_says_so(rig, in_thread, fault, told):
+def test_an_end_that_may_not_have_vented_says_so(rig, fault, told):
     """A board that hears nothing, or reads nothing from a pseudo-terminal, keeps its pressures."""
-    rig.driver.close()
-    process, thread, channel = in_thread(rig.settings)
-    rig.send, rig.ask = channel.send, lambda _: process.core.arm()[0]
     rig.pressurise()
-    wait_for(lambda: process.core.highest_pressure() > 1000.0, "the reading")
+    wait_for(lambda: max(rig.state["measured_differential"]) > 1000.0, "the reading")
     rig.have(fault)
     wait_for(lambda: rig.board.faults.deaf or not rig.port.host_present, "the fault")
-    rig.send("end")
-    thread.join(30.0)
-    while (content := channel.receive()[0])[0] != "ended":
-        pass
-    assert re.search(f"{told}.*close the air supply", content[1])
+    assert re.search(f"{told}.*close the air supply", rig.driver.close())
 
 
 # ---------------------------------------------------------------------------- names and rights

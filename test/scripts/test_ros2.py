@@ -124,29 +124,22 @@ def test_rate_over_a_window():
 
 
 def test_qos_hears_every_publisher_unless_the_command_line_says_more():
-    def publisher(reliability: str, durability: str) -> SimpleNamespace:
-        return SimpleNamespace(
-            qos_profile=QoSProfile(
-                depth=1,
-                reliability=ReliabilityPolicy[reliability],
-                durability=DurabilityPolicy[durability],
-            )
+    latched, camera = (
+        SimpleNamespace(qos_profile=QoSProfile(depth=1, reliability=which, durability=kept))
+        for which, kept in (
+            (ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL),
+            (ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE),
         )
-
-    def policies(publishers, **given) -> tuple[str, str, int]:
-        options = {f"qos_{key}": None for key in ("profile", "depth", "reliability", "durability")}
-        found = qos_profile(Namespace(**{**options, **given}), "sensor_data", publishers)
-        return found.reliability.name, found.durability.name, found.depth
-
-    latched = publisher("RELIABLE", "TRANSIENT_LOCAL")
-    camera = publisher("BEST_EFFORT", "VOLATILE")
-    assert policies([latched, latched]) == ("RELIABLE", "TRANSIENT_LOCAL", 5)
-    assert policies([latched, camera]) == ("BEST_EFFORT", "VOLATILE", 5)
+    )
+    nothing = {f"qos_{key}": None for key in ("profile", "depth", "reliability", "durability")}
     given = {"qos_profile": "default", "qos_durability": "transient_local", "qos_depth": 3}
-    assert policies([camera], **given) == ("RELIABLE", "TRANSIENT_LOCAL", 3)
-
-
-# Processes.
+    for publishers, options, policies in (
+        ([latched, latched], {}, ("RELIABLE", "TRANSIENT_LOCAL", 5)),
+        ([latched, camera], {}, ("BEST_EFFORT", "VOLATILE", 5)),
+        ([camera], given, ("RELIABLE", "TRANSIENT_LOCAL", 3)),
+    ):
+        found = qos_profile(Namespace(**nothing | options), "sensor_data", publishers)
+        assert (found.reliability.name, found.durability.name, found.depth) == policies
 
 
 def ros2(*arguments: str) -> SimpleNamespace:

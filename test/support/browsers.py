@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import socket
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import psutil
 import pytest
@@ -36,12 +34,11 @@ def start_page(graph: Any, **parameters: object) -> tuple[Any, str]:
 
 
 def open_browser(profile: Path) -> Any:
-    """Start a browser with a profile of its own that notes its requests."""
+    """Start a browser with a profile of its own."""
     options = webdriver.ChromeOptions()
     options.binary_location = CHROMIUM
     for flag in (*FLAGS, f"--user-data-dir={profile}"):
         options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"performance": "ALL"})
     browser = webdriver.Chrome(options=options, service=webdriver.ChromeService(CHROMEDRIVER))
     browser.set_script_timeout(90)
     return browser
@@ -52,17 +49,3 @@ def signal_browser(window: Any, number: int) -> None:
     driving = psutil.Process(window.service.process.pid)
     for process in (*driving.children(recursive=True), driving):
         process.send_signal(number)
-
-
-def requested_hosts(browser: Any) -> set[str]:
-    """Return the hosts of every request and websocket of a window."""
-    found = []
-    for entry in browser.get_log("performance"):
-        message = json.loads(entry["message"])["message"]
-        parameters = message["params"]
-        if message["method"] == "Network.requestWillBeSent":
-            found.append(parameters["request"]["url"])
-        elif message["method"] == "Network.webSocketCreated":
-            found.append(parameters["url"])
-    addresses = [urlsplit(url) for url in found]
-    return {each.netloc for each in addresses if each.scheme in ("http", "https", "ws", "wss")}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from functools import partial
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
@@ -85,8 +86,8 @@ class PressureDriver(Node):
         self._port.start()
         self._setpoint_topic = self.resolve_topic_name(topics.PRESSURE_SETPOINT)
         # Ready services are served in the order of their creation.
-        self.create_service(Trigger, "~/vent", self._on_vent, qos_profile=CALLS)
-        self.create_service(Trigger, "~/arm", self._on_arm, qos_profile=CALLS)
+        for word in ("vent", "arm"):
+            self.create_service(Trigger, f"~/{word}", partial(self._ask, word), qos_profile=CALLS)
         self.create_subscription(
             PressureSetpoint,
             topics.PRESSURE_SETPOINT,
@@ -124,12 +125,8 @@ class PressureDriver(Node):
         number = info["publication_sequence_number"]
         self._port.send("setpoint", *setpoint, topic, number, alone)
 
-    def _on_vent(self, _: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
-        answer.success, answer.message = self._port.ask("vent")
-        return answer
-
-    def _on_arm(self, _: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
-        answer.success, answer.message = self._port.ask("arm")
+    def _ask(self, word: str, _: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
+        answer.success, answer.message = self._port.ask(word)
         return answer
 
     def _show_life(self) -> None:
@@ -143,11 +140,11 @@ class PressureDriver(Node):
         self._write_log()
         for _ in range(len(self._port.states)):
             state = self._state = self._port.states.popleft()
-            self._late.append(state["tick_to_write"] / 1e6)
+            self._late.append(state.pop("tick_to_write") / 1e6)
             message = PressureState(**{name: state[name] for name in STATE_FIELDS})
-            message.header.stamp = stamp_from_nanoseconds(state["tick"])
+            message.header.stamp = stamp_from_nanoseconds(state.pop("tick"))
             message.header.frame_id = topics.BASE_FRAME
-            message.setpoint_stamp = stamp_from_nanoseconds(state["setpoint_stamp"])
+            message.setpoint_stamp = stamp_from_nanoseconds(state.pop("setpoint_stamp"))
             self._state_publisher.publish(message)
 
     def _write_log(self) -> None:
@@ -202,7 +199,7 @@ class PressureDriver(Node):
 def _written(value: object) -> str:
     """Return a value of the diagnostics as people read it."""
     if isinstance(value, float):
-        return f"{value:.4g}"
+        return f"{value:.6g}"
     if isinstance(value, list | tuple):
         return "; ".join(value) or "none"
     return str(value) or "none"

@@ -271,26 +271,18 @@ class PublisherGate:
 
     def refuse(self, origin: Origin) -> str:
         """Return why a setpoint from there is not taken, or nothing if it is."""
-        reason = self._judge(origin)
-        if reason:
-            self.refused += 1
-        else:
-            self._owner = origin
-        return reason
-
-    def _judge(self, origin: Origin) -> str:
-        owner = self._owner
-        if owner is None:
-            return ""
+        owner = self._owner or origin._replace(number=origin.number - 1)
         counted = origin.number - owner.number if origin.topic == owner.topic else -1
         before = (origin.topic, origin.number - 1)
         # A number that two publishers have reached does not tell any more which of them goes on.
         if counted == 0 or (counted == 1 and before in self._others):
             self._in_step = True
+        if not self._in_step and (counted == 1 or (counted > 1 and origin.alone)):
+            self._owner = origin
+            return ""
+        self.refused += 1
         if self._in_step:
             return "two publishers count in step and cannot be told apart: stop one and arm again"
-        if counted == 1 or (counted > 1 and origin.alone):
-            return ""
         if before in self._others:
             self._others.remove(before)
         self._others.append((origin.topic, origin.number))

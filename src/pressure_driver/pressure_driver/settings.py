@@ -126,17 +126,16 @@ class Settings:
     def __post_init__(self) -> None:
         for name, declaration, _ in declarations(type(self)):
             _check(name, getattr(self, name), declaration)
-        if self.supply_low >= self.supply_high:
-            raise SettingError(
-                f"parameters 'supply_low' ({self.supply_low:g} Pa) and 'supply_high' "
-                f"({self.supply_high:g} Pa): the first must be smaller"
-            )
-        if self.over_pressure <= self.pressure_limit:
-            raise SettingError(
-                f"parameters 'over_pressure' ({self.over_pressure:g} Pa) and 'pressure_limit' "
-                f"({self.pressure_limit:g} Pa): the first must be larger, or every full command "
-                "would end in a fault"
-            )
+        for low, high, reason in (
+            ("supply_low", "supply_high", ""),
+            ("pressure_limit", "over_pressure", ", or every full command would end in a fault"),
+        ):
+            below, above = getattr(self, low), getattr(self, high)
+            if below >= above:
+                raise SettingError(
+                    f"parameters '{low}' ({below:g} Pa) and '{high}' ({above:g} Pa): the first "
+                    f"must be smaller{reason}"
+                )
         if self.command_validity * self.rate <= 1.0:
             raise SettingError(
                 f"parameters 'command_validity' ({self.command_validity:g} s) and 'rate' "

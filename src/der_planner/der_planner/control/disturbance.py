@@ -232,7 +232,7 @@ def without_gaps(value: Array, known: Mask, period: float, fade: float) -> Array
         return np.where(known[:, None], value, 0.0)
     place = np.arange(len(value))
     there = place[known]
-    result = np.column_stack([np.interp(place, there, column) for column in value[known].T])
+    result = interpolate(place, there, value[known])
     outside = np.maximum(there[0] - place, 0) + np.maximum(place - there[-1], 0)
     faded: Array = result * np.exp(-outside * period / fade)[:, None]
     return faded

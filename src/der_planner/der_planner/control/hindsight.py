@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from der_planner.arrays import Array
+from der_planner.arrays import Array, interpolate
 from der_planner.control.estimation import Estimator
 from der_planner.control.knowledge import EstimatorSettings
 from der_planner.control.nominal import STEP, ChamberLog, Nominal
@@ -64,7 +64,7 @@ class Smoothed:
             tip: (N, 2) where the tip truly was [m].
         """
         inside = (self.time >= time[0]) & (self.time <= time[-1])
-        true = np.column_stack([np.interp(self.time[inside], time, axis) for axis in tip.T])
+        true = interpolate(self.time[inside], time, tip)
         gap = (self.tip[inside] - true)[..., None]
         squares = np.swapaxes(gap, 1, 2) @ np.linalg.solve(self.tip_covariance[inside], gap)
         return float(squares.mean() / 2)

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from der_planner.arrays import Array
+from der_planner.arrays import Array, interpolate
 from der_planner.control.disturbance import (
     LearningError,
     Measured,
@@ -235,9 +235,7 @@ class Learner:
                 shown = Shown(np.where(kept[:, None], shown.value, np.nan), shown.variance, kept)
         astray = astray or moves_with(expected.tip + shown.value, expected.tip)
         inside = (measured.time >= plan.time[0]) & (measured.time <= plan.time[-1])
-        wanted = np.column_stack(
-            [np.interp(measured.time[inside], plan.time, axis) for axis in plan.tip_reference.T]
-        )
+        wanted = interpolate(measured.time[inside], plan.time, plan.tip_reference)
         missed = np.linalg.norm(measured.tip[inside] - wanted, axis=1)
         return PlayedRun(given, expected, shown), missed if len(missed) else _UNSEEN, astray
 
@@ -280,7 +278,7 @@ class Learner:
             except (PlanningError, LimbError):
                 return None
 
-        nearer = adapted(self._of_file.limb, tip_of, tip)
+        nearer = adapted(self._of_file.model.limb, tip_of, tip)
         if nearer is None:
             return self._seen_by_model(first), ""
         self._correction = self._of_file.of(nearer)

@@ -69,11 +69,6 @@ class Sensors:
     seed: int = 0
     seen: Callable[[float], bool] = lambda _time: True
 
-    def covariance(self, segments: int) -> Array:
-        """Return the stated covariance of bend angles and tip (M + 2, M + 2)."""
-        deviation = np.repeat([self.bend_noise, self.tip_noise], [segments, 2])
-        return np.diag(np.maximum(deviation, _SMALLEST) ** 2)
-
 
 @dataclass(frozen=True)
 class Played:
@@ -196,7 +191,8 @@ class _Told:
         self._plant, self._feedback, self._sensors = plant, feedback, sensors
         self._draw = np.random.default_rng([47, sensors.seed])
         self._pictures: list[tuple[float, float, Array, Array]] = []
-        self._covariance = sensors.covariance(segments)
+        deviation = np.repeat([sensors.bend_noise, sensors.tip_noise], [segments, 2])
+        self._covariance = np.diag(np.maximum(deviation, _SMALLEST) ** 2)
 
     def inform(self, instant: float) -> None:
         """Tell the pressures of an instant [s], and the pictures that have arrived."""

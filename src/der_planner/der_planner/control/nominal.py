@@ -89,8 +89,7 @@ class Nominal:
         model = plan.body if isinstance(plan.body, RodModel) else RodModel(plan.limb)
         self.model = model
         self.kinematics = model.kinematics
-        last = np.repeat(plan.differential_pressure[-1:], _HOLD, axis=0)
-        self.commands = np.concatenate([plan.differential_pressure, last])
+        self.commands = _held(plan.differential_pressure)
         count = len(self.commands)
         time = np.arange(count, dtype=np.float64) * CONTROL_PERIOD
         start = plan.reference.start
@@ -105,9 +104,7 @@ class Nominal:
                 None if start is None else model.state(spline(0.0), spline(0.0, 1)), self.before
             ),
         )
-        self.reference = np.concatenate(
-            [plan.tip_reference, np.repeat(plan.tip_reference[-1:], _HOLD, axis=0)]
-        )
+        self.reference = _held(plan.tip_reference)
         known = self._known_disturbance(plan, response.tip[: len(plan.time)])
         tip, bend = response.tip[:-1] + known, response.bend_angles[:-1]
         bend = bend + self._bend_of(bend, known)
@@ -164,8 +161,7 @@ class Nominal:
         """Return what a learned plan expects beyond the model (K', 2) [m]; the last of it stays."""
         if plan.model != "der":
             return np.zeros_like(self.reference)
-        known = plan.tip_predicted - model_tip
-        return np.concatenate([known, np.repeat(known[-1:], _HOLD, axis=0)])
+        return _held(plan.tip_predicted - model_tip)
 
     def _bend_of(self, bend: Array, moved: Array) -> Array:
         """Return changes of bend (K', M) [rad] that move the tip by (K', 2) [m].
@@ -179,20 +175,20 @@ class Nominal:
         return np.linalg.solve(square, load[..., None])[..., 0]
 
     def _linearise(self, time: Array) -> None:
-        balance, q = self.model.balance.projected, self._bend_spline(time)
-        v, a = self._bend_spline(time, 1), self._bend_spline(time, 2)
-        count, inputs = q.shape
-        each = []
-        for place, size in enumerate(_CHANGES):
+        balance = self.model.balance.projected
+        motion = np.stack([self._bend_spline(time, order) for order in range(3)])
+        count, inputs = motion.shape[1:]
+
+        def slope(order: int, size: float) -> Array:
+            """Return ∂balance/∂(bend, rate or acceleration) (K', M, M) by finite differences."""
             columns = []
-            for i in range(inputs):
-                moved = [q, v, a], [q, v, a]
-                for sign, case in zip((1.0, -1.0), moved, strict=True):
-                    case[place] = case[place] + sign * size * np.eye(inputs)[i]
-                difference = balance(*moved[0]) - balance(*moved[1])
-                columns.append(difference / (2 * size))
-            each.append(np.stack(columns, axis=2))
-        stiffness, damping, mass = each
+            for unit in np.eye(inputs):
+                step = np.zeros_like(motion)
+                step[order] = size * unit
+                columns.append((balance(*motion + step) - balance(*motion - step)) / (2 * size))
+            return np.stack(columns, axis=2)
+
+        stiffness, damping, mass = (slope(*each) for each in enumerate(_CHANGES))
         system = np.zeros((count, 3 * inputs, 3 * inputs))
         rates = slice(inputs, 2 * inputs)
         system[:, :inputs, rates] = np.eye(inputs)
@@ -203,6 +199,11 @@ class Nominal:
         fine, whole = expm(system * STEP), expm(system * CONTROL_PERIOD)
         self.fine_transition, self.fine_input = fine[:, :both, :both], fine[:, :both, both:]
         self.transition, self.input = whole[:, :both, :both], whole[:, :both, both:]
+
+
+def _held(rows: Array) -> Array:
+    """Return the rows (K, n) of a plan's setpoints with the last of them held (K', n)."""
+    return np.concatenate([rows, np.repeat(rows[-1:], _HOLD, axis=0)])
 
 
 class ChamberLog:

@@ -68,12 +68,18 @@ def read_parameters(node: Node) -> PlannerOptions:
         LimbError: the limb file cannot be used.
     """
     read: Any = functools.partial(declare, node)
+    limb_file = read("limb_file", "", "limb file (YAML); empty: the default limb")
+    limb = Limb.from_yaml(limb_file) if limb_file else Limb.default()
+    mounting = read(
+        "mounting", "", "horizontal, hanging, standing, sideways or degrees of tilt; empty: "
+        "gravity as in the limb file"
+    )  # fmt: skip
     learned_plans = read(
         "learned_plans", "", "folder of learned plans: a command of the method 'learned' names one "
         "of them in place of its motion"
     )  # fmt: skip
     return PlannerOptions(
-        limb=_read_limb(read),
+        limb=limb.mounted(mounting) if mounting else limb,
         payload=read(
             "payload", 0.0, "mass [kg] carried beside the limb's own masses, where a command names "
             "none", at_least=0.0, at_most=HEAVIEST, read_only=False
@@ -122,17 +128,6 @@ def read_parameters(node: Node) -> PlannerOptions:
             "does not ask for it"
         ),
     )  # fmt: skip
-
-
-def _read_limb(read: Any) -> Limb:
-    """Return the limb of the file that is named, mounted as the parameter says."""
-    limb_file = read("limb_file", "", "limb file (YAML); empty: the default limb")
-    mounting = read(
-        "mounting", "", "horizontal, hanging, standing, sideways or degrees of tilt; empty: "
-        "gravity as in the limb file"
-    )  # fmt: skip
-    limb = Limb.from_yaml(limb_file) if limb_file else Limb.default()
-    return limb.mounted(mounting) if mounting else limb
 
 
 # Messages that ask for a motion ------------------------------------------------------------------
@@ -188,41 +183,23 @@ def from_command(message: MotionCommand, options: PlannerOptions, now: int) -> R
     Raises:
         ValueError: a field has a value that cannot be planned; names it.
     """
-    start = start_of(nanoseconds(message.header.stamp), now)
-    limb = options.limb.mounted(message.mounting) if message.mounting else options.limb
-    if message.payload < 0 or message.payload > HEAVIEST:
-        raise ValueError(f"the payload is {message.payload} kg: give 0 to {HEAVIEST:g} kg")
-    limb = _carrying(limb, message if message.payload else options)
-    if message.path and (message.motion or message.method == LEARNED):
-        raise ValueError(
-            "the command has a path, and a motion or a learned plan beside it: give one of them"
-        )
-    learned: Plan | None = None
-    if message.method == LEARNED:
-        # Its name stands in place of the motion's.
-        learned = learned_plan(options.learned_plans, message.motion, limb)
-        motion = Motion(learned.motion, learned.amplitude, learned.period, learned.cycles)
-        limb, model, method = learned.limb, learned.model, LEARNED
-    else:
-        model = message.model or options.model
-        if message.path:
-            tip = np.array([(point.x, point.y) for point in message.path])
-            motion = _along_path(None, tip, options, message.nearest_path or options.nearest_path)
-        else:
-            motion = Motion.named(
-                message.motion,
-                amplitude=message.amplitude or DEFAULT_AMPLITUDE,
-                period=message.period or DEFAULT_PERIOD,
-                cycles=message.cycles or DEFAULT_CYCLES,
-                branch=options.branch,
+    motion = None
+    if message.path:
+        if message.motion or message.method == LEARNED:
+            raise ValueError(
+                "the command has a path, and a motion or a learned plan beside it: give one of them"
             )
-        method = choose_method(model, message.method or options.method)
-    if message.feedback and model != "der":
-        raise ValueError(
-            f"feedback corrects plans of the rod, not of the model {model}: ask for der"
+        tip = np.array([(point.x, point.y) for point in message.path])
+        motion = _along_path(None, tip, options, message.nearest_path or options.nearest_path)
+    elif message.method != LEARNED:
+        motion = Motion.named(
+            message.motion,
+            amplitude=message.amplitude or DEFAULT_AMPLITUDE,
+            period=message.period or DEFAULT_PERIOD,
+            cycles=message.cycles or DEFAULT_CYCLES,
+            branch=options.branch,
         )
-    feedback = message.feedback or (options.feedback and model == "der")
-    return Request(message.plan_id, limb, motion, model, method, start, learned, feedback)
+    return _request(message, motion, options, now)
 
 
 def from_path(message: PathMessage, plan_id: str, options: PlannerOptions, now: int) -> Request:
@@ -238,22 +215,42 @@ def from_path(message: PathMessage, plan_id: str, options: PlannerOptions, now: 
     stamps = [nanoseconds(pose.header.stamp) for pose in message.poses]
     time = (np.array(stamps) - stamps[0]) * 1e-9 if any(stamps) else None
     motion = _along_path(time, tip.reshape(-1, 2), options, options.nearest_path)
-    start = start_of(nanoseconds(message.header.stamp), now)
-    method = choose_method(options.model, options.method)
-    feedback = options.feedback and options.model == "der"
-    limb = _carrying(options.limb, options)
-    return Request(plan_id, limb, motion, options.model, method, start, feedback=feedback)
-
-
-def _carrying(limb: Limb, load: MotionCommand | PlannerOptions) -> Limb:
-    """Return the limb with the payload of a command or of the parameters; at 0 it is at the tip."""
-    return limb.carrying(load.payload, load.payload_at or None)
+    return _request(MotionCommand(header=message.header, plan_id=plan_id), motion, options, now)
 
 
 def _along_path(time: Array | None, tip: Array, options: PlannerOptions, nearest: bool) -> Motion:
     return Motion.from_tip_path(
         time, tip, branch=options.branch, limits=options.limits, nearest=nearest
     )
+
+
+def _request(
+    message: MotionCommand, motion: Motion | None, options: PlannerOptions, now: int
+) -> Request:
+    """Return the motion under the loads, by the method and from the instant that are asked for.
+
+    What a command does not name is that of the parameters; without a motion it names a learned plan
+    in place of it.
+    """
+    start = start_of(nanoseconds(message.header.stamp), now)
+    limb = options.limb.mounted(message.mounting) if message.mounting else options.limb
+    if message.payload < 0 or message.payload > HEAVIEST:
+        raise ValueError(f"the payload is {message.payload} kg: give 0 to {HEAVIEST:g} kg")
+    load = message if message.payload else options
+    limb = limb.carrying(load.payload, load.payload_at or None)
+    model, learned = message.model or options.model, None
+    if motion is None:
+        learned = learned_plan(options.learned_plans, message.motion, limb)
+        motion = Motion(learned.motion, learned.amplitude, learned.period, learned.cycles)
+        limb, model, method = learned.limb, learned.model, LEARNED
+    else:
+        method = choose_method(model, message.method or options.method)
+    if message.feedback and model != "der":
+        raise ValueError(
+            f"feedback corrects plans of the rod, not of the model {model}: ask for der"
+        )
+    feedback = message.feedback or (options.feedback and model == "der")
+    return Request(message.plan_id, limb, motion, model, method, start, learned, feedback)
 
 
 # The action --------------------------------------------------------------------------------------

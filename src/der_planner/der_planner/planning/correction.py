@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from der_planner.arrays import Array
+from der_planner.arrays import Array, interpolate
 from der_planner.limb import Limb
 from der_planner.methods import LEARNED
 from der_planner.model import CONTROL_PERIOD, Model, simulate
@@ -92,11 +92,6 @@ class Correction:
     def model(self) -> Model:
         """Of the limb."""
         return self._configuration.model
-
-    @property
-    def limb(self) -> Limb:
-        """The limb whose model it is."""
-        return self.model.limb
 
     @property
     def tip_per_pressure(self) -> float:
@@ -267,5 +262,5 @@ def carried_over(fresh: Plan, learned: Plan) -> Plan:
     model = Correction(learned).expected(learned.differential_pressure).tip
     shown = (learned.tip_predicted - model) * (fresh.amplitude / learned.amplitude)
     phase = fresh.time * (learned.duration / fresh.duration)
-    expected = np.column_stack([np.interp(phase, learned.time, axis) for axis in shown.T])
+    expected = interpolate(phase, learned.time, shown)
     return Correction(fresh).plan(fresh.differential_pressure, expected)

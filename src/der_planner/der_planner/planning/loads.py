@@ -152,11 +152,7 @@ def critical_share(limb: Limb) -> float:
 
 
 def check_load(
-    model: AnyModel,
-    time: Array,
-    tip: Array,
-    pressure: Array,
-    needed: Callable[[AnyModel], Array],
+    model: AnyModel, time: Array, tip: Array, pressure: Array, needed: Callable[[AnyModel], Array]
 ) -> None:
     """Refuse a motion along which resting takes more pressure than the limb may have.
 

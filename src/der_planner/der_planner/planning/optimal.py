@@ -129,9 +129,7 @@ class Optimiser:
         self._pulse = np.tile(pulse[:, None], (1, inputs))
 
     def run(
-        self,
-        progress: Callable[[float], None] = lambda _share: None,
-        begin: Array | None = None,
+        self, progress: Callable[[float], None] = lambda _share: None, begin: Array | None = None
     ) -> Optimum:
         """Solve all windows, one after the other.
 

@@ -15,13 +15,7 @@ from scipy.interpolate import make_interp_spline
 from der_planner.arrays import Array, interpolate
 from der_planner.model.bending import Kinematics
 from der_planner.planning.loads import PlanningError
-from der_planner.planning.timing import (
-    LONGEST,
-    PathLimits,
-    paced,
-    smooth_step,
-    tip_rates,
-)
+from der_planner.planning.timing import LONGEST, PathLimits, paced, smooth_step, tip_rates
 
 SHAPES = ("circle", "figure_eight", "line", "star")
 """Shapes that the tip can draw."""

@@ -20,6 +20,7 @@ import yaml
 from der_planner.arrays import Array
 from der_planner.limb import Limb, LimbError
 from der_planner.model import CONTROL_PERIOD, Model
+from der_planner.model.commands import within_limits
 from der_planner.planning.configuration import configure
 from der_planner.planning.loads import PlanningError
 from der_planner.planning.motions import Reference
@@ -191,17 +192,13 @@ def _plan_of(content: Any) -> Plan:
     start = None
     if content["start"] is not None:
         start = Start(**{key: np.array(value, float) for key, value in content["start"].items()})
-    air = limb.pneumatics
-    steps = np.abs(np.diff(command, axis=0)).max(initial=0.0)
-    slack = 1 + 1e-9
-    if np.abs(command).max() > air.pressure_limit * slack:
-        raise ValueError("its pressures are beyond the limb's limit")
-    if steps > air.slew_limit * CONTROL_PERIOD * slack:
-        raise ValueError("its pressures change faster than the limb's limit")
+    body = Model.of(limb, str(content["model"]))
+    beside = within_limits(command, body.air, CONTROL_PERIOD, command[0])[1]
+    if beside > _SAME * limb.pneumatics.pressure_limit:
+        raise ValueError("its pressures or their changes are beyond the limb's limits")
     time: Array = np.arange(count, dtype=np.float64) * CONTROL_PERIOD
     rest = np.array(content["rest_bend_angles_rad"], dtype=float)
     reference = Reference(time, tip, angles, resting_spline(time, angles, start), rest, start)
-    body = Model.of(limb, str(content["model"]))
     bend = configure(body, reference).bend_at(time)
     return Plan(
         time=time,

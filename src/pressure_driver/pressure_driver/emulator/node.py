@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
+from collections.abc import Sequence
 
+import numpy as np
+from numpy.typing import NDArray
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -33,16 +36,16 @@ class BoardEmulator(Node):
         self._board = EmulatedBoard(protocol, pneumatics, settings.seed)
         faults = self._parse(settings.faults)  # before the port stands where others see it
         self._port = EmulatedPort(settings.port_link, settings.baud_rate)
-        self._air: deque[tuple[int, list[float]]] = deque(maxlen=100)
-        self._commands: deque[ReceivedCommand] = deque(maxlen=1000)
-        self._sequences = [0, 0]
+        self._unpublished: deque[tuple[str, int, Sequence[float]]] = deque(maxlen=1000)
+        self._sequences: Counter[str] = Counter()
         self._guard = self.create_guard_condition(self._publish)
-        self._air_publisher = self.create_publisher(
-            ChamberPressures, topics.TWIN_CHAMBER_PRESSURES, qos.STATES
-        )
-        self._command_publisher = self.create_publisher(
-            ChamberPressures, topics.TWIN_BOARD_COMMANDS, qos.SETPOINTS
-        )
+        self._topic_publishers = {
+            topic: self.create_publisher(ChamberPressures, topic, profile)
+            for topic, profile in (
+                (topics.TWIN_CHAMBER_PRESSURES, qos.STATES),
+                (topics.TWIN_BOARD_COMMANDS, qos.SETPOINTS),
+            )
+        }
         self._runner = BoardRunner(
             self._board,
             self._port,
@@ -72,34 +75,28 @@ class BoardEmulator(Node):
                 self.get_logger().info(f"faults: {parameter.value or 'none'}")
         return SetParametersResult(successful=True)
 
-    def _on_air(self, stamp: int, pressure: object) -> None:
-        self._air.append((stamp, pressure.tolist()))
+    def _on_air(self, stamp: int, pressure: NDArray[np.float64]) -> None:
+        self._unpublished.append((topics.TWIN_CHAMBER_PRESSURES, stamp, pressure.tolist()))
         self._guard.trigger()
 
     def _on_command(self, command: ReceivedCommand) -> None:
-        self._commands.append(command)
+        self._unpublished.append((topics.TWIN_BOARD_COMMANDS, command.stamp, command.pressure))
         self._guard.trigger()
 
     def _publish(self) -> None:
-        while self._commands:
-            command = self._commands.popleft()
-            self._send(self._command_publisher, 1, command.stamp, command.pressure)
-        while self._air:
-            stamp, pressure = self._air.popleft()
-            self._send(self._air_publisher, 0, stamp, pressure)
-
-    def _send(self, publisher: object, stream: int, stamp: int, pressure: object) -> None:
-        message = ChamberPressures(sequence=self._sequences[stream], pressure=pressure)
-        message.header.stamp = stamp_from_nanoseconds(stamp)
-        self._sequences[stream] += 1
-        publisher.publish(message)
+        while self._unpublished:
+            topic, stamp, pressure = self._unpublished.popleft()
+            message = ChamberPressures(sequence=self._sequences[topic], pressure=pressure)
+            message.header.stamp = stamp_from_nanoseconds(stamp)
+            self._sequences[topic] += 1
+            self._topic_publishers[topic].publish(message)
 
     def _report(self) -> Health:
         faults = self.get_parameter("faults").value
         values = {
             "port": self._port.link,
             "host_present": self._port.host_present,
-            "commands_received": self._sequences[1],
+            "commands_received": self._sequences[topics.TWIN_BOARD_COMMANDS],
             "commands_rejected": self._board.protocol.rejected,
             "faults": faults or "none",
         }
