@@ -109,25 +109,3 @@ def test_a_limb_with_another_family_is_tracked(tags, model, swing, name):
 def test_a_detector_of_another_family_than_the_map_is_refused(tags, model):
     with pytest.raises(ValueError, match=r"tag25h9 .* tag36h11"):
         LimbTracker(tags, model.intrinsics, detector=Detector(family="tag25h9"))
-
-
-def spiral(cells):
-    """Return a code as the AprilTag 3 library writes it: quadrants from outside in, as they turn.
-
-    Its `bit_x` and `bit_y` of square codes begin with the upper row less its last cell, go on with
-    the row below less a cell at each end, and repeat that for the other sides, clockwise.
-    """
-    edge = cells.shape[0]
-    quadrant = [(x, y) for y in range(edge // 2) for x in range(y, edge - 1 - y)]
-    bits = []
-    for _ in range(4):
-        bits += [int(cells[y, x]) for x, y in quadrant]
-        quadrant = [(edge - 1 - y, x) for x, y in quadrant]
-    return int("".join(map(str, bits)), 2)
-
-
-def test_a_family_that_the_c_library_does_not_read_has_its_codes():
-    """`pyapriltags` is built without tag36h10; these are the first codes of its C table."""
-    known = (0x1A42F9469, 0x21A48C08D, 0x26DFDBC5D, 0x2D19B78FB, 0x31C5557DF, 0x3F2B3D349)
-    ours = FAMILIES["tag36h10"].codes()[:6].reshape(6, 6, 6)
-    assert tuple(spiral(code) for code in ours) == known

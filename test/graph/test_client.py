@@ -24,8 +24,7 @@ def test_a_tracker_without_camera_is_named_with_the_cure(graph):
 
 def test_a_driver_without_its_board_ends_with_the_port_and_the_remedy(graph):
     port = str(graph.folder / "no_such_board")
-    driver = graph.start("pressure_driver", "pressure_driver", port=port)
-    graph.client.watch([driver])
+    graph.client.watch([graph.start("pressure_driver", "pressure_driver", port=port)])
     with pytest.raises(NodeError, match=r"'pressure_driver' died \(exit code 1\)") as caught:
         graph.client.wait_ready(["pressure_driver"])
     assert port in str(caught.value)
