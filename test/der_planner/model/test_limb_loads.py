@@ -46,6 +46,7 @@ def test_a_payload_of_nothing_changes_nothing_and_one_off_the_limb_is_refused():
         LIMB.carrying(-0.01)
     base = dataclasses.replace(LIMB, base_length=0.02)
     assert base.carrying(0.01).masses[0].arc_length == pytest.approx(0.264)
+    assert LIMB.carrying(0.01, 0.1).carrying(0.02).payload == (0.02, 0.0)
     assert base.carrying(0.01).for_model("pcc").masses == base.carrying(0.01).masses
 
 
@@ -71,10 +72,6 @@ def test_what_sits_on_the_stiff_base_weighs_and_moves_nothing():
     density = LIMB.segments[0].mass_per_length
     assert limb.mass == pytest.approx(density * (0.244 + 0.01 + 0.005) + 0.05)
     assert limb.moving_mass == pytest.approx(density * (0.244 + 0.005) + 0.02)
-
-
-def test_the_payload_is_the_run_s_even_where_a_file_has_a_mass_of_that_name():
-    assert LIMB.carrying(0.01, 0.1).carrying(0.02).payload == (0.02, 0.0)
 
 
 def test_a_limb_remembers_the_mounting_that_its_numbers_were_found_in(tmp_path):

@@ -5,15 +5,7 @@ import pytest
 
 from der_planner.rod import Rod, RodState
 
-NODES = 7
-COMMON = {
-    "length": 0.2,
-    "nodes": NODES,
-    "EI": 0.02,
-    "EA": 60.0,
-    "GJ": 0.013,
-    "mass_per_length": 1.0,
-}
+COMMON = {"length": 0.2, "nodes": 7, "EI": 0.02, "EA": 60.0, "GJ": 0.013, "mass_per_length": 1.0}
 
 
 def bent_state(rod: Rod, seed: int, size: float = 0.012) -> RodState:
