@@ -175,20 +175,20 @@ class Nominal:
         return np.linalg.solve(square, load[..., None])[..., 0]
 
     def _linearise(self, time: Array) -> None:
-        balance, q = self.model.balance.projected, self._bend_spline(time)
-        v, a = self._bend_spline(time, 1), self._bend_spline(time, 2)
-        count, inputs = q.shape
-        each = []
-        for place, size in enumerate(_CHANGES):
+        balance = self.model.balance.projected
+        motion = np.stack([self._bend_spline(time, order) for order in range(3)])
+        count, inputs = motion.shape[1:]
+
+        def slope(order: int, size: float) -> Array:
+            """Return ∂balance/∂(bend, rate or acceleration) (K', M, M) by finite differences."""
             columns = []
-            for i in range(inputs):
-                moved = [q, v, a], [q, v, a]
-                for sign, case in zip((1.0, -1.0), moved, strict=True):
-                    case[place] = case[place] + sign * size * np.eye(inputs)[i]
-                difference = balance(*moved[0]) - balance(*moved[1])
-                columns.append(difference / (2 * size))
-            each.append(np.stack(columns, axis=2))
-        stiffness, damping, mass = each
+            for unit in np.eye(inputs):
+                step = np.zeros_like(motion)
+                step[order] = size * unit
+                columns.append((balance(*motion + step) - balance(*motion - step)) / (2 * size))
+            return np.stack(columns, axis=2)
+
+        stiffness, damping, mass = (slope(*each) for each in enumerate(_CHANGES))
         system = np.zeros((count, 3 * inputs, 3 * inputs))
         rates = slice(inputs, 2 * inputs)
         system[:, :inputs, rates] = np.eye(inputs)
