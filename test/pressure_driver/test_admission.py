@@ -187,7 +187,7 @@ def test_random_setpoints_never_step_the_output(simulate):
                 plan = f"plan {generator.integers(0, 40)}"
                 sim.offer(value, ahead, plan, index)
             sim.tick()
-            commanded.append(sim.core.state()["commanded_differential"])
+            commanded.append(sim.core.machine.differential)
             if sim.mode is Mode.FAULT:
                 break
         live = np.array(commanded)

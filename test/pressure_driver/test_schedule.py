@@ -32,14 +32,6 @@ def test_a_setpoint_waits_for_its_stamp_and_is_then_held():
     assert schedule.counts["executed"] == 1
 
 
-def test_order_of_arrival_does_not_matter():
-    schedule = SetpointSchedule(Settings())
-    for k in (5, 3, 4):
-        assert offer(schedule, setpoint(k, 1000.0 + k, index=k)) is Verdict.ACCEPTED
-    values = [schedule.sample(NOW + k * PERIOD).differential[0] for k in (3, 4, 5)]
-    assert values == [1003.0, 1004.0, 1005.0]
-
-
 def test_a_stamp_between_ticks_takes_effect_at_the_next_one():
     schedule = SetpointSchedule(Settings())
     offer(schedule, setpoint(2, offset=1))
@@ -93,14 +85,6 @@ def test_late_ones_are_counted_and_refused():
     assert offer(schedule, setpoint(5), NOW + 4 * PERIOD) is Verdict.ACCEPTED
     assert schedule.counts["late"] == 2
     assert "after its stamp" in schedule.reason
-
-
-def test_duplicates_are_counted_and_refused():
-    schedule = SetpointSchedule(Settings())
-    offer(schedule, setpoint(1, 1000.0))
-    assert offer(schedule, setpoint(1, 2000.0)) is Verdict.DUPLICATE
-    assert schedule.sample(NOW + PERIOD).differential[0] == 1000.0
-    assert schedule.counts["duplicate"] == 1
 
 
 def test_a_new_plan_replaces_the_old_from_its_first_stamp_on():

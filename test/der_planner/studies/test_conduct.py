@@ -22,6 +22,7 @@ from der_planner.studies.conduct import (
     conduct,
 )
 from der_planner.studies.factors import StudyError
+from der_planner.studies.report import summarise
 from der_planner.studies.study import Study
 from der_planner.studies.tasks import Twin, calibrated
 
@@ -94,6 +95,8 @@ def test_one_or_two_workers_and_rows_that_fail(tmp_path, monkeypatch):
     Store(folders[0], study).keep(good, Outcome({}, "lost", one[bad.key]["sources"]))
     settings = PlaySettings(folders[0], workers=1, retry_failed=True)
     assert conduct(study, settings, Progress()) == one
+    page = summarise(study, one, Store(folders[0], study))
+    assert {"errors.png", "errors.pdf"} <= {path.name for path in page.parent.iterdir()}
 
 
 class Breaking(Progress):

@@ -210,13 +210,10 @@ def mean_error(runs: Sequence[RunSeries], rate: float = 20.0) -> tuple[Array, Ar
             np.abs(grid - series.time[nearest - 1]), np.abs(series.time[nearest] - grid)
         )
         row[away > 0.1] = np.nan
-    known = np.ma.masked_invalid(rows[:, np.isfinite(rows).any(axis=0)])
+    keep = np.isfinite(rows).any(axis=0)
+    known = np.ma.masked_invalid(rows[:, keep])
     deviation = known.std(axis=0, ddof=1) if len(runs) > 1 else np.zeros(known.shape[1])
-    return (
-        grid[np.isfinite(rows).any(axis=0)],
-        np.asarray(known.mean(axis=0)),
-        np.ma.filled(deviation, 0.0),
-    )
+    return grid[keep], np.asarray(known.mean(axis=0)), np.ma.filled(deviation, 0.0)
 
 
 def plot_pressures(runs: Sequence[RunSeries], folder: Path) -> list[Path]:

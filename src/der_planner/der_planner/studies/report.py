@@ -106,15 +106,14 @@ def _panels(study: Study, plot: Mapping[str, str], rows: Records) -> Figure:
     panels, log = list(_groups(plot.get("panels"), rows)), plot.get("log", "")
     drawn = style.new_figure(style.PAGE if len(panels) > 1 else style.COLUMN, _HEIGHT)
     axes = drawn.subplots(1, len(panels), squeeze=False, sharey=True)[0]
-    for place, ((value, mine), panel) in enumerate(zip(panels, axes, strict=True)):
+    for (value, mine), panel in zip(panels, axes, strict=True):
         (_histogram if plot["kind"] == "histogram" else _lines)(study, plot, mine, panel)
         if "panels" in plot:
             label, scale = quantity(plot["panels"], study)
             panel.set_title(value if isinstance(value, str) else f"{label}: {value * scale:.3g}")
-        if place:
-            panel.set_ylabel("")
-            if panel.get_legend() is not None:
-                panel.get_legend().remove()
+        panel.label_outer()
+    if "lines" in plot:
+        style.shared_legend(drawn, axes)
     # Panels share their axis: where it ends is known when all are drawn.
     for panel in axes:
         if "x" in log:
@@ -133,8 +132,6 @@ def _panels(study: Study, plot: Mapping[str, str], rows: Records) -> Figure:
         elif plot["kind"] == "lines" and len(values) <= _MOST_TICKS:
             scale = quantity(plot["x"], study)[1]
             panel.set_xticks([x * scale for x in values], [f"{x * scale:.3g}" for x in values])
-        elif plot["kind"] == "scatter" and "x" not in log:
-            panel.locator_params(axis="x", nbins=5)
     if plot.get("title"):
         drawn.suptitle(plot["title"])
     return drawn
@@ -169,8 +166,6 @@ def _lines(study: Study, plot: Mapping[str, str], rows: Records, panel: Axes) ->
         panel.plot(x, mean, "o" + dashes, ms=3, label=label, color=colour)
         panel.fill_between(x, mean - deviation, mean + deviation, alpha=0.18, lw=0, color=colour)
     panel.set(xlabel=x_label, ylabel=y_label)
-    if by:
-        panel.legend()
 
 
 def _histogram(study: Study, plot: Mapping[str, str], rows: Records, panel: Axes) -> None:
