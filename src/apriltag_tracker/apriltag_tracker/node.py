@@ -29,6 +29,7 @@ from apriltag_tracker.pipeline import (
     Uncertainty,
     warm_up,
 )
+from apriltag_tracker.pose.shape import CURVE_POINTS
 from apriltag_tracker.reports import (
     NO_CALIBRATION,
     ImageWatch,
@@ -198,7 +199,7 @@ class TrackerNode(Node):
         ):
             return
         self._tracker = LimbTracker(self._map, intrinsics, self._options, self._detector)
-        self._curve = [Point() for _ in range(self._tracker.fitter.curve_points)]
+        self._curve = [Point() for _ in range(CURVE_POINTS)]
 
     def _on_image(self, message: Image) -> None:
         self._frame = message.header.frame_id
