@@ -88,7 +88,6 @@ class TrackerNode(Node):
         self._make_topics()
         if calibration:
             self._set_calibration(Intrinsics.from_yaml(str(calibration)))
-        self._source_name = source
         self._source: Source | None = None
         if source == "topic":
             self._subscribe(needs_info=not calibration)

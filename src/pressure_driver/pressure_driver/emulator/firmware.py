@@ -331,8 +331,3 @@ BOARDS: dict[str, type[BoardProtocol]] = {
     "native": NativeBoard,
 }
 """The board's end of each protocol."""
-
-
-def board_protocol(name: str, chamber_count: int = 4) -> BoardProtocol:
-    """Return the board's end of one of the `BOARDS`."""
-    return BOARDS[name](chamber_count)
