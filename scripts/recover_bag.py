@@ -6,4 +6,4 @@ import sys
 import workspace
 
 if __name__ == "__main__":
-    sys.exit(workspace.run("der_planner.commands.recover_bag"))
+    sys.exit(workspace.run("der_planner.bags.recover"))

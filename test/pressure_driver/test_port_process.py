@@ -21,8 +21,7 @@ from pressure_driver.emulator.board import EmulatedBoard, Faults
 from pressure_driver.emulator.firmware import board_protocol
 from pressure_driver.emulator.pneumatics import BoardPneumatics
 from pressure_driver.emulator.runner import BoardRunner, EmulatedPort
-from pressure_driver.lines import Channel, open_port
-from pressure_driver.port_process import PortError, PortProcess, explain
+from pressure_driver.port_process import Channel, PortError, PortProcess, explain, open_port
 from pressure_driver.protocols import NAMES
 from pressure_driver.safety import Mode
 from pressure_driver.settings import Settings

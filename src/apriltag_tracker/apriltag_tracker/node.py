@@ -29,9 +29,16 @@ from apriltag_tracker.pipeline import (
     Uncertainty,
     warm_up,
 )
-from apriltag_tracker.reports import NO_CALIBRATION, ImageWatch, StampGaps, draw_observation
+from apriltag_tracker.reports import (
+    NO_CALIBRATION,
+    ImageWatch,
+    StampGaps,
+    camera_transform,
+    draw_observation,
+    limb_transforms,
+    transform_publisher,
+)
 from apriltag_tracker.tag_map import TagMap
-from apriltag_tracker.transforms import camera_transform, limb_transforms, transform_publisher
 from der_msgs.msg import LimbState, TagDetection, TagDetectionArray
 from limb_interfaces import qos, stamps, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health

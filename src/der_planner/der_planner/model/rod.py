@@ -35,7 +35,7 @@ from der_planner.model.bending import (
 )
 from der_planner.model.model import NODES, Model, Outputs, Rollout, State
 from der_planner.rod import ConvergenceError, Rod, RodState
-from der_planner.rod.trajectory import Linearisation
+from der_planner.rod.integration import Linearisation
 
 _ITERATIONS = 30
 _SMALL = 1e-7

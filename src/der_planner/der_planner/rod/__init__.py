@@ -5,7 +5,7 @@ where it went. All values are SI.
 """
 
 from der_planner.rod.backend import ConvergenceError, RodState
+from der_planner.rod.integration import Trajectory
 from der_planner.rod.rod import Rod
-from der_planner.rod.trajectory import Trajectory
 
 __all__ = ["ConvergenceError", "Rod", "RodState", "Trajectory"]

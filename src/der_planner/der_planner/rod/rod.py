@@ -12,7 +12,14 @@ from der_planner.arrays import Array
 from der_planner.limb import Limb
 from der_planner.rod.backend import RodState, positions_of
 from der_planner.rod.dimensions import PlanarBackend, SpatialBackend
-from der_planner.rod.integration import Integrator, Method, find_equilibrium
+from der_planner.rod.integration import (
+    Integrator,
+    Method,
+    Trajectory,
+    find_equilibrium,
+    linearisation_of,
+    step_matrices,
+)
 from der_planner.rod.mesh import (
     Mesh,
     array,
@@ -26,7 +33,6 @@ from der_planner.rod.mesh import (
     require,
     voronoi_lengths,
 )
-from der_planner.rod.trajectory import Trajectory, linearisation_of, step_matrices
 
 Plane = Literal["xy", "xz"]
 
