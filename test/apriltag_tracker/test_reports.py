@@ -2,20 +2,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from waiting import Clock
 
 from apriltag_tracker.camera import project
 from apriltag_tracker.pipeline import LimbObservation, LimbTracker
 from apriltag_tracker.reports import ImageWatch, StampGaps, draw_observation
 
 PERIOD = 33_333_333
-
-
-class Clock:
-    def __init__(self):
-        self.now = 100.0
-
-    def __call__(self):
-        return self.now
 
 
 @pytest.fixture

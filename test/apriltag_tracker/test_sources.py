@@ -6,6 +6,7 @@ import time
 import cv2
 import numpy as np
 import pytest
+from waiting import Clock, wait_for
 
 from apriltag_tracker.camera.images import (
     DeviceSource,
@@ -16,14 +17,6 @@ from apriltag_tracker.camera.images import (
     open_source,
     to_grey,
 )
-
-
-class Clock:
-    def __init__(self):
-        self.now = 1_000_000_000
-
-    def __call__(self):
-        return self.now
 
 
 @pytest.fixture
@@ -110,7 +103,7 @@ def test_a_folder_is_played_in_order_at_its_rate(tmp_path, picture):
     for k in (2, 0, 1):
         cv2.imwrite(str(tmp_path / f"{k}.png"), picture // (k + 1))
     (tmp_path / "notes.txt").write_text("no picture")
-    clock = Clock()
+    clock = Clock(1_000_000_000)
     source = open_source(str(tmp_path), 10.0, clock)
     stamps = []
     for k in range(3):
@@ -134,7 +127,7 @@ def test_a_video_is_played_to_its_end(tmp_path, picture):
     for _ in range(3):
         writer.write(picture)
     writer.release()
-    clock = Clock()
+    clock = Clock(1_000_000_000)
     source = open_source(str(path), 30.0, clock)
     assert isinstance(source, VideoSource)
     for _ in range(3):
@@ -175,15 +168,6 @@ class FakeCamera:
         pass
 
 
-def wait_until(condition, timeout=60.0):
-    end = time.monotonic() + timeout
-    while time.monotonic() < end:
-        if condition():
-            return True
-        time.sleep(0.005)
-    return False
-
-
 def test_an_unplugged_camera_is_named_and_comes_back(monkeypatch):
     camera = FakeCamera()
     monkeypatch.setattr(DeviceSource, "_RETRY", 0.01)
@@ -203,12 +187,12 @@ def test_an_unplugged_camera_is_named_and_comes_back(monkeypatch):
             return False
 
     try:
-        assert wait_until(there)
+        wait_for(there, "a picture")
         camera.plugged.clear()
-        assert wait_until(gone)
+        wait_for(gone, "the error")
         # A frame from before is never given again.
         assert gone()
         camera.plugged.set()
-        assert wait_until(there)
+        wait_for(there, "a picture")
     finally:
         source.close()

@@ -14,8 +14,6 @@ from apriltag_tracker.synthetic.camera import (
 from apriltag_tracker.synthetic.shapes import constant_curvature
 from benchmarks.tracker.renderer import BLACK, FULL, WHITE, Scene, draw_patch
 
-CLEAN = Optics(noise=0.0, light_fall=0.0)
-
 
 @pytest.mark.parametrize("blur", [0.5, 1.2])
 def test_pixels_agree_with_brute_force_sampling(model, tags, blur):

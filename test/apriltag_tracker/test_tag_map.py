@@ -14,14 +14,6 @@ def content(config):
     return yaml.safe_load((config / "tags.yaml").read_text())
 
 
-def test_default_map(tags):
-    assert tags.segment_lengths == (0.122, 0.122)
-    assert tags.length == pytest.approx(0.244)
-    assert len(tags.limb) == 5
-    assert all(tag.height == 0.030 for tag in tags.limb)
-    assert tags.world_tag(100) is not None
-
-
 def test_corners_of_a_turned_tag():
     tag = WorldTag(1, (1.0, 2.0, 0.1), np.pi / 2, 0.2)
     expected = [(1.1, 1.9, 0.1), (1.1, 2.1, 0.1), (0.9, 2.1, 0.1), (0.9, 1.9, 0.1)]

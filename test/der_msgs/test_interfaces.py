@@ -1,9 +1,6 @@
 """The Python half of the contract: parameters and their files, the transport of images."""
 
 import contextlib
-import platform
-import subprocess
-import sys
 
 import pytest
 import rclpy
@@ -120,27 +117,3 @@ def test_the_images_transport_is_set_unless_somebody_did(tmp_path, monkeypatch):
     assert runner.use_large_messages() == profile
     monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", "mine.xml")
     assert runner.use_large_messages() is None
-
-
-_RECEIVE = """
-import resource, sys
-from limb_interfaces import runner
-if "keep" in sys.argv:
-    assert runner.keep_buffers()
-before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-for _ in range(50):
-    copies = [bytearray(1 << 20) for _ in range(4)]
-    del copies
-print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
-"""
-
-
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="a setting of the GNU C library")
-def test_the_memory_of_an_image_is_kept_for_the_next_one():
-    """A process of its own: pages of 4 MiB that are faulted anew with each of 50 images, or not."""
-    faults = [
-        int(subprocess.check_output([sys.executable, "-c", _RECEIVE, how], text=True))
-        for how in ("give", "keep")
-    ]
-    assert faults[1] < 3000
-    assert faults[0] > 5 * faults[1]

@@ -56,14 +56,3 @@ def test_a_second_graph_that_begins_meanwhile_is_named(graph, monkeypatch):
             running_graph(graph.client, setup, graph.folder, Progress()),
         ):
             raise AssertionError("it was recorded")
-
-
-def test_nodes_end_with_zero_on_both_signals(graph):
-    for number in (signal.SIGINT, signal.SIGTERM):
-        link = str(graph.folder / f"board_{number}")
-        board = graph.start("pressure_driver", "board_emulator", port_link=link)
-        graph.client.diagnostics.clear()
-        graph.client.wait_ready(["board_emulator"])
-        board.signal(number)
-        graph.client.wait_for(lambda board=board: not board.alive, 60.0, "the end of the node")
-        assert board.exit_code == 0

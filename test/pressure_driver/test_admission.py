@@ -215,18 +215,3 @@ def test_a_higher_revision_that_comes_in_time_replaces_the_earlier_one(simulate)
     assert sim.core.offer(late, sim.wall) is Verdict.LATE
     counters = sim.core.machine.schedule.counts
     assert (counters["accepted"], counters["executed"], counters["superseded"]) == (2, 1, 1)
-
-
-def test_a_horizon_that_is_revised_at_every_tick_is_played_newest_first(simulate):
-    sim = simulate()
-    sim.arm()
-    start = sim.wall
-    for step in range(60):
-        for index in range(step + 1, step + 5):
-            value = (100.0 * index + 10.0 * (step + 1), 0.0)
-            item = Setpoint(start + index * TICK, value, "horizon", index, step)
-            assert sim.core.offer(item, sim.wall) is Verdict.ACCEPTED, (
-                sim.core.machine.schedule.reason
-            )
-        sim.tick()
-        assert sim.core.state()["commanded_differential"][0] == 110.0 * (step + 1)

@@ -167,27 +167,6 @@ def test_bytes_are_stamped_when_the_host_writes_them(tmp_path):
         port.close()
 
 
-def test_the_port_disappears_and_comes_back_under_the_same_name(tmp_path):
-    port = EmulatedPort(str(tmp_path / "board"), 0)
-    host = open_host(port)
-    port.unplug()
-    assert not port.link.exists()
-    with pytest.raises(OSError, match=r"\[Errno 5\]"):
-        os.write(host, b"x")
-    os.close(host)
-    port.plug()
-    host = open_host(port)
-    try:
-        assert port.read(0)
-        port.send(b"hello")
-        port.pump(1)
-        assert os.read(host, 100) == b"hello"
-    finally:
-        os.close(host)
-        port.close()
-    assert not port.link.is_symlink()
-
-
 def test_the_port_overwrites_no_file_and_takes_no_link_from_another_emulator(tmp_path):
     (tmp_path / "file").write_text("precious")
     with pytest.raises(FileExistsError, match="port_link"):

@@ -1,19 +1,15 @@
 """The driver and the emulated board as running nodes: runs, callers, refusals, how they end."""
 
-import contextlib
 import os
 import signal
 import subprocess
 import time
 import uuid
-from pathlib import Path
 
 import numpy as np
 import pytest
 from driver_bench import PERIOD, difference
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Float64MultiArray
-from std_srvs.srv import Trigger
 
 from der_msgs.msg import PressureSetpoint, PressureState
 from der_planner.experiment.processes import find_executable
@@ -62,26 +58,6 @@ def test_cmd_u_t_is_taken_in_hectopascal(bench):
     assert run.states[-1].plan_id in ("", "cmd_u_t")
 
 
-def refused(process, *words):
-    deadline = time.monotonic() + 60.0
-    while process.alive and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert process.exit_code == 1, process.last_words()
-    for word in words:
-        assert word in process.last_words(), process.last_words()
-
-
-def test_what_cannot_work_is_refused_at_the_start(graph):
-    missing = graph.start("pressure_driver", "pressure_driver", name="a", port="/dev/ttyNOWHERE")
-    limit = graph.start("pressure_driver", "pressure_driver", name="d", pressure_limit=-5.0)
-    link = f"/tmp/der_limb_board_test_{uuid.uuid4().hex[:8]}"
-    fault = graph.start("pressure_driver", "board_emulator", name="e", faults="jam", port_link=link)
-    refused(missing, "/dev/ttyNOWHERE", "ports that exist", "'port'")
-    refused(limit, "pressure_limit")
-    refused(fault, "jam", "stick:CHAMBER")
-    assert not os.path.lexists(link)
-
-
 def test_two_publishers_of_a_running_graph_are_not_mixed(bench):
     """Their numbers come from the middleware."""
     run = bench()
@@ -103,21 +79,6 @@ def test_two_publishers_of_a_running_graph_are_not_mixed(bench):
     run.wait(both_heard, "the count of refused setpoints")
     assert min(difference(command)[0] for command in run.commands) > -100.0
     assert "another publisher" in run.driver.log.read_text()
-
-
-def test_a_hundred_calls_at_once_are_all_answered(bench):
-    run = bench()
-    profile = QoSProfile(
-        history=HistoryPolicy.KEEP_LAST, depth=1000, reliability=ReliabilityPolicy.RELIABLE
-    )
-    for service in ("arm", "vent"):
-        caller = run.client.node.create_client(
-            Trigger, f"pressure_driver/{service}", qos_profile=profile
-        )
-        run.wait(caller.service_is_ready, service)
-        answers = [caller.call_async(Trigger.Request()) for _ in range(100)]
-        run.wait(lambda answers=answers: all(each.done() for each in answers), "the answers")
-    assert all(each.result().success for each in answers)
 
 
 HANGING = """
@@ -189,28 +150,6 @@ def test_every_exit_vents(bench):
             assert end != "crash" or b"a callback failed" in process.stderr.read()
             run.wait(run.vented, "vented chambers")
             assert np.ptp(difference(run.commands[-1])) == 0.0
-
-
-def test_a_signal_while_a_node_is_being_loaded_ends_it_without_a_word(graph):
-    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
-        node = graph.start("pressure_driver", "board_emulator", name=f"board_{number}")
-        deadline = time.monotonic() + 90.0
-
-        def caught(status=Path(f"/proc/{node.pid}/status")):
-            with contextlib.suppress(OSError):
-                masks = dict(line.split(":", 1) for line in status.read_text().splitlines())
-                return int(masks["SigCgt"], 16) & 1 << signal.SIGHUP - 1
-
-        # Python itself catches SIGINT from the start; SIGHUP only once the node's entry runs.
-        while not caught():
-            assert time.monotonic() < deadline
-            time.sleep(0.001)
-        node.signal(number)
-        while node.alive:
-            assert time.monotonic() < deadline, "it does not end"
-            time.sleep(0.01)
-        assert node.exit_code == 0, node.last_words()
-        assert "Traceback" not in node.log.read_text()
 
 
 def test_signals_that_come_again_change_nothing_and_nohup_is_respected(graph):

@@ -34,6 +34,7 @@ from shape_msgs.msg import SolidPrimitive
 from std_msgs.msg import Byte, Float32, Float64MultiArray, Header, Int32, String
 from std_srvs.srv import SetBool
 from visualization_msgs.msg import MarkerArray
+from waiting import wait_for
 
 from der_msgs.action import PlayMotion
 from ros2_verbs import cli
@@ -328,9 +329,7 @@ def test_pub(talker: Talker):
     line = "std_msgs.msg.String(data='go')\n\n"
     expected = "".join(f"publishing #{count}: {line}" for count in (1, 2, 3))
     assert published == f"publisher: beginning loop\n{expected}"
-    deadline = time.monotonic() + TIMEOUT
-    while len(talker.heard) < 3 and time.monotonic() < deadline:
-        time.sleep(0.05)
+    wait_for(lambda: len(talker.heard) >= 3, "what was published", TIMEOUT)
     assert talker.heard == ["go"] * 3
 
 

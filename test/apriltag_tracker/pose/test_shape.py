@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from apriltag_tracker.pose.curve import Curve, Evaluation, wrap
+from apriltag_tracker.pose.curve import Curve, Evaluation
 from apriltag_tracker.pose.shape import (
     PlanarTag,
     ShapeFitter,
@@ -126,8 +126,3 @@ def test_tags_that_contradict_each_other_give_nothing(tags):
     ]
     assert ShapeFitter(tags).fit(placed) is None
     assert ShapeFitter(tags).fit([]) is None
-
-
-@pytest.mark.parametrize("turns", [-2, -1, 0, 1])
-def test_angles_are_wrapped(turns):
-    assert wrap(2.0 * np.pi * turns + 0.1) == pytest.approx(0.1)

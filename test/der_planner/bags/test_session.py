@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 from bags import START, TEXT, read_texts, spec, string
+from waiting import wait_for
 
 from der_planner.bags import writer
 from der_planner.bags.reader import BagReader
@@ -13,15 +14,6 @@ from der_planner.bags.session import RecordingSession
 from der_planner.bags.writer import BagWriteError, BagWriter
 
 TALK = "/talk"
-
-
-def wait_until(condition, timeout: float = 20.0) -> None:
-    done = threading.Event()
-    for _ in range(int(timeout / 0.01)):
-        if condition():
-            return
-        done.wait(0.01)
-    raise AssertionError("condition not met in time")
 
 
 def test_flush_without_new_messages_makes_the_file_readable(tmp_path: Path):
@@ -37,7 +29,7 @@ def test_flush_without_new_messages_makes_the_file_readable(tmp_path: Path):
             return False
         return seen == ["early"]
 
-    wait_until(on_disk)
+    wait_for(on_disk, "the message on the disk")
     session.stop()
 
 
@@ -70,9 +62,9 @@ def test_little_space_stops_with_a_whole_bag_and_says_so_at_once(tmp_path: Path,
     )
     topic = spec(TALK, TEXT)
     session.put(topic, START, START, string("kept"))
-    wait_until(lambda: session.writer.message_count == 1)
+    wait_for(lambda: session.writer.message_count == 1, "the message")
     free[0] = 1000
-    wait_until(lambda: told)
+    wait_for(lambda: told, "the failure")
     assert "fewer than 1 MiB are free" in told[0]
     assert session.failure == told[0]
     assert not session.put(topic, START + 1, START, string("too late"))

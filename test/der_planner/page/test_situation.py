@@ -9,22 +9,15 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point
+from waiting import Clock, wait_for
 
 from der_msgs.msg import LimbState, PressurePlan, PressureState
 from der_planner.page.situation import DEAD, FRESH, LATE, Situation
 from limb_interfaces.stamps import stamp_from_nanoseconds
-
-
-class Clock:
-    now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 @pytest.fixture
@@ -102,10 +95,7 @@ def test_a_process_that_ends_or_stops_is_dead_at_once(situation: Situation) -> N
         return node["state"], node["message"]
 
     def becomes(wanted: tuple[str, str]) -> None:
-        deadline = time.monotonic() + 60.0
-        while state() != wanted:
-            assert time.monotonic() < deadline, state()
-            time.sleep(0.01)
+        wait_for(lambda: state() == wanted, str(wanted))
 
     try:
         situation.put_status(status("/limb/planner", "idle", process=here))

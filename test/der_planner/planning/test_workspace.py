@@ -125,10 +125,3 @@ def test_distance_to_reach_agrees_with_a_search():
         found = SPACE.distance_to_reach(point, np.array([0.1, 0.1]))
         assert found <= searched + 1e-9
         assert found == pytest.approx(searched, abs=1e-3)
-
-
-def test_static_pressure_inverts_the_angle_limits():
-    low, high = SPACE.low, SPACE.high
-    np.testing.assert_allclose(
-        SPACE.arcs.static_pressure([low, high]), [[-24e3] * 2, [24e3] * 2], rtol=1e-9
-    )

@@ -31,15 +31,6 @@ DER = [result(e, trial=t) for t, e in enumerate([0.010, 0.012, 0.014])]
 PCC = [result(e, "pcc", t) for t, e in enumerate([0.020, 0.021, 0.025])]
 
 
-def test_mean_and_sample_deviation_over_trials():
-    (row,) = summarise(DER)
-    assert row.trials == 3
-    assert row.mean_error_m == pytest.approx(0.012)
-    assert row.std_error_m == pytest.approx(0.002)
-    assert row.max_error_m == max(run.max_error_m for run in DER)
-    assert math.isnan(summarise(DER[:1])[0].std_error_m)
-
-
 def test_paired_difference_and_interval():
     (found,) = compare([*DER, *PCC])
     assert found.paired

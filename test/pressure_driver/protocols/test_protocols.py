@@ -1,5 +1,6 @@
 """Both ends of every board protocol: bytes, splits, garbage, limits, and a million random bytes."""
 
+import crcmod.predefined
 import numpy as np
 import pytest
 
@@ -12,7 +13,7 @@ from pressure_driver.protocols import (
     Telemetry,
     host_protocol,
 )
-from pressure_driver.protocols.native import FrameType, encode
+from pressure_driver.protocols.native import FrameType, crc16, encode, seal, unseal
 
 ATMOSPHERE = 101_812.0
 READING = BoardReading(
@@ -106,7 +107,9 @@ def test_commands_arrive_as_they_were_meant(name, split):
     places = [c.first_byte for c in commands]
     assert places == sorted(set(places))
     first = host_protocol(name).setpoint([1.0, 1.0], ATMOSPHERE, 0.25)[0][:1]
-    if name != "native":
+    if name == "native":  # a frame begins after the zero that ends the one before
+        assert all(stream[place - 1] == 0 for place in places)
+    else:
         assert all(stream[place : place + 1] == first for place in places)
 
 
@@ -150,12 +153,26 @@ def test_native_board_refuses_malformed_setpoints(body):
 
 
 def test_frames_of_another_version_or_type_are_rejected():
-    from pressure_driver.protocols.native import seal
-
     host = host_protocol("native")
     assert host.decode(seal(bytes([2, FrameType.STATUS, 0, 0]))) == []
     assert host.decode(seal(bytes([1, 0x44, 0, 0]))) == []
     assert host.rejected == 2
+
+
+def test_the_checksum_is_that_of_an_independent_implementation():
+    independent = crcmod.predefined.mkCrcFun("crc-ccitt-false")
+    assert crc16(b"123456789") == 0x29B1
+    for length in (0, 1, 255, 256, 600):
+        data = bytes(place * 7 % 256 for place in range(length))
+        assert crc16(data) == independent(data)
+
+
+def test_every_single_bit_error_is_found():
+    frame = seal(bytes(range(1, 30)))[:-1]
+    for bit in range(8 * len(frame)):
+        damaged = bytearray(frame)
+        damaged[bit // 8] ^= 1 << bit % 8
+        assert unseal(bytes(damaged)) is None
 
 
 # ---------------------------------------------------------------------------------- fuzzing
