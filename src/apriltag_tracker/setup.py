@@ -34,8 +34,8 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "apriltag_tracker = apriltag_tracker:apriltag_tracker",
-            "synthetic_camera = apriltag_tracker:synthetic_camera",
+            "apriltag_tracker = apriltag_tracker.entry:apriltag_tracker",
+            "synthetic_camera = apriltag_tracker.entry:synthetic_camera",
         ],
     },
 )

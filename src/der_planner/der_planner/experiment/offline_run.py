@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from der_planner.bags.run import Description, PressureArrays, RunSeries, method_name
+from der_planner.bags.series import described
 from der_planner.control import Feedback, lockstep
 from der_planner.control.lockstep import Played
 from der_planner.experiment.console import Progress
@@ -83,8 +84,7 @@ def _play(planned: Plan, run: TrialRun) -> tuple[Played, dict[str, Any]]:
         return played, {}
     size = np.linalg.norm(played.estimated_tip - played.tip, axis=1)
     return played, {
-        "correction_rms_pa": np.sqrt(np.mean(played.correction**2, axis=0)).tolist(),
-        "correction_max_pa": np.abs(played.correction).max(axis=0).tolist(),
+        **described(played.correction, np.empty(0)),
         "estimate_rms_m": float(np.sqrt(np.mean(size**2))),
         "warnings": [f"{w.time:.2f} s: {w.name}, {w.message}" for w in feedback.warnings],
     }

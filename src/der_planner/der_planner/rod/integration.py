@@ -183,17 +183,6 @@ def step_matrices(backend: Backend, solved: Solved) -> tuple[Array, Array]:
     return both[:, : 2 * count], both[:, 2 * count :]
 
 
-def solver_of(method: str, dt: float, length: float, lever: float) -> Solver:
-    """Return how a method solves steps of dt [s] of a rod of this length [m].
-
-    Raises:
-        ValueError: an unknown method.
-    """
-    require(method in _STAGES, "method", f"one of {sorted(_STAGES)}", method)
-    fraction, extrapolate = _STAGES[method]
-    return Solver(dt * fraction, extrapolate, 1e-10 * length, lever, _LIMIT)
-
-
 @dataclass
 class _Journey:
     """A run under way: its state and its recorded samples."""
@@ -225,10 +214,15 @@ class Integrator:
         A step that does not converge is cut in two, its halves too, `halvings` times deep.
 
         Raises:
+            ValueError: an unknown method.
             ConvergenceError: with the step's index and the last good state.
         """
         backend = self._backend
-        solver = solver_of(method, dt, self._length, backend.lever)
+        require(method in _STAGES, "method", f"one of {sorted(_STAGES)}", method)
+        fraction, extrapolate = _STAGES[method]
+        solver = Solver(
+            dt * fraction, extrapolate, 1e-10 * self._length, backend.lever, limit=_LIMIT
+        )
         intervals, steps, _ = pressures.shape
         journey = _Journey(backend.place(state), load, linearise, method)
         x = np.empty((intervals + 1, backend.size))

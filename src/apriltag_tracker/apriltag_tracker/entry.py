@@ -1,0 +1,15 @@
+"""What `ros2 run apriltag_tracker` starts: each function is the process of one node."""
+
+from __future__ import annotations
+
+from limb_interfaces.entry import run_module
+
+
+def apriltag_tracker() -> int:
+    """Run the tracker."""
+    return int(run_module("apriltag_tracker.node"))
+
+
+def synthetic_camera() -> int:
+    """Run the synthetic camera."""
+    return int(run_module("apriltag_tracker.synthetic.node"))
