@@ -5,7 +5,7 @@ import pytest
 
 from pressure_driver.core import DriverCore
 from pressure_driver.emulator.board import EmulatedBoard, Faults
-from pressure_driver.emulator.firmware import board_protocol
+from pressure_driver.emulator.firmware import BOARDS
 from pressure_driver.emulator.pneumatics import BoardPneumatics
 from pressure_driver.protocols import host_protocol
 from pressure_driver.safety import Mode
@@ -30,7 +30,7 @@ class Simulation:
         self.clock_error = 0
         self.settings = Settings(protocol=protocol, **settings)
         self.core = DriverCore(host_protocol(protocol), self.settings, steady=lambda: self.steady)
-        self.board = EmulatedBoard(board_protocol(protocol), BoardPneumatics(2, seed), seed)
+        self.board = EmulatedBoard(BOARDS[protocol](), BoardPneumatics(2, seed), seed)
         self.plugged = True
         self.sent = []
         self.received = []
@@ -65,7 +65,7 @@ class Simulation:
     def is_vent(self, data):
         """Tell whether the bytes of a tick ask the board to open every chamber."""
         name = self.core.protocol.name
-        commands = [c for c in board_protocol(name).decode(data) if c.kind in ("setpoint", "vent")]
+        commands = [c for c in BOARDS[name]().decode(data) if c.kind in ("setpoint", "vent")]
         return bool(commands) and all(
             c.kind == "vent"
             or (

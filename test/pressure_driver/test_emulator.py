@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pressure_driver.emulator.board import EmulatedBoard, FaultError, Faults
-from pressure_driver.emulator.firmware import board_protocol
+from pressure_driver.emulator.firmware import BOARDS
 from pressure_driver.emulator.pneumatics import BoardPneumatics
 from pressure_driver.emulator.runner import EmulatedPort
 from pressure_driver.protocols import host_protocol
@@ -69,7 +69,7 @@ def test_the_step_size_does_not_matter():
 
 
 def test_a_command_is_stamped_with_its_first_byte():
-    board = EmulatedBoard(board_protocol("ezloop"), BoardPneumatics(2), 0)
+    board = EmulatedBoard(BOARDS["ezloop"](), BoardPneumatics(2), 0)
     first, second = b"<1013.00,1014.00,1015.00,1016.00>\n", b"<1013.00,1013.00,1013.00,1013.00>\n"
     pieces = [(b"junk" + first[:3], 100), (first[3:20], 200), (first[20:] + second[:1], 300)]
     received = [c for data, stamp in pieces for c in board.receive(data, stamp)[0]]
@@ -97,7 +97,7 @@ def test_fault_texts():
 
 
 def test_dropped_and_corrupted_bytes_come_in_the_stated_share():
-    board = EmulatedBoard(board_protocol("ezloop"), BoardPneumatics(2), 0)
+    board = EmulatedBoard(BOARDS["ezloop"](), BoardPneumatics(2), 0)
     board.set_faults(Faults.parse(["drop:0.3"], 4))
     data = host_protocol("ezloop").vent(101_325.0)[0]
     got = sum(len(board.receive(data, 0)[0]) for _ in range(2000))

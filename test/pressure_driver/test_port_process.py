@@ -18,7 +18,7 @@ from waiting import wait_for
 
 from pressure_driver import port_process
 from pressure_driver.emulator.board import EmulatedBoard, Faults
-from pressure_driver.emulator.firmware import board_protocol
+from pressure_driver.emulator.firmware import BOARDS
 from pressure_driver.emulator.pneumatics import BoardPneumatics
 from pressure_driver.emulator.runner import BoardRunner, EmulatedPort
 from pressure_driver.port_process import Channel, PortError, PortProcess, explain, open_port
@@ -42,7 +42,7 @@ class Rig:
         air = BoardPneumatics(2, 1)
         # Valves ten times as wide, so that nobody waits for the air.
         air._fill_rate, air._vent_coefficient = 10 * air._fill_rate, 10 * air._vent_coefficient
-        self.board = EmulatedBoard(board_protocol(protocol), air, 1)
+        self.board = EmulatedBoard(BOARDS[protocol](), air, 1)
         self.runner = BoardRunner(self.board, self.port, on_command=self.commands.append)
         self.runner.start()
         self.settings = Settings(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pressure_driver.emulator.firmware import board_protocol
+from pressure_driver.emulator.firmware import BOARDS
 from pressure_driver.protocols import BoardReset, host_protocol
 from pressure_driver.safety import Mode
 
@@ -91,7 +91,7 @@ def test_one_damaged_report_of_a_ctrlp_board_is_no_reset():
 
 def test_echoes_and_warnings_of_a_ctrlp_board_are_no_reset():
     host = host_protocol("ctrlp")
-    board = board_protocol("ctrlp")
+    board = BOARDS["ctrlp"]()
     from pressure_driver.emulator.firmware import BoardReading
 
     reading = BoardReading(0.0, (101_325.0,) * 4, 101_325.0, (0.0,) * 4, 0.0)
@@ -133,7 +133,7 @@ def test_lines_of_setpoints_and_of_the_supply_are_no_damage():
 
 
 def test_the_clock_of_a_native_board_may_overflow():
-    host, board = host_protocol("native"), board_protocol("native")
+    host, board = host_protocol("native"), BOARDS["native"]()
     from pressure_driver.emulator.firmware import BoardReading
 
     def status(milliseconds):

@@ -29,6 +29,7 @@ from apriltag_tracker.pipeline import (
     Uncertainty,
     warm_up,
 )
+from apriltag_tracker.pose.shape import CURVE_POINTS
 from apriltag_tracker.reports import (
     NO_CALIBRATION,
     ImageWatch,
@@ -87,7 +88,6 @@ class TrackerNode(Node):
         self._make_topics()
         if calibration:
             self._set_calibration(Intrinsics.from_yaml(str(calibration)))
-        self._source_name = source
         self._source: Source | None = None
         if source == "topic":
             self._subscribe(needs_info=not calibration)
@@ -198,7 +198,7 @@ class TrackerNode(Node):
         ):
             return
         self._tracker = LimbTracker(self._map, intrinsics, self._options, self._detector)
-        self._curve = [Point() for _ in range(self._tracker.fitter.curve_points)]
+        self._curve = [Point() for _ in range(CURVE_POINTS)]
 
     def _on_image(self, message: Image) -> None:
         self._frame = message.header.frame_id

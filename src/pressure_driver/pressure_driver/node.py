@@ -9,7 +9,7 @@ from typing import Any
 
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
@@ -30,9 +30,7 @@ LIFE_PERIOD = 0.1
 """[s] between two signs of life to the port's process."""
 MOST_LINES = 20
 """Lines of the log that one callback writes: whatever else waits has its turn in between."""
-CALLS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=1000, reliability=ReliabilityPolicy.RELIABLE
-)
+CALLS = QoSProfile(depth=1000)
 """Of `arm` and `vent`: the middleware's depth of 10 loses requests that come at once."""
 STATE_FIELDS = set(PressureState.get_fields_and_field_types()) - {"header", "setpoint_stamp"}
 """Of the message, by the names of the state; what else the state has is for the diagnostics."""

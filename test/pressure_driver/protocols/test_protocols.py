@@ -4,7 +4,7 @@ import crcmod.predefined
 import numpy as np
 import pytest
 
-from pressure_driver.emulator.firmware import BoardReading, NativeBoard, board_protocol
+from pressure_driver.emulator.firmware import BOARDS, BoardReading, NativeBoard
 from pressure_driver.protocols import (
     NAMES,
     BoardFailure,
@@ -41,7 +41,7 @@ def decode_all(decoder, stream, generator=None):
 
 
 def reporting_board(name):
-    board = board_protocol(name)
+    board = BOARDS[name]()
     board.boot(ATMOSPHERE)
     board.decode(host_protocol(name).start())
     return board
@@ -57,7 +57,7 @@ def test_ezloop_bytes():
         None,
     )
     assert host.vent(101_325.0)[0] == b"<1013.25,1013.25,1013.25,1013.25>\n"
-    assert board_protocol("ezloop").telemetry(READING) == (
+    assert BOARDS["ezloop"]().telemetry(READING) == (
         b"[MPR]: 1019.00 1093.22 1018.50 1018.40\r\n"
         b"[RPR]: 1400.20\r\n[VAL]: 0.00 0.25 1.00 0.50\r\n"
     )
@@ -73,7 +73,7 @@ def test_ctrlp_bytes():
 
 
 def test_a_pair_near_the_boards_limit_is_sent_lower_with_the_same_difference():
-    board = board_protocol("ezloop")
+    board = BOARDS["ezloop"]()
     for difference in (24_000.0, -24_000.0, 30_000.0):
         data, _ = host_protocol("ezloop").setpoint([difference, 0.0], 102_900.0, 0.25)
         (command,) = board.decode(data)
@@ -82,7 +82,7 @@ def test_a_pair_near_the_boards_limit_is_sent_lower_with_the_same_difference():
 
 
 def test_the_ezloop_board_ignores_a_command_above_its_limit_whole():
-    board = board_protocol("ezloop")
+    board = BOARDS["ezloop"]()
     assert board.decode(b"<1013.00,1250.01,1013.00,1013.00>\n") == []
     assert board.rejected == 1
     assert len(board.decode(b"<1013.00,1250.00,1013.00,1013.00>\n")) == 1
@@ -95,7 +95,7 @@ def test_the_ezloop_board_ignores_a_command_above_its_limit_whole():
 @pytest.mark.parametrize("split", [False, True])
 def test_commands_arrive_as_they_were_meant(name, split):
     generator = np.random.default_rng(3) if split else None
-    host, board = host_protocol(name), board_protocol(name)
+    host, board = host_protocol(name), BOARDS[name]()
     wanted = np.random.default_rng(4).uniform(-24_000.0, 24_000.0, (60, 2))
     stream = host.start() + b"".join(host.setpoint(u, ATMOSPHERE, 0.25)[0] for u in wanted)
     commands = [c for c in decode_all(board, stream, generator) if c.kind == "setpoint"]
@@ -147,7 +147,7 @@ def test_a_native_board_refuses_more_than_it_reaches():
     ids=["empty", "valid for nothing", "three chambers", "negative"],
 )
 def test_native_board_refuses_malformed_setpoints(body):
-    (command,) = board_protocol("native").decode(encode(FrameType.SETPOINT, 5, body))
+    (command,) = BOARDS["native"]().decode(encode(FrameType.SETPOINT, 5, body))
     assert command.kind == "refused"
     assert command.sequence == 5
 

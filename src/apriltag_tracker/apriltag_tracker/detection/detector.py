@@ -41,6 +41,9 @@ _BLENDED = 0.17
 """Where blur or smear blend the cells, those of the code reach over the border: lines are shifted
 by this share of a cell for a misfit of one that is beyond `_SHARP_MISFIT`."""
 
+_LARGEST_RESIDUAL = 0.4
+"""A candidate is dropped whose border's lines have a larger RMS residual than this [px]."""
+
 _CHECKED: set[str] = set()
 """Families whose conventions have been checked in this process."""
 
@@ -110,8 +113,6 @@ class Detector:
             once in 790 000 at 1, once in 44 000 at 2; of tag25h9 once in 240 000 at 0; of tag16h5
             once in 550 at 0; of tagStandard41h12 once in 300 000 at 2; of tagStandard52h13 once in
             980 000 at 3, once in 78 000 at 4.
-        largest_residual: RMS residual of the border's lines above which a candidate is dropped
-            [px].
         family: of the tags, or its name.
 
     Raises:
@@ -123,7 +124,6 @@ class Detector:
         self,
         smallest: float = SMALLEST_TAG,
         correct_bits: int | None = None,
-        largest_residual: float = 0.4,
         family: Family | str = "tag36h11",
     ) -> None:
         if smallest < 8.0:
@@ -138,7 +138,6 @@ class Detector:
             )
         self.smallest = smallest
         self.correct_bits = correct_bits
-        self.largest_residual = largest_residual
         if self.family.name not in _CHECKED:
             self._check_conventions()
             _CHECKED.add(self.family.name)
@@ -213,7 +212,7 @@ class Detector:
         corners, covariances, residuals, found = refine_quads(image, quads, _SEARCH)
         misfits, codes = read_codes(image, corners, self.family.layout)
         along, across = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
-        good = found & (residuals <= self.largest_residual) & (misfits < UNREADABLE)
+        good = found & (residuals <= _LARGEST_RESIDUAL) & (misfits < UNREADABLE)
         good &= misfits <= self.family.largest_misfit
         # Corners run as printed, not as in a mirror; y points down in the image.
         turned = along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]

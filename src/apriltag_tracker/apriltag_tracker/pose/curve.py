@@ -17,6 +17,9 @@ _PASSES = 12
 _SETTLED = 1e-5
 """Steps end when heading [rad] and base [m] change by less than this; its square is left."""
 
+_GRID = 6
+"""Intervals of a segment over which the heading is integrated."""
+
 
 class Curve:
     """A family of curves: heading linear in the parameters, evaluated at fixed arc lengths.
@@ -26,11 +29,7 @@ class Curve:
     """
 
     def __init__(
-        self,
-        lengths: Sequence[float],
-        degrees: int,
-        stiff: Sequence[tuple[float, float]] = (),
-        grid: int = 6,
+        self, lengths: Sequence[float], degrees: int, stiff: Sequence[tuple[float, float]] = ()
     ) -> None:
         ends = np.concatenate([[0.0], np.cumsum(lengths)])
         self.ends = ends
@@ -42,7 +41,7 @@ class Curve:
         self.active = np.diff(self._bending_length(ends))
         edges = np.unique(
             np.concatenate(
-                [np.linspace(a, b, grid + 1) for a, b in itertools.pairwise(ends)]
+                [np.linspace(a, b, _GRID + 1) for a, b in itertools.pairwise(ends)]
                 + [np.array(stretch) for stretch in self._stiff]
             )
         )

@@ -115,6 +115,8 @@ def _furthest(fit: CurveFit) -> float:
     return float(np.hypot(fit.residuals[:, 0], fit.residuals[:, 1]).max())
 
 
+CURVE_POINTS = 41
+"""Points of the published curve."""
 _HOPELESS = 5.0
 """Residual over the distance of rejection above which nothing can be said."""
 
@@ -128,7 +130,6 @@ class ShapeFitter:
         reject_beyond: distance from the fit of all others at which a tag is on the wrong place [m].
         mounting: standard deviation of the tags' mounting on the limb [m].
         mounting_angle: the same of their direction [rad].
-        curve_points: points of the published curve.
     """
 
     def __init__(
@@ -138,16 +139,14 @@ class ShapeFitter:
         reject_beyond: float = 0.004,
         mounting: float = 2e-4,
         mounting_angle: float = 5e-3,
-        curve_points: int = 41,
     ) -> None:
         self.prior = prior or ShapePrior()
         self.reject_beyond = reject_beyond
-        self.curve_points = curve_points
         self._mounting = np.array([mounting, mounting, mounting_angle])
         self._smooth = Curve(tags.segment_lengths, len(self.prior.corrections), tags.stiff)
         self._constant = Curve(tags.segment_lengths, 0, tags.stiff)
         self._outline = Evaluation(
-            self._smooth, np.linspace(0.0, tags.length, curve_points).tolist()
+            self._smooth, np.linspace(0.0, tags.length, CURVE_POINTS).tolist()
         )
         self._evaluations: dict[tuple[int, tuple[float, ...]], Evaluation] = {}
         self._last = np.zeros(self._smooth.size)

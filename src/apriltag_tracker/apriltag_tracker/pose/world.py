@@ -12,6 +12,17 @@ from apriltag_tracker.camera import CameraError, CameraPose, Intrinsics, solve_p
 from apriltag_tracker.detection import Tag
 from apriltag_tracker.tag_map import TagMap, WorldTag
 
+_MEMORY = 150
+"""Pictures over which corners are averaged."""
+_SOLVE_EVERY = 30
+"""Frames between two solutions once the pose has settled."""
+_BUMP = 0.5
+"""Shift of the fixed tags, all together, that means that the camera was moved [px]."""
+_BUMP_FRAMES = 3
+"""Frames in a row that must show it."""
+_MISFIT = 1.5
+"""Residual at which a fixed tag does not fit the others [px]."""
+
 
 @dataclass
 class _Seen:
@@ -27,9 +38,9 @@ class _Seen:
     noise: NDArray[np.float64]
     count: int = 1
 
-    def add(self, tag: Tag, memory: int) -> None:
+    def add(self, tag: Tag) -> None:
         """Take one more picture."""
-        self.count = min(self.count + 1, memory)
+        self.count = min(self.count + 1, _MEMORY)
         share = 1.0 / self.count
         self.corners += share * (tag.corners - self.corners)
         self.noise = (1.0 - share) ** 2 * self.noise + share**2 * tag.covariance
@@ -48,30 +59,11 @@ class WorldPose:
     Args:
         tags: the tag map.
         intrinsics: of the camera.
-        memory: pictures over which corners are averaged.
-        solve_every: frames between two solutions once the pose has settled.
-        bump: shift of the fixed tags, all together, that means that the camera was moved [px].
-        bump_frames: frames in a row that must show it.
-        misfit: residual at which a fixed tag does not fit the others [px].
     """
 
-    def __init__(
-        self,
-        tags: TagMap,
-        intrinsics: Intrinsics,
-        memory: int = 150,
-        solve_every: int = 30,
-        bump: float = 0.5,
-        bump_frames: int = 3,
-        misfit: float = 1.5,
-    ) -> None:
+    def __init__(self, tags: TagMap, intrinsics: Intrinsics) -> None:
         self._map = tags
         self._intrinsics = intrinsics
-        self._memory = memory
-        self._solve_every = solve_every
-        self._bump = bump
-        self._bump_frames = bump_frames
-        self._misfit = misfit
         self._seen: dict[int, _Seen] = {}
         self._frames = 0
         self._shifted = 0
@@ -97,8 +89,8 @@ class WorldPose:
             if seen is None:
                 self._seen[tag.id] = _Seen(tag.corners.copy(), tag.covariance.copy())
             else:
-                seen.add(tag, self._memory)
-        if known and (self._frames < 10 or self._frames % self._solve_every == 0):
+                seen.add(tag)
+        if known and (self._frames < 10 or self._frames % _SOLVE_EVERY == 0):
             self._solve()
         if known:
             self._frames += 1
@@ -111,11 +103,11 @@ class WorldPose:
             return False
         gaps = np.array([tag.corners - self._seen[tag.id].corners for tag in averaged])
         shifts = sorted(np.hypot(*gaps.mean(axis=1).T).tolist())
-        if shifts[(len(shifts) - 1) // 2] > self._bump:
+        if shifts[(len(shifts) - 1) // 2] > _BUMP:
             self._shifted += 1
         else:
             self._shifted = 0
-        if self._shifted < self._bump_frames:
+        if self._shifted < _BUMP_FRAMES:
             return False
         self._shifted = 0
         return True
@@ -137,14 +129,14 @@ class WorldPose:
                 return
             per_tag = np.sqrt(np.mean(np.sum(residuals.reshape(-1, 4, 2) ** 2, axis=2), axis=1))
             worst = int(np.argmax(per_tag))
-            if per_tag[worst] <= self._misfit or len(ids) <= 2:
+            if per_tag[worst] <= _MISFIT or len(ids) <= 2:
                 break
             # Out goes the tag without which the others agree best, not the one that shows it most.
             worst = self._best_without(ids, entries)
             excluded[ids[worst]] = float(per_tag[worst])
             del ids[worst]
             start = None
-        if per_tag.max() > 4.0 * self._misfit:
+        if per_tag.max() > 4.0 * _MISFIT:
             self.pose = None
             self.problem = (
                 f"the fixed tags {ids} do not fit together ({per_tag.max():.1f} px): survey their "

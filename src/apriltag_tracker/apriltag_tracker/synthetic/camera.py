@@ -29,6 +29,8 @@ from apriltag_tracker.synthetic.shapes import (
 from apriltag_tracker.tag_map import LimbTag, TagMap, WorldTag
 
 SCHEMA_VERSION = 1
+_BODY_RADIUS = 0.013
+"""Half the width of the limb [m]."""
 _NOISE_LENGTH = 1 << 21
 
 
@@ -128,7 +130,6 @@ class SyntheticCamera:
         optics: picture quality.
         errors: differences between the tag map and the set-up.
         seed: of noise, floor and errors.
-        body_radius: half the width of the limb [m].
     """
 
     def __init__(
@@ -138,13 +139,11 @@ class SyntheticCamera:
         optics: Optics | None = None,
         errors: Errors | None = None,
         seed: int = 0,
-        body_radius: float = 0.013,
     ) -> None:
         self.model = model
         self.tags = tags
         self.optics = optics or Optics()
         self.errors = errors or Errors()
-        self.body_radius = body_radius
         self._random = np.random.default_rng(seed)
         self._eye = self._make_eye()
         scale = model.intrinsics.matrix[0, 0] / model.pose.position[2]
@@ -229,8 +228,8 @@ class SyntheticCamera:
         """Draw the limb's silhouette: dark silicone at half the height of its tags."""
         height = 0.5 * max(tag.height for tag in self.tags.limb)
         normal = np.stack([-np.sin(shape.heading), np.cos(shape.heading)], axis=1)
-        left = shape.points + self.body_radius * normal
-        right = shape.points - self.body_radius * normal
+        left = shape.points + _BODY_RADIUS * normal
+        right = shape.points - _BODY_RADIUS * normal
         outline = np.vstack([left, right[::-1]])
         points = np.column_stack([outline, np.full(len(outline), height)])
         pixels = project(self.model.intrinsics, self.model.pose, points)

@@ -35,6 +35,7 @@ from der_planner.experiment.console import (
     check_file,
     check_folder,
     check_kilograms,
+    command_parser,
     interrupt_once,
     run_command,
 )
@@ -115,9 +116,7 @@ def _main(given: argparse.Namespace) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser(__doc__)
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--offline", action="store_true", help="calibrate the twin of --seed")
     source.add_argument(

@@ -25,6 +25,7 @@ from der_planner.experiment.console import (
     OptionError,
     add_load_options,
     check_file,
+    command_parser,
     run_command,
 )
 from der_planner.identification import CalibrationLog, LogError, check, read_log, update
@@ -56,9 +57,7 @@ def _main(given: argparse.Namespace) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser(__doc__)
     parser.add_argument(
         "runs", nargs="+", type=Path, metavar="BAG", help="bags of runs, or CSV tables"
     )

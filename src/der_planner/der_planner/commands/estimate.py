@@ -19,16 +19,14 @@ import numpy as np
 from der_planner.arrays import Array
 from der_planner.commands.learn import FAILURES, add_plan_options, check_same, plan_of
 from der_planner.control.hindsight import Filmed, Smoothed, smooth
-from der_planner.experiment.console import check_file, run_command
+from der_planner.experiment.console import check_file, command_parser, run_command
 from der_planner.planning import Plan
 from der_planner.results import EvaluationError, RunSeries, load_run
 
 
 def main() -> int:
     """Run the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser(__doc__)
     parser.add_argument("bag", type=Path, metavar="BAG", help="of a run")
     parser.add_argument("--out", type=Path, metavar="FILE", help="table (CSV) to write")
     add_plan_options(parser)

@@ -12,7 +12,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from der_planner.experiment.console import Progress, check_file, check_folder, run_command
+from der_planner.experiment.console import (
+    Progress,
+    check_file,
+    check_folder,
+    command_parser,
+    run_command,
+)
 from der_planner.results import (
     BagError,
     EvaluationError,
@@ -29,9 +35,7 @@ from der_planner.results.overlay import write_video
 
 
 def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser(__doc__)
     parser.add_argument(
         "bags", nargs="+", type=Path, metavar="BAG", help="bags, or experiment folders"
     )

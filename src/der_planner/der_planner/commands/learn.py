@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from der_planner.control import Learner, LearningError
-from der_planner.experiment.console import check_file, run_command
+from der_planner.experiment.console import check_file, command_parser, run_command
 from der_planner.limb import Limb, LimbError
 from der_planner.planning import Motion, Plan, PlanningError, plan
 from der_planner.planning.motions import NAMES
@@ -34,9 +34,7 @@ _SAME_POINT = 2e-3
 
 def main() -> int:
     """Run the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser(__doc__)
     parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="bags, oldest first")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the next plan")
     add_plan_options(parser)

@@ -28,7 +28,13 @@ from rosgraph_msgs.msg import Clock
 from der_planner.bags.reader import BagError, BagReader, RawMessage, RecordedTopic
 from der_planner.bags.record import NANOSECONDS
 from der_planner.experiment.client import GraphClient
-from der_planner.experiment.console import OptionError, Progress, interrupt_once, run_command
+from der_planner.experiment.console import (
+    OptionError,
+    Progress,
+    command_parser,
+    interrupt_once,
+    run_command,
+)
 from der_planner.experiment.processes import GraphError
 
 CLOCK_PERIOD = NANOSECONDS // 100
@@ -246,9 +252,7 @@ def _profile(topic: RecordedTopic) -> QoSProfile:
 
 
 def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser(__doc__)
     parser.add_argument("bag", type=Path, metavar="BAG", help="folder, .mcap or .db3 file")
     parser.add_argument("--rate", type=float, default=1.0, help="0: as fast as possible")
     parser.add_argument("--from", dest="start", type=float, default=0.0, metavar="S")

@@ -18,6 +18,7 @@ from der_planner.experiment.console import (
     OptionError,
     Progress,
     check_folder,
+    command_parser,
     interrupt_once,
     run_command,
 )
@@ -29,9 +30,7 @@ from der_planner.studies.tasks import TASKS
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser(__doc__)
     parser.add_argument("study", nargs="?", metavar="STUDY.yaml", help="file, or a shipped name")
     parser.add_argument(
         "--scheduler",

@@ -2,6 +2,6 @@
 
 from der_planner.control.disturbance import LearningError
 from der_planner.control.feedback import Feedback
-from der_planner.control.learning import Learner, LearningRun
+from der_planner.control.learning import Learner
 
-__all__ = ["Feedback", "Learner", "LearningError", "LearningRun"]
+__all__ = ["Feedback", "Learner", "LearningError"]

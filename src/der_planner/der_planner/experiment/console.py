@@ -74,6 +74,13 @@ def interrupt_once() -> None:
     on_end_signals(interrupt)
 
 
+def command_parser(text: str | None) -> argparse.ArgumentParser:
+    """Return the parser of a command whose module's text is shown by --help as it stands."""
+    return argparse.ArgumentParser(
+        description=text, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+
+
 def run_command(
     work: Callable[[], int], *failures: type[Exception], stopped: str = "", code: int = 1
 ) -> int:

@@ -5,7 +5,7 @@
 
 from der_planner.model.arcs import ArcModel
 from der_planner.model.material import Material
-from der_planner.model.model import NODES, ArcState, Model, State
+from der_planner.model.model import NODES, Model, State
 from der_planner.model.rod import RodModel
 from der_planner.model.simulation import CONTROL_PERIOD, STEPS, Initial, Response, simulate
 
@@ -14,7 +14,6 @@ __all__ = [
     "NODES",
     "STEPS",
     "ArcModel",
-    "ArcState",
     "Initial",
     "Material",
     "Model",

@@ -184,17 +184,14 @@ class Material:
         ]
         return np.column_stack(columns)
 
-    def memory_pressures(
-        self, time: Array, bend_angle: Array, start: Memory | None = None
-    ) -> Array:
-        """Return the (K, M) pressures that friction and creep take along bend histories [Pa].
+    def memory_pressures(self, time: Array, bend_angle: Array) -> Array:
+        """Return the (K, M) pressures that friction and creep take of a limb that has rested [Pa].
 
         Args:
             time: (K,) rising [s].
             bend_angle: (K, M) [rad].
-            start: what they remember at ``time[0]``; None: a limb that has rested.
         """
-        return self.pressure_taken(self.remember(time, bend_angle, start))
+        return self.pressure_taken(self.remember(time, bend_angle, None))
 
     # Along the bend at rest --------------------------------------------------------------------
 

@@ -309,13 +309,12 @@ class Recorder(Node):
         return response
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        if self._session is None:
-            response.message = "not recording: start a recording first"
-            return response
-        self._receive_waiting()
-        self._session.paused = request.data
-        response.success = True
-        response.message = "paused" if request.data else "recording again"
+        response.message = "not recording: start a recording first"
+        if self._session is not None:
+            self._receive_waiting()
+            self._session.paused = request.data
+            response.success = True
+            response.message = "paused" if request.data else "recording again"
         return response
 
     def _on_mark(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

@@ -188,7 +188,7 @@ class Previewer:
         self._limits = limits
         self._carried = carried
         self._process: ProcessPoolExecutor | None = None
-        self.region = lru_cache(REGIONS_KEPT)(self._region)
+        self.region = lru_cache(REGIONS_KEPT)(lambda load: reachable_region(self.limb_under(load)))
         self.limb_under(carried)
 
     def limb_under(self, load: Load) -> Limb:
@@ -200,14 +200,6 @@ class Previewer:
         limb = self.limb.mounted(load.mounting) if load.mounting else self.limb
         carried = load if load.payload else self._carried
         return limb.carrying(carried.payload, carried.payload_at or None)
-
-    def _region(self, load: Load) -> list[Array]:
-        """Return outlines (P, 2) [m] of what the tip reaches; takes about a second at first.
-
-        Raises:
-            LimbError: as `limb_under`.
-        """
-        return reachable_region(self.limb_under(load))
 
     def ask(self, limb: Limb, tip: Array, model: str = "der", method: str = "") -> Future[Preview]:
         """Plan a drawing (P, 2) [m] for a limb; the first starts the process and takes longer."""

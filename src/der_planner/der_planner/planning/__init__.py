@@ -8,13 +8,12 @@ from der_planner.planning.configuration import METHODS
 from der_planner.planning.loads import BucklingError, OverloadError, PlanningError
 from der_planner.planning.motions import NAMES, Motion, Reference
 from der_planner.planning.plan_file import Plan
-from der_planner.planning.planner import DEFAULT_METHOD, choose_method, plan
+from der_planner.planning.planner import choose_method, plan
 from der_planner.planning.timing import PathLimits, Start
 from der_planner.planning.workspace import UnreachableError, Workspace
 
 __all__ = [
     "CONTROL_PERIOD",
-    "DEFAULT_METHOD",
     "METHODS",
     "NAMES",
     "BucklingError",

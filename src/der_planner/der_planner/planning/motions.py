@@ -202,20 +202,14 @@ class Motion:
         return cls(name, path=path, branch=branch, nearest=nearest)
 
     @classmethod
-    def from_csv(
-        cls,
-        path: str | Path,
-        branch: str = "",
-        limits: PathLimits | None = None,
-        nearest: bool = False,
-    ) -> Motion:
+    def from_csv(cls, path: str | Path, nearest: bool = False) -> Motion:
         """Return a motion along a path in a CSV file: columns x, y [m] and, if timed, time [s].
 
         Raises:
             PlanningError: the file cannot be read; the message names line and column.
         """
         time, tip = paths.read_csv(path)
-        return cls.from_tip_path(time, tip, Path(path).stem, branch, limits, nearest)
+        return cls.from_tip_path(time, tip, Path(path).stem, nearest=nearest)
 
     def reference(self, workspace: Workspace, start: Start | None = None) -> Reference:
         """Return q̄(t) and r̄(t) for a limb.

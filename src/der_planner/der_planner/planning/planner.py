@@ -22,7 +22,6 @@ from der_planner.planning.timing import Start
 from der_planner.planning.workspace import Workspace
 from der_planner.rod import ConvergenceError
 
-DEFAULT_METHOD = {"der": "optimal", "pcc": "optimal"}
 _THREADS = ThreadpoolController()
 _FINE = 2
 """Points of the balance's grid a control period."""
@@ -52,7 +51,7 @@ def plan(
         limb: the robot.
         motion: what the tip should do.
         model: ``der`` (discrete elastic rod) or ``pcc`` (constant curvature).
-        method: ``paper``, ``projected`` or ``optimal``; empty: the default.
+        method: ``paper``, ``projected`` or ``optimal``; empty: ``optimal``.
         nodes: of the rod.
         start: where another motion is left; None: where the vented limb rests.
         progress: called with the share that is done, 0 … 1.
@@ -131,14 +130,14 @@ def _solve(
 
 
 def choose_method(model: str, method: str) -> str:
-    """Return the method, or the model's default for an empty one.
+    """Return the method, or ``optimal`` for an empty one.
 
     Raises:
         PlanningError: unknown model, or a method that it has not.
     """
     if model not in METHODS:
         raise PlanningError(f"model '{model}' is unknown: choose {' or '.join(METHODS)}")
-    chosen = method or DEFAULT_METHOD[model]
+    chosen = method or "optimal"
     if chosen not in METHODS[model]:
         raise PlanningError(
             f"the model '{model}' has no method '{method}': choose {', '.join(METHODS[model])}"
@@ -198,10 +197,8 @@ def _limit_warnings(
             f"filled by up to {slow.opposite:.0f} Pa to make up for it{effect}; a longer period or "
             "a smaller amplitude needs less"
         )
-    air, fastest = (
-        configuration.model.air.pneumatics,
-        np.abs(np.diff(wanted, axis=0)).max(initial=0),
-    )
+    air = configuration.model.air.pneumatics
+    fastest = np.abs(np.diff(wanted, axis=0)).max(initial=0)
     largest, per_second = np.abs(wanted).max(), fastest / CONTROL_PERIOD
     if found.limited and (largest > air.pressure_limit or per_second > air.slew_limit):
         excess = (

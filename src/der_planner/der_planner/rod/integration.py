@@ -194,24 +194,6 @@ def solver_of(method: str, dt: float, length: float, lever: float) -> Solver:
     return Solver(dt * fraction, extrapolate, 1e-10 * length, lever, _LIMIT)
 
 
-@dataclass(frozen=True)
-class Run:
-    """What a simulation returned.
-
-    Attributes:
-        q: (K+1, 4N-1). v: likewise.
-        final: the last state.
-        iterations: Newton iterations of all steps.
-        solved: the linearisation, if asked for.
-    """
-
-    q: Array
-    v: Array
-    final: RodState
-    iterations: int
-    solved: Solved | None
-
-
 @dataclass
 class _Journey:
     """A run under way: its state and its recorded samples."""
@@ -221,10 +203,7 @@ class _Journey:
     linearise: bool
     method: str
     iterations: int = 0
-    records: list[Record] = field(default_factory=list)
-    rates: list[Array] = field(default_factory=list)
-    extrapolates: list[Array] = field(default_factory=list)
-    steps: list[NDArray[np.int64]] = field(default_factory=list)
+    pieces: list[Solved] = field(default_factory=list)
 
 
 class Integrator:
@@ -237,8 +216,11 @@ class Integrator:
     def run(
         self, state: RodState, pressures: Array, dt: float, method: str, load: Array,
         linearise: bool = False, halvings: int = 0,
-    ) -> Run:  # fmt: skip
+    ) -> tuple[Trajectory, Solved | None]:  # fmt: skip
         """Run K intervals of S steps of dt under pressures (K, S, M) and load (4N-1,).
+
+        Returns:
+            The motion, and what its linearisation comes from, if that was asked for.
 
         A step that does not converge is cut in two, its halves too, `halvings` times deep.
 
@@ -263,11 +245,11 @@ class Integrator:
             begin += 1
             if step == steps - 1:
                 x[interval + 1], rate[interval + 1] = journey.place.x, journey.place.v
-        final = backend.state(journey.place, state)
-        return Run(
-            backend.restore(x, state.q), backend.restore(rate, state.v), final,
-            journey.iterations, _solved(journey) if linearise else None,
+        motion = Trajectory(
+            steps * dt * np.arange(intervals + 1), backend.restore(x, state.q),
+            backend.restore(rate, state.v), backend.state(journey.place, state), journey.iterations,
         )  # fmt: skip
+        return motion, _joined(journey.pieces) if linearise else None
 
     def _go(
         self, journey: _Journey, motion: tuple[Array, Array], pressures: Array, begin: int,
@@ -286,11 +268,15 @@ class Integrator:
         journey.iterations += piece.iterations
         done = piece.done - begin
         if journey.linearise and done:
-            journey.records.append(Record(*(part[: done * stages] for part in record)))
-            journey.rates.append(np.full(done * stages, 1.0 / solver.h))
-            journey.extrapolates.append(np.tile(solver.extrapolate, done))
             owners = np.arange(begin, piece.done) if step is None else np.full(done, step)
-            journey.steps.append(np.repeat(owners, stages))
+            journey.pieces.append(
+                Solved(
+                    record=Record(*(part[: done * stages] for part in record)),
+                    rates=np.full(done * stages, 1.0 / solver.h),
+                    extrapolate=np.tile(solver.extrapolate, done),
+                    steps=np.repeat(owners, stages),
+                )
+            )
         return piece
 
     def _cut(
@@ -330,16 +316,13 @@ def _no_state(nodes: int) -> RodState:
     return RodState(zero, zero, np.tile([0.0, 1.0, 0.0], (nodes - 1, 1)), np.zeros(nodes))
 
 
-def _solved(journey: _Journey) -> Solved:
+def _joined(pieces: list[Solved]) -> Solved:
     """Join the pieces of a run's linearisation."""
-    if len(journey.records) == 1:
-        record = journey.records[0]
-    else:
-        record = Record(*(np.concatenate(parts) for parts in zip(*journey.records, strict=True)))
-    steps = np.concatenate(journey.steps)
-    return Solved(
-        record, np.concatenate(journey.rates), np.concatenate(journey.extrapolates), steps
-    )
+    if len(pieces) == 1:
+        return pieces[0]
+    records, *others = zip(*pieces, strict=True)
+    record = Record(*(np.concatenate(parts) for parts in zip(*records, strict=True)))
+    return Solved(record, *map(np.concatenate, others))
 
 
 def find_equilibrium(backend: Backend, start: RodState, u: Array, load: Array) -> RodState:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -237,9 +238,10 @@ class Rod:
         """
         pressures = array(u, (self.segment_count,), "u")[None, None, :]
         load = self._load(forces)
-        return self._integrator.run(
+        motion, _ = self._integrator.run(
             state, pressures, positive(dt, "dt"), method, load, halvings=halvings
-        ).final
+        )
+        return motion.final
 
     def simulate(
         self,
@@ -277,18 +279,16 @@ class Rod:
                 good state.
         """
         inputs = by_step(pressures, substeps, self.segment_count)
-        intervals = inputs.shape[0]
         h = positive(dt, "dt") / substeps
         load = self._load(forces)
-        run = self._integrator.run(state, inputs, h, method, load, linearise, halvings)
-        linearisation = None
-        if run.solved is not None:
-            wanted = self.output_indices(outputs)
-            linearisation = linearisation_of(
-                self._backend, run.solved, (intervals, substeps), wanted, self._backend.rows(wanted)
-            )
-        time = dt * np.arange(intervals + 1)
-        return Trajectory(time, run.q, run.v, run.final, run.iterations, linearisation)
+        motion, solved = self._integrator.run(state, inputs, h, method, load, linearise, halvings)
+        if solved is None:
+            return motion
+        wanted = self.output_indices(outputs)
+        linearisation = linearisation_of(
+            self._backend, solved, (len(inputs), substeps), wanted, self._backend.rows(wanted)
+        )
+        return replace(motion, linearisation=linearisation)
 
     def equilibrium(
         self, u: ArrayLike, *, start: RodState | None = None, forces: ArrayLike | None = None
@@ -357,11 +357,11 @@ class Rod:
         beginning and of the step's result at the end: what `Rod.state(q, like=…)` does.
         """
         pressures = array(u, (self.segment_count,), "u")[None, None, :]
-        run = self._integrator.run(
+        _, solved = self._integrator.run(
             state, pressures, positive(dt, "dt"), method, self._load(forces), linearise=True
         )
-        assert run.solved is not None  # since it was linearised
-        return step_matrices(self._backend, run.solved)
+        assert solved is not None  # since it was linearised
+        return step_matrices(self._backend, solved)
 
     def _load(self, forces: ArrayLike | None) -> Array:
         if forces is None:

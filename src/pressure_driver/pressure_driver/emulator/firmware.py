@@ -241,13 +241,12 @@ class NativeBoard(BoardProtocol):
 
     gauge = True
 
-    def __init__(
-        self, chamber_count: int = 4, largest_pressure: int = 30_000, firmware: str = "emulator 1"
-    ) -> None:
+    _FIRMWARE = b"emulator 1"
+
+    def __init__(self, chamber_count: int = 4, largest_pressure: int = 30_000) -> None:
         super().__init__(chamber_count)
         self._frames = FrameSplitter()
         self._largest = largest_pressure
-        self._firmware = firmware.encode("ascii")
         self._sequence = 0
 
     def decode(self, data: bytes) -> list[BoardCommand]:
@@ -310,9 +309,9 @@ class NativeBoard(BoardProtocol):
         """IDENTITY to HELLO, FAULT to what was refused, STATUS to everything else."""
         if command.kind == "hello":
             body = HELLO_BODY.pack(
-                self.chamber_count, 0, self._largest, round(reading.atmosphere), len(self._firmware)
+                self.chamber_count, 0, self._largest, round(reading.atmosphere), len(self._FIRMWARE)
             )
-            return encode(FrameType.IDENTITY, self._next(), body + self._firmware)
+            return encode(FrameType.IDENTITY, self._next(), body + self._FIRMWARE)
         if command.kind == "refused":
             return self.fault(FaultCode.REFUSED, command.text)
         return self.telemetry(reading)
@@ -332,8 +331,3 @@ BOARDS: dict[str, type[BoardProtocol]] = {
     "native": NativeBoard,
 }
 """The board's end of each protocol."""
-
-
-def board_protocol(name: str, chamber_count: int = 4) -> BoardProtocol:
-    """Return the board's end of one of the `BOARDS`."""
-    return BOARDS[name](chamber_count)

@@ -17,7 +17,7 @@ from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.runner import run_node
 from limb_interfaces.stamps import stamp_from_nanoseconds
 from pressure_driver.emulator.board import EmulatedBoard, FaultError, Faults, ReceivedCommand
-from pressure_driver.emulator.firmware import board_protocol
+from pressure_driver.emulator.firmware import BOARDS
 from pressure_driver.emulator.pneumatics import BoardPneumatics
 from pressure_driver.emulator.runner import BoardRunner, EmulatedPort
 from pressure_driver.node import read_settings
@@ -32,7 +32,7 @@ class BoardEmulator(Node):
         self.fatal_error = ""
         settings = read_settings(self, EmulatorSettings)
         pneumatics = BoardPneumatics(settings.segment_count, settings.seed)
-        protocol = board_protocol(settings.protocol, 2 * settings.segment_count)
+        protocol = BOARDS[settings.protocol](2 * settings.segment_count)
         self._board = EmulatedBoard(protocol, pneumatics, settings.seed)
         faults = self._parse(settings.faults)  # before the port stands where others see it
         self._port = EmulatedPort(settings.port_link, settings.baud_rate)

@@ -75,7 +75,10 @@ class BoardPneumatics:
             return nominal * (1.0 + VARIATION * spread)
 
         self._fill_rate = vary(FILL_RATE)
-        self._vent_coefficient = _vent_coefficient(vary(VENT_TIME))
+        # c of dp/dt = −c p^n from the 90-to-10-% time of a step of `REFERENCE_STEP`.
+        power = 1.0 - VENT_EXPONENT
+        span = (0.9**power - 0.1**power) / power
+        self._vent_coefficient = REFERENCE_STEP**power * span / vary(VENT_TIME)
         self._regulator_time = vary(REGULATOR_TIME)
         self._vent_deadband = vary(VENT_DEADBAND)
         self._fill_coupling = vary(FILL_COUPLING)
@@ -151,10 +154,3 @@ class BoardPneumatics:
         felt = rate[self._neighbour]
         source = np.where(felt > 0.0, self._fill_coupling, self._vent_coupling) * felt
         self._disturbance += dt * (source - self._disturbance / self._coupling_time)
-
-
-def _vent_coefficient(vent_time: FloatArray) -> FloatArray:
-    """Return c of dp/dt = −c p^n from the 90-to-10-% time of a step of `REFERENCE_STEP`."""
-    power = 1.0 - VENT_EXPONENT
-    span = (0.9**power - 0.1**power) / power
-    return np.asarray(REFERENCE_STEP**power * span / vent_time)
