@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import signal
 
 import pytest
 
@@ -28,15 +27,6 @@ def test_a_driver_without_its_board_ends_with_the_port_and_the_remedy(graph):
     with pytest.raises(NodeError, match=r"'pressure_driver' died \(exit code 1\)") as caught:
         graph.client.wait_ready(["pressure_driver"])
     assert port in str(caught.value)
-
-
-def test_a_waiting_client_notices_a_death_at_once(graph):
-    board = graph.start("pressure_driver", "board_emulator", port_link=str(graph.folder / "board"))
-    graph.client.watch([board])
-    graph.client.wait_ready(["board_emulator"])
-    board.signal(signal.SIGKILL)
-    with pytest.raises(NodeError, match="killed by SIGKILL"):
-        graph.client.wait_for(lambda: False, 60.0, "what never comes")
 
 
 def test_a_second_graph_that_begins_meanwhile_is_named(graph, monkeypatch):

@@ -1,10 +1,10 @@
 """Learning from run to run, on limbs that are not the one of the plan."""
 
 import copy
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from limbs import mean_error, other_limb, play
 from link_chain import LinkChain
 
 from der_planner.control import Learner, LearningError
@@ -15,23 +15,6 @@ from der_planner.planning import CONTROL_PERIOD, Motion, plan
 pytestmark = pytest.mark.slow
 
 LIMB = Limb.default()
-
-
-def other_limb(gain=0.9, rest=0.035):
-    segments = tuple(
-        replace(s, moment_gain=s.moment_gain * gain, rest_curvature=rest / s.length)
-        for s in LIMB.segments
-    )
-    return replace(LIMB, segments=segments)
-
-
-def play(planned, limb):
-    """Return the tip (K, 2) [m] of another limb under the plan's commands."""
-    return simulate(limb, planned.time, commands=planned.differential_pressure).tip[:-1]
-
-
-def mean_error(planned, tip):
-    return np.linalg.norm(tip - planned.tip_reference, axis=1).mean()
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,5 @@
 """A path is drawn offline: from the file to the report."""
 
-import dataclasses
 import json
 from pathlib import Path
 
@@ -9,15 +8,13 @@ import pytest
 
 from der_planner.commands.run_experiment import run
 from der_planner.experiment.options import parse
-from der_planner.limb import CalibratedRange, Limb
-from der_planner.planning import PlanningError
 
 
-def write_arc(file: Path, scale: float = 1.0) -> None:
+def write_arc(file: Path) -> None:
     """Write a timed arc at the reach of the default limb, in cm."""
     angle = np.linspace(0.46, 0.56, 13)
     rows = [
-        f"{time:.2f}, {22.4 * scale * np.cos(a):.4f}, {22.4 * scale * np.sin(a):.4f}"
+        f"{time:.2f}, {22.4 * np.cos(a):.4f}, {22.4 * np.sin(a):.4f}"
         for time, a in zip(np.linspace(0, 6, 13), angle, strict=True)
     ]
     file.write_text("\n".join(["time [s], x [cm], y [cm]", *rows]) + "\n")
@@ -40,24 +37,6 @@ def test_a_path_is_drawn_and_reported(tmp_path: Path):
     page = (out / "report" / "report.html").read_text()
     assert "arc" in page
     assert str(file) in page
-
-
-def test_an_unreachable_path_says_where(tmp_path: Path):
-    file = tmp_path / "far.csv"
-    write_arc(file, scale=2.0)
-    options = parse(["--offline", "--no-calibration", "--path", str(file), "--out", str(tmp_path)])
-    with pytest.raises(PlanningError, match=r"point \(0\.40\d+, 0\.19\d+\) m at t = 0\.00 s"):
-        run(options)
-
-
-def test_another_mounting_than_the_calibrations_is_said(tmp_path: Path, capfd):
-    known = CalibratedRange((2e4, 2e4), (1.5, 1.5))
-    dataclasses.replace(Limb.default(), calibrated=known).to_yaml(tmp_path / "limb.yaml")
-    arguments = ["--offline", "--limb", str(tmp_path / "limb.yaml"), "--mounting", "hanging"]
-    arguments += ["--out", str(tmp_path / "out")]
-    said = "warning: the mounting is hanging, the limb was calibrated as horizontal"
-    run(parse([*arguments, "--dry-run"]))
-    assert said in capfd.readouterr().err
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from limbs import with_segments
 from link_chain import LinkChain
 
 from der_planner.identification import CalibrationLog, LogError, fit, predict
@@ -72,11 +73,11 @@ def test_a_chain_held_sideways_that_swings_and_carries_a_mass_is_fitted():
 
 def test_lengths_that_are_far_off_are_named_in_place_of_a_traceback():
     limb = Limb.default().mounted("hanging")
-    long = tuple(replace(segment, length=1.35 * segment.length) for segment in limb.segments)
+    long = with_segments(limb, length=lambda s: 1.35 * s.length)
     pressure = waves(12_000.0, 2, 12.0)
     time = 0.05 * np.arange(len(pressure))
     log = LinkChain(3, gravity_of("hanging")).play(time, pressure, 20.0).log()
-    _, report = fit(replace(limb, segments=long), log, terms=())
+    _, report = fit(long, log, terms=())
     assert "segment 1 is given as 165 mm and was found to be 132 mm or less" in report.text()
     assert "limb file of --prior" in report.text()
     for factor, shift in ((1000.0, 0.0), (0.01, 0.0), (1.0, 0.4)):
@@ -116,8 +117,7 @@ def test_a_limb_that_gives_way_in_the_rod_of_more_nodes_is_told_by_the_other_one
     pressure = np.minimum(time / 3.0, 1.0)[:, None] * np.array([-20e3, -20e3])
 
     def softening(growth: float) -> Limb:
-        changes = {"bending_stiffness": 0.0183, "cubic_stiffness": growth, "damping": 0.7}
-        return replace(known, segments=tuple(replace(s, **changes) for s in known.segments))
+        return with_segments(known, bending_stiffness=0.0183, cubic_stiffness=growth, damping=0.7)
 
     none = np.zeros_like(pressure)
     log = logged(time, pressure, none, none)

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from limbs import with_segments
 from log_table import write_csv
 
 from der_planner.commands import check_limb
@@ -13,12 +14,10 @@ from der_planner.limb import Limb
 from der_planner.model import simulate
 
 LIMB = Limb.default()
-RUBBING = replace(
+RUBBING = with_segments(
     LIMB,
-    segments=tuple(
-        replace(s, friction_moment=300.0 * s.moment_gain, friction_curvature=0.1 / s.length)
-        for s in LIMB.segments
-    ),
+    friction_moment=lambda s: 300.0 * s.moment_gain,
+    friction_curvature=lambda s: 0.1 / s.length,
 )
 
 

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from limbs import with_segments
 
 from der_planner.limb import Limb
 from der_planner.model import ArcModel, arc_kernel
@@ -204,11 +205,8 @@ def test_pressures_at_rest_balance_the_gradient_of_the_energy(count):
 
 
 def test_a_stiff_limb_is_not_stepped_over_its_fastest_mode():
-    limb = limb_of(3)
-    segments = tuple(
-        dataclasses.replace(s, bending_stiffness=60 * s.bending_stiffness) for s in limb.segments
-    )
-    model = ArcModel(dataclasses.replace(limb, segments=segments))
+    stiff = with_segments(limb_of(3), bending_stiffness=lambda s: 60 * s.bending_stiffness)
+    model = ArcModel(stiff)
     pressures = np.full((20, 5, 3), 5e4)
     coarse, _ = rolled(model, pressures, 0.01)
     fine, _ = rolled(model, np.repeat(pressures, 20, axis=1), 0.0005)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from limbs import with_segments
 
 from der_planner.limb import Limb, LimbError
 from der_planner.model.material import Material, dahl, maxwell
@@ -16,24 +17,19 @@ def felt(limb, differential, bend):
 
 
 def rubbing(**changes: float) -> Limb:
-    limb = Limb.default()
-    segments = tuple(
-        replace(
-            s,
-            gain_asymmetry=0.05,
-            pressure_stiffening=5e-6,
-            friction_moment=400 * s.moment_gain,
-            friction_curvature=0.1 / s.length,
-            creep_stiffness=500 * s.moment_gain * s.length,
-            creep_time=8.0,
-            rest_curvature=0.2,
-            coupling_before=0.04,
-            coupling_after=-0.03,
-            **changes,
-        )
-        for s in limb.segments
+    return with_segments(
+        Limb.default(),
+        gain_asymmetry=0.05,
+        pressure_stiffening=5e-6,
+        friction_moment=lambda s: 400 * s.moment_gain,
+        friction_curvature=lambda s: 0.1 / s.length,
+        creep_stiffness=lambda s: 500 * s.moment_gain * s.length,
+        creep_time=8.0,
+        rest_curvature=0.2,
+        coupling_before=0.04,
+        coupling_after=-0.03,
+        **changes,
     )
-    return replace(limb, segments=segments)
 
 
 TIME = np.arange(600) * 0.05
@@ -73,10 +69,7 @@ def test_creep_relaxes_exponentially():
 def test_resting_bend_is_where_moment_and_effective_pressure_agree():
     cubic = 0.3
     limb = rubbing()
-    stiffer = [
-        replace(s, cubic_stiffness=cubic * s.bending_stiffness * s.length**2) for s in limb.segments
-    ]
-    limb = replace(limb, segments=tuple(stiffer))
+    limb = with_segments(limb, cubic_stiffness=lambda s: cubic * s.bending_stiffness * s.length**2)
     bend = Material(limb).resting_bend(TIME, WANTED)
     effective = felt(limb, WANTED, bend)
     bent = bend - np.array([s.rest_curvature * s.length for s in limb.segments])
@@ -101,10 +94,9 @@ def test_coupling_adds_the_share_of_the_neighbours_pressure():
 
 
 def test_too_much_stiffening_is_refused_by_its_name():
-    limb = rubbing()
-    segments = tuple(replace(s, pressure_stiffening=1e-4) for s in limb.segments)
+    limb = with_segments(rubbing(), pressure_stiffening=1e-4)
     with pytest.raises(ValueError, match="pressure_stiffening"):
-        Material(replace(limb, segments=segments)).differential_pressure(TIME, WANTED, BEND)
+        Material(limb).differential_pressure(TIME, WANTED, BEND)
 
 
 def test_limb_file_keeps_everything(tmp_path):

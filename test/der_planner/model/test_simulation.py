@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from limbs import with_segments
 
 from der_planner.limb import VENT_REFERENCE, Limb
 from der_planner.model import CONTROL_PERIOD, STEPS, Initial, Material, Model, RodModel, simulate
@@ -181,14 +182,11 @@ def test_wrong_input_is_named():
 def test_mass_that_resists_and_mass_that_weighs_are_told_apart(model):
     # What weighs 1 and resists 0.8 is what resists 0.8 and is pulled at 1 / 0.8 as strongly.
     limb = everything().mounted("30")
-    slow = replace(limb, segments=tuple(replace(s, swing_inertia=0.8) for s in limb.segments))
-    same = replace(
-        limb,
-        gravity=tuple(g / 0.8 for g in limb.gravity),
-        segments=tuple(
-            replace(s, mass_per_length=0.8 * s.mass_per_length, damping=s.damping / 0.8)
-            for s in limb.segments
-        ),
+    slow = with_segments(limb, swing_inertia=0.8)
+    same = with_segments(
+        replace(limb, gravity=tuple(g / 0.8 for g in limb.gravity)),
+        mass_per_length=lambda s: 0.8 * s.mass_per_length,
+        damping=lambda s: s.damping / 0.8,
     )
     time = np.arange(0.0, 2.0, 0.05)
     pressures = 6000.0 * np.sin(np.outer(time, [3.0, 7.0]))

@@ -5,35 +5,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from limbs import mean_error, other_limb, play
 
 from der_planner.control import Learner
 from der_planner.limb import Limb
-from der_planner.model import RodModel, simulate
+from der_planner.model import RodModel
 from der_planner.planning import Motion, plan
 from der_planner.planning.correction import carried_over, nearest
 from der_planner.planning.plan_file import write_plan
 
 LIMB = Limb.default()
-OTHER = replace(
-    LIMB,
-    segments=tuple(
-        replace(s, moment_gain=0.9 * s.moment_gain, rest_curvature=0.04 / s.length)
-        for s in LIMB.segments
-    ),
-)
+OTHER = other_limb(rest=0.04)
 
 
 def planned(period, amplitude=0.6, motion="same_direction"):
     given = Motion.named(motion, amplitude=amplitude, period=period, cycles=1)
     return plan(LIMB, given, method="optimal")
-
-
-def play(planned):
-    return simulate(OTHER, planned.time, commands=planned.differential_pressure).tip[:-1]
-
-
-def mean_error(planned):
-    return np.linalg.norm(play(planned) - planned.tip_reference, axis=1).mean()
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +29,7 @@ def library(tmp_path_factory):
     folder, following = tmp_path_factory.mktemp("learned"), planned(8.0)
     learner = Learner(following)
     for run in (1, 2):
-        learner.add(following.time, play(following))
+        learner.add(following.time, play(following, OTHER))
         following = learner.next()
         write_plan(following, folder / f"run_{run}.yaml")
         os.utime(folder / f"run_{run}.yaml", (run, run))
@@ -58,7 +45,7 @@ def test_a_near_motion_begins_with_less_than_half_of_the_error(library, period, 
     begun = carried_over(fresh, learned)
     assert begun.method == "learned"
     assert begun.period == period
-    assert mean_error(begun) < 0.5 * mean_error(fresh)
+    assert mean_error(begun, play(begun, OTHER)) < 0.5 * mean_error(fresh, play(fresh, OTHER))
     assert np.abs(begun.differential_pressure).max() <= LIMB.pneumatics.pressure_limit
 
 

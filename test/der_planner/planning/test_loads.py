@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from limbs import with_segments
 
 from der_planner.limb import GRAVITY, Limb
 from der_planner.model import RodModel
@@ -23,15 +24,11 @@ SPATIAL = dataclasses.replace(LIMB, gravity=(0.0, 0.0, -4.0))
 
 
 def stiffer(limb, factor):
-    segments = tuple(
-        dataclasses.replace(
-            s,
-            bending_stiffness=factor * s.bending_stiffness,
-            moment_gain=factor * s.moment_gain,
-        )
-        for s in limb.segments
+    return with_segments(
+        limb,
+        bending_stiffness=lambda s: factor * s.bending_stiffness,
+        moment_gain=lambda s: factor * s.moment_gain,
     )
-    return dataclasses.replace(limb, segments=segments)
 
 
 MOUNTED = {
@@ -158,8 +155,7 @@ def test_a_standing_limb_beyond_its_critical_load_is_refused_by_name():
 def test_a_leaning_limb_beyond_its_critical_load_is_refused_by_name(model):
     """It is bent by its rest curvature, so that Newton's method may find a fallen rest."""
     for curvature in (0.2, 2.0):
-        segments = tuple(dataclasses.replace(s, rest_curvature=curvature) for s in LIMB.segments)
-        bent = dataclasses.replace(LIMB, segments=segments).mounted("standing").carrying(0.1)
+        bent = with_segments(LIMB, rest_curvature=curvature).mounted("standing").carrying(0.1)
         with pytest.raises(BucklingError, match=r"does not stay upright|may fall to either side"):
             plan(bent, Motion.named("same_direction", 0.1, 8.0, 1), model)
 

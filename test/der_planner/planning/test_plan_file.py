@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from limbs import with_segments
 
 from der_planner.limb import Limb
 from der_planner.planning import Motion, PlanningError, Start, plan
@@ -14,11 +15,11 @@ from der_planner.planning.plan_file import learned_plan, read_plan, write_plan
 @pytest.fixture(scope="module")
 def bent():
     """Return a plan of a limb that rests bent, which begins where another motion is left."""
-    limb = Limb.default()
-    segments = tuple(replace(s, rest_curvature=0.3) for s in limb.segments)
     motion = Motion.named("asynchronous", amplitude=0.3, period=3.0, cycles=1)
     start = Start(np.array([0.1, 0.05]), np.zeros(2), np.zeros(2), np.array([500.0, 100.0]))
-    return plan(replace(limb, segments=segments), motion, method="projected", start=start)
+    return plan(
+        with_segments(Limb.default(), rest_curvature=0.3), motion, method="projected", start=start
+    )
 
 
 def test_a_plan_is_read_back_whole(bent, tmp_path):

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from limbs import with_segments
 
 from der_planner.limb import Limb
 from der_planner.rod import ConvergenceError, Rod, integration
@@ -12,9 +13,8 @@ METHODS = ["sdirk2", "midpoint", "backward_euler"]
 
 
 def limb_rod(**options) -> Rod:
-    limb = Limb.default()
-    segments = tuple(dataclasses.replace(segment, **options) for segment in limb.segments)
-    return Rod.from_limb(dataclasses.replace(limb, segments=segments, gravity=(0.3, -2.0, 0.0)))
+    limb = dataclasses.replace(Limb.default(), gravity=(0.3, -2.0, 0.0))
+    return Rod.from_limb(with_segments(limb, **options))
 
 
 def spatial_rod() -> Rod:

@@ -2,23 +2,9 @@
 
 import numpy as np
 import pytest
+from cantilever import cantilever
 
 from der_planner.rod import ConvergenceError, Rod
-
-RADIUS = 0.015
-AREA = np.pi * RADIUS**2
-INERTIA = np.pi * RADIUS**4 / 4
-YOUNG = 1.5e6
-LENGTH = 0.25
-WEIGHT = 1240 * AREA * 9.81
-
-
-def cantilever(nodes: int, clamp: str = "ghost", plane="xz", axial: float = 1.0) -> Rod:
-    return Rod.uniform(
-        length=LENGTH, nodes=nodes, EI=YOUNG * INERTIA, EA=axial * YOUNG * AREA,
-        GJ=YOUNG / 3 * 2 * INERTIA, mass_per_length=1240 * AREA, clamp=clamp,
-        gravity=(0, 0, -9.81), plane=plane,
-    )  # fmt: skip
 
 
 @pytest.mark.parametrize("plane", ["xz", None])
@@ -77,7 +63,7 @@ def helix(curvature, torsion, length, nodes):
 
 
 def test_load_stepping_reaches_what_newton_alone_does_not():
-    rod = cantilever(21)
+    rod = cantilever(clamp="ghost")
     heavy = np.zeros((21, 3))
     heavy[:, 2] = -40 * rod.mass_diagonal[0::4]
     heavy[-1, 0] = -3.0

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from plain_hardware import plain
+from limbs import plain, with_segments
 
 from der_planner.limb import PointMass, gravity_of
 from der_planner.twin import LimbTwin, TwinError
@@ -54,10 +54,7 @@ def test_bent_limb_is_arcs_between_straight_fittings():
 
 def test_first_frequency_is_a_cantilevers():
     hardware = replace(plain(), drag=0.05, base_fitting=5e-3, connector_mass=0.0, tip_mass=0.0)
-    hardware = replace(
-        hardware,
-        segments=tuple(replace(s, bending_stiffness=0.0175) for s in hardware.segments),
-    )
+    hardware = with_segments(hardware, bending_stiffness=0.0175)
     twin = LimbTwin(hardware=hardware)
     twin.step(REST + np.array([600.0, 0.0, 600.0, 0.0]), 0.3)
     heights = []
@@ -138,16 +135,10 @@ def test_pressures_in_small_steps_do_not_shake_the_friction_loose():
 
 def test_creep_goes_on_after_the_step():
     calm = replace(plain(), drag=6.0)
-    creeping = replace(
+    creeping = with_segments(
         calm,
-        segments=tuple(
-            replace(
-                s,
-                creep_stiffness=(0.0, 0.03 * s.bending_stiffness, 0.0),
-                creep_time=(0.03, 5.0, 60.0),
-            )
-            for s in calm.segments
-        ),
+        creep_stiffness=lambda s: (0.0, 0.03 * s.bending_stiffness, 0.0),
+        creep_time=(0.03, 5.0, 60.0),
     )
     moved = []
     for hardware in (calm, creeping):

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from plain_hardware import plain
+from limbs import plain
 from scipy.optimize import brentq
 
 from der_planner.limb import PointMass, gravity_of
