@@ -111,7 +111,6 @@ def test_echoes_and_warnings_of_a_ctrlp_board_are_no_reset():
         (b"_NEW UNITS: kPa\tkPa\r\n", True),
         (b"_UNITS: kPa\tkPa\r\n", True),
         (b"_NEW UNITS: 1\n", True),
-        (b"_NEW UNITS: psi\tpsi\r\n", False),
         (b"_NEW UNITS: kPa\tpsi\r\n", False),
         (b"_NEW UNITS: 0\n", False),
     ],

@@ -107,10 +107,8 @@ def test_a_new_plan_replaces_the_old_from_its_first_stamp_on():
     ("values", "reason"),
     [
         ((float("nan"), 0.0), "not finite"),
-        ((float("inf"), 0.0), "not finite"),
         ((1000.0,), "expected 2"),
         ((1.0, 2.0, 3.0), "expected 2"),
-        ((), "expected 2"),
         ((24_000.1, 0.0), "limit is ±24000 Pa"),
         ((0.0, -24_000.1), "limit is ±24000 Pa"),
         ((10_000.1, 0.0), "Pa/s"),
