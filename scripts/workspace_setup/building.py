@@ -97,7 +97,7 @@ def kernel_jobs() -> list[Job]:
     if not changed:
         return []
     drop_stale_kernels(source, changed)
-    paths = [str(ROOT / "scripts"), *(str(source / package) for package in PACKAGES[1:])]
+    paths = [str(ROOT / "scripts"), *(str(source / package) for package in PACKAGES)]
     inside = {**clean_environment(), "PYTHONPATH": os.pathsep.join(paths)}
     done: list[str] = []
 
