@@ -1,1 +1,4 @@
-"""The commands of ``scripts/``, one module a command; each ``main()`` returns the exit code."""
+"""The commands of ``scripts/``; each ``main()`` returns the exit code.
+
+One module is one command; that of ``recover_bag.py`` stands in `der_planner.bags.recover`.
+"""
