@@ -13,9 +13,11 @@ import dataclasses
 import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from der_planner.arrays import Array
 from der_planner.identification.least_squares import (
@@ -23,6 +25,7 @@ from der_planner.identification.least_squares import (
     Rows,
     Unknowns,
     correlation_length,
+    same_values,
 )
 from der_planner.identification.log import Prepared
 from der_planner.limb import Limb, Segment, Term, declarations
@@ -33,6 +36,18 @@ GROUPS = ("asymmetry", "stiffening", "cubic", "coupling", "friction", "creep", "
 OPTIONAL = ("mass",)
 """Model terms that are fitted only on request: the mass, in place of the stiffness. A log without
 measured forces shows only ratios of stiffness, gain and mass, so one of them must be given."""
+EXPERIMENTS = {
+    "linear": "slow pressures both ways on each segment, in the units of the log,",
+    "asymmetry": "slow pressures both ways on each segment",
+    "stiffening": "slow pressures up to the limit",
+    "cubic": "slow pressures up to the limit",
+    "coupling": "pressures on each segment alone",
+    "friction": "slow strokes of a few degrees, there and back,",
+    "creep": "pressures that are held for a minute",
+    "dynamics": "swings while both segments bend on in one direction, or a known weight (--weight),",
+    "mass": "a scale (--mass)",
+}
+"""What tells the terms of a group where a log does not, as the subject of a sentence."""
 _ORDER = ("linear", *GROUPS, *OPTIONAL)
 _DECLARED = {key: item for key, item in declarations(Segment).items() if item.fit}
 _FIELDS = {item.fit.name: key for key, item in _DECLARED.items() if item.fit}
@@ -54,7 +69,13 @@ ANGLE_ERROR = np.deg2rad(0.3)
 CORRELATION = 20.0
 """Rows over which an error of the model stays the same (1 s)."""
 SOFTNESS = 3.0
-"""Errors beyond this multiple of `ANGLE_ERROR` count less than their square."""
+"""Errors beyond this multiple of the usual one count less than their square."""
+ROUGH = 1e-2
+"""Relative change of the sum of squares at which a search ends whose weights are not known yet."""
+SAME_WEIGHT = math.log(1.5)
+"""Change of the logarithm of the data's variance up to which a search need not be repeated."""
+MOST_FITS = 3
+"""Largest number of searches, each with the weights that the last one told."""
 _STEPS = {"der": 1, "pcc": 2}
 """Integrator steps in each row of 50 ms; the page of the identification shows the convergence."""
 _NUDGE = 1e-3
@@ -109,6 +130,29 @@ class FreeTerms:
         """What is known of the free terms."""
         known = [(term.spread, term.low, term.high, term.scale) for term in self.terms]
         return Unknowns(self.at_places(self.values), *np.reshape(known, (-1, 4)).T)
+
+    def only(self, chosen: NDArray[np.bool_]) -> Self:
+        """Return those of the terms that are chosen (P,)."""
+        places, terms = compress(self.places, chosen), compress(self.terms, chosen)
+        return replace(self, places=tuple(places), terms=tuple(terms))
+
+    def told(self, name: str, value: Array, deviation: Array) -> Self:
+        """Return the terms where something else than the log has measured one of each segment.
+
+        Args:
+            name: of the term.
+            value: (M,) measured.
+            deviation: (M,) standard deviation of it; what was known before counts by its own.
+        """
+        values, terms, column = self.values.copy(), list(self.terms), COLUMN[name]
+        for index, (segment, place) in enumerate(self.places):
+            if place != column:
+                continue
+            spread = terms[index].spread
+            share = 1.0 / (1.0 + (deviation[segment] / spread) ** 2)
+            values[segment, column] += share * (value[segment] - values[segment, column])
+            terms[index] = replace(terms[index], spread=spread * math.sqrt(1.0 - share))
+        return replace(self, values=values, terms=tuple(terms))
 
     def at_places(self, table: Array) -> Array:
         """Return the values (P,) of the free terms in a table (M, T)."""
@@ -225,14 +269,17 @@ def predicted(free: FreeTerms, model: Model, log: Prepared, values: Array) -> Pr
         RuntimeError: the model cannot follow.
     """
     limb, scale = free.limb_with(values), free.unknowns.scale
-    response = follow(model.another(limb), log, linearise=True)
-    assert response.derivative is not None
+    units = np.diag(scale)
+    limbs = [free.limb_with(values + _NUDGE * unit) for unit in units]
+    driven = [_same_body(limb, nudged) for nudged in limbs]
+    # The tangent of the arcs takes longer than all their differences: only where it is needed.
+    response = follow(model.another(limb), log, linearise=any(driven))
     angles, tip = response.bend_angles, response.tip
     moments, gain = _moments(limb, log, angles), _gain(limb)
     angles_by, tip_by = (np.empty((*part.shape, len(values))) for part in (angles, tip))
-    for place, unit in enumerate(np.diag(scale)):
-        nudged = free.limb_with(values + _NUDGE * unit)
-        if _same_body(limb, nudged):
+    for place, (unit, nudged) in enumerate(zip(units, limbs, strict=True)):
+        if driven[place]:
+            assert response.derivative is not None
             change = (_moments(nudged, log, angles) - moments) / gain / (_NUDGE * scale[place])
             tip_by[:, :, place], angles_by[:, :, place] = response.derivative.by_effective(change)
             continue
@@ -282,14 +329,54 @@ class BendFit:
         more_rows: Callable[[Predicted], Rows] | None = None,
     ) -> None:
         self.free, self._model, self._logs, self._more_rows = free, model, logs, more_rows
-        self.search = LeastSquares(free.unknowns, self._rows, SOFTNESS / np.sqrt(CORRELATION))
+        self._last: tuple[bytes, list[Predicted] | None] = (b"", None)
+        self.weigh(1.0)
+
+    def weigh(self, factor: float) -> None:
+        """Take the bend angles' variance for so many times that of `ANGLE_ERROR`."""
+        self.factor = factor
+        unknowns = self.free.unknowns
+        self.search = LeastSquares(unknowns, self._rows, SOFTNESS / np.sqrt(CORRELATION))
+
+    def solve(self, start: Array) -> Array:
+        """Return the best values (P,), the bend angles weighed by what these leave of them.
+
+        With the variance of `ANGLE_ERROR`, a log that the model cannot explain would outweigh
+        everything that is known before it, and move what it does not tell.
+
+        Args:
+            start: (P,) that the model follows.
+
+        Raises:
+            ValueError: the model cannot be followed at the start.
+        """
+        values = self.search.solve(start, ROUGH)
+        factor = self.least_excess(values)
+        for _ in range(MOST_FITS):
+            self.weigh(factor)
+            values = self.search.solve(values)
+            factor = self.least_excess(values)
+            if abs(math.log(factor / self.factor)) < SAME_WEIGHT:
+                break
+        return values
+
+    def _predicted(self, values: Array) -> list[Predicted] | None:
+        """Return what is predicted along the logs, or None; the last one is kept."""
+        key = same_values(values, self.free.unknowns)
+        if self._last[0] != key:
+            try:
+                found = [predicted(self.free, self._model, log, values) for log in self._logs]
+            except RuntimeError:  # also where arcs that buckle do not come to rest
+                self._last = (key, None)
+            else:
+                self._last = (key, found)
+        return self._last[1]
 
     def _rows(self, values: Array) -> Rows | None:
-        weight = 1.0 / (ANGLE_ERROR * np.sqrt(CORRELATION))
+        weight = 1.0 / (ANGLE_ERROR * np.sqrt(CORRELATION * self.factor))
         errors, slopes = [], []
-        try:
-            found = [predicted(self.free, self._model, log, values) for log in self._logs]
-        except RuntimeError:  # also where arcs that buckle under their load do not come to rest
+        found = self._predicted(values)
+        if found is None:
             return None
         for log, part in zip(self._logs, found, strict=True):
             rows = log.usable
@@ -312,6 +399,10 @@ class BendFit:
         for error, log in zip(errors, self._logs, strict=True):
             error[~log.usable] = np.nan
         return np.concatenate(errors)
+
+    def least_excess(self, values: Array) -> float:
+        """Return `excess` of what values (P,) leave; at least 1, which any model leaves anyhow."""
+        return max(1.0, self.excess(self.remaining(values)))
 
     def excess(self, remaining: Array) -> float:
         """Return by how much the data's variance exceeds that of `ANGLE_ERROR` and `CORRELATION`.

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Collection, Iterable
+import math
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from der_planner.arrays import Array
 from der_planner.identification.air import AirFit, fit_air
 from der_planner.identification.bends import (
     COLUMN,
+    EXPERIMENTS,
     GROUPS,
     NODES,
     OPTIONAL,
@@ -38,10 +41,13 @@ from der_planner.identification.log import (
     Prepared,
     prepare,
 )
-from der_planner.identification.report import FitReport, Unknown
-from der_planner.limb import CalibratedRange, Limb
+from der_planner.identification.report import FitReport, Unknown, readable
+from der_planner.identification.weight import HungWeight
+from der_planner.limb import CalibratedRange, Limb, Term
 from der_planner.model import ArcModel, Material, RodModel
 from der_planner.planning.loads import nearly_buckling
+
+Mask = NDArray[np.bool_]
 
 UNTOLD = 0.8
 """Share of its prior spread above which the deviation of an unknown means that the log does not
@@ -100,21 +106,25 @@ def fit(
     prepared = replace(recorded, pressure=recorded.pressure - offset)
     fitted = _fit_bends_and_lengths(limb, prepared, groups)
     warnings += filter(None, [lengths_at_their_end(limb, fitted.known)])
+    if hung is not None:
+        change, deviation = hung.stiffness_change(fitted.known, fitted.limb)
+        weighed = fitted.free.told("log_stiffness", change, deviation)
+        fitted = _again(fitted, weighed, prepared)
     unknowns, correlation = _told(fitted)
-    stiffness = [u.untold for u in unknowns if u.name.startswith("log_stiffness")]
-    if "dynamics" in groups and stiffness and all(stiffness):
-        warnings.append(
-            "the log is too slow to tell the stiffness apart from the gain: stiffness and damping "
-            "keep their old values; steps or a sweep would tell them"
-        )
-        groups -= {"dynamics"}
-        fitted = _fit_bends(fitted.known, prepared, groups, fitted.lengths)
+    kept, said = _untold_stiffness(fitted.free, unknowns)
+    without_kept = _again(fitted, fitted.free.only(~kept), prepared) if kept.any() else fitted
+    if without_kept is not fitted:
+        left = tuple(_kept_unknowns(fitted.free.only(kept)))
+        fitted = without_kept
         unknowns, correlation = _told(fitted)
+        unknowns += left
+        warnings.append(said)
+    warnings += _at_bounds(fitted)
     found = _calibrated(fitted, limb, air, recorded)
     warnings += filter(None, [nearly_buckling(found)])
     pcc_residual = np.full(limb.segment_count, np.nan)
-    if "dynamics" in groups or limb.weighs_in_plane:
-        found, pcc_residual = _with_arcs(found, prepared, warnings)
+    if limb.weighs_in_plane or any(term.group == "dynamics" for term in fitted.free.terms):
+        found, pcc_residual = _with_arcs(found, fitted, prepared, warnings)
     return found, FitReport(
         limb=found,
         source=log.source,
@@ -133,14 +143,22 @@ def fit(
 
 
 class _Fitted(NamedTuple):
-    """A limb with its lengths, the problem solved on it, what it left, and the limb found."""
+    """A limb with its lengths, the problem solved on it, what it left, the limb found, and which
+    places the log did not tell."""
 
     known: Limb
     lengths: GeometryFit | None
+    tips: UnevenTips | None
     problem: BendFit
     values: Array
     remaining: Array
     limb: Limb
+    kept: frozenset[tuple[int, int]] = frozenset()
+
+    @property
+    def free(self) -> FreeTerms:
+        """The terms that were free."""
+        return self.problem.free
 
 
 def _fit_bends_and_lengths(prior: Limb, prepared: Prepared, groups: Collection[str]) -> _Fitted:
@@ -160,7 +178,7 @@ def _fit_bends_and_lengths(prior: Limb, prepared: Prepared, groups: Collection[s
             break
         tips = UnevenTips(prior, RodModel(lengths.limb, NODES), prepared, lacking)
         change = np.abs(lengths_of(lengths.limb) - lengths_of(fitted.known))
-        fitted = _fit_bends(lengths.limb, prepared, groups, lengths, fitted.values, tips)
+        fitted = _fit_bends(lengths.limb, prepared, groups, lengths, fitted, tips)
         if change[: prior.segment_count + 1].max() < SAME_LENGTH:
             break
     if loaded:
@@ -173,7 +191,7 @@ def _fit_bends(
     prepared: Prepared,
     groups: Collection[str],
     lengths: GeometryFit | None,
-    start: Array | None = None,
+    before: _Fitted | None = None,
     tips: UnevenTips | None = None,
 ) -> _Fitted:
     """Fit the rod to the bend angles.
@@ -183,7 +201,7 @@ def _fit_bends(
         prepared: the log.
         groups: of terms to fit.
         lengths: of the limb.
-        start: (P,) of the free terms; None: in closed form from the log's statics.
+        before: a fit of the same terms to begin at; None: in closed form from the log's statics.
         tips: fit to them, too; None: to the bend angles alone.
     """
     names = {term.name for term in TERMS if term.group in ("linear", *groups)}
@@ -194,11 +212,14 @@ def _fit_bends(
         names.discard("log_inertia")
     free = FreeTerms.of(known, names, without(values_of(known, starts=True), groups))
     problem = BendFit(free, RodModel(known, NODES), [prepared], tips.rows if tips else None)
-    if start is None:
+    if before is None:
         start = free.at_places(_static_start(free, prepared))
-    values = problem.search.solve(_followed(problem, free, start))
+    else:
+        start = before.values
+        problem.weigh(before.problem.factor)
+    values = problem.solve(_followed(problem, free, start))
     return _Fitted(
-        known, lengths, problem, values, problem.remaining(values), free.limb_with(values)
+        known, lengths, tips, problem, values, problem.remaining(values), free.limb_with(values)
     )
 
 
@@ -246,29 +267,103 @@ def _followed(problem: BendFit, free: FreeTerms, start: Array) -> Array:
     )
 
 
+def _again(fitted: _Fitted, free: FreeTerms, prepared: Prepared) -> _Fitted:
+    """Fit terms that were fitted before, some of them or with more known of them.
+
+    Returns what was given where the rod cannot follow the log from there.
+    """
+    found = dict(zip(fitted.free.places, fitted.values, strict=True))
+    start = np.array([found[place] for place in free.places])
+    tips = fitted.tips
+    problem = BendFit(free, RodModel(fitted.known, NODES), [prepared], tips.rows if tips else None)
+    problem.weigh(fitted.problem.factor)
+    if not problem.search.follows(start):
+        return fitted
+    values = problem.solve(start)
+    remaining, limb = problem.remaining(values), free.limb_with(values)
+    kept = fitted.kept.union(set(fitted.free.places) - set(free.places))
+    return _Fitted(
+        *(fitted.known, fitted.lengths, tips, problem, values, remaining, limb), kept=kept
+    )
+
+
+def _untold_stiffness(free: FreeTerms, unknowns: Sequence[Unknown]) -> tuple[Mask, str]:
+    """Return which unknowns (P,) keep what was known before the log, and the sentence for it.
+
+    Stiffness that the log does not tell takes up what the model lacks in friction and creep. Where
+    it tells that of no segment, it does not tell the damping either.
+    """
+    stiff = np.array([term.name == "log_stiffness" for term in free.terms], dtype=bool)
+    untold = stiff & np.array([unknown.untold for unknown in unknowns], dtype=bool)
+    if not untold.any():
+        return untold, ""
+    if np.array_equal(untold, stiff):
+        return np.array([term.group == "dynamics" for term in free.terms]), (
+            "the log is too slow to tell the stiffness apart from the gain: stiffness and damping "
+            "keep their old values; steps, a sweep or a known weight (--weight) would tell them"
+        )
+    segments = [str(segment) for (segment, _), out in zip(free.places, untold, strict=True) if out]
+    return untold, (
+        f"the log hardly tells the stiffness of segment {' and '.join(segments)}: it stays as it "
+        f"was known before; {EXPERIMENTS['dynamics']} would tell it"
+    )
+
+
+def _kept_unknowns(free: FreeTerms) -> Iterator[Unknown]:
+    """Yield terms that the fit left as they were known before, with the deviation of that."""
+    before = free.at_places(free.values)
+    for term, (segment, _), value in zip(free.terms, free.places, before, strict=True):
+        yield Unknown(_name(term, segment), term.unit, float(value), term.spread, untold=True)
+
+
+def _at_bounds(fitted: _Fitted) -> Iterator[str]:
+    """Yield a sentence for each unknown at the end of its range, but for what is just not there."""
+    free, values = fitted.free, fitted.values
+    ends = free.unknowns.at_bound(values)
+    for term, (segment, _), value, at_end in zip(
+        free.terms, free.places, values, ends, strict=True
+    ):
+        absent = term.low == 0.0 and value < 0.5 * term.high
+        if at_end and not absent:
+            factor, unit = readable(term.unit)
+            size = math.exp(value) if term.relative else factor * value
+            yield (
+                f"{_name(term, segment)} is at the end of its range, {size:.3g} "
+                f"{'times what was known before' if term.relative else unit}, so that others may be "
+                f"wrong as well: {EXPERIMENTS[term.group]} would tell it"
+            )
+
+
+def _name(term: Term, segment: int) -> str:
+    return term.name if term.shared else f"{term.name}[{segment}]"
+
+
 def _told(fitted: _Fitted) -> tuple[tuple[Unknown, ...], Array]:
     """Return the unknowns with standard deviations, and their correlation (P, P)."""
-    problem, free = fitted.problem, fitted.problem.free
-    covariance = problem.search.covariance(fitted.values, problem.excess(fitted.remaining))
+    problem, free = fitted.problem, fitted.free
+    excess = problem.excess(fitted.remaining) / problem.factor
+    covariance = problem.search.covariance(fitted.values, excess)
     deviation = np.sqrt(np.diag(covariance))
     at_bound = free.unknowns.at_bound(fitted.values)
     unknowns = tuple(
         Unknown(
-            name=term.name if term.shared else f"{term.name}[{segment}]",
+            name=_name(term, segment),
             unit=term.unit,
             value=float(value),
             deviation=float(sigma),
-            untold=bool(sigma > UNTOLD * term.spread),
+            untold=bool(sigma > UNTOLD * TERMS[place].spread),
             at_bound=bool(edge),
         )
-        for term, (segment, _), value, sigma, edge in zip(
+        for term, (segment, place), value, sigma, edge in zip(
             free.terms, free.places, fitted.values, deviation, at_bound, strict=True
         )
     )
     return unknowns, covariance / np.outer(deviation, deviation)
 
 
-def _with_arcs(found: Limb, prepared: Prepared, warnings: list[str]) -> tuple[Limb, Array]:
+def _with_arcs(
+    found: Limb, fitted: _Fitted, prepared: Prepared, warnings: list[str]
+) -> tuple[Limb, Array]:
     """Return the limb with the PCC model's numbers, and that model's errors (M,) [rad].
 
     Without gravity both models have the same statics, segment by segment, so gain, rest angle,
@@ -280,7 +375,10 @@ def _with_arcs(found: Limb, prepared: Prepared, warnings: list[str]) -> tuple[Li
     if found.weighs_in_plane:
         names |= {"gain", "rest_angle"}
     free = FreeTerms.of(found, names)
+    # What the log does not tell of the rod it does not tell of the arcs either.
+    free = free.only(np.array([place not in fitted.kept for place in free.places]))
     problem = BendFit(free, ArcModel(found), [prepared])
+    problem.weigh(fitted.problem.factor)
     if not problem.search.follows(free.unknowns.prior):
         warnings.append(
             "arcs of constant curvature cannot follow this log under its loads: the PCC model has "

@@ -13,15 +13,14 @@ import datetime
 import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from itertools import compress
 
 import numpy as np
-from numpy.typing import NDArray
 
 from der_planner.arrays import Array
 from der_planner.identification.bends import (
     COLUMN,
     CORRELATION,
+    MOST_FITS,
     NODES,
     BendFit,
     FreeTerms,
@@ -55,8 +54,6 @@ LEAST_DURATION = 5.0
 """Least duration of all runs together [s]."""
 CALIBRATE_AGAIN = math.radians(3.0)
 """Root mean square error that a limb file should not leave [rad]."""
-MOST_FITS = 3
-"""Largest number of fits, each with the weights and without the untold unknowns of the last."""
 
 FAR = 3e-3
 """Mean distance of measured and expected tip beyond which a model is adapted [m]."""
@@ -85,11 +82,6 @@ class DayTerms(FreeTerms):
         return replace(
             free, terms=tuple(map(_of_days, free.terms, free.at_places(values).tolist()))
         )
-
-    def only(self, chosen: NDArray[np.bool_]) -> DayTerms:
-        """Return those of the terms that are chosen (P,)."""
-        places, terms = compress(self.places, chosen), compress(self.terms, chosen)
-        return replace(self, places=tuple(places), terms=tuple(terms))
 
     def limb_with(self, free: Array) -> Limb:
         """Return the limb with values (P,) of the free terms put in place.
@@ -260,9 +252,10 @@ def _solve(every: DayTerms, runs: Sequence[Prepared]) -> tuple[Array, Array]:
     values, deviation, told = known.prior, known.spread, np.ones(len(known.prior), dtype=bool)
     for _ in range(MOST_FITS):
         problem = BendFit(every.only(told), RodModel(every.limb, NODES), runs)
-        found = problem.search.solve(values[told], factor)
-        factor = max(1.0, problem.excess(problem.remaining(found)))
-        of_found = np.sqrt(np.diag(problem.search.covariance(found, factor)))
+        problem.weigh(factor)
+        found = problem.search.solve(values[told])
+        factor = problem.least_excess(found)
+        of_found = np.sqrt(np.diag(problem.search.covariance(found, factor / problem.factor)))
         better = of_found <= UNTOLD * known.spread[told]
         told[told] = better
         values, deviation = known.prior.copy(), known.spread.copy()
