@@ -74,6 +74,7 @@ def fit(
     *,
     terms: Iterable[str] = GROUPS,
     longest_gap: float = LONGEST_GAP,
+    weight: tuple[float, float] | None = None,
 ) -> tuple[Limb, FitReport]:
     """Identify a limb from a calibration run.
 
@@ -84,6 +85,8 @@ def fit(
             `OPTIONAL`) the mass of each segment is fitted and its stiffness is the prior's. A log
             shows the mass only under gravity or in fast motion.
         longest_gap: between two rows of the log that a straight line may bridge [s].
+        weight: mass [kg] and place along the limb [m] of a weight that was hung on the resting limb
+            at the end of the log, see `HungWeight`; None: none was.
 
     Returns:
         The identified limb, with provenance and calibrated ranges, and what the data say of it.
@@ -95,7 +98,14 @@ def fit(
     if not groups <= {*GROUPS, *OPTIONAL}:
         known = (*GROUPS, *OPTIONAL)
         raise LogError(f"unknown model term {sorted(groups - set(known))}: choose {known}")
+    if weight and ("dynamics" not in groups or "mass" in groups):
+        raise LogError(
+            "a known weight tells the stiffness: leave dynamics among the terms, and the mass out"
+        )
     recorded = prepare(log, limb, longest_gap)
+    hung = HungWeight.found(recorded, *weight) if weight else None
+    if hung is not None:
+        recorded = recorded.without(hung.rows)
     warnings = list(recorded.warnings)
     try:
         air = fit_air(recorded.log)
@@ -143,8 +153,10 @@ def fit(
 
 
 class _Fitted(NamedTuple):
-    """A limb with its lengths, the problem solved on it, what it left, the limb found, and which
-    places the log did not tell."""
+    """A limb with its lengths, the problem solved on it, what it left, and the limb found.
+
+    What the log did not tell is in ``kept``, pairs of segment and term.
+    """
 
     known: Limb
     lengths: GeometryFit | None
@@ -282,8 +294,8 @@ def _again(fitted: _Fitted, free: FreeTerms, prepared: Prepared) -> _Fitted:
     values = problem.solve(start)
     remaining, limb = problem.remaining(values), free.limb_with(values)
     kept = fitted.kept.union(set(fitted.free.places) - set(free.places))
-    return _Fitted(
-        *(fitted.known, fitted.lengths, tips, problem, values, remaining, limb), kept=kept
+    return fitted._replace(
+        problem=problem, values=values, remaining=remaining, limb=limb, kept=kept
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -146,6 +146,14 @@ class Prepared:
     bend: Array
     usable: NDArray[np.bool_]
     warnings: tuple[str, ...]
+
+    def without(self, rows: NDArray[np.bool_]) -> Prepared:
+        """Return the log with rows (K,) more that are not fitted to."""
+        missing = np.where(rows, np.nan, 0.0)[:, None]
+        log = replace(
+            self.log, bend_angles=self.log.bend_angles + missing, tip=self.log.tip + missing
+        )
+        return replace(self, log=log, usable=self.usable & ~rows)
 
 
 def prepare(
