@@ -31,6 +31,7 @@ from der_planner.control.estimation import Estimator
 from der_planner.control.horizon import Horizon
 from der_planner.control.knowledge import Estimate
 from der_planner.control.nominal import ChamberLog, Nominal
+from der_planner.limb.plausible import possible_pressures
 from der_planner.model import CONTROL_PERIOD
 from der_planner.model.commands import within_limits
 from der_planner.planning.plan_file import Plan
@@ -42,6 +43,8 @@ REASONS = {
     "oscillation": "corrections swing by {:.0f} Pa, and neither they nor the limb come to rest",
     "saturation": "a correction is at its limit of {:.0f} Pa, and the tip far from its path",
     "late": "commands come {:.2f} s after their instant",
+    "pressures": "the chambers are said to hold {:.3g} Pa, which no command has made: are pressures "
+    "told in Pa, and is the supply open?",
 }
 """Every reason with the sentence of its warning."""
 _GOES_ON = 0.7
@@ -73,6 +76,14 @@ _TURNS = 6
 """Number of turns within the window that are an oscillation, unless it begins or dies out."""
 _WINDOW = 4.0
 """Time in which the turns are counted [s]."""
+_EMPTY = 0.03
+"""Share of the commands that chambers hold at most that hold next to nothing."""
+_FILLED = 0.1
+"""Command from which on that is looked at, as a share of the limb's pressure limit."""
+_FILLING = 30
+"""Control periods for which it must have been commanded."""
+_STRANGE = 1.0
+"""Time for which chambers may be said to hold what no command has made [s]."""
 _LATE = 4.0
 """Number of commands that may come too late; one in time makes up for half of one."""
 
@@ -157,6 +168,11 @@ class Supervisor:
         distance = self._oscillation()
         if distance > 0.0 and time - self._astray_at <= _WINDOW:
             self.stop(time, "oscillation", distance)
+
+    def held(self, time: float, pressure: float, possible: bool) -> None:
+        """Look at what chambers are said to hold [Pa], and whether commands can have made it."""
+        if self._lasts("pressures", not possible, time) > _STRANGE:
+            self.stop(time, "pressures", pressure)
 
     def _lasts(self, what: str, now: bool, time: float) -> float:
         """Return for how long something has been so at an instant, without a break [s]."""
@@ -274,9 +290,22 @@ class Feedback:
         Raises:
             ValueError: another shape.
         """
-        changed = self._chambers.read(time, differential)
+        values = np.asarray(differential, dtype=float)
+        possible = bool(np.all(possible_pressures(self.plan.limb, values)))
+        changed = self._chambers.read(time, values if possible else np.full_like(values, np.nan))
         if changed is not None:
             self._estimator.changed(changed)
+        if np.isfinite(values).all():
+            held = float(np.abs(values).max())
+            self._supervisor.held(time, held, possible and held >= _EMPTY * self._asked(time))
+
+    def _asked(self, time: float) -> float:
+        """Return what a chamber has been commanded to hold for a while [Pa]; 0: next to nothing."""
+        k = round(time / CONTROL_PERIOD)
+        sent = np.array([self._chambers.sent(j) for j in range(k - _FILLING, k + 1, 5)])
+        same = np.abs(np.sign(sent).sum(axis=0)) == len(sent)
+        asked = float(np.max(np.abs(sent).min(axis=0) * same))
+        return asked if asked > _FILLED * self.plan.limb.pneumatics.pressure_limit else 0.0
 
     def measure(
         self,

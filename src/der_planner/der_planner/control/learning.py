@@ -18,6 +18,7 @@ expects, gains and rest angles of the model are taken from it (`der_planner.iden
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +37,7 @@ from der_planner.control.disturbance import (
 from der_planner.control.repeatability import PlayedRun, Runs
 from der_planner.identification.update import adapted
 from der_planner.limb import Limb, LimbError
+from der_planner.limb.plausible import FEW, possible_tips, wrong_unit
 from der_planner.methods import LEARNED
 from der_planner.planning.correction import PULL, Correction
 from der_planner.planning.loads import PlanningError
@@ -57,6 +59,10 @@ _PATIENCE = 3
 """Runs that bring nothing before learning stops."""
 _NOTHING = 0.05
 """Share of the error that a run must take away to have brought something."""
+_LONGEST_RUN = 20.0
+"""Last instant of a run over the duration of its plan: more is another unit."""
+_LEAST_COMMAND = 0.05
+"""Largest command that was in force over the largest of the plan: less is another unit."""
 _UNSEEN = np.full(1, np.nan)
 _FIRST = "the first run"
 _ADAPTED = (
@@ -159,9 +165,9 @@ class Learner:
                 not known. Feedback on the learned plan then does not correct the same again.
 
         Raises:
-            LearningError: the arrays do not fit together or to the plan.
+            LearningError: the arrays do not fit together or to the plan, or have other units.
         """
-        measured = Measured.build(time, tip, covariance)
+        measured = _possible(self._plan, Measured.build(time, tip, covariance), commands)
         played, missed, astray = self._played(measured, commands)
         seen = float(played.shown.seen.mean())
         beyond = None
@@ -336,6 +342,32 @@ class Learner:
                     "limits, reach or what does not repeat"
                 )
         return ""
+
+
+def _possible(plan: Plan, measured: Measured, commands: ArrayLike | None) -> Measured:
+    """Return a run without single tips that its limb cannot reach.
+
+    Raises:
+        LearningError: tips, times or commands have another unit than those of the plan.
+    """
+    limb, duration = plan.limb, float(np.ptp(plan.time))
+    possible = possible_tips(limb, measured.tip)
+    if (~possible).sum() > FEW * len(possible):
+        raise LearningError(wrong_unit("tips", measured.tip[~possible], "m from the clamp", limb))
+    if measured.time.size and measured.time[-1] > _LONGEST_RUN * duration:
+        raise LearningError(
+            f"the run goes on to {measured.time[-1]:.4g} s, its plan lasts {duration:.4g} s: give "
+            "times in seconds since the plan's first setpoint"
+        )
+    largest = math.inf if commands is None else float(np.abs(np.asarray(commands)).max(initial=0.0))
+    planned = float(np.abs(plan.differential_pressure).max())
+    if largest < _LEAST_COMMAND * planned:
+        raise LearningError(
+            f"the commands that were in force are {largest:.3g} Pa at the most, those of the plan "
+            f"{planned:.0f} Pa: give Pa"
+        )
+    variance = None if measured.variance is None else measured.variance[possible]
+    return Measured(measured.time[possible], measured.tip[possible], variance)
 
 
 def _refusal(seen: float, astray: str) -> str:

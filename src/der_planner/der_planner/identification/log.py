@@ -10,6 +10,13 @@ from numpy.typing import NDArray
 
 from der_planner.arrays import Array
 from der_planner.limb import Limb
+from der_planner.limb.plausible import (
+    FEW,
+    possible_bends,
+    possible_pressures,
+    possible_tips,
+    wrong_unit,
+)
 from der_planner.model import CONTROL_PERIOD
 
 LONGEST_GAP = 1.0
@@ -22,6 +29,18 @@ LEAST_SEEN = 0.05
 """Share of a log to predict in which the tags must be seen."""
 SWING = np.deg2rad(0.5)
 """Amplitude below which a swing need not be waited for [rad]."""
+LONGEST_PERIOD = 1.0
+"""Median time between two rows above which the time must have another unit [s]."""
+LEAST_DURATION = 1.0
+"""Duration below which it must, too [s]."""
+HELD_FOR = 1.5
+"""Time for which a chamber must be commanded on one side to be judged [s]."""
+MOST_EMPTY = 0.1
+"""Share of its command that a chamber without pressure holds at most."""
+LEAST_SCALE = 0.05
+"""Share of a bend that its pressure must explain, whatever day it is."""
+LEAST_MOTION = np.deg2rad(3.0)
+"""Range of motion from which on gains are judged [rad]."""
 LONGEST_SWING = 12.0
 """Longest time at the beginning of a log that is waited for a swing to end [s]."""
 
@@ -178,8 +197,9 @@ def prepare(
             f"the log has {log.segment_count} segments, the limb '{limb.name}' "
             f"{limb.segment_count}: this limb file belongs to another limb"
         )
-    grid = log.resampled(CONTROL_PERIOD, longest_gap)
+    _check_time(log)
     warnings: list[str] = []
+    grid = _possible(log, limb, warnings).resampled(CONTROL_PERIOD, longest_gap)
     valid = np.all(np.isfinite(grid.bend_angles), axis=1)
     least = LEAST_VALID if to_fit else LEAST_SEEN
     if valid.mean() < least:
@@ -202,6 +222,9 @@ def prepare(
         _check_commands(grid)
         _check_excitation(pressure[valid & ~swinging], limb)
         _check_match(pressure, bend, warnings)
+    else:
+        _check_scale(pressure, bend, limb)
+    _check_chambers(grid, limb)
     if swinging.any():
         grid.bend_angles[swinging], grid.tip[swinging] = np.nan, np.nan
         warnings.append(
@@ -227,6 +250,38 @@ def _still_swinging(time: Array, pressure: Array, bend: Array, limb: Limb) -> ND
     decay = 0.5 * max(float(np.mean([s.damping for s in limb.segments])), 0.2)
     swing = min(float(np.log(amplitude / SWING)) / decay, LONGEST_SWING, 0.2 * elapsed[-1])
     return np.asarray(elapsed < swing)
+
+
+def _check_time(log: CalibrationLog) -> None:
+    """Refuse a log whose time is not in seconds."""
+    period, duration = float(np.median(np.diff(log.time))), float(np.ptp(log.time))
+    if period > LONGEST_PERIOD or duration < LEAST_DURATION:
+        raise LogError(
+            f"the log lasts {duration:.3g} s, with a row every {period:.3g} s: give the time in "
+            "seconds, or name its unit (time_unit)"
+        )
+
+
+def _possible(log: CalibrationLog, limb: Limb, warnings: list[str]) -> CalibrationLog:
+    """Return the log without single numbers that no such limb shows.
+
+    Raises:
+        LogError: they are many, so that they have another unit.
+    """
+    tables = {"measured_differential": "pressures", "bend_angles": "bend angles", "tip": "tips"}
+    pressures, bends = log.measured_differential, log.bend_angles
+    rows = (possible_pressures(limb, pressures), possible_bends(bends), possible_tips(limb, log.tip))
+    kept: dict[str, Array] = {}
+    for (name, what), unit, possible in zip(tables.items(), ("Pa", "rad", "m"), rows, strict=True):
+        table = getattr(log, name)
+        seen = max(int(np.isfinite(table).any(axis=1).sum()), 1)
+        wrong = int((~possible).sum())
+        if wrong > FEW * seen and name != "tip":  # `_check_tips` names a wrong origin as well
+            raise LogError(wrong_unit(what, table[~possible], unit, limb))
+        if 0 < wrong <= FEW * seen:
+            kept[name] = np.where(possible[:, None], table, np.nan)
+            warnings.append(f"{wrong} rows have {what} that this limb cannot have: left out")
+    return replace(log, **kept) if kept else log
 
 
 def _check_tips(log: CalibrationLog, limb: Limb) -> None:
@@ -255,6 +310,37 @@ def _check_commands(log: CalibrationLog) -> None:
                 f"measured pressure {index} does not follow its command (correlation "
                 f"{agreement:.2f}): check the column map and the tubes"
             )
+
+
+def _check_chambers(log: CalibrationLog, limb: Limb) -> None:
+    """Refuse a chamber that stays empty while it is commanded."""
+    held = np.ones(round(HELD_FOR / CONTROL_PERIOD))
+    columns = zip(log.commanded_differential.T, log.measured_differential.T, strict=True)
+    for index, (command, measured) in enumerate(columns):
+        for side, name in ((1.0, "left"), (-1.0, "right")):
+            asked = side * command > 0.2 * limb.pneumatics.pressure_limit
+            rows = np.convolve(asked, held)[: len(asked)] >= len(held)
+            rows &= np.isfinite(measured)
+            if rows.sum() < len(held):
+                continue
+            share = float(np.median(measured[rows] / command[rows]))
+            if share < MOST_EMPTY:
+                raise LogError(
+                    f"the {name} chamber of segment {index} holds {100 * share:.0f} % of what is "
+                    "commanded: check its valve, its tube, its sensor and the column map"
+                )
+
+
+def _check_scale(pressure: Array, bend: Array, limb: Limb) -> None:
+    """Refuse pressures that are far too small for the bends that they go with."""
+    driven = float((limb.static_gain * np.ptp(pressure, axis=0)).max())
+    moved = float(np.ptp(bend, axis=0).max())
+    if moved > LEAST_MOTION and driven < LEAST_SCALE * moved:
+        raise LogError(
+            f"segments bend by {np.degrees(moved):.0f}° while their pressures change by "
+            f"{np.ptp(pressure, axis=0).max():.3g} Pa: check the unit of the pressures, and that "
+            "nobody moves the limb"
+        )
 
 
 def _check_excitation(pressure: Array, limb: Limb) -> None:

@@ -50,6 +50,8 @@ MOST_FRICTION_CHANGE = 20.0
 """Largest change of a friction in a fit, in spreads of a day."""
 WRONG_WAY = -0.5
 """Correlation of predicted and measured bend below which pressure and bend have other signs."""
+ONE_SIDED = 0.2
+"""Share of the gain of one side that the other side has at least."""
 LEAST_DURATION = 5.0
 """Least duration of all runs together [s]."""
 CALIBRATE_AGAIN = math.radians(3.0)
@@ -217,7 +219,7 @@ def update(limb: Limb, logs: CalibrationLog | Sequence[CalibrationLog]) -> tuple
             f"the rod of the limb '{limb.name}' cannot follow these runs: check that they are of "
             "this limb, with its mounting and what it carries"
         ) from error
-    _refuse_wrong_way(runs, remaining)
+    _refuse_other_limbs(runs, remaining)
     values, deviation = _solve(every, runs)
     before, after = (
         np.sqrt(np.nanmean(left**2, axis=0)) for left in (remaining, whole.remaining(values))
@@ -265,27 +267,54 @@ def _solve(every: DayTerms, runs: Sequence[Prepared]) -> tuple[Array, Array]:
     return values, deviation
 
 
-def _refuse_wrong_way(runs: Sequence[Prepared], remaining: Array) -> None:
-    """Refuse runs in which a segment bends against its pressure.
+def _refuse_other_limbs(runs: Sequence[Prepared], remaining: Array) -> None:
+    """Refuse runs in which a segment bends as no day makes it.
 
     Args:
         runs: prepared.
         remaining: (K, M) measured less predicted bend of all runs [rad].
 
     Raises:
-        LogError: a segment does.
+        LogError: a segment bends against its pressure, with another's, or to one side only.
     """
-    measured = np.concatenate([run.log.bend_angles for run in runs])
     rows = np.isfinite(remaining).all(axis=1)
-    expected = measured - remaining
-    for m, (seen, told) in enumerate(zip(measured[rows].T, expected[rows].T, strict=True)):
-        moved = min(np.ptp(seen), np.ptp(told)) >= LEAST_MOTION
-        if moved and np.corrcoef(seen, told)[0, 1] < WRONG_WAY:
+    measured = np.concatenate([run.log.bend_angles for run in runs])[rows]
+    pressure = np.concatenate([run.pressure for run in runs])[rows]
+    expected = measured - remaining[rows]
+    moved = np.minimum(np.ptp(measured, axis=0), np.ptp(expected, axis=0)) >= LEAST_MOTION
+    for m in np.flatnonzero(moved):
+        alike = [np.corrcoef(measured[:, m], expected[:, n])[0, 1] for n in np.flatnonzero(moved)]
+        own = float(np.corrcoef(measured[:, m], expected[:, m])[0, 1])
+        other = int(np.flatnonzero(moved)[int(np.argmax(alike))])
+        if own < WRONG_WAY:
             raise LogError(
                 f"segment {m} bends the wrong way in these runs: check that they are of this limb, "
                 "that no tubes, signs or columns are swapped, and that what it carries is named; "
                 "else calibrate again"
             )
+        if other != m and own < 0.5 and max(alike) > 0.8:
+            raise LogError(
+                f"segment {m} bends with input {other}, not with input {m}: columns or tubes are "
+                "swapped, or the runs are of another limb"
+            )
+        _refuse_one_sided(int(m), pressure[:, m], expected[:, m], measured[:, m])
+
+
+def _refuse_one_sided(m: int, pressure: Array, expected: Array, measured: Array) -> None:
+    """Refuse a segment that its pressure (K,) [Pa] bends to one side only, by bends (K,) [rad]."""
+    slopes = {}
+    for side, name in ((1.0, "left"), (-1.0, "right")):
+        rows = side * pressure > 0.1 * np.abs(pressure).max()
+        if rows.any() and np.ptp(expected[rows]) >= LEAST_MOTION:
+            slopes[name] = float(np.polyfit(expected[rows], measured[rows], 1)[0])
+    best = max(slopes.values(), default=0.0)
+    if len(slopes) < 2 or best < 0.5 or min(slopes.values()) >= ONE_SIDED * best:
+        return
+    side = min(slopes, key=slopes.__getitem__)
+    raise LogError(
+        f"segment {m} bends to the {side} by {100 * slopes[side]:.0f} % of what its pressure should "
+        "do, and to the other side as it should: its chamber or tube on that side leaks"
+    )
 
 
 def adapted(limb: Limb, tip_of: Callable[[Limb], Array | None], tip: Array) -> Limb | None:
