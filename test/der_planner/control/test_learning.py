@@ -205,6 +205,13 @@ def test_arrays_that_do_not_fit_are_refused(first):
             learner.add(time, given, covariance)
     with pytest.raises(LearningError, match="commands must be finite"):
         learner.add(first.time, tip, commands=np.zeros((3, 2)))
+    for time, given, commands, said in (
+        (first.time, 1e3 * tip, None, "give them in m from the clamp"),
+        (1e3 * first.time, tip, None, "give times in seconds"),
+        (first.time, tip, 1e-3 * first.differential_pressure, "give Pa"),
+    ):
+        with pytest.raises(LearningError, match=said):
+            learner.add(time, given, commands=commands)
     assert learner.history == []
 
 

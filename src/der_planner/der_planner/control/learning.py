@@ -18,7 +18,6 @@ expects, gains and rest angles of the model are taken from it (`der_planner.iden
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -167,7 +166,7 @@ class Learner:
         Raises:
             LearningError: the arrays do not fit together or to the plan, or have other units.
         """
-        measured = _possible(self._plan, Measured.build(time, tip, covariance), commands)
+        measured = _possible(self._plan, Measured.build(time, tip, covariance))
         played, missed, astray = self._played(measured, commands)
         seen = float(played.shown.seen.mean())
         beyond = None
@@ -228,6 +227,12 @@ class Learner:
                 raise LearningError(
                     f"commands must be finite, of shape {plan.differential_pressure.shape}, got "
                     f"{given.shape}: give those of all setpoints of the plan"
+                )
+            largest, planned = (float(np.abs(c).max()) for c in (given, plan.differential_pressure))
+            if largest < _LEAST_COMMAND * planned:
+                raise LearningError(
+                    f"the commands that were in force are {largest:.3g} Pa at the most, those of the "
+                    f"plan {planned:.0f} Pa: give Pa"
                 )
         expected = self._runs.expected(given) or self._correction.expected(given)
         shown = disturbance(measured, plan.time, expected.tip)
@@ -344,11 +349,11 @@ class Learner:
         return ""
 
 
-def _possible(plan: Plan, measured: Measured, commands: ArrayLike | None) -> Measured:
+def _possible(plan: Plan, measured: Measured) -> Measured:
     """Return a run without single tips that its limb cannot reach.
 
     Raises:
-        LearningError: tips, times or commands have another unit than those of the plan.
+        LearningError: tips or times have another unit than those of the plan.
     """
     limb, duration = plan.limb, float(np.ptp(plan.time))
     possible = possible_tips(limb, measured.tip)
@@ -358,13 +363,6 @@ def _possible(plan: Plan, measured: Measured, commands: ArrayLike | None) -> Mea
         raise LearningError(
             f"the run goes on to {measured.time[-1]:.4g} s, its plan lasts {duration:.4g} s: give "
             "times in seconds since the plan's first setpoint"
-        )
-    largest = math.inf if commands is None else float(np.abs(np.asarray(commands)).max(initial=0.0))
-    planned = float(np.abs(plan.differential_pressure).max())
-    if largest < _LEAST_COMMAND * planned:
-        raise LearningError(
-            f"the commands that were in force are {largest:.3g} Pa at the most, those of the plan "
-            f"{planned:.0f} Pa: give Pa"
         )
     variance = None if measured.variance is None else measured.variance[possible]
     return Measured(measured.time[possible], measured.tip[possible], variance)

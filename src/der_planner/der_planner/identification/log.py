@@ -280,7 +280,7 @@ def _possible(log: CalibrationLog, limb: Limb, warnings: list[str]) -> Calibrati
             raise LogError(wrong_unit(what, table[~possible], unit, limb))
         if 0 < wrong <= FEW * seen:
             kept[name] = np.where(possible[:, None], table, np.nan)
-            warnings.append(f"{wrong} rows have {what} that this limb cannot have: left out")
+            warnings.append(f"{wrong} of {seen} rows have {what} that this limb cannot have: left out")
     return replace(log, **kept) if kept else log
 
 
@@ -326,7 +326,7 @@ def _check_chambers(log: CalibrationLog, limb: Limb) -> None:
             share = float(np.median(measured[rows] / command[rows]))
             if share < MOST_EMPTY:
                 raise LogError(
-                    f"the {name} chamber of segment {index} holds {100 * share:.0f} % of what is "
+                    f"the {name} chamber of segment {index} holds {abs(100 * share):.0f} % of what is "
                     "commanded: check its valve, its tube, its sensor and the column map"
                 )
 

@@ -27,7 +27,7 @@ from der_planner.arrays import Array
 from der_planner.identification.log import LogError, Prepared
 from der_planner.limb import Limb
 from der_planner.limb.loads import GRAVITY
-from der_planner.model import CONTROL_PERIOD, Material
+from der_planner.model import CONTROL_PERIOD, ArcModel
 
 REST = 40.0
 """Rest without pressure at the end of a run, in which the weight is hung on and taken off [s]."""
@@ -140,12 +140,18 @@ class HungWeight:
 
     def _torque(self, limb: Limb) -> Array:
         """Return the change of torque (M,) on the bends by the weight and by the limb's own."""
-        own = Material(limb).weight_torques(self.bends)
         pulled = limb
         if not limb.weighs_in_plane:
             side = math.copysign(GRAVITY, float((self.bends[1] - self.bends[0]).sum()))
             pulled = replace(limb, gravity=(0.0, side, 0.0))
-        alone = Material(pulled).weight_torques(self.bends[1:])[0]
-        together = Material(pulled.carrying(self.mass, self.at)).weight_torques(self.bends[1:])[0]
-        torque: Array = together - alone + own[1] - own[0]
+        own, alone = _weights(limb, self.bends), _weights(pulled, self.bends)
+        together = _weights(pulled.carrying(self.mass, self.at), self.bends)
+        torque: Array = (together - alone)[1] + own[1] - own[0]
         return torque
+
+
+def _weights(limb: Limb, bends: Array) -> Array:
+    """Return the torques (K, M) [N·m] of a limb's weight on bend angles (K, M) [rad]."""
+    arcs = ArcModel(limb)
+    torque: Array = arcs.elastic_torque(bends) - arcs.gain * arcs.static_pressure(bends)
+    return torque
