@@ -34,7 +34,7 @@ DOORS = {
             "measured_differential": 0.01 * log.measured_differential,
             "commanded_differential": 0.01 * log.commanded_differential,
         },
-        "check the unit of the pressures",
+        "check the units of the log",
     ),
     "thousandths of Pa": (
         lambda log: {"measured_differential": 1e3 * log.measured_differential},

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from limbs import with_segments
 
 from der_planner.identification import CalibrationLog, LogError, check, fit, predict

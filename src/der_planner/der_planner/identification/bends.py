@@ -36,18 +36,6 @@ GROUPS = ("asymmetry", "stiffening", "cubic", "coupling", "friction", "creep", "
 OPTIONAL = ("mass",)
 """Model terms that are fitted only on request: the mass, in place of the stiffness. A log without
 measured forces shows only ratios of stiffness, gain and mass, so one of them must be given."""
-EXPERIMENTS = {
-    "linear": "slow pressures both ways on each segment, in the units of the log,",
-    "asymmetry": "slow pressures both ways on each segment",
-    "stiffening": "slow pressures up to the limit",
-    "cubic": "slow pressures up to the limit",
-    "coupling": "pressures on each segment alone",
-    "friction": "slow strokes of a few degrees, there and back,",
-    "creep": "pressures that are held for a minute",
-    "dynamics": "swings while both segments bend on in one direction, or a known weight (--weight),",
-    "mass": "a scale (--mass)",
-}
-"""What tells the terms of a group where a log does not, as the subject of a sentence."""
 _ORDER = ("linear", *GROUPS, *OPTIONAL)
 _DECLARED = {key: item for key, item in declarations(Segment).items() if item.fit}
 _FIELDS = {item.fit.name: key for key, item in _DECLARED.items() if item.fit}

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import datetime
-import math
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from der_planner.arrays import Array
 from der_planner.identification.air import AirFit, fit_air
 from der_planner.identification.bends import (
     COLUMN,
-    EXPERIMENTS,
     GROUPS,
     NODES,
     OPTIONAL,
@@ -41,17 +38,13 @@ from der_planner.identification.log import (
     Prepared,
     prepare,
 )
-from der_planner.identification.report import FitReport, Unknown, readable
+from der_planner.identification.report import FitReport
+from der_planner.identification.told import at_bounds, kept_unknowns, told, untold_stiffness
 from der_planner.identification.weight import HungWeight
-from der_planner.limb import CalibratedRange, Limb, Term
+from der_planner.limb import CalibratedRange, Limb
 from der_planner.model import ArcModel, Material, RodModel
 from der_planner.planning.loads import nearly_buckling
 
-Mask = NDArray[np.bool_]
-
-UNTOLD = 0.8
-"""Share of its prior spread above which the deviation of an unknown means that the log does not
-tell it."""
 MOST_PASSES = 4
 """Largest number of times that lengths and bend angles are fitted in turn, for a limb that its
 weight bends unevenly."""
@@ -120,16 +113,16 @@ def fit(
         change, deviation = hung.stiffness_change(fitted.known, fitted.limb)
         weighed = fitted.free.told("log_stiffness", change, deviation)
         fitted = _again(fitted, weighed, prepared)
-    unknowns, correlation = _told(fitted)
-    kept, said = _untold_stiffness(fitted.free, unknowns)
+    unknowns, correlation = told(fitted.problem, fitted.values, fitted.remaining)
+    kept, said = untold_stiffness(fitted.free, unknowns)
     without_kept = _again(fitted, fitted.free.only(~kept), prepared) if kept.any() else fitted
     if without_kept is not fitted:
-        left = tuple(_kept_unknowns(fitted.free.only(kept)))
+        left = tuple(kept_unknowns(fitted.free.only(kept)))
         fitted = without_kept
-        unknowns, correlation = _told(fitted)
+        unknowns, correlation = told(fitted.problem, fitted.values, fitted.remaining)
         unknowns += left
         warnings.append(said)
-    warnings += _at_bounds(fitted)
+    warnings += at_bounds(fitted.free, fitted.values)
     found = _calibrated(fitted, limb, air, recorded)
     warnings += filter(None, [nearly_buckling(found)])
     pcc_residual = np.full(limb.segment_count, np.nan)
@@ -297,80 +290,6 @@ def _again(fitted: _Fitted, free: FreeTerms, prepared: Prepared) -> _Fitted:
     return fitted._replace(
         problem=problem, values=values, remaining=remaining, limb=limb, kept=kept
     )
-
-
-def _untold_stiffness(free: FreeTerms, unknowns: Sequence[Unknown]) -> tuple[Mask, str]:
-    """Return which unknowns (P,) keep what was known before the log, and the sentence for it.
-
-    Stiffness that the log does not tell takes up what the model lacks in friction and creep. Where
-    it tells that of no segment, it does not tell the damping either.
-    """
-    stiff = np.array([term.name == "log_stiffness" for term in free.terms], dtype=bool)
-    untold = stiff & np.array([unknown.untold for unknown in unknowns], dtype=bool)
-    if not untold.any():
-        return untold, ""
-    if np.array_equal(untold, stiff):
-        return np.array([term.group == "dynamics" for term in free.terms]), (
-            "the log is too slow to tell the stiffness apart from the gain: stiffness and damping "
-            "keep their old values; steps, a sweep or a known weight (--weight) would tell them"
-        )
-    segments = [str(segment) for (segment, _), out in zip(free.places, untold, strict=True) if out]
-    return untold, (
-        f"the log hardly tells the stiffness of segment {' and '.join(segments)}: it stays as it "
-        f"was known before; {EXPERIMENTS['dynamics']} would tell it"
-    )
-
-
-def _kept_unknowns(free: FreeTerms) -> Iterator[Unknown]:
-    """Yield terms that the fit left as they were known before, with the deviation of that."""
-    before = free.at_places(free.values)
-    for term, (segment, _), value in zip(free.terms, free.places, before, strict=True):
-        yield Unknown(_name(term, segment), term.unit, float(value), term.spread, untold=True)
-
-
-def _at_bounds(fitted: _Fitted) -> Iterator[str]:
-    """Yield a sentence for each unknown at the end of its range, but for what is just not there."""
-    free, values = fitted.free, fitted.values
-    ends = free.unknowns.at_bound(values)
-    for term, (segment, _), value, at_end in zip(
-        free.terms, free.places, values, ends, strict=True
-    ):
-        absent = term.low == 0.0 and value < 0.5 * term.high
-        if at_end and not absent:
-            factor, unit = readable(term.unit)
-            size = math.exp(value) if term.relative else factor * value
-            yield (
-                f"{_name(term, segment)} is at the end of its range, {size:.3g} "
-                f"{'times what was known before' if term.relative else unit}, so that others may be "
-                f"wrong as well: {EXPERIMENTS[term.group]} would tell it"
-            )
-
-
-def _name(term: Term, segment: int) -> str:
-    return term.name if term.shared else f"{term.name}[{segment}]"
-
-
-def _told(fitted: _Fitted) -> tuple[tuple[Unknown, ...], Array]:
-    """Return the unknowns with standard deviations, and their correlation (P, P)."""
-    problem, free = fitted.problem, fitted.free
-    excess = problem.excess(fitted.remaining) / problem.factor
-    covariance = problem.search.covariance(fitted.values, excess)
-    deviation = np.sqrt(np.diag(covariance))
-    at_bound = free.unknowns.at_bound(fitted.values)
-    unknowns = tuple(
-        Unknown(
-            name=_name(term, segment),
-            unit=term.unit,
-            value=float(value),
-            deviation=float(sigma),
-            untold=bool(sigma > UNTOLD * TERMS[place].spread),
-            at_bound=bool(edge),
-        )
-        for term, (segment, place), value, sigma, edge in zip(
-            free.terms, free.places, fitted.values, deviation, at_bound, strict=True
-        )
-    )
-    return unknowns, covariance / np.outer(deviation, deviation)
 
 
 def _with_arcs(

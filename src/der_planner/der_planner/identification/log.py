@@ -217,13 +217,12 @@ def prepare(
             )
     pressure, bend = bridge(grid.measured_differential), bridge(grid.bend_angles)
     swinging = _still_swinging(grid.time, pressure, bend, limb)
+    _check_scale(pressure, bend, limb)
     if to_fit:
         _check_tips(grid, limb)
         _check_commands(grid)
-        _check_excitation(pressure[valid & ~swinging], limb)
+        _check_excitation(pressure[valid & ~swinging])
         _check_match(pressure, bend, warnings)
-    else:
-        _check_scale(pressure, bend, limb)
     _check_chambers(grid, limb)
     if swinging.any():
         grid.bend_angles[swinging], grid.tip[swinging] = np.nan, np.nan
@@ -338,18 +337,12 @@ def _check_scale(pressure: Array, bend: Array, limb: Limb) -> None:
     if moved > LEAST_MOTION and driven < LEAST_SCALE * moved:
         raise LogError(
             f"segments bend by {np.degrees(moved):.0f}° while their pressures change by "
-            f"{np.ptp(pressure, axis=0).max():.3g} Pa: check the unit of the pressures, and that "
+            f"{np.ptp(pressure, axis=0).max():.3g} Pa: check the units of the log, and that "
             "nobody moves the limb"
         )
 
 
-def _check_excitation(pressure: Array, limb: Limb) -> None:
-    largest, limit = np.abs(pressure).max(), limb.pneumatics.pressure_limit
-    if not 100.0 < largest < 20.0 * limit:
-        raise LogError(
-            f"the largest measured differential pressure is {largest:.3g} Pa, the limb's limit "
-            f"{limit:.0f} Pa: check the units of the log"
-        )
+def _check_excitation(pressure: Array) -> None:
     for index, value in enumerate(np.std(pressure, axis=0)):
         if value < LEAST_EXCITATION:
             raise LogError(
