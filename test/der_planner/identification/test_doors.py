@@ -61,6 +61,6 @@ def test_single_impossible_numbers_are_left_out_and_said():
     log.tip[300] = 1e9
     prepared = prepare(log, LIMB, to_fit=False)
     assert len(prepared.warnings) == 3
-    assert "1 of 600 rows have tips that this limb cannot have" in prepared.warnings[2]
+    assert "1 of 600 rows have tips that no such limb has" in prepared.warnings[2]
     assert np.abs(prepared.bend).max() < 1.0
     assert np.abs(prepared.pressure).max() < 1e4

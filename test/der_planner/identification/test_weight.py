@@ -19,7 +19,7 @@ HELD_BY_FRICTION = 0.02
 
 
 def resting(gravity: tuple[float, float, float], mass: float) -> np.ndarray:
-    """Return the bend (2,) [rad] of a limb of other stiffness that rests and carries a mass [kg]."""
+    """Return the bend (2,) [rad] of a limb of other stiffness that rests with a mass [kg]."""
     segments = tuple(
         replace(s, bending_stiffness=factor * s.bending_stiffness)
         for s, factor in zip(LIMB.segments, STIFFER, strict=True)

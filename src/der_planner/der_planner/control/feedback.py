@@ -43,7 +43,7 @@ REASONS = {
     "oscillation": "corrections swing by {:.0f} Pa, and neither they nor the limb come to rest",
     "saturation": "a correction is at its limit of {:.0f} Pa, and the tip far from its path",
     "late": "commands come {:.2f} s after their instant",
-    "pressures": "the chambers are said to hold {:.3g} Pa, which no command has made: are pressures "
+    "pressures": "chambers are said to hold {:.3g} Pa, which no command has made: are pressures "
     "told in Pa, and is the supply open?",
 }
 """Every reason with the sentence of its warning."""

@@ -231,7 +231,7 @@ class Learner:
             largest, planned = (float(np.abs(c).max()) for c in (given, plan.differential_pressure))
             if largest < _LEAST_COMMAND * planned:
                 raise LearningError(
-                    f"the commands that were in force are {largest:.3g} Pa at the most, those of the "
+                    f"the commands in force are {largest:.3g} Pa at the most, those of the "
                     f"plan {planned:.0f} Pa: give Pa"
                 )
         expected = self._runs.expected(given) or self._correction.expected(given)

@@ -269,7 +269,8 @@ def _possible(log: CalibrationLog, limb: Limb, warnings: list[str]) -> Calibrati
     """
     tables = {"measured_differential": "pressures", "bend_angles": "bend angles", "tip": "tips"}
     pressures, bends = log.measured_differential, log.bend_angles
-    rows = (possible_pressures(limb, pressures), possible_bends(bends), possible_tips(limb, log.tip))
+    tips = possible_tips(limb, log.tip)
+    rows = (possible_pressures(limb, pressures), possible_bends(bends), tips)
     kept: dict[str, Array] = {}
     for (name, what), unit, possible in zip(tables.items(), ("Pa", "rad", "m"), rows, strict=True):
         table = getattr(log, name)
@@ -279,7 +280,7 @@ def _possible(log: CalibrationLog, limb: Limb, warnings: list[str]) -> Calibrati
             raise LogError(wrong_unit(what, table[~possible], unit, limb))
         if 0 < wrong <= FEW * seen:
             kept[name] = np.where(possible[:, None], table, np.nan)
-            warnings.append(f"{wrong} of {seen} rows have {what} that this limb cannot have: left out")
+            warnings.append(f"{wrong} of {seen} rows have {what} that no such limb has: left out")
     return replace(log, **kept) if kept else log
 
 
@@ -325,8 +326,8 @@ def _check_chambers(log: CalibrationLog, limb: Limb) -> None:
             share = float(np.median(measured[rows] / command[rows]))
             if share < MOST_EMPTY:
                 raise LogError(
-                    f"the {name} chamber of segment {index} holds {abs(100 * share):.0f} % of what is "
-                    "commanded: check its valve, its tube, its sensor and the column map"
+                    f"the {name} chamber of segment {index} holds {abs(100 * share):.0f} % of what "
+                    "is commanded: check its valve, its tube, its sensor and the column map"
                 )
 
 

@@ -1,4 +1,4 @@
-"""What a log tells of each unknown of a fit, what it leaves as it was known, and what would tell it."""
+"""What a log tells of each unknown of a fit, what it leaves as it was, and what would tell it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ EXPERIMENTS = {
     "coupling": "pressures on each segment alone",
     "friction": "slow strokes of a few degrees, there and back,",
     "creep": "pressures that are held for a minute",
-    "dynamics": "swings while both segments bend on in one direction, or a known weight (--weight),",
+    "dynamics": "swings while all segments bend on in one direction, or a weight (--weight),",
     "mass": "a scale (--mass)",
 }
 """What tells the terms of a group where a log does not, as the subject of a sentence."""
@@ -73,7 +73,7 @@ def at_bounds(free: FreeTerms, values: Array) -> Iterator[str]:
             size = math.exp(value) if term.relative else factor * value
             yield (
                 f"{_name(term, segment)} is at the end of its range, {size:.3g} "
-                f"{'times what was known before' if term.relative else unit}, so that others may be "
+                f"{'times what was known' if term.relative else unit}, so that others may be "
                 f"wrong as well: {EXPERIMENTS[term.group]} would tell it"
             )
 

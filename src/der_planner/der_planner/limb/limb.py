@@ -220,7 +220,7 @@ class Limb:
             return self
         if payload > MOST_CARRIED * self.mass:
             raise LimbError(
-                f"the {name} of {payload:g} kg is {payload / self.mass:.0f} times what the limb weighs: "
+                f"the {name} of {payload:g} kg is {payload / self.mass:.0f} times the limb's mass: "
                 "give kg"
             )
         place = self.length if at is None else float(at)

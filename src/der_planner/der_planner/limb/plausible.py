@@ -1,7 +1,7 @@
 """Numbers that no limb shows, told from its own length and limits: mostly another unit.
 
-Each function returns which rows are possible; NaN, which is not measured, is. `wrong_unit` is what a
-door says where they are not.
+Each function returns which rows are possible; NaN, which was not measured, is. `wrong_unit` is what
+a door says where they are not.
 """
 
 from __future__ import annotations
