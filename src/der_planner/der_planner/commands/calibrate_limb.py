@@ -287,8 +287,8 @@ def _excitation(prior: Limb, pressure_limit: float, given: argparse.Namespace) -
     if given.weight is None:
         return run
     print(
-        f"after {run.duration + FREE:.0f} s hang {given.weight:g} kg on at {given.at:g} m, leave it "
-        f"for ten seconds or more; the run ends after {run.duration + REST:.0f} s",
+        f"after {run.duration + FREE:.0f} s, hang {given.weight:g} kg on at {given.at:g} m for "
+        f"ten seconds or more; the run ends after {run.duration + REST:.0f} s",
         file=sys.stderr,
     )
     return run.with_rest(REST)
