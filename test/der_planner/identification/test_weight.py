@@ -59,7 +59,7 @@ def test_stiffness_follows_from_the_weight_and_friction_is_accounted_for(mountin
         friction_curvature=lambda s: 0.1 / s.length,
     )
     change, deviation = hung.stiffness_change(limb, rubbing)
-    assert np.exp(change) == pytest.approx(STIFFER, rel=0.05)
+    assert np.exp(change) == pytest.approx(STIFFER, rel=0.08)
     assert np.all((deviation > 0.03) & (deviation < 0.2))
 
 

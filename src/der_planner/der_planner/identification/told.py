@@ -82,9 +82,7 @@ def _name(term: Term, segment: int) -> str:
     return term.name if term.shared else f"{term.name}[{segment}]"
 
 
-def told(
-    problem: BendFit, values: Array, remaining: Array
-) -> tuple[tuple[Unknown, ...], Array]:
+def told(problem: BendFit, values: Array, remaining: Array) -> tuple[tuple[Unknown, ...], Array]:
     """Return the unknowns with standard deviations, and their correlation (P, P).
 
     Args:
@@ -111,5 +109,3 @@ def told(
         )
     )
     return unknowns, covariance / np.outer(deviation, deviation)
-
-
