@@ -15,7 +15,6 @@ from der_planner.model import RodModel
 LIMB = Limb.default()
 MASS, AT = 0.05, 0.2
 STIFFER = np.array([1.4, 0.7])
-HELD_BY_FRICTION = 0.02
 
 
 def resting(gravity: tuple[float, float, float], mass: float) -> np.ndarray:
@@ -40,22 +39,23 @@ def recorded(before: np.ndarray, under: np.ndarray, rest: float = 40.0) -> Prepa
     return Prepared(log, pressure, bend + noise, np.ones(len(time), dtype=bool), ())
 
 
-@pytest.mark.parametrize("mounting", ["horizontal", "sideways"])
-def test_stiffness_follows_from_the_weight_and_friction_is_accounted_for(mounting):
+@pytest.mark.parametrize(("mounting", "held_by"), [("horizontal", 0.02), ("10", 0.0)])
+def test_stiffness_follows_from_the_weight_and_friction_is_accounted_for(mounting, held_by):
     limb = LIMB.mounted(mounting)
     before = resting(limb.gravity, 0.0)
-    if mounting == "sideways":
-        under = resting(limb.gravity, MASS)
+    mass = MASS if mounting == "horizontal" else 6.0 * MASS
+    if mounting != "horizontal":
+        under = resting(limb.gravity, mass)
     else:
         # A thread pulls across the limb, whose own weight the plate carries.
         under = resting((0.0, -9.81e-3, 0.0), 1e3 * MASS)
-    held = under - HELD_BY_FRICTION * np.sign(under - before)
-    hung = HungWeight.found(recorded(before, held), MASS, AT)
+    held = under - held_by * np.sign(under - before)
+    hung = HungWeight.found(recorded(before, held), mass, AT)
     assert not hung.rows[:200].any()
     assert hung.rows[-300:-20].all()
     rubbing = with_segments(
         limb,
-        friction_moment=lambda s: HELD_BY_FRICTION * s.bending_stiffness / s.length,
+        friction_moment=lambda s: held_by * s.bending_stiffness / s.length,
         friction_curvature=lambda s: 0.1 / s.length,
     )
     change, deviation = hung.stiffness_change(limb, rubbing)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -271,7 +272,7 @@ def _possible(log: CalibrationLog, limb: Limb, warnings: list[str]) -> Calibrati
     pressures, bends = log.measured_differential, log.bend_angles
     tips = possible_tips(limb, log.tip)
     rows = (possible_pressures(limb, pressures), possible_bends(bends), tips)
-    kept: dict[str, Array] = {}
+    kept: dict[str, Any] = {}
     for (name, what), unit, possible in zip(tables.items(), ("Pa", "rad", "m"), rows, strict=True):
         table = getattr(log, name)
         seen = max(int(np.isfinite(table).any(axis=1).sum()), 1)

@@ -310,9 +310,9 @@ def _refuse_one_sided(m: int, pressure: Array, expected: Array, measured: Array)
     best = max(slopes.values(), default=0.0)
     if len(slopes) < 2 or best < 0.5 or min(slopes.values()) >= ONE_SIDED * best:
         return
-    side = min(slopes, key=slopes.__getitem__)
+    worst = min(slopes, key=slopes.__getitem__)
     raise LogError(
-        f"segment {m} bends to the {side} by {abs(100 * slopes[side]):.0f} % of what its pressure "
+        f"segment {m} bends to the {worst} by {abs(100 * slopes[worst]):.0f} % of what its pressure "
         "should do, and to the other side as it should: its chamber or tube on that side leaks"
     )
 
