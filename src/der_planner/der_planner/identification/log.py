@@ -30,7 +30,7 @@ LEAST_SEEN = 0.05
 """Share of a log to predict in which the tags must be seen."""
 SWING = np.deg2rad(0.5)
 """Amplitude below which a swing need not be waited for [rad]."""
-LONGEST_PERIOD = 1.0
+LONGEST_PERIOD = 5.0
 """Median time between two rows above which the time must have another unit [s]."""
 LEAST_DURATION = 1.0
 """Duration below which it must, too [s]."""
