@@ -313,7 +313,7 @@ def _refuse_one_sided(m: int, pressure: Array, expected: Array, measured: Array)
     worst = min(slopes, key=slopes.__getitem__)
     raise LogError(
         f"segment {m} bends to the {worst} by {abs(100 * slopes[worst]):.0f} % of what its "
-        "pressure should do, and to the other side as it should: its chamber or tube on that side leaks"
+        "pressure should do, and to the other side as it should: a chamber or tube there leaks"
     )
 
 
