@@ -213,14 +213,6 @@ def _check(given: argparse.Namespace) -> None:
             (given.weight is None) != (given.at is None),
             "--weight KG and --at M go together: a weight, and where along the limb it was hung on",
         ),
-        (
-            given.weight is not None and (given.offline or (given.graph and not given.hardware)),
-            "--weight needs a limb that something can be hung on: --hardware, --bag or --csv",
-        ),
-        (
-            given.weight is not None and given.fit_mass,
-            "--weight tells the stiffness, --fit-mass keeps it: choose one of the two",
-        ),
     ):
         if wrong:
             raise OptionError(said)

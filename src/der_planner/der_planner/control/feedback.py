@@ -31,7 +31,7 @@ from der_planner.control.estimation import Estimator
 from der_planner.control.horizon import Horizon
 from der_planner.control.knowledge import Estimate
 from der_planner.control.nominal import ChamberLog, Nominal
-from der_planner.limb.plausible import possible_pressures
+from der_planner.limb.plausible import TOO_SMALL, impossible
 from der_planner.model import CONTROL_PERIOD
 from der_planner.model.commands import within_limits
 from der_planner.planning.plan_file import Plan
@@ -76,13 +76,9 @@ _TURNS = 6
 """Number of turns within the window that are an oscillation, unless it begins or dies out."""
 _WINDOW = 4.0
 """Time in which the turns are counted [s]."""
-_EMPTY = 0.03
-"""Share of the commands that chambers hold at most that hold next to nothing."""
 _FILLED = 0.1
-"""Command from which on that is looked at, as a share of the limb's pressure limit."""
-_FILLING = 30
-"""Control periods for which it must have been commanded."""
-_STRANGE = 1.0
+"""Command from which on chambers must hold something, as a share of the limb's pressure limit."""
+_STRANGE = 1.5
 """Time for which chambers may be said to hold what no command has made [s]."""
 _LATE = 4.0
 """Number of commands that may come too late; one in time makes up for half of one."""
@@ -290,22 +286,15 @@ class Feedback:
         Raises:
             ValueError: another shape.
         """
-        values = np.asarray(differential, dtype=float)
-        possible = bool(np.all(possible_pressures(self.plan.limb, values)))
-        changed = self._chambers.read(time, values if possible else np.full_like(values, np.nan))
+        values, limb = np.asarray(differential, dtype=float), self.plan.limb
+        beyond = bool(impossible(limb, "pressures", values))
+        changed = self._chambers.read(time, np.full_like(values, np.nan) if beyond else values)
         if changed is not None:
             self._estimator.changed(changed)
-        if np.isfinite(values).all():
-            held = float(np.abs(values).max())
-            self._supervisor.held(time, held, possible and held >= _EMPTY * self._asked(time))
-
-    def _asked(self, time: float) -> float:
-        """Return what a chamber has been commanded to hold for a while [Pa]; 0: next to nothing."""
-        k = round(time / CONTROL_PERIOD)
-        sent = np.array([self._chambers.sent(j) for j in range(k - _FILLING, k + 1, 5)])
-        same = np.abs(np.sign(sent).sum(axis=0)) == len(sent)
-        asked = float(np.max(np.abs(sent).min(axis=0) * same))
-        return asked if asked > _FILLED * self.plan.limb.pneumatics.pressure_limit else 0.0
+        asked = np.abs(self._chambers.sent(round(time / CONTROL_PERIOD)))
+        filled = asked > _FILLED * limb.pneumatics.pressure_limit
+        empty = bool(np.any(filled & (np.abs(values) < TOO_SMALL * asked)))
+        self._supervisor.held(time, float(np.abs(values).max()), not (beyond or empty))
 
     def measure(
         self,

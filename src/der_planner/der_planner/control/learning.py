@@ -36,7 +36,7 @@ from der_planner.control.disturbance import (
 from der_planner.control.repeatability import PlayedRun, Runs
 from der_planner.identification.update import adapted
 from der_planner.limb import Limb, LimbError
-from der_planner.limb.plausible import FEW, possible_tips, wrong_unit
+from der_planner.limb.plausible import TOO_SMALL, outliers
 from der_planner.methods import LEARNED
 from der_planner.planning.correction import PULL, Correction
 from der_planner.planning.loads import PlanningError
@@ -60,8 +60,6 @@ _NOTHING = 0.05
 """Share of the error that a run must take away to have brought something."""
 _LONGEST_RUN = 20.0
 """Last instant of a run over the duration of its plan: more is another unit."""
-_LEAST_COMMAND = 0.05
-"""Largest command that was in force over the largest of the plan: less is another unit."""
 _UNSEEN = np.full(1, np.nan)
 _FIRST = "the first run"
 _ADAPTED = (
@@ -229,7 +227,7 @@ class Learner:
                     f"{given.shape}: give those of all setpoints of the plan"
                 )
             largest, planned = (float(np.abs(c).max()) for c in (given, plan.differential_pressure))
-            if largest < _LEAST_COMMAND * planned:
+            if largest < TOO_SMALL * planned:
                 raise LearningError(
                     f"the commands in force are {largest:.3g} Pa at the most, those of the "
                     f"plan {planned:.0f} Pa: give Pa"
@@ -355,17 +353,15 @@ def _possible(plan: Plan, measured: Measured) -> Measured:
     Raises:
         LearningError: tips or times have another unit than those of the plan.
     """
-    limb, duration = plan.limb, float(np.ptp(plan.time))
-    possible = possible_tips(limb, measured.tip)
-    if (~possible).sum() > FEW * len(possible):
-        raise LearningError(wrong_unit("tips", measured.tip[~possible], "m from the clamp", limb))
-    if measured.time.size and measured.time[-1] > _LONGEST_RUN * duration:
+    rows = ~outliers(plan.limb, "tips", measured.tip, LearningError)
+    last, duration = float(measured.time.max(initial=0.0)), float(np.ptp(plan.time))
+    if last > _LONGEST_RUN * duration:
         raise LearningError(
-            f"the run goes on to {measured.time[-1]:.4g} s, its plan lasts {duration:.4g} s: give "
-            "times in seconds since the plan's first setpoint"
+            f"the run goes on to {last:.4g} s, its plan lasts {duration:.4g} s: give times in "
+            "seconds since the plan's first setpoint"
         )
-    variance = None if measured.variance is None else measured.variance[possible]
-    return Measured(measured.time[possible], measured.tip[possible], variance)
+    variance = None if measured.variance is None else measured.variance[rows]
+    return Measured(measured.time[rows], measured.tip[rows], variance)
 
 
 def _refusal(seen: float, astray: str) -> str:

@@ -4,20 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.arrays import Array
 from der_planner.limb import Limb
-from der_planner.limb.plausible import (
-    FEW,
-    possible_bends,
-    possible_pressures,
-    possible_tips,
-    wrong_unit,
-)
+from der_planner.limb.plausible import FEW, TOO_SMALL, impossible, outliers
 from der_planner.model import CONTROL_PERIOD
 
 LONGEST_GAP = 1.0
@@ -34,12 +27,6 @@ LONGEST_PERIOD = 5.0
 """Median time between two rows above which the time must have another unit [s]."""
 LEAST_DURATION = 1.0
 """Duration below which it must, too [s]."""
-HELD_FOR = 1.5
-"""Time for which a chamber must be commanded on one side to be judged [s]."""
-MOST_EMPTY = 0.1
-"""Share of its command that a chamber without pressure holds at most."""
-LEAST_SCALE = 0.05
-"""Share of a bend that its pressure must explain, whatever day it is."""
 LEAST_MOTION = np.deg2rad(3.0)
 """Range of motion from which on gains are judged [rad]."""
 LONGEST_SWING = 12.0
@@ -200,7 +187,7 @@ def prepare(
         )
     _check_time(log)
     warnings: list[str] = []
-    grid = _possible(log, limb, warnings).resampled(CONTROL_PERIOD, longest_gap)
+    grid = _without_outliers(log, limb, warnings).resampled(CONTROL_PERIOD, longest_gap)
     valid = np.all(np.isfinite(grid.bend_angles), axis=1)
     least = LEAST_VALID if to_fit else LEAST_SEEN
     if valid.mean() < least:
@@ -224,7 +211,6 @@ def prepare(
         _check_commands(grid)
         _check_excitation(pressure[valid & ~swinging])
         _check_match(pressure, bend, warnings)
-    _check_chambers(grid, limb)
     if swinging.any():
         grid.bend_angles[swinging], grid.tip[swinging] = np.nan, np.nan
         warnings.append(
@@ -262,27 +248,21 @@ def _check_time(log: CalibrationLog) -> None:
         )
 
 
-def _possible(log: CalibrationLog, limb: Limb, warnings: list[str]) -> CalibrationLog:
-    """Return the log without single numbers that no such limb shows.
-
-    Raises:
-        LogError: they are many, so that they have another unit.
-    """
-    tables = {"measured_differential": "pressures", "bend_angles": "bend angles", "tip": "tips"}
-    pressures, bends = log.measured_differential, log.bend_angles
-    tips = possible_tips(limb, log.tip)
-    rows = (possible_pressures(limb, pressures), possible_bends(bends), tips)
-    kept: dict[str, Any] = {}
-    for (name, what), unit, possible in zip(tables.items(), ("Pa", "rad", "m"), rows, strict=True):
-        table = getattr(log, name)
-        seen = max(int(np.isfinite(table).any(axis=1).sum()), 1)
-        wrong = int((~possible).sum())
-        if wrong > FEW * seen and name != "tip":  # `_check_tips` names a wrong origin as well
-            raise LogError(wrong_unit(what, table[~possible], unit, limb))
-        if 0 < wrong <= FEW * seen:
-            kept[name] = np.where(possible[:, None], table, np.nan)
-            warnings.append(f"{wrong} of {seen} rows have {what} that no such limb has: left out")
-    return replace(log, **kept) if kept else log
+def _without_outliers(log: CalibrationLog, limb: Limb, warnings: list[str]) -> CalibrationLog:
+    """Return the log without single numbers that no such limb shows."""
+    far = impossible(limb, "tips", log.tip)
+    wrong = {
+        "pressures": outliers(limb, "pressures", log.measured_differential, LogError),
+        "bend angles": outliers(limb, "bend angles", log.bend_angles, LogError),
+        "tips": far & (far.mean() <= FEW),  # `_check_tips` refuses many
+    }
+    for what, rows in wrong.items():
+        if rows.any():
+            warnings.append(f"{rows.sum()} rows have {what} that no such limb has: left out")
+    tables = (log.measured_differential, log.bend_angles, log.tip)
+    pairs = zip(wrong.values(), tables, strict=True)
+    pressures, bends, tips = (np.where(rows[:, None], np.nan, table) for rows, table in pairs)
+    return replace(log, measured_differential=pressures, bend_angles=bends, tip=tips)
 
 
 def _check_tips(log: CalibrationLog, limb: Limb) -> None:
@@ -313,30 +293,11 @@ def _check_commands(log: CalibrationLog) -> None:
             )
 
 
-def _check_chambers(log: CalibrationLog, limb: Limb) -> None:
-    """Refuse a chamber that stays empty while it is commanded."""
-    held = np.ones(round(HELD_FOR / CONTROL_PERIOD))
-    columns = zip(log.commanded_differential.T, log.measured_differential.T, strict=True)
-    for index, (command, measured) in enumerate(columns):
-        for side, name in ((1.0, "left"), (-1.0, "right")):
-            asked = side * command > 0.2 * limb.pneumatics.pressure_limit
-            rows = np.convolve(asked, held)[: len(asked)] >= len(held)
-            rows &= np.isfinite(measured)
-            if rows.sum() < len(held):
-                continue
-            share = float(np.median(measured[rows] / command[rows]))
-            if share < MOST_EMPTY:
-                raise LogError(
-                    f"the {name} chamber of segment {index} holds {abs(100 * share):.0f} % of what "
-                    "is commanded: check its valve, its tube, its sensor and the column map"
-                )
-
-
 def _check_scale(pressure: Array, bend: Array, limb: Limb) -> None:
     """Refuse pressures that are far too small for the bends that they go with."""
     driven = float((limb.static_gain * np.ptp(pressure, axis=0)).max())
     moved = float(np.ptp(bend, axis=0).max())
-    if moved > LEAST_MOTION and driven < LEAST_SCALE * moved:
+    if moved > LEAST_MOTION and driven < TOO_SMALL * moved:
         raise LogError(
             f"segments bend by {np.degrees(moved):.0f}° while their pressures change by "
             f"{np.ptp(pressure, axis=0).max():.3g} Pa: check the units of the log, and that "

@@ -279,42 +279,33 @@ def _refuse_other_limbs(runs: Sequence[Prepared], remaining: Array) -> None:
     """
     rows = np.isfinite(remaining).all(axis=1)
     measured = np.concatenate([run.log.bend_angles for run in runs])[rows]
-    pressure = np.concatenate([run.pressure for run in runs])[rows]
     expected = measured - remaining[rows]
     moved = np.minimum(np.ptp(measured, axis=0), np.ptp(expected, axis=0)) >= LEAST_MOTION
     for m in np.flatnonzero(moved):
-        alike = [np.corrcoef(measured[:, m], expected[:, n])[0, 1] for n in np.flatnonzero(moved)]
-        own = float(np.corrcoef(measured[:, m], expected[:, m])[0, 1])
-        other = int(np.flatnonzero(moved)[int(np.argmax(alike))])
-        if own < WRONG_WAY:
+        seen, told = measured[:, m], expected[:, m]
+        alike = {int(n): np.corrcoef(seen, expected[:, n])[0, 1] for n in np.flatnonzero(moved)}
+        most = max(alike, key=alike.__getitem__)
+        if alike[m] < WRONG_WAY:
             raise LogError(
                 f"segment {m} bends the wrong way in these runs: check that they are of this limb, "
                 "that no tubes, signs or columns are swapped, and that what it carries is named; "
                 "else calibrate again"
             )
-        if other != m and own < 0.5 and max(alike) > 0.8:
+        if alike[m] < 0.5 and alike[most] > 0.8:
             raise LogError(
-                f"segment {m} bends with input {other}, not with input {m}: columns or tubes are "
+                f"segment {m} bends with input {most}, not with input {m}: columns or tubes are "
                 "swapped, or the runs are of another limb"
             )
-        _refuse_one_sided(int(m), pressure[:, m], expected[:, m], measured[:, m])
-
-
-def _refuse_one_sided(m: int, pressure: Array, expected: Array, measured: Array) -> None:
-    """Refuse a segment that its pressure (K,) [Pa] bends to one side only, by bends (K,) [rad]."""
-    slopes = {}
-    for side, name in ((1.0, "left"), (-1.0, "right")):
-        rows = side * pressure > 0.1 * np.abs(pressure).max()
-        if rows.any() and np.ptp(expected[rows]) >= LEAST_MOTION:
-            slopes[name] = float(np.polyfit(expected[rows], measured[rows], 1)[0])
-    best = max(slopes.values(), default=0.0)
-    if len(slopes) < 2 or best < 0.5 or min(slopes.values()) >= ONE_SIDED * best:
-        return
-    worst = min(slopes, key=slopes.__getitem__)
-    raise LogError(
-        f"segment {m} bends to the {worst} by {abs(100 * slopes[worst]):.0f} % of what its "
-        "pressure should do, and to the other side as it should: a chamber or tube there leaks"
-    )
+        if min(told.max(), -told.min()) < 2.0 * LEAST_MOTION:
+            continue
+        sides = {"left": told > LEAST_MOTION, "right": told < -LEAST_MOTION}
+        gains = {name: np.polyfit(told[side], seen[side], 1)[0] for name, side in sides.items()}
+        worst = min(gains, key=gains.__getitem__)
+        if gains[worst] < ONE_SIDED * max(gains.values()):
+            raise LogError(
+                f"segment {m} bends to the {worst} by {abs(100 * gains[worst]):.0f} % of what its "
+                "pressure should do, to the other side as it should: a chamber or tube there leaks"
+            )
 
 
 def adapted(limb: Limb, tip_of: Callable[[Limb], Array | None], tip: Array) -> Limb | None:

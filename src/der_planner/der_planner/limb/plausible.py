@@ -1,8 +1,4 @@
-"""Numbers that no limb shows, told from its own length and limits: mostly another unit.
-
-Each function returns which rows are possible; NaN, which was not measured, is. `wrong_unit` is what
-a door says where they are not.
-"""
+"""The one check of magnitudes at every door: numbers that no limb shows have another unit."""
 
 from __future__ import annotations
 
@@ -13,49 +9,42 @@ from numpy.typing import ArrayLike, NDArray
 
 from der_planner.limb.limb import Limb
 
-Mask = NDArray[np.bool_]
-
-MOST_PRESSURE = 20.0
-"""Largest |pressure| over the limb's pressure limit."""
-MOST_BEND = 2.0 * math.pi
-"""Largest |bend angle| of a segment [rad]."""
-FARTHEST = 1.5
-"""Largest distance of a tip from the clamp over the limb's length."""
 FEW = 0.02
 """Share of rows up to which impossible numbers are outliers, and not another unit."""
+TOO_SMALL = 0.05
+"""Share of what is expected below which pressures have another unit, or are not there."""
+_UNITS = {"pressures": "Pa", "bend angles": "rad", "tips": "m from the clamp"}
 
 
-def possible_pressures(limb: Limb, pressure: ArrayLike) -> Mask:
-    """Return which rows (…, M) of differential pressures are possible [Pa]."""
-    return _within(pressure, MOST_PRESSURE * limb.pneumatics.pressure_limit)
-
-
-def possible_bends(bend_angle: ArrayLike) -> Mask:
-    """Return which rows (…, M) of bend angles are possible [rad]."""
-    return _within(bend_angle, MOST_BEND)
-
-
-def possible_tips(limb: Limb, tip: ArrayLike) -> Mask:
-    """Return which tips (…, 2) the limb can reach, with some room [m]."""
-    away = np.linalg.norm(np.asarray(tip, dtype=float), axis=-1)
-    return np.asarray(~(away > FARTHEST * limb.length))
-
-
-def wrong_unit(what: str, values: ArrayLike, unit: str, limb: Limb) -> str:
-    """Return the sentence for impossible numbers.
+def impossible(limb: Limb, what: str, values: ArrayLike) -> NDArray[np.bool_]:
+    """Return which rows (…, N) are beyond anything that a limb of this length and limit shows.
 
     Args:
-        what: they are, in the plural.
-        values: all of them; the median of their sizes is named.
-        unit: that they should have.
         limb: whose they should be.
+        what: they are: "pressures" [Pa], "bend angles" [rad] or "tips" [m].
+        values: NaN, which was not measured, is not impossible.
     """
-    size = np.abs(np.asarray(values, dtype=float))
-    return (
-        f"the {what} are about {np.nanmedian(size):.3g}: give them in {unit}, of the limb "
-        f"'{limb.name}' of {limb.length:.3g} m and ±{limb.pneumatics.pressure_limit:.0f} Pa"
-    )
+    most = {
+        "pressures": 20.0 * limb.pneumatics.pressure_limit,
+        "bend angles": 2.0 * math.pi,
+        "tips": 1.5 * limb.length,
+    }[what]
+    return np.asarray(np.any(np.abs(np.asarray(values, dtype=float)) > most, axis=-1))
 
 
-def _within(values: ArrayLike, most: float) -> Mask:
-    return np.asarray(~np.any(np.abs(np.asarray(values, dtype=float)) > most, axis=-1))
+def outliers(
+    limb: Limb, what: str, values: ArrayLike, error: type[ValueError]
+) -> NDArray[np.bool_]:
+    """Return the few rows (K,) of values (K, N) that are impossible, as `impossible` has it.
+
+    Raises:
+        ValueError: as ``error``: they are not few.
+    """
+    rows, size = impossible(limb, what, values), np.abs(np.asarray(values, dtype=float))
+    if rows.sum() > FEW * np.isfinite(size).any(axis=-1).sum():
+        raise error(
+            f"the {what} are about {np.nanmedian(size[rows]):.3g}: give them in {_UNITS[what]}, of "
+            f"the limb '{limb.name}' of {limb.length:.3g} m and "
+            f"±{limb.pneumatics.pressure_limit:.0f} Pa"
+        )
+    return rows
