@@ -31,7 +31,8 @@ Written by `python3 scripts/write_limb_page.py` from `parameters.py`, `limb.py` 
 All values are SI. A key without a default has to be in the limb file. "Fit" is the unknown by
 which the [calibration](../guide/identification.md) finds the value: its unit, its bounds, and ±
 the standard deviation of what is known before any data. A relative one is ln(value / the prior's).
-Without an entry there, the fit of the bend angles keeps the value; lengths and air have fits of their own.
+Without an entry there, the fit of the bend angles keeps the value; lengths and air have fits of
+their own.
 """
 _SECTIONS: tuple[tuple[str, Any], ...] = (
     ("`segments`, `pcc_segments`: one entry per segment", Segment),
