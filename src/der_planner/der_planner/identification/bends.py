@@ -18,6 +18,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion, uniform_filter1d
 
 from der_planner.arrays import Array
 from der_planner.identification.least_squares import (
@@ -29,7 +30,7 @@ from der_planner.identification.least_squares import (
 )
 from der_planner.identification.log import Prepared
 from der_planner.limb import Limb, Segment, Term, declarations
-from der_planner.model import Material, Model, Response, simulate
+from der_planner.model import CONTROL_PERIOD, Material, Model, Response, simulate
 
 GROUPS = ("asymmetry", "stiffening", "cubic", "coupling", "friction", "creep", "dynamics")
 """Model terms that may be left out, in the order in which they are explained."""
@@ -54,14 +55,18 @@ NODES = 13
 change by 2 %."""
 ANGLE_ERROR = np.deg2rad(0.3)
 """Error of a predicted bend angle that is taken for granted before its residual is known [rad]."""
+FAST_ERROR = np.deg2rad(0.1)
+"""Its part that changes within `CORRELATION`: the noise of tags [rad]."""
 CORRELATION = 20.0
-"""Rows over which an error of the model stays the same (1 s)."""
+"""Rows over which an error of the model stays the same (1 s), and which part slow from fast."""
+BENDS_ON = np.deg2rad(2.0)
+"""Rate of the bend that pressures ask for from which on friction does not turn round [rad/s]."""
 SOFTNESS = 3.0
 """Errors beyond this multiple of the usual one count less than their square."""
 ROUGH = 1e-2
 """Relative change of the sum of squares at which a search ends whose weights are not known yet."""
-SAME_WEIGHT = math.log(1.5)
-"""Change of the logarithm of the data's variance up to which a search need not be repeated."""
+SAME_WEIGHT = math.log(1.25)
+"""Change of the logarithm of an error up to which a search need not be repeated."""
 MOST_FITS = 3
 """Largest number of searches, each with the weights that the last one told."""
 _STEPS = {"der": 1, "pcc": 2}
@@ -318,18 +323,19 @@ class BendFit:
     ) -> None:
         self.free, self._model, self._logs, self._more_rows = free, model, logs, more_rows
         self._last: tuple[bytes, list[Predicted] | None] = (b"", None)
-        self.weigh(1.0)
+        self._bends_on = [_bends_on(free.limb, log) for log in logs]
+        self.weigh(np.full((2, free.limb.segment_count), ANGLE_ERROR))
 
-    def weigh(self, factor: float) -> None:
-        """Take the bend angles' variance for so many times that of `ANGLE_ERROR`."""
-        self.factor = factor
+    def weigh(self, errors: Array) -> None:
+        """Take errors (2, M) of bend angles for granted, slow and fast ones [rad]."""
+        self.errors = errors
         unknowns = self.free.unknowns
         self.search = LeastSquares(unknowns, self._rows, SOFTNESS / np.sqrt(CORRELATION))
 
     def solve(self, start: Array) -> Array:
-        """Return the best values (P,), the bend angles weighed by what these leave of them.
+        """Return the best values (P,), the bend angles weighed by the errors that these leave.
 
-        With the variance of `ANGLE_ERROR`, a log that the model cannot explain would outweigh
+        With the errors taken for granted, a log that the model cannot explain would outweigh
         everything that is known before it, and move what it does not tell.
 
         Args:
@@ -339,12 +345,12 @@ class BendFit:
             ValueError: the model cannot be followed at the start.
         """
         values = self.search.solve(start, ROUGH)
-        factor = self.least_excess(values)
+        errors = self.errors_left(values)
         for _ in range(MOST_FITS):
-            self.weigh(factor)
+            self.weigh(errors)
             values = self.search.solve(values)
-            factor = self.least_excess(values)
-            if abs(math.log(factor / self.factor)) < SAME_WEIGHT:
+            errors = self.errors_left(values)
+            if np.abs(np.log(errors / self.errors)).max() < SAME_WEIGHT:
                 break
         return values
 
@@ -361,15 +367,19 @@ class BendFit:
         return self._last[1]
 
     def _rows(self, values: Array) -> Rows | None:
-        weight = 1.0 / (ANGLE_ERROR * np.sqrt(CORRELATION * self.factor))
-        errors, slopes = [], []
         found = self._predicted(values)
         if found is None:
             return None
-        for log, part in zip(self._logs, found, strict=True):
+        errors, slopes = [], []
+        for log, part, on in zip(self._logs, found, self._bends_on, strict=True):
             rows = log.usable
-            errors.append(weight * (part.angles[rows] - log.log.bend_angles[rows]).ravel())
-            slopes.append(weight * part.angles_by[rows].reshape(-1, len(values)))
+            left = _apart(part.angles[rows] - log.log.bend_angles[rows])
+            by = _apart(part.angles_by[rows])
+            for error, change, usual, counts in zip(left, by, self.errors, (rows, on), strict=True):
+                weight = 1.0 / (usual * np.sqrt(CORRELATION))
+                chosen = counts[rows]
+                errors.append((weight * error[chosen]).ravel())
+                slopes.append((weight[:, None] * change[chosen]).reshape(-1, len(values)))
         if self._more_rows is not None:
             more = self._more_rows(found[0])
             errors.append(more[0])
@@ -388,20 +398,41 @@ class BendFit:
             error[~log.usable] = np.nan
         return np.concatenate(errors)
 
-    def least_excess(self, values: Array) -> float:
-        """Return `excess` of what values (P,) leave; at least 1, which any model leaves anyhow."""
-        return max(1.0, self.excess(self.remaining(values)))
+    def errors_left(self, values: Array) -> Array:
+        """Return the slow and fast errors (2, M) [rad] that values (P,) leave of the bend angles.
 
-    def excess(self, remaining: Array) -> float:
-        """Return by how much the data's variance exceeds that of `ANGLE_ERROR` and `CORRELATION`.
-
-        Args:
-            remaining: (K, M) of the values that were found [rad].
+        They are as large as errors that stay the same for `CORRELATION` rows would have to be, at
+        least `ANGLE_ERROR` and `FAST_ERROR`, which any model leaves anyhow.
         """
-        error = float(np.sqrt(np.nanmean(remaining**2)))
-        # Errors of neighbouring rows are correlated: rows / correlation length are independent.
-        length = correlation_length(remaining)
-        independent = np.count_nonzero(np.isfinite(remaining)) / length
-        # Each fitted unknown uses up one of them (degrees of freedom).
+        remaining = self.remaining(values)
+        usable = np.concatenate([log.usable for log in self._logs])
+        slow, fast = _apart(remaining[usable])
+        fast = fast[np.concatenate(self._bends_on)[usable]]
+        # Each fitted unknown uses up some of what is independent (degrees of freedom).
+        length = correlation_length(slow)
+        independent = slow.size / max(length, CORRELATION)
         left = max(independent - len(self.free.unknowns.prior), 0.2 * independent)
-        return float((error / ANGLE_ERROR) ** 2 * length / CORRELATION * independent / left)
+        longer = max(length / CORRELATION, 1.0) * independent / left
+        return np.stack(
+            [
+                np.maximum(np.sqrt(longer * np.mean(slow**2, axis=0)), ANGLE_ERROR),
+                np.maximum(np.sqrt(np.sum(fast**2, axis=0) / max(len(fast), 1)), FAST_ERROR),
+            ]
+        )
+
+
+def _apart(table: Array) -> tuple[Array, Array]:
+    """Return the slow part of a table (K, …), its mean over `CORRELATION` rows, and the rest.
+
+    Friction that turns round in a swing is taken for stiffness or damping. While all segments bend
+    on it stays the same, and what is fast is the swing of the body.
+    """
+    slow: Array = uniform_filter1d(table, round(CORRELATION), axis=0, mode="nearest")
+    return slow, table - slow
+
+
+def _bends_on(limb: Limb, log: Prepared) -> NDArray[np.bool_]:
+    """Return the rows (K,) around which the pressures bend all segments on, each in one way."""
+    rate = limb.static_gain * np.gradient(_apart(log.pressure)[0], CONTROL_PERIOD, axis=0)
+    on = log.usable & np.all(np.abs(rate) > BENDS_ON, axis=1)
+    return np.asarray(binary_erosion(on, iterations=round(CORRELATION / 2)))

@@ -113,13 +113,13 @@ def fit(
         change, deviation = hung.stiffness_change(fitted.known, fitted.limb)
         weighed = fitted.free.told("log_stiffness", change, deviation)
         fitted = _again(fitted, weighed, prepared)
-    unknowns, correlation = told(fitted.problem, fitted.values, fitted.remaining)
+    unknowns, correlation = told(fitted.problem, fitted.values)
     kept, said = untold_stiffness(fitted.free, unknowns)
     without_kept = _again(fitted, fitted.free.only(~kept), prepared) if kept.any() else fitted
     if without_kept is not fitted:
         left = tuple(kept_unknowns(fitted.free.only(kept)))
         fitted = without_kept
-        unknowns, correlation = told(fitted.problem, fitted.values, fitted.remaining)
+        unknowns, correlation = told(fitted.problem, fitted.values)
         unknowns += left
         warnings.append(said)
     warnings += at_bounds(fitted.free, fitted.values)
@@ -221,7 +221,7 @@ def _fit_bends(
         start = free.at_places(_static_start(free, prepared))
     else:
         start = before.values
-        problem.weigh(before.problem.factor)
+        problem.weigh(before.problem.errors)
     values = problem.solve(_followed(problem, free, start))
     return _Fitted(
         known, lengths, tips, problem, values, problem.remaining(values), free.limb_with(values)
@@ -281,7 +281,7 @@ def _again(fitted: _Fitted, free: FreeTerms, prepared: Prepared) -> _Fitted:
     start = np.array([found[place] for place in free.places])
     tips = fitted.tips
     problem = BendFit(free, RodModel(fitted.known, NODES), [prepared], tips.rows if tips else None)
-    problem.weigh(fitted.problem.factor)
+    problem.weigh(fitted.problem.errors)
     if not problem.search.follows(start):
         return fitted
     values = problem.solve(start)
@@ -309,7 +309,7 @@ def _with_arcs(
     # What the log does not tell of the rod it does not tell of the arcs either.
     free = free.only(np.array([place not in fitted.kept for place in free.places]))
     problem = BendFit(free, ArcModel(found), [prepared])
-    problem.weigh(fitted.problem.factor)
+    problem.weigh(fitted.problem.errors)
     if not problem.search.follows(free.unknowns.prior):
         warnings.append(
             "arcs of constant curvature cannot follow this log under its loads: the PCC model has "

@@ -82,17 +82,16 @@ def _name(term: Term, segment: int) -> str:
     return term.name if term.shared else f"{term.name}[{segment}]"
 
 
-def told(problem: BendFit, values: Array, remaining: Array) -> tuple[tuple[Unknown, ...], Array]:
+def told(problem: BendFit, values: Array) -> tuple[tuple[Unknown, ...], Array]:
     """Return the unknowns with standard deviations, and their correlation (P, P).
 
     Args:
         problem: that was solved.
         values: (P,) found.
-        remaining: (K, M) measured less predicted bend angles [rad].
     """
     free = problem.free
-    excess = problem.excess(remaining) / problem.factor
-    covariance = problem.search.covariance(values, excess)
+    problem.weigh(problem.errors_left(values))
+    covariance = problem.search.covariance(values)
     deviation = np.sqrt(np.diag(covariance))
     at_bound = free.unknowns.at_bound(values)
     unknowns = tuple(

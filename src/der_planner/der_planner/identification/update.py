@@ -250,14 +250,16 @@ def update(limb: Limb, logs: CalibrationLog | Sequence[CalibrationLog]) -> tuple
 
 def _solve(every: DayTerms, runs: Sequence[Prepared]) -> tuple[Array, Array]:
     """Return the values (P,) and their deviations (P,), both as known before where not told."""
-    known, factor = every.unknowns, 1.0
+    known, errors = every.unknowns, None
     values, deviation, told = known.prior, known.spread, np.ones(len(known.prior), dtype=bool)
     for _ in range(MOST_FITS):
         problem = BendFit(every.only(told), RodModel(every.limb, NODES), runs)
-        problem.weigh(factor)
+        if errors is not None:
+            problem.weigh(errors)
         found = problem.search.solve(values[told])
-        factor = problem.least_excess(found)
-        of_found = np.sqrt(np.diag(problem.search.covariance(found, factor / problem.factor)))
+        errors = problem.errors_left(found)
+        problem.weigh(errors)
+        of_found = np.sqrt(np.diag(problem.search.covariance(found)))
         better = of_found <= UNTOLD * known.spread[told]
         told[told] = better
         values, deviation = known.prior.copy(), known.spread.copy()
@@ -281,7 +283,7 @@ def _refuse_other_limbs(runs: Sequence[Prepared], remaining: Array) -> None:
     measured = np.concatenate([run.log.bend_angles for run in runs])[rows]
     expected = measured - remaining[rows]
     moved = np.minimum(np.ptp(measured, axis=0), np.ptp(expected, axis=0)) >= LEAST_MOTION
-    for m in np.flatnonzero(moved):
+    for m in map(int, np.flatnonzero(moved)):
         seen, told = measured[:, m], expected[:, m]
         alike = {int(n): np.corrcoef(seen, expected[:, n])[0, 1] for n in np.flatnonzero(moved)}
         most = max(alike, key=alike.__getitem__)
