@@ -413,12 +413,11 @@ class BendFit:
         independent = slow.size / max(length, CORRELATION)
         left = max(independent - len(self.free.unknowns.prior), 0.2 * independent)
         longer = max(length / CORRELATION, 1.0) * independent / left
-        return np.stack(
-            [
-                np.maximum(np.sqrt(longer * np.mean(slow**2, axis=0)), ANGLE_ERROR),
-                np.maximum(np.sqrt(np.sum(fast**2, axis=0) / max(len(fast), 1)), FAST_ERROR),
-            ]
-        )
+        errors = np.empty((2, slow.shape[1]))
+        errors[0] = np.maximum(np.sqrt(longer * np.mean(slow**2)), ANGLE_ERROR)
+        swing = np.sqrt(np.sum(fast**2, axis=0) / max(len(fast), 1))
+        errors[1] = np.maximum(swing, FAST_ERROR)
+        return errors
 
 
 def _apart(table: Array) -> tuple[Array, Array]:
