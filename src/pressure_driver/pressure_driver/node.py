@@ -73,7 +73,7 @@ class PressureDriver(Node):
                 "parameter 'use_sim_time' is true: the driver moves air in real time; leave it out"
             )
         settings = read_settings(self, Settings)
-        self._protocol = host_protocol(settings.protocol, 2 * settings.segment_count)
+        self._protocol = host_protocol(settings.protocol, 2 * settings.segment_count, settings)
         self._state: dict[str, Any] = {}
         self._late: deque[float] = deque(maxlen=LATE_TICKS)
         self._state_publisher = self.create_publisher(

@@ -1,4 +1,4 @@
-"""The port and its process: the serial line, the socket to the node, and the node's end of it.
+"""The process of the port as the node sees it: the socket to it, and the node's end of that.
 
 The node starts the process, talks with it, and vents if it dies.
 
@@ -6,7 +6,7 @@ Messages are JSON lists that begin with a word. From the node: ``setpoint``, ``a
 ``alive``, ``end``. To the node:
 
 =========== ==================================================================================
-``port``    the port has been opened: vent command (hexadecimal), with the port's descriptor
+``port``    the line is open: vent commands (hexadecimal), with the descriptor of a serial port
 ``lost``    the port is gone
 ``failed``  the port cannot be opened: the number of the error or null, its text
 ``state``   the state at each tick, by names
@@ -21,27 +21,32 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import json
 import os
 import queue
 import socket
-import struct
 import subprocess
 import sys
-import termios
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import serial
 from serial.tools import list_ports
 
-from pressure_driver.settings import Settings
+from pressure_driver.line import (
+    IN_USE,
+    is_tcp,
+    numeric_address,
+    release_descriptor,
+    vent_anew,
+    vent_line,
+)
+
+if TYPE_CHECKING:
+    from pressure_driver.settings import Settings
 
 STABLE_NAMES = Path("/dev/serial/by-id")
 """Where the system keeps names of ports that survive re-plugging."""
@@ -60,15 +65,10 @@ RELEASE_TIME = 4.0
 """[s] in which a process that vents after the end of its driver has let go of the port."""
 VENT_TIME = 1.0
 """[s] for which one process of the driver vents in the place of the other."""
-VENT_PERIOD = 0.05
-"""[s] between two of its vent commands."""
-ADVICE = "close the air supply"
-IN_USE = (errno.EAGAIN, errno.EBUSY)
-"""Error numbers of a port that another program has."""
 
 
 class PortError(RuntimeError):
-    """The serial port cannot be used; the message names it, the cause and the remedy."""
+    """The line to the board cannot be used; the message names it, the cause and the remedy."""
 
 
 def available_ports() -> list[str]:
@@ -81,7 +81,14 @@ def available_ports() -> list[str]:
 
 
 def stable_name(port: str) -> str:
-    """Return the by-id name of a port, which survives re-plugging, or the name itself."""
+    """Return the by-id name of a serial port, which survives re-plugging, or a host's number.
+
+    A name that nobody knows is returned as it is.
+    """
+    if is_tcp(port):
+        with contextlib.suppress(OSError):
+            return numeric_address(port)
+        return port
     if STABLE_NAMES.is_dir():
         for path in sorted(STABLE_NAMES.iterdir()):
             if os.path.realpath(path) == os.path.realpath(port):
@@ -92,6 +99,8 @@ def stable_name(port: str) -> str:
 def explain(port: str, error: OSError) -> str:
     """Return a sentence with the cause and the remedy of a port that does not open."""
     number = error.errno
+    if is_tcp(port):
+        return _explain_connection(port, error)
     ports = ", ".join(available_ports()) or "none"
     if not Path(port).exists() or number == errno.ENOENT:
         return (
@@ -108,6 +117,17 @@ def explain(port: str, error: OSError) -> str:
     if number in (errno.EACCES, errno.EPERM):
         return f"no permission to open {port}: sudo usermod -a -G dialout $USER, then log in again"
     return f"cannot open serial port {port}: {error}; ports that exist: {ports}"
+
+
+def _explain_connection(port: str, error: OSError) -> str:
+    if error.errno in IN_USE:
+        return f"another program of this computer has the board at {port}: end it"
+    if error.errno == errno.EINVAL or (error.errno or 0) < 0:  # of the look-up of a name
+        return f"{port}: {error.strerror}; set the parameter 'port'"
+    return (
+        f"no board answers at {port} ({error}): look at its power, its cable and whether this "
+        "computer has an address in its network, or set the parameter 'port'"
+    )
 
 
 class Channel:
@@ -147,91 +167,6 @@ class Channel:
         return json.loads(data), descriptors[0] if descriptors else None
 
 
-def open_port(port: str, baud_rate: int, patience: float = 0.0) -> serial.Serial:
-    """Open a serial port for this program alone.
-
-    Args:
-        port: its path.
-        baud_rate: [baud].
-        patience: [s] to wait for another program to leave it.
-
-    Raises:
-        OSError, ValueError: it does not exist, is in use, or may not be opened.
-    """
-    deadline = time.monotonic() + patience
-    while True:
-        try:
-            device = serial.Serial(port, baud_rate, timeout=0, write_timeout=0.05, exclusive=True)
-            break
-        except OSError as error:
-            if error.errno not in IN_USE or time.monotonic() >= deadline:
-                raise
-        time.sleep(0.1)
-    with contextlib.suppress(OSError):
-        fcntl.ioctl(device.fileno(), termios.TIOCEXCL)
-    return device
-
-
-def release_port(device: serial.Serial, drop: bool = True) -> None:
-    """Close a port without waiting for the board.
-
-    The lock is taken off by name: another descriptor of the same port may live a little longer.
-
-    Args:
-        device: the port.
-        drop: throw away what waits in its output queue, for which the kernel would wait. Not after
-            the last words: a board on a pseudo-terminal may not have read them yet.
-    """
-    if drop:
-        with contextlib.suppress(Exception):
-            device.reset_output_buffer()
-    with contextlib.suppress(Exception):
-        release_descriptor(os.dup(device.fileno()))
-    with contextlib.suppress(Exception):
-        device.close()
-
-
-def vent_port(descriptor: int, command: bytes, duration: float) -> str:
-    """Send the vent command again and again, before all that waits to be sent.
-
-    Args:
-        descriptor: of the open port; −1 if there is none.
-        command: opens every chamber, complete after any half-sent bytes.
-        duration: [s] for which it is repeated: bytes may be damaged.
-
-    Returns:
-        What is left to be done, or nothing if the last command has left.
-    """
-    if descriptor < 0:
-        return f"the board cannot be reached: {ADVICE}"
-    taken, end = False, time.monotonic() + duration
-    try:
-        termios.tcflush(descriptor, termios.TCOFLUSH)
-        while time.monotonic() < end:
-            try:
-                taken = os.write(descriptor, command) == len(command)
-            except BlockingIOError:
-                taken = False
-                termios.tcflush(descriptor, termios.TCOFLUSH)
-            time.sleep(VENT_PERIOD)
-        (waiting,) = struct.unpack("i", fcntl.ioctl(descriptor, termios.TIOCOUTQ, bytes(4)))
-    except (OSError, termios.error) as error:
-        return f"the port is gone ({error}): {ADVICE}"
-    return "" if taken and not waiting else f"the board takes no bytes: {ADVICE}"
-
-
-def release_descriptor(descriptor: int) -> None:
-    """Close a descriptor of a port, if there is one, and take off the locks of the port."""
-    if descriptor < 0:
-        return
-    with contextlib.suppress(OSError):
-        fcntl.ioctl(descriptor, termios.TIOCNXCL)
-    with contextlib.suppress(OSError):
-        fcntl.flock(descriptor, fcntl.LOCK_UN)
-    with contextlib.suppress(OSError):
-        os.close(descriptor)
-
-
 def prefer_thread(priority: int) -> bool:
     """Give the calling thread real-time priority (SCHED_FIFO): it serves a port.
 
@@ -267,7 +202,7 @@ class PortProcess:
         self._settings = replace(settings, port=stable_name(settings.port))
         self._on_message = on_message
         self._answers: queue.Queue[tuple[bool, str]] = queue.Queue()
-        self._vent_command = b""
+        self._vent_commands: list[bytes] = []
         self._descriptor = -1
         self._outcome: str | None = None
         self._thread = threading.Thread(target=self._listen, name="port process", daemon=True)
@@ -359,7 +294,10 @@ class PortProcess:
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(LOOK)
         if self._outcome is None:
-            problem = vent_port(self._descriptor, self._vent_command, VENT_TIME)
+            if is_tcp(self._settings.port):
+                problem = vent_anew(self._settings.port, self._vent_commands, VENT_TIME)
+            else:
+                problem = vent_line(self._descriptor, self._vent_commands, VENT_TIME)
             told = f"the vent command was sent for {VENT_TIME:g} s; see that it has vented"
             self.error = f"{reason}: {problem or told}"
         release_descriptor(self._descriptor)
@@ -372,7 +310,7 @@ class PortProcess:
                 os.close(self._descriptor)
             self._descriptor = -1 if descriptor is None else descriptor
         if word == "port":
-            self._vent_command = bytes.fromhex(content[0])
+            self._vent_commands = [bytes.fromhex(text) for text in content[0]]
         elif word == "state":
             self.states.append(content[0])
         elif word == "log":

@@ -14,6 +14,12 @@ from typing import Any, NamedTuple, TypeVar
 
 from pressure_driver.protocols import NAMES
 
+TERMINALS = ("vtem", "mpa")
+TERMINAL = "valves of a `festo` terminal: a motion terminal, or VPPM regulators"
+SENSOR_RANGE = "of the sensors of a `pneudrive` board, whose counts are a thousandth of it"
+MOST_ON_A_BUS = 8
+"""Pairs of valves that a terminal, or a bus of boards, can have."""
+
 
 class SettingError(ValueError):
     """A parameter has a value that the driver cannot work with; the message names both."""
@@ -57,11 +63,15 @@ class Settings:
 
     port: str = _other(
         "/dev/ttyACM0",
-        "serial port of the board; better its name under /dev/serial/by-id, which survives "
-        "re-plugging",
+        "serial port of the board, better its name under /dev/serial/by-id, which survives "
+        "re-plugging; or tcp://host:port",
     )
     protocol: str = _other("ezloop", "language of the board", NAMES)
-    baud_rate: int = _number(0, "baud", 0, 4_000_000, "0: what the protocol says, 115200")
+    baud_rate: int = _number(
+        0, "baud", 0, 4_000_000, "0: what the protocol says, 1000000 for `pneudrive`, else 115200"
+    )
+    terminal: str = _other("vtem", TERMINAL, TERMINALS)
+    sensor_range: float = _number(689_500.0, "Pa", 1e3, 1e7, SENSOR_RANGE)
     rate: float = _number(20.0, "Hz", 1.0, 100.0, "ticks, on an absolute grid")
     real_time_priority: int = _number(
         10, "", 0, 90, "SCHED_FIFO of the port's process; 0: none; ignored without the right to it"
@@ -136,6 +146,11 @@ class Settings:
                     f"parameters '{low}' ({below:g} Pa) and '{high}' ({above:g} Pa): the first "
                     f"must be smaller{reason}"
                 )
+        if self.protocol in ("festo", "pneudrive") and self.segment_count > MOST_ON_A_BUS:
+            raise SettingError(
+                f"parameter 'segment_count' is {self.segment_count}: a `{self.protocol}` board has "
+                f"at most {MOST_ON_A_BUS} pairs of valves"
+            )
         if self.command_validity * self.rate <= 1.0:
             raise SettingError(
                 f"parameters 'command_validity' ({self.command_validity:g} s) and 'rate' "
@@ -147,9 +162,14 @@ class Settings:
 class EmulatorSettings:
     """The parameters of the emulated board."""
 
-    port_link: str = _other("/tmp/der_limb_board_0", "symbolic link to the pseudo-terminal")
+    port_link: str = _other(
+        "/tmp/der_limb_board_0",
+        "symbolic link to the pseudo-terminal, or tcp://host:port to listen at",
+    )
     protocol: str = _other("ezloop", "language of the board", NAMES)
     baud_rate: int = _number(115_200, "baud", 0, 4_000_000, "pace of the bytes; 0: none")
+    terminal: str = _other("vtem", TERMINAL, TERMINALS)
+    sensor_range: float = _number(689_500.0, "Pa", 1e3, 1e7, SENSOR_RANGE)
     segment_count: int = _number(2, "", 1, 16, "pairs of chambers")
     seed: int = _number(0, "", 0, 2**62, "of sensors, valves and the day's atmosphere")
     reset_on_open: bool = _other(True, "opening the port restarts the board")

@@ -23,6 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pressure_driver.emulator.board import EmulatedBoard, Faults, ReceivedCommand
+from pressure_driver.emulator.network import EmulatedSocket
+from pressure_driver.line import is_tcp
 from pressure_driver.port_process import prefer_thread
 from pressure_driver.schedule import NANOSECONDS
 
@@ -249,6 +251,11 @@ class EmulatedPort:
             os.close(self._claim_file)
 
 
+def emulated_line(link: str, baud_rate: int) -> EmulatedPort | EmulatedSocket:
+    """Return the board's end of `tcp://host:port`, or of a serial port with a symbolic link."""
+    return EmulatedSocket(link) if is_tcp(link) else EmulatedPort(link, baud_rate)
+
+
 class BoardRunner:
     """Keeps the firmware, the air and the line going.
 
@@ -265,7 +272,7 @@ class BoardRunner:
     def __init__(
         self,
         board: EmulatedBoard,
-        port: EmulatedPort,
+        port: EmulatedPort | EmulatedSocket,
         on_air: Callable[[int, NDArray[np.float64]], None] = lambda *_: None,
         on_command: Callable[[ReceivedCommand], None] = lambda *_: None,
         real_time_priority: int = 0,

@@ -1,0 +1,312 @@
+"""The line to a board: a serial port, or `tcp://host:port`.
+
+Both are descriptors that the process of the port waits for and never waits in. A serial port is
+handed to the driver's node beside the process, which vents through it. A connection is not: what
+the process has sent by halves would be in it, so whoever vents opens one of its own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import re
+import socket
+import struct
+import termios
+import time
+from abc import ABC, abstractmethod
+
+import serial
+
+VENT_PERIOD = 0.05
+"""[s] in which each vent command is sent once, by a process that vents in the place of another."""
+CONNECT_TIME = 0.1
+"""[s] for a connection: a board in the same room answers in 0.001 s, and meanwhile nothing runs."""
+ADVICE = "close the air supply"
+IN_USE = (errno.EAGAIN, errno.EBUSY)
+"""Error numbers of a line that another program has."""
+_ADDRESS = re.compile(r"tcp://(\[[0-9A-Fa-f:.]+\]|[^:/\[\]]+):(\d{1,5})")
+
+
+class Line(ABC):
+    """An open line to a board.
+
+    Attributes:
+        shared: the descriptor may be given to another process, which vents through it.
+    """
+
+    shared = False
+
+    @abstractmethod
+    def fileno(self) -> int:
+        """Return the descriptor to wait for."""
+
+    @abstractmethod
+    def read(self) -> bytes:
+        """Return the bytes that are there.
+
+        Raises:
+            OSError: the board has gone.
+        """
+
+    def write(self, data: bytes) -> int:
+        """Hand bytes to the operating system without waiting; return how many it has taken.
+
+        Raises:
+            BlockingIOError: it takes none.
+            OSError: the board has gone.
+        """
+        # pyserial's own `write` waits for the terminal after each write.
+        return os.write(self.fileno(), data)
+
+    def waiting(self) -> int:
+        """Return how many bytes have not left, or over TCP have not been acknowledged."""
+        return _waiting(self.fileno())
+
+    @abstractmethod
+    def drop(self) -> None:
+        """Throw away what has not left, where that can be done."""
+
+    @abstractmethod
+    def close(self, drop: bool) -> None:
+        """Leave the line without waiting for the board.
+
+        Args:
+            drop: throw away what has not left. Not after the last words: a board on a
+                pseudo-terminal may not have read them yet.
+        """
+
+
+class SerialLine(Line):
+    """A serial port, of this program alone.
+
+    Args:
+        port: its path.
+        baud_rate: [baud].
+
+    Raises:
+        OSError, ValueError: it does not exist, is in use, or may not be opened.
+    """
+
+    shared = True
+
+    def __init__(self, port: str, baud_rate: int) -> None:
+        self._device = serial.Serial(port, baud_rate, timeout=0, write_timeout=0.05, exclusive=True)
+        with contextlib.suppress(OSError):
+            fcntl.ioctl(self._device.fileno(), termios.TIOCEXCL)
+
+    def fileno(self) -> int:
+        """Return the descriptor to wait for."""
+        return int(self._device.fileno())
+
+    def read(self) -> bytes:
+        """Return the bytes that are there; none at all means that the device has gone."""
+        return bytes(self._device.read(max(self._device.in_waiting, 1)))
+
+    def drop(self) -> None:
+        """Throw away what is in the output queue."""
+        with contextlib.suppress(Exception):
+            self._device.reset_output_buffer()
+
+    def close(self, drop: bool) -> None:
+        """Leave the port; without ``drop`` the kernel still sends what waits.
+
+        The lock is taken off by name: another descriptor of the port may live a little longer.
+        """
+        if drop:
+            self.drop()
+        with contextlib.suppress(Exception):
+            release_descriptor(os.dup(self._device.fileno()))
+        with contextlib.suppress(Exception):
+            self._device.close()
+
+
+class TcpLine(Line):
+    """A connection to a board, or to a server that has the board on a serial port.
+
+    Args:
+        port: `tcp://host:port`.
+        alone: keep other programs of this computer from the same board meanwhile. Boards themselves
+            listen to several hosts at once.
+
+    Raises:
+        OSError: nobody answers, or another program has the board.
+    """
+
+    def __init__(self, port: str, alone: bool = True) -> None:
+        self._claim = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        if alone:
+            try:
+                # A name without a file: the kernel forgets it with the process.
+                self._claim.bind(f"\0limb board at {port}")
+            except OSError as error:
+                self._claim.close()
+                raise OSError(errno.EBUSY, f"another program has {port}") from error
+        try:
+            self._socket = socket.create_connection(tcp_address(port), CONNECT_TIME)
+        except OSError:
+            self._claim.close()
+            raise
+        self._socket.setblocking(False)
+        # A command is never held back to wait for more.
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def fileno(self) -> int:
+        """Return the descriptor to wait for."""
+        return self._socket.fileno()
+
+    def read(self) -> bytes:
+        """Return the bytes that are there.
+
+        Raises:
+            OSError: the board has closed the connection.
+        """
+        try:
+            data = self._socket.recv(1 << 16)
+        except BlockingIOError:
+            return b""
+        if not data:
+            raise ConnectionResetError(errno.ECONNRESET, "the board has closed the connection")
+        return data
+
+    def write(self, data: bytes) -> int:
+        """Send bytes; half a frame cannot be taken back, so a connection that is full is lost."""
+        count = super().write(data)
+        if count < len(data):
+            raise OSError(errno.ENOBUFS, "the connection takes no bytes")
+        return count
+
+    def drop(self) -> None:
+        """Do nothing: what the kernel has taken over arrives, in order, or the connection ends."""
+
+    def close(self, drop: bool) -> None:
+        """End the connection; with ``drop`` it is reset, and nothing old is sent any more."""
+        if drop:
+            with contextlib.suppress(OSError):
+                linger = struct.pack("ii", 1, 0)
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
+        self._socket.close()
+        self._claim.close()
+
+
+def is_tcp(port: str) -> bool:
+    """Return whether a line is a connection and no serial port."""
+    return port.startswith("tcp:")
+
+
+def tcp_address(port: str) -> tuple[str, int]:
+    """Return host and number of `tcp://host:port`.
+
+    Raises:
+        OSError: it is written otherwise.
+    """
+    found = _ADDRESS.fullmatch(port)
+    if not found or not 0 < int(found[2]) < 1 << 16:
+        raise OSError(errno.EINVAL, f"'{port}' is no address: write tcp://host:port")
+    return found[1].strip("[]"), int(found[2])
+
+
+def numeric_address(port: str) -> str:
+    """Return `tcp://host:port` with the number of the host, so that nobody waits for a name again.
+
+    Raises:
+        OSError: the name of the host is not known.
+    """
+    host, number = tcp_address(port)
+    family, _, _, _, address = socket.getaddrinfo(host, number, type=socket.SOCK_STREAM)[0]
+    host = f"[{address[0]}]" if family == socket.AF_INET6 else str(address[0])
+    return f"tcp://{host}:{number}"
+
+
+def may_open(port: str) -> bool:
+    """Return whether it is worth while to try to open a line: a serial port must have its file."""
+    return is_tcp(port) or os.path.exists(port)
+
+
+def open_line(port: str, baud_rate: int, patience: float = 0.0) -> Line:
+    """Open a line for this program alone.
+
+    Args:
+        port: path of a serial port, or `tcp://host:port`.
+        baud_rate: [baud] of a serial port.
+        patience: [s] to wait for another program to leave it.
+
+    Raises:
+        OSError, ValueError: it does not exist, is in use, or may not be opened.
+    """
+    deadline = time.monotonic() + patience
+    while True:
+        try:
+            return TcpLine(port) if is_tcp(port) else SerialLine(port, baud_rate)
+        except OSError as error:
+            if error.errno not in IN_USE or time.monotonic() >= deadline:
+                raise
+        time.sleep(0.1)
+
+
+def vent_line(descriptor: int, commands: list[bytes], duration: float) -> str:
+    """Send the vent commands again and again, before all that waits to be sent.
+
+    Args:
+        descriptor: of the open line; −1 if there is none.
+        commands: open every chamber, complete after any half-sent bytes. They are sent in turn: a
+            board on a bus must have answered before the next is spoken to.
+        duration: [s] for which they are repeated: bytes may be damaged.
+
+    Returns:
+        What is left to be done, or nothing if the last command has left.
+    """
+    if descriptor < 0:
+        return f"the board cannot be reached: {ADVICE}"
+    taken, end = False, time.monotonic() + duration
+    try:
+        _flush(descriptor)
+        while time.monotonic() < end:
+            for command in commands:
+                try:
+                    taken = os.write(descriptor, command) == len(command)
+                except BlockingIOError:
+                    taken = False
+                    _flush(descriptor)
+                time.sleep(VENT_PERIOD / len(commands))
+        waiting = _waiting(descriptor)
+    except (OSError, termios.error) as error:
+        return f"the port is gone ({error}): {ADVICE}"
+    return "" if taken and not waiting else f"the board takes no bytes: {ADVICE}"
+
+
+def vent_anew(port: str, commands: list[bytes], duration: float) -> str:
+    """Vent over a connection of its own, as `vent_line` does; return what is left to be done."""
+    try:
+        line = TcpLine(port, alone=False)
+    except OSError as error:
+        return f"the board cannot be reached ({error}): {ADVICE}"
+    problem = vent_line(line.fileno(), commands, duration)
+    line.close(drop=bool(problem))
+    return problem
+
+
+def release_descriptor(descriptor: int) -> None:
+    """Close a descriptor of a serial port, if there is one, and take off the locks of the port."""
+    if descriptor < 0:
+        return
+    with contextlib.suppress(OSError):
+        fcntl.ioctl(descriptor, termios.TIOCNXCL)
+    with contextlib.suppress(OSError):
+        fcntl.flock(descriptor, fcntl.LOCK_UN)
+    with contextlib.suppress(OSError):
+        os.close(descriptor)
+
+
+def _flush(descriptor: int) -> None:
+    """Throw away what is in the output queue of a terminal; a connection has none to throw away."""
+    with contextlib.suppress(termios.error):
+        termios.tcflush(descriptor, termios.TCOFLUSH)
+
+
+def _waiting(descriptor: int) -> int:
+    """Return how many bytes have not left a terminal, or have not been acknowledged over TCP."""
+    (waiting,) = struct.unpack("i", fcntl.ioctl(descriptor, termios.TIOCOUTQ, bytes(4)))
+    return int(waiting)
