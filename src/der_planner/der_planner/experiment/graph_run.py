@@ -21,6 +21,7 @@ from der_planner.experiment.processes import (
     NodeError,
     NodeProcess,
     NodeSpec,
+    board_line,
 )
 from limb_interfaces import qos, topics
 
@@ -54,7 +55,7 @@ def running_graph(
     graph = RunningGraph(client, progress)
     client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES)
     with tempfile.TemporaryDirectory(prefix="der_limb_") as folder:
-        port = str(Path(folder) / "board")
+        port = board_line(setup.board, folder)
         specs = setup.nodes(port)
         client.spin(DISCOVERY)
         _refuse_second_graph(client, specs)
@@ -117,7 +118,9 @@ class RunningGraph:
                 spec.package, spec.executable, spec.parameters, logs, remap
             )
             self.client.watch(self.processes.values())
-            if spec.executable == "board_emulator":
+            if spec.executable == "board_emulator" and port.startswith("tcp:"):
+                self.client.wait_ready([spec.executable])
+            elif spec.executable == "board_emulator":
                 self.client.wait_for(lambda: os.path.exists(port), 60.0, "the port of the board")
         self.client.wait_ready(self.processes)
         self.progress.say(f"  ready after {time.monotonic() - begin:.1f} s")

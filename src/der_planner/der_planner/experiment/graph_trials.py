@@ -50,6 +50,7 @@ def play_on_graph(run: TrialRun, progress: Progress) -> dict[str, Any]:
         run=run.trial.run - 1,
         limb=run.limb,
         hardware=options.hardware,
+        board=options.board,
         planner=_planner_parameters(run),
         record_images=options.record_images,
         page=options.page,

@@ -9,6 +9,7 @@ import json
 import os
 import secrets
 import signal
+import socket
 import subprocess
 import time
 from collections.abc import Mapping
@@ -31,6 +32,8 @@ STOP_ORDER = (
     "page",
     "board_emulator",
 )
+BOARD_PARAMETERS = {"pneudrive": {"sensor_range": 103_400.0}}
+"""Of boards of the twin: with sensors of 15 psi, a step is 0.13 kPa and not 0.84."""
 PAGE_TOKEN = secrets.token_urlsafe()
 """Opens the page of each run's graph, so that a window that is open stays let in."""
 _PR_SET_PDEATHSIG = 1
@@ -82,7 +85,7 @@ class Hardware:
                 raise OptionError(f"hardware file {path}: unknown key '{key}'; known: {known}")
         hardware = cls(**{key: value for key, value in content.items() if value is not None})
         port = str(hardware.driver.get("port", ""))
-        if not port or not Path(port).exists():
+        if not port.startswith("tcp://") and not (port and Path(port).exists()):
             raise OptionError(
                 f"hardware file {path}: no serial device '{port}' (driver.port); is the valve "
                 "board plugged in? `ls /dev/serial/by-id` shows what is there"
@@ -110,6 +113,7 @@ class GraphSetup:
         run: of the same twin: its rest angles wander in each in a way of their own.
         limb: whose gravity and masses the twin gets; None: no loads.
         hardware: in place of the twin.
+        board: protocol of the twin's board.
         planner: parameters of the planner; None for a graph without one.
         record_images: whether the bag holds the raw images, too.
         page: port of the operator's page; None for a graph without one.
@@ -121,6 +125,7 @@ class GraphSetup:
     run: int = 0
     limb: Limb | None = None
     hardware: Hardware | None = None
+    board: str = "ezloop"
     planner: dict[str, Any] | None = None
     record_images: bool = False
     page: int | None = None
@@ -128,9 +133,10 @@ class GraphSetup:
     def nodes(self, port: str) -> list[NodeSpec]:
         """Return the nodes in the order in which they start; the emulated board is at ``port``."""
         rig = self.hardware or Hardware()
-        board = {"port_link": port, "seed": self.seed}
+        language = {"protocol": self.board, **BOARD_PARAMETERS.get(self.board, {})}
+        board = {"port_link": port, "seed": self.seed, **language}
         twin = {"seed": self.seed, "run": self.run, **_twin_loads(self.limb)}
-        driver = {"port": port, "protocol": "ezloop", **rig.driver}
+        driver = {"port": port, **(language if self.hardware is None else {}), **rig.driver}
         recorder = {
             "output": str(self.bag),
             "metadata": json.dumps(self.metadata),
@@ -168,6 +174,14 @@ def _twin_loads(limb: Limb | None) -> dict[str, Any]:
         parameters["masses"] = [item.mass for item in limb.masses]
         parameters["masses_at"] = [item.arc_length for item in limb.masses]
     return parameters
+
+
+def board_line(board: str, folder: str) -> str:
+    """Return where the twin's board is: a terminal in the network, others on a serial port."""
+    if board != "festo":
+        return str(Path(folder) / "board")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return f"tcp://127.0.0.1:{free.getsockname()[1]}"
 
 
 # Processes ---------------------------------------------------------------------------------------

@@ -238,8 +238,7 @@ class EmulatedBoard:
             if command.valid_for is not None:
                 hold = self.faults.hold
                 self._valid_until = None if hold else self._time + command.valid_for
-        repeats = command.kind in ("setpoint", "vent", "hello")
-        if self.faults.echoless and repeats:
+        if self.faults.echoless and command.kind != "read":
             return b""
         return self.protocol.reply(command, self.reading())
 

@@ -223,6 +223,7 @@ class FestoHost(HostProtocol):
         events: list[Event] = [BoardFailure(problem)] if problem and self._sound else []
         self._sound, self.unsettled = not problem, problem
         if self._sound:
+            self._acknowledging = False
             self._started_at = -math.inf  # whatever fails next is started again at once
         gauge = (PASCAL_PER_MILLIBAR * signed(word) for word in pressures)
         readings = tuple(self.assumed_atmosphere + value for value in gauge)
