@@ -12,6 +12,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
 from limb_interfaces import qos, topics
+from limb_interfaces.clocks import ClockWatch
 
 
 @dataclass
@@ -52,12 +53,20 @@ class DiagnosticsPublisher:
         node: the node that the status is about.
         report: returns the present health; its ``level`` is ok, warning, error or stale.
         hardware_id: what the node is connected to, if anything.
+        clock_of_all: the clocks of all others are compared with this node's.
     """
 
-    def __init__(self, node: Node, report: Callable[[], Health], hardware_id: str = "") -> None:
+    def __init__(
+        self,
+        node: Node,
+        report: Callable[[], Health],
+        hardware_id: str = "",
+        clock_of_all: bool = False,
+    ) -> None:
         self._node = node
         self._report = report
         self._hardware_id = hardware_id
+        self._clock = ClockWatch(node, clock_of_all)
         self._publisher = node.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, qos.STATES)
         self._process, self._started = f"{socket.gethostname()}:{os.getpid()}", time.time()
         self._others = node.create_subscription(
@@ -93,23 +102,28 @@ class DiagnosticsPublisher:
     def publish(self) -> str:
         """Publish now, without waiting for the next second; return the level."""
         health = self._report()
-        values = {
-            **health.values,
+        level, text, values = health.level, health.message, dict(health.values)
+        if offset := self._clock.look():
+            values["clock_offset_s"] = f"{offset.seconds:.6f}"
+            values["clock_uncertainty_s"] = f"{offset.uncertainty:.6f}"
+            if offset.warning and level == "ok":
+                level, text = "warning", offset.warning
+        values |= {
             "cpu_percent": f"{self._measure_cpu():.0f}",
             "process": self._process,
             "started": f"{self._started:.3f}",
         }
         status = DiagnosticStatus(
-            level=_LEVELS[health.level],
+            level=_LEVELS[level],
             name=self._node.get_fully_qualified_name(),
-            message=health.message,
+            message=text,
             hardware_id=self._hardware_id,
             values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
         )
         message = DiagnosticArray(status=[status])
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)
-        return health.level
+        return level
 
     def _measure_cpu(self) -> float:
         """Return this process's share of one core [%] since it was last measured."""

@@ -94,7 +94,7 @@ class PressureDriver(Node):
         )
         if settings.accept_cmd_u_t:
             self.create_subscription(Float64MultiArray, CMD_U_T, self._on_cmd_u_t, qos.SETPOINTS)
-        DiagnosticsPublisher(self, self._report, hardware_id=settings.port)
+        DiagnosticsPublisher(self, self._report, settings.port, clock_of_all=True)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(LIFE_PERIOD, self._show_life, clock=steady)
         self.get_logger().info(

@@ -24,6 +24,7 @@ from der_planner.experiment.processes import (
     board_line,
 )
 from limb_interfaces import qos, topics
+from limb_interfaces.clocks import LARGEST, Offset
 
 DISCOVERY = 1.0
 """The orchestrator listens for another graph this long [s] before it starts nodes."""
@@ -64,6 +65,7 @@ def running_graph(
             # A graph that was not seen at once, or that began meanwhile, is known by now.
             _refuse_second_graph(client, specs, own=1)
             graph.bag = Path(client.call("recorder/start"))
+            graph.check_clocks(bool((setup.planner or {}).get("feedback")))
             graph.arm()
             yield graph
         except BaseException:
@@ -127,6 +129,30 @@ class RunningGraph:
         if "page" in self.processes:
             address = self.client.diagnostic_values("page").get("url", "unknown")
             self.progress.say(f"  the operator's page is at {address}?token={PAGE_TOKEN}")
+
+    def check_clocks(self, feedback: bool) -> None:
+        """Say whose clock is off the driver's.
+
+        Args:
+            feedback: commands are to be corrected by what is measured: that wants stamps which are
+                true.
+
+        Raises:
+            GraphError: a clock is too far off for feedback.
+        """
+        for name in self.processes:
+            told = self.client.diagnostic_values(name)
+            offset = Offset(
+                float(told.get("clock_offset_s", "nan")),
+                float(told.get("clock_uncertainty_s", "inf")),
+            )
+            if offset.warning:
+                self.progress.say(f"  warning: {name}: {offset.warning}")
+            if feedback and offset.too_far:
+                raise GraphError(
+                    f"not armed: feedback needs clocks that agree within {1e3 * LARGEST:.0f} ms, and "
+                    f"{name} says: {offset.warning}. Without --feedback it is played"
+                )
 
     def arm(self) -> None:
         """Arm the driver; what forbids it for a moment, as a late report of the board, may pass."""
