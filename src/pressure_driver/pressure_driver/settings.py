@@ -177,17 +177,40 @@ class EmulatorSettings:
     faults: str = _other("", 'e.g. "stick:1,leak:2"; may be set while it runs', changeable=True)
 
 
-NODES: dict[str, type[Settings] | type[EmulatorSettings]] = {
+@dataclass(frozen=True)
+class TopicBoardSettings:
+    """The parameters of the board that a lab's own driver of valves is."""
+
+    listen: str = _other("tcp://127.0.0.1:5021", "where the driver finds it, as its port")
+    message: str = _other(
+        "Float64MultiArray",
+        "of both topics: one array, or one `FluidPressure` for each chamber",
+        ("Float64MultiArray", "FluidPressure"),
+    )
+    command_topic: str = _other(
+        "/valves/command", "pressures to regulate to; {} stands for the place of a chamber"
+    )
+    measured_topic: str = _other("/valves/measured", "pressures that are measured, as above")
+    scale: float = _number(1.0, "1/Pa", 1e-9, 1e9, "of the topics: 0.001 where they are in kPa")
+    offset: float = _number(0.0, "", -1e9, 1e9, "added to scaled pressures")
+    absolute: bool = _other(False, "the topics have absolute pressures")
+    order: str = _other("0,1,2,3", "the chamber at each place of the topics")
+    atmosphere: float = _number(101_325.0, "Pa", 5e4, 1.1e5, "of the room")
+    segment_count: int = _number(2, "", 1, 16, "pairs of chambers")
+    largest_pressure: float = _number(30_000.0, "Pa", 0.0, 1e6, "gauge, that the valves take")
+
+
+NodeSettings = Settings | EmulatorSettings | TopicBoardSettings
+NODES: dict[str, type[NodeSettings]] = {
     "pressure_driver": Settings,
     "board_emulator": EmulatorSettings,
+    "topic_board": TopicBoardSettings,
 }
 """The parameters of each node."""
-Declared = TypeVar("Declared", Settings, EmulatorSettings)
+Declared = TypeVar("Declared", Settings, EmulatorSettings, TopicBoardSettings)
 
 
-def declarations(
-    settings: type[Settings] | type[EmulatorSettings],
-) -> Iterator[tuple[str, Declaration, Any]]:
+def declarations(settings: type[NodeSettings]) -> Iterator[tuple[str, Declaration, Any]]:
     """Yield name, declaration and default of each parameter."""
     each: Field[Any]
     for each in fields(settings):

@@ -175,8 +175,14 @@ class NativeBoard(BoardProtocol):
 
     _FIRMWARE = b"emulator 1"
 
-    def __init__(self, chamber_count: int = 4, largest_pressure: int = 30_000) -> None:
+    def __init__(
+        self,
+        chamber_count: int = 4,
+        largest_pressure: int = 30_000,
+        known: int = StatusFlag.SUPPLY_KNOWN | StatusFlag.VALVES_KNOWN,
+    ) -> None:
         super().__init__(chamber_count)
+        self._known = known
         self._frames = FrameSplitter()
         self._largest = largest_pressure
         self._sequence = 0
@@ -221,7 +227,7 @@ class NativeBoard(BoardProtocol):
 
     def telemetry(self, reading: BoardReading) -> bytes:
         """One STATUS frame."""
-        flags = StatusFlag.SUPPLY_KNOWN | StatusFlag.VALVES_KNOWN
+        flags = self._known
         flags |= StatusFlag.VENTED if reading.vented else 0
         flags |= StatusFlag.EXPIRED if reading.expired else 0
         atmosphere = round(reading.atmosphere)

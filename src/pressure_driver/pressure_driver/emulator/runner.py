@@ -22,8 +22,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pressure_driver.board_socket import BoardSocket
 from pressure_driver.emulator.board import EmulatedBoard, Faults, ReceivedCommand
-from pressure_driver.emulator.network import EmulatedSocket
 from pressure_driver.line import is_tcp
 from pressure_driver.port_process import prefer_thread
 from pressure_driver.schedule import NANOSECONDS
@@ -251,9 +251,9 @@ class EmulatedPort:
             os.close(self._claim_file)
 
 
-def emulated_line(link: str, baud_rate: int) -> EmulatedPort | EmulatedSocket:
+def emulated_line(link: str, baud_rate: int) -> EmulatedPort | BoardSocket:
     """Return the board's end of `tcp://host:port`, or of a serial port with a symbolic link."""
-    return EmulatedSocket(link) if is_tcp(link) else EmulatedPort(link, baud_rate)
+    return BoardSocket(link) if is_tcp(link) else EmulatedPort(link, baud_rate)
 
 
 class BoardRunner:
@@ -272,7 +272,7 @@ class BoardRunner:
     def __init__(
         self,
         board: EmulatedBoard,
-        port: EmulatedPort | EmulatedSocket,
+        port: EmulatedPort | BoardSocket,
         on_air: Callable[[int, NDArray[np.float64]], None] = lambda *_: None,
         on_command: Callable[[ReceivedCommand], None] = lambda *_: None,
         real_time_priority: int = 0,

@@ -13,8 +13,8 @@ LONGEST_WAIT = 20_000_000
 """[ns] between two looks for hosts that want a connection."""
 
 
-class EmulatedSocket:
-    """A board in a network; what `EmulatedPort` is for one on a serial port.
+class BoardSocket:
+    """A board in a network: what an emulated board and `topic_board` listen with.
 
     Bytes cost no time. What a host asks is answered to the host that has spoken last.
 
