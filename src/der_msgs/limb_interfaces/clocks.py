@@ -63,8 +63,8 @@ class OffsetEstimate:
     def add(self, sent: int, received: int, answered: int, back: int) -> None:
         """Take one exchange [ns]: the first and the last by the clock of the node that asks.
 
-        An answer that is back before it was sent tells nothing; one that contradicts the others says
-        that a clock was set, and they are forgotten.
+        An answer that is back before it was sent tells nothing. One that contradicts the others
+        says that a clock was set: they are forgotten.
         """
         delay = _SECONDS * ((back - sent) - (answered - received))
         offset = _SECONDS * ((received - sent) + (answered - back)) / 2.0

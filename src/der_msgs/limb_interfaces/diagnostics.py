@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import socket
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
+from der_msgs import msg
 from limb_interfaces import qos, topics
 from limb_interfaces.clocks import ClockWatch
 
@@ -40,6 +43,14 @@ _FIRST_TIME = 20.0
 """Longest time for which a node that starts speaks more often [s]."""
 _CPU_INTERVAL = 0.5
 """Shortest time over which the CPU time is measured [s]: over less, its own ticks show."""
+
+
+@cache
+def message_version() -> str:
+    """Return a short digest of all messages of the project: nodes with another do not hear this."""
+    kinds = [kind for name, kind in sorted(vars(msg).items()) if name[0].isupper()]
+    fields = [(kind.__name__, sorted(kind.get_fields_and_field_types().items())) for kind in kinds]
+    return hashlib.sha256(repr(fields).encode()).hexdigest()[:8]
 
 
 class DiagnosticsPublisher:
@@ -112,6 +123,7 @@ class DiagnosticsPublisher:
             "cpu_percent": f"{self._measure_cpu():.0f}",
             "process": self._process,
             "started": f"{self._started:.3f}",
+            "messages": message_version(),
         }
         status = DiagnosticStatus(
             level=_LEVELS[level],

@@ -13,7 +13,7 @@ import socket
 import subprocess
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,8 @@ STOP_ORDER = (
     "page",
     "board_emulator",
 )
+MOVABLE = {"driver": "pressure_driver", "tracker": "apriltag_tracker"}
+"""Nodes that may run on another computer, by their keys in a hardware file."""
 BOARD_PARAMETERS = {"pneudrive": {"sensor_range": 103_400.0}}
 """Of boards of the twin: with sensors of 15 psi, a step is 0.13 kPa and not 0.84."""
 PAGE_TOKEN = secrets.token_urlsafe()
@@ -58,6 +60,8 @@ class Hardware:
     Attributes:
         driver, tracker, planner, recorder: parameters by name for each node.
         remap: new names of topics by their old ones, for all nodes.
+        hosts: computers on which somebody else starts a node, by its name; in the file `host` stands
+            in the place of the node's parameters.
         limb: the limb file, or None for the one on the command line.
     """
 
@@ -66,7 +70,13 @@ class Hardware:
     planner: dict[str, Any] = field(default_factory=dict)
     recorder: dict[str, Any] = field(default_factory=dict)
     remap: dict[str, str] = field(default_factory=dict)
+    hosts: dict[str, str] = field(default_factory=dict)
     limb: str | None = None
+
+    @property
+    def place(self) -> str:
+        """Where the valve board is: its port, or the computer of its driver."""
+        return str(self.driver.get("port") or self.hosts.get("pressure_driver", ""))
 
     @classmethod
     def from_yaml(cls, path: Path) -> Hardware:
@@ -79,18 +89,40 @@ class Hardware:
             content = yaml.safe_load(path.read_text())
         except (OSError, yaml.YAMLError) as error:
             raise OptionError(f"cannot read hardware file {path}: {error}") from error
-        known = [item.name for item in dataclasses.fields(cls)]
+        known = [item.name for item in dataclasses.fields(cls) if item.name != "hosts"]
         for key in content if isinstance(content, dict) else ["not a mapping"]:
             if key not in known:
                 raise OptionError(f"hardware file {path}: unknown key '{key}'; known: {known}")
         hardware = cls(**{key: value for key, value in content.items() if value is not None})
+        hardware.hosts.update(_hosts(hardware, path))
         port = str(hardware.driver.get("port", ""))
-        if not port.startswith("tcp://") and not (port and Path(port).exists()):
+        here = "pressure_driver" not in hardware.hosts and not port.startswith("tcp://")
+        if here and not (port and Path(port).exists()):
             raise OptionError(
                 f"hardware file {path}: no serial device '{port}' (driver.port); is the valve "
                 "board plugged in? `ls /dev/serial/by-id` shows what is there"
             )
         return hardware
+
+
+def _hosts(hardware: Hardware, path: Path) -> dict[str, str]:
+    """Return the nodes that are marked with `host`, and take the mark from their parameters.
+
+    Raises:
+        OptionError: parameters stand beside the mark, which nobody would hand over.
+    """
+    hosts = {}
+    for key, node in MOVABLE.items():
+        parameters = getattr(hardware, key)
+        if "host" not in parameters:
+            continue
+        hosts[node] = str(parameters.pop("host"))
+        if parameters:
+            raise OptionError(
+                f"hardware file {path}: {key} is started on {hosts[node]}: give its parameters "
+                f"({', '.join(parameters)}) there, and leave them out here"
+            )
+    return hosts
 
 
 @dataclass(frozen=True)
@@ -100,6 +132,8 @@ class NodeSpec:
     package: str
     executable: str
     parameters: dict[str, Any] = field(default_factory=dict)
+    host: str = ""
+    """Computer on which somebody else starts it; empty: it is started here."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +196,7 @@ class GraphSetup:
             page |= {name: value for name, value in rig.tracker.items() if name == "tag_map"}
             page |= {"port": self.page, "token": PAGE_TOKEN}
             specs.append(NodeSpec("der_planner", "page", page))
-        return specs
+        return [replace(spec, host=rig.hosts.get(spec.executable, "")) for spec in specs]
 
 
 def _twin_loads(limb: Limb | None) -> dict[str, Any]:

@@ -139,9 +139,7 @@ class FestoBoard(BoardProtocol):
         millibar = (modbus.signed(value) for value in values)
         # Regulators of an MPA terminal that are told less than nothing open wide.
         wild = 0 if self._motion_terminal else LARGEST_SETPOINT
-        return tuple(
-            PASCAL_PER_MILLIBAR * (value if value >= 0 else wild) for value in millibar
-        )
+        return tuple(PASCAL_PER_MILLIBAR * (value if value >= 0 else wild) for value in millibar)
 
     def target(self, pressure: Sequence[float], time: float) -> Sequence[float]:
         """Return setpoints of slots that run; the others are vented."""

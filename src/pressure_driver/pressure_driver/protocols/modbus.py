@@ -55,8 +55,8 @@ def to_bytes(words: Iterable[int]) -> bytes:
 
 
 def to_words(data: bytes) -> tuple[int, ...]:
-    """Return registers, 0 … 65535."""
-    return struct.unpack(f">{len(data) // 2}H", data)
+    """Return registers, 0 … 65535; half a register at the end is left out."""
+    return struct.unpack_from(f">{len(data) // 2}H", data)
 
 
 def signed(word: int) -> int:
