@@ -2,11 +2,10 @@
 
 import pytest
 
-from limb_interfaces.parameters import ParameterError
 from pressure_driver.emulator.firmware import NativeBoard
 from pressure_driver.protocols import BoardFailure, BoardIdentity, Echo, Telemetry, host_protocol
-from pressure_driver.settings import TopicBoardSettings
-from pressure_driver.topic_board import STALE, Scale, WatchedBoard
+from pressure_driver.settings import SettingError, TopicBoardSettings
+from pressure_driver.topic_board.board import STALE, Scale, WatchedBoard
 
 ROOM = 101_325.0
 READING = (7_000.0, 0.0, 0.0, 3_000.0)
@@ -33,7 +32,7 @@ def test_the_topics_have_their_own_unit_zero_and_order():
 
 @pytest.mark.parametrize("order", ["0,1,2", "0,1,2,2", "1,2,3,4", "a,b,c,d", ""])
 def test_an_order_that_does_not_name_every_chamber_is_refused(order):
-    with pytest.raises(ParameterError, match="'order'"):
+    with pytest.raises(SettingError, match="'order'"):
         Scale(TopicBoardSettings(order=order))
 
 

@@ -32,7 +32,7 @@ def board_emulator() -> int:
 
 def topic_board() -> int:
     """Run the board that a lab's own driver of valves is."""
-    return _run_node("pressure_driver.topic_board")
+    return _run_node("pressure_driver.topic_board.node")
 
 
 def _run_node(module: str) -> int:

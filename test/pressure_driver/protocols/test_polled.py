@@ -34,7 +34,7 @@ def answer(host, *words):
 
 def told(data):
     """Return first register and words of a write, and what is asked for."""
-    (_, write), (_, read) = modbus.FrameReader().feed(data)
+    (_, write), (_, read) = modbus.ModbusReader().feed(data)
     first, count = struct.unpack(">HH", write.data[:4])
     words = modbus.to_words(write.data[5:])
     assert len(words) == count

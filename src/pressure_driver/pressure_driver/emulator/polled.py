@@ -72,7 +72,7 @@ class FestoBoard(BoardProtocol):
 
     def __init__(self, chamber_count: int = 4) -> None:
         super().__init__(chamber_count)
-        self._frames = modbus.FrameReader()
+        self._frames = modbus.ModbusReader()
         self._motion_terminal = True
         self.boot(0.0)
 
@@ -95,7 +95,7 @@ class FestoBoard(BoardProtocol):
         self.rejected += self._frames.rejected - before
         return commands
 
-    def _interpret(self, place: int, frame: modbus.Frame) -> BoardCommand:
+    def _interpret(self, place: int, frame: modbus.ModbusFrame) -> BoardCommand:
         function, data, number = frame.function, frame.data, frame.transaction
         words: Sequence[int] = ()
         problem = 0
@@ -200,7 +200,7 @@ class PneudriveBoard(BoardProtocol):
 
     def __init__(self, chamber_count: int = 4) -> None:
         super().__init__(chamber_count)
-        self._frames = pneudrive.FrameReader()
+        self._frames = pneudrive.TargetReader()
         self._range = pneudrive.NOMINAL_RANGE
         self._counts = [0] * chamber_count
 

@@ -31,8 +31,8 @@ from pressure_driver.protocols.modbus import (
     FAILED,
     READ,
     WRITE,
-    Frame,
-    FrameReader,
+    ModbusFrame,
+    ModbusReader,
     read_request,
     signed,
     to_words,
@@ -82,7 +82,7 @@ class FestoHost(HostProtocol):
     def __init__(self, chamber_count: int = 4) -> None:
         super().__init__(chamber_count)
         self._motion_terminal = True
-        self._frames = FrameReader()
+        self._frames = ModbusReader()
         self._transaction = 0
         self.reset()
 
@@ -176,7 +176,7 @@ class FestoHost(HostProtocol):
         self.rejected += self._frames.rejected - before
         return events
 
-    def _interpret(self, frame: Frame) -> list[Event]:
+    def _interpret(self, frame: ModbusFrame) -> list[Event]:
         if frame.function == WRITE and len(frame.data) == BLOCK.size:
             first, _ = BLOCK.unpack(frame.data)
             return [Echo(frame.transaction)] if first == FIRST_OUTPUT else []

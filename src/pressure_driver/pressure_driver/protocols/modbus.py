@@ -25,7 +25,7 @@ LENGTH_BEGINS = 6
 """[bytes] before those that the length counts."""
 
 
-class Frame(NamedTuple):
+class ModbusFrame(NamedTuple):
     """One request or answer."""
 
     transaction: int
@@ -64,7 +64,7 @@ def signed(word: int) -> int:
     return word - 0x10000 if word & 0x8000 else word
 
 
-class FrameReader:
+class ModbusReader:
     """Cuts a byte stream into frames.
 
     TCP loses and changes nothing. What does not begin as a frame is skipped to where one may begin.
@@ -77,9 +77,9 @@ class FrameReader:
         """Of the first byte that is kept, in the stream."""
         self._buffer = bytearray()
 
-    def feed(self, data: bytes) -> list[tuple[int, Frame]]:
+    def feed(self, data: bytes) -> list[tuple[int, ModbusFrame]]:
         """Return (place of the first byte, frame) of those that became complete."""
-        frames: list[tuple[int, Frame]] = []
+        frames: list[tuple[int, ModbusFrame]] = []
         self._buffer += data
         while len(self._buffer) >= HEADER.size:
             transaction, zero, length, _, function = HEADER.unpack_from(self._buffer)
@@ -93,7 +93,7 @@ class FrameReader:
             if len(self._buffer) < end:
                 break
             body = bytes(self._buffer[HEADER.size : end])
-            frames.append((self.position, Frame(transaction, function, body)))
+            frames.append((self.position, ModbusFrame(transaction, function, body)))
             self._skip(end)
         return frames
 

@@ -47,7 +47,7 @@ def gauge_of(counts: int, sensor_range: float) -> float:
     return sensor_range * (counts / _STEPS - _ZERO) / _SPAN
 
 
-class FrameReader:
+class TargetReader:
     """Cuts a byte stream into frames: an address, and four numbers of counts that there can be."""
 
     def __init__(self) -> None:
@@ -98,7 +98,7 @@ class PneudriveHost(HostProtocol):
     def __init__(self, chamber_count: int = 4) -> None:
         super().__init__(chamber_count)
         self._board_count = -(-chamber_count // VALVES)
-        self._frames = FrameReader()
+        self._frames = TargetReader()
         self._set_range(NOMINAL_RANGE)
         self._first = 0
         self.reset()
