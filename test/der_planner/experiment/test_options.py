@@ -54,7 +54,7 @@ def test_a_node_of_another_computer_is_marked_and_keeps_its_parameters_there(tmp
     rig.write_text("driver: {host: valve-pc}\n")
     assert Hardware.from_yaml(rig).place == "valve-pc"
     rig.write_text("driver: {host: valve-pc, port: /dev/ttyACM0}\n")
-    with pytest.raises(OptionError, match=r"started on valve-pc: give its parameters \(port\) there"):
+    with pytest.raises(OptionError, match=r"on valve-pc: give its parameters \(port\) there"):
         Hardware.from_yaml(rig)
 
 

@@ -60,8 +60,8 @@ class Hardware:
     Attributes:
         driver, tracker, planner, recorder: parameters by name for each node.
         remap: new names of topics by their old ones, for all nodes.
-        hosts: computers on which somebody else starts a node, by its name; in the file `host` stands
-            in the place of the node's parameters.
+        hosts: computers on which somebody else starts a node, by its name; in the file, `host`
+            stands in the place of the node's parameters.
         limb: the limb file, or None for the one on the command line.
     """
 
