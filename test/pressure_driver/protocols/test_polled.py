@@ -1,23 +1,13 @@
 """Boards that are asked: how a terminal is started, its registers, and boards that share a bus."""
 
-import asyncio
-import socket
 import struct
-import threading
 
 import numpy as np
 import pytest
-from pymodbus.datastore import (
-    ModbusDeviceContext,
-    ModbusSequentialDataBlock,
-    ModbusServerContext,
-)
-from pymodbus.server import ModbusTcpServer
-from waiting import Clock, wait_for
+from waiting import Clock
 
 from pressure_driver.emulator.device import BoardReading
 from pressure_driver.emulator.polled import FestoBoard, PneudriveBoard
-from pressure_driver.line import TcpLine
 from pressure_driver.protocols import BoardFailure, Echo, Telemetry, host_protocol, modbus
 from pressure_driver.safety import Mode
 from pressure_driver.settings import Settings
@@ -121,60 +111,6 @@ def test_a_diagnosis_of_a_regulator_is_a_failure():
     assert host.unsettled == ""
     failure, _ = answer(host, *(0, 0, 0) * 3, 0, 0, 5)
     assert failure == BoardFailure("valve 3 reports: diagnosis 5")
-
-
-# ---------------------------------------------------------------- a foreign implementation
-
-
-@pytest.fixture
-def plain_server():
-    """Address and registers of a Modbus TCP server that knows nothing of valves."""
-    registers = ModbusDeviceContext(hr=ModbusSequentialDataBlock(1, [0] * 0xFFFF))
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        address = free.getsockname()
-    loop = asyncio.new_event_loop()
-    server = None
-
-    async def serve():
-        nonlocal server
-        context = ModbusServerContext(registers, single=True)
-        server = ModbusTcpServer(context, address=address)
-        await server.serve_forever(background=True)
-
-    loop.run_until_complete(serve())
-    thread = threading.Thread(target=loop.run_forever, daemon=True)
-    thread.start()
-    yield "tcp://{}:{}".format(*address), registers
-    asyncio.run_coroutine_threadsafe(server.shutdown(), loop).result(10.0)
-    loop.call_soon_threadsafe(loop.stop)
-    thread.join(10.0)
-    loop.close()
-
-
-@pytest.mark.slow
-def test_registers_are_where_a_plain_server_has_them(plain_server):
-    address, registers = plain_server
-    host = host_protocol("festo")
-    registers.setValues(3, 45395, [RUNNING, 0, 75, RUNNING, 0xFFFF, 200])
-    line = TcpLine(address)
-    events = []
-    try:
-        data, number = host.setpoint([7_500.0, -20_000.0], ROOM, 0.25)
-        line.write(data)
-
-        def answered():
-            events.extend(host.decode(line.read()))
-            return len(events) == 2
-
-        wait_for(answered, "both answers", 10.0)
-    finally:
-        line.close(drop=False)
-    assert events == [
-        Echo(number),
-        Telemetry(chamber_pressure=(ROOM, ROOM + 7_500.0, ROOM - 100.0, ROOM + 20_000.0)),
-    ]
-    assert registers.getValues(3, 40003, 6) == [0xC3, 75, 0, 0xC3, 0, 200]
-    assert host.rejected == 0
 
 
 # ---------------------------------------------------------------------------- boards on a bus
