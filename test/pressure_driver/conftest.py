@@ -99,8 +99,8 @@ class Simulation:
         self.time += PERIOD
         data = self.core.tick(self.wall)
         self.sent.append(data)
-        self._receive(data)
         self.core.sent()
+        self._receive(data)
         self.board.step(PERIOD / 1e9)
         report = self.board.telemetry()
         if report and self.plugged:
