@@ -19,11 +19,10 @@ import time
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
-from pressure_driver import port_process
+from pressure_driver import lines
 from pressure_driver.core import DriverCore
 from pressure_driver.following import Duration
-from pressure_driver.line import ADVICE, Line, may_open, open_line, vent_line
-from pressure_driver.port_process import Channel
+from pressure_driver.lines import Channel, Line, may_open, open_line, vent_line
 from pressure_driver.protocols import host_protocol
 from pressure_driver.schedule import Origin, Setpoint, TickGrid, Verdict
 
@@ -80,7 +79,7 @@ class BoardProcess:
         self._heard_at = self._said_at = self.core.clock()
         self._refused_at = 0.0
         self._node_is_silent = False
-        self._real_time = port_process.prefer_thread(settings.real_time_priority)
+        self._real_time = lines.prefer_thread(settings.real_time_priority)
 
     def end(self, *_: object) -> None:
         """End in order, after the present turn of the loop: a handler of signals."""
@@ -89,7 +88,7 @@ class BoardProcess:
     def run(self) -> int:
         """Serve the port until the end; return the exit code."""
         try:
-            self._line = open_line(self._port, self._baud_rate, port_process.RELEASE_TIME)
+            self._line = open_line(self._port, self._baud_rate, lines.RELEASE_TIME)
         except (OSError, ValueError) as error:
             self._send("failed", getattr(error, "errno", None), str(error))
             return 1
@@ -102,14 +101,14 @@ class BoardProcess:
                 self._turn()
             problem = self._empty()
         except EOFError:
-            duration, node_has_ended = port_process.VENT_TIME, True
+            duration, node_has_ended = lines.VENT_TIME, True
         finally:
             unreached = self._send_last_words(duration)
         if unreached:
             alone = " (a board with a watchdog vents by itself)"
             problem = (
                 f"the board on {self._port} cannot be reached and may hold its pressures"
-                f"{alone if self.core.protocol.has_watchdog else ''}: {ADVICE}"
+                f"{alone if self.core.protocol.has_watchdog else ''}: {lines.ADVICE}"
             )
         self._send("ended", problem)
         if node_has_ended:
@@ -319,7 +318,7 @@ class BoardProcess:
         while self.core.highest_pressure() > EMPTYING_SHARE * before:
             if self.core.clock() > deadline:
                 left = self.core.highest_pressure()
-                return f"the chambers on {self._port} keep {left:.0f} Pa: {ADVICE}"
+                return f"the chambers on {self._port} keep {left:.0f} Pa: {lines.ADVICE}"
             self._turn()
         return ""
 

@@ -7,7 +7,7 @@ import socket
 from collections import deque
 from collections.abc import Callable
 
-from pressure_driver.line import tcp_address
+from pressure_driver.lines import tcp_address
 
 LONGEST_WAIT = 20_000_000
 """[ns] between two looks for hosts that want a connection."""

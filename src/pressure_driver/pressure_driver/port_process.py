@@ -1,6 +1,4 @@
-"""The process of the port as the node sees it: the socket to it, and the node's end of that.
-
-The node starts the process, talks with it, and vents if it dies.
+"""The node's end of the process of the port: it starts it, talks with it, and vents if it dies.
 
 Messages are JSON lists that begin with a word. From the node: ``setpoint``, ``arm``, ``vent``,
 ``alive``, ``end``. To the node:
@@ -32,21 +30,13 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from serial.tools import list_ports
 
-from pressure_driver.line import (
-    IN_USE,
-    is_tcp,
-    numeric_address,
-    release_descriptor,
-    vent_anew,
-    vent_line,
-)
-
-if TYPE_CHECKING:
-    from pressure_driver.settings import Settings
+from pressure_driver import lines
+from pressure_driver.lines import Channel, is_tcp, numeric_address
+from pressure_driver.settings import Settings
 
 STABLE_NAMES = Path("/dev/serial/by-id")
 """Where the system keeps names of ports that survive re-plugging."""
@@ -61,10 +51,6 @@ ANSWER_TIME = 1.0
 """[s] for an answer to `arm` or `vent`."""
 END_TIME = 6.0
 """[s] for the process to vent, see that the board obeys, and end."""
-RELEASE_TIME = 4.0
-"""[s] in which a process that vents after the end of its driver has let go of the port."""
-VENT_TIME = 1.0
-"""[s] for which one process of the driver vents in the place of the other."""
 
 
 class PortError(RuntimeError):
@@ -107,7 +93,7 @@ def explain(port: str, error: OSError) -> str:
             f"no serial device {port}; ports that exist: {ports}. Plug the board in, or set the "
             "parameter 'port'"
         )
-    if number in IN_USE:
+    if number in lines.IN_USE:
         return (
             f"serial port {port} is in use by another program; find it with 'fuser -v {port}', "
             f"close it, or set the parameter 'port' (ports that exist: {ports})"
@@ -120,7 +106,7 @@ def explain(port: str, error: OSError) -> str:
 
 
 def _explain_connection(port: str, error: OSError) -> str:
-    if error.errno in IN_USE:
+    if error.errno in lines.IN_USE:
         return f"another program of this computer has the board at {port}: end it"
     if error.errno == errno.EINVAL or (error.errno or 0) < 0:  # of the look-up of a name
         return f"{port}: {error.strerror}; set the parameter 'port'"
@@ -128,60 +114,6 @@ def _explain_connection(port: str, error: OSError) -> str:
         f"no board answers at {port} ({error}): look at its power, its cable and whether this "
         "computer has an address in its network, or set the parameter 'port'"
     )
-
-
-class Channel:
-    """One end of the socket between the node and the process of the port; it never waits to send.
-
-    Args:
-        end: of a socket pair that keeps the bounds of messages (SOCK_SEQPACKET).
-    """
-
-    def __init__(self, end: socket.socket) -> None:
-        self.socket = end
-
-    def fileno(self) -> int:
-        """Return the descriptor to wait for."""
-        return self.socket.fileno()
-
-    def send(self, *message: Any, descriptor: int | None = None) -> None:
-        """Send a message, or drop it if the other end has gone or does not read."""
-        descriptors = [] if descriptor is None else [descriptor]
-        data = [json.dumps(message).encode()]
-        with contextlib.suppress(OSError):
-            socket.send_fds(self.socket, data, descriptors, socket.MSG_DONTWAIT)
-
-    def receive(self) -> tuple[list[Any], int | None]:
-        """Return the next message and the descriptor that came along, if any.
-
-        Raises:
-            EOFError: the other end has gone.
-            BlockingIOError, TimeoutError: there is no message.
-        """
-        try:
-            data, descriptors, _, _ = socket.recv_fds(self.socket, 1 << 16, 1)
-        except ConnectionError:
-            data, descriptors = b"", []
-        if not data:
-            raise EOFError
-        return json.loads(data), descriptors[0] if descriptors else None
-
-
-def prefer_thread(priority: int) -> bool:
-    """Give the calling thread real-time priority (SCHED_FIFO): it serves a port.
-
-    Args:
-        priority: 1 … 99, 0 to leave the thread as it is.
-
-    Returns:
-        Whether it was granted; it needs root, CAP_SYS_NICE or an rtprio limit.
-    """
-    if priority <= 0:
-        return False
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-        return True
-    return False
 
 
 class PortProcess:
@@ -295,12 +227,12 @@ class PortProcess:
             self._process.wait(LOOK)
         if self._outcome is None:
             if is_tcp(self._settings.port):
-                problem = vent_anew(self._settings.port, self._vent_commands, VENT_TIME)
+                problem = lines.vent_anew(self._settings.port, self._vent_commands, lines.VENT_TIME)
             else:
-                problem = vent_line(self._descriptor, self._vent_commands, VENT_TIME)
-            told = f"the vent command was sent for {VENT_TIME:g} s; see that it has vented"
+                problem = lines.vent_line(self._descriptor, self._vent_commands, lines.VENT_TIME)
+            told = f"the vent command was sent for {lines.VENT_TIME:g} s; see that it has vented"
             self.error = f"{reason}: {problem or told}"
-        release_descriptor(self._descriptor)
+        lines.release_descriptor(self._descriptor)
         self._on_message()
 
     def _serve(self, message: list[Any], descriptor: int | None) -> None:

@@ -13,7 +13,7 @@ from pymodbus.datastore import (
 from pymodbus.server import ModbusTcpServer
 from waiting import wait_for
 
-from pressure_driver.line import TcpLine
+from pressure_driver.lines import TcpLine
 from pressure_driver.protocols import Echo, Telemetry, host_protocol
 
 RUNNING = 3 | 2 << 6

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 
 from pressure_driver.board_socket import BoardSocket
 from pressure_driver.emulator.board import EmulatedBoard, Faults, ReceivedCommand
-from pressure_driver.line import is_tcp
-from pressure_driver.port_process import prefer_thread
+from pressure_driver.lines import is_tcp, prefer_thread
 from pressure_driver.schedule import NANOSECONDS
 
 TELEMETRY_PERIOD = 50_000_000

@@ -1,7 +1,7 @@
-"""The line to a board: a serial port, or `tcp://host:port`.
+"""The lines of the process of the port: to the board, serial or `tcp://`, and to the node.
 
-Both are descriptors that the process of the port waits for and never waits in. A serial port is
-handed to the driver's node beside the process, which vents through it. A connection is not: what
+The line to the board is a descriptor that the process waits for and never waits in. A serial port
+is handed to the driver's node beside the process, which vents through it. A connection is not: what
 the process has sent by halves would be in it, so whoever vents opens one of its own.
 """
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import json
 import os
 import re
 import socket
@@ -17,9 +18,14 @@ import struct
 import termios
 import time
 from abc import ABC, abstractmethod
+from typing import Any
 
 import serial
 
+RELEASE_TIME = 4.0
+"""[s] in which a process that vents after the end of its driver has let go of the port."""
+VENT_TIME = 1.0
+"""[s] for which one process of the driver vents in the place of the other."""
 VENT_PERIOD = 0.05
 """[s] in which each vent command is sent once, by a process that vents in the place of another."""
 CONNECT_TIME = 0.1
@@ -28,6 +34,43 @@ ADVICE = "close the air supply"
 IN_USE = (errno.EAGAIN, errno.EBUSY)
 """Error numbers of a line that another program has."""
 _ADDRESS = re.compile(r"tcp://(\[[0-9A-Fa-f:.]+\]|[^:/\[\]]+):(\d{1,5})")
+
+
+class Channel:
+    """One end of the socket between the node and the process of the port; it never waits to send.
+
+    Args:
+        end: of a socket pair that keeps the bounds of messages (SOCK_SEQPACKET).
+    """
+
+    def __init__(self, end: socket.socket) -> None:
+        self.socket = end
+
+    def fileno(self) -> int:
+        """Return the descriptor to wait for."""
+        return self.socket.fileno()
+
+    def send(self, *message: Any, descriptor: int | None = None) -> None:
+        """Send a message, or drop it if the other end has gone or does not read."""
+        descriptors = [] if descriptor is None else [descriptor]
+        data = [json.dumps(message).encode()]
+        with contextlib.suppress(OSError):
+            socket.send_fds(self.socket, data, descriptors, socket.MSG_DONTWAIT)
+
+    def receive(self) -> tuple[list[Any], int | None]:
+        """Return the next message and the descriptor that came along, if any.
+
+        Raises:
+            EOFError: the other end has gone.
+            BlockingIOError, TimeoutError: there is no message.
+        """
+        try:
+            data, descriptors, _, _ = socket.recv_fds(self.socket, 1 << 16, 1)
+        except ConnectionError:
+            data, descriptors = b"", []
+        if not data:
+            raise EOFError
+        return json.loads(data), descriptors[0] if descriptors else None
 
 
 class Line(ABC):
@@ -310,3 +353,20 @@ def _waiting(descriptor: int) -> int:
     """Return how many bytes have not left a terminal, or have not been acknowledged over TCP."""
     (waiting,) = struct.unpack("i", fcntl.ioctl(descriptor, termios.TIOCOUTQ, bytes(4)))
     return int(waiting)
+
+
+def prefer_thread(priority: int) -> bool:
+    """Give the calling thread real-time priority (SCHED_FIFO): it serves a port.
+
+    Args:
+        priority: 1 … 99, 0 to leave the thread as it is.
+
+    Returns:
+        Whether it was granted; it needs root, CAP_SYS_NICE or an rtprio limit.
+    """
+    if priority <= 0:
+        return False
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        return True
+    return False
