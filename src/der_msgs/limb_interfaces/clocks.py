@@ -45,7 +45,7 @@ class Offset(NamedTuple):
         return (
             f"the clock of this computer is {1e3 * abs(self.seconds):.1f} ms {side} the driver's "
             f"(± {1e3 * self.uncertainty:.1f} ms): have both computers run chrony "
-            "(doc/two_computers.md)"
+            "(docs/guide/two_computers.md)"
         )
 
     @property

@@ -161,7 +161,7 @@ class RunningGraph:
             raise GraphError(
                 f"nothing was heard of {', '.join(missing)} for {ELSEWHERE:.0f} s: is it started, "
                 "with the same ROS_DOMAIN_ID, ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET on both "
-                "computers and no firewall between them (doc/two_computers.md)?"
+                "computers and no firewall between them (docs/guide/two_computers.md)?"
             ) from error
         self.client.wait_ready(self.elsewhere)
         for name, host in self.elsewhere.items():
