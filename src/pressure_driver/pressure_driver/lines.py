@@ -17,7 +17,6 @@ import socket
 import struct
 import termios
 import time
-from abc import ABC, abstractmethod
 from typing import Any
 
 import serial
@@ -31,7 +30,7 @@ VENT_PERIOD = 0.05
 CONNECT_TIME = 0.1
 """[s] for a connection: a board in the same room answers in 0.001 s, and meanwhile nothing runs."""
 ADVICE = "close the air supply"
-IN_USE = (errno.EAGAIN, errno.EBUSY)
+IN_USE = (errno.EAGAIN, errno.EBUSY, errno.EADDRINUSE)
 """Error numbers of a line that another program has."""
 _ADDRESS = re.compile(r"tcp://(\[[0-9A-Fa-f:.]+\]|[^:/\[\]]+):(\d{1,5})")
 
@@ -73,164 +72,104 @@ class Channel:
         return json.loads(data), descriptors[0] if descriptors else None
 
 
-class Line(ABC):
-    """An open line to a board.
+class Line:
+    """An open line to a board: a serial port, or a connection to a board or to what has its port.
+
+    Args:
+        port: path of a serial port, or `tcp://host:port`.
+        baud_rate: [baud] of a serial port.
+        alone: keep other programs of this computer from the same board in a network; the boards
+            themselves listen to several hosts at once. A serial port is always kept.
 
     Attributes:
         shared: the descriptor may be given to another process, which vents through it.
-    """
-
-    shared = False
-
-    @abstractmethod
-    def fileno(self) -> int:
-        """Return the descriptor to wait for."""
-
-    @abstractmethod
-    def read(self) -> bytes:
-        """Return the bytes that are there.
-
-        Raises:
-            OSError: the board has gone.
-        """
-
-    def write(self, data: bytes) -> int:
-        """Hand bytes to the operating system without waiting; return how many it has taken.
-
-        Raises:
-            BlockingIOError: it takes none.
-            OSError: the board has gone.
-        """
-        # pyserial's own `write` waits for the terminal after each write.
-        return os.write(self.fileno(), data)
-
-    def waiting(self) -> int:
-        """Return how many bytes have not left, or over TCP have not been acknowledged."""
-        return _waiting(self.fileno())
-
-    @abstractmethod
-    def drop(self) -> None:
-        """Throw away what has not left, where that can be done."""
-
-    @abstractmethod
-    def close(self, drop: bool) -> None:
-        """Leave the line without waiting for the board.
-
-        Args:
-            drop: throw away what has not left. Not after the last words: a board on a
-                pseudo-terminal may not have read them yet.
-        """
-
-
-class SerialLine(Line):
-    """A serial port, of this program alone.
-
-    Args:
-        port: its path.
-        baud_rate: [baud].
 
     Raises:
-        OSError, ValueError: it does not exist, is in use, or may not be opened.
+        OSError, ValueError: it does not exist, is in use, or may not be opened; nobody answers.
     """
 
-    shared = True
-
-    def __init__(self, port: str, baud_rate: int) -> None:
-        self._device = serial.Serial(port, baud_rate, timeout=0, write_timeout=0.05, exclusive=True)
-        with contextlib.suppress(OSError):
-            fcntl.ioctl(self._device.fileno(), termios.TIOCEXCL)
+    def __init__(self, port: str, baud_rate: int = 0, alone: bool = True) -> None:
+        self.shared = not is_tcp(port)
+        self._device: Any = None
+        self._claim = socket.socket(socket.AF_UNIX)
+        try:
+            if self.shared:
+                options = {"timeout": 0, "write_timeout": 0.05, "exclusive": True}
+                self._device = serial.Serial(port, baud_rate, **options)
+                with contextlib.suppress(OSError):
+                    fcntl.ioctl(self._device.fileno(), termios.TIOCEXCL)
+                return
+            if alone:
+                # A name without a file: the kernel forgets it with the process.
+                self._claim.bind(f"\0limb board at {port}")
+            self._device = socket.create_connection(tcp_address(port), CONNECT_TIME)
+            self._device.setblocking(False)
+            # A command is never held back to wait for more.
+            self._device.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        except (OSError, ValueError):
+            self._claim.close()
+            raise
 
     def fileno(self) -> int:
         """Return the descriptor to wait for."""
         return int(self._device.fileno())
 
     def read(self) -> bytes:
-        """Return the bytes that are there; none at all means that the device has gone."""
-        return bytes(self._device.read(max(self._device.in_waiting, 1)))
-
-    def drop(self) -> None:
-        """Throw away what is in the output queue."""
-        with contextlib.suppress(Exception):
-            self._device.reset_output_buffer()
-
-    def close(self, drop: bool) -> None:
-        """Leave the port; without ``drop`` the kernel still sends what waits.
-
-        The lock is taken off by name: another descriptor of the port may live a little longer.
-        """
-        if drop:
-            self.drop()
-        with contextlib.suppress(Exception):
-            release_descriptor(os.dup(self._device.fileno()))
-        with contextlib.suppress(Exception):
-            self._device.close()
-
-
-class TcpLine(Line):
-    """A connection to a board, or to a server that has the board on a serial port.
-
-    Args:
-        port: `tcp://host:port`.
-        alone: keep other programs of this computer from the same board meanwhile. Boards themselves
-            listen to several hosts at once.
-
-    Raises:
-        OSError: nobody answers, or another program has the board.
-    """
-
-    def __init__(self, port: str, alone: bool = True) -> None:
-        self._claim = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        if alone:
-            try:
-                # A name without a file: the kernel forgets it with the process.
-                self._claim.bind(f"\0limb board at {port}")
-            except OSError as error:
-                self._claim.close()
-                raise OSError(errno.EBUSY, f"another program has {port}") from error
-        try:
-            self._socket = socket.create_connection(tcp_address(port), CONNECT_TIME)
-        except OSError:
-            self._claim.close()
-            raise
-        self._socket.setblocking(False)
-        # A command is never held back to wait for more.
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-
-    def fileno(self) -> int:
-        """Return the descriptor to wait for."""
-        return self._socket.fileno()
-
-    def read(self) -> bytes:
         """Return the bytes that are there.
 
         Raises:
-            OSError: the board has closed the connection.
+            OSError: the board has gone.
         """
-        try:
-            data = self._socket.recv(1 << 16)
-        except BlockingIOError:
-            return b""
-        if not data:
+        if self.shared:
+            return bytes(self._device.read(max(self._device.in_waiting, 1)))
+        with contextlib.suppress(BlockingIOError):
+            data: bytes = self._device.recv(1 << 16)
+            if data:
+                return data
             raise ConnectionResetError(errno.ECONNRESET, "the board has closed the connection")
-        return data
+        return b""
 
     def write(self, data: bytes) -> int:
-        """Send bytes; half a frame cannot be taken back, so a connection that is full is lost."""
-        count = super().write(data)
-        if count < len(data):
+        """Hand bytes to the operating system without waiting; return how many it has taken.
+
+        Raises:
+            BlockingIOError: it takes none.
+            OSError: the board has gone, or a connection is full: half a frame cannot be taken back.
+        """
+        # pyserial's own `write` waits for the terminal after each write.
+        count = os.write(self.fileno(), data)
+        if count < len(data) and not self.shared:
             raise OSError(errno.ENOBUFS, "the connection takes no bytes")
         return count
 
+    def waiting(self) -> int:
+        """Return how many bytes have not left, or over TCP have not been acknowledged."""
+        return _waiting(self.fileno())
+
     def drop(self) -> None:
-        """Do nothing: what the kernel has taken over arrives, in order, or the connection ends."""
+        """Throw away what has not left; of a connection, the kernel gives nothing back."""
+        _flush(self.fileno())
 
     def close(self, drop: bool) -> None:
-        """End the connection; with ``drop`` it is reset, and nothing old is sent any more."""
-        if drop:
-            with contextlib.suppress(OSError):
-                linger = struct.pack("ii", 1, 0)
-                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
-        self._socket.close()
+        """Leave the line without waiting for the board.
+
+        The lock of a port is taken off by name: another descriptor of it may live a little longer.
+
+        Args:
+            drop: throw away what has not left; a connection is reset. Not after the last words: a
+                board on a pseudo-terminal may not have read them yet.
+        """
+        with contextlib.suppress(Exception):
+            if drop and self.shared:
+                self.drop()
+            elif drop:
+                now = struct.pack("ii", 1, 0)
+                self._device.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, now)
+        if self.shared:
+            with contextlib.suppress(Exception):
+                release_descriptor(os.dup(self.fileno()))
+        with contextlib.suppress(Exception):
+            self._device.close()
         self._claim.close()
 
 
@@ -282,7 +221,7 @@ def open_line(port: str, baud_rate: int, patience: float = 0.0) -> Line:
     deadline = time.monotonic() + patience
     while True:
         try:
-            return TcpLine(port) if is_tcp(port) else SerialLine(port, baud_rate)
+            return Line(port, baud_rate)
         except OSError as error:
             if error.errno not in IN_USE or time.monotonic() >= deadline:
                 raise
@@ -323,7 +262,7 @@ def vent_line(descriptor: int, commands: list[bytes], duration: float) -> str:
 def vent_anew(port: str, commands: list[bytes], duration: float) -> str:
     """Vent over a connection of its own, as `vent_line` does; return what is left to be done."""
     try:
-        line = TcpLine(port, alone=False)
+        line = Line(port, alone=False)
     except OSError as error:
         return f"the board cannot be reached ({error}): {ADVICE}"
     problem = vent_line(line.fileno(), commands, duration)

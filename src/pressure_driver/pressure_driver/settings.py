@@ -17,8 +17,6 @@ from pressure_driver.protocols import NAMES
 TERMINALS = ("vtem", "mpa")
 TERMINAL = "valves of a `festo` terminal: a motion terminal, or VPPM regulators"
 SENSOR_RANGE = "of the sensors of a `pneudrive` board, whose counts are a thousandth of it"
-MOST_ON_A_BUS = 8
-"""Pairs of valves that a terminal, or a bus of boards, can have."""
 
 
 class SettingError(ValueError):
@@ -146,11 +144,6 @@ class Settings:
                     f"parameters '{low}' ({below:g} Pa) and '{high}' ({above:g} Pa): the first "
                     f"must be smaller{reason}"
                 )
-        if self.protocol in ("festo", "pneudrive") and self.segment_count > MOST_ON_A_BUS:
-            raise SettingError(
-                f"parameter 'segment_count' is {self.segment_count}: a `{self.protocol}` board has "
-                f"at most {MOST_ON_A_BUS} pairs of valves"
-            )
         if self.command_validity * self.rate <= 1.0:
             raise SettingError(
                 f"parameters 'command_validity' ({self.command_validity:g} s) and 'rate' "

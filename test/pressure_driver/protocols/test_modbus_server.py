@@ -5,15 +5,12 @@ import socket
 import threading
 
 import pytest
-from pymodbus.datastore import (
-    ModbusDeviceContext,
-    ModbusSequentialDataBlock,
-    ModbusServerContext,
-)
+from pymodbus.client import ModbusTcpClient
 from pymodbus.server import ModbusTcpServer
+from pymodbus.simulator import DataType, SimData, SimDevice
 from waiting import wait_for
 
-from pressure_driver.lines import TcpLine
+from pressure_driver.lines import Line
 from pressure_driver.protocols import Echo, Telemetry, host_protocol
 
 RUNNING = 3 | 2 << 6
@@ -22,8 +19,12 @@ ROOM = 101_325.0
 
 @pytest.fixture
 def plain_server():
-    """Address and registers of a Modbus TCP server that knows nothing of valves."""
-    registers = ModbusDeviceContext(hr=ModbusSequentialDataBlock(1, [0] * 0xFFFF))
+    """Address of a Modbus TCP server that has the registers of two slots and no others."""
+    said = [RUNNING, 0, 75, RUNNING, 0xFFFF, 200]
+    blocks = [
+        SimData(40003, values=[0] * 6, datatype=DataType.REGISTERS),
+        SimData(45395, values=said, datatype=DataType.REGISTERS, readonly=True),
+    ]
     with socket.create_server(("127.0.0.1", 0)) as free:
         address = free.getsockname()
     loop = asyncio.new_event_loop()
@@ -31,14 +32,13 @@ def plain_server():
 
     async def serve():
         nonlocal server
-        context = ModbusServerContext(registers, single=True)
-        server = ModbusTcpServer(context, address=address)
+        server = ModbusTcpServer(SimDevice(0, simdata=blocks), address=address)
         await server.serve_forever(background=True)
 
     loop.run_until_complete(serve())
     thread = threading.Thread(target=loop.run_forever, daemon=True)
     thread.start()
-    yield "tcp://{}:{}".format(*address), registers
+    yield address
     asyncio.run_coroutine_threadsafe(server.shutdown(), loop).result(10.0)
     loop.call_soon_threadsafe(loop.stop)
     thread.join(10.0)
@@ -47,10 +47,8 @@ def plain_server():
 
 @pytest.mark.slow
 def test_registers_are_where_a_plain_server_has_them(plain_server):
-    address, registers = plain_server
     host = host_protocol("festo")
-    registers.setValues(3, 45395, [RUNNING, 0, 75, RUNNING, 0xFFFF, 200])
-    line = TcpLine(address)
+    line = Line("tcp://{}:{}".format(*plain_server))
     events = []
     try:
         data, number = host.setpoint([7_500.0, -20_000.0], ROOM, 0.25)
@@ -58,6 +56,7 @@ def test_registers_are_where_a_plain_server_has_them(plain_server):
 
         def answered():
             events.extend(host.decode(line.read()))
+            line.write(host.follow_up())
             return len(events) == 2
 
         wait_for(answered, "both answers", 10.0)
@@ -67,5 +66,6 @@ def test_registers_are_where_a_plain_server_has_them(plain_server):
         Echo(number),
         Telemetry(chamber_pressure=(ROOM, ROOM + 7_500.0, ROOM - 100.0, ROOM + 20_000.0)),
     ]
-    assert registers.getValues(3, 40003, 6) == [0xC3, 75, 0, 0xC3, 0, 200]
     assert host.rejected == 0
+    with ModbusTcpClient(plain_server[0], port=plain_server[1]) as other:
+        assert other.read_holding_registers(40003, count=6).registers == [0xC3, 75, 0, 0xC3, 0, 200]

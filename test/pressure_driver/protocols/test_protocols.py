@@ -49,12 +49,15 @@ def reporting_board(name):
     return board
 
 
-def report(board, host, reading=READING):
+def report(board, asker, reading=READING):
     """Return what a board says at one tick: a report, or the answers to what it is asked."""
-    if said := board.telemetry(reading):
-        return said
-    commands = board.decode(host.vent(ATMOSPHERE)[0])
-    return b"".join(board.reply(command, reading) for command in commands)
+    said = board.telemetry(reading)
+    data = b"" if said else asker.vent(ATMOSPHERE)[0]
+    while data:
+        answer = b"".join(board.reply(command, reading) for command in board.decode(data))
+        asker.decode(answer)
+        said, data = said + answer, asker.follow_up()
+    return said
 
 
 # ------------------------------------------------------------------------------ exact bytes
@@ -133,7 +136,7 @@ def test_telemetry_arrives_as_it_was_measured(name, split):
     host, board = host_protocol(name), reporting_board(name)
     host.assumed_atmosphere = ATMOSPHERE
     garbage = b"\x00noise\xff" + (b"\0" if name == "native" else b"\n")
-    events = decode_all(host, garbage + report(board, host), generator)
+    events = decode_all(host, garbage + report(board, host_protocol(name)), generator)
     merged = {}
     for event in events:
         if isinstance(event, Telemetry):
@@ -216,7 +219,7 @@ def mutated(sound, seed):
 
 def board_stream(name):
     """What a board says in a while, with changing numbers."""
-    board, host = reporting_board(name), host_protocol(name)
+    board, asker = reporting_board(name), host_protocol(name)
     generator = np.random.default_rng(6)
     stream = b""
     for step in range(200):
@@ -224,7 +227,7 @@ def board_stream(name):
         reading = BoardReading(
             step * 0.05, tuple(pressure), ATMOSPHERE, (0.0, 0.1, 0.2, 1.0), 1.4e5
         )
-        stream += report(board, host, reading)
+        stream += report(board, asker, reading)
     return stream
 
 

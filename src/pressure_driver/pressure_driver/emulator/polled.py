@@ -31,7 +31,6 @@ SLOT_START_TIME = 1.5
 PNEUDRIVE_BOOT_TIME = 2.0
 """[s] for which a PneuDrive board vents at its start, whatever it is told."""
 NOT_READY, TO_BE_CONFIGURED = 0, 1
-WRITE_ONE = 6
 ILLEGAL_FUNCTION, ILLEGAL_ADDRESS = 1, 2
 """Exceptions of Modbus."""
 
@@ -59,11 +58,6 @@ class Slot:
             if time - self._started_at >= SLOT_START_TIME:
                 self.state = RUNNING
 
-    @property
-    def running(self) -> bool:
-        """Whether setpoints are in force."""
-        return self.state == RUNNING
-
 
 class FestoBoard(BoardProtocol):
     """The terminal's end of ``festo``."""
@@ -83,9 +77,8 @@ class FestoBoard(BoardProtocol):
 
     def boot(self, atmosphere: float) -> bytes:  # noqa: ARG002 - the wire has gauge pressures
         """All registers are zero, and slots have to be started."""
-        self.slots = [Slot() for _ in range(self.chamber_count // 2)]
-        count = 3 * len(self.slots) if self._motion_terminal else self.chamber_count
-        self._outputs = [0] * count
+        self.slots = [Slot() for _ in range(self.chamber_count // 2 * self._motion_terminal)]
+        self._outputs = [0] * (3 * len(self.slots) or self.chamber_count)
         return b""
 
     def decode(self, data: bytes) -> list[BoardCommand]:
@@ -97,64 +90,49 @@ class FestoBoard(BoardProtocol):
 
     def _interpret(self, place: int, frame: modbus.ModbusFrame) -> BoardCommand:
         function, data, number = frame.function, frame.data, frame.transaction
-        words: Sequence[int] = ()
-        problem = 0
-        if function not in (modbus.READ, WRITE_ONE, modbus.WRITE):
-            problem = ILLEGAL_FUNCTION
-        elif len(data) < modbus.BLOCK.size:
-            problem = ILLEGAL_ADDRESS
-        else:
-            first, count = modbus.BLOCK.unpack_from(data)
-            if function == modbus.READ:
-                if not self._registers(first, count, None):
-                    problem = ILLEGAL_ADDRESS
-            else:
-                words = modbus.to_words(data[2:4] if function == WRITE_ONE else data[5:])
-                count = 1 if function == WRITE_ONE else count
-                offset = first - FIRST_OUTPUT
-                if len(words) != count or not 0 <= offset <= len(self._outputs) - count:
-                    problem = ILLEGAL_ADDRESS
-        if problem:
-            self.rejected += 1
-            return BoardCommand("refused", place, sequence=number, text=f"{function} {problem}")
-        if function == modbus.READ:
-            return BoardCommand("read", place, text=f"{number} {first} {count}")
-        self._outputs[offset : offset + count] = words
-        if self._motion_terminal:
-            for slot, word in zip(self.slots, self._outputs[0::3], strict=True):
+        first, count = modbus.BLOCK.unpack(data[:4].ljust(4, b"\0"))
+        if function == modbus.READ and self._registers(first, count, None):
+            return BoardCommand("read", place, sequence=number, text=f"{first} {count}")
+        words, offset = modbus.to_words(data[5:]), first - FIRST_OUTPUT
+        inside = 0 <= offset <= len(self._outputs) - count
+        if function == modbus.WRITE and inside and len(words) == count:
+            self._outputs[offset : offset + count] = words
+            for slot, word in zip(self.slots, self._outputs[0::3], strict=False):
                 slot.tell(word)
-        return BoardCommand(
-            "setpoint",
-            place,
-            pressure=self._setpoints(),
-            valid_for=BUS_PATIENCE,
-            sequence=number,
-            text=f"{function} {data[:4].hex()}",
-        )
+            return BoardCommand(
+                "setpoint",
+                place,
+                pressure=self._setpoints(),
+                valid_for=BUS_PATIENCE,
+                sequence=number,
+                text=f"{first} {count}",
+            )
+        self.rejected += 1
+        known = function in (modbus.READ, modbus.WRITE)
+        problem = ILLEGAL_ADDRESS if known else ILLEGAL_FUNCTION
+        return BoardCommand("refused", place, sequence=number, text=f"{function} {problem}")
 
     def _setpoints(self) -> tuple[float, ...]:
-        values = self._outputs
-        if self._motion_terminal:
-            values = [value for place, value in enumerate(values) if place % 3]
+        values = [v for place, v in enumerate(self._outputs) if place % 3 or not self.slots]
         millibar = (modbus.signed(value) for value in values)
         # Regulators of an MPA terminal that are told less than nothing open wide.
-        wild = 0 if self._motion_terminal else LARGEST_SETPOINT
+        wild = 0 if self.slots else LARGEST_SETPOINT
         return tuple(PASCAL_PER_MILLIBAR * (value if value >= 0 else wild) for value in millibar)
 
     def target(self, pressure: Sequence[float], time: float) -> Sequence[float]:
         """Return setpoints of slots that run; the others are vented."""
-        if not self._motion_terminal:
+        if not self.slots:
             return pressure
         for slot in self.slots:
             slot.look(time)
         return [
-            value if self.slots[chamber // 2].running else 0.0
+            value if self.slots[chamber // 2].state == RUNNING else 0.0
             for chamber, value in enumerate(pressure)
         ]
 
     def _registers(self, first: int, count: int, reading: BoardReading | None) -> list[int]:
         """Return what registers hold, or nothing if there are none of these numbers."""
-        inputs = [0] * (INPUTS * (len(self.slots) if self._motion_terminal else self.chamber_count))
+        inputs = [0] * (INPUTS * (len(self.slots) or self.chamber_count))
         if reading is not None:
             inputs = self._inputs(reading)
         for begin, registers in ((FIRST_OUTPUT, self._outputs), (FIRST_INPUT, inputs)):
@@ -167,7 +145,7 @@ class FestoBoard(BoardProtocol):
             round((pressure - reading.atmosphere) / PASCAL_PER_MILLIBAR)
             for pressure in reading.chamber_pressure
         ]
-        if not self._motion_terminal:
+        if not self.slots:
             pairs = zip(measured, self._outputs, strict=True)
             return [word for value, told in pairs for word in (value, told, 0)]
         words: list[int] = []
@@ -178,15 +156,13 @@ class FestoBoard(BoardProtocol):
 
     def reply(self, command: BoardCommand, reading: BoardReading) -> bytes:
         """Registers to a read, first register and their number to a write, else an exception."""
-        if command.kind == "read":
-            number, first, count = map(int, command.text.split())
-            data = modbus.to_bytes(self._registers(first, count, reading))
-            return modbus.encode(number, modbus.READ, bytes([len(data)]) + data)
-        function, rest = command.text.split()
-        number = command.sequence or 0
+        number, (first, second) = command.sequence or 0, map(int, command.text.split())
         if command.kind == "refused":
-            return modbus.encode(number, int(function) | modbus.FAILED, bytes([int(rest)]))
-        return modbus.encode(number, int(function), bytes.fromhex(rest))
+            return modbus.encode(number, first | modbus.FAILED, bytes([second]))
+        if command.kind == "setpoint":
+            return modbus.encode(number, modbus.WRITE, modbus.BLOCK.pack(first, second))
+        data = modbus.to_bytes(self._registers(first, second, reading))
+        return modbus.encode(number, modbus.READ, bytes([len(data)]) + data)
 
     def expired(self) -> bytes:
         """The bus is lost: all outputs are zero, and slots have to be started again."""

@@ -120,6 +120,33 @@ class StreamCutter:
         self._overlong = False
 
 
+class FrameBuffer:
+    """Bytes that are cut into frames whose length is known, and how often some were skipped."""
+
+    def __init__(self) -> None:
+        self.rejected = 0
+        """Places at which bytes had to be skipped."""
+        self.position = 0
+        """Of the first byte that is kept, in the stream."""
+        self.kept = bytearray()
+
+    def take(self, count: int) -> bytes:
+        """Return the first bytes and forget them."""
+        taken = bytes(self.kept[:count])
+        del self.kept[:count]
+        self.position += len(taken)
+        return taken
+
+    def skip_to(self, begin: int) -> None:
+        """Skip bytes that are no frame, up to a place or, if it is not behind them, all of them."""
+        self.rejected += 1
+        self.take(begin if begin > 0 else len(self.kept))
+
+    def reset(self) -> None:
+        """Forget a half-received frame."""
+        self.take(len(self.kept))
+
+
 class LineSplitter:
     """Collects bytes and returns complete lines with the place of their first byte.
 

@@ -2,7 +2,8 @@
 
 Its proportional valves are a motion terminal VTEM, or VPPM regulators of an MPA terminal, as the
 parameter `terminal` says. Gauge pressures are numbers of 16 bits in mbar. Every tick writes one
-block of registers and reads one, in a single segment.
+block of registers and reads one when the write is answered: many servers lose the second of two
+requests that wait.
 
 ``vtem``: a slot has two valves, which are the pair of a segment. Slot s has three registers from
 40003 + 3s on for what it is told, and three from 45395 + 3s on for what it says::
@@ -93,7 +94,7 @@ class FestoHost(HostProtocol):
     def reset(self) -> None:
         """Forget a half-received frame and whether the valves run."""
         self._frames.reset()
-        self._sound = False
+        self._sound = self._written = False
         self._acknowledging = False
         self._started_at = -math.inf
         self._modes: set[int] = set()
@@ -122,15 +123,12 @@ class FestoHost(HostProtocol):
         atmosphere: float,  # noqa: ARG002 - the wire carries gauge pressures
         valid_for: float,  # noqa: ARG002 - the bus node has a patience of its own
     ) -> tuple[bytes, int | None]:
-        """Encode one write of all setpoints to 1 mbar, and one question for all pressures."""
+        """Encode one write of all setpoints to 1 mbar; its answer brings the question."""
         values = [
             min(max(round(gauge / PASCAL_PER_MILLIBAR), 0), LARGEST_SETPOINT)
             for gauge in chamber_gauge(differential)
         ]
-        written = self._write(values, self._acknowledging)
-        number = self._transaction
-        count = INPUTS * self._places
-        return written + read_request(self._next(), FIRST_INPUT, count), number
+        return self._write(values, self._acknowledging), self._transaction
 
     def vent(self, atmosphere: float) -> tuple[bytes, int | None]:
         """Regulate every chamber to the room's pressure."""
@@ -139,6 +137,13 @@ class FestoHost(HostProtocol):
     def emergency(self, atmosphere: float) -> list[bytes]:  # noqa: ARG002
         """Regulate to the room's pressure, also where slots are being acknowledged."""
         return [self._write([0] * self.chamber_count, False)]
+
+    def follow_up(self) -> bytes:
+        """Ask for all pressures once a write has been answered."""
+        if not self._written:
+            return b""
+        self._written = False
+        return read_request(self._next(), FIRST_INPUT, INPUTS * self._places)
 
     @property
     def _places(self) -> int:
@@ -178,8 +183,8 @@ class FestoHost(HostProtocol):
 
     def _interpret(self, frame: ModbusFrame) -> list[Event]:
         if frame.function == WRITE and len(frame.data) == BLOCK.size:
-            first, _ = BLOCK.unpack(frame.data)
-            return [Echo(frame.transaction)] if first == FIRST_OUTPUT else []
+            self._written = True
+            return [Echo(frame.transaction)]
         if frame.function in (READ | FAILED, WRITE | FAILED) and len(frame.data) == 1:
             asked = "read" if frame.function == READ | FAILED else "write"
             return [

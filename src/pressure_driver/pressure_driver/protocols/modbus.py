@@ -11,6 +11,8 @@ import struct
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
+from pressure_driver.protocols import FrameBuffer
+
 HEADER = struct.Struct(">HHHBB")
 BLOCK = struct.Struct(">HH")
 UNIT = 0xFF
@@ -64,43 +66,24 @@ def signed(word: int) -> int:
     return word - 0x10000 if word & 0x8000 else word
 
 
-class ModbusReader:
+class ModbusReader(FrameBuffer):
     """Cuts a byte stream into frames.
 
     TCP loses and changes nothing. What does not begin as a frame is skipped to where one may begin.
     """
 
-    def __init__(self) -> None:
-        self.rejected = 0
-        """Places at which bytes had to be skipped."""
-        self.position = 0
-        """Of the first byte that is kept, in the stream."""
-        self._buffer = bytearray()
-
     def feed(self, data: bytes) -> list[tuple[int, ModbusFrame]]:
         """Return (place of the first byte, frame) of those that became complete."""
         frames: list[tuple[int, ModbusFrame]] = []
-        self._buffer += data
-        while len(self._buffer) >= HEADER.size:
-            transaction, zero, length, _, function = HEADER.unpack_from(self._buffer)
+        self.kept += data
+        while len(self.kept) >= HEADER.size:
+            transaction, zero, length, _, function = HEADER.unpack_from(self.kept)
             if zero or not 2 < length <= LONGEST_LENGTH:
-                self.rejected += 1
                 # The two zero bytes stand behind the transaction.
-                begin = self._buffer.find(b"\0\0", 3) - 2
-                self._skip(begin if begin > 0 else len(self._buffer) - 3)
+                self.skip_to(self.kept.find(b"\0\0", 3) - 2)
                 continue
-            end = LENGTH_BEGINS + length
-            if len(self._buffer) < end:
+            if len(self.kept) < LENGTH_BEGINS + length:
                 break
-            body = bytes(self._buffer[HEADER.size : end])
-            frames.append((self.position, ModbusFrame(transaction, function, body)))
-            self._skip(end)
+            place, frame = self.position, self.take(LENGTH_BEGINS + length)
+            frames.append((place, ModbusFrame(transaction, function, frame[HEADER.size :])))
         return frames
-
-    def reset(self) -> None:
-        """Forget a half-received frame."""
-        self._skip(len(self._buffer))
-
-    def _skip(self, count: int) -> None:
-        del self._buffer[:count]
-        self.position += count

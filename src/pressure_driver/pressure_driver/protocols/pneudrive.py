@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from pressure_driver.following import chamber_gauge
-from pressure_driver.protocols import Echo, Event, HostProtocol, Telemetry
+from pressure_driver.protocols import Echo, Event, FrameBuffer, HostProtocol, Telemetry
 
 if TYPE_CHECKING:
     from pressure_driver.settings import Settings
@@ -47,39 +47,22 @@ def gauge_of(counts: int, sensor_range: float) -> float:
     return sensor_range * (counts / _STEPS - _ZERO) / _SPAN
 
 
-class TargetReader:
+class TargetReader(FrameBuffer):
     """Cuts a byte stream into frames: an address, and four numbers of counts that there can be."""
-
-    def __init__(self) -> None:
-        self.rejected = 0
-        """Places at which bytes had to be skipped."""
-        self.position = 0
-        """Of the first byte that is kept, in the stream."""
-        self._buffer = bytearray()
 
     def feed(self, data: bytes) -> list[tuple[int, int, tuple[int, ...]]]:
         """Return (place of the first byte, number of the board, counts) of complete frames."""
         found: list[tuple[int, int, tuple[int, ...]]] = []
-        self._buffer += data
-        while len(self._buffer) >= FRAME.size:
-            address, *counts = FRAME.unpack_from(self._buffer)
+        self.kept += data
+        while len(self.kept) >= FRAME.size:
+            address, *counts = FRAME.unpack_from(self.kept)
             board = 0xFFFF - address
             if board < MOST_BOARDS and max(counts) <= LARGEST_COUNT:
                 found.append((self.position, board, tuple(counts)))
-                self._skip(FRAME.size)
-                continue
-            self.rejected += 1
-            begin = self._buffer.find(_FIRST_BYTE, 1)
-            self._skip(begin if begin > 0 else len(self._buffer))
+                self.take(FRAME.size)
+            else:
+                self.skip_to(self.kept.find(_FIRST_BYTE, 1))
         return found
-
-    def reset(self) -> None:
-        """Forget a half-received frame."""
-        self._skip(len(self._buffer))
-
-    def _skip(self, count: int) -> None:
-        del self._buffer[:count]
-        self.position += count
 
 
 class PneudriveHost(HostProtocol):
