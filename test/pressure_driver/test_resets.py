@@ -61,7 +61,7 @@ def test_without_the_echo_of_the_units_no_pressure_is_commanded(simulate):
     assert any(b"UNITS;1" in data for data in sim.sent[before:])
 
 
-@pytest.mark.parametrize("protocol", ["ctrlp", "native", "festo"])
+@pytest.mark.parametrize("protocol", ["ctrlp", "native"])
 def test_echoes_that_stop_are_a_fault_within_two_seconds(simulate, protocol):
     sim = simulate(protocol)
     sim.track()
