@@ -31,6 +31,8 @@ DISCOVERY = 1.0
 """The orchestrator listens for another graph this long [s] before it starts nodes."""
 ARMING = 5.0
 """The driver may refuse to be armed this long [s] before the run is given up."""
+COMPARING = 20.0
+"""Clocks of other computers are compared with the driver's for this long [s] at the most."""
 ELSEWHERE = 30.0
 """Nodes that somebody else starts are waited for this long [s]."""
 PORT_VENTS = 3.0
@@ -180,14 +182,17 @@ class RunningGraph:
                 true.
 
         Raises:
-            GraphError: a clock is too far off for feedback.
+            GraphError: a clock is too far off for feedback, or not known where there are several.
         """
-        for name in (*self.processes, *self.elsewhere):
-            told = self.client.diagnostic_values(name)
-            offset = Offset(
-                float(told.get("clock_offset_s", "nan")),
-                float(told.get("clock_uncertainty_s", "inf")),
+        names = [name for name in (*self.processes, *self.elsewhere) if name != "pressure_driver"]
+        if self.elsewhere:
+            self.client.wait_for(
+                lambda: all(self._offset(name).uncertainty < LARGEST for name in names),
+                COMPARING,
+                "the clocks of all nodes",
             )
+        for name in names:
+            offset = self._offset(name)
             if offset.warning:
                 self.progress.say(f"  warning: {name}: {offset.warning}")
             if feedback and offset.too_far:
@@ -195,6 +200,12 @@ class RunningGraph:
                     f"not armed: feedback needs clocks that agree within {1e3 * LARGEST:.0f} ms, "
                     f"and {name} says: {offset.warning}. Without --feedback it is played"
                 )
+
+    def _offset(self, name: str) -> Offset:
+        """Return what a node has said of its clock."""
+        told = self.client.diagnostic_values(name)
+        keys = ("clock_offset_s", "nan"), ("clock_uncertainty_s", "inf")
+        return Offset(*(float(told.get(key, unknown)) for key, unknown in keys))
 
     def arm(self) -> None:
         """Arm the driver; what forbids it for a moment, as a late report of the board, may pass."""
