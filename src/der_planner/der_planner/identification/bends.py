@@ -55,10 +55,11 @@ NODES = 13
 change by 2 %."""
 ANGLE_ERROR = np.deg2rad(0.3)
 """Error of a predicted bend angle that is taken for granted before its residual is known [rad]."""
-FAST_ERROR = np.deg2rad(0.1)
-"""Its part that changes within `CORRELATION`: the noise of tags [rad]."""
 CORRELATION = 20.0
 """Rows over which an error of the model stays the same (1 s), and which part slow from fast."""
+LEAST_ERRORS = np.array([[ANGLE_ERROR], [np.deg2rad(0.1)]])
+"""Least slow and fast errors (2, 1) for which bend angles are weighed: of any model, and of tags
+[rad]."""
 BENDS_ON = np.deg2rad(2.0)
 """Rate of the bend that pressures ask for from which on friction does not turn round [rad/s]."""
 SOFTNESS = 3.0
@@ -328,7 +329,7 @@ class BendFit:
 
     def weigh(self, errors: Array) -> None:
         """Take errors (2, M) of bend angles for granted, slow and fast ones [rad]."""
-        self.errors = errors
+        self.errors = np.maximum(errors, 1e-3 * ANGLE_ERROR)
         unknowns = self.free.unknowns
         self.search = LeastSquares(unknowns, self._rows, SOFTNESS / np.sqrt(CORRELATION))
 
@@ -345,11 +346,11 @@ class BendFit:
             ValueError: the model cannot be followed at the start.
         """
         values = self.search.solve(start, ROUGH)
-        errors = self.errors_left(values)
+        errors = np.maximum(self.errors_left(values), LEAST_ERRORS)
         for _ in range(MOST_FITS):
             self.weigh(errors)
             values = self.search.solve(values)
-            errors = self.errors_left(values)
+            errors = np.maximum(self.errors_left(values), LEAST_ERRORS)
             if np.abs(np.log(errors / self.errors)).max() < SAME_WEIGHT:
                 break
         return values
@@ -401,8 +402,7 @@ class BendFit:
     def errors_left(self, values: Array) -> Array:
         """Return the slow and fast errors (2, M) [rad] that values (P,) leave of the bend angles.
 
-        They are as large as errors that stay the same for `CORRELATION` rows would have to be, at
-        least `ANGLE_ERROR` and `FAST_ERROR`, which any model leaves anyhow.
+        They are as large as errors that stay the same for `CORRELATION` rows would have to be.
         """
         remaining = self.remaining(values)
         usable = np.concatenate([log.usable for log in self._logs])
@@ -414,9 +414,8 @@ class BendFit:
         left = max(independent - len(self.free.unknowns.prior), 0.2 * independent)
         longer = max(length / CORRELATION, 1.0) * independent / left
         errors = np.empty((2, slow.shape[1]))
-        errors[0] = np.maximum(np.sqrt(longer * np.mean(slow**2)), ANGLE_ERROR)
-        swing = np.sqrt(np.sum(fast**2, axis=0) / max(len(fast), 1))
-        errors[1] = np.maximum(swing, FAST_ERROR)
+        errors[0] = np.sqrt(longer * np.mean(slow**2))
+        errors[1] = np.sqrt(np.sum(fast**2, axis=0) / max(len(fast), 1))
         return errors
 
 

@@ -20,6 +20,7 @@ from der_planner.arrays import Array
 from der_planner.identification.bends import (
     COLUMN,
     CORRELATION,
+    LEAST_ERRORS,
     MOST_FITS,
     NODES,
     BendFit,
@@ -257,7 +258,7 @@ def _solve(every: DayTerms, runs: Sequence[Prepared]) -> tuple[Array, Array]:
         if errors is not None:
             problem.weigh(errors)
         found = problem.search.solve(values[told])
-        errors = problem.errors_left(found)
+        errors = np.maximum(problem.errors_left(found), LEAST_ERRORS)
         problem.weigh(errors)
         of_found = np.sqrt(np.diag(problem.search.covariance(found)))
         better = of_found <= UNTOLD * known.spread[told]
