@@ -371,16 +371,16 @@ class BendFit:
         found = self._predicted(values)
         if found is None:
             return None
-        errors, slopes = [], []
+        errors, slopes, scale = [], [], np.sqrt(CORRELATION)
         for log, part, on in zip(self._logs, found, self._bends_on, strict=True):
             rows = log.usable
             left = _apart(part.angles[rows] - log.log.bend_angles[rows])
             by = _apart(part.angles_by[rows])
-            for error, change, usual, counts in zip(left, by, self.errors, (rows, on), strict=True):
-                weight = 1.0 / (usual * np.sqrt(CORRELATION))
-                chosen = counts[rows]
-                errors.append((weight * error[chosen]).ravel())
-                slopes.append((weight[:, None] * change[chosen]).reshape(-1, len(values)))
+            usual = np.repeat(self.errors[:, None], rows.sum(), axis=1)
+            usual[1, ~on[rows]] = self.errors[0]  # elsewhere fast errors count as slow ones do
+            for error, change, weight in zip(left, by, 1.0 / (usual * scale), strict=True):
+                errors.append((weight * error).ravel())
+                slopes.append((weight[..., None] * change).reshape(-1, len(values)))
         if self._more_rows is not None:
             more = self._more_rows(found[0])
             errors.append(more[0])
@@ -411,7 +411,7 @@ class BendFit:
         # Each fitted unknown uses up some of what is independent (degrees of freedom).
         length = correlation_length(slow)
         independent = slow.size / max(length, CORRELATION)
-        left = max(independent - len(self.free.unknowns.prior), 0.2 * independent)
+        left = max(independent - len(self.free.unknowns.prior), 0.5 * independent)
         longer = max(length / CORRELATION, 1.0) * independent / left
         errors = np.empty((2, slow.shape[1]))
         errors[0] = np.sqrt(longer * np.mean(slow**2))
