@@ -17,6 +17,7 @@ from der_msgs.msg import LimbState, MotionCommand, PressureState
 from der_planner.control.feedback import Feedback
 from der_planner.nodes.planner_feedback import Corrector
 from der_planner.nodes.planner_requests import (
+    Cancelled,
     MotionAction,
     PlannerOptions,
     Request,
@@ -27,21 +28,17 @@ from der_planner.nodes.planner_requests import (
 )
 from der_planner.nodes.planner_topics import DriverWatch, PlannerPublishers, Status
 from der_planner.planning import METHODS, Motion, Plan, plan
-from der_planner.planning.streaming import MARGIN, Schedule, Streamer, first_stamp
+from der_planner.planning.streaming import MARGIN, Ending, Schedule, Streamer, first_stamp
 from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.parameters import check_overrides
 from limb_interfaces.runner import run_node
-from limb_interfaces.stamps import NANOSECONDS
+from limb_interfaces.stamps import NANOSECONDS, nanoseconds
 
 _ARMING_PATIENCE = 0.5
 """The state of a driver that was armed just now is waited for this long [s]."""
 _FEEDBACK_MARGIN = 500_000_000
 """Making feedback ready for a plan takes less than this [ns]."""
-
-
-class Cancelled(Exception):  # noqa: N818 - not an error
-    """A newer command or `stop` made this plan useless."""
 
 
 class PlannerNode(Node):
@@ -83,6 +80,7 @@ class PlannerNode(Node):
         ending = self._driver.update(message, self._streamer.begun)
         if ending is not None:
             self._streamer.abandon(ending)
+            self._drop_request(ending, nanoseconds(message.header.stamp))
         self._corrector.add_pressures(message)
 
     def _on_limb(self, message: LimbState) -> None:
@@ -183,7 +181,24 @@ class PlannerNode(Node):
         asked = f"{request.motion.name}, {request.model} {request.method}"
         self.get_logger().info(f"plan {request.plan_id} accepted: {asked}")
         self._status = Status("planning", request.plan_id)
+        self._diagnostics.publish()
         self._work.put(request)
+
+    def _drop_request(self, ending: Ending, stamp: int) -> None:
+        """Refuse what was asked for before an instant [ns] at which the driver took nothing.
+
+        A request belongs to the arming in which it was made: it never plays after a later one.
+        """
+        with self._streamer.lock:
+            request = self._request
+            # Without auto_start it is only planned, and waits to be started.
+            if request is None or not self._options.auto_start or request.asked > stamp:
+                return
+            if request.cancelled.is_set():
+                return
+            request.cancelled.set()
+            self._request = None
+        self._refuse(request.plan_id, ending.reason)
 
     def _refuse(self, plan_id: str, reason: str) -> None:
         """Refuse a plan; what is being planned or played meanwhile stays the state of the node."""
@@ -234,6 +249,8 @@ class PlannerNode(Node):
         Raises:
             ValueError: it cannot be planned, or not be played; says why.
         """
+        if request.cancelled.is_set():
+            raise Cancelled
         self._status = Status("planning", request.plan_id)
         stamp, result = self._make(request)
         feedback = Feedback(result) if request.feedback else None
@@ -379,6 +396,8 @@ class PlannerNode(Node):
     def _show(self) -> None:
         """Ten times a second: end what is over, tell who asked, show the reference limb."""
         self._streamer.end_what_is_over()
+        if (ending := self._driver.obstacle()) is not None and ending.outcome == "lost":
+            self._drop_request(ending, self._now())
         self._action.tell(self._status.plan_id, self._status.state, self._progress)
         position = self._streamer.position
         if position is not None:

@@ -139,6 +139,7 @@ class Request:
 
     `limb` is mounted as asked for and carries the payload; a plan that was learned is played as it
     is.
+    `asked` is when it came [ns of ROS time]: no arming after that makes it play.
     """
 
     plan_id: str
@@ -147,9 +148,14 @@ class Request:
     model: str
     method: str
     start: int
+    asked: int = 0
     learned: Plan | None = None
     feedback: bool = False
     cancelled: threading.Event = field(default_factory=threading.Event)
+
+
+class Cancelled(Exception):  # noqa: N818 - not an error
+    """A newer command, `stop` or the driver made this plan useless."""
 
 
 def new_plan_id() -> str:
@@ -250,7 +256,8 @@ def _request(
             f"feedback corrects plans of the rod, not of the model {model}: ask for der"
         )
     feedback = message.feedback or (options.feedback and model == "der")
-    return Request(message.plan_id, limb, motion, model, method, start, learned, feedback)
+    plan_id = message.plan_id
+    return Request(plan_id, limb, motion, model, method, start, now, learned, feedback)
 
 
 # The action --------------------------------------------------------------------------------------
