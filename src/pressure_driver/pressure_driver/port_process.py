@@ -3,7 +3,7 @@
 The node starts the process, talks with it, and vents if it dies.
 
 Messages are JSON lists that begin with a word. From the node: ``setpoint``, ``arm``, ``vent``,
-``alive``, ``end``. To the node:
+``lease``, ``alive``, ``end``. To the node:
 
 =========== ==================================================================================
 ``port``    the port has been opened: vent command (hexadecimal), with the port's descriptor
