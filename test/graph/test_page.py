@@ -35,11 +35,11 @@ class WatchedPage(Bench):
     """A board, a driver and the page; browsers that look at it."""
 
     def __init__(self, graph: Any, folder: Path) -> None:
-        super().__init__(graph, bounds={})
+        super().__init__(graph, bounds={}, on_lost_operator="vent")
         self.client.watch([])
         self.folder = folder
         self.browsers: list[Any] = []
-        self.page, self.url = start_page(graph, on_lost_operator="vent")
+        self.page, self.url = start_page(graph)
         self.client.wait_ready(["page"])
 
     def open(self) -> Any:
@@ -89,7 +89,7 @@ def test_one_arms_and_everybody_vents(rig: WatchedPage) -> None:
     assert not enabled(first, "arm")
     press(rig, first, "take")
     arm(rig, first)
-    first.refresh()  # it is the same tab of the same browser: on_lost_operator=vent does nothing
+    first.refresh()  # the same tab of the same browser: nobody is lost
     rig.wait(lambda: first.find_elements("id", "arm") and enabled(first, "arm"), "the operator")
     rig.wait(lambda: not enabled(second, "take"), "the second window to see the first one command")
     assert not enabled(second, "arm")
@@ -138,12 +138,15 @@ def test_what_died_is_not_shown_as_live(rig: WatchedPage) -> None:
     wait(f"{row('page')}.includes('could not be used')", "the page to say so")
     rig.driver.signal(signal.SIGSTOP)
     wait(old, "the driver's silence")
-    assert "ago" in browser.find_element("id", "faults").text
+    assert "ago" in browser.find_element("id", "meaning").text
+    assert browser.find_element("id", "mode").text == "NOT KNOWN"
     rig.driver.signal(signal.SIGCONT)
     wait(f"!{old}", "the driver's state again")
     rig.driver.signal(signal.SIGKILL)
     wait(old, "the driver's death")
-    wait(f"{row('pressure_driver')}.includes('its process has ended')", "its row to say why")
+    wait(notice("The driver is dead: its process has ended"), "the alarm to say why")
+    wait(notice("port:="), "the command that starts it again")
+    assert "limb was without pressure, in mode disarmed" in browser.find_element("id", "alarm").text
     browser.find_element("id", "vent").click()
     wait(notice("VENT FAILED"), "the failure to show")
 

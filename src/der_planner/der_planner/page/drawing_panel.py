@@ -161,13 +161,13 @@ class DrawingPanel:
         }
         self._run("show", preview)
 
-    def _on_play(self) -> None:
+    async def _on_play(self) -> None:
         if not self._may_command():
             return
         if self._playable is None:
             ui.notify("draw a line first, and wait for its preview", type="warning")
             return
-        self._show("play drawing", self._parts.commands.play(self._playable))
+        self._show("play drawing", await self._parts.commands.play(self._playable))
 
     async def _on_load(self) -> None:
         if not self._kept.value:

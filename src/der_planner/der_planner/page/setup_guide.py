@@ -186,7 +186,7 @@ def _camera(live: bool, calibrated: bool) -> Step:
 
 def _planned_limb(nodes: Sequence[dict[str, Any]]) -> str:
     """Return the name of the limb that the planner plans for; empty if it is not heard."""
-    planner = next((node for node in nodes if node["name"] == "planner"), None)
+    planner = next((node for node in nodes if node["own"] == "planner"), None)
     if planner is None or planner["state"] in ("late", "dead"):
         return ""
     return str(planner["values"].get("limb", ""))
@@ -198,20 +198,25 @@ def show_answer(client: Client, answer: Answer) -> None:
         ui.notify(answer.message, type="positive" if answer.success else "negative", timeout=6000)
 
 
+def add_frame(client: Client) -> None:
+    """Add what every window has beside its panels, plain HTML: alarm, state, vent, live data."""
+    name = f"<script>window.limbWindow = '{client.id}';</script>"
+    ui.add_body_html(name + (STATIC / "frame.html").read_text())
+
+
 def add_setup_guide(parts: Parts) -> None:
     """Add the page at `ADDRESS`."""
 
     @ui.page(ADDRESS, title="Limb: set-up", favicon="🦑")
     def show_guide(client: Client) -> None:
         ui.add_head_html('<link rel="stylesheet" href="/static/page.css">')
-        ui.add_body_html((STATIC / "frame.html").read_text())
+        add_frame(client)
         guide = SetupGuide(parts.previewer.limb.segment_count, Limb.default().name)
         with ui.element("main").props('id="setup"'):
             ui.html("<h2>First power-up</h2>", sanitize=False)
             ui.label("From top to bottom; every line is checked twice a second.")
             lines = ui.column().classes("fill")
             _add_buttons(client, parts)
-        client.on_delete(lambda: parts.desk.disconnected(client.id))
 
         def judge() -> None:
             calibrated, problem = parts.overlay.camera_problem()

@@ -16,13 +16,13 @@ from der_planner.page.commands import Answer, answer_of
 from der_planner.page.drawing_panel import DrawingPanel
 from der_planner.page.server import STATIC, Parts
 from der_planner.page.setup_guide import ADDRESS as SETUP_ADDRESS
-from der_planner.page.setup_guide import add_setup_guide, show_answer
+from der_planner.page.setup_guide import add_frame, add_setup_guide, show_answer
 from der_planner.page.situation import CENTIMETRES, GRAMS
 from der_planner.planning import METHODS
 from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD, NAMES
 
-RECONNECT = 3.0
-"""A browser's connection may be away for this time [s] before it counts as lost."""
+RECONNECT = 15.0
+"""A browser's connection may be away for this time [s] before its window is loaded anew."""
 DESK_INTERVAL = 0.3
 """A window looks who commands at this interval [s]."""
 LEARNED_INTERVAL = 2.0
@@ -51,7 +51,7 @@ class OperatorWindow:
         self._parts = parts
         self._buttons: list[ui.button] = []
         ui.add_head_html('<link rel="stylesheet" href="/static/page.css">')
-        ui.add_body_html((STATIC / "frame.html").read_text())
+        add_frame(client)
         with ui.element("main").props('id="panels"'):
             with self._panel("view", "Camera", "camera"):
                 self._drawing = DrawingPanel(
@@ -61,8 +61,6 @@ class OperatorWindow:
                 self._add_controls()
             self._panel("numbers", "Last 30 s", "driver")
             self._panel("nodes", "Nodes")
-        client.on_connect(lambda: parts.desk.connected(client.id, str(client.tab_id)))
-        client.on_delete(lambda: parts.desk.disconnected(client.id))
         ui.timer(DESK_INTERVAL, self._show_desk)
         ui.timer(LEARNED_INTERVAL, lambda: self._form.offer(parts.commands.learned_plans()))
 
@@ -146,7 +144,7 @@ class OperatorWindow:
         except FormError as error:
             ui.notify(str(error), type="negative")
             return
-        self._show("play", self._parts.commands.play(command))
+        self._show("play", await self._parts.commands.play(command))
 
     def _show(self, what: str, answer: Answer) -> None:
         show_answer(self._client, Answer(answer.success, f"{what}: {answer.message}"))

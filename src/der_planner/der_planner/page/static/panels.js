@@ -20,7 +20,7 @@
       body.replaceChildren(...nodes.map((node) => {
         const row = document.createElement("tr");
         for (let cell = 0; cell < 5; cell += 1) row.insertCell();
-        row.dataset.node = node.name;
+        row.dataset.node = node.own || node.name;
         return row;
       }));
     }
@@ -39,7 +39,7 @@
     const plan = find("plan-line");
     if (plan) { plan.hidden = !data.plan; put(plan, `Newest plan: ${data.plan}`); }
     for (const [id, title, describe] of [["planner", "Planner", planning], ["recorder", "Recorder", recording]]) {
-      const line = find(`${id}-line`), node = data.nodes.find((one) => one.name === id);
+      const line = find(`${id}-line`), node = data.nodes.find((one) => one.own === id);
       if (!line) continue;
       const gone = !node || ["late", "dead"].includes(node.state);
       const away = node ? `${node.state}, last heard ${node.age.toFixed(1)} s ago` : "not heard";
