@@ -6,7 +6,7 @@ import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from urllib.parse import urljoin
+from urllib.parse import urljoin, urlsplit
 
 import pytest
 from browsers import (
@@ -16,6 +16,7 @@ from browsers import (
     start_page,
     webdriver,
 )
+from cable import Cable
 from driver_bench import Bench
 
 from der_msgs.msg import PressurePlan, PressureState
@@ -34,8 +35,8 @@ return true;
 class WatchedPage(Bench):
     """A board, a driver and the page; browsers that look at it."""
 
-    def __init__(self, graph: Any, folder: Path) -> None:
-        super().__init__(graph, bounds={}, on_lost_operator="vent")
+    def __init__(self, graph: Any, folder: Path, **driver: object) -> None:
+        super().__init__(graph, bounds={}, on_lost_operator="vent", **driver)
         self.client.watch([])
         self.folder = folder
         self.browsers: list[Any] = []
@@ -116,6 +117,32 @@ def test_one_arms_and_everybody_vents(rig: WatchedPage) -> None:
     press(rig, second, "fill-1-right")
     rig.wait(lambda: min(rig.states[-1].measured_differential) < -3000.0, "the chamber to fill")
     assert abs(rig.states[-1].measured_differential[0]) < 1000.0
+
+
+def test_a_limb_whose_operator_is_lost_is_vented(graph: Any, tmp_path: Path) -> None:
+    """The cable between browser and page is pulled, the page hangs, the page is killed."""
+    rig = WatchedPage(graph, tmp_path, hold_time=60.0)
+    cable = Cable(urlsplit(rig.url).port)
+    rig.url = rig.url.replace(f":{urlsplit(rig.url).port}", f":{cable.port}")
+    try:
+        browser = rig.open()
+        press(rig, browser, "take")
+        for lose, return_ in (
+            (cable.pull, cable.plug),
+            (lambda: rig.page.signal(signal.SIGSTOP), lambda: rig.page.signal(signal.SIGCONT)),
+            (lambda: rig.page.signal(signal.SIGKILL), lambda: None),
+        ):
+            rig.wait(lambda: enabled(browser, "arm"), "the desk, which is kept")
+            arm(rig, browser)
+            rig.play(10, lambda k: (min(900.0 * (k + 1), 6000.0), 0.0))
+            rig.wait_mode(PressureState.HOLDING)  # for a minute, while somebody watches
+            lose()
+            rig.wait_mode(PressureState.DISARMED)
+            return_()
+        assert rig.driver.log.read_text().count("is lost") >= 3
+    finally:
+        cable.close()
+        rig.close()
 
 
 def test_what_died_is_not_shown_as_live(rig: WatchedPage) -> None:
