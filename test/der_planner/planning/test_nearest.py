@@ -8,6 +8,7 @@ import pytest
 from der_planner.limb import Limb
 from der_planner.model import ArcModel, RodModel
 from der_planner.planning import Motion, Workspace, plan
+from der_planner.planning.configuration import configure
 
 LIMB = Limb.default()
 ARCS = ArcModel(LIMB)
@@ -100,3 +101,31 @@ def test_the_plan_says_how_far_it_is_from_the_drawing(model):
     assert "nearest path leaves" in planned.warnings[0]
     assert np.abs(planned.differential_pressure).max() <= LIMB.pneumatics.pressure_limit
     assert planned.predicted_error < 2e-3
+
+
+def scrawls(count, seed=11):
+    """Yield lines (P, 2) [m] as a hand scrawls them, mostly where the tip does not reach."""
+    random = np.random.default_rng(seed)
+    share = np.linspace(0.0, 1.0, 80)
+    for _ in range(count):
+        middle = CENTRE + random.normal(0.0, 0.06, 2)
+        waves = random.normal(0.0, 0.03, (4, 2)) / np.arange(1, 5)[:, None]
+        phases = random.uniform(0.0, 2 * np.pi, (4, 2))
+        angle = 2 * np.pi * np.arange(1, 5)[:, None, None] * share[None, :, None]
+        yield middle + (waves[:, None] * np.sin(angle + phases[:, None])).sum(axis=0)
+
+
+@pytest.mark.slow
+def test_no_scrawl_is_refused():
+    """The nearest path that is shown is one that the rod can be planned along."""
+    body, far = RodModel(LIMB), []
+    for tip in scrawls(200):
+        reference = Motion.from_tip_path(None, tip, nearest=True).reference(SPACE)
+        configuration = configure(body, reference)
+        angles = configuration.bend_at(reference.time)
+        pressure = np.abs(ARCS.static_pressure(angles)).max()
+        assert pressure <= 1.001 * LIMB.pneumatics.pressure_limit
+        left = np.linalg.norm(body.kinematics.tip(angles) - reference.tip, axis=1).max()
+        far.append(left)
+        assert reference.deviation.largest > 1e-4
+    assert max(far) < 4e-3, "the rod stays where it is shown"

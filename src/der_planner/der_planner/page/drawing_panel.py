@@ -158,6 +158,7 @@ class DrawingPanel:
             "path": pixels_of(found.path),
             "poses": [pixels_of(pose) for pose in thinned],
             "duration": found.duration,
+            "place": pixels_of(np.array(found.place).reshape(-1, 2)) if found.place else [],
         }
         self._run("show", preview)
 

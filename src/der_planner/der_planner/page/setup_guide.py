@@ -16,6 +16,8 @@ from der_planner.page.server import STATIC, Parts
 from der_planner.page.situation import PASCAL_PER_KILOPASCAL
 
 ADDRESS = "/setup"
+RECONNECT = 60.0
+"""What a window's panels hold is kept for this time [s] while its connection is away."""
 INTERVAL = 0.5
 """The steps are judged at this interval [s]."""
 DRIVEN = 3.0
@@ -207,7 +209,7 @@ def add_frame(client: Client) -> None:
 def add_setup_guide(parts: Parts) -> None:
     """Add the page at `ADDRESS`."""
 
-    @ui.page(ADDRESS, title="Limb: set-up", favicon="🦑")
+    @ui.page(ADDRESS, title="Limb: set-up", favicon="🦑", reconnect_timeout=RECONNECT)
     def show_guide(client: Client) -> None:
         ui.add_head_html('<link rel="stylesheet" href="/static/page.css">')
         add_frame(client)

@@ -16,13 +16,13 @@ from der_planner.page.commands import Answer, answer_of
 from der_planner.page.drawing_panel import DrawingPanel
 from der_planner.page.server import STATIC, Parts
 from der_planner.page.setup_guide import ADDRESS as SETUP_ADDRESS
-from der_planner.page.setup_guide import add_frame, add_setup_guide, show_answer
+from der_planner.page.setup_guide import RECONNECT, add_frame, add_setup_guide, show_answer
 from der_planner.page.situation import CENTIMETRES, GRAMS
 from der_planner.planning import METHODS
 from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD, NAMES
 
-RECONNECT = 15.0
-"""A browser's connection may be away for this time [s] before its window is loaded anew."""
+PING = 3.0
+"""The framework notices a connection that is gone within about this time [s]."""
 DESK_INTERVAL = 0.3
 """A window looks who commands at this interval [s]."""
 LEARNED_INTERVAL = 2.0
@@ -40,7 +40,7 @@ def lay_out(app: FastAPI, parts: Parts) -> None:
         OperatorWindow(client, parts)
 
     add_setup_guide(parts)
-    ui.run_with(app, show_welcome_message=False, reconnect_timeout=RECONNECT, tailwind=False)
+    ui.run_with(app, show_welcome_message=False, reconnect_timeout=PING, tailwind=False)
 
 
 class OperatorWindow:

@@ -89,6 +89,23 @@ const page = {
     heard -= slept;
   }
 
+  // The panels' framework would load the window anew whenever it cannot connect for a while, and state and
+  // vent would be away for as long. It connects again by itself; where the server does not know the panels
+  // any more, they are loaded anew once live data have come for a while.
+  const AGAIN = 3000; // ms
+  let unknown = false, alive = 0;
+  const hold = setInterval(() => {
+    if (!window.socket) return;
+    clearInterval(hold);
+    window.socket.off("connect_error");
+    window.socket.on("connect_error", (error) => { unknown = error.message.startsWith("Implicit"); });
+    window.socket.on("connect", () => { unknown = false; });
+  }, 50);
+  setInterval(() => {
+    alive = seconds() - page.at > LOST ? 0 : alive + 200;
+    if (unknown && alive >= AGAIN) location.reload();
+  }, 200);
+
   setInterval(() => {
     // A connection that says nothing is given up, since a dead server's may stay open for minutes.
     if (socket && seconds() - Math.max(heard, opened) > 3) { socket.close(); socket = null; }
