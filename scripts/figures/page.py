@@ -100,7 +100,7 @@ def main() -> int:
         press("take")
         press("arm")
         draw_ring(photographer)
-        press("play-drawing")
+        press("play")
         graph.wait_mode(PressureState.TRACKING)
         graph.client.spin(6.0)
         photographer.take("page_desktop.png")

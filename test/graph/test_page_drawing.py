@@ -102,7 +102,7 @@ def test_a_drawing_is_previewed_played_and_kept(
     browser.execute_script(SELECT, "Payload [g]")
     browser.switch_to.active_element.send_keys("20")
     wait("return page.drawing.load.startsWith('payload=0.02&')", "the load to be reckoned with")
-    press("play-drawing")  # once it is planned anew
+    press("play")  # once it is planned anew
     client.wait_for(lambda: topics.PLAN in client.newest, 60.0, "the plan")
     assert client.newest[topics.PLAN].payload == pytest.approx(0.02)
     bench.wait_mode(PressureState.TRACKING)
