@@ -23,6 +23,7 @@ from der_planner.nodes.planner_requests import (
     Request,
     from_command,
     from_path,
+    identified,
     new_plan_id,
     read_parameters,
 )
@@ -381,6 +382,7 @@ class PlannerNode(Node):
             "last_refusal": self._last_refusal,
             "progress": f"{self._progress:.3f}",
             "limb": self._options.limb.name,
+            "limb_identified": identified(self._options.limb),
             "driver": self._driver.mode or "not heard",
             "feedback": self._corrector.reason,
             "learned_plans": self._options.learned_plans,

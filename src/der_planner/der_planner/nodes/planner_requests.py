@@ -158,6 +158,12 @@ class Cancelled(Exception):  # noqa: N818 - not an error
     """A newer command, `stop` or the driver made this plan useless."""
 
 
+def identified(limb: Limb) -> str:
+    """Return when and on what a limb was identified; empty if its file tells of no such thing."""
+    told = limb.provenance
+    return f"{told['date']}, {told.get('source', 'no source given')}" if "date" in told else ""
+
+
 def new_plan_id() -> str:
     """Return a name for a plan that was given none."""
     return uuid.uuid4().hex[:8]
