@@ -226,10 +226,12 @@ def add_setup_guide(parts: Parts) -> None:
         def judge() -> None:
             for (line, label), step in zip(shown, read(), strict=True):
                 label.set_text(step.seen if step.done else f"{step.seen}. {step.advice}")
-                if bool(line.props.get("done")) != step.done:
-                    line.props(f":done={str(step.done).lower()}")
+                title = f"{'✔' if step.done else '○'} {step.title}"
+                if line.props["title"] != title:
+                    line.props["title"] = title
 
-        with main, ui.stepper().props("vertical header-nav").classes("fill") as stepper:
+        first = next((step.title for step in read() if not step.done), None)
+        with main, ui.stepper(value=first).props("vertical header-nav").classes("fill") as stepper:
             for step in read():
                 with ui.step(step.title) as line:
                     shown.append((line, ui.label()))
