@@ -15,6 +15,7 @@ from waiting import Clock, wait_for
 
 from der_msgs.msg import PressureState
 from der_planner.page.situation import DEAD, FRESH, Situation
+from limb_interfaces.diagnostics import ENDED_IN_ORDER
 
 
 @pytest.fixture
@@ -124,3 +125,16 @@ def test_a_node_of_another_limb_does_not_pass_for_this_ones(
     situation.put_driver(state(PressureState.ARMED))
     (alarm,) = alarms(situation)
     assert "The planner is dead: nothing is heard of it" in alarm["text"]
+
+
+def test_nodes_that_were_ended_in_order_alarm_nobody(situation: Situation, clock: Clock) -> None:
+    situation.put_driver(state(PressureState.DISARMED))
+    for name in ("pressure_driver", "planner"):
+        last = status(f"/limb/{name}")
+        last.message = ENDED_IN_ORDER
+        situation.put_status(last)
+    clock.now += 100.0
+    (alarm,) = alarms(situation)
+    assert alarm["level"] == "notice"
+    assert "ended in order, and has vented the limb" in alarm["text"]
+    assert [node["state"] for node in situation.snapshot()["nodes"]] == ["ended", "ended"]

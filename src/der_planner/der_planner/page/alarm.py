@@ -21,7 +21,7 @@ NODES = {
 }
 """Nodes of a limb, worst first, with what their end means."""
 DRIVER = "pressure_driver"
-ORDER = ("dead", "error", "late", "warning", "stale", "ok")
+ORDER = ("dead", "error", "late", "warning", "stale", "ok", "ended")
 """States of nodes, worst first."""
 
 
@@ -82,6 +82,10 @@ def _of_driver(snapshot: dict[str, Any], node: dict[str, Any] | None) -> Iterato
         if node is None:
             yield Alarm("notice", "No driver is heard", None, "start it: " + start_of(DRIVER, None))
             return
+    elif not source["fresh"] and node is not None and node["state"] == "ended":
+        told = "The driver has been ended in order, and has vented the limb"
+        yield Alarm("notice", told, None, "start it again: " + start_of(DRIVER, node))
+        return
     elif not source["fresh"]:
         yield Alarm("danger", *_silence(source, driver, node))
         return

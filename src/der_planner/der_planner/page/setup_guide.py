@@ -188,7 +188,7 @@ def _camera(live: bool, calibrated: bool) -> Step:
 def _planned_limb(nodes: Sequence[dict[str, Any]]) -> tuple[str, str]:
     """Return the limb that the planner plans for, and when and on what it was identified."""
     planner = next((node for node in nodes if node["own"] == "planner"), None)
-    if planner is None or planner["state"] in ("late", "dead"):
+    if planner is None or planner["state"] in ("late", "dead", "ended"):
         return "", ""
     values = planner["values"]
     return str(values.get("limb", "")), str(values.get("limb_identified", ""))

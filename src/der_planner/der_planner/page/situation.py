@@ -19,6 +19,7 @@ from rcl_interfaces.msg import Log
 from der_msgs.msg import LimbEstimate, LimbState, PressurePlan, PressureState
 from der_planner.limb import mounting_of
 from der_planner.page.alarm import NODES, alarms, describe_limb, worst_first
+from limb_interfaces.diagnostics import ENDED_IN_ORDER
 from limb_interfaces.stamps import NANOSECONDS, nanoseconds
 
 PASCAL_PER_KILOPASCAL = 1000.0
@@ -277,7 +278,9 @@ def _kilopascal(values: Sequence[float]) -> list[float | None]:
 def _with_age(node: dict[str, Any], age: float, trouble: str) -> dict[str, Any]:
     """Return what is shown of a node that spoke some seconds ago."""
     shown = {**node, "age": round(age, 1), "trouble": trouble or "nothing is heard of it"}
-    if trouble or age > LATE:
+    if node["message"] == ENDED_IN_ORDER:
+        shown["state"] = "ended"
+    elif trouble or age > LATE:
         shown["state"] = "dead" if trouble or age > DEAD else "late"
         shown["message"] = trouble or node["message"]
     return shown

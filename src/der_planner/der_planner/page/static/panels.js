@@ -41,7 +41,7 @@
     for (const [id, title, describe] of [["planner", "Planner", planning], ["recorder", "Recorder", recording]]) {
       const line = find(`${id}-line`), node = data.nodes.find((one) => one.own === id);
       if (!line) continue;
-      const gone = !node || ["late", "dead"].includes(node.state);
+      const gone = !node || ["late", "dead", "ended"].includes(node.state);
       const away = node ? `${node.state}, last heard ${node.age.toFixed(1)} s ago` : "not heard";
       put(line, `${title}: ${gone ? away : describe(node.message, node.values)}`);
       line.className = gone || lost ? "gone" : node.state;
