@@ -203,7 +203,8 @@ def test_a_plan_belongs_to_the_arming_in_which_it_was_asked_for(planner):
     client.node.create_timer(0.05, tick)
     hears("DISARMED")
     node.command(plan_id="early", period=60.0)
-    client.wait_for(lambda: "early: the driver is DISARMED" in node.state()["last_refusal"], 30, "")
+    refused = "early: the driver is DISARMED"
+    client.wait_for(lambda: refused in node.state()["last_refusal"], 30.0, "the refusal")
     action = ActionClient(client.node, PlayMotion, "planner/play_motion")
     client.wait_for(action.server_is_ready, 30.0, "the action")
     command = MotionCommand(motion="asynchronous", amplitude=0.3, period=60.0, cycles=1)
@@ -219,7 +220,8 @@ def test_a_plan_belongs_to_the_arming_in_which_it_was_asked_for(planner):
     node.command(plan_id="halted", period=600.0)  # it takes longer to plan than to disarm
     client.wait_for(lambda: node.state()["plan_id"] == "halted", 30.0, "it to be planned")
     mode = PressureState.FAULT
-    client.wait_for(lambda: "halted: the driver is in FAULT" in node.state()["last_refusal"], 30, "")
+    refused = "halted: the driver is in FAULT"
+    client.wait_for(lambda: refused in node.state()["last_refusal"], 30.0, "it to be refused")
     mode = PressureState.ARMED
     hears("ARMED")
     node.command(plan_id="later", period=2.0)

@@ -42,7 +42,7 @@ class Alarm(NamedTuple):
 
 
 def worst_first(nodes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return nodes in the order in which they are shown: this limb's, the worst first, then others."""
+    """Return nodes in the order in which they are shown: this limb's worst first, then others."""
     ranks = list(NODES)
 
     def rank(node: dict[str, Any]) -> tuple[int, int, str]:

@@ -142,7 +142,8 @@ class Commands:
         end, taken = time.monotonic() + PATIENCE, False
         while time.monotonic() < end:
             await asyncio.sleep(LOOK)
-            plan_id, _, refusal = self._situation.value_of("planner", "last_refusal").partition(": ")
+            refused = self._situation.value_of("planner", "last_refusal")
+            plan_id, _, refusal = refused.partition(": ")
             if plan_id == f"plan {command.plan_id}":
                 return Answer(False, f"refused: {refusal}")
             if not taken and self._situation.value_of("planner", "plan_id") == command.plan_id:
