@@ -172,7 +172,7 @@ def test_what_died_is_not_shown_as_live(rig: WatchedPage) -> None:
     rig.driver.signal(signal.SIGKILL)
     wait(old, "the driver's death")
     wait(notice("The driver is dead: its process has ended"), "the alarm to say why")
-    wait(notice("port:="), "the command that starts it again")
+    wait(notice("--params-file"), "the command that starts it again")
     assert "limb was without pressure, in mode disarmed" in browser.find_element("id", "alarm").text
     browser.find_element("id", "vent").click()
     wait(notice("VENT FAILED"), "the failure to show")

@@ -138,3 +138,18 @@ def test_nodes_that_were_ended_in_order_alarm_nobody(situation: Situation, clock
     assert alarm["level"] == "notice"
     assert "ended in order, and has vented the limb" in alarm["text"]
     assert [node["state"] for node in situation.snapshot()["nodes"]] == ["ended", "ended"]
+
+
+def test_an_experiment_between_two_runs_alarms_nobody(situation: Situation, clock: Clock) -> None:
+    situation.put_status(status("/limb/experiment"))
+    assert alarms(situation) == []  # it calibrates: no driver has run yet
+    situation.put_driver(state(PressureState.DISARMED))
+    last = status("/limb/pressure_driver")
+    last.message = ENDED_IN_ORDER
+    situation.put_status(last)
+    clock.now += 1.0
+    assert alarms(situation) == []
+    clock.now += DEAD
+    (first, second) = alarms(situation)
+    assert "The experiment is dead" in first["text"]
+    assert "ended in order" in second["text"]

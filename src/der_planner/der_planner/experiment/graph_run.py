@@ -14,7 +14,6 @@ from der_msgs.msg import PressureState
 from der_planner.experiment.client import GraphClient
 from der_planner.experiment.console import Progress
 from der_planner.experiment.processes import (
-    PAGE_TOKEN,
     STOP_ORDER,
     GraphError,
     GraphSetup,
@@ -121,9 +120,6 @@ class RunningGraph:
                 self.client.wait_for(lambda: os.path.exists(port), 60.0, "the port of the board")
         self.client.wait_ready(self.processes)
         self.progress.say(f"  ready after {time.monotonic() - begin:.1f} s")
-        if "page" in self.processes:
-            address = self.client.diagnostic_values("page").get("url", "unknown")
-            self.progress.say(f"  the operator's page is at {address}?token={PAGE_TOKEN}")
 
     def arm(self) -> None:
         """Arm the driver; what forbids it for a moment, as a late report of the board, may pass."""

@@ -15,6 +15,7 @@ NODES = {
     "apriltag_tracker": "the limb is not tracked",
     "recorder": "nothing is recorded",
     "page": "",
+    "experiment": "the experiment has stopped",
     "board_emulator": "the twin's valve board stands still",
     "limb_twin": "the twin stands still",
     "synthetic_camera": "the twin's camera stands still",
@@ -72,8 +73,17 @@ def alarms(snapshot: dict[str, Any]) -> list[Alarm]:
         snapshot: `Situation.snapshot`, with nodes and sources.
     """
     own = {node["own"]: node for node in snapshot["nodes"] if node["own"]}
-    found = [*_of_driver(snapshot, own.get(DRIVER)), *_of_nodes(own)]
+    found = list(_of_nodes(own))
+    if not _between_runs(own):
+        found[:0] = _of_driver(snapshot, own.get(DRIVER))
     return sorted(found, key=lambda alarm: alarm.level != "danger")
+
+
+def _between_runs(own: dict[str, dict[str, Any]]) -> bool:
+    """Tell whether an experiment will start the driver, which has not run or was ended in order."""
+    driver, experiment = own.get(DRIVER), own.get("experiment")
+    waits = driver is None or driver["state"] == "ended"
+    return waits and experiment is not None and experiment["state"] == "ok"
 
 
 def _of_driver(snapshot: dict[str, Any], node: dict[str, Any] | None) -> Iterator[Alarm]:

@@ -68,6 +68,7 @@ class PageNode(Node):
         read: Callable[..., Any] = functools.partial(declare, self)
         binding = self._read_binding(read)
         previewer = self._read_previewer(read)
+        report = read("report", "", "folder of an experiment's report: shown as soon as it is there")
         drawings = read("drawings", "~/limb_drawings", "folder of kept drawings")
         share = Path(get_package_share_directory("apriltag_tracker")) / "config"
         tag_map = read("tag_map", str(share / "tags.yaml"), "YAML file: where the tags are")
@@ -94,6 +95,7 @@ class PageNode(Node):
             commands=Commands(self, self._situation, previewer.limb.segment_count),
             previewer=previewer,
             drawings=DrawingFolder(Path(drawings).expanduser()),
+            report=Path(report).absolute() if report else None,
         )
         self._picture, self._overlay = self._parts.picture, self._parts.overlay
         self._server = PageServer(binding, self._parts, lay_out)

@@ -36,6 +36,8 @@ LONGEST_WAIT = 1.0
 """A request for a picture may wait for the next one during this time [s]."""
 PICTURE_POLL = 0.01
 """A waiting request looks for a new picture at this interval [s]."""
+REPORT = "report.html"
+"""The file of an experiment's report in its folder."""
 UNCACHED = {"Cache-Control": "no-store"}
 
 
@@ -50,12 +52,15 @@ class Parts:
     commands: Commands
     previewer: Previewer
     drawings: DrawingFolder
+    report: Path | None = None
 
 
 def create_app(parts: Parts) -> FastAPI:
     """Return the application without its layout."""
     app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
     app.mount("/static", StaticFiles(directory=STATIC))
+    if parts.report is not None:
+        app.mount("/report", StaticFiles(directory=parts.report, check_dir=False))
     _add_live_data(app, parts)
     _add_picture(app, parts)
 
@@ -92,6 +97,7 @@ def _add_live_data(app: FastAPI, parts: Parts) -> None:
                 await asyncio.sleep(due - came)
                 waited = round(time.monotonic() - came, 4)
                 data = {"asked": asked, "waited": waited, **parts.situation.snapshot()}
+                data["report"] = bool(parts.report and (parts.report / REPORT).is_file())
                 await websocket.send_text(json.dumps(data, separators=(",", ":"), allow_nan=False))
                 # On a grid, so that what sending takes does not add up; nothing is made up for.
                 due = max(due + 1.0 / RATE, time.monotonic())
