@@ -38,6 +38,9 @@
   function showWork(data, lost) {
     const plan = find("plan-line");
     if (plan) { plan.hidden = !data.plan; put(plan, `Newest plan: ${data.plan}`); }
+    const experiment = data.nodes.find((one) => one.own === "experiment"), told = find("experiment-line");
+    if (told) { told.hidden = !experiment; put(told, `Experiment: ${experiment?.message}`); }
+    find("report-link")?.toggleAttribute("hidden", !data.report);
     for (const [id, title, describe] of [["planner", "Planner", planning], ["recorder", "Recorder", recording]]) {
       const line = find(`${id}-line`), node = data.nodes.find((one) => one.own === id);
       if (!line) continue;
