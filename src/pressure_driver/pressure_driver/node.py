@@ -34,6 +34,8 @@ CALLS = QoSProfile(depth=1000)
 """Of `arm` and `vent`: the middleware's depth of 10 loses requests that come at once."""
 STATE_FIELDS = set(PressureState.get_fields_and_field_types()) - {"header", "setpoint_stamp"}
 """Of the message, by the names of the state; what else the state has is for the diagnostics."""
+LONGEST_NAME = 100
+"""Characters of the source of a lease that are kept."""
 LATE_TICKS = 1200
 """Ticks over which it is told how late their bytes are written: a minute."""
 
@@ -122,7 +124,7 @@ class PressureDriver(Node):
         self._offer((0, differential, "", 0, 0), CMD_U_T, info)
 
     def _on_lease(self, message: OperatorLease) -> None:
-        self._port.send("lease", message.source, message.period)
+        self._port.send("lease", message.source[:LONGEST_NAME], message.period)
 
     def _offer(self, setpoint: tuple[object, ...], topic: str, info: dict[str, int]) -> None:
         alone = self.count_publishers(topic) <= 1

@@ -153,3 +153,12 @@ def test_an_experiment_between_two_runs_alarms_nobody(situation: Situation, cloc
     (first, second) = alarms(situation)
     assert "The experiment is dead" in first["text"]
     assert "ended in order" in second["text"]
+
+
+def test_what_is_missing_of_a_graph_is_named_with_the_command(situation: Situation) -> None:
+    situation.put_status(status("/limb/planner"))
+    situation.put_status(status("/other/recorder"))
+    starts = situation.snapshot()["missing"]
+    assert [line.split()[-1] for line in starts] == [
+        "pressure_driver", "apriltag_tracker", "recorder",
+    ]  # fmt: skip

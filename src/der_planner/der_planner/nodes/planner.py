@@ -52,6 +52,7 @@ class PlannerNode(Node):
         self._status = Status()
         self._progress = 0.0  # share of the planning or of the playing that is done
         self._last_refusal = ""
+        self._lost = False  # whether the driver was silent at the last look
         self._request: Request | None = None
         self._newest: tuple[str, Plan, bool] | None = None
         self._work: queue.SimpleQueue[Request | None] = queue.SimpleQueue()
@@ -398,8 +399,11 @@ class PlannerNode(Node):
     def _show(self) -> None:
         """Ten times a second: end what is over, tell who asked, show the reference limb."""
         self._streamer.end_what_is_over()
-        if (ending := self._driver.obstacle()) is not None and ending.outcome == "lost":
+        ending = self._driver.obstacle()
+        lost = ending is not None and ending.outcome == "lost"
+        if ending is not None and lost and self._lost:  # not what waits to be read meanwhile
             self._drop_request(ending, self._now())
+        self._lost = lost
         self._action.tell(self._status.plan_id, self._status.state, self._progress)
         position = self._streamer.position
         if position is not None:

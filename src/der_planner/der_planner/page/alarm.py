@@ -22,6 +22,8 @@ NODES = {
 }
 """Nodes of a limb, worst first, with what their end means."""
 DRIVER = "pressure_driver"
+WANTED = (DRIVER, "planner", "apriltag_tracker", "recorder")
+"""Without these a limb is not played, seen and recorded."""
 ORDER = ("dead", "error", "late", "warning", "stale", "ok", "ended")
 """States of nodes, worst first."""
 
@@ -52,6 +54,12 @@ def worst_first(nodes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         return ORDER.index(node["state"]), ranks.index(node["own"]), node["name"]
 
     return sorted(nodes, key=rank)
+
+
+def missing(nodes: Sequence[dict[str, Any]]) -> list[str]:
+    """Return the commands that start what has never been heard of a whole graph."""
+    heard = {node["own"] for node in nodes}
+    return [start_of(name, None) for name in WANTED if name not in heard]
 
 
 def describe_limb(driver: dict[str, Any] | None) -> str:

@@ -18,7 +18,7 @@ from rcl_interfaces.msg import Log
 
 from der_msgs.msg import LimbEstimate, LimbState, PressurePlan, PressureState
 from der_planner.limb import mounting_of
-from der_planner.page.alarm import NODES, alarms, describe_limb, worst_first
+from der_planner.page.alarm import NODES, alarms, describe_limb, missing, worst_first
 from limb_interfaces.diagnostics import ENDED_IN_ORDER
 from limb_interfaces.stamps import NANOSECONDS, nanoseconds
 
@@ -168,7 +168,7 @@ class Situation:
                     return
             self._nodes[status.name] = node, self._clock()
             if process != self._processes.get(status.name, _UNKNOWN)[0]:
-                self._processes[status.name] = process, *_process(process)
+                self._processes[status.name] = (process, *_process(process))
                 self._last_words.pop(status.name, None)
 
     def put_log(self, message: Log) -> None:
@@ -248,6 +248,7 @@ class Situation:
             "plan": self._plan,
             "estimate": values.get("estimate"),
             "nodes": worst_first(nodes),
+            "missing": missing(nodes),
             "limb_is": describe_limb(values.get("driver")),
         }
         return found | {"alarms": [alarm._asdict() for alarm in alarms(found)]}

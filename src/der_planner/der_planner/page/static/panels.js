@@ -7,6 +7,8 @@
   page.onShow.push((data, waited, lost) => {
     showNodes(data.nodes, waited);
     showWork(data, lost);
+    const missing = data.missing.length ? `Not heard yet; to start it: ${data.missing.join(" · ")}` : "";
+    put(find("missing-line"), missing);
     if (data.driver) showSupply(data.driver);
     showEstimate(data.estimate);
   });
