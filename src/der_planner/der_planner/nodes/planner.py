@@ -15,7 +15,7 @@ from std_srvs.srv import Trigger
 
 from der_msgs.msg import LimbState, MotionCommand, PressureState
 from der_planner.control.feedback import Feedback
-from der_planner.nodes.planner_feedback import Corrector
+from der_planner.nodes.planner_feedback import Corrector, warm_up
 from der_planner.nodes.planner_requests import (
     Cancelled,
     MotionAction,
@@ -27,8 +27,8 @@ from der_planner.nodes.planner_requests import (
     new_plan_id,
     read_parameters,
 )
-from der_planner.nodes.planner_topics import DriverWatch, PlannerPublishers, Status
-from der_planner.planning import METHODS, Motion, Plan, plan
+from der_planner.nodes.planner_topics import DriverWatch, PlannerPublishers, Status, told_of
+from der_planner.planning import Plan, plan
 from der_planner.planning.streaming import MARGIN, Ending, Schedule, Streamer, first_stamp
 from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
@@ -216,7 +216,7 @@ class PlannerNode(Node):
     def _run(self) -> None:
         """Plan one request after the other; every failure becomes a refusal with its reason."""
         try:
-            self._warm_up()
+            warm_up(self._options.limb, self._options.nodes)
             if self._status == Status():
                 self._status = Status("idle")
         except Exception as error:
@@ -235,15 +235,6 @@ class PlannerNode(Node):
                     self._request = None
             if failure and not request.cancelled.is_set():
                 self._refuse(request.plan_id, failure)
-
-    def _warm_up(self) -> None:
-        """Compile every kernel, so that no plan has to wait for it."""
-        quick = Motion.named("asynchronous", amplitude=0.1, period=2.0, cycles=1)
-        for model, methods in METHODS.items():
-            for method in methods:
-                found = plan(self._options.limb, quick, model, method, nodes=self._options.nodes)
-        # The last of them has compiled whatever feedback calls as well.
-        Feedback(found)
 
     def _plan(self, request: Request) -> None:
         """Plan what was asked for and play it.
@@ -389,11 +380,7 @@ class PlannerNode(Node):
             "learned_plans": self._options.learned_plans,
         }
         if self._newest is not None:
-            newest = self._newest[1]
-            values["predicted_error_m"] = f"{newest.predicted_error:.6f}"
-            values["pressure_margin_pa"] = f"{newest.pressure_margin:.0f}"
-            values["slew_margin_pa_per_s"] = f"{newest.slew_margin:.0f}"
-            values["solve_time_s"] = f"{newest.solve_time:.3f}"
+            values |= told_of(self._newest[1])
         return self._status.health(self._last_refusal, values)
 
     def _show(self) -> None:
