@@ -17,7 +17,7 @@
       error: seen && [seen.error_cm],
     });
     while (now - samples[0].at > SPAN) samples.shift();
-    if (document.hidden || now - drawn < PAUSE || !page.curves) return;
+    if (document.hidden || now - drawn < PAUSE || !page.curves || !window.did_handshake) return;
     drawn = now;
     for (const [name, element] of Object.entries(page.curves)) fill(name, getElement(element)?.chart, now);
   });
