@@ -94,9 +94,7 @@ class PressureDriver(Node):
             self._on_setpoint,
             qos.SETPOINTS,
         )
-        self.create_subscription(
-            OperatorLease, topics.OPERATOR_LEASE, self._on_lease, qos.LEASES
-        )
+        self.create_subscription(OperatorLease, topics.OPERATOR_LEASE, self._on_lease, qos.LEASES)
         if settings.accept_cmd_u_t:
             self.create_subscription(Float64MultiArray, CMD_U_T, self._on_cmd_u_t, qos.SETPOINTS)
         DiagnosticsPublisher(self, self._report, hardware_id=settings.port)

@@ -87,7 +87,8 @@ class Settings:
     on_lost_operator: str = _other(
         "ramp",
         "when an operator's lease ends while armed: keep the pressures for hold_time and then let "
-        "them down; let them down; vent at once. DISARMED afterwards; without a lease nothing changes",
+        "them down; let them down; vent at once. DISARMED afterwards; without a lease nothing "
+        "changes",
         ("hold", "ramp", "vent"),
     )
     vent_rate: float = _number(10_000.0, "Pa/s", 100.0, 1e6, "of the ramp down")

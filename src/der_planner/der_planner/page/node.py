@@ -68,7 +68,9 @@ class PageNode(Node):
         read: Callable[..., Any] = functools.partial(declare, self)
         binding = self._read_binding(read)
         previewer = self._read_previewer(read)
-        report = read("report", "", "folder of an experiment's report: shown as soon as it is there")
+        report = read(
+            "report", "", "folder of an experiment's report: shown as soon as it is there"
+        )
         drawings = read("drawings", "~/limb_drawings", "folder of kept drawings")
         share = Path(get_package_share_directory("apriltag_tracker")) / "config"
         tag_map = read("tag_map", str(share / "tags.yaml"), "YAML file: where the tags are")

@@ -163,9 +163,9 @@ class Situation:
         process = values.get("process", "")
         with self._lock:
             self._forget_nodes()
-            if status.name not in self._nodes and not node["own"]:
-                if len(self._nodes) >= MOST_NODES:
-                    return
+            known = node["own"] or status.name in self._nodes
+            if not known and len(self._nodes) >= MOST_NODES:
+                return
             self._nodes[status.name] = node, self._clock()
             if process != self._processes.get(status.name, _UNKNOWN)[0]:
                 self._processes[status.name] = (process, *_process(process))

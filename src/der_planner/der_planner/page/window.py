@@ -210,7 +210,8 @@ def add_curves(segments: int) -> None:
             }
             for kind in kinds
             for segment in range(segments)
-        ] or [{"name": "tip", "type": "line", "showSymbol": False, "color": COLOURS[0]}]  # fmt: skip
+        ]  # fmt: skip
+        tip = {"name": "tip", "type": "line", "showSymbol": False, "color": COLOURS[0]}
         chart = ui.echart(
             {
                 "animation": False,
@@ -221,7 +222,7 @@ def add_curves(segments: int) -> None:
                 "yAxis": {"type": "value", "scale": True, "splitNumber": 3},
                 "tooltip": {"trigger": "axis"},
                 "dataZoom": [{"type": "inside"}],
-                "series": series,
+                "series": series or [tip],
             }
         )
         numbers[name] = chart.classes("curve").id
