@@ -6,6 +6,7 @@ import contextlib
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from rclpy.executors import ExternalShutdownException
 
@@ -29,7 +30,9 @@ def experiment_page(options: Options, progress: Progress) -> Iterator[NodeProces
         NodeError: it cannot be started, or has ended at once.
         GraphError: it is not ready in time.
     """
-    planner = {"limb_file": str(options.limb or ""), "mounting": options.loads.mounting}
+    planner: dict[str, Any] = {
+        "limb_file": str(options.limb or ""), "mounting": options.loads.mounting,
+    }  # fmt: skip
     planner |= {"payload": options.loads.payload, "payload_at": options.loads.payload_at or 0.0}
     setup = GraphSetup(Path(), {}, hardware=options.hardware, planner=planner, page=options.page)
     (spec,) = [each for each in setup.nodes("") if each.executable == "page"]

@@ -105,7 +105,7 @@ def _add_live_data(app: FastAPI, parts: Parts) -> None:
 
 def _read_request(text: str) -> tuple[float | None, str, str]:
     """Return the time that a window sent, None if no clock shows that; its name, and its tab."""
-    said, window, tab = (text[:LONGEST_ASK].split(" ") + ["", ""])[:3]
+    said, window, tab = [*text[:LONGEST_ASK].split(" "), "", ""][:3]
     try:
         sent = float(said)
     except ValueError:
