@@ -52,7 +52,6 @@ class PlannerNode(Node):
         self._status = Status()
         self._progress = 0.0  # share of the planning or of the playing that is done
         self._last_refusal = ""
-        self._lost = False  # whether the driver was silent at the last look
         self._request: Request | None = None
         self._newest: tuple[str, Plan, bool] | None = None
         self._work: queue.SimpleQueue[Request | None] = queue.SimpleQueue()
@@ -109,16 +108,10 @@ class PlannerNode(Node):
                     f"plan '{wanted}' was ended by the driver, which takes no more of it: "
                     "give the command another plan_id, or none"
                 )
-            return from_command(message, self._current_options(), self._now())
+            return from_command(message, self._options.as_now(self), self._now())
         except ValueError as error:
             self._refuse(message.plan_id, str(error))
             return None
-
-    def _current_options(self) -> PlannerOptions:
-        """Return the parameters with what may be changed while the node runs as it is now."""
-        changeable = ("nearest_path", "payload", "payload_at")
-        now: dict[str, Any] = {name: self.get_parameter(name).value for name in changeable}
-        return dataclasses.replace(self._options, **now)
 
     def _is_busy(self, plan_id: str) -> bool:
         """Tell whether a plan of this id is being planned or played."""
@@ -130,7 +123,7 @@ class PlannerNode(Node):
     def _on_path(self, message: PathMessage) -> None:
         plan_id = new_plan_id()
         try:
-            self._accept(from_path(message, plan_id, self._current_options(), self._now()))
+            self._accept(from_path(message, plan_id, self._options.as_now(self), self._now()))
         except (ValueError, IndexError) as error:
             self._refuse(plan_id, str(error))
 
@@ -386,11 +379,6 @@ class PlannerNode(Node):
     def _show(self) -> None:
         """Ten times a second: end what is over, tell who asked, show the reference limb."""
         self._streamer.end_what_is_over()
-        ending = self._driver.obstacle()
-        lost = ending is not None and ending.outcome == "lost"
-        if ending is not None and lost and self._lost:  # not what waits to be read meanwhile
-            self._drop_request(ending, self._now())
-        self._lost = lost
         self._action.tell(self._status.plan_id, self._status.state, self._progress)
         position = self._streamer.position
         if position is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 import threading
@@ -58,6 +59,12 @@ class PlannerOptions:
     driver_timeout: float
     learned_plans: str
     feedback: bool
+
+    def as_now(self, node: Node) -> PlannerOptions:
+        """Return the parameters with what may be changed while the node runs as it is now."""
+        changeable = ("nearest_path", "payload", "payload_at")
+        now: dict[str, Any] = {name: node.get_parameter(name).value for name in changeable}
+        return dataclasses.replace(self, **now)
 
 
 def read_parameters(node: Node) -> PlannerOptions:
