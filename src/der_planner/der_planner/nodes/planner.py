@@ -19,7 +19,6 @@ from der_planner.nodes.planner_feedback import Corrector, warm_up
 from der_planner.nodes.planner_requests import (
     Cancelled,
     MotionAction,
-    PlannerOptions,
     Request,
     from_command,
     from_path,

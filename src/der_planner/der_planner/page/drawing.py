@@ -30,7 +30,6 @@ from der_planner.planning import (
     Motion,
     PathLimits,
     PlanningError,
-    UnreachableError,
     Workspace,
     plan,
 )
@@ -165,7 +164,8 @@ def preview(limb: Limb, tip: Array, limits: PathLimits, model: str, method: str)
         motion = Motion.from_tip_path(None, tip, limits=limits, nearest=True)
         planned = plan(limb, motion, model, method)
     except PlanningError as error:
-        place = error.point if isinstance(error, UnreachableError) else None
+        # Of a point that is out of reach, and of a load that is too much there.
+        place: tuple[float, float] | None = getattr(error, "point", None)
         return Preview(np.empty((0, 2)), problem=str(error), place=place)
     deviation = planned.reference.deviation
     frames = np.linspace(0, len(planned.time) - 1, min(FRAMES, len(planned.time))).astype(int)
