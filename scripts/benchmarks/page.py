@@ -71,7 +71,10 @@ class PageGraph:
         board = str(folder / "board")
         setup = GraphSetup(bag=folder / "bag", metadata={}, planner={}, page=page_port)
         for spec in setup.nodes(board):
-            process = NodeProcess(spec.package, spec.executable, spec.parameters, folder)
+            parameters = spec.parameters
+            if spec.executable == "page":  # a window whose picture is taken is silent meanwhile
+                parameters = {**parameters, "lease_period": 10.0}
+            process = NodeProcess(spec.package, spec.executable, parameters, folder)
             self._processes[spec.executable] = process
             stack.callback(process.stop)
             self.client.watch(self._processes.values())

@@ -366,6 +366,7 @@ class PlannerNode(Node):
             "last_refusal": self._last_refusal,
             "progress": f"{self._progress:.3f}",
             "limb": self._options.limb.name,
+            "limb_file": self._options.limb_file,
             "limb_identified": identified(self._options.limb),
             "driver": self._driver.mode or "not heard",
             "feedback": self._corrector.reason,

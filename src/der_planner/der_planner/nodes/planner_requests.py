@@ -46,6 +46,7 @@ class PlannerOptions:
     """
 
     limb: Limb
+    limb_file: str
     payload: float
     payload_at: float
     model: str
@@ -87,6 +88,7 @@ def read_parameters(node: Node) -> PlannerOptions:
     )  # fmt: skip
     return PlannerOptions(
         limb=limb.mounted(mounting) if mounting else limb,
+        limb_file=str(Path(limb_file).absolute()) if limb_file else "",
         payload=read(
             "payload", 0.0, "mass [kg] carried beside the limb's own masses, where a command names "
             "none", at_least=0.0, at_most=HEAVIEST, read_only=False

@@ -201,6 +201,11 @@ class Previewer:
         self.region = lru_cache(REGIONS_KEPT)(lambda load: reachable_region(self.limb_under(load)))
         self.limb_under(carried)
 
+    def follow(self, limb: Limb) -> None:
+        """Draw from now on with another limb, mounted as the planner's."""
+        self.limb = limb
+        self.region.cache_clear()
+
     def limb_under(self, load: Load) -> Limb:
         """Return the limb as the planner would have it for a command of this load.
 

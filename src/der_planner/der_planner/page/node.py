@@ -36,7 +36,7 @@ from der_msgs.msg import (
     PressureState,
     TagDetectionArray,
 )
-from der_planner.limb import Limb
+from der_planner.limb import Limb, LimbError
 from der_planner.page.access import Binding, Desk
 from der_planner.page.commands import Commands, Load
 from der_planner.page.drawing import DrawingFolder, Previewer
@@ -126,16 +126,20 @@ class PageNode(Node):
         )
 
     def _read_previewer(self, read: Callable[..., Any]) -> Previewer:
-        limb_file = read("limb_file", "", "the planner's limb file; empty: the default limb")
-        limb = Limb.from_yaml(limb_file) if limb_file else Limb.default()
-        mounting = read("mounting", "", "as the planner's; empty: as in the limb file")
+        limb_file = read(
+            "limb_file", "", "the planner's limb file until it is heard; empty: the default limb"
+        )
+        self._mounting: str = read("mounting", "", "as the planner's; empty: as in the limb file")
         payload = read("payload", 0.0, "as the planner's [kg]", at_least=0.0)
         place = read("payload_at", 0.0, "as the planner's [m]; 0: the tip", at_least=0.0)
         speed = read("path_speed", 0.03, "as the planner's [m/s]", at_least=1e-3)
         most = read("path_acceleration", 0.05, "as the planner's [m/s^2]", at_least=1e-3)
-        if mounting:
-            limb = limb.mounted(mounting)
-        return Previewer(limb, PathLimits(speed, most), Load(payload, place))
+        return Previewer(self._read_limb(limb_file), PathLimits(speed, most), Load(payload, place))
+
+    def _read_limb(self, file: str) -> Limb:
+        self._limb_file = file
+        limb = Limb.from_yaml(file) if file else Limb.default()
+        return limb.mounted(self._mounting) if self._mounting else limb
 
     # What comes in -------------------------------------------------------------------------
 
@@ -241,7 +245,13 @@ class PageNode(Node):
         self._picture.put(nanoseconds(message.header.stamp), grey)
 
     def _watch(self) -> None:
-        """Subscribe to images while somebody looks; end with the server."""
+        """Draw with the planner's limb, take images while somebody looks, end with the server."""
+        file = self._situation.value_of("planner", "limb_file")
+        if file not in ("", self._limb_file):
+            try:
+                self._parts.previewer.follow(self._read_limb(file))
+            except LimbError as error:  # as on another computer
+                self.get_logger().warning(f"drawings are not planned as the planner does: {error}")
         if self._server.error is not None:
             self.fatal_error = f"the page's server ended: {self._server.error}"
         if self._picture.watched and self._images is None:
@@ -272,6 +282,7 @@ class PageNode(Node):
         values = {
             "url": self._server.url,
             "operator": "yes" if self._parts.desk.operator else "no",
+            "limb": self._parts.previewer.limb.name,
             "picture": "watched" if self._picture.watched else "nobody looks",
             "refused_requests": self._server.access.refused,
             "refused_messages": self._refused,

@@ -204,7 +204,7 @@ def add_curves(segments: int) -> None:
     for name, (title, unit, kinds) in CURVES.items():
         series: list[dict[str, Any]] = [
             {
-                "name": f"segment {segment + 1} {kind}", "type": "line", "showSymbol": False,
+                "name": f"segment {segment} {kind}", "type": "line", "showSymbol": False,
                 "color": COLOURS[segment % len(COLOURS)],
                 "lineStyle": {"type": "dotted" if kind == "commanded" else "solid"},
             }
@@ -215,11 +215,19 @@ def add_curves(segments: int) -> None:
         chart = ui.echart(
             {
                 "animation": False,
-                "title": {"text": f"{title} [{unit}]", "textStyle": {"fontSize": 12}},
-                "legend": {"top": 0, "right": 0, "itemHeight": 8, "textStyle": {"fontSize": 10}},
-                "grid": {"left": 42, "right": 12, "top": 34, "bottom": 30},
+                "title": {"text": f"{title} [{unit}]", "left": 0, "textStyle": {"fontSize": 12}},
+                "legend": {
+                    "top": 16,
+                    "left": 0,
+                    "type": "scroll",
+                    "itemHeight": 8,
+                    "itemGap": 6,
+                    "textStyle": {"fontSize": 10},
+                },
+                "grid": {"left": 36, "right": 14, "top": 40, "bottom": 20},
                 "xAxis": {"type": "value", "min": -30, "max": 0, "name": "s", "nameGap": 4},
-                "yAxis": {"type": "value", "scale": True, "splitNumber": 3},
+                # Noise of a limb at rest is not drawn as if it were motion.
+                "yAxis": {"type": "value", "splitNumber": 3, "minInterval": 1 if kinds else 0.1},
                 "tooltip": {"trigger": "axis"},
                 "dataZoom": [{"type": "inside"}],
                 "series": series or [tip],

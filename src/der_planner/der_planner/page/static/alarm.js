@@ -3,6 +3,7 @@
 (() => {
   const SLOW = 1.5; // s since the server was last heard, up to which a connection is slow and not dead
   const { find, put } = page;
+  const rounded = (value) => value.toFixed(1).replace(/^-(0\.0)$/, "$1");
   const ago = (age) => `${age.toFixed(age < 10 ? 1 : 0)} s`;
 
   page.onState.push((silence, lost, unheard) => {
@@ -57,7 +58,7 @@
 
   // Present numbers: pressures, tip error, progress of the plan.
   function figures(driver) {
-    const pressures = driver.measured_kpa.map((value) => (value === null ? "?" : value.toFixed(1))).join(" / ");
+    const pressures = driver.measured_kpa.map((value) => (value === null ? "?" : rounded(value))).join(" / ");
     const error = page.isOld("tracker") ? null : page.data.limb?.error_cm ?? null;
     const planner = page.data.nodes.find((node) => node.own === "planner");
     const busy = planner && ["ok", "warning"].includes(planner.state)
