@@ -91,7 +91,7 @@ def test_a_preview_says_what_would_be_played_or_why_not() -> None:
     hanging = LIMB.mounted("hanging").carrying(0.1)
     heavy = preview(hanging, ring, PathLimits(), "der", "projected")
     assert "kPa are allowed" in heavy.problem
-    assert np.linalg.norm(ring - heavy.place, axis=1).min() < 0.03  # marked in the drawing
+    assert np.linalg.norm(ring - heavy.place, axis=1).min() < 0.1  # on the way there
 
 
 @pytest.mark.parametrize("name", ["../up", "a/b", ".hidden", "/etc/passwd", "star\x00", "Über 1"])
