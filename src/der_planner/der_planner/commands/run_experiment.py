@@ -151,7 +151,8 @@ class Ledger:
             "payload_at": options.loads.payload_at or "",
             "calibrate": options.calibrate,
             "offline": options.offline,
-            "hardware": options.hardware.driver.get("port") if options.hardware else "",
+            "hardware": options.hardware.place if options.hardware else "",
+            "board": options.board,
         }
 
     def finished(self, trial: Trial) -> dict[str, Any] | None:
@@ -302,8 +303,8 @@ def _read(limb: Path | None) -> Limb:
 
 def _stage(options: Options) -> str:
     if options.hardware is not None:
-        return f"the hardware at {options.hardware.driver['port']}"
-    return "the twin, offline" if options.offline else "the twin"
+        return f"the hardware at {options.hardware.place}"
+    return "the twin, offline" if options.offline else f"the twin, with a {options.board} board"
 
 
 def _describe(
