@@ -45,3 +45,6 @@ IMAGES = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 SENSOR_DATA = qos_profile_sensor_data
 """A publisher of images and camera calibration."""
+
+LEASES = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Signs of an operator: one that a network held up must not come later in place of a newer one."""
