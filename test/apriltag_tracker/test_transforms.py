@@ -8,7 +8,7 @@ from builtin_interfaces.msg import Time
 from scipy.spatial.transform import Rotation
 
 from apriltag_tracker.camera import CameraPose
-from apriltag_tracker.reports import camera_transform, limb_transforms, transform_publisher
+from apriltag_tracker.publishing import camera_transform, limb_transforms, transform_publisher
 
 STAMP = Time(sec=3, nanosec=5)
 

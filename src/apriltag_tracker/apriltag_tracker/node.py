@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import array
-import math
 import sys
 import time
 from pathlib import Path
@@ -12,11 +11,10 @@ import cv2
 import numpy as np
 from ament_index_python.packages import get_package_share_directory
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Pose2D
+from geometry_msgs.msg import Pose2D
 from numpy.typing import NDArray
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
-from visualization_msgs.msg import Marker, MarkerArray
 
 from apriltag_tracker.camera import CameraError, Intrinsics
 from apriltag_tracker.camera.images import Grabbed, ImageReader, Source, SourceError, open_source
@@ -26,28 +24,20 @@ from apriltag_tracker.pipeline import (
     LimbTracker,
     PlacedTag,
     TrackerOptions,
-    Uncertainty,
     warm_up,
 )
-from apriltag_tracker.pose.shape import CURVE_POINTS
-from apriltag_tracker.reports import (
-    NO_CALIBRATION,
-    ImageWatch,
-    StampGaps,
-    camera_transform,
-    draw_observation,
-    limb_transforms,
-    transform_publisher,
-)
+from apriltag_tracker.pose.following import Uncertainty
+from apriltag_tracker.publishing import StatePublisher, camera_transform
+from apriltag_tracker.reports import NO_CALIBRATION, ImageWatch, draw_observation
 from apriltag_tracker.tag_map import TagMap
-from der_msgs.msg import LimbState, TagDetection, TagDetectionArray
+from apriltag_tracker.watching import StampGaps
+from der_msgs.msg import TagDetection, TagDetectionArray
 from limb_interfaces import qos, stamps, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.parameters import check_overrides, declare
 from limb_interfaces.runner import run_node
 
 ANNOTATED_IMAGE = "camera/image_annotated"
-_MARKER_PERIOD = 0.1
 
 
 class TrackerNode(Node):
@@ -74,13 +64,10 @@ class TrackerNode(Node):
         warm_up(self._detector)
         self._gaps = StampGaps()
         self._tracker: LimbTracker | None = None
-        self._curve: list[Point] = []
-        """Points of the message, which are written anew for every state."""
         self._reader = ImageReader()
         self._last_stamp = -1
         self._frame = ""
         self._level = ""
-        self._last_markers = 0.0
         self._image_topic = self.resolve_topic_name(topics.IMAGE)
         self._watch = ImageWatch(
             self._image_topic if source == "topic" else source, is_topic=source == "topic"
@@ -160,10 +147,8 @@ class TrackerNode(Node):
 
     def _make_topics(self) -> None:
         self._tags = self.create_publisher(TagDetectionArray, topics.TAGS, qos.STATES)
-        self._states = self.create_publisher(LimbState, topics.LIMB_STATE, qos.STATES)
-        self._markers = self.create_publisher(MarkerArray, topics.SHAPE_MARKERS, qos.STATES)
+        self._states = StatePublisher(self, len(self._map.segment_lengths))
         self._annotated = self.create_publisher(Image, ANNOTATED_IMAGE, qos.SENSOR_DATA)
-        self._publish_on_tf = transform_publisher(self)
 
     def _subscribe(self, needs_info: bool) -> None:
         # A best-effort subscriber hears best-effort and reliable publishers alike.
@@ -198,7 +183,6 @@ class TrackerNode(Node):
         ):
             return
         self._tracker = LimbTracker(self._map, intrinsics, self._options, self._detector)
-        self._curve = [Point() for _ in range(CURVE_POINTS)]
 
     def _on_image(self, message: Image) -> None:
         self._frame = message.header.frame_id
@@ -252,28 +236,25 @@ class TrackerNode(Node):
     def _fail(self, stamp: Time, problem: str) -> None:
         """Say at once that this image gives no state, and why."""
         self._watch.failed_with(problem)
-        self._states.publish(self._state(LimbObservation((), None, problem), stamp))
+        self._states.publish(None, problem, stamp)
 
     # Output
 
     def _publish(self, observation: LimbObservation, gray: NDArray[np.uint8], stamp: Time) -> float:
         """Publish everything; returns the latency of the state [s]."""
-        state = self._state(observation, stamp)
-        self._states.publish(state)
+        assert self._tracker is not None
+        pose = self._tracker.world.pose
+        camera = (
+            [camera_transform(pose.rotation, pose.translation, stamp, self._frame)]
+            if pose is not None and self._states.tells_transforms
+            else []
+        )
+        latency = self._states.publish(observation.estimate, observation.reason, stamp, camera)
         tags = TagDetectionArray(detections=[_tag_message(placed) for placed in observation.tags])
         tags.header.stamp = stamp
         tags.header.frame_id = topics.BASE_FRAME
         self._tags.publish(tags)
-        self._publish_transforms(observation, stamp)
-        now = time.monotonic()
-        if (
-            now - self._last_markers >= _MARKER_PERIOD
-            and self._markers.get_subscription_count() > 0
-            and observation.estimate is not None
-        ):
-            self._last_markers = now
-            self._markers.publish(_limb_markers(state))
-        if self._annotated.get_subscription_count() > 0 and self._tracker is not None:
+        if self._annotated.get_subscription_count() > 0:
             picture = draw_observation(gray, observation, self._tracker)
             message = Image(
                 height=picture.shape[0],
@@ -284,50 +265,7 @@ class TrackerNode(Node):
             )
             message.header.stamp = stamp
             self._annotated.publish(message)
-        return float(state.latency)
-
-    def _publish_transforms(self, observation: LimbObservation, stamp: Time) -> None:
-        """Tell RViz where clamp, tip and camera are, where tf2 is installed."""
-        if self._publish_on_tf is None or self._tracker is None:
-            return
-        found = []
-        if observation.estimate is not None:
-            found += limb_transforms(observation.estimate.curve, stamp)
-        pose = self._tracker.world.pose
-        if pose is not None:
-            found.append(camera_transform(pose.rotation, pose.translation, stamp, self._frame))
-        if found:
-            self._publish_on_tf(found)
-
-    def _state(self, observation: LimbObservation, stamp: Time) -> LimbState:
-        message = LimbState(reason=observation.reason)
-        message.header.stamp = stamp
-        message.header.frame_id = topics.BASE_FRAME
-        count = len(self._map.segment_lengths)
-        estimate = observation.estimate
-        if estimate is None:
-            nan = math.nan
-            message.tip = Point(x=nan, y=nan, z=nan)
-            message.tip_covariance = message.tip_systematic = [nan] * 4
-            message.bend_angle = message.bend_angle_sigma = message.curvature = [nan] * count
-            message.elongation = message.residual = nan
-        else:
-            message.valid = True
-            message.tip = Point(x=float(estimate.tip[0]), y=float(estimate.tip[1]), z=0.0)
-            message.tip_covariance = estimate.tip_covariance.ravel()
-            message.tip_systematic = estimate.tip_systematic.ravel()
-            message.bend_angle = estimate.bend_angle.tolist()
-            message.bend_angle_sigma = estimate.bend_angle_sigma.tolist()
-            message.curvature = estimate.curvature.tolist()
-            message.elongation = estimate.elongation
-            message.residual = estimate.residual
-            for point, (x, y) in zip(self._curve, estimate.curve.tolist(), strict=True):
-                point.x, point.y = x, y
-            message.curve = self._curve
-            message.tags_used = len(estimate.tags_used)
-        now = self.get_clock().now().nanoseconds
-        message.latency = (now - stamps.nanoseconds(stamp)) / stamps.NANOSECONDS
-        return message
+        return latency
 
     def _health(self) -> Health:
         publishers = self.count_publishers(self._image_topic) if self._source is None else 0
@@ -358,21 +296,6 @@ def _tag_message(placed: PlacedTag) -> TagDetection:
         x, y, yaw = placed.pose.tolist()
         message.pose = Pose2D(x=x, y=y, theta=yaw)
     return message
-
-
-def _limb_markers(state: LimbState) -> MarkerArray:
-    """Draw the measured limb and its tip for RViz and Foxglove."""
-    line = Marker(ns="measured", id=0, type=Marker.LINE_STRIP, points=list(state.curve))
-    tip = Marker(ns="measured", id=1, type=Marker.SPHERE)
-    for marker in (line, tip):
-        marker.header = state.header
-        marker.color.g = marker.color.b = 0.7
-        marker.color.a = 1.0
-        marker.pose.orientation.w = 1.0
-    line.scale.x = 0.004
-    tip.pose.position = state.tip
-    tip.scale.x = tip.scale.y = tip.scale.z = 0.01
-    return MarkerArray(markers=[line, tip])
 
 
 def main() -> int:
