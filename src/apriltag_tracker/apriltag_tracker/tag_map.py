@@ -138,19 +138,27 @@ class TagMap:
             raise TagMapError(str(error)) from error
         limb = section(data, "limb")
         world = section(data, "world")
-        lengths = tuple(floats(limb.get("segment_lengths"), None, "limb.segment_lengths"))
-        if not lengths or min(lengths) <= 0.0:
-            raise TagMapError("limb.segment_lengths: a list of positive lengths in m expected")
+        lengths, stiff = limb_geometry(limb)
         total = sum(lengths)
         limb_tags = tuple(_limb_tag(entry, total, family) for entry in limb.get("tags") or [])
         if not limb_tags:
             raise TagMapError("limb.tags is empty: at least one tag must be on the limb")
         world_tags = tuple(_world_tag(entry, family) for entry in world.get("tags") or [])
-        stiff = stiff_stretches(limb.get("stiff") or [], lengths)
         return cls(lengths, limb_tags, world_tags, stiff, family)
 
 
+def limb_geometry(
+    limb: dict[str, Any],
+) -> tuple[tuple[float, ...], tuple[tuple[float, float], ...]]:
+    """Read the segments' lengths and the stiff stretches [m] of a map; raises `TagMapError`."""
+    lengths = tuple(floats(limb.get("segment_lengths"), None, "limb.segment_lengths"))
+    if not lengths or min(lengths) <= 0.0:
+        raise TagMapError("limb.segment_lengths: a list of positive lengths in m expected")
+    return lengths, _stiff(limb.get("stiff") or [], lengths)
+
+
 def section(data: dict[str, Any], name: str) -> dict[str, Any]:
+    """Return a part of a map that must be there; raises `TagMapError`."""
     found = data.get(name)
     if not isinstance(found, dict):
         raise TagMapError(f"section '{name}' is missing")
@@ -158,18 +166,20 @@ def section(data: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def floats(value: Any, count: int | None, name: str) -> list[float]:
+    """Return a list of ``count`` finite numbers, of any count if None; raises `TagMapError`."""
     if not isinstance(value, list) or (count is not None and len(value) != count):
         raise TagMapError(f"{name}: a list of {count or 'some'} numbers expected, not {value!r}")
     return [number(entry, name) for entry in value]
 
 
 def number(value: Any, name: str) -> float:
+    """Return a finite number; raises `TagMapError`."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise TagMapError(f"{name}: a finite number expected, not {value!r}")
     return float(value)
 
 
-def stiff_stretches(value: Any, lengths: tuple[float, ...]) -> tuple[tuple[float, float], ...]:
+def _stiff(value: Any, lengths: tuple[float, ...]) -> tuple[tuple[float, float], ...]:
     result: list[tuple[float, float]] = []
     for entry in value if isinstance(value, list) else [value]:
         start, end = floats(entry, 2, "limb.stiff")
