@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from apriltag_tracker.bodies.body_map import AXES, LENGTH_UNITS, BodyMap
+from apriltag_tracker.bodies.body_map import BodyMap
 from apriltag_tracker.bodies.tracker import PoseFrame
 from apriltag_tracker.synthetic.shapes import Shape
 
@@ -108,17 +108,3 @@ class SyntheticMocap:
             pair = [bodies.names.index(name) for name in faults.swapped]
             positions[pair], quaternions[pair] = positions[pair[::-1]], quaternions[pair[::-1]]
         return PoseFrame(stamp + round(1e9 * faults.delay), positions / bodies.unit, quaternions)
-
-
-def in_frame(bodies: BodyMap, unit: str, up: str) -> BodyMap:
-    """Return a body map whose poses come in another unit and with another axis up."""
-    return BodyMap(
-        bodies.segment_lengths,
-        bodies.limb,
-        bodies.fixed,
-        bodies.names,
-        bodies.stiff,
-        LENGTH_UNITS[unit],
-        tuple(AXES[up].tolist()),
-        bodies.frame,
-    )

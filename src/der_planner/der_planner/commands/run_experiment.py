@@ -137,6 +137,7 @@ class Ledger:
             "payload_at": options.loads.payload_at or "",
             "calibrate": options.calibrate,
             "offline": options.offline,
+            "poses": "yes" if options.poses else "",
             "hardware": options.hardware.driver.get("port") if options.hardware else "",
         }
 

@@ -52,6 +52,7 @@ def play_on_graph(run: TrialRun, progress: Progress) -> dict[str, Any]:
         hardware=options.hardware,
         planner=_planner_parameters(run),
         record_images=options.record_images,
+        poses=options.poses,
         page=options.page,
     )
     drawn = options.path if run.learned is None else None

@@ -24,7 +24,9 @@ from der_planner.limb import Limb
 STOP_ORDER = (
     "planner",
     "apriltag_tracker",
+    "pose_tracker",
     "synthetic_camera",
+    "synthetic_poses",
     "limb_twin",
     "recorder",
     "pressure_driver",
@@ -33,6 +35,8 @@ STOP_ORDER = (
 )
 PAGE_TOKEN = secrets.token_urlsafe()
 """Opens the page of each run's graph, so that a window that is open stays let in."""
+POSE_RATE = 120.0
+"""Simulated motion capture tells poses so often [Hz]."""
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)
 
@@ -54,12 +58,17 @@ class Hardware:
 
     Attributes:
         driver, tracker, planner, recorder: parameters by name for each node.
+        poses: parameters of the tracker of bodies, where motion capture stands in place of the
+            camera; None: the camera.
+        found: what scripts/check_rig.py has written; for people.
         remap: new names of topics by their old ones, for all nodes.
         limb: the limb file, or None for the one on the command line.
     """
 
     driver: dict[str, Any] = field(default_factory=dict)
     tracker: dict[str, Any] = field(default_factory=dict)
+    poses: dict[str, Any] | None = None
+    found: dict[str, Any] = field(default_factory=dict)
     planner: dict[str, Any] = field(default_factory=dict)
     recorder: dict[str, Any] = field(default_factory=dict)
     remap: dict[str, str] = field(default_factory=dict)
@@ -113,6 +122,7 @@ class GraphSetup:
         planner: parameters of the planner; None for a graph without one.
         record_images: whether the bag holds the raw images, too.
         page: port of the operator's page; None for a graph without one.
+        poses: simulated motion capture in place of the twin's camera.
     """
 
     bag: Path
@@ -124,6 +134,7 @@ class GraphSetup:
     planner: dict[str, Any] | None = None
     record_images: bool = False
     page: int | None = None
+    poses: bool = False
 
     def nodes(self, port: str) -> list[NodeSpec]:
         """Return the nodes in the order in which they start; the emulated board is at ``port``."""
@@ -140,9 +151,15 @@ class GraphSetup:
         specs = [NodeSpec("pressure_driver", "pressure_driver", driver)]
         if self.hardware is None:
             specs.insert(0, NodeSpec("pressure_driver", "board_emulator", board))
+            # Motion capture is faster than a camera.
+            twin |= {"rate": POSE_RATE} if self.poses else {}
             specs.append(NodeSpec("der_planner", "limb_twin", twin))
-            specs.append(NodeSpec("apriltag_tracker", "synthetic_camera", {"seed": self.seed}))
-        specs.append(NodeSpec("apriltag_tracker", "apriltag_tracker", dict(rig.tracker)))
+            seen = "synthetic_poses" if self.poses else "synthetic_camera"
+            specs.append(NodeSpec("apriltag_tracker", seen, {"seed": self.seed}))
+        if self.poses or rig.poses is not None:
+            specs.append(NodeSpec("apriltag_tracker", "pose_tracker", dict(rig.poses or {})))
+        else:
+            specs.append(NodeSpec("apriltag_tracker", "apriltag_tracker", dict(rig.tracker)))
         planner = {**(self.planner or {}), **rig.planner}
         if self.planner is not None:
             specs.append(NodeSpec("der_planner", "planner", planner))
