@@ -123,6 +123,7 @@ class GraphSetup:
         record_images: whether the bag holds the raw images, too.
         page: port of the operator's page; None for a graph without one.
         poses: simulated motion capture in place of the twin's camera.
+        wiring: of the twin, as its parameter; None: as everybody expects.
     """
 
     bag: Path
@@ -135,6 +136,7 @@ class GraphSetup:
     record_images: bool = False
     page: int | None = None
     poses: bool = False
+    wiring: tuple[int, ...] | None = None
 
     def nodes(self, port: str) -> list[NodeSpec]:
         """Return the nodes in the order in which they start; the emulated board is at ``port``."""
@@ -153,6 +155,7 @@ class GraphSetup:
             specs.insert(0, NodeSpec("pressure_driver", "board_emulator", board))
             # Motion capture is faster than a camera.
             twin |= {"rate": POSE_RATE} if self.poses else {}
+            twin |= {"wiring": list(self.wiring)} if self.wiring is not None else {}
             specs.append(NodeSpec("der_planner", "limb_twin", twin))
             seen = "synthetic_poses" if self.poses else "synthetic_camera"
             specs.append(NodeSpec("apriltag_tracker", seen, {"seed": self.seed}))
