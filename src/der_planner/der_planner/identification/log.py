@@ -90,18 +90,8 @@ class CalibrationLog:
     def parted(self, share: float) -> tuple[CalibrationLog, CalibrationLog]:
         """Return the log without its last part, and that part; ``share`` is that of its time."""
         edge = self.time[-1] - share * (self.time[-1] - self.time[0])
-
-        def cut(rows: NDArray[np.bool_]) -> CalibrationLog:
-            return CalibrationLog(
-                self.time[rows],
-                self.commanded_differential[rows],
-                self.measured_differential[rows],
-                self.bend_angles[rows],
-                self.tip[rows],
-                self.source,
-            )
-
-        return cut(self.time <= edge), cut(self.time > edge)
+        after = float(np.nextafter(edge, np.inf))
+        return self.between(self.time[0], edge), self.between(after, self.time[-1])
 
     def _of(self, time: Array, table: Callable[[Array], Array]) -> CalibrationLog:
         """Return the log at other instants, its tables changed by a function."""
