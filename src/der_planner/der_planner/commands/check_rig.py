@@ -21,6 +21,7 @@ import numpy as np
 import yaml
 
 from apriltag_tracker.bodies.body_map import BodyMap, BodyMapError
+from apriltag_tracker.pose.clamp import Clamp, find_clamp
 from apriltag_tracker.tag_map import TagMap, TagMapError
 from der_planner.arrays import Array
 from der_planner.bags.reader import BagError, BagReader
@@ -44,6 +45,8 @@ from pressure_driver.hoses import HoseError, Hoses
 from pressure_driver.settings import Settings
 
 TAGS_TYPE = "der_msgs/msg/TagDetectionArray"
+CLAMP_OFF = (0.002, 0.002, float(np.deg2rad(1.5)))
+"""What the clamp may be beside the origin of `limb_base` [m, m, rad]."""
 SEEN_TOGETHER = 10
 """Messages of each kind that a bag must hold."""
 
@@ -85,8 +88,15 @@ def _main(given: argparse.Namespace) -> int:
     if given.out is not None:
         check_file(given.out)
     bag = given.bag or _play(given, hardware)
-    finding = find_rig(read_check(bag, _bodies(given, hardware)))
+    bodies = _bodies(given, hardware)
+    log = read_check(bag, bodies)
+    finding = find_rig(log)
     print(finding.text())
+    found = finding.as_mapping()
+    offsets = [body.offset for body in bodies.limb]
+    clamp = find_clamp(bodies, log.arc_lengths, offsets, log.places)
+    if clamp is not None and not finding.contradictions:
+        found["clamp"] = _clamp(clamp)
     driver = dict(hardware.driver) if hardware else {}
     if finding.contradictions:
         print("the rig contradicts itself: no file is written", file=sys.stderr)
@@ -98,11 +108,34 @@ def _main(given: argparse.Namespace) -> int:
         return 3
     if given.out is not None:
         content = yaml.safe_load(given.hardware.read_text()) if given.hardware else {}
-        content |= {"driver": driver, "found": finding.as_mapping()}
+        content |= {"driver": driver, "found": found}
         given.out.parent.mkdir(parents=True, exist_ok=True)
         given.out.write_text(yaml.safe_dump(content, sort_keys=False))
         print(f"rig file: {given.out}")
     return 0
+
+
+def _clamp(clamp: Clamp) -> dict[str, list[float]]:
+    """Say where the limb begins, and return it for the rig file."""
+    units = (1e3, 1e3, float(np.rad2deg(1.0)))
+    words = [
+        f"{name} {unit * value:.1f} ± {unit * sigma:.1f} {symbol}"
+        for name, symbol, unit, value, sigma in zip(
+            ("x", "y", "turned"), ("mm", "mm", "°"), units, clamp.place, clamp.sigma, strict=True
+        )
+    ]
+    print(f"clamp in limb_base: {', '.join(words)}")
+    far = np.abs(clamp.place) > np.maximum(CLAMP_OFF, 3.0 * clamp.sigma)
+    if far.any():
+        print(
+            "warning: limb_base is not at the clamp: take this off the positions of the fixed tags "
+            "or bodies in their map",
+            file=sys.stderr,
+        )
+    return {
+        "place_m_rad": [round(float(value), 5) for value in clamp.place],
+        "sigma": [round(float(value), 5) for value in clamp.sigma],
+    }
 
 
 def _play(given: argparse.Namespace, hardware: Hardware | None) -> Path:
