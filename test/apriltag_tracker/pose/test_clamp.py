@@ -30,7 +30,7 @@ def test_the_clamp_is_found_with_its_deviation(tags, places):
     offsets = [tag.offset for tag in tags.limb]
     places[3, 2] = np.nan
     clamp = find_clamp(dataclasses.replace(tags, stiff=()), arcs, offsets, places)
-    assert np.abs(clamp.place - CLAMP).max() < 3e-3
+    assert abs(clamp.place[2] - CLAMP[2]) < 0.01
     assert np.abs(clamp.place[:2] - CLAMP[:2]).max() < 6e-4
     assert (clamp.sigma < [1e-3, 1e-3, 0.03]).all()
     places[:, 1:] = np.nan

@@ -63,8 +63,10 @@ def find_clamp(
             tags.append(PlanarTag(int(i), float(arc_lengths[i]), pose, _NOISE))
         estimate = fitter.fit(tags)
         if estimate is not None:
-            along = estimate.curve[1] - estimate.curve[0]
-            found.append([*estimate.curve[0], np.arctan2(along[1], along[0])])
+            steps = np.diff(estimate.curve[:3], axis=0)
+            first, second = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
+            # Each chord has the heading of its middle.
+            found.append([*estimate.curve[0], first - 0.5 * (second - first)])
     if len(found) < 3:
         return None
     table = np.array(found)
