@@ -169,7 +169,8 @@ def test_poses_of_motion_capture_become_the_tip(graph, states, config, tags, tmp
     """The poses come in millimetres and with y up, some are lost."""
     body_map = tmp_path / "bodies.yaml"
     text = (config / "bodies.yaml").read_text()
-    body_map.write_text(text.replace("length_unit: m ", "length_unit: mm ").replace("up: z", "up: y"))
+    text = text.replace("length_unit: m ", "length_unit: mm ").replace("up: z", "up: y")
+    body_map.write_text(text)
     mapped = {"body_map": str(body_map)}
     mocap = graph.start("apriltag_tracker", "synthetic_poses", dropout=0.02, **mapped)
     tracker = graph.start("apriltag_tracker", "pose_tracker", **mapped)

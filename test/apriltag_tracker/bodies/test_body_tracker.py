@@ -115,7 +115,7 @@ def test_bodies_of_the_table_that_move_together_are_the_mocap_that_was_moved(bod
 
 def test_a_frame_is_found_from_points_that_are_not_on_a_line():
     points = np.random.default_rng(2).normal(size=(4, 3))
-    turned = points @ np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]) + [1.0, 2.0, 3.0]
+    turned = points @ np.roll(np.eye(3), 1, axis=0) + [1.0, 2.0, 3.0]
     frame, left = fit_frame(points, turned)
     assert left < 1e-12
     assert np.allclose(frame.of(points), turned)

@@ -23,6 +23,7 @@ from der_planner.limb import Limb, PointMass
         (["--page", "70000"], "--page is 70000"),
         (["--page", "--offline"], "does not go with --offline"),
         (["--library", "/nowhere"], "/nowhere is no folder"),
+        (["--poses", "--offline"], "--poses is motion capture of the twin"),
     ],
 )
 def test_a_bad_option_is_refused_by_its_name(arguments, named):

@@ -42,7 +42,8 @@ def take(bodies):
 def motive(path: Path, bodies: BodyMap, take, unit: str = "Millimeters") -> Path:
     """Write a take as Motive exports it: rotation before position, markers among the bodies."""
     scale = {"Millimeters": 1e3, "Meters": 1.0}[unit]
-    columns = [(name, part) for name in bodies.names for part in ("Rotation",) * 4 + ("Position",) * 3]
+    parts = ("Rotation",) * 4 + ("Position",) * 3
+    columns = [(name, part) for name in bodies.names for part in parts]
     rows = [
         ["Format Version", "1.23", "Take Name", "t", "Rotation Type", "Quaternion"]
         + ["Length Units", unit, "Coordinate Space", "Global"],

@@ -1,4 +1,4 @@
-"""What a motion capture system would tell of a simulated limb, with what goes wrong in real ones."""
+"""What motion capture would tell of a simulated limb, with what goes wrong in real systems."""
 
 from __future__ import annotations
 

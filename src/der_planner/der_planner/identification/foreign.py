@@ -70,8 +70,8 @@ def read_poses(path: Path) -> PoseLog:
     except (ValueError, IndexError) as error:
         raise LogError(f"the table {path} is not as its program writes it: {error}") from error
     raise LogError(
-        f"{path} is no table of motion capture that is known: export it from Motive as CSV, or from "
-        "QTM as TSV of 6DOF data, each with its header"
+        f"{path} is no table of motion capture that is known: export it from Motive as CSV, or "
+        "from QTM as TSV of 6DOF data, each with its header"
     )
 
 

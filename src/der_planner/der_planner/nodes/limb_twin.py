@@ -47,7 +47,7 @@ class LimbTwinNode(Node):
             at_least=0.0, at_most=2.0, read_only=False,
         )  # fmt: skip
         wiring = read(
-            "wiring", [0], "chamber that each valve fills, from 1; minus: bends the other way; 0: own"
+            "wiring", [0], "chamber of each valve, from 1; minus: it bends the other way; 0: own"
         )
         self._wiring = None if list(wiring) == [0] else Wiring(tuple(map(int, wiring)))
         check_overrides(self)
