@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from apriltag_tracker.bodies.body_map import BodyMap
-from apriltag_tracker.bodies.forms import FORMS, FormError, PoseSubscriber, pose_messages, topics_of
+from apriltag_tracker.bodies.forms import FORMS, PoseFormError, PoseSubscriber, pose_messages, topics_of
 from apriltag_tracker.bodies.tracker import PoseFrame
 
 
@@ -89,7 +89,7 @@ def test_an_array_of_another_size_is_told(bodies):
 def test_a_form_that_cannot_be_is_refused_with_the_remedy(bodies, monkeypatch):
     monkeypatch.setitem(sys.modules, "motion_capture_tracking_interfaces", None)
     monkeypatch.setitem(sys.modules, "motion_capture_tracking_interfaces.msg", None)
-    with pytest.raises(FormError, match="install ros-jazzy-motion-capture-tracking-interfaces"):
+    with pytest.raises(PoseFormError, match="install ros-jazzy-motion-capture-tracking-interfaces"):
         PoseSubscriber(FakeNode(), "named_pose_array", "", bodies, list)
-    with pytest.raises(FormError, match="{body}"):
+    with pytest.raises(PoseFormError, match="{body}"):
         topics_of("pose_stamped", "poses", bodies.names)

@@ -30,7 +30,7 @@ class BodyMapError(ValueError):
 
 
 @dataclass(frozen=True)
-class LimbBody:
+class BodyOnLimb:
     """A rigid body on the limb.
 
     Attributes:
@@ -94,7 +94,7 @@ class BodyMap:
     """
 
     segment_lengths: tuple[float, ...]
-    limb: tuple[LimbBody, ...]
+    limb: tuple[BodyOnLimb, ...]
     fixed: tuple[FixedBody, ...]
     names: tuple[str, ...]
     stiff: tuple[tuple[float, float], ...] = ()
@@ -144,7 +144,7 @@ class BodyMap:
         names = tuple(body.name for body in found)
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise BodyMapError(f"bodies {', '.join(twice)} are listed twice: each has its own name")
-        limb = tuple(body for body in found if isinstance(body, LimbBody))
+        limb = tuple(body for body in found if isinstance(body, BodyOnLimb))
         if not limb:
             raise BodyMapError("bodies: at least one must have an arc_length on the limb")
         fixed = tuple(body for body in found if isinstance(body, FixedBody))
@@ -161,7 +161,7 @@ class BodyMap:
         )
 
 
-def _body(entry: Any, total: float) -> LimbBody | FixedBody:
+def _body(entry: Any, total: float) -> BodyOnLimb | FixedBody:
     if not isinstance(entry, dict) or not isinstance(entry.get("name"), str):
         raise BodyMapError(f"bodies: an entry 'name: …, arc_length: …' expected, not {entry!r}")
     name = f"body {entry['name']}"
@@ -181,7 +181,7 @@ def _body(entry: Any, total: float) -> LimbBody | FixedBody:
     along, across, angle = floats(entry.get("offset", [0.0, 0.0, 0.0]), 3, f"{name}: offset")
     height = number(entry.get("height", 0.0), f"{name}: height")
     rotation = np.eye(3) if turn is None else turn
-    return LimbBody(entry["name"], arc_length, height, (along, across, angle), rotation)
+    return BodyOnLimb(entry["name"], arc_length, height, (along, across, angle), rotation)
 
 
 def _rotation(value: Any, name: str) -> NDArray[np.float64]:

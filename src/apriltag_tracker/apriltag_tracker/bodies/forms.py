@@ -38,7 +38,7 @@ _TYPES = {
 }
 
 
-class FormError(RuntimeError):
+class PoseFormError(RuntimeError):
     """Poses cannot come in this way here; the message says what to install or to set."""
 
 
@@ -46,14 +46,14 @@ def message_type(form: str) -> Any:
     """Return the type of a form's messages.
 
     Raises:
-        FormError: its package is not installed.
+        PoseFormError: its package is not installed.
     """
     module, name = _TYPES[form]
     try:
         return getattr(importlib.import_module(module), name)
     except ImportError as error:
         package = module.split(".")[0]
-        raise FormError(
+        raise PoseFormError(
             f"form '{form}' needs the package {package}: install ros-jazzy-"
             f"{package.replace('_', '-')}, or have the poses published as geometry_msgs"
         ) from error
@@ -63,14 +63,14 @@ def topics_of(form: str, topic: str, names: tuple[str, ...]) -> dict[str, str]:
     """Return the topic of each body, or of all under an empty name.
 
     Raises:
-        FormError: a body has a topic of its own and the topic's name does not say where its name is
+        PoseFormError: a body has a topic of its own and the topic's name does not say where its name is
             to stand.
     """
     topic = topic or TOPICS[form]
     if form != "pose_stamped":
         return {"": topic}
     if BODY not in topic and len(names) > 1:
-        raise FormError(f"topic '{topic}': write {BODY} where the name of a body is to stand")
+        raise PoseFormError(f"topic '{topic}': write {BODY} where the name of a body is to stand")
     return {name: topic.replace(BODY, name) for name in names}
 
 
@@ -85,7 +85,7 @@ class PoseSubscriber:
         take: called with every frame.
 
     Raises:
-        FormError: the form's package is not installed, or the topic does not fit it.
+        PoseFormError: the form's package is not installed, or the topic does not fit it.
     """
 
     def __init__(
@@ -152,7 +152,7 @@ def pose_messages(
     Bodies that are missing are left out, or NaN in a message without names.
 
     Raises:
-        FormError: the form's package is not installed.
+        PoseFormError: the form's package is not installed.
     """
     kind = message_type(form)
     stamp = stamps.stamp_from_nanoseconds(frame.stamp)
