@@ -56,6 +56,8 @@ class TrackerNode(Node):
         source = str(declare(self, "source", "topic", where))
         rate = self._number("source_rate", 30.0, "images a second from a folder", 0.1, 500.0)
         cv2.setNumThreads(int(self._number("threads", 1, "threads of OpenCV", 1, 64)))
+        late = "from an exposure to its stamp [s]"
+        self._delay = round(1e9 * self._number("sensor_delay", 0.0, late, -0.5, 0.5))
         self._map = TagMap.from_yaml(str(tag_map))
         self._options = self._declare_options()
         self._detector = self._make_detector()
@@ -220,6 +222,7 @@ class TrackerNode(Node):
             self._watch.repeated += 1
             return
         self._last_stamp = stamps.nanoseconds(stamp)
+        stamp = stamps.stamp_from_nanoseconds(self._last_stamp - self._delay)
         self._gaps.take(self._last_stamp)
         if self._tracker is None:
             self._fail(stamp, self._watch.calibration_problem or NO_CALIBRATION)

@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 
 from apriltag_tracker.bodies.body_map import BodyMap
-from apriltag_tracker.bodies.forms import FORMS, PoseFormError, PoseSubscriber, pose_messages, topics_of
+from apriltag_tracker.bodies.forms import (
+    FORMS,
+    PoseFormError,
+    PoseSubscriber,
+    pose_messages,
+    topics_of,
+)
 from apriltag_tracker.bodies.tracker import PoseFrame
 
 
