@@ -228,7 +228,7 @@ def read_check(path: Path, bodies: TagMap | BodyMap) -> RigLog:
     headed[..., 2] = _unwrapped(headed[..., 2])
     return RigLog(
         seconds(commands),
-        commands.values(count),
+        np.nan_to_num(commands.values(count)),
         measured.values(2 * count),
         opening.values(2 * count),
         seconds(places),
