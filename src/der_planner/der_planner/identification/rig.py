@@ -152,11 +152,6 @@ class RigFinding:
         valves = {valve.chamber: valve.valve for valve in self.valves}
         return tuple(valves[chamber] for chamber in range(len(self.valves)))
 
-    @property
-    def permuted(self) -> bool:
-        """Whether a valve fills another chamber than the driver believes."""
-        return any(valve.chamber != valve.valve for valve in self.valves)
-
     def text(self) -> str:
         """Say it in lines for people."""
         lines = [valve.text() for valve in self.valves]
@@ -185,6 +180,7 @@ class RigFinding:
                 for each in self.valves
             ],
             "order": [self.names[k] for k in self.order],
+            "order_ratio": round(self.order_sure, 2),
             "warnings": list(self.warnings),
         }
 
