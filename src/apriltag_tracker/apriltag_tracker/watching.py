@@ -65,9 +65,7 @@ class StreamWatch:
         clock: a steady clock [s].
     """
 
-    def __init__(
-        self, source: str, noun: str, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, source: str, noun: str, clock: Callable[[], float] = time.monotonic) -> None:
         self._source = source
         self._noun = noun
         self._clock = clock

@@ -126,9 +126,7 @@ def test_a_frame_is_found_from_points_that_are_not_on_a_line():
 
 def test_the_plane_of_motion_is_told_with_its_tilt(swing, bodies):
     watch, tilt = PlaneWatch(2), np.deg2rad(3.0)
-    turn = np.array(
-        [[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]]
-    )
+    turn = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
     assert watch.normal is None
     for time in np.arange(0.0, 6.0, 0.05):
         points = swing.shape(time).points[[60, -1]]

@@ -119,16 +119,22 @@ class BaseFinder:
                 places += list(body.position + _ARM * body.rotation.T)
         found = fit_frame(np.array(points), np.array(places))
         if found is None:
-            self.frame, self.problem = None, (
-                "the fixed bodies that are seen tell no frame: three that are not on a line, or "
-                "one with its rotation in the map, are needed"
+            self.frame, self.problem = (
+                None,
+                (
+                    "the fixed bodies that are seen tell no frame: three that are not on a line, or "
+                    "one with its rotation in the map, are needed"
+                ),
             )
             return
         frame, self.residual = found
         if self.residual > _MISFIT:
-            self.frame, self.problem = None, (
-                f"the fixed bodies do not fit together ({1e3 * self.residual:.0f} mm): measure "
-                "their positions again, and check length_unit and names"
+            self.frame, self.problem = (
+                None,
+                (
+                    f"the fixed bodies do not fit together ({1e3 * self.residual:.0f} mm): measure "
+                    "their positions again, and check length_unit and names"
+                ),
             )
             return
         self.frame, self.problem = frame, ""

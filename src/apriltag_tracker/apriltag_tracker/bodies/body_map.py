@@ -175,9 +175,7 @@ def _body(entry: Any, total: float) -> BodyOnLimb | FixedBody:
         return FixedBody(entry["name"], np.array(position), turn)
     arc_length = number(entry["arc_length"], f"{name}: arc_length")
     if not 0.0 <= arc_length <= total:
-        raise BodyMapError(
-            f"{name}: arc_length {arc_length} m is not on the limb (0 to {total} m)"
-        )
+        raise BodyMapError(f"{name}: arc_length {arc_length} m is not on the limb (0 to {total} m)")
     along, across, angle = floats(entry.get("offset", [0.0, 0.0, 0.0]), 3, f"{name}: offset")
     height = number(entry.get("height", 0.0), f"{name}: height")
     rotation = np.eye(3) if turn is None else turn

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from apriltag_tracker.pose.curve import PLACE, Curve, CurveFit, Evaluation, fit_curve
 
+
 class LimbGeometry(Protocol):
     """What the fit knows of the limb: a map of tags or of bodies says it."""
 
@@ -31,7 +32,6 @@ class LimbGeometry(Protocol):
     @property
     def length(self) -> float:
         """Arc length of the tip at rest [m]."""
-
 
 
 @dataclass(frozen=True)
@@ -180,9 +180,7 @@ class ShapeFitter:
         self.prior = prior or ShapePrior()
         self.reject_beyond = reject_beyond
         self._mounting = np.array([mounting, mounting, mounting_angle])
-        self._smooth = Curve(
-            geometry.segment_lengths, len(self.prior.corrections), geometry.stiff
-        )
+        self._smooth = Curve(geometry.segment_lengths, len(self.prior.corrections), geometry.stiff)
         self._constant = Curve(geometry.segment_lengths, 0, geometry.stiff)
         self._outline = Evaluation(
             self._smooth, np.linspace(0.0, geometry.length, CURVE_POINTS).tolist()

@@ -66,9 +66,7 @@ class SyntheticPosesNode(Node):
     def _number(
         self, name: str, default: float, description: str, at_least: float, at_most: float
     ) -> float:
-        return float(
-            declare(self, name, default, description, at_least=at_least, at_most=at_most)
-        )
+        return float(declare(self, name, default, description, at_least=at_least, at_most=at_most))
 
     def _on_shape(self, message: LimbShape) -> None:
         self._last_shape = time.monotonic()

@@ -156,9 +156,7 @@ def bends_of(log: PoseLog, body_map: Path) -> tuple[Array, Array]:
         raise LogError(str(error)) from error
     missing = [name for name in bodies.names if name not in log.names]
     if missing:
-        raise LogError(
-            f"the poses have no body '{missing[0]}': theirs are {', '.join(log.names)}"
-        )
+        raise LogError(f"the poses have no body '{missing[0]}': theirs are {', '.join(log.names)}")
     order = [log.names.index(name) for name in bodies.names]
     tracker = BodyTracker(bodies)
     angles = np.full((len(log.time), len(bodies.segment_lengths)), np.nan)
@@ -253,9 +251,7 @@ _WITH_POSES = ("bodies", "poses_late")
 _WITHOUT_POSES = ("angles", "angle_unit", "tip", "length_unit")
 
 
-def ask_map(
-    names: Sequence[str], path: Path, ask: Callable[[str], str] = input
-) -> dict[str, Any]:
+def ask_map(names: Sequence[str], path: Path, ask: Callable[[str], str] = input) -> dict[str, Any]:
     """Ask a person what the columns of a log are, and write the answers down for ever.
 
     Args:

@@ -215,9 +215,7 @@ def find_rig(log: RigLog) -> RigFinding:
     ends = _segment_ends(arcs, log.segment_lengths)
     headings = log.places[:, [along[k] for k in ends], 2]
     bends = np.diff(headings, axis=1, prepend=0.0)
-    valves = tuple(
-        _judge(log, valve, fill, bends) for valve, fill in enumerate(fills)
-    )
+    valves = tuple(_judge(log, valve, fill, bends) for valve, fill in enumerate(fills))
     contradictions, warnings = _compare(valves, len(log.segment_lengths))
     expected = [int(k) for k in np.argsort(log.arc_lengths) if not blind[k]]
     if along != expected:
@@ -341,8 +339,9 @@ def _judge(log: RigLog, valve: int, fill: tuple[float, float], bends: Array) -> 
         if short > LEAKS or opening > OPEN:
             problems.append(
                 f"it leaks or is fed too little: {100 * short:.0f} % below its command, its inlet "
-                f"{100 * opening:.0f} % open" if np.isfinite(opening) else
-                f"it leaks or is fed too little: {100 * short:.0f} % below its command"
+                f"{100 * opening:.0f} % open"
+                if np.isfinite(opening)
+                else f"it leaks or is fed too little: {100 * short:.0f} % below its command"
             )
         later = (log.time > fill[1] + VENT - LEVEL) & (log.time < fill[1] + VENT)
         left = _mean(log.measured[later])[sensor] - levels[sensor] if later.any() else 0.0
