@@ -97,5 +97,5 @@ def test_a_form_that_cannot_be_is_refused_with_the_remedy(bodies, monkeypatch):
     monkeypatch.setitem(sys.modules, "motion_capture_tracking_interfaces.msg", None)
     with pytest.raises(PoseFormError, match="install ros-jazzy-motion-capture-tracking-interfaces"):
         PoseSubscriber(FakeNode(), "named_pose_array", "", bodies, list)
-    with pytest.raises(PoseFormError, match="{body}"):
+    with pytest.raises(PoseFormError, match=r"\{body\}"):
         topics_of("pose_stamped", "poses", bodies.names)

@@ -45,8 +45,8 @@ def motive(path: Path, bodies: BodyMap, take, unit: str = "Millimeters") -> Path
     parts = ("Rotation",) * 4 + ("Position",) * 3
     columns = [(name, part) for name in bodies.names for part in parts]
     rows = [
-        ["Format Version", "1.23", "Take Name", "t", "Rotation Type", "Quaternion"]
-        + ["Length Units", unit, "Coordinate Space", "Global"],
+        "Format Version,1.23,Take Name,t,Rotation Type,Quaternion,Length Units".split(",")
+        + [unit, "Coordinate Space", "Global"],
         [],
         ["", "Type", *["Rigid Body"] * len(columns), "Marker"],
         ["", "Name", *[name for name, _ in columns], "loose"],

@@ -135,7 +135,7 @@ def test_what_is_broken_is_named(straight):
 
     opening = np.where(np.abs(straight.command[:, [0, 0, 1, 1]]) > 0, 0.3, 0.0)
     found = find_rig(dataclasses.replace(straight, opening=opening))
-    assert any("its inlet 30 % open" in each for each in found.warnings)
+    assert any("its inlet 27 % open" in each for each in found.warnings)
 
     crossed = straight.measured[:, [1, 0, 2, 3]]
     found = find_rig(dataclasses.replace(straight, measured=crossed))

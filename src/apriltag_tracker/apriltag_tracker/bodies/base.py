@@ -122,8 +122,8 @@ class BaseFinder:
             self.frame, self.problem = (
                 None,
                 (
-                    "the fixed bodies that are seen tell no frame: three that are not on a line, or "
-                    "one with its rotation in the map, are needed"
+                    "the fixed bodies that are seen tell no frame: three that are not on a line, "
+                    "or one with its rotation in the map, are needed"
                 ),
             )
             return

@@ -63,8 +63,8 @@ def topics_of(form: str, topic: str, names: tuple[str, ...]) -> dict[str, str]:
     """Return the topic of each body, or of all under an empty name.
 
     Raises:
-        PoseFormError: a body has a topic of its own and the topic's name does not say where its name is
-            to stand.
+        PoseFormError: each body has a topic of its own, and the name does not say where that of the
+            body is to stand.
     """
     topic = topic or TOPICS[form]
     if form != "pose_stamped":

@@ -125,7 +125,8 @@ class LimbFollower:
         Args:
             seen: what was seen of the limb, each id once.
             stamp: of the picture [s].
-            common, shared_noise: as of `ShapeFitter.fit`.
+            common: as of `ShapeFitter.fit`.
+            shared_noise: as of `ShapeFitter.fit`.
         """
         estimate = self._fitter.fit(seen, common, shared_noise) if seen else None
         if estimate is None:

@@ -194,7 +194,8 @@ def play_calibration(
         prior: whose gravity and masses the twin gets.
         seed: of the twin.
         hardware: in place of the twin.
-        wiring, poses: of the twin, as of `GraphSetup`.
+        wiring: of the twin, as of `GraphSetup`.
+        poses: of the twin, as of `GraphSetup`.
 
     Returns:
         The bag.
