@@ -44,9 +44,9 @@ def motive(path: Path, bodies: BodyMap, take, unit: str = "Millimeters") -> Path
     scale = {"Millimeters": 1e3, "Meters": 1.0}[unit]
     parts = ("Rotation",) * 4 + ("Position",) * 3
     columns = [(name, part) for name in bodies.names for part in parts]
+    about = ["Format Version", "1.23", "Take Name", "t", "Rotation Type", "Quaternion"]
     rows = [
-        "Format Version,1.23,Take Name,t,Rotation Type,Quaternion,Length Units".split(",")
-        + [unit, "Coordinate Space", "Global"],
+        [*about, "Length Units", unit, "Coordinate Space", "Global"],
         [],
         ["", "Type", *["Rigid Body"] * len(columns), "Marker"],
         ["", "Name", *[name for name, _ in columns], "loose"],

@@ -53,14 +53,14 @@ def find_clamp(
         The clamp; None if fewer than three frames show three of them.
     """
     fitter = ShapeFitter(geometry, _FREE, reject_beyond=1.0)
-    seen = np.isfinite(places).all(axis=2)
+    seen: NDArray[np.bool_] = np.isfinite(places).all(axis=2)
     frames = np.flatnonzero(seen.sum(axis=1) >= 3)
     found = []
     for k in frames[np.linspace(0, len(frames) - 1, min(_MOST, len(frames))).astype(int)]:
         tags = []
-        for i in np.flatnonzero(seen[k]):
+        for i in np.flatnonzero(seen[k]).tolist():
             pose = centreline_pose(places[k, i], offsets[i])
-            tags.append(PlanarTag(int(i), float(arc_lengths[i]), pose, _NOISE))
+            tags.append(PlanarTag(i, float(arc_lengths[i]), pose, _NOISE))
         estimate = fitter.fit(tags)
         if estimate is not None:
             steps = np.diff(estimate.curve[:3], axis=0)

@@ -195,7 +195,9 @@ def read_check(path: Path, bodies: TagMap | BodyMap) -> RigLog:
         RigError: it holds no pressures, or nothing was seen of the limb.
         BagError: the bag cannot be read.
     """
-    limb = {(body.id if isinstance(bodies, TagMap) else k): k for k, body in enumerate(bodies.limb)}
+    # The id of a body is its place in the map.
+    ids = [tag.id for tag in bodies.limb] if isinstance(bodies, TagMap) else None
+    limb = {ids[k] if ids else k: k for k in range(len(bodies.limb))}
     commands, measured, opening, places = Columns(), Columns(), Columns(), Columns()
     with BagReader(path) as bag:
         kinds = {name: topic.type_name for name, topic in bag.topics.items()}

@@ -194,7 +194,8 @@ def check_run(segment_count: int = 2, pressure: float = GENTLE) -> Excitation:
         fill[:held, valve // 2] = pressure * (1 - 2 * (valve % 2))
         rows.append(fill)
     table = np.concatenate(rows)
-    return Excitation(CONTROL_PERIOD * np.arange(len(table)), table)
+    time = CONTROL_PERIOD * np.arange(len(table), dtype=np.float64)
+    return Excitation(time, table)
 
 
 def find_rig(log: RigLog) -> RigFinding:
@@ -379,7 +380,8 @@ def _largest(changes: Array, least: float) -> tuple[int | None, float, float]:
 
 def _compare(valves: Sequence[ValveFinding], count: int) -> tuple[list[str], list[str]]:
     """Return why valves contradict each other, and what else is worth a warning."""
-    contradictions, warnings = [], []
+    contradictions: list[str] = []
+    warnings: list[str] = []
     for each in valves:
         for said in each.problems:
             grave = each.segment is None or "more than one" in said
