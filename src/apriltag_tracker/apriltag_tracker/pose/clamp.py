@@ -53,7 +53,7 @@ def find_clamp(
         The clamp; None if fewer than three frames show three of them.
     """
     fitter = ShapeFitter(geometry, _FREE, reject_beyond=1.0)
-    seen: NDArray[np.bool_] = np.isfinite(places).all(axis=2)
+    seen = np.asarray(np.isfinite(places).all(axis=2))
     frames = np.flatnonzero(seen.sum(axis=1) >= 3)
     found = []
     for k in frames[np.linspace(0, len(frames) - 1, min(_MOST, len(frames))).astype(int)]:
