@@ -5,15 +5,13 @@ from __future__ import annotations
 import array
 import sys
 import time
-from pathlib import Path
+from dataclasses import replace
 
 import cv2
 import numpy as np
-from ament_index_python.packages import get_package_share_directory
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose2D
 from numpy.typing import NDArray
-from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
 
 from apriltag_tracker.camera import CameraError, Intrinsics
@@ -26,12 +24,12 @@ from apriltag_tracker.pipeline import (
     TrackerOptions,
     warm_up,
 )
-from apriltag_tracker.pose.following import Uncertainty
-from apriltag_tracker.publishing import StatePublisher, camera_transform
+from apriltag_tracker.pose.node import LimbStateNode
 from apriltag_tracker.reports import NO_CALIBRATION, ImageWatch, draw_observation
+from apriltag_tracker.state_messages import camera_transform
 from apriltag_tracker.tag_map import TagMap
 from apriltag_tracker.watching import StampGaps
-from der_msgs.msg import TagDetection, TagDetectionArray
+from der_msgs.msg import TagDetection
 from limb_interfaces import qos, stamps, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.parameters import check_overrides, declare
@@ -40,25 +38,19 @@ from limb_interfaces.runner import run_node
 ANNOTATED_IMAGE = "camera/image_annotated"
 
 
-class TrackerNode(Node):
+class TrackerNode(LimbStateNode):
     """Follows the limb in images of a topic, a camera, a video file or a folder."""
 
     def __init__(self) -> None:
-        super().__init__("apriltag_tracker", namespace=topics.NAMESPACE)
-        share = Path(get_package_share_directory("apriltag_tracker")) / "config"
-        tag_map = declare(
-            self, "tag_map", str(share / "tags.yaml"), "YAML file: where the tags are"
-        )
+        super().__init__("apriltag_tracker", "tag_map", "tags.yaml", "tag")
         calibration = declare(
             self, "calibration_file", "", "camera_info YAML; empty: from the camera_info topic"
         )
         where = "where images come from: topic, /dev/videoN, a video file, or a folder of images"
         source = str(declare(self, "source", "topic", where))
-        rate = self._number("source_rate", 30.0, "images a second from a folder", 0.1, 500.0)
-        cv2.setNumThreads(int(self._number("threads", 1, "threads of OpenCV", 1, 64)))
-        late = "from an exposure to its stamp [s]"
-        self._delay = round(1e9 * self._number("sensor_delay", 0.0, late, -0.5, 0.5))
-        self._map = TagMap.from_yaml(str(tag_map))
+        rate = self.number("source_rate", 30.0, "images a second from a folder", 0.1, 500.0)
+        cv2.setNumThreads(int(self.number("threads", 1, "threads of OpenCV", 1, 64)))
+        self._map = TagMap.from_yaml(self.map_path)
         self._options = self._declare_options()
         self._detector = self._make_detector()
         check_overrides(self)
@@ -102,54 +94,28 @@ class TrackerNode(Node):
         lens = self._tracker.intrinsics
         return open_source(source, rate, size=(lens.width, lens.height))
 
-    def _number(
-        self, name: str, default: float, description: str, at_least: float, at_most: float
-    ) -> float:
-        """Declare a number; one whose default is whole is whole."""
-        return declare(self, name, default, description, at_least=at_least, at_most=at_most)
-
     def _declare_options(self) -> TrackerOptions:
-        usual = TrackerOptions()
-        sigma = usual.uncertainty
-        of_heights, of_places = "of limb tags' heights, m", "of limb tags on the limb, m"
-        missing = "frames without limb tags that are bridged and marked"
-        apart = "distance in m from the other tags' shape at which a tag is left out"
-        unsure = "standard deviation of the tip in m above which no tip is told"
+        options = self.declare_following(TrackerOptions())
+        heights = "of limb tags' heights, m"
+        height = self.number("height_sigma", options.uncertainty.height, heights, 0.0, 0.1)
         period = "s between searches of the whole image; 0 searches every image in full"
-        number = self._number
-        return TrackerOptions(
-            bridge_frames=int(number("bridge_frames", usual.bridge_frames, missing, 0, 30)),
-            reject_beyond=number("reject_beyond", usual.reject_beyond, apart, 0.0, 0.1),
-            largest_tip_sigma=number(
-                "largest_tip_sigma", usual.largest_tip_sigma, unsure, 0.0, 1.0
-            ),
-            uncertainty=Uncertainty(
-                survey=number("survey_sigma", sigma.survey, "of fixed tags' places, m", 0.0, 0.1),
-                height=number("height_sigma", sigma.height, of_heights, 0.0, 0.1),
-                mounting=number("mounting_sigma", sigma.mounting, of_places, 0.0, 0.1),
-                mounting_angle=number(
-                    "mounting_angle_sigma",
-                    sigma.mounting_angle,
-                    "of limb tags' directions, rad",
-                    0.0,
-                    1.0,
-                ),
-            ),
-            full_search_period=number(
-                "full_search_period", usual.full_search_period, period, 0.0, 60.0
+        return replace(
+            options,
+            uncertainty=replace(options.uncertainty, height=height),
+            full_search_period=self.number(
+                "full_search_period", options.full_search_period, period, 0.0, 60.0
             ),
         )
 
     def _make_detector(self) -> Detector:
         family = self._map.family
-        shortest = self._number("smallest_tag", 14.0, "shortest side of a tag in px", 8.0, 500.0)
+        shortest = self.number("smallest_tag", 14.0, "shortest side of a tag in px", 8.0, 500.0)
         forgiven = "wrong bits of a code that are forgiven in a search"
-        bits = self._number("correct_bits", family.correct_bits, forgiven, 0, family.most_corrected)
+        bits = self.number("correct_bits", family.correct_bits, forgiven, 0, family.most_corrected)
         return Detector(shortest, int(bits), family=family)
 
     def _make_topics(self) -> None:
-        self._tags = self.create_publisher(TagDetectionArray, topics.TAGS, qos.STATES)
-        self._states = StatePublisher(self, len(self._map.segment_lengths))
+        self.make_outputs(len(self._map.segment_lengths))
         self._annotated = self.create_publisher(Image, ANNOTATED_IMAGE, qos.SENSOR_DATA)
 
     def _subscribe(self, needs_info: bool) -> None:
@@ -222,7 +188,7 @@ class TrackerNode(Node):
             self._watch.repeated += 1
             return
         self._last_stamp = stamps.nanoseconds(stamp)
-        stamp = stamps.stamp_from_nanoseconds(self._last_stamp - self._delay)
+        stamp = stamps.stamp_from_nanoseconds(self._last_stamp - self.sensor_delay)
         self._gaps.take(self._last_stamp)
         if self._tracker is None:
             self._fail(stamp, self._watch.calibration_problem or NO_CALIBRATION)
@@ -239,7 +205,7 @@ class TrackerNode(Node):
     def _fail(self, stamp: Time, problem: str) -> None:
         """Say at once that this image gives no state, and why."""
         self._watch.failed_with(problem)
-        self._states.publish(None, problem, stamp)
+        self.publish_state(None, problem, stamp)
 
     # Output
 
@@ -248,15 +214,12 @@ class TrackerNode(Node):
         assert self._tracker is not None
         pose = self._tracker.world.pose
         camera = (
-            [camera_transform(pose.rotation, pose.translation, stamp, self._frame)]
-            if pose is not None and self._states.tells_transforms
-            else []
+            []
+            if pose is None
+            else [camera_transform(pose.rotation, pose.translation, stamp, self._frame)]
         )
-        latency = self._states.publish(observation.estimate, observation.reason, stamp, camera)
-        tags = TagDetectionArray(detections=[_tag_message(placed) for placed in observation.tags])
-        tags.header.stamp = stamp
-        tags.header.frame_id = topics.BASE_FRAME
-        self._tags.publish(tags)
+        latency = self.publish_state(observation.estimate, observation.reason, stamp, camera)
+        self.publish_tags([_tag_message(placed) for placed in observation.tags], stamp)
         if self._annotated.get_subscription_count() > 0:
             picture = draw_observation(gray, observation, self._tracker)
             message = Image(

@@ -1,101 +1,70 @@
-"""Poses as messages of other trackers: what goes out in a form comes back as the same frame."""
+"""Poses in the messages of other trackers."""
 
 from __future__ import annotations
 
 import sys
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Pose, PoseArray, PoseStamped, TransformStamped
 
-from apriltag_tracker.bodies.body_map import BodyMap
-from apriltag_tracker.bodies.forms import (
-    FORMS,
-    PoseFormError,
-    PoseSubscriber,
-    pose_messages,
-    topics_of,
-)
-from apriltag_tracker.bodies.tracker import PoseFrame
+from apriltag_tracker.bodies.forms import PoseFormError, message_type, poses_of, topics_of
+
+NAMES = ("clamp", "tip")
+STAMP = Time(sec=2, nanosec=5)
+HEADER = SimpleNamespace(stamp=STAMP)
 
 
-class FakeMessage(SimpleNamespace):
-    """A message of a package that is not installed here."""
-
-    def __init__(self, **values):
-        stamp = SimpleNamespace(sec=0, nanosec=0)
-        super().__init__(header=SimpleNamespace(stamp=stamp, frame_id=""), **values)
+def pose(x: float) -> Pose:
+    found = Pose()
+    found.position.x, found.orientation.w = x, 1.0
+    return found
 
 
-@pytest.fixture
-def other_packages(monkeypatch):
-    """Have `tf2_msgs` and `motion_capture_tracking_interfaces` installed."""
-    for name, kinds in (
-        ("tf2_msgs", ("TFMessage",)),
-        ("motion_capture_tracking_interfaces", ("NamedPose", "NamedPoseArray")),
-    ):
-        module = SimpleNamespace(**dict.fromkeys(kinds, FakeMessage))
-        monkeypatch.setitem(sys.modules, name, SimpleNamespace(msg=module))
-        monkeypatch.setitem(sys.modules, f"{name}.msg", module)
+def transform(name: str, x: float) -> TransformStamped:
+    found = TransformStamped(child_frame_id=name)
+    found.header.stamp = STAMP
+    found.transform.translation.x, found.transform.rotation.w = x, 1.0
+    return found
 
 
-class FakeNode:
-    """Keeps what subscribes to which topic."""
-
-    def __init__(self):
-        self.listeners = {}
-
-    def get_clock(self):
-        return SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=77))
-
-    def create_subscription(self, kind, topic, take, profile):
-        self.listeners[topic] = take
+def named(name: str, x: float) -> SimpleNamespace:
+    return SimpleNamespace(name=name, pose=pose(x))
 
 
-@pytest.fixture
-def bodies(config) -> BodyMap:
-    return BodyMap.from_yaml(config / "bodies.yaml")
+# Two of the types are of packages that are not installed here.
+MESSAGES = {
+    "pose_array": PoseArray(poses=[pose(1.0), pose(2.0)]),
+    "tf": SimpleNamespace(transforms=[transform("clamp", 1.0), transform("tip", 2.0)]),
+    "named_pose_array": SimpleNamespace(
+        header=HEADER, poses=[named("clamp", 1.0), named("tip", 2.0)]
+    ),
+}
+MESSAGES["pose_array"].header.stamp = STAMP
 
 
-def frames(bodies, count):
-    random = np.random.default_rng(1)
-    size = len(bodies.names)
-    turns = random.standard_normal((count, size, 4))
-    turns /= np.linalg.norm(turns, axis=2, keepdims=True)
-    return [
-        PoseFrame(1_000_000_000 + 10_000_000 * k, random.standard_normal((size, 3)), turns[k])
-        for k in range(count)
+@pytest.mark.parametrize("form", MESSAGES)
+def test_all_bodies_of_a_message_are_told(form):
+    found = list(poses_of(form, MESSAGES[form], "", NAMES))
+    assert [each.name for each in found] == list(NAMES)
+    assert {each.stamp for each in found} == {2_000_000_005}
+    assert [each.pose for each in found] == [(x, 0, 0, 0, 0, 0, 1) for x in (1.0, 2.0)]
+
+
+def test_a_topic_of_its_own_names_the_body():
+    message = PoseStamped(pose=pose(3.0))
+    assert list(poses_of("pose_stamped", message, "tip", NAMES)) == [
+        ("tip", 0, (3.0, 0, 0, 0, 0, 0, 1))
     ]
+    assert topics_of("pose_stamped", "", NAMES)["tip"] == "poses/tip/pose"
+    with pytest.raises(PoseFormError, match=r"\{body\}"):
+        topics_of("pose_stamped", "poses", NAMES)
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_a_frame_comes_back_as_it_went_out(form, bodies, other_packages):
-    node, taken = FakeNode(), []
-    reader = PoseSubscriber(node, form, "", bodies, taken.append)
-    sent = frames(bodies, 4)
-    for frame in sent:
-        for name, message in pose_messages(form, bodies.names, frame, "mocap").items():
-            node.listeners[reader.topics[name]](message)
-    assert [frame.stamp for frame in taken] == [frame.stamp for frame in sent]
-    for came, went in zip(taken, sent, strict=True):
-        assert np.array_equal(came.positions, went.positions)
-        assert np.array_equal(came.quaternions, went.quaternions)
-
-
-def test_an_array_of_another_size_is_told(bodies):
-    node, taken = FakeNode(), []
-    reader = PoseSubscriber(node, "pose_array", "mocap/poses", bodies, taken.append)
-    message = pose_messages("pose_array", bodies.names, frames(bodies, 1)[0], "mocap")[""]
-    message.poses = message.poses[:-1]
-    node.listeners["mocap/poses"](message)
-    assert "array of 7 poses came, the body map has 8 bodies" in reader.wrong_size
-    assert not taken
-
-
-def test_a_form_that_cannot_be_is_refused_with_the_remedy(bodies, monkeypatch):
-    monkeypatch.setitem(sys.modules, "motion_capture_tracking_interfaces", None)
+def test_what_cannot_be_is_refused_with_the_remedy(monkeypatch):
+    with pytest.raises(PoseFormError, match="array of 2 poses came, the body map has 1 bodies"):
+        list(poses_of("pose_array", MESSAGES["pose_array"], "", NAMES[:1]))
     monkeypatch.setitem(sys.modules, "motion_capture_tracking_interfaces.msg", None)
     with pytest.raises(PoseFormError, match="install ros-jazzy-motion-capture-tracking-interfaces"):
-        PoseSubscriber(FakeNode(), "named_pose_array", "", bodies, list)
-    with pytest.raises(PoseFormError, match=r"\{body\}"):
-        topics_of("pose_stamped", "poses", bodies.names)
+        message_type("named_pose_array")

@@ -67,13 +67,17 @@ def motive(path: Path, bodies: BodyMap, take, unit: str = "Millimeters") -> Path
 
 def qualisys(path: Path, bodies: BodyMap, take) -> Path:
     """Write a take as QTM exports it: millimetres, matrices by columns, zeros for what is lost."""
+    parts = ["X", "Y", "Z", "Roll", "Pitch", "Yaw", "Residual", *[f"Rot[{k}]" for k in range(9)]]
+    heads = [f"{name} {part}" if part == "X" else part for name in bodies.names for part in parts]
     lines = [
         f"NO_OF_FRAMES\t{len(take[0])}",
-        "FREQUENCY\t50",
-        "DATA_INCLUDED\t6D",
+        "NO_OF_CAMERAS\t4",
         f"NO_OF_BODIES\t{len(bodies.names)}",
+        "FREQUENCY\t50",
+        "DESCRIPTION\t--",
+        "DATA_INCLUDED\t6D",
         "\t".join(["BODY_NAMES", *bodies.names]),
-        "\t".join(["Frame", "Time", *["X", "Y", "Z", "Roll"] * len(bodies.names)]),
+        "\t".join(["Frame", "Time", *heads, ""]),
     ]
     for k, (time, _, frame) in enumerate(zip(*take, strict=True)):
         cells = [str(k + 1), f"{time:.5f}"]
@@ -94,7 +98,7 @@ def test_tables_of_motion_capture_become_angles_and_tips(tmp_path, bodies, take,
     assert np.allclose(log.time, time, atol=1e-4)
     assert np.isnan(log.positions[10, 1]).all()
     assert np.allclose(log.positions[20], frames[20].positions, atol=1e-6)
-    found, tips = bends_of(log, BODIES)
+    found, tips = bends_of(log, BODIES, log.time)
     # The map's stiff stretches are not in these arcs.
     assert np.nanmax(np.abs(found - angles)) < 0.03
     assert np.isfinite(tips).all(axis=1).mean() > 0.95
@@ -113,7 +117,7 @@ def test_poses_that_cannot_be_used_are_refused_with_the_remedy(tmp_path, bodies,
     stranger = tmp_path / "bodies.yaml"
     stranger.write_text(BODIES.read_text().replace("limb_5", "tip_body"))
     with pytest.raises(LogError, match="no body 'tip_body': theirs are clamp, limb_1"):
-        bends_of(strangers, stranger)
+        bends_of(strangers, stranger, strangers.time)
 
 
 def test_pressures_of_a_table_and_poses_beside_it_are_one_log(tmp_path, bodies, take):
@@ -180,12 +184,12 @@ def test_a_bag_of_joint_states_and_arrays_becomes_a_table(tmp_path):
     assert isinstance(read_csv(tmp_path / "bag", columns), CalibrationLog)
 
 
-def test_what_cannot_be_known_is_asked_once(tmp_path):
+def test_what_cannot_be_known_is_asked_once(tmp_path, capsys):
     answers = {
         "time": "0",
         "time_unit": "ms",
         "commanded": "1 2",
-        "chambers": "p0, p1, p2, p3",
+        "chambers": "p0, p1, 5, 6",
         "pressure_unit": "hPa",
         "poses": "take.csv",
         "bodies": "bodies.yaml",
@@ -201,7 +205,7 @@ def test_what_cannot_be_known_is_asked_once(tmp_path):
     path = tmp_path / "log.csv.columns.yaml"
     ask_map(names, path, ask)
     assert len(asked) == len(answers)
-    assert "3: p0" in asked[0]
+    assert "  3: p0" in capsys.readouterr().out
     assert yaml.safe_load(path.read_text())["commanded"] == ["u0", "u1"]
     found = ColumnMap.from_yaml(path)
     assert found.chambers == ("p0", "p1", "p2", "p3")

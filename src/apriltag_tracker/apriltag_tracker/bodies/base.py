@@ -13,8 +13,6 @@ Array = NDArray[np.float64]
 
 _MEMORY = 300
 """Frames over which fixed bodies are averaged."""
-_SOLVE_EVERY = 30
-"""Frames between two solutions once the frame has settled."""
 _ARM = 0.05
 """Distance of the points that stand for the axes of a body whose rotation is known [m]."""
 _MISFIT = 0.003
@@ -58,20 +56,26 @@ class BaseFinder:
     """
 
     def __init__(self, bodies: BodyMap) -> None:
-        self._bodies = bodies
         self._index = [bodies.names.index(body.name) for body in bodies.fixed]
-        self._clear()
+        self._turned = np.array([body.rotation is not None for body in bodies.fixed], dtype=bool)
+        axes = [np.eye(3) if body.rotation is None else body.rotation for body in bodies.fixed]
+        places = np.array([body.position for body in bodies.fixed]).reshape(-1, 3)
+        self._places = _arms(places, np.array(axes).reshape(-1, 3, 3))
+        self._fixed = bodies.frame
+        self._mean, self._seen = np.zeros_like(self._places), np.zeros(len(self._index))
+        self._shifted = 0
         self.frame = bodies.frame
         self.residual = math.nan
         """RMS distance of the fixed bodies from where the map has them [m]."""
         self.bumps = 0
-        self.problem = "" if bodies.frame is not None else "no fixed body has been seen yet"
-
-    def _clear(self) -> None:
-        count = len(self._index)
-        self._mean, self._axes = np.zeros((count, 3)), np.zeros((count, 3, 3))
-        self._seen = np.zeros(count, dtype=np.int64)
-        self._frames = self._shifted = 0
+        self.problem = ""
+        if bodies.frame is None:
+            self.problem = (
+                "no fixed body has been seen yet"
+                if self._index
+                else "the body map has neither fixed bodies nor a frame: add 'place: clamp' or "
+                "'place: world'"
+            )
 
     def update(self, positions: Array, rotations: Array) -> BaseFrame | None:
         """Take one frame of all bodies and return the base to use for it, None without one.
@@ -80,64 +84,44 @@ class BaseFinder:
             positions: (n, 3) m, in the order of the map's names; NaN for what was not seen.
             rotations: (n, 3, 3) the bodies' axes, as columns.
         """
-        if self._bodies.frame is not None or not self._index:
-            if self._bodies.frame is None:
-                self.problem = (
-                    "the body map has neither fixed bodies nor a frame: add 'place: clamp' or "
-                    "'place: world', or let scripts/check_rig.py find the frame"
-                )
-            return self.frame
-        here, axes = positions[self._index], rotations[self._index]
-        seen = np.isfinite(here).all(axis=1)
-        if not seen.any():
+        points = _arms(positions[self._index], rotations[self._index])
+        seen = np.isfinite(points[:, 0, 0])
+        if self._fixed is not None or not seen.any():
             return self.frame
         known = seen & (self._seen > 0)
-        ways = np.linalg.norm(here[known] - self._mean[known], axis=1)
-        moved = bool(len(ways)) and float(np.median(ways)) > _BUMP
-        self._shifted = self._shifted + 1 if moved else 0
+        ways = np.linalg.norm(points[known, 0] - self._mean[known, 0], axis=1)
+        self._shifted = self._shifted + 1 if len(ways) and np.median(ways) > _BUMP else 0
         if self._shifted >= _BUMP_FRAMES:
             self.bumps += 1
-            self._clear()
+            self._shifted = 0
+            self._seen[:] = 0
         self._seen[seen] = np.minimum(self._seen[seen] + 1, _MEMORY)
-        share = 1.0 / self._seen[seen]
-        self._mean[seen] += share[:, None] * (here[seen] - self._mean[seen])
-        self._axes[seen] += share[:, None, None] * (axes[seen] - self._axes[seen])
-        if self._frames < 10 or self._frames % _SOLVE_EVERY == 0:
-            self._solve()
-        self._frames += 1
+        share = 1.0 / self._seen[seen, None, None]
+        self._mean[seen] += share * (points[seen] - self._mean[seen])
+        # The ends of the axes count where the map says how a body is turned.
+        used = (self._seen > 0)[:, None] & (np.arange(4) == 0)
+        used |= ((self._seen > 0) & self._turned)[:, None]
+        found = fit_frame(self._mean[used], self._places[used])
+        self.frame = None
+        if found is None:
+            self.problem = (
+                "the fixed bodies that are seen tell no frame: three that are not on a line, "
+                "or one with its rotation in the map, are needed"
+            )
+        elif found[1] > _MISFIT:
+            self.problem = (
+                f"the fixed bodies do not fit together ({1e3 * found[1]:.0f} mm): measure "
+                "their positions again, and check length_unit and names"
+            )
+        else:
+            (self.frame, self.residual), self.problem = found, ""
         return self.frame
 
-    def _solve(self) -> None:
-        points, places = [], []
-        for k, body in enumerate(self._bodies.fixed):
-            if not self._seen[k]:
-                continue
-            points.append(self._mean[k])
-            places.append(body.position)
-            if body.rotation is not None:
-                points += list(self._mean[k] + _ARM * self._axes[k].T)
-                places += list(body.position + _ARM * body.rotation.T)
-        found = fit_frame(np.array(points), np.array(places))
-        if found is None:
-            self.frame, self.problem = (
-                None,
-                (
-                    "the fixed bodies that are seen tell no frame: three that are not on a line, "
-                    "or one with its rotation in the map, are needed"
-                ),
-            )
-            return
-        frame, self.residual = found
-        if self.residual > _MISFIT:
-            self.frame, self.problem = (
-                None,
-                (
-                    f"the fixed bodies do not fit together ({1e3 * self.residual:.0f} mm): measure "
-                    "their positions again, and check length_unit and names"
-                ),
-            )
-            return
-        self.frame, self.problem = frame, ""
+
+def _arms(positions: Array, rotations: Array) -> Array:
+    """Return the origins of bodies and the ends of their axes, (n, 4, 3)."""
+    ends = positions[:, None] + _ARM * rotations.swapaxes(1, 2)
+    return np.concatenate([positions[:, None], ends], axis=1)
 
 
 class PlaneWatch:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import math
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -18,6 +19,8 @@ from apriltag_tracker.pose.shape import CURVE_POINTS, PlanarTag, centreline_pose
 
 Array = NDArray[np.float64]
 
+_OPEN_FRAMES = 2
+"""A body that is missing is waited for until so many later frames have begun."""
 _FROZEN_FRAMES = 3
 """A body whose pose has been the very same for so many frames while others moved is lost."""
 _CLOCK_SET = 1_000_000_000
@@ -45,6 +48,9 @@ class PoseFrame(NamedTuple):
 class FrameAssembler:
     """Puts poses that come one body at a time together to frames.
 
+    A frame is complete when all bodies have come that came lately. Messages of one body keep their
+    order, those of different bodies may not: a few frames are open at a time.
+
     Args:
         bodies: the body map.
         tolerance: stamps that are nearer than this belong to one frame [ns].
@@ -53,48 +59,44 @@ class FrameAssembler:
     def __init__(self, bodies: BodyMap, tolerance: int = 1_000_000) -> None:
         self._places = {name: place for place, name in enumerate(bodies.names)}
         self._tolerance = tolerance
-        self._frame: PoseFrame | None = None
+        self._open: list[tuple[PoseFrame, set[int]]] = []
         self._closed: int | None = None
-        self._expected: frozenset[int] = frozenset()
-        self._given: set[int] = set()
+        self._expected = set(self._places.values())
         self.unknown: dict[str, int] = {}
         """Poses of bodies that are not in the map, by name."""
 
-    def take(self, name: str, stamp: int, pose: tuple[float, ...]) -> PoseFrame | None:
-        """Take x, y, z and the quaternion x, y, z, w of a body; return a frame that is complete.
-
-        A frame is complete when the bodies of the one before have all come, or a later one begins.
-        """
+    def take(self, name: str, stamp: int, pose: tuple[float, ...]) -> list[PoseFrame]:
+        """Take x, y, z and the quaternion x, y, z, w of a body; return the frames that end so."""
         place = self._places.get(name)
         if place is None:
             self.unknown[name] = self.unknown.get(name, 0) + 1
-            return None
-        complete = None
-        if self._frame is not None and (
-            place in self._given or abs(stamp - self._frame.stamp) > self._tolerance
-        ):
-            complete = self._close()
-        if self._closed is not None and self._closed - _CLOCK_SET < stamp <= (
-            self._closed + self._tolerance
-        ):
-            # Of a frame that was told already: the next one waits for this body, too.
-            self._expected |= {place}
-            return complete
-        if self._frame is None:
+            return []
+        if self._closed is not None and stamp <= self._closed + self._tolerance:
+            if stamp > self._closed - _CLOCK_SET:
+                # Of a frame that was told already: the next one waits for this body, too.
+                self._expected.add(place)
+                return []
+            self._open, self._closed = [], None
+        at = bisect.bisect(self._open, stamp - self._tolerance - 1, key=lambda each: each[0].stamp)
+        if at == len(self._open) or self._open[at][0].stamp > stamp + self._tolerance:
             count = len(self._places)
-            self._frame = PoseFrame(stamp, np.full((count, 3), np.nan), np.full((count, 4), np.nan))
-        self._frame.positions[place], self._frame.quaternions[place] = pose[:3], pose[3:]
-        self._given.add(place)
-        if self._expected and self._given >= self._expected:
-            complete = self._close()
-        return complete
+            frame = PoseFrame(stamp, np.full((count, 3), np.nan), np.full((count, 4), np.nan))
+            self._open.insert(at, (frame, set()))
+        frame, given = self._open[at]
+        frame.positions[place], frame.quaternions[place] = pose[:3], pose[3:]
+        given.add(place)
+        if given >= self._expected:
+            # The bodies that an older one lacks have come with this one.
+            return self._close(at + 1)
+        if len(self._open) > _OPEN_FRAMES:
+            self._expected = set(self._open[0][1])
+            return self._close(1)
+        return []
 
-    def _close(self) -> PoseFrame:
-        assert self._frame is not None
-        frame, self._frame = self._frame, None
-        self._expected, self._given = frozenset(self._given), set()
-        self._closed = frame.stamp
-        return frame
+    def _close(self, count: int) -> list[PoseFrame]:
+        frames = [frame for frame, _ in self._open[:count]]
+        self._open, self._closed = self._open[count:], frames[-1].stamp
+        return frames
 
 
 @dataclass(frozen=True)
@@ -217,14 +219,13 @@ class BodyTracker:
         if last is None or len(seen) < 2:
             return own
         along = np.linspace(0.0, self.bodies.length, CURVE_POINTS)
-        heading = np.arctan2(*np.gradient(last.curve, axis=0).T[::-1])
+        heading = np.unwrap(np.arctan2(*np.gradient(last.curve, axis=0).T[::-1]))
+        turn = np.interp(self._arcs, along, heading)
+        axes = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        sideways = axes[:, ::-1] * [-1.0, 1.0]
         offsets = np.array([body.offset for body in self.bodies.limb])
-        turn = np.interp(self._arcs, along, np.unwrap(heading))
-        x = np.interp(self._arcs, along, last.curve[:, 0])
-        y = np.interp(self._arcs, along, last.curve[:, 1])
-        x = x + np.cos(turn) * offsets[:, 0] - np.sin(turn) * offsets[:, 1]
-        y = y + np.sin(turn) * offsets[:, 0] + np.cos(turn) * offsets[:, 1]
-        expected = np.column_stack([x, y])[seen]
+        middle = np.stack([np.interp(self._arcs, along, each) for each in last.curve.T], axis=1)
+        expected = (middle + offsets[:, :1] * axes + offsets[:, 1:2] * sideways)[seen]
         distances = np.linalg.norm(expected[:, None] - points[None, seen, :2], axis=2)
         rows, columns = linear_sum_assignment(distances)
         if distances[rows, columns].sum() < _SWAP_GAIN * np.trace(distances):

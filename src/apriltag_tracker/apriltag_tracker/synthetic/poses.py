@@ -25,7 +25,7 @@ class MocapFaults:
         direction_noise: standard deviation of a turn about each axis [rad].
         dropout: share of frames in which a body is lost, each for itself.
         swapped: names of two bodies that have each other's names; empty: none.
-        swapped_from, swapped_until: time in which they have, since the first frame [s].
+        swapped_from: when this begins, since the first frame [s].
         delay: by which stamps are late [s].
     """
 
@@ -34,7 +34,6 @@ class MocapFaults:
     dropout: float = 0.0
     swapped: tuple[str, ...] = ()
     swapped_from: float = 0.0
-    swapped_until: float = np.inf
     delay: float = 0.0
 
 
@@ -104,7 +103,7 @@ class SyntheticMocap:
         lost = self._random.random(count) < faults.dropout
         positions[lost] = np.nan
         since = (stamp - self._started) * 1e-9
-        if faults.swapped and faults.swapped_from <= since < faults.swapped_until:
+        if faults.swapped and since >= faults.swapped_from:
             pair = [bodies.names.index(name) for name in faults.swapped]
             positions[pair], quaternions[pair] = positions[pair[::-1]], quaternions[pair[::-1]]
         return PoseFrame(stamp + round(1e9 * faults.delay), positions / bodies.unit, quaternions)

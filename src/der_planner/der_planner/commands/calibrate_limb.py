@@ -105,7 +105,7 @@ def _main(given: argparse.Namespace) -> int:
     log = _obtain(prior, given)
     kept_back = []
     if given.log is not None:
-        log, rest = log.parted(LAST_PART if given.keep_back is None else given.keep_back)
+        log, rest = log.parted(LAST_PART)
         kept_back = [dataclasses.replace(rest, source=f"the end of {rest.source}, not shown")]
     limb, report = _fit(prior, log, loads, given)
     unseen = [read_log(path, given.columns, given.namespace) for path in given.held_out]
@@ -178,12 +178,6 @@ def _parser() -> argparse.ArgumentParser:
         action="store_true",
         help="fit the mass of each segment and keep the prior's stiffness, not the other way round",
     )
-    parser.add_argument(
-        "--keep-back",
-        type=float,
-        metavar="SHARE",
-        help="of a LOG: its end is not fitted to, the fit is judged on it (default: 0.25)",
-    )
     parser.add_argument("--longest-gap", type=float, default=1.0, help="in the log, bridged [s]")
     parser.add_argument(
         "--held-out",
@@ -206,10 +200,6 @@ def _check(given: argparse.Namespace) -> None:
     """
     for wrong, said in (
         (given.csv and not given.columns, "--csv needs --columns FILE"),
-        (
-            given.keep_back is not None and not (given.log and 0.05 <= given.keep_back <= 0.9),
-            "--keep-back is a share of a LOG: 0.05 to 0.9",
-        ),
         (given.hardware and not given.graph, "--hardware goes with --graph"),
         (given.folder and not given.graph, "--folder goes with --graph"),
         (
@@ -302,20 +292,20 @@ def _columns(given: argparse.Namespace) -> Path | None:
         LogError: the log cannot be read, or there is nobody to ask.
     """
     if given.columns is not None or given.log is None:
-        return given.columns
-    path: Path = given.log.with_name(f"{given.log.name}.columns.yaml")
-    if not path.exists():
-        bag = is_bag(given.log)
-        if bag and is_ours(given.log):
-            return None
-        names = list(read_bag_table(given.log) if bag else read_table(given.log))
-        if not sys.stdin.isatty():
-            raise LogError(
-                f"{given.log} needs {path}, a map of its columns {', '.join(names)}: run this in a "
-                "terminal, and it asks"
-            )
-        ask_map(names, path)
-        print(f"written: {path}")
+        return Path(given.columns) if given.columns else None
+    path = Path(f"{given.log}.columns.yaml")
+    if path.exists():
+        return path
+    if is_bag(given.log) and is_ours(given.log):
+        return None
+    names = list(read_bag_table(given.log) if is_bag(given.log) else read_table(given.log))
+    if not sys.stdin.isatty():
+        raise LogError(
+            f"{given.log} needs {path}, a map of its columns {', '.join(names)}: run this in a "
+            "terminal, and it asks"
+        )
+    ask_map(names, path)
+    print(f"written: {path}")
     return path
 
 

@@ -22,8 +22,7 @@ import yaml
 
 from apriltag_tracker.bodies.body_map import BodyMap, BodyMapError
 from apriltag_tracker.pose.clamp import Clamp, find_clamp
-from apriltag_tracker.tag_map import TagMap, TagMapError
-from der_planner.arrays import Array
+from apriltag_tracker.tag_map import LimbTag, TagMap, TagMapError
 from der_planner.bags.reader import BagError, BagReader
 from der_planner.bags.record import PRESSURE_TYPE, Columns, header_stamp
 from der_planner.experiment.console import (
@@ -91,51 +90,40 @@ def _main(given: argparse.Namespace) -> int:
     bodies = _bodies(given, hardware)
     log = read_check(bag, bodies)
     finding = find_rig(log)
-    print(finding.text())
-    found = finding.as_mapping()
+    lines = finding.lines()
     offsets = [body.offset for body in bodies.limb]
     clamp = find_clamp(bodies, log.arc_lengths, offsets, log.places)
     if clamp is not None and not finding.contradictions:
-        found["clamp"] = _clamp(clamp)
+        lines += clamp_lines(clamp)
+    print("\n".join(lines))
     driver = dict(hardware.driver) if hardware else {}
-    if finding.contradictions:
-        print("the rig contradicts itself: no file is written", file=sys.stderr)
-        return 3
     try:
         driver["wiring"] = played_wiring(finding, str(driver.get("wiring", "")))
-    except HoseError as error:
-        print(f"refused: {error}", file=sys.stderr)
+    except (HoseError, RigError) as error:
+        print(f"no file is written: {error}", file=sys.stderr)
         return 3
     if given.out is not None:
         content = yaml.safe_load(given.hardware.read_text()) if given.hardware else {}
-        content |= {"driver": driver, "found": found}
+        content |= {"driver": driver, "found": lines}
         given.out.parent.mkdir(parents=True, exist_ok=True)
-        given.out.write_text(yaml.safe_dump(content, sort_keys=False))
+        given.out.write_text(yaml.safe_dump(content, sort_keys=False, width=100))
         print(f"rig file: {given.out}")
     return 0
 
 
-def _clamp(clamp: Clamp) -> dict[str, list[float]]:
-    """Say where the limb begins, and return it for the rig file."""
-    units = (1e3, 1e3, float(np.rad2deg(1.0)))
-    words = [
-        f"{name} {unit * value:.1f} ± {unit * sigma:.1f} {symbol}"
-        for name, symbol, unit, value, sigma in zip(
-            ("x", "y", "turned"), ("mm", "mm", "°"), units, clamp.place, clamp.sigma, strict=True
-        )
+def clamp_lines(clamp: Clamp) -> list[str]:
+    """Say where the limb begins, and what to do where that is not the origin."""
+    (x, y, turn), (x_sigma, y_sigma, turn_sigma) = clamp.place, clamp.sigma
+    lines = [
+        f"clamp in limb_base: x {1e3 * x:.1f} ± {1e3 * x_sigma:.1f} mm, y {1e3 * y:.1f} ± "
+        f"{1e3 * y_sigma:.1f} mm, turned by {np.degrees(turn):.1f} ± {np.degrees(turn_sigma):.1f}°"
     ]
-    print(f"clamp in limb_base: {', '.join(words)}")
-    far = np.abs(clamp.place) > np.maximum(CLAMP_OFF, 3.0 * clamp.sigma)
-    if far.any():
-        print(
+    if (np.abs(clamp.place) > np.maximum(CLAMP_OFF, 3.0 * clamp.sigma)).any():
+        lines.append(
             "warning: limb_base is not at the clamp: take this off the positions of the fixed tags "
-            "or bodies in their map",
-            file=sys.stderr,
+            "or bodies in their map"
         )
-    return {
-        "place_m_rad": [round(float(value), 5) for value in clamp.place],
-        "sigma": [round(float(value), 5) for value in clamp.sigma],
-    }
+    return lines
 
 
 def _play(given: argparse.Namespace, hardware: Hardware | None) -> Path:
@@ -144,15 +132,14 @@ def _play(given: argparse.Namespace, hardware: Hardware | None) -> Path:
     from der_planner.experiment.graph_trials import play_calibration  # noqa: PLC0415
 
     interrupt_once()
-    stamp = time.strftime("%Y-%m-%d_%H-%M-%S")
-    folder = (given.folder or Path("checks") / stamp).resolve()
+    folder = given.folder or Path("checks") / time.strftime("%Y-%m-%d_%H-%M-%S")
     check_folder(folder, "--folder")
     driver = {**vars(Settings()), **(hardware.driver if hardware else {})}
     count, limit = int(driver["segment_count"]), float(driver["pressure_limit"])
     run = within_limits(check_run(count, given.pressure), limit, float(driver["slew_limit"]))
     wiring = Wiring(tuple(given.wiring)).chambers if given.wiring else None
     return play_calibration(
-        run, folder, Progress(), Limb.default(), given.seed, hardware, wiring, given.poses
+        run, folder.resolve(), Progress(), Limb.default(), given.seed, hardware, wiring, given.poses
     )
 
 
@@ -196,8 +183,10 @@ def read_check(path: Path, bodies: TagMap | BodyMap) -> RigLog:
         BagError: the bag cannot be read.
     """
     # The id of a body is its place in the map.
-    ids = [tag.id for tag in bodies.limb] if isinstance(bodies, TagMap) else None
-    limb = {ids[k] if ids else k: k for k in range(len(bodies.limb))}
+    limb = {
+        body.id if isinstance(body, LimbTag) else place: place
+        for place, body in enumerate(bodies.limb)
+    }
     commands, measured, opening, places = Columns(), Columns(), Columns(), Columns()
     with BagReader(path) as bag:
         kinds = {name: topic.type_name for name, topic in bag.topics.items()}
@@ -217,32 +206,21 @@ def read_check(path: Path, bodies: TagMap | BodyMap) -> RigLog:
     for kind, columns in (("pressures", commands), ("tags or bodies", places)):
         if len(columns) < SEEN_TOGETHER:
             raise RigError(f"the bag {path} holds no {kind}: were driver and tracker running?")
-    count = len(bodies.segment_lengths)
-    first = int(commands.stamps()[0])
-
-    def seconds(columns: Columns) -> Array:
-        return np.asarray((columns.stamps() - first) * 1e-9, dtype=np.float64)
-
-    names = tuple(str(getattr(body, "name", getattr(body, "id", ""))) for body in bodies.limb)
-    headed = places.values(3 * len(limb)).reshape(-1, len(limb), 3)
-    headed[..., 2] = _unwrapped(headed[..., 2])
-    return RigLog(
-        seconds(commands),
-        np.nan_to_num(commands.values(count)),
-        measured.values(2 * count),
-        opening.values(2 * count),
-        seconds(places),
-        headed,
-        names,
-        np.array([body.arc_length for body in bodies.limb]),
-        bodies.segment_lengths,
-    )
-
-
-def _unwrapped(angles: Array) -> Array:
-    """Return angles (J, B) without jumps; NaN stays NaN."""
-    result = angles.copy()
-    for column in result.T:
+    count, first = len(bodies.segment_lengths), commands.stamps()[0]
+    seen = places.values(3 * len(limb)).reshape(-1, len(limb), 3)
+    for column in seen[..., 2].T:
         known = np.isfinite(column)
         column[known] = np.unwrap(column[known])
-    return result
+    return RigLog(
+        time=1e-9 * (commands.stamps() - first),
+        command=np.nan_to_num(commands.values(count)),
+        measured=measured.values(2 * count),
+        opening=opening.values(2 * count),
+        seen_time=1e-9 * (places.stamps() - first),
+        places=seen,
+        names=tuple(
+            str(body.id if isinstance(body, LimbTag) else body.name) for body in bodies.limb
+        ),
+        arc_lengths=np.array([body.arc_length for body in bodies.limb]),
+        segment_lengths=bodies.segment_lengths,
+    )

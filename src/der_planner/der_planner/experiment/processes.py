@@ -68,7 +68,7 @@ class Hardware:
     driver: dict[str, Any] = field(default_factory=dict)
     tracker: dict[str, Any] = field(default_factory=dict)
     poses: dict[str, Any] | None = None
-    found: dict[str, Any] = field(default_factory=dict)
+    found: tuple[str, ...] = ()
     planner: dict[str, Any] = field(default_factory=dict)
     recorder: dict[str, Any] = field(default_factory=dict)
     remap: dict[str, str] = field(default_factory=dict)
@@ -150,17 +150,22 @@ class GraphSetup:
             "record_images": self.record_images,
             **rig.recorder,
         }
+        poses = rig.poses
         specs = [NodeSpec("pressure_driver", "pressure_driver", driver)]
         if self.hardware is None:
             specs.insert(0, NodeSpec("pressure_driver", "board_emulator", board))
-            # Motion capture is faster than a camera.
-            twin |= {"rate": POSE_RATE} if self.poses else {}
-            twin |= {"wiring": list(self.wiring)} if self.wiring is not None else {}
-            specs.append(NodeSpec("der_planner", "limb_twin", twin))
-            seen = "synthetic_poses" if self.poses else "synthetic_camera"
-            specs.append(NodeSpec("apriltag_tracker", seen, {"seed": self.seed}))
-        if self.poses or rig.poses is not None:
-            specs.append(NodeSpec("apriltag_tracker", "pose_tracker", dict(rig.poses or {})))
+            if self.wiring is not None:
+                twin["wiring"] = list(self.wiring)
+            camera = NodeSpec("apriltag_tracker", "synthetic_camera", {"seed": self.seed})
+            if self.poses:
+                poses = {"form": "pose_array"}
+                twin["rate"] = POSE_RATE
+                camera = NodeSpec(
+                    "apriltag_tracker", "synthetic_poses", {"seed": self.seed, **poses}
+                )
+            specs += [NodeSpec("der_planner", "limb_twin", twin), camera]
+        if poses is not None:
+            specs.append(NodeSpec("apriltag_tracker", "pose_tracker", dict(poses)))
         else:
             specs.append(NodeSpec("apriltag_tracker", "apriltag_tracker", dict(rig.tracker)))
         planner = {**(self.planner or {}), **rig.planner}

@@ -10,24 +10,23 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from apriltag_tracker.bodies.body_map import BodyMap, BodyMapError
 from apriltag_tracker.bodies.tracker import BodyTracker, PoseFrame
 from der_planner.arrays import Array
 from der_planner.bags.reader import BagError, BagReader
+from der_planner.bags.record import header_stamp
 from der_planner.identification.log import LogError, on_grid
 from der_planner.model import CONTROL_PERIOD
 
-BAG_SUFFIXES = (".mcap", ".db3")
 LONGEST_SILENCE = 0.25
 """Time between two messages or frames that a straight line may bridge [s]."""
-_MOTIVE = "Format Version"
-_QUALISYS = ("NO_OF_FRAMES", "FILE_VERSION")
+_MOTIVE, _QUALISYS = "Format Version", ("NO_OF_FRAMES", "FILE_VERSION")
+"""First words of the tables."""
 _MOTIVE_UNITS = {"Meters": 1.0, "Centimeters": 1e-2, "Millimeters": 1e-3}
-_QUALISYS_COLUMNS = 16
-"""Of a body: x, y, z, three angles, the residual, nine numbers of the rotation matrix."""
+_LARGEST_ARRAY = 64
+"""Longer arrays in bags are pictures and the like."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ class PoseLog:
 
 def is_bag(path: Path) -> bool:
     """Tell whether a path is that of a bag."""
-    return path.is_dir() or path.suffix in BAG_SUFFIXES
+    return path.is_dir() or path.suffix in (".mcap", ".db3")
 
 
 def read_poses(path: Path) -> PoseLog:
@@ -59,15 +58,16 @@ def read_poses(path: Path) -> PoseLog:
         LogError: it is neither, or holds no rigid bodies with rotations; says how to export them.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig", errors="replace")
+        lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     except OSError as error:
         raise LogError(f"cannot read the poses {path}: {error.strerror}") from error
+    start = lines[0] if lines else ""
     try:
-        if text.startswith(_MOTIVE):
-            return _motive(path, list(csv.reader(text.splitlines())))
-        if text.startswith(_QUALISYS):
-            return _qualisys(path, [line.split("\t") for line in text.splitlines()])
-    except (ValueError, IndexError) as error:
+        if start.startswith(_MOTIVE):
+            return _motive(path, lines)
+        if start.startswith(_QUALISYS):
+            return _qualisys(path, lines)
+    except (ValueError, IndexError, KeyError, StopIteration) as error:
         raise LogError(f"the table {path} is not as its program writes it: {error}") from error
     raise LogError(
         f"{path} is no table of motion capture that is known: export it from Motive as CSV, or "
@@ -75,16 +75,9 @@ def read_poses(path: Path) -> PoseLog:
     )
 
 
-def _numbers(rows: Sequence[Sequence[str]], width: int) -> Array:
-    """Return rows of numbers (K, width); empty cells and rows that end early are NaN."""
-    table = np.full((len(rows), width), np.nan)
-    for target, row in zip(table, rows, strict=True):
-        cells = [cell.strip() for cell in row[:width]]
-        target[: len(cells)] = [float(cell) if cell else np.nan for cell in cells]
-    return table
-
-
-def _motive(path: Path, rows: list[list[str]]) -> PoseLog:
+def _motive(path: Path, lines: Sequence[str]) -> PoseLog:
+    first = next(k for k, line in enumerate(lines) if line.startswith("Frame,"))
+    rows = list(csv.reader(lines[: first + 1]))
     about = dict(zip(rows[0][::2], rows[0][1::2], strict=False))
     unit = _MOTIVE_UNITS.get(about.get("Length Units", "Meters"))
     if unit is None or about.get("Rotation Type", "Quaternion") != "Quaternion":
@@ -92,59 +85,50 @@ def _motive(path: Path, rows: list[list[str]]) -> PoseLog:
             f"{path}: lengths in {about.get('Length Units')}, rotations as "
             f"{about.get('Rotation Type')}: export meters or millimeters, and quaternions"
         )
-    first = next(k for k, row in enumerate(rows) if row and row[0] == "Frame")
-    header = {row[1]: row for row in rows[1:first] if len(row) > 1 and row[1]}
-    kinds, labels, parts, axes = header["Type"], header["Name"], rows[first - 1], rows[first]
-    columns: dict[str, dict[tuple[str, str], int]] = {}
-    for k in range(2, len(axes)):
-        if kinds[k] == "Rigid Body":
-            columns.setdefault(labels[k], {})[parts[k], axes[k]] = k
-    table = _numbers([row for row in rows[first + 1 :] if row], len(axes))
-    names = tuple(name for name, found in columns.items() if ("Rotation", "W") in found)
+    header = {row[1]: row for row in rows[1:] if len(row) > 1}
+    columns = {
+        head: k
+        for k, head in enumerate(zip(header["Type"], header["Name"], *rows[-2:], strict=False))
+    }
+    names = tuple(name for kind, name, part, axis in columns if (kind, part, axis) == _BODY)
     if not names:
         raise LogError(f"{path} holds no rigid bodies: export them from Motive, not markers alone")
-    positions = [[columns[name]["Position", axis] for axis in "XYZ"] for name in names]
-    turns = [[columns[name]["Rotation", axis] for axis in "XYZW"] for name in names]
-    return PoseLog(names, table[:, 1], unit * table[:, positions], table[:, turns])
+    table = np.genfromtxt(lines[first + 1 :], delimiter=",")
+    places, turns = (
+        [[columns["Rigid Body", name, part, axis] for axis in axes] for name in names]
+        for part, axes in (("Position", "XYZ"), ("Rotation", "XYZW"))
+    )
+    return PoseLog(names, table[:, 1], unit * table[:, places], table[:, turns])
 
 
-def _qualisys(path: Path, rows: list[list[str]]) -> PoseLog:
-    about = {row[0]: row[1:] for row in rows if row and row[0].isupper()}
+_BODY = ("Rigid Body", "Rotation", "W")
+"""Each rigid body of Motive has one such column."""
+
+
+def _qualisys(path: Path, lines: Sequence[str]) -> PoseLog:
+    first = next(k for k, line in enumerate(lines) if "Rot[0]" in line or k == len(lines) - 1)
+    about = {word: rest for word, *rest in (line.split("\t") for line in lines[:first])}
     names = tuple(name for name in about.get("BODY_NAMES", []) if name)
-    if not names:
+    heads = lines[first].split("\t")
+    # x, y, z [mm], three angles and the residual stand before the matrix.
+    starts = np.array([k - 7 for k, head in enumerate(heads) if head == "Rot[0]"], dtype=np.int64)
+    if not names or len(starts) != len(names):
         raise LogError(f"{path} holds no rigid bodies: export 6DOF data from QTM, with its header")
-    data = [row for row in rows if row and _is_number(row[0])]
-    width = max(len(row) for row in data)
-    lead = width - _QUALISYS_COLUMNS * len(names)
-    # A last tab makes a column that holds nothing.
-    lead -= all(len(row) < width or not row[-1].strip() for row in data)
-    if lead not in (0, 1, 2):
-        raise LogError(
-            f"{path} has {width} columns for {len(names)} bodies: {_QUALISYS_COLUMNS} a body are "
-            "expected, after frame and time"
-        )
-    table = _numbers(data, lead + _QUALISYS_COLUMNS * len(names))
-    time = table[:, 1] if lead == 2 else np.arange(len(table)) / float(about["FREQUENCY"][0])
-    bodies = table[:, lead:].reshape(len(table), len(names), _QUALISYS_COLUMNS)
+    table = np.genfromtxt(lines[first + 1 :], delimiter="\t")
+    time = np.arange(len(table)) / float(about["FREQUENCY"][0])
+    if "Time" in heads:
+        time = table[:, heads.index("Time")]
+    positions = 1e-3 * table[:, starts[:, None] + np.arange(3)]
     # The nine numbers go down the columns of the matrix; a body that is lost is all zeros.
-    matrices = bodies[..., 7:].reshape(*bodies.shape[:2], 3, 3).swapaxes(-1, -2)
-    lost = ~np.isfinite(bodies).all(axis=2) | (np.abs(matrices).sum(axis=(-1, -2)) < 0.5)
-    matrices = np.where(lost[..., None, None], np.eye(3), matrices)
-    quaternions = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_quat()
-    positions = np.where(lost[..., None], np.nan, 1e-3 * bodies[..., :3])
+    matrices = table[:, starts[:, None] + np.arange(7, 16)].reshape(*positions.shape, 3)
+    lost = ~(np.abs(np.linalg.det(matrices) - 1.0) < 0.1)
+    matrices[lost], positions[lost] = np.eye(3), np.nan
+    quaternions = Rotation.from_matrix(matrices.swapaxes(-1, -2).reshape(-1, 3, 3)).as_quat()
     return PoseLog(names, time, positions, quaternions.reshape(*lost.shape, 4))
 
 
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
-def bends_of(log: PoseLog, body_map: Path) -> tuple[Array, Array]:
-    """Return bend angles (K, M) [rad] and tips (K, 2) [m] of recorded poses; NaN where not told.
+def bends_of(log: PoseLog, body_map: Path, time: Array) -> tuple[Array, Array]:
+    """Return bend angles (L, M) [rad] and tips (L, 2) [m] at times (L,) [s]; NaN where not told.
 
     Raises:
         LogError: the map cannot be read, names a body that the log has not, or the limb was never
@@ -158,10 +142,9 @@ def bends_of(log: PoseLog, body_map: Path) -> tuple[Array, Array]:
     if missing:
         raise LogError(f"the poses have no body '{missing[0]}': theirs are {', '.join(log.names)}")
     order = [log.names.index(name) for name in bodies.names]
-    tracker = BodyTracker(bodies)
+    tracker, reason = BodyTracker(bodies), "the log is empty"
     angles = np.full((len(log.time), len(bodies.segment_lengths)), np.nan)
     tips = np.full((len(log.time), 2), np.nan)
-    reason = "the log is empty"
     for k, instant in enumerate(log.time):
         positions = log.positions[k, order] / bodies.unit
         frame = PoseFrame(round(1e9 * instant), positions, log.quaternions[k, order])
@@ -172,7 +155,10 @@ def bends_of(log: PoseLog, body_map: Path) -> tuple[Array, Array]:
             angles[k], tips[k] = followed.estimate.bend_angle, followed.estimate.tip
     if np.isnan(tips).all():
         raise LogError(f"no frame of the poses shows the limb: {reason}")
-    return angles, tips
+    return (
+        on_grid(log.time, angles, time, LONGEST_SILENCE),
+        on_grid(log.time, tips, time, LONGEST_SILENCE),
+    )
 
 
 def read_bag_table(path: Path) -> dict[str, Array]:
@@ -184,33 +170,28 @@ def read_bag_table(path: Path) -> dict[str, Array]:
     Raises:
         LogError: the bag cannot be read, or holds none of these.
     """
-    found: dict[str, tuple[list[float], list[float]]] = {}
+    found: dict[str, dict[float, float]] = {}
     try:
         with BagReader(path) as bag:
             for topic, logged, message in bag.messages(list(bag.topics)):
                 header = getattr(message, "header", None)
-                stamp = logged * 1e-9
-                if header is not None and header.stamp.sec:
-                    stamp = header.stamp.sec + header.stamp.nanosec * 1e-9
+                stamp = header_stamp(message) if header is not None else 0
                 for name, value in _values(topic, message).items():
-                    times, values = found.setdefault(name, ([], []))
-                    times.append(stamp)
-                    values.append(value)
+                    found.setdefault(name, {})[1e-9 * (stamp or logged)] = value
     except BagError as error:
         raise LogError(str(error)) from error
-    found = {name: kept for name, kept in found.items() if len(kept[0]) > 1}
+    found = {name: dict(sorted(kept.items())) for name, kept in found.items() if len(kept) > 1}
     if not found:
         raise LogError(f"the bag {path} holds no joint states, arrays or fluid pressures")
-    start = max(min(times) for times, _ in found.values())
-    end = min(max(times) for times, _ in found.values())
+    start = max(min(kept) for kept in found.values())
+    end = min(max(kept) for kept in found.values())
     if end - start < 1.0:
         raise LogError(f"the topics of {path} do not overlap: do their clocks agree?")
     grid = np.arange(start, end, CONTROL_PERIOD)
     table = {"time": grid - start}
-    for name, (times, values) in found.items():
-        instants, rows = np.unique(np.array(times), return_index=True)
-        column = np.array(values)[rows][:, None]
-        table[name] = on_grid(instants, column, grid, LONGEST_SILENCE)[:, 0]
+    for name, kept in found.items():
+        column = np.array(list(kept.values()))[:, None]
+        table[name] = on_grid(np.array(list(kept)), column, grid, LONGEST_SILENCE)[:, 0]
     return table
 
 
@@ -225,34 +206,33 @@ def _values(topic: str, message: Any) -> dict[str, float]:
     if hasattr(message, "fluid_pressure"):
         return {topic: float(message.fluid_pressure)}
     data = getattr(message, "data", None)
-    if isinstance(data, np.ndarray) and data.dtype.kind in "fi" and data.size <= 64:
+    if isinstance(data, np.ndarray) and data.dtype.kind in "fi" and data.size <= _LARGEST_ARRAY:
         return {f"{topic}[{k}]": float(value) for k, value in enumerate(data)}
     return {}
 
 
-# What to ask --------------------------------------------------------------------------------------
+QUESTIONS = {
+    "time": "column of the time",
+    "time_unit": "unit of the time: s, ms or us",
+    "commanded": "columns of the commands: one a segment, or two, left chamber first",
+    "chambers": "columns of the measured chamber pressures, left and right of each segment",
+    "pressure_unit": "unit of the pressures: Pa, hPa, mbar, kPa, bar or psi",
+    "poses": "file of motion capture (CSV of Motive, TSV of QTM); empty: none",
+    "bodies": "body map of it: which body sits where",
+    "poses_late": "what to take off the times of the poses to have those of the table [s]",
+    "angles": "columns of the bend angles, one a segment",
+    "angle_unit": "unit of the angles: rad or deg",
+    "tip": "columns of the tip's x and y in limb_base; empty: none",
+    "length_unit": "unit of the tip: m, cm or mm",
+}
+"""What to ask for each key of a map of columns."""
+_LISTS = ("commanded", "chambers", "angles", "tip")
+_OF_POSES = ("bodies", "poses_late")
+_OF_COLUMNS = ("angles", "angle_unit", "tip", "length_unit")
 
-QUESTIONS = (
-    ("time", "column of the time", False),
-    ("time_unit", "unit of the time: s, ms or us", False),
-    ("commanded", "columns of the commands: one a segment, or two, left chamber first", True),
-    ("chambers", "columns of the measured chamber pressures, left and right of each segment", True),
-    ("pressure_unit", "unit of the pressures: Pa, hPa, mbar, kPa, bar or psi", False),
-    ("poses", "file of motion capture (CSV of Motive, TSV of QTM); empty: none", False),
-    ("bodies", "body map of it: which body sits where", False),
-    ("poses_late", "what to take off the times of the poses to have those of the table [s]", False),
-    ("angles", "columns of the bend angles, one a segment", True),
-    ("angle_unit", "unit of the angles: rad or deg", False),
-    ("tip", "columns of the tip's x and y in limb_base; empty: none", True),
-    ("length_unit", "unit of the tip: m, cm or mm", False),
-)
-"""Keys of a map of columns, what to ask for each, and whether the answer is a list."""
-_WITH_POSES = ("bodies", "poses_late")
-_WITHOUT_POSES = ("angles", "angle_unit", "tip", "length_unit")
 
-
-def ask_map(names: Sequence[str], path: Path, ask: Callable[[str], str] = input) -> dict[str, Any]:
-    """Ask a person what the columns of a log are, and write the answers down for ever.
+def ask_map(names: Sequence[str], path: Path, ask: Callable[[str], str] = input) -> None:
+    """Ask a person what the columns of a log are, and write the answers down.
 
     Args:
         names: of the columns.
@@ -260,42 +240,16 @@ def ask_map(names: Sequence[str], path: Path, ask: Callable[[str], str] = input)
         ask: shows a question and returns the answer; columns are answered by number or name.
 
     Raises:
-        LogError: the map cannot be written.
+        OSError: the map cannot be written.
     """
-    listed = "\n".join(f"  {k}: {name}" for k, name in enumerate(names))
-    shown = f"The log has these columns:\n{listed}\n"
+    print("\n".join(f"  {k}: {name}" for k, name in enumerate(names)))
     content: dict[str, Any] = {}
-    for key, question, is_list in QUESTIONS:
-        if key in (_WITHOUT_POSES if content.get("poses") else _WITH_POSES):
+    for key, question in QUESTIONS.items():
+        if key in (_OF_COLUMNS if "poses" in content else _OF_POSES):
             continue
-        answer = ask(f"{shown}{question}: ").strip()
-        shown = ""
-        if not answer:
-            continue
-        words = answer.replace(",", " ").split()
-        picked = [
-            names[int(word)] if word.isdigit() and int(word) < len(names) else word
-            for word in words
-        ]
-        if is_list:
-            content[key] = picked
-        elif key == "poses_late":
-            content[key] = float(answer)
-        else:
-            content[key] = picked[0] if key == "time" else answer
-    try:
-        path.write_text(yaml.safe_dump(content, sort_keys=False))
-    except OSError as error:
-        raise LogError(f"cannot write the map of columns {path}: {error.strerror}") from error
-    return content
-
-
-def joined(log: PoseLog, found: tuple[Array, Array], time: Array) -> tuple[Array, Array]:
-    """Return bend angles and tips of poses at the times (K,) of a table [s]; NaN in gaps."""
-    angles, tips = found
-    instants, rows = np.unique(log.time, return_index=True)
-    grid: NDArray[np.float64] = np.asarray(time, dtype=np.float64)
-    return (
-        on_grid(instants, angles[rows], grid, LONGEST_SILENCE),
-        on_grid(instants, tips[rows], grid, LONGEST_SILENCE),
-    )
+        words = ask(f"{question}: ").replace(",", " ").split()
+        is_column = key in _LISTS or key == "time"
+        found = [names[int(each)] if is_column and each.isdigit() else each for each in words]
+        if found:
+            content[key] = found if key in _LISTS else found[0]
+    path.write_text(yaml.safe_dump(content, sort_keys=False))

@@ -23,7 +23,6 @@ from der_planner.identification.foreign import (
     LONGEST_SILENCE,
     bends_of,
     is_bag,
-    joined,
     read_bag_table,
     read_poses,
 )
@@ -231,7 +230,7 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
     if columns.poses:
         poses = read_poses(Path(columns.poses))
         poses = replace(poses, time=poses.time - columns.poses_late)
-        angles, tip = joined(poses, bends_of(poses, Path(columns.bodies)), time)
+        angles, tip = bends_of(poses, Path(columns.bodies), time)
     else:
         angles = columns.factor("angle_unit") * columns.angle_factor * pick(columns.angles)
     if columns.tip:

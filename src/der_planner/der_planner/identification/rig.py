@@ -9,10 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from der_planner.arrays import Array
 from der_planner.identification.excitation import Excitation
@@ -127,7 +126,7 @@ class RigFinding:
     Attributes:
         valves: (2M,) what each of them does.
         order: (B,) the bodies by how far along the limb they are, as indices into ``names``.
-        order_sure: smallest ratio between the ways of neighbours that tell the order.
+        order_ratio: smallest ratio between the ways of neighbours, which tell the order.
         names: of the bodies.
         contradictions: why the rig cannot be played as it is; each names the cables to look at.
         warnings: what does not keep it from being played.
@@ -135,7 +134,7 @@ class RigFinding:
 
     valves: tuple[ValveFinding, ...]
     order: tuple[int, ...]
-    order_sure: float
+    order_ratio: float
     names: tuple[str, ...]
     contradictions: tuple[str, ...]
     warnings: tuple[str, ...]
@@ -152,37 +151,16 @@ class RigFinding:
         valves = {valve.chamber: valve.valve for valve in self.valves}
         return tuple(valves[chamber] for chamber in range(len(self.valves)))
 
-    def text(self) -> str:
-        """Say it in lines for people."""
-        lines = [valve.text() for valve in self.valves]
+    def lines(self) -> list[str]:
+        """Say it in lines, for people and for the rig file."""
         along = ", ".join(self.names[k] for k in self.order)
-        lines.append(f"from the clamp to the tip: {along}")
-        lines += [f"warning: {each}" for each in self.warnings]
-        lines += [f"refused: {each}" for each in self.contradictions]
-        return "\n".join(lines)
-
-    def as_mapping(self) -> dict[str, Any]:
-        """Return it as the section ``found`` of a rig file: valves and sensors count from 1."""
-        return {
-            "valves": [
-                {
-                    "valve": each.valve + 1,
-                    "segment": None if each.segment is None else each.segment + 1,
-                    "side": SIDES[each.side] if each.segment is not None else None,
-                    "sensor": None if each.sensor is None else each.sensor + 1,
-                    "rise_Pa": round(each.rise, 1),
-                    "bend_deg": round(float(np.degrees(each.bend)), 2),
-                    "command_to_pressure_s": round(each.to_pressure, 3),
-                    "pressure_to_motion_s": round(each.to_motion, 3),
-                    "sure": round(each.sure, 3),
-                    "problems": list(each.problems),
-                }
-                for each in self.valves
-            ],
-            "order": [self.names[k] for k in self.order],
-            "order_ratio": round(self.order_sure, 2),
-            "warnings": list(self.warnings),
-        }
+        return [
+            *(valve.text() for valve in self.valves),
+            f"from the clamp to the tip: {along}; each goes {self.order_ratio:.1f} times as far as "
+            "the one before, or farther",
+            *(f"warning: {each}" for each in self.warnings),
+            *(f"refused: {each}" for each in self.contradictions),
+        ]
 
 
 def check_run(segment_count: int = 2, pressure: float = GENTLE) -> Excitation:
@@ -244,22 +222,18 @@ def _fills(log: RigLog) -> list[tuple[float, float]]:
     Raises:
         RigError: one was not, or two were at once.
     """
-    largest = float(np.abs(log.command).max())
-    filled = np.abs(log.command) > 0.5 * largest
-    if largest <= 0.0 or (filled.sum(axis=1) > 1).any():
+    filled = np.abs(log.command) > 0.5 * np.abs(log.command).max()
+    if not filled.any() or (filled.sum(axis=1) > 1).any():
         raise RigError("this is no log of a check: no chamber is filled, or two are at once")
-    found: dict[int, tuple[float, float]] = {}
-    for segment in range(log.command.shape[1]):
-        for side in (0, 1):
-            on = filled[:, segment] & (np.sign(log.command[:, segment]) == 1 - 2 * side)
-            rows = np.flatnonzero(on)
-            if len(rows):
-                last = min(rows[-1] + 1, len(log.time) - 1)
-                found[2 * segment + side] = (float(log.time[rows[0]]), float(log.time[last]))
-    missing = [str(k + 1) for k in range(2 * log.command.shape[1]) if k not in found]
-    if missing:
-        raise RigError(f"valve {', '.join(missing)} was not filled in this log")
-    return [found[k] for k in sorted(found)]
+    found = []
+    for valve in range(2 * log.command.shape[1]):
+        side = log.command[:, valve // 2] * (1 - 2 * (valve % 2)) > 0.0
+        rows = np.flatnonzero(filled[:, valve // 2] & side)
+        if not len(rows):
+            raise RigError(f"valve {valve + 1} was not filled in this log")
+        last = min(rows[-1] + 1, len(log.time) - 1)
+        found.append((float(log.time[rows[0]]), float(log.time[last])))
+    return found
 
 
 def _change(time: Array, values: Array, fill: tuple[float, float]) -> tuple[Array, Array]:
@@ -287,30 +261,26 @@ def _crossing(time: Array, values: Array, fill: tuple[float, float]) -> float:
     change, level = _change(time, values, fill)
     rows = np.flatnonzero((time >= fill[0]) & (time <= fill[1]) & np.isfinite(values))
     share = (values[rows] - level) / change
-    beyond = np.flatnonzero(share >= CROSSING)
-    if not len(beyond):
+    k = int(np.argmax(share >= CROSSING))
+    if share[k] < CROSSING:
         return float("nan")
-    k = int(beyond[0])
-    if k == 0:
-        return float(time[rows[0]])
-    part = (CROSSING - share[k - 1]) / (share[k] - share[k - 1])
-    return float(time[rows[k - 1]] + part * (time[rows[k]] - time[rows[k - 1]]))
+    around = slice(max(k - 1, 0), k + 1)
+    return float(np.interp(CROSSING, share[around], time[rows][around]))
 
 
-def _segment_ends(arcs: Array, lengths: Sequence[float]) -> NDArray[np.int64]:
+def _segment_ends(arcs: Array, lengths: Sequence[float]) -> list[int]:
     """Return which body, in the order along the limb, tells the heading where a segment ends.
 
     Raises:
         RigError: no body is on the second half of a segment.
     """
-    ends = np.cumsum(lengths)
     found = []
-    for index, (end, length) in enumerate(zip(ends, lengths, strict=True)):
+    for index, (end, length) in enumerate(zip(np.cumsum(lengths), lengths, strict=True)):
         within = np.flatnonzero((arcs <= end + 0.05 * length) & (arcs > end - 0.5 * length))
         if not len(within):
             raise RigError(f"no tag or body on the second half of segment {index + 1} was seen")
         found.append(int(within[-1]))
-    return np.array(found)
+    return found
 
 
 def _judge(log: RigLog, valve: int, fill: tuple[float, float], bends: Array) -> ValveFinding:
@@ -328,43 +298,35 @@ def _judge(log: RigLog, valve: int, fill: tuple[float, float], bends: Array) -> 
     turns, _ = _change(log.seen_time, bends, fill)
     sensor, rise, sensor_sure = _largest(rises, LEAST_RISE * wanted)
     segment, bend, bend_sure = _largest(turns, LEAST_BEND)
-    to_pressure = to_motion = float("nan")
-    answered = float("nan")
+    answered, moved = fill[0], float("nan")
     if sensor is not None:
-        if rise < 0.0:
-            problems.append(f"sensor {sensor + 1} falls when its chamber is filled")
         answered = _crossing(log.time, log.measured[:, sensor], fill)
-        to_pressure = answered - fill[0]
-        short = 1.0 - abs(rise) / wanted
+        short = 1.0 - rise / wanted
         opening = _mean(log.opening[(log.time > fill[1] - LEVEL) & (log.time <= fill[1])])[valve]
         if short > LEAKS or opening > OPEN:
-            problems.append(
-                f"it leaks or is fed too little: {100 * short:.0f} % below its command, its inlet "
-                f"{100 * opening:.0f} % open"
-                if np.isfinite(opening)
-                else f"it leaks or is fed too little: {100 * short:.0f} % below its command"
-            )
+            said = f"it leaks or is fed too little: {100 * short:.0f} % below its command"
+            is_open = f", its inlet {100 * opening:.0f} % open" if np.isfinite(opening) else ""
+            problems.append(said + is_open)
         later = (log.time > fill[1] + VENT - LEVEL) & (log.time < fill[1] + VENT)
-        left = _mean(log.measured[later])[sensor] - levels[sensor] if later.any() else 0.0
-        if abs(left) > STAYS * abs(rise):
+        left = _mean(log.measured[later])[sensor] - levels[sensor]
+        if left > STAYS * rise:
             problems.append(f"it does not vent: {left:.0f} Pa are left after {VENT:.0f} s")
+        if sensor_sure < 1.0 - CLEAR:
+            problems.append("more than one sensor rises: is its hose joined to another one?")
     if segment is not None:
-        begun = _crossing(log.seen_time, bends[:, segment], fill)
-        to_motion = begun - (answered if np.isfinite(answered) else fill[0])
+        moved = _crossing(log.seen_time, bends[:, segment], fill)
         if bend_sure < 1.0 - CLEAR:
-            problems.append("it bends more than one segment: is its hose joined to another one?")
-    if sensor is not None and sensor_sure < 1.0 - CLEAR:
-        problems.append("more than one sensor rises with it: is its hose joined to another one?")
+            problems.append("more than one segment bends: is its hose joined to another one?")
     if sensor is None and segment is None:
         problems.append("dead: look at its valve, its supply and its hose at the board")
     elif segment is None:
         problems.append("pressure but no motion: its hose ends in no chamber, or is blocked")
     elif sensor is None:
         problems.append("motion but no pressure: look at its sensor")
-    return ValveFinding(
-        valve, sensor, segment, 1 if bend >= 0.0 else -1, float(rise), float(bend),
-        max(0.0, min(sensor_sure, bend_sure)), to_pressure, to_motion, tuple(problems),
-    )  # fmt: skip
+    sure = max(0.0, min(sensor_sure, bend_sure))
+    lags = (answered - fill[0] if sensor is not None else float("nan"), moved - answered)
+    side = 1 if bend >= 0.0 else -1
+    return ValveFinding(valve, sensor, segment, side, rise, bend, sure, *lags, tuple(problems))
 
 
 def _largest(changes: Array, least: float) -> tuple[int | None, float, float]:
@@ -386,27 +348,23 @@ def _compare(valves: Sequence[ValveFinding], count: int) -> tuple[list[str], lis
         for said in each.problems:
             grave = each.segment is None or "more than one" in said
             (contradictions if grave else warnings).append(f"valve {each.valve + 1}: {said}")
-    for segment in range(count):
-        for side in (1, -1):
-            by = [v for v in valves if v.segment == segment and v.side == side]
-            moved = f"segment {segment + 1} to the {SIDES[side]}"
-            if len(by) > 1:
-                named = " and ".join(str(each.valve + 1) for each in by)
-                contradictions.append(
-                    f"valves {named} both bend {moved}: the hose of one of them is in the wrong "
-                    "port of the limb"
-                )
-            elif not by:
-                contradictions.append(f"no valve bends {moved}")
-    for sensor in range(2 * count):
-        by = [v for v in valves if v.sensor == sensor]
+    for chamber in range(2 * count):
+        moved = f"segment {chamber // 2 + 1} to the {SIDES[1 - 2 * (chamber % 2)]}"
+        by = [str(each.valve + 1) for each in valves if each.chamber == chamber]
         if len(by) > 1:
-            named = " and ".join(str(each.valve + 1) for each in by)
             contradictions.append(
-                f"sensor {sensor + 1} answers to valves {named}: look at the cables of its board"
+                f"valves {' and '.join(by)} both bend {moved}: the hose of one of them is in the "
+                "wrong port of the limb"
             )
-    others = [v for v in valves if v.sensor is not None and v.sensor != v.valve]
-    if others:
-        named = ", ".join(f"{v.valve + 1} by sensor {(v.sensor or 0) + 1}" for v in others)
-        warnings.append(f"sensors are wired otherwise than valves: valve {named}")
+        elif not by:
+            contradictions.append(f"no valve bends {moved}")
+    for sensor in range(2 * count):
+        by = [str(each.valve + 1) for each in valves if each.sensor == sensor]
+        if len(by) > 1:
+            contradictions.append(
+                f"sensor {sensor + 1} answers to valves {' and '.join(by)}: look at its cable and "
+                "at the ports of its board"
+            )
+        elif by and by != [str(sensor + 1)]:
+            warnings.append(f"sensor {sensor + 1} reads valve {by[0]}: are their cables swapped?")
     return contradictions, warnings

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 from ament_index_python.packages import get_package_share_directory
+from geometry_msgs.msg import Pose, PoseArray, PoseStamped
 from rclpy.node import Node
 
 from apriltag_tracker.bodies.body_map import BodyMap
-from apriltag_tracker.bodies.forms import FORMS, message_type, pose_messages, topics_of
+from apriltag_tracker.bodies.forms import message_type, topics_of
 from apriltag_tracker.synthetic.poses import MocapFaults, SyntheticMocap
 from apriltag_tracker.synthetic.shapes import Shape
 from der_msgs.msg import LimbShape
@@ -22,6 +23,7 @@ from limb_interfaces.parameters import check_overrides, declare
 from limb_interfaces.runner import run_node
 
 _FRAME = "mocap"
+_FORMS = ("pose_stamped", "pose_array")
 
 
 class SyntheticPosesNode(Node):
@@ -29,34 +31,28 @@ class SyntheticPosesNode(Node):
 
     def __init__(self) -> None:
         super().__init__("synthetic_poses", namespace=topics.NAMESPACE)
-        share = Path(get_package_share_directory("apriltag_tracker")) / "config"
-        body_map = declare(
-            self, "body_map", str(share / "bodies.yaml"), "YAML file: where the bodies are"
-        )
-        form = declare(self, "form", FORMS[0], "messages in which poses go", choices=FORMS)
-        topic = declare(self, "topic", "", "of the poses; empty: that of the form")
+        share = Path(get_package_share_directory("apriltag_tracker")) / "config" / "bodies.yaml"
+        body_map = declare(self, "body_map", str(share), "YAML file: which body is where")
+        form = str(declare(self, "form", _FORMS[0], "messages in which poses go", choices=_FORMS))
         seed = declare(self, "seed", 0, "of noise and dropouts", at_least=0)
+        swapped = str(declare(self, "swapped", "", "bodies with each other's names: NAME,NAME"))
         number = self._number
-        swapped = declare(self, "swapped", "", "two bodies with each other's names: NAME,NAME")
         faults = MocapFaults(
             position_noise=number("position_noise", 1e-4, "of a coordinate [m]", 0.0, 0.01),
             direction_noise=number("direction_noise", 2e-3, "of a turn [rad]", 0.0, 0.3),
             dropout=number("dropout", 0.0, "share of frames without a body", 0.0, 1.0),
-            swapped=tuple(name.strip() for name in str(swapped).split(",") if name.strip()),
+            swapped=tuple(swapped.split(",")) if swapped else (),
             swapped_from=number("swapped_from", 0.0, "[s] since the first frame", 0.0, 1e6),
-            swapped_until=number("swapped_until", 1e6, "[s] since the first frame", 0.0, 1e6),
             delay=number("delay", 0.0, "by which stamps are late [s]", -0.5, 0.5),
         )
-        turn = number("turn", 0.3, "of limb_base in the frame of the poses [rad]", -4.0, 4.0)
         tilt = number("tilt", 0.0, "of the plane of motion against the floor [rad]", -2.0, 2.0)
         check_overrides(self)
-        self._form = str(form)
         bodies = BodyMap.from_yaml(str(body_map))
-        self._mocap = SyntheticMocap(bodies, faults, turn, tilt, int(seed))
-        kind = message_type(self._form)
-        self._outputs: dict[str, Any] = {
+        self._mocap = SyntheticMocap(bodies, faults, tilt=tilt, seed=int(seed))
+        kind = message_type(form)
+        self._outputs = {
             name: self.create_publisher(kind, place, qos.STATES)
-            for name, place in topics_of(self._form, str(topic), bodies.names).items()
+            for name, place in topics_of(form, "", bodies.names).items()
         }
         self._frames = self._refused = 0
         self._last_shape = time.monotonic()
@@ -72,14 +68,24 @@ class SyntheticPosesNode(Node):
         self._last_shape = time.monotonic()
         points = np.array([(point.x, point.y) for point in message.points]).reshape(-1, 2)
         shape = Shape(np.array(message.arc_length), points, np.array(message.heading))
-        count = len(points)
-        if count < 2 or not count == len(shape.arc_length) == len(shape.heading):
+        if len(points) < 2 or not len(points) == len(shape.arc_length) == len(shape.heading):
             self._refused += 1
             return
         frame = self._mocap.frame(stamps.nanoseconds(message.header.stamp), shape)
-        found = pose_messages(self._form, self._mocap.bodies.names, frame, _FRAME)
+        poses = [_pose(*each) for each in zip(frame.positions, frame.quaternions, strict=True)]
+        outputs = self._outputs
+        found: dict[str, Any] = {"": PoseArray(poses=poses)}
+        if "" not in outputs:
+            # A body that is lost is not told of.
+            found = {
+                name: PoseStamped(pose=pose)
+                for name, pose in zip(self._mocap.bodies.names, poses, strict=True)
+                if np.isfinite(pose.position.x)
+            }
         for name, each in found.items():
-            self._outputs[name].publish(each)
+            each.header.stamp = stamps.stamp_from_nanoseconds(frame.stamp)
+            each.header.frame_id = _FRAME
+            outputs[name].publish(each)
         self._frames += 1
 
     def _health(self) -> Health:
@@ -91,6 +97,14 @@ class SyntheticPosesNode(Node):
             said = f"no shape on {topics.TWIN_SHAPE} for {silent:.0f} s: is limb_twin running?"
             return Health("warning", said, values)
         return Health("ok", "telling poses", values)
+
+
+def _pose(position: np.ndarray, quaternion: np.ndarray) -> Pose:
+    pose = Pose()
+    place, turn = pose.position, pose.orientation
+    place.x, place.y, place.z = position.tolist()
+    turn.x, turn.y, turn.z, turn.w = quaternion.tolist()
+    return pose
 
 
 def main() -> int:
