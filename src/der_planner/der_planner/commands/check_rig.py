@@ -106,7 +106,7 @@ def _main(given: argparse.Namespace) -> int:
         content = yaml.safe_load(given.hardware.read_text()) if given.hardware else {}
         content |= {"driver": driver, "found": lines}
         given.out.parent.mkdir(parents=True, exist_ok=True)
-        given.out.write_text(yaml.safe_dump(content, sort_keys=False, width=100))
+        given.out.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
         print(f"rig file: {given.out}")
     return 0
 
