@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import socket
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
+from der_msgs import msg
 from limb_interfaces import qos, topics
+from limb_interfaces.clocks import ClockWatch
 
 
 @dataclass
@@ -41,6 +45,14 @@ _CPU_INTERVAL = 0.5
 """Shortest time over which the CPU time is measured [s]: over less, its own ticks show."""
 
 
+@cache
+def message_version() -> str:
+    """Return a short digest of all messages of the project: nodes with another do not hear this."""
+    kinds = [kind for name, kind in sorted(vars(msg).items()) if name[0].isupper()]
+    fields = [(kind.__name__, sorted(kind.get_fields_and_field_types().items())) for kind in kinds]
+    return hashlib.sha256(repr(fields).encode()).hexdigest()[:8]
+
+
 class DiagnosticsPublisher:
     """Calls ``report`` once a second and publishes what it returns, the CPU time and the process.
 
@@ -52,12 +64,20 @@ class DiagnosticsPublisher:
         node: the node that the status is about.
         report: returns the present health; its ``level`` is ok, warning, error or stale.
         hardware_id: what the node is connected to, if anything.
+        clock_of_all: the clocks of all others are compared with this node's.
     """
 
-    def __init__(self, node: Node, report: Callable[[], Health], hardware_id: str = "") -> None:
+    def __init__(
+        self,
+        node: Node,
+        report: Callable[[], Health],
+        hardware_id: str = "",
+        clock_of_all: bool = False,
+    ) -> None:
         self._node = node
         self._report = report
         self._hardware_id = hardware_id
+        self._clock = ClockWatch(node, clock_of_all)
         self._publisher = node.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, qos.STATES)
         self._process, self._started = f"{socket.gethostname()}:{os.getpid()}", time.time()
         self._others = node.create_subscription(
@@ -93,23 +113,29 @@ class DiagnosticsPublisher:
     def publish(self) -> str:
         """Publish now, without waiting for the next second; return the level."""
         health = self._report()
-        values = {
-            **health.values,
+        level, text, values = health.level, health.message, dict(health.values)
+        if offset := self._clock.look():
+            values["clock_offset_s"] = f"{offset.seconds:.6f}"
+            values["clock_uncertainty_s"] = f"{offset.uncertainty:.6f}"
+            if offset.warning and level == "ok":
+                level, text = "warning", offset.warning
+        values |= {
             "cpu_percent": f"{self._measure_cpu():.0f}",
             "process": self._process,
             "started": f"{self._started:.3f}",
+            "messages": message_version(),
         }
         status = DiagnosticStatus(
-            level=_LEVELS[health.level],
+            level=_LEVELS[level],
             name=self._node.get_fully_qualified_name(),
-            message=health.message,
+            message=text,
             hardware_id=self._hardware_id,
             values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
         )
         message = DiagnosticArray(status=[status])
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)
-        return health.level
+        return level
 
     def _measure_cpu(self) -> float:
         """Return this process's share of one core [%] since it was last measured."""

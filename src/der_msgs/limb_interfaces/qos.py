@@ -37,6 +37,9 @@ LATCHED = QoSProfile(
 )
 """The last one is kept for those who come later: plans, calibration."""
 
+CLOCKS = QoSProfile(depth=20, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Questions for the time: one that comes late because it was sent again says nothing."""
+
 IMAGES = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """A subscriber of images takes the newest and never queues."""
 

@@ -14,6 +14,8 @@ TAGS = "tags"
 LIMB_STATE = "state"
 ESTIMATE = "estimate"
 SHAPE_MARKERS = "shape_markers"
+CLOCK_QUESTIONS = "clock/questions"
+CLOCK_ANSWERS = "clock/answers"
 DIAGNOSTICS = "/diagnostics"
 
 # The twin's own topics. Planner, driver and tracker never subscribe to them.

@@ -142,6 +142,7 @@ class DriverCore:
         """What the board has said last in plain words."""
         self.clock = RunningClock(2.0 / settings.rate, steady)
         """Counts the seconds of every patience."""
+        protocol.clock = self.clock
         self.monitor = TelemetryMonitor(protocol, settings)
         self.machine = SafetyMachine(settings, self.monitor, self._conditions)
         self.board = BoardWatch(protocol, settings)
@@ -202,7 +203,7 @@ class DriverCore:
     def highest_pressure(self) -> float:
         """Return the highest gauge pressure [Pa] that was measured; 0 where it counts as none."""
         pressure = max(self.monitor.gauge)
-        return pressure if pressure > self._settings.vented_tolerance else 0.0
+        return pressure if pressure > self.monitor.vented_tolerance else 0.0
 
     def state(self) -> dict[str, Any]:
         """Return the driver at this tick, by the names of `der_msgs/PressureState`, and more."""
@@ -280,9 +281,9 @@ class DriverCore:
         if self._texts:
             self._log(f"board: {self._texts.popleft()}", False)
 
-    def emergency(self) -> bytes:
-        """Return the vent command, complete after any half-sent bytes."""
-        return self.protocol.separator + self._vent_bytes()
+    def emergency(self) -> list[bytes]:
+        """Return the vent commands, complete after any half-sent bytes, to be sent in turn."""
+        return self.protocol.emergency(self._wire_atmosphere())
 
     def _wire_atmosphere(self) -> float:
         return self.monitor.rest.mean if self.monitor.rest.known else STANDARD_ATMOSPHERE
@@ -303,8 +304,8 @@ class DriverCore:
 
     # --------------------------------------------------------------------- from the board
 
-    def received(self, data: bytes) -> None:
-        """Decode what the board has sent."""
+    def received(self, data: bytes) -> bytes:
+        """Decode what the board has sent; return what is to be sent to it at once."""
         now = self.clock()
         rejected = self.protocol.rejected
         events = self.protocol.decode(data)
@@ -312,6 +313,7 @@ class DriverCore:
             self._serve(event, now)
         readings = sum(isinstance(event, Telemetry) for event in events)
         self.monitor.count_lines(readings, self.protocol.rejected - rejected, now)
+        return self.protocol.follow_up()
 
     def lost(self, reason: str) -> None:
         """The port is gone: everything that was armed faults."""

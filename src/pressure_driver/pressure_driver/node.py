@@ -73,7 +73,7 @@ class PressureDriver(Node):
                 "parameter 'use_sim_time' is true: the driver moves air in real time; leave it out"
             )
         settings = read_settings(self, Settings)
-        self._protocol = host_protocol(settings.protocol, 2 * settings.segment_count)
+        self._protocol = host_protocol(settings.protocol, 2 * settings.segment_count, settings)
         self._state: dict[str, Any] = {}
         self._late: deque[float] = deque(maxlen=LATE_TICKS)
         self._state_publisher = self.create_publisher(
@@ -94,7 +94,7 @@ class PressureDriver(Node):
         )
         if settings.accept_cmd_u_t:
             self.create_subscription(Float64MultiArray, CMD_U_T, self._on_cmd_u_t, qos.SETPOINTS)
-        DiagnosticsPublisher(self, self._report, hardware_id=settings.port)
+        DiagnosticsPublisher(self, self._report, settings.port, clock_of_all=True)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(LIFE_PERIOD, self._show_life, clock=steady)
         self.get_logger().info(

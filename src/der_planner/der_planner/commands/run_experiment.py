@@ -138,7 +138,8 @@ class Ledger:
             "calibrate": options.calibrate,
             "offline": options.offline,
             "poses": "yes" if options.poses else "",
-            "hardware": options.hardware.driver.get("port") if options.hardware else "",
+            "hardware": options.hardware.place if options.hardware else "",
+            "board": options.board,
         }
 
     def finished(self, trial: Trial) -> dict[str, Any] | None:
@@ -289,8 +290,8 @@ def _read(limb: Path | None) -> Limb:
 
 def _stage(options: Options) -> str:
     if options.hardware is not None:
-        return f"the hardware at {options.hardware.driver['port']}"
-    return "the twin, offline" if options.offline else "the twin"
+        return f"the hardware at {options.hardware.place}"
+    return "the twin, offline" if options.offline else f"the twin, with a {options.board} board"
 
 
 def _describe(
