@@ -34,7 +34,7 @@ STOP_ORDER = (
     "page",
     "board_emulator",
 )
-MOVABLE = {"driver": "pressure_driver", "tracker": "apriltag_tracker"}
+MOVABLE = {"driver": "pressure_driver", "tracker": "apriltag_tracker", "poses": "pose_tracker"}
 """Nodes that may run on another computer, by their keys in a hardware file."""
 BOARD_PARAMETERS = {"pneudrive": {"sensor_range": 103_400.0}}
 """Of boards of the twin: with sensors of 15 psi, a step is 0.13 kPa and not 0.84."""
@@ -122,7 +122,7 @@ def _hosts(hardware: Hardware, path: Path) -> dict[str, str]:
     """
     hosts = {}
     for key, node in MOVABLE.items():
-        parameters = getattr(hardware, key)
+        parameters = getattr(hardware, key) or {}
         if "host" not in parameters:
             continue
         hosts[node] = str(parameters.pop("host"))
