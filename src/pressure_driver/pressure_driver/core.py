@@ -233,6 +233,8 @@ class DriverCore:
             "setpoints_waiting": machine.schedule.waiting,
             "setpoints_of_other_publishers": machine.publishers.refused,
             "last_refusal": machine.schedule.reason,
+            "operators": str(machine.leases),
+            "lost_operator": machine.lost_operator,
             "obstacles_to_arming": self.obstacles(),
             "board": self.board.identity.firmware if self.board.identity else self.last_text,
             "atmosphere_pa": monitor.rest.mean,
@@ -361,6 +363,9 @@ class DriverCore:
     def _note_mode(self) -> None:
         mode = self.machine.mode
         if mode is not self._last_mode:
-            reasons = ": " + "; ".join(self.machine.faults) if mode is Mode.FAULT else ""
-            self._log(f"{self._last_mode.name} -> {mode.name}{reasons}", mode is Mode.FAULT)
+            lost = self.machine.lost_operator
+            reasons = f": the operator ({lost}) is lost" if lost else ""
+            if mode is Mode.FAULT:
+                reasons = ": " + "; ".join(self.machine.faults)
+            self._log(f"{self._last_mode.name} -> {mode.name}{reasons}", bool(reasons))
             self._last_mode = mode

@@ -98,6 +98,13 @@ class Settings:
     )
     setpoint_timeout: float = _number(0.2, "s", 0.05, 60.0, "without a next setpoint until HOLDING")
     hold_time: float = _number(1.0, "s", 0.0, 600.0, "of HOLDING until the ramp down")
+    on_lost_operator: str = _other(
+        "ramp",
+        "when an operator's lease ends while armed: keep the pressures for hold_time and then let "
+        "them down; let them down; vent at once. DISARMED afterwards; without a lease nothing "
+        "changes",
+        ("hold", "ramp", "vent"),
+    )
     vent_rate: float = _number(10_000.0, "Pa/s", 100.0, 1e6, "of the ramp down")
     vent_timeout: float = _number(10.0, "s", 0.5, 120.0, "a vent may take before it is a fault")
     telemetry_timeout: float = _number(0.5, "s", 0.06, 60.0, "without chamber pressures")

@@ -54,7 +54,6 @@ def play_on_graph(run: TrialRun, progress: Progress) -> dict[str, Any]:
         planner=_planner_parameters(run),
         record_images=options.record_images,
         poses=options.poses,
-        page=options.page,
     )
     drawn = options.path if run.learned is None else None
     asked = _path(drawn) if drawn is not None else _command(run)

@@ -151,8 +151,8 @@ class Options:
     )
     page: int | None = _option(
         None,
-        f"serve the operator's page while the graph runs, at port {DEFAULT_PAGE_PORT} of this "
-        "machine if none is given",
+        f"serve the operator's page from the first second until Ctrl-C after the last run, at port "
+        f"{DEFAULT_PAGE_PORT} of this machine if none is given",
         (1, 65535),
         type=int,
         nargs="?",
