@@ -11,11 +11,15 @@ from dataclasses import dataclass, field
 from functools import cache
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.duration import Duration
 from rclpy.node import Node
 
 from der_msgs import msg
 from limb_interfaces import qos, topics
 from limb_interfaces.clocks import ClockWatch
+
+ENDED_IN_ORDER = "ended in order"
+"""What a node says last, unless something ended it: its silence is then no alarm."""
 
 
 @dataclass
@@ -41,6 +45,8 @@ _FIRST_READY = 2.0
 """Time for which a node that is ready goes on to speak more often [s]."""
 _FIRST_TIME = 20.0
 """Longest time for which a node that starts speaks more often [s]."""
+_LAST_WORDS = Duration(seconds=0.2)
+"""Listeners have this long to receive what a node says last."""
 _CPU_INTERVAL = 0.5
 """Shortest time over which the CPU time is measured [s]: over less, its own ticks show."""
 
@@ -87,6 +93,7 @@ class DiagnosticsPublisher:
         self._cpu = 0.0
         self._slow_from = time.monotonic() + _FIRST_TIME
         self._timer = node.create_timer(_FIRST_INTERVAL, self._publish_first)
+        node.conclude = self.conclude  # for `limb_interfaces.runner`
 
     def _publish_first(self) -> None:
         now = time.monotonic()
@@ -109,6 +116,12 @@ class DiagnosticsPublisher:
                     "one another name or namespace (--ros-args -r __ns:=/OTHER), or set another "
                     "ROS_DOMAIN_ID"
                 )
+
+    def conclude(self) -> None:
+        """Say that the node ends in order, and wait shortly until it has been heard."""
+        self._report = lambda: Health("stale", ENDED_IN_ORDER)
+        self.publish()
+        self._publisher.wait_for_all_acked(_LAST_WORDS)
 
     def publish(self) -> str:
         """Publish now, without waiting for the next second; return the level."""

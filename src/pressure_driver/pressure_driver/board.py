@@ -182,6 +182,8 @@ class BoardProcess:
             self._send("answer", *self.core.arm())
         elif word == "vent":
             self._send("answer", *self._vent_now())
+        elif word == "lease":
+            self._renew_lease(*content)
         elif word == "end":
             self.end()
 
@@ -191,6 +193,11 @@ class BoardProcess:
         if verdict is not Verdict.ACCEPTED and now - self._refused_at >= REFUSAL_PERIOD:
             self._refused_at = now
             self._log(f"{verdict.value}: {self.core.machine.schedule.reason}", True)
+
+    def _renew_lease(self, source: str, period: float) -> None:
+        core = self.core
+        if problem := core.machine.leases.renew(source, period, core.clock()):
+            self._log(problem, True)
 
     def _vent_now(self) -> tuple[bool, str]:
         """Vent before the next tick, and before all that waits to be sent."""

@@ -1,7 +1,7 @@
 """The node's end of the process of the port: it starts it, talks with it, and vents if it dies.
 
 Messages are JSON lists that begin with a word. From the node: ``setpoint``, ``arm``, ``vent``,
-``alive``, ``end``. To the node:
+``lease``, ``alive``, ``end``. To the node:
 
 =========== ==================================================================================
 ``port``    the line is open: vent commands (hexadecimal), with the descriptor of a serial port

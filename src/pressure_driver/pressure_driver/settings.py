@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import MISSING, Field, dataclass, field, fields
 from typing import Any, NamedTuple, TypeVar
 
+from pressure_driver.hoses import HoseError, Hoses
 from pressure_driver.protocols import NAMES
 
 TERMINALS = ("vtem", "mpa")
@@ -78,6 +79,11 @@ class Settings:
         0.25, "s", 0.06, 10.0, "a `native` board vents by itself after this time without a command"
     )
     segment_count: int = _number(2, "", 1, 16, "pairs of chambers")
+    wiring: str = _other(
+        "",
+        "valve of the board that feeds each chamber of the limb, as 3,4,1,2; empty: each its own "
+        "(scripts/check_rig.py finds it)",
+    )
     pressure_limit: float = _number(24_000.0, "Pa", 0.0, 1e5, "largest differential pressure")
     slew_limit: float = _number(
         200_000.0, "Pa/s", 1.0, 1e7, "of setpoints and of what is commanded: 10 kPa a tick"
@@ -92,6 +98,13 @@ class Settings:
     )
     setpoint_timeout: float = _number(0.2, "s", 0.05, 60.0, "without a next setpoint until HOLDING")
     hold_time: float = _number(1.0, "s", 0.0, 600.0, "of HOLDING until the ramp down")
+    on_lost_operator: str = _other(
+        "ramp",
+        "when an operator's lease ends while armed: keep the pressures for hold_time and then let "
+        "them down; let them down; vent at once. DISARMED afterwards; without a lease nothing "
+        "changes",
+        ("hold", "ramp", "vent"),
+    )
     vent_rate: float = _number(10_000.0, "Pa/s", 100.0, 1e6, "of the ramp down")
     vent_timeout: float = _number(10.0, "s", 0.5, 120.0, "a vent may take before it is a fault")
     telemetry_timeout: float = _number(0.5, "s", 0.06, 60.0, "without chamber pressures")
@@ -144,6 +157,11 @@ class Settings:
                     f"parameters '{low}' ({below:g} Pa) and '{high}' ({above:g} Pa): the first "
                     f"must be smaller{reason}"
                 )
+        if self.wiring:
+            try:
+                Hoses(self.wiring, self.segment_count)
+            except HoseError as error:
+                raise SettingError(f"parameter 'wiring': {error}") from error
         if self.command_validity * self.rate <= 1.0:
             raise SettingError(
                 f"parameters 'command_validity' ({self.command_validity:g} s) and 'rate' "

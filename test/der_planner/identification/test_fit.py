@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from limbs import with_segments
 
 from der_planner.identification import CalibrationLog, LogError, check, fit, predict
 from der_planner.identification.bends import (
     COLUMN,
     NODES,
     TERMS,
+    BendFit,
     FreeTerms,
     follow,
     predicted,
@@ -18,7 +18,7 @@ from der_planner.identification.bends import (
 )
 from der_planner.identification.excitation import calibration_run, steps, sweep, waves
 from der_planner.identification.lengths import fit_geometry, lengths_of, with_lengths
-from der_planner.identification.log import Prepared
+from der_planner.identification.log import Prepared, prepare
 from der_planner.limb import Limb
 from der_planner.model import RodModel
 
@@ -191,28 +191,14 @@ def test_excitation_stays_inside_its_amplitude_and_excites_each_input_alone():
     np.testing.assert_array_equal(run.differential_pressure[[0, -1]], 0.0)
 
 
-def test_a_number_at_the_end_of_its_range_names_what_would_tell_it():
-    sticking = with_segments(
-        Limb.default(),
-        friction_moment=lambda s: 800.0 * s.moment_gain,
-        friction_curvature=lambda s: 0.003 / s.length,
-    )
-    _, report = fit(Limb.default(), synthetic_log(sticking), terms=("friction", "dynamics"))
-    said = [warning for warning in report.warnings if "at the end of its range" in warning]
-    assert any("friction_angle[0]" in warning for warning in said)
-    assert all("slow strokes of a few degrees" in w for w in said if "friction" in w)
-
-
-def test_stiffness_that_the_log_hardly_tells_stays_where_the_model_misses_the_log():
-    """Slow errors of the model must not move what only fast motion would tell."""
-    log = synthetic_log(hidden_limb(), slow=True)
-    strange = np.deg2rad(2.0) * np.sign(np.sin(log.time[:, None] * [0.9, 0.7]))
-    prior = Limb.default()
-    limb, report = fit(
-        prior, replace(log, bend_angles=log.bend_angles + strange), terms=("friction", "dynamics")
-    )
-    assert any("tells the stiffness of segment 1" in warning for warning in report.warnings)
-    kept = report.value("log_stiffness[1]")
-    assert kept.untold
-    assert (kept.value, kept.deviation) == (0.0, 0.3)
-    assert limb.segments[1].bending_stiffness == prior.segments[1].bending_stiffness
+def test_what_is_seen_late_is_told_with_its_deviation(fitted, log):
+    limb, report = fitted
+    late, deviation = report.delay
+    assert abs(late) < max(4.0 * deviation, 0.004)
+    seen = [np.interp(log.time - 0.03, log.time, column) for column in log.bend_angles.T]
+    delayed = prepare(replace(log, bend_angles=np.stack(seen, axis=1)), limb)
+    names = {"gain", "rest_angle", "log_stiffness", "log_damping", "material_damping"}
+    free = FreeTerms.of(limb, names)
+    late, deviation = BendFit(free, RodModel(limb, NODES), [delayed]).delay(free.unknowns.prior)
+    assert late == pytest.approx(0.03, abs=max(0.003, 3.0 * deviation))
+    assert deviation < 0.005

@@ -5,6 +5,7 @@
     python3 scripts/calibrate_limb.py --graph --hardware my_rig.yaml --out my_limb.yaml
     python3 scripts/calibrate_limb.py --bag calibrations/DATE/bag --out my_limb.yaml
     python3 scripts/calibrate_limb.py --csv log.csv --columns map.yaml --mass 0.31 --out limb.yaml
+    python3 scripts/calibrate_limb.py their_log.csv --out limb.yaml
 
 --offline plays the calibration on the twin in one process, in seconds. --graph plays it in real
 time on the running graph, on the twin or the hardware, records a bag, vents, and fits to the bag:
@@ -14,11 +15,6 @@ writes the pressures of the calibration run, and `--play FILE.csv` plays such a 
 --mounting says how the limb was mounted in the log, --payload what it carried beside its own
 masses: the payload belongs to the log and does not enter the limb file. --mass is what a scale
 shows of the limb: the limb file weighs as much, and its stiffness and gains follow from that.
-
---weight KG --at M says that a known weight was hung on at a place along the limb, once it rested
-after the run, for ten seconds or more: its stiffness is then known whatever friction does. With
---graph the limb rests for that at the end of the run. A limb on a plate is pulled across by a
-thread over a pulley.
 """
 
 from __future__ import annotations
@@ -64,15 +60,18 @@ from der_planner.identification.excitation import (
     within_limits,
     write_excitation,
 )
+from der_planner.identification.foreign import ask_map, is_bag, read_bag_table
 from der_planner.identification.log import prepare
+from der_planner.identification.readers import is_ours, read_table
 from der_planner.identification.report import plot_prediction
-from der_planner.identification.weight import FREE, REST
 from der_planner.limb import Limb, LimbError
 from der_planner.planning.loads import nearly_buckling
 from pressure_driver.settings import Settings
 
 LIGHTEST = 1e-3
 """A limb of less [kg] is a mistake in the unit."""
+LAST_PART = 0.25
+"""Share of a LOG that is kept back to judge the fit."""
 SAME_MASS = 0.01
 """Share by which the fitted lengths may change the mass of a limb that was weighed."""
 
@@ -104,8 +103,13 @@ def _main(given: argparse.Namespace) -> int:
             file=sys.stderr,
         )
     log = _obtain(prior, given)
+    kept_back = []
+    if given.log is not None:
+        log, rest = log.parted(LAST_PART)
+        kept_back = [dataclasses.replace(rest, source=f"the end of {rest.source}, not shown")]
     limb, report = _fit(prior, log, loads, given)
     unseen = [read_log(path, given.columns, given.namespace) for path in given.held_out]
+    unseen = [*kept_back, *unseen]
     kept = loads.unloaded(limb)
     lines = [report.text(), *(_held_out_text(limb, each, given.longest_gap) for each in unseen)]
     text = "\n".join([*lines, _weight(kept, given)])
@@ -129,6 +133,13 @@ def _parser() -> argparse.ArgumentParser:
         "--graph", action="store_true", help="play on the running graph, record a bag and fit to it"
     )
     source.add_argument("--bag", type=Path, help="fit to a recorded run")
+    source.add_argument(
+        "log",
+        type=Path,
+        nargs="?",
+        metavar="LOG",
+        help="fit to a log of any program, a table or a bag; what cannot be known is asked once",
+    )
     source.add_argument("--csv", type=Path, help="fit to a table; needs --columns")
     source.add_argument(
         "--excitation", type=Path, metavar="FILE", help="write the run's pressures as CSV and stop"
@@ -167,15 +178,6 @@ def _parser() -> argparse.ArgumentParser:
         action="store_true",
         help="fit the mass of each segment and keep the prior's stiffness, not the other way round",
     )
-    parser.add_argument(
-        "--weight",
-        type=float,
-        metavar="KG",
-        help="weight that was hung on the resting limb after the run; needs --at",
-    )
-    parser.add_argument(
-        "--at", type=float, metavar="M", help="where it was hung on, along the limb from its clamp"
-    )
     parser.add_argument("--longest-gap", type=float, default=1.0, help="in the log, bridged [s]")
     parser.add_argument(
         "--held-out",
@@ -209,17 +211,11 @@ def _check(given: argparse.Namespace) -> None:
             given.mass is not None and given.fit_mass,
             "--fit-mass looks for the mass that --mass gives: choose one of the two",
         ),
-        (
-            (given.weight is None) != (given.at is None),
-            "--weight KG and --at M go together: a weight, and where along the limb it was hung on",
-        ),
     ):
         if wrong:
             raise OptionError(said)
     if given.mass is not None:
         check_kilograms("--mass", given.mass, LIGHTEST)
-    if given.weight is not None:
-        check_kilograms("--weight", given.weight, LIGHTEST)
     if given.excitation:
         check_file(given.excitation, "--excitation")
         return
@@ -239,8 +235,7 @@ def _fit(
     """Fit; a limb that was weighed weighs the same with the lengths that were found."""
     terms = [] if given.terms == "none" else given.terms.split(",")
     terms += ["mass"] if given.fit_mass else []
-    weight = None if given.weight is None else (given.weight, given.at)
-    limb, report = fit(prior, log, terms=terms, longest_gap=given.longest_gap, weight=weight)
+    limb, report = fit(prior, log, terms=terms, longest_gap=given.longest_gap)
     if given.mass is None:
         return limb, report
     found = loads.unloaded(limb)
@@ -257,7 +252,7 @@ def _fit(
             for old, new in zip(prior.segments, weighed, strict=True)
         )
         again = dataclasses.replace(prior, segments=segments, pcc_segments=())
-        limb, report = fit(again, log, terms=terms, longest_gap=given.longest_gap, weight=weight)
+        limb, report = fit(again, log, terms=terms, longest_gap=given.longest_gap)
     provenance = {**limb.provenance, "weighed_kg": given.mass}
     return dataclasses.replace(limb, provenance=provenance), report
 
@@ -275,15 +270,7 @@ def _weight(limb: Limb, given: argparse.Namespace) -> str:
 def _excitation(prior: Limb, pressure_limit: float, given: argparse.Namespace) -> Excitation:
     if given.play:
         return read_excitation(given.play, prior.segment_count)
-    run = calibration_run(AMPLITUDE * pressure_limit, prior.segment_count, given.quick)
-    if given.weight is None:
-        return run
-    print(
-        f"after {run.duration + FREE:.0f} s, hang {given.weight:g} kg on at {given.at:g} m for "
-        f"ten seconds or more; the run ends after {run.duration + REST:.0f} s",
-        file=sys.stderr,
-    )
-    return run.with_rest(REST)
+    return calibration_run(AMPLITUDE * pressure_limit, prior.segment_count, given.quick)
 
 
 def _obtain(prior: Limb, given: argparse.Namespace) -> CalibrationLog:
@@ -291,11 +278,35 @@ def _obtain(prior: Limb, given: argparse.Namespace) -> CalibrationLog:
     if given.graph:
         return read_bag(_play_on_graph(prior, given))
     if not given.offline:
-        return read_log(given.bag or given.csv, given.columns, given.namespace)
+        return read_log(given.log or given.bag or given.csv, _columns(given), given.namespace)
     limit = prior.pneumatics.pressure_limit
     run = within_limits(_excitation(prior, limit, given), limit, math.inf)
     print(f"playing {run.duration:.0f} s on the twin of seed {given.seed} …", file=sys.stderr)
     return record_twin(given.seed, run, limb=prior)
+
+
+def _columns(given: argparse.Namespace) -> Path | None:
+    """Return the map of the log's columns; of a LOG without one, ask for it and keep it.
+
+    Raises:
+        LogError: the log cannot be read, or there is nobody to ask.
+    """
+    if given.columns is not None or given.log is None:
+        return Path(given.columns) if given.columns else None
+    path = Path(f"{given.log}.columns.yaml")
+    if path.exists():
+        return path
+    if is_bag(given.log) and is_ours(given.log):
+        return None
+    names = list(read_bag_table(given.log) if is_bag(given.log) else read_table(given.log))
+    if not sys.stdin.isatty():
+        raise LogError(
+            f"{given.log} needs {path}, a map of its columns {', '.join(names)}: run this in a "
+            "terminal, and it asks"
+        )
+    ask_map(names, path)
+    print(f"written: {path}")
+    return path
 
 
 def _play_on_graph(prior: Limb, given: argparse.Namespace) -> Path:

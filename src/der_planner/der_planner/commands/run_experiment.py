@@ -13,6 +13,7 @@ Everything else is one path.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -78,11 +79,24 @@ def _main() -> int:
     options = parse(sys.argv[1:])
     if not options.offline:
         interrupt_once()
-    run(options)
+    if options.page is None or options.dry_run:
+        run(options)
+        return 0
+    # ROS is imported only by who needs it.
+    from der_planner.experiment.graph_page import experiment_page  # noqa: PLC0415
+
+    progress = Progress()
+    check_folder(options.out)
+    with experiment_page(options, progress) as page:
+        run(options, progress)
+        progress.say("done; the page stays with the report until Ctrl-C")
+        with contextlib.suppress(KeyboardInterrupt):
+            while page.alive:
+                time.sleep(0.5)
     return 0
 
 
-def run(options: Options) -> None:
+def run(options: Options, progress: Progress | None = None) -> None:
     """Play what the options say and leave results.json, figures, bags and logs in the folder.
 
     Raises:
@@ -91,7 +105,7 @@ def run(options: Options) -> None:
         PlanningError, LearningError: a motion cannot be planned, or cannot be learned.
         GraphError, NodeError: a trial failed; finished trials stay finished.
     """
-    progress = Progress()
+    progress = progress or Progress()
     try:
         limb = options.loads.loaded(_read(options.limb))
     except LimbError as error:
@@ -137,6 +151,7 @@ class Ledger:
             "payload_at": options.loads.payload_at or "",
             "calibrate": options.calibrate,
             "offline": options.offline,
+            "poses": "yes" if options.poses else "",
             "hardware": options.hardware.place if options.hardware else "",
             "board": options.board,
         }

@@ -14,7 +14,6 @@ from der_msgs.msg import PressureState
 from der_planner.experiment.client import GraphClient
 from der_planner.experiment.console import Progress
 from der_planner.experiment.processes import (
-    PAGE_TOKEN,
     STOP_ORDER,
     GraphError,
     GraphSetup,
@@ -139,9 +138,6 @@ class RunningGraph:
         self._wait_elsewhere()
         self.client.wait_ready(self.processes)
         self.progress.say(f"  ready after {time.monotonic() - begin:.1f} s")
-        if "page" in self.processes:
-            address = self.client.diagnostic_values("page").get("url", "unknown")
-            self.progress.say(f"  the operator's page is at {address}?token={PAGE_TOKEN}")
 
     def _wait_elsewhere(self) -> None:
         """Wait for the nodes that somebody else starts, and see that they speak as these do.

@@ -151,13 +151,16 @@ class Options:
     )
     page: int | None = _option(
         None,
-        f"serve the operator's page while the graph runs, at port {DEFAULT_PAGE_PORT} of this "
-        "machine if none is given",
+        f"serve the operator's page from the first second until Ctrl-C after the last run, at port "
+        f"{DEFAULT_PAGE_PORT} of this machine if none is given",
         (1, 65535),
         type=int,
         nargs="?",
         const=DEFAULT_PAGE_PORT,
         metavar="PORT",
+    )
+    poses: bool = _option(
+        False, "simulated motion capture of rigid bodies in place of the twin's camera and tags"
     )
     record_images: bool = _option(False, "raw images into the bags, too")
     report: bool = _option(True, "skip the HTML report at the end", flag="--no-report")
@@ -267,6 +270,11 @@ def parse(arguments: Sequence[str]) -> Options:
         (
             hardware is not None and given.offline,
             "--offline simulates everything: it does not go with --hardware",
+        ),
+        (
+            given.poses and (given.offline or hardware is not None),
+            "--poses is motion capture of the twin: it goes with neither --offline nor --hardware "
+            "(a hardware file has the key poses)",
         ),
         (
             hardware is not None and given.board != BOARDS[0],

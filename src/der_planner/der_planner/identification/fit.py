@@ -38,13 +38,14 @@ from der_planner.identification.log import (
     Prepared,
     prepare,
 )
-from der_planner.identification.report import FitReport
-from der_planner.identification.told import at_bounds, kept_unknowns, told, untold_stiffness
-from der_planner.identification.weight import HungWeight
+from der_planner.identification.report import FitReport, Unknown
 from der_planner.limb import CalibratedRange, Limb
 from der_planner.model import ArcModel, Material, RodModel
 from der_planner.planning.loads import nearly_buckling
 
+UNTOLD = 0.8
+"""Share of its prior spread above which the deviation of an unknown means that the log does not
+tell it."""
 MOST_PASSES = 4
 """Largest number of times that lengths and bend angles are fitted in turn, for a limb that its
 weight bends unevenly."""
@@ -67,7 +68,6 @@ def fit(
     *,
     terms: Iterable[str] = GROUPS,
     longest_gap: float = LONGEST_GAP,
-    weight: tuple[float, float] | None = None,
 ) -> tuple[Limb, FitReport]:
     """Identify a limb from a calibration run.
 
@@ -78,8 +78,6 @@ def fit(
             `OPTIONAL`) the mass of each segment is fitted and its stiffness is the prior's. A log
             shows the mass only under gravity or in fast motion.
         longest_gap: between two rows of the log that a straight line may bridge [s].
-        weight: mass [kg] and place along the limb [m] of a weight that was hung on the resting limb
-            at the end of the log, see `HungWeight`; None: none was.
 
     Returns:
         The identified limb, with provenance and calibrated ranges, and what the data say of it.
@@ -91,14 +89,7 @@ def fit(
     if not groups <= {*GROUPS, *OPTIONAL}:
         known = (*GROUPS, *OPTIONAL)
         raise LogError(f"unknown model term {sorted(groups - set(known))}: choose {known}")
-    if weight and ("dynamics" not in groups or "mass" in groups):
-        raise LogError(
-            "a known weight tells the stiffness: leave dynamics among the terms, and the mass out"
-        )
     recorded = prepare(log, limb, longest_gap)
-    hung = HungWeight.found(recorded, *weight) if weight else None
-    if hung is not None:
-        recorded = recorded.without(hung.rows)
     warnings = list(recorded.warnings)
     try:
         air = fit_air(recorded.log)
@@ -109,25 +100,21 @@ def fit(
     prepared = replace(recorded, pressure=recorded.pressure - offset)
     fitted = _fit_bends_and_lengths(limb, prepared, groups)
     warnings += filter(None, [lengths_at_their_end(limb, fitted.known)])
-    if hung is not None:
-        change, deviation = hung.stiffness_change(fitted.known, fitted.limb)
-        weighed = fitted.free.told("log_stiffness", change, deviation)
-        fitted = _again(fitted, weighed, prepared)
-    unknowns, correlation = told(fitted.problem, fitted.values)
-    kept, said = untold_stiffness(fitted.free, unknowns)
-    without_kept = _again(fitted, fitted.free.only(~kept), prepared) if kept.any() else fitted
-    if without_kept is not fitted:
-        left = tuple(kept_unknowns(fitted.free.only(kept)))
-        fitted = without_kept
-        unknowns, correlation = told(fitted.problem, fitted.values)
-        unknowns += left
-        warnings.append(said)
-    warnings += at_bounds(fitted.free, fitted.values)
+    unknowns, correlation = _told(fitted)
+    stiffness = [u.untold for u in unknowns if u.name.startswith("log_stiffness")]
+    if "dynamics" in groups and stiffness and all(stiffness):
+        warnings.append(
+            "the log is too slow to tell the stiffness apart from the gain: stiffness and damping "
+            "keep their old values; steps or a sweep would tell them"
+        )
+        groups -= {"dynamics"}
+        fitted = _fit_bends(fitted.known, prepared, groups, fitted.lengths)
+        unknowns, correlation = _told(fitted)
     found = _calibrated(fitted, limb, air, recorded)
     warnings += filter(None, [nearly_buckling(found)])
     pcc_residual = np.full(limb.segment_count, np.nan)
-    if limb.weighs_in_plane or any(term.group == "dynamics" for term in fitted.free.terms):
-        found, pcc_residual = _with_arcs(found, fitted, prepared, warnings)
+    if "dynamics" in groups or limb.weighs_in_plane:
+        found, pcc_residual = _with_arcs(found, prepared, warnings)
     return found, FitReport(
         limb=found,
         source=log.source,
@@ -141,29 +128,20 @@ def fit(
         span=np.ptp(prepared.bend[prepared.usable], axis=0),
         duration=float(np.ptp(prepared.log.time)),
         rows=int(prepared.usable.sum()),
+        delay=fitted.problem.delay(fitted.values),
         warnings=tuple(warnings),
     )
 
 
 class _Fitted(NamedTuple):
-    """A limb with its lengths, the problem solved on it, what it left, and the limb found.
-
-    What the log did not tell is in ``kept``, pairs of segment and term.
-    """
+    """A limb with its lengths, the problem solved on it, what it left, and the limb found."""
 
     known: Limb
     lengths: GeometryFit | None
-    tips: UnevenTips | None
     problem: BendFit
     values: Array
     remaining: Array
     limb: Limb
-    kept: frozenset[tuple[int, int]] = frozenset()
-
-    @property
-    def free(self) -> FreeTerms:
-        """The terms that were free."""
-        return self.problem.free
 
 
 def _fit_bends_and_lengths(prior: Limb, prepared: Prepared, groups: Collection[str]) -> _Fitted:
@@ -183,7 +161,7 @@ def _fit_bends_and_lengths(prior: Limb, prepared: Prepared, groups: Collection[s
             break
         tips = UnevenTips(prior, RodModel(lengths.limb, NODES), prepared, lacking)
         change = np.abs(lengths_of(lengths.limb) - lengths_of(fitted.known))
-        fitted = _fit_bends(lengths.limb, prepared, groups, lengths, fitted, tips)
+        fitted = _fit_bends(lengths.limb, prepared, groups, lengths, fitted.values, tips)
         if change[: prior.segment_count + 1].max() < SAME_LENGTH:
             break
     if loaded:
@@ -196,7 +174,7 @@ def _fit_bends(
     prepared: Prepared,
     groups: Collection[str],
     lengths: GeometryFit | None,
-    before: _Fitted | None = None,
+    start: Array | None = None,
     tips: UnevenTips | None = None,
 ) -> _Fitted:
     """Fit the rod to the bend angles.
@@ -206,7 +184,7 @@ def _fit_bends(
         prepared: the log.
         groups: of terms to fit.
         lengths: of the limb.
-        before: a fit of the same terms to begin at; None: in closed form from the log's statics.
+        start: (P,) of the free terms; None: in closed form from the log's statics.
         tips: fit to them, too; None: to the bend angles alone.
     """
     names = {term.name for term in TERMS if term.group in ("linear", *groups)}
@@ -217,14 +195,11 @@ def _fit_bends(
         names.discard("log_inertia")
     free = FreeTerms.of(known, names, without(values_of(known, starts=True), groups))
     problem = BendFit(free, RodModel(known, NODES), [prepared], tips.rows if tips else None)
-    if before is None:
+    if start is None:
         start = free.at_places(_static_start(free, prepared))
-    else:
-        start = before.values
-        problem.weigh(before.problem.errors)
-    values = problem.solve(_followed(problem, free, start))
+    values = problem.search.solve(_followed(problem, free, start))
     return _Fitted(
-        known, lengths, tips, problem, values, problem.remaining(values), free.limb_with(values)
+        known, lengths, problem, values, problem.remaining(values), free.limb_with(values)
     )
 
 
@@ -272,29 +247,29 @@ def _followed(problem: BendFit, free: FreeTerms, start: Array) -> Array:
     )
 
 
-def _again(fitted: _Fitted, free: FreeTerms, prepared: Prepared) -> _Fitted:
-    """Fit terms that were fitted before, some of them or with more known of them.
-
-    Returns what was given where the rod cannot follow the log from there.
-    """
-    found = dict(zip(fitted.free.places, fitted.values, strict=True))
-    start = np.array([found[place] for place in free.places])
-    tips = fitted.tips
-    problem = BendFit(free, RodModel(fitted.known, NODES), [prepared], tips.rows if tips else None)
-    problem.weigh(fitted.problem.errors)
-    if not problem.search.follows(start):
-        return fitted
-    values = problem.solve(start)
-    remaining, limb = problem.remaining(values), free.limb_with(values)
-    kept = fitted.kept.union(set(fitted.free.places) - set(free.places))
-    return fitted._replace(
-        problem=problem, values=values, remaining=remaining, limb=limb, kept=kept
+def _told(fitted: _Fitted) -> tuple[tuple[Unknown, ...], Array]:
+    """Return the unknowns with standard deviations, and their correlation (P, P)."""
+    problem, free = fitted.problem, fitted.problem.free
+    covariance = problem.search.covariance(fitted.values, problem.excess(fitted.remaining))
+    deviation = np.sqrt(np.diag(covariance))
+    at_bound = free.unknowns.at_bound(fitted.values)
+    unknowns = tuple(
+        Unknown(
+            name=term.name if term.shared else f"{term.name}[{segment}]",
+            unit=term.unit,
+            value=float(value),
+            deviation=float(sigma),
+            untold=bool(sigma > UNTOLD * term.spread),
+            at_bound=bool(edge),
+        )
+        for term, (segment, _), value, sigma, edge in zip(
+            free.terms, free.places, fitted.values, deviation, at_bound, strict=True
+        )
     )
+    return unknowns, covariance / np.outer(deviation, deviation)
 
 
-def _with_arcs(
-    found: Limb, fitted: _Fitted, prepared: Prepared, warnings: list[str]
-) -> tuple[Limb, Array]:
+def _with_arcs(found: Limb, prepared: Prepared, warnings: list[str]) -> tuple[Limb, Array]:
     """Return the limb with the PCC model's numbers, and that model's errors (M,) [rad].
 
     Without gravity both models have the same statics, segment by segment, so gain, rest angle,
@@ -306,10 +281,7 @@ def _with_arcs(
     if found.weighs_in_plane:
         names |= {"gain", "rest_angle"}
     free = FreeTerms.of(found, names)
-    # What the log does not tell of the rod it does not tell of the arcs either.
-    free = free.only(np.array([place not in fitted.kept for place in free.places]))
     problem = BendFit(free, ArcModel(found), [prepared])
-    problem.weigh(fitted.problem.errors)
     if not problem.search.follows(free.unknowns.prior):
         warnings.append(
             "arcs of constant curvature cannot follow this log under its loads: the PCC model has "

@@ -17,7 +17,9 @@ import numpy as np
 from der_msgs.msg import LimbState, PressureState
 from der_planner.arrays import Array
 from der_planner.control.feedback import Feedback
+from der_planner.limb import Limb
 from der_planner.nodes.planner_topics import PlannerPublishers
+from der_planner.planning import METHODS, Motion, plan
 from der_planner.planning.streaming import GRID, Schedule
 from limb_interfaces.clocks import LARGEST
 from limb_interfaces.stamps import NANOSECONDS, nanoseconds
@@ -265,3 +267,13 @@ class Corrector:
         with self._wake:
             later = self._open[self._open.index(each) + 1 :] if each in self._open else []
         return any(other.schedule.start <= stamp for other in later)
+
+
+def warm_up(limb: Limb, nodes: int) -> None:
+    """Compile every kernel that planning and feedback call, so that no plan has to wait for it."""
+    quick = Motion.named("asynchronous", amplitude=0.1, period=2.0, cycles=1)
+    for model, methods in METHODS.items():
+        for method in methods:
+            found = plan(limb, quick, model, method, nodes=nodes)
+    # The last of them has compiled whatever feedback calls as well.
+    Feedback(found)
