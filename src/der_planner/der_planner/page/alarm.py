@@ -62,6 +62,7 @@ def worst_first(nodes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 def missing(nodes: Sequence[dict[str, Any]]) -> list[str]:
     """Return the commands that start what has never been heard of a whole graph."""
     heard = {node["own"] for node in nodes}
+    heard |= set(TRACKERS) if heard & set(TRACKERS) else set()
     return [start_of(name, None) for name in WANTED if name not in heard]
 
 
@@ -148,9 +149,8 @@ def _reason(node: dict[str, Any]) -> str:
 def start_of(name: str, node: dict[str, Any] | None) -> str:
     """Return the command that starts a node: as it was started, where that is known."""
     known = "" if node is None else node["command"]
-    package = {DRIVER: DRIVER, **dict.fromkeys(TRACKERS, "apriltag_tracker")}.get(
-        name, "der_planner"
-    )
+    package = "apriltag_tracker" if name in TRACKERS else "der_planner"
+    package = DRIVER if name == DRIVER else package
     return known or f"scripts/ros2 run {package} {name}"
 
 

@@ -142,8 +142,8 @@ class SetupGuide:
         return Step(
             "A check of hoses, sensors and tags has been played",
             *self._run(CHECK),
-            "`python3 scripts/check_rig.py --hardware RIG.yaml --out CHECKED.yaml` says which valve "
-            "fills which chamber; end all nodes but this page first.",
+            "`python3 scripts/check_rig.py --hardware RIG.yaml --out CHECKED.yaml` says which "
+            "valve fills which chamber; end all nodes but this page first.",
         )
 
     def _calibration(self, identified: str) -> Step:
