@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from limbs import with_segments
 
 from der_planner.identification import CalibrationLog, LogError, check, fit, predict
 from der_planner.identification.bends import (
@@ -202,3 +203,30 @@ def test_what_is_seen_late_is_told_with_its_deviation(fitted, log):
     late, deviation = BendFit(free, RodModel(limb, NODES), [delayed]).delay(free.unknowns.prior)
     assert late == pytest.approx(0.03, abs=max(0.003, 3.0 * deviation))
     assert deviation < 0.005
+
+
+def test_a_number_at_the_end_of_its_range_names_what_would_tell_it():
+    sticking = with_segments(
+        Limb.default(),
+        friction_moment=lambda s: 800.0 * s.moment_gain,
+        friction_curvature=lambda s: 0.003 / s.length,
+    )
+    _, report = fit(Limb.default(), synthetic_log(sticking), terms=("friction", "dynamics"))
+    said = [warning for warning in report.warnings if "at the end of its range" in warning]
+    assert any("friction_angle[0]" in warning for warning in said)
+    assert all("slow strokes of a few degrees" in w for w in said if "friction" in w)
+
+
+def test_stiffness_that_the_log_hardly_tells_stays_where_the_model_misses_the_log():
+    """Slow errors of the model must not move what only fast motion would tell."""
+    log = synthetic_log(hidden_limb(), slow=True)
+    strange = np.deg2rad(2.0) * np.sign(np.sin(log.time[:, None] * [0.9, 0.7]))
+    prior = Limb.default()
+    limb, report = fit(
+        prior, replace(log, bend_angles=log.bend_angles + strange), terms=("friction", "dynamics")
+    )
+    assert any("tells the stiffness of segment 1" in warning for warning in report.warnings)
+    kept = report.value("log_stiffness[1]")
+    assert kept.untold
+    assert (kept.value, kept.deviation) == (0.0, 0.3)
+    assert limb.segments[1].bending_stiffness == prior.segments[1].bending_stiffness

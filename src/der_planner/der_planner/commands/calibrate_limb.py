@@ -15,6 +15,11 @@ writes the pressures of the calibration run, and `--play FILE.csv` plays such a 
 --mounting says how the limb was mounted in the log, --payload what it carried beside its own
 masses: the payload belongs to the log and does not enter the limb file. --mass is what a scale
 shows of the limb: the limb file weighs as much, and its stiffness and gains follow from that.
+
+--weight KG --at M says that a known weight was hung on at a place along the limb, once it rested
+after the run, for ten seconds or more: its stiffness is then known whatever friction does. With
+--graph the limb rests for that at the end of the run. A limb on a plate is pulled across by a
+thread over a pulley.
 """
 
 from __future__ import annotations
@@ -64,6 +69,7 @@ from der_planner.identification.foreign import ask_map, is_bag, read_bag_table
 from der_planner.identification.log import prepare
 from der_planner.identification.readers import is_ours, read_table
 from der_planner.identification.report import plot_prediction
+from der_planner.identification.weight import FREE, REST
 from der_planner.limb import Limb, LimbError
 from der_planner.planning.loads import nearly_buckling
 from pressure_driver.settings import Settings
@@ -178,6 +184,15 @@ def _parser() -> argparse.ArgumentParser:
         action="store_true",
         help="fit the mass of each segment and keep the prior's stiffness, not the other way round",
     )
+    parser.add_argument(
+        "--weight",
+        type=float,
+        metavar="KG",
+        help="weight that was hung on the resting limb after the run; needs --at",
+    )
+    parser.add_argument(
+        "--at", type=float, metavar="M", help="where it was hung on, along the limb from its clamp"
+    )
     parser.add_argument("--longest-gap", type=float, default=1.0, help="in the log, bridged [s]")
     parser.add_argument(
         "--held-out",
@@ -211,11 +226,17 @@ def _check(given: argparse.Namespace) -> None:
             given.mass is not None and given.fit_mass,
             "--fit-mass looks for the mass that --mass gives: choose one of the two",
         ),
+        (
+            (given.weight is None) != (given.at is None),
+            "--weight KG and --at M go together: a weight, and where along the limb it was hung on",
+        ),
     ):
         if wrong:
             raise OptionError(said)
     if given.mass is not None:
         check_kilograms("--mass", given.mass, LIGHTEST)
+    if given.weight is not None:
+        check_kilograms("--weight", given.weight, LIGHTEST)
     if given.excitation:
         check_file(given.excitation, "--excitation")
         return
@@ -235,7 +256,8 @@ def _fit(
     """Fit; a limb that was weighed weighs the same with the lengths that were found."""
     terms = [] if given.terms == "none" else given.terms.split(",")
     terms += ["mass"] if given.fit_mass else []
-    limb, report = fit(prior, log, terms=terms, longest_gap=given.longest_gap)
+    weight = None if given.weight is None else (given.weight, given.at)
+    limb, report = fit(prior, log, terms=terms, longest_gap=given.longest_gap, weight=weight)
     if given.mass is None:
         return limb, report
     found = loads.unloaded(limb)
@@ -252,7 +274,7 @@ def _fit(
             for old, new in zip(prior.segments, weighed, strict=True)
         )
         again = dataclasses.replace(prior, segments=segments, pcc_segments=())
-        limb, report = fit(again, log, terms=terms, longest_gap=given.longest_gap)
+        limb, report = fit(again, log, terms=terms, longest_gap=given.longest_gap, weight=weight)
     provenance = {**limb.provenance, "weighed_kg": given.mass}
     return dataclasses.replace(limb, provenance=provenance), report
 
@@ -270,7 +292,15 @@ def _weight(limb: Limb, given: argparse.Namespace) -> str:
 def _excitation(prior: Limb, pressure_limit: float, given: argparse.Namespace) -> Excitation:
     if given.play:
         return read_excitation(given.play, prior.segment_count)
-    return calibration_run(AMPLITUDE * pressure_limit, prior.segment_count, given.quick)
+    run = calibration_run(AMPLITUDE * pressure_limit, prior.segment_count, given.quick)
+    if given.weight is None:
+        return run
+    print(
+        f"after {run.duration + FREE:.0f} s, hang {given.weight:g} kg on at {given.at:g} m for "
+        f"ten seconds or more; the run ends after {run.duration + REST:.0f} s",
+        file=sys.stderr,
+    )
+    return run.with_rest(REST)
 
 
 def _obtain(prior: Limb, given: argparse.Namespace) -> CalibrationLog:

@@ -13,9 +13,12 @@ import dataclasses
 import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion, uniform_filter1d
 
 from der_planner.arrays import Array
 from der_planner.identification.least_squares import (
@@ -23,10 +26,11 @@ from der_planner.identification.least_squares import (
     Rows,
     Unknowns,
     correlation_length,
+    same_values,
 )
 from der_planner.identification.log import Prepared
 from der_planner.limb import Limb, Segment, Term, declarations
-from der_planner.model import Material, Model, Response, simulate
+from der_planner.model import CONTROL_PERIOD, Material, Model, Response, simulate
 
 GROUPS = ("asymmetry", "stiffening", "cubic", "coupling", "friction", "creep", "dynamics")
 """Model terms that may be left out, in the order in which they are explained."""
@@ -52,9 +56,20 @@ change by 2 %."""
 ANGLE_ERROR = np.deg2rad(0.3)
 """Error of a predicted bend angle that is taken for granted before its residual is known [rad]."""
 CORRELATION = 20.0
-"""Rows over which an error of the model stays the same (1 s)."""
+"""Rows over which an error of the model stays the same (1 s), and which part slow from fast."""
+LEAST_ERRORS = np.array([[ANGLE_ERROR], [np.deg2rad(0.1)]])
+"""Least slow and fast errors (2, 1) for which bend angles are weighed: of any model, and of tags
+[rad]."""
+BENDS_ON = np.deg2rad(2.0)
+"""Rate of the bend that pressures ask for from which on friction does not turn round [rad/s]."""
 SOFTNESS = 3.0
-"""Errors beyond this multiple of `ANGLE_ERROR` count less than their square."""
+"""Errors beyond this multiple of the usual one count less than their square."""
+ROUGH = 1e-2
+"""Relative change of the sum of squares at which a search ends whose weights are not known yet."""
+SAME_WEIGHT = math.log(1.25)
+"""Change of the logarithm of an error up to which a search need not be repeated."""
+MOST_FITS = 3
+"""Largest number of searches, each with the weights that the last one told."""
 _STEPS = {"der": 1, "pcc": 2}
 """Integrator steps in each row of 50 ms; the page of the identification shows the convergence."""
 _NUDGE = 1e-3
@@ -109,6 +124,29 @@ class FreeTerms:
         """What is known of the free terms."""
         known = [(term.spread, term.low, term.high, term.scale) for term in self.terms]
         return Unknowns(self.at_places(self.values), *np.reshape(known, (-1, 4)).T)
+
+    def only(self, chosen: NDArray[np.bool_]) -> Self:
+        """Return those of the terms that are chosen (P,)."""
+        places, terms = compress(self.places, chosen), compress(self.terms, chosen)
+        return replace(self, places=tuple(places), terms=tuple(terms))
+
+    def told(self, name: str, value: Array, deviation: Array) -> Self:
+        """Return the terms where something else than the log has measured one of each segment.
+
+        Args:
+            name: of the term.
+            value: (M,) measured.
+            deviation: (M,) standard deviation of it; what was known before counts by its own.
+        """
+        values, terms, column = self.values.copy(), list(self.terms), COLUMN[name]
+        for index, (segment, place) in enumerate(self.places):
+            if place != column:
+                continue
+            spread = terms[index].spread
+            share = 1.0 / (1.0 + (deviation[segment] / spread) ** 2)
+            values[segment, column] += share * (value[segment] - values[segment, column])
+            terms[index] = replace(terms[index], spread=spread * math.sqrt(1.0 - share))
+        return replace(self, values=values, terms=tuple(terms))
 
     def at_places(self, table: Array) -> Array:
         """Return the values (P,) of the free terms in a table (M, T)."""
@@ -225,14 +263,17 @@ def predicted(free: FreeTerms, model: Model, log: Prepared, values: Array) -> Pr
         RuntimeError: the model cannot follow.
     """
     limb, scale = free.limb_with(values), free.unknowns.scale
-    response = follow(model.another(limb), log, linearise=True)
-    assert response.derivative is not None
+    units = np.diag(scale)
+    limbs = [free.limb_with(values + _NUDGE * unit) for unit in units]
+    driven = [_same_body(limb, nudged) for nudged in limbs]
+    # The tangent of the arcs takes longer than all their differences: only where it is needed.
+    response = follow(model.another(limb), log, linearise=any(driven))
     angles, tip = response.bend_angles, response.tip
     moments, gain = _moments(limb, log, angles), _gain(limb)
     angles_by, tip_by = (np.empty((*part.shape, len(values))) for part in (angles, tip))
-    for place, unit in enumerate(np.diag(scale)):
-        nudged = free.limb_with(values + _NUDGE * unit)
-        if _same_body(limb, nudged):
+    for place, (unit, nudged) in enumerate(zip(units, limbs, strict=True)):
+        if driven[place]:
+            assert response.derivative is not None
             change = (_moments(nudged, log, angles) - moments) / gain / (_NUDGE * scale[place])
             tip_by[:, :, place], angles_by[:, :, place] = response.derivative.by_effective(change)
             continue
@@ -282,19 +323,64 @@ class BendFit:
         more_rows: Callable[[Predicted], Rows] | None = None,
     ) -> None:
         self.free, self._model, self._logs, self._more_rows = free, model, logs, more_rows
-        self.search = LeastSquares(free.unknowns, self._rows, SOFTNESS / np.sqrt(CORRELATION))
+        self._last: tuple[bytes, list[Predicted] | None] = (b"", None)
+        self._bends_on = [_bends_on(free.limb, log) for log in logs]
+        self.weigh(np.full((2, free.limb.segment_count), ANGLE_ERROR))
+
+    def weigh(self, errors: Array) -> None:
+        """Take errors (2, M) of bend angles for granted, slow and fast ones [rad]."""
+        self.errors = np.maximum(errors, 1e-3 * ANGLE_ERROR)
+        unknowns = self.free.unknowns
+        self.search = LeastSquares(unknowns, self._rows, SOFTNESS / np.sqrt(CORRELATION))
+
+    def solve(self, start: Array) -> Array:
+        """Return the best values (P,), the bend angles weighed by the errors that these leave.
+
+        With the errors taken for granted, a log that the model cannot explain would outweigh
+        everything that is known before it, and move what it does not tell.
+
+        Args:
+            start: (P,) that the model follows.
+
+        Raises:
+            ValueError: the model cannot be followed at the start.
+        """
+        values = self.search.solve(start, ROUGH)
+        errors = np.maximum(self.errors_left(values), LEAST_ERRORS)
+        for _ in range(MOST_FITS):
+            self.weigh(errors)
+            values = self.search.solve(values)
+            errors = np.maximum(self.errors_left(values), LEAST_ERRORS)
+            if np.abs(np.log(errors / self.errors)).max() < SAME_WEIGHT:
+                break
+        return values
+
+    def _predicted(self, values: Array) -> list[Predicted] | None:
+        """Return what is predicted along the logs, or None; the last one is kept."""
+        key = same_values(values, self.free.unknowns)
+        if self._last[0] != key:
+            try:
+                found = [predicted(self.free, self._model, log, values) for log in self._logs]
+            except RuntimeError:  # also where arcs that buckle do not come to rest
+                self._last = (key, None)
+            else:
+                self._last = (key, found)
+        return self._last[1]
 
     def _rows(self, values: Array) -> Rows | None:
-        weight = 1.0 / (ANGLE_ERROR * np.sqrt(CORRELATION))
-        errors, slopes = [], []
-        try:
-            found = [predicted(self.free, self._model, log, values) for log in self._logs]
-        except RuntimeError:  # also where arcs that buckle under their load do not come to rest
+        found = self._predicted(values)
+        if found is None:
             return None
-        for log, part in zip(self._logs, found, strict=True):
+        errors, slopes, scale = [], [], np.sqrt(CORRELATION)
+        for log, part, on in zip(self._logs, found, self._bends_on, strict=True):
             rows = log.usable
-            errors.append(weight * (part.angles[rows] - log.log.bend_angles[rows]).ravel())
-            slopes.append(weight * part.angles_by[rows].reshape(-1, len(values)))
+            left = _apart(part.angles[rows] - log.log.bend_angles[rows])
+            by = _apart(part.angles_by[rows])
+            usual = np.repeat(self.errors[:, None], rows.sum(), axis=1)
+            usual[1, ~on[rows]] = self.errors[0]  # elsewhere fast errors count as slow ones do
+            for error, change, weight in zip(left, by, 1.0 / (usual * scale), strict=True):
+                errors.append((weight * error).ravel())
+                slopes.append((weight[..., None] * change).reshape(-1, len(values)))
         if self._more_rows is not None:
             more = self._more_rows(found[0])
             errors.append(more[0])
@@ -312,6 +398,25 @@ class BendFit:
         for error, log in zip(errors, self._logs, strict=True):
             error[~log.usable] = np.nan
         return np.concatenate(errors)
+
+    def errors_left(self, values: Array) -> Array:
+        """Return the slow and fast errors (2, M) [rad] that values (P,) leave of the bend angles.
+
+        They are as large as errors that stay the same for `CORRELATION` rows would have to be.
+        """
+        remaining = self.remaining(values)
+        usable = np.concatenate([log.usable for log in self._logs])
+        slow, fast = _apart(remaining[usable])
+        fast = fast[np.concatenate(self._bends_on)[usable]]
+        # Each fitted unknown uses up some of what is independent (degrees of freedom).
+        length = correlation_length(slow)
+        independent = slow.size / max(length, CORRELATION)
+        left = max(independent - len(self.free.unknowns.prior), 0.5 * independent)
+        longer = max(length / CORRELATION, 1.0) * independent / left
+        errors = np.empty((2, slow.shape[1]))
+        errors[0] = np.sqrt(longer * np.mean(slow**2))
+        errors[1] = np.sqrt(np.sum(fast**2, axis=0) / max(len(fast), 1))
+        return errors
 
     def excess(self, remaining: Array) -> float:
         """Return by how much the data's variance exceeds that of `ANGLE_ERROR` and `CORRELATION`.
@@ -354,3 +459,20 @@ class BendFit:
         information = table.T @ table + np.diag(np.append(0.0, known**2))
         covariance = np.linalg.pinv(information, hermitian=True)
         return float(covariance[0] @ table.T @ error), float(np.sqrt(covariance[0, 0]))
+
+
+def _apart(table: Array) -> tuple[Array, Array]:
+    """Return the slow part of a table (K, …), its mean over `CORRELATION` rows, and the rest.
+
+    Friction that turns round in a swing is taken for stiffness or damping. While all segments bend
+    on it stays the same, and what is fast is the swing of the body.
+    """
+    slow: Array = uniform_filter1d(table, round(CORRELATION), axis=0, mode="nearest")
+    return slow, table - slow
+
+
+def _bends_on(limb: Limb, log: Prepared) -> NDArray[np.bool_]:
+    """Return the rows (K,) around which the pressures bend all segments on, each in one way."""
+    rate = limb.static_gain * np.gradient(_apart(log.pressure)[0], CONTROL_PERIOD, axis=0)
+    on = log.usable & np.all(np.abs(rate) > BENDS_ON, axis=1)
+    return np.asarray(binary_erosion(on, iterations=round(CORRELATION / 2)))

@@ -49,6 +49,12 @@ class Excitation:
         """Length of the run [s]."""
         return float(self.time[-1] + PERIOD)
 
+    def with_rest(self, duration: float) -> Excitation:
+        """Return the run with a rest without pressure after it [s]."""
+        rows = np.zeros((round(duration / PERIOD), self.differential_pressure.shape[1]))
+        pressure = np.concatenate([self.differential_pressure, rows])
+        return Excitation(PERIOD * np.arange(len(pressure), dtype=float), pressure)
+
 
 def write_excitation(excitation: Excitation, path: Path) -> None:
     """Write a run as CSV: time_s and one column of pressures [Pa] a segment."""

@@ -38,14 +38,13 @@ from der_planner.identification.log import (
     Prepared,
     prepare,
 )
-from der_planner.identification.report import FitReport, Unknown
+from der_planner.identification.report import FitReport
+from der_planner.identification.told import at_bounds, kept_unknowns, told, untold_stiffness
+from der_planner.identification.weight import HungWeight
 from der_planner.limb import CalibratedRange, Limb
 from der_planner.model import ArcModel, Material, RodModel
 from der_planner.planning.loads import nearly_buckling
 
-UNTOLD = 0.8
-"""Share of its prior spread above which the deviation of an unknown means that the log does not
-tell it."""
 MOST_PASSES = 4
 """Largest number of times that lengths and bend angles are fitted in turn, for a limb that its
 weight bends unevenly."""
@@ -68,6 +67,7 @@ def fit(
     *,
     terms: Iterable[str] = GROUPS,
     longest_gap: float = LONGEST_GAP,
+    weight: tuple[float, float] | None = None,
 ) -> tuple[Limb, FitReport]:
     """Identify a limb from a calibration run.
 
@@ -78,6 +78,8 @@ def fit(
             `OPTIONAL`) the mass of each segment is fitted and its stiffness is the prior's. A log
             shows the mass only under gravity or in fast motion.
         longest_gap: between two rows of the log that a straight line may bridge [s].
+        weight: mass [kg] and place along the limb [m] of a weight that was hung on the resting limb
+            at the end of the log, see `HungWeight`; None: none was.
 
     Returns:
         The identified limb, with provenance and calibrated ranges, and what the data say of it.
@@ -89,7 +91,14 @@ def fit(
     if not groups <= {*GROUPS, *OPTIONAL}:
         known = (*GROUPS, *OPTIONAL)
         raise LogError(f"unknown model term {sorted(groups - set(known))}: choose {known}")
+    if weight and ("dynamics" not in groups or "mass" in groups):
+        raise LogError(
+            "a known weight tells the stiffness: leave dynamics among the terms, and the mass out"
+        )
     recorded = prepare(log, limb, longest_gap)
+    hung = HungWeight.found(recorded, *weight) if weight else None
+    if hung is not None:
+        recorded = recorded.without(hung.rows)
     warnings = list(recorded.warnings)
     try:
         air = fit_air(recorded.log)
@@ -100,21 +109,25 @@ def fit(
     prepared = replace(recorded, pressure=recorded.pressure - offset)
     fitted = _fit_bends_and_lengths(limb, prepared, groups)
     warnings += filter(None, [lengths_at_their_end(limb, fitted.known)])
-    unknowns, correlation = _told(fitted)
-    stiffness = [u.untold for u in unknowns if u.name.startswith("log_stiffness")]
-    if "dynamics" in groups and stiffness and all(stiffness):
-        warnings.append(
-            "the log is too slow to tell the stiffness apart from the gain: stiffness and damping "
-            "keep their old values; steps or a sweep would tell them"
-        )
-        groups -= {"dynamics"}
-        fitted = _fit_bends(fitted.known, prepared, groups, fitted.lengths)
-        unknowns, correlation = _told(fitted)
+    if hung is not None:
+        change, deviation = hung.stiffness_change(fitted.known, fitted.limb)
+        weighed = fitted.free.told("log_stiffness", change, deviation)
+        fitted = _again(fitted, weighed, prepared)
+    unknowns, correlation = told(fitted.problem, fitted.values)
+    kept, said = untold_stiffness(fitted.free, unknowns)
+    without_kept = _again(fitted, fitted.free.only(~kept), prepared) if kept.any() else fitted
+    if without_kept is not fitted:
+        left = tuple(kept_unknowns(fitted.free.only(kept)))
+        fitted = without_kept
+        unknowns, correlation = told(fitted.problem, fitted.values)
+        unknowns += left
+        warnings.append(said)
+    warnings += at_bounds(fitted.free, fitted.values)
     found = _calibrated(fitted, limb, air, recorded)
     warnings += filter(None, [nearly_buckling(found)])
     pcc_residual = np.full(limb.segment_count, np.nan)
-    if "dynamics" in groups or limb.weighs_in_plane:
-        found, pcc_residual = _with_arcs(found, prepared, warnings)
+    if limb.weighs_in_plane or any(term.group == "dynamics" for term in fitted.free.terms):
+        found, pcc_residual = _with_arcs(found, fitted, prepared, warnings)
     return found, FitReport(
         limb=found,
         source=log.source,
@@ -134,14 +147,24 @@ def fit(
 
 
 class _Fitted(NamedTuple):
-    """A limb with its lengths, the problem solved on it, what it left, and the limb found."""
+    """A limb with its lengths, the problem solved on it, what it left, and the limb found.
+
+    What the log did not tell is in ``kept``, pairs of segment and term.
+    """
 
     known: Limb
     lengths: GeometryFit | None
+    tips: UnevenTips | None
     problem: BendFit
     values: Array
     remaining: Array
     limb: Limb
+    kept: frozenset[tuple[int, int]] = frozenset()
+
+    @property
+    def free(self) -> FreeTerms:
+        """The terms that were free."""
+        return self.problem.free
 
 
 def _fit_bends_and_lengths(prior: Limb, prepared: Prepared, groups: Collection[str]) -> _Fitted:
@@ -161,7 +184,7 @@ def _fit_bends_and_lengths(prior: Limb, prepared: Prepared, groups: Collection[s
             break
         tips = UnevenTips(prior, RodModel(lengths.limb, NODES), prepared, lacking)
         change = np.abs(lengths_of(lengths.limb) - lengths_of(fitted.known))
-        fitted = _fit_bends(lengths.limb, prepared, groups, lengths, fitted.values, tips)
+        fitted = _fit_bends(lengths.limb, prepared, groups, lengths, fitted, tips)
         if change[: prior.segment_count + 1].max() < SAME_LENGTH:
             break
     if loaded:
@@ -174,7 +197,7 @@ def _fit_bends(
     prepared: Prepared,
     groups: Collection[str],
     lengths: GeometryFit | None,
-    start: Array | None = None,
+    before: _Fitted | None = None,
     tips: UnevenTips | None = None,
 ) -> _Fitted:
     """Fit the rod to the bend angles.
@@ -184,7 +207,7 @@ def _fit_bends(
         prepared: the log.
         groups: of terms to fit.
         lengths: of the limb.
-        start: (P,) of the free terms; None: in closed form from the log's statics.
+        before: a fit of the same terms to begin at; None: in closed form from the log's statics.
         tips: fit to them, too; None: to the bend angles alone.
     """
     names = {term.name for term in TERMS if term.group in ("linear", *groups)}
@@ -195,11 +218,14 @@ def _fit_bends(
         names.discard("log_inertia")
     free = FreeTerms.of(known, names, without(values_of(known, starts=True), groups))
     problem = BendFit(free, RodModel(known, NODES), [prepared], tips.rows if tips else None)
-    if start is None:
+    if before is None:
         start = free.at_places(_static_start(free, prepared))
-    values = problem.search.solve(_followed(problem, free, start))
+    else:
+        start = before.values
+        problem.weigh(before.problem.errors)
+    values = problem.solve(_followed(problem, free, start))
     return _Fitted(
-        known, lengths, problem, values, problem.remaining(values), free.limb_with(values)
+        known, lengths, tips, problem, values, problem.remaining(values), free.limb_with(values)
     )
 
 
@@ -247,29 +273,29 @@ def _followed(problem: BendFit, free: FreeTerms, start: Array) -> Array:
     )
 
 
-def _told(fitted: _Fitted) -> tuple[tuple[Unknown, ...], Array]:
-    """Return the unknowns with standard deviations, and their correlation (P, P)."""
-    problem, free = fitted.problem, fitted.problem.free
-    covariance = problem.search.covariance(fitted.values, problem.excess(fitted.remaining))
-    deviation = np.sqrt(np.diag(covariance))
-    at_bound = free.unknowns.at_bound(fitted.values)
-    unknowns = tuple(
-        Unknown(
-            name=term.name if term.shared else f"{term.name}[{segment}]",
-            unit=term.unit,
-            value=float(value),
-            deviation=float(sigma),
-            untold=bool(sigma > UNTOLD * term.spread),
-            at_bound=bool(edge),
-        )
-        for term, (segment, _), value, sigma, edge in zip(
-            free.terms, free.places, fitted.values, deviation, at_bound, strict=True
-        )
+def _again(fitted: _Fitted, free: FreeTerms, prepared: Prepared) -> _Fitted:
+    """Fit terms that were fitted before, some of them or with more known of them.
+
+    Returns what was given where the rod cannot follow the log from there.
+    """
+    found = dict(zip(fitted.free.places, fitted.values, strict=True))
+    start = np.array([found[place] for place in free.places])
+    tips = fitted.tips
+    problem = BendFit(free, RodModel(fitted.known, NODES), [prepared], tips.rows if tips else None)
+    problem.weigh(fitted.problem.errors)
+    if not problem.search.follows(start):
+        return fitted
+    values = problem.solve(start)
+    remaining, limb = problem.remaining(values), free.limb_with(values)
+    kept = fitted.kept.union(set(fitted.free.places) - set(free.places))
+    return fitted._replace(
+        problem=problem, values=values, remaining=remaining, limb=limb, kept=kept
     )
-    return unknowns, covariance / np.outer(deviation, deviation)
 
 
-def _with_arcs(found: Limb, prepared: Prepared, warnings: list[str]) -> tuple[Limb, Array]:
+def _with_arcs(
+    found: Limb, fitted: _Fitted, prepared: Prepared, warnings: list[str]
+) -> tuple[Limb, Array]:
     """Return the limb with the PCC model's numbers, and that model's errors (M,) [rad].
 
     Without gravity both models have the same statics, segment by segment, so gain, rest angle,
@@ -281,7 +307,10 @@ def _with_arcs(found: Limb, prepared: Prepared, warnings: list[str]) -> tuple[Li
     if found.weighs_in_plane:
         names |= {"gain", "rest_angle"}
     free = FreeTerms.of(found, names)
+    # What the log does not tell of the rod it does not tell of the arcs either.
+    free = free.only(np.array([place not in fitted.kept for place in free.places]))
     problem = BendFit(free, ArcModel(found), [prepared])
+    problem.weigh(fitted.problem.errors)
     if not problem.search.follows(free.unknowns.prior):
         warnings.append(
             "arcs of constant curvature cannot follow this log under its loads: the PCC model has "

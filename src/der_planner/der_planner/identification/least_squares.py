@@ -92,12 +92,12 @@ class LeastSquares:
         """Return whether the model follows with values (P,)."""
         return self._evaluate(self.unknowns.inside(values)) is not None
 
-    def solve(self, start: Array | None = None, factor: float = 1.0) -> Array:
+    def solve(self, start: Array | None = None, tolerance: float = TOLERANCE) -> Array:
         """Return the best values (P,).
 
         Args:
             start: (P,) that the model follows; None: the prior's values.
-            factor: by which the data's variance is larger than their weights say.
+            tolerance: relative change of the sum of squares at which the search ends.
 
         Raises:
             ValueError: the model cannot be followed at the start.
@@ -108,20 +108,19 @@ class LeastSquares:
         if found is None:
             raise ValueError("a fit must begin where its model can be followed")
         lost = np.full(len(found[0]), NOT_FOLLOWED)
-        inflated = np.sqrt(factor)
         known, tightness = unknowns.known, unknowns.scale / unknowns.spread
 
         def residual(x: Array) -> Array:
             found = self._evaluate(x * unknowns.scale)
             prior = ((x - unknowns.prior / unknowns.scale) * tightness)[known]
-            return np.concatenate([lost if found is None else found[0] / inflated, prior])
+            return np.concatenate([lost if found is None else found[0], prior])
 
         def jacobian(x: Array) -> Array:
             found = self._evaluate(x * unknowns.scale)
             assert found is not None  # the search never stays where the model is not followed
-            return np.concatenate([found[1] * unknowns.scale / inflated, np.diag(tightness)[known]])
+            return np.concatenate([found[1] * unknowns.scale, np.diag(tightness)[known]])
 
-        tolerance = 1e-4 * TOLERANCE if self._cheap else TOLERANCE
+        tolerance *= 1e-4 if self._cheap else 1.0
         solution = least_squares(
             residual,
             begin / unknowns.scale,
@@ -154,12 +153,17 @@ class LeastSquares:
 
     def _evaluate(self, values: Array) -> Rows | None:
         """Return the rows at values (P,), or None; the last ones are kept."""
-        key = values.tobytes()
+        key = same_values(values, self.unknowns)
         if self._last[0] != key:
             found = self._rows(values)
             followed = found is not None and bool(np.all(np.isfinite(found[0])))
             self._last = (key, found if followed else None)
         return self._last[1]
+
+
+def same_values(values: Array, unknowns: Unknowns) -> bytes:
+    """Return a key that values (P,) share with those that differ by rounding alone."""
+    return np.round(values / unknowns.scale, 12).tobytes()
 
 
 def with_differences(residual: Callable[[Array], Array], values: Array, steps: Array) -> Rows:

@@ -1,0 +1,110 @@
+"""What a log tells of each unknown of a fit, what it leaves as it was, and what would tell it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from der_planner.arrays import Array
+from der_planner.identification.bends import TERMS, BendFit, FreeTerms
+from der_planner.identification.report import Unknown, readable
+from der_planner.limb import Term
+
+Mask = NDArray[np.bool_]
+
+UNTOLD = 0.8
+"""Share of its prior spread above which the deviation of an unknown means that the log does not
+tell it."""
+EXPERIMENTS = {
+    "linear": "slow pressures both ways on each segment, in the units of the log,",
+    "asymmetry": "slow pressures both ways on each segment",
+    "stiffening": "slow pressures up to the limit",
+    "cubic": "slow pressures up to the limit",
+    "coupling": "pressures on each segment alone",
+    "friction": "slow strokes of a few degrees, there and back,",
+    "creep": "pressures that are held for a minute",
+    "dynamics": "swings while all segments bend on in one direction, or a weight (--weight),",
+    "mass": "a scale (--mass)",
+}
+"""What tells the terms of a group where a log does not, as the subject of a sentence."""
+
+
+def untold_stiffness(free: FreeTerms, unknowns: Sequence[Unknown]) -> tuple[Mask, str]:
+    """Return which unknowns (P,) keep what was known before the log, and the sentence for it.
+
+    Stiffness that the log does not tell takes up what the model lacks in friction and creep. Where
+    it tells that of no segment, it does not tell the damping either.
+    """
+    stiff = np.array([term.name == "log_stiffness" for term in free.terms], dtype=bool)
+    untold = stiff & np.array([unknown.untold for unknown in unknowns], dtype=bool)
+    if not untold.any():
+        return untold, ""
+    if np.array_equal(untold, stiff):
+        return np.array([term.group == "dynamics" for term in free.terms]), (
+            "the log is too slow to tell the stiffness apart from the gain: stiffness and damping "
+            "keep their old values; steps, a sweep or a known weight (--weight) would tell them"
+        )
+    segments = [str(segment) for (segment, _), out in zip(free.places, untold, strict=True) if out]
+    return untold, (
+        f"the log hardly tells the stiffness of segment {' and '.join(segments)}: it stays as it "
+        f"was known before; {EXPERIMENTS['dynamics']} would tell it"
+    )
+
+
+def kept_unknowns(free: FreeTerms) -> Iterator[Unknown]:
+    """Yield terms that the fit left as they were known before, with the deviation of that."""
+    before = free.at_places(free.values)
+    for term, (segment, _), value in zip(free.terms, free.places, before, strict=True):
+        yield Unknown(_name(term, segment), term.unit, float(value), term.spread, untold=True)
+
+
+def at_bounds(free: FreeTerms, values: Array) -> Iterator[str]:
+    """Yield a sentence for each unknown at the end of its range, but for what is just not there."""
+    ends = free.unknowns.at_bound(values)
+    for term, (segment, _), value, at_end in zip(
+        free.terms, free.places, values, ends, strict=True
+    ):
+        absent = term.low == 0.0 and value < 0.5 * term.high
+        if at_end and not absent:
+            factor, unit = readable(term.unit)
+            size = math.exp(value) if term.relative else factor * value
+            yield (
+                f"{_name(term, segment)} is at the end of its range, {size:.3g} "
+                f"{'times what was known' if term.relative else unit}, so that others may be "
+                f"wrong as well: {EXPERIMENTS[term.group]} would tell it"
+            )
+
+
+def _name(term: Term, segment: int) -> str:
+    return term.name if term.shared else f"{term.name}[{segment}]"
+
+
+def told(problem: BendFit, values: Array) -> tuple[tuple[Unknown, ...], Array]:
+    """Return the unknowns with standard deviations, and their correlation (P, P).
+
+    Args:
+        problem: that was solved.
+        values: (P,) found.
+    """
+    free = problem.free
+    problem.weigh(problem.errors_left(values))
+    covariance = problem.search.covariance(values)
+    deviation = np.sqrt(np.diag(covariance))
+    at_bound = free.unknowns.at_bound(values)
+    unknowns = tuple(
+        Unknown(
+            name=_name(term, segment),
+            unit=term.unit,
+            value=float(value),
+            deviation=float(sigma),
+            untold=bool(sigma > UNTOLD * TERMS[place].spread),
+            at_bound=bool(edge),
+        )
+        for term, (segment, place), value, sigma, edge in zip(
+            free.terms, free.places, values, deviation, at_bound, strict=True
+        )
+    )
+    return unknowns, covariance / np.outer(deviation, deviation)

@@ -1,0 +1,82 @@
+"""A known weight on the resting limb tells its stiffness, whatever friction does."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from limbs import with_segments
+
+from der_planner.identification import CalibrationLog, LogError
+from der_planner.identification.log import Prepared
+from der_planner.identification.weight import HungWeight
+from der_planner.limb import Limb, PointMass
+from der_planner.model import RodModel
+
+LIMB = Limb.default()
+MASS, AT = 0.05, 0.2
+STIFFER = np.array([1.4, 0.7])
+
+
+def resting(gravity: tuple[float, float, float], mass: float) -> np.ndarray:
+    """Return the bend (2,) [rad] of a limb of other stiffness that rests with a mass [kg]."""
+    segments = tuple(
+        replace(s, bending_stiffness=factor * s.bending_stiffness)
+        for s, factor in zip(LIMB.segments, STIFFER, strict=True)
+    )
+    masses = (PointMass(AT, mass),)
+    model = RodModel(replace(LIMB, segments=segments, gravity=gravity, masses=masses), 41)
+    return model.bend_of(model.resting(np.zeros(2)))
+
+
+def recorded(before: np.ndarray, under: np.ndarray, rest: float = 40.0) -> Prepared:
+    """Return a log of a motion and a rest, in which the weight hangs from 15 to 27 s."""
+    time = np.arange(0.0, 10.0 + rest, 0.05)
+    moving, hung = time < 10.0, (time > 25.0) & (time < 37.0)
+    pressure = 8e3 * np.outer(np.sin(time), [1.0, -1.0]) * moving[:, None]
+    bend = LIMB.static_gain * pressure + np.where(hung[:, None], under, before)
+    noise = np.deg2rad(0.1) * np.random.default_rng(0).standard_normal(bend.shape)
+    log = CalibrationLog(time, pressure, pressure, bend + noise, np.full(bend.shape, np.nan))
+    return Prepared(log, pressure, bend + noise, np.ones(len(time), dtype=bool), ())
+
+
+@pytest.mark.parametrize(("mounting", "held_by"), [("horizontal", 0.02), ("10", 0.0)])
+def test_stiffness_follows_from_the_weight_and_friction_is_accounted_for(mounting, held_by):
+    limb = LIMB.mounted(mounting)
+    before = resting(limb.gravity, 0.0)
+    mass = MASS if mounting == "horizontal" else 6.0 * MASS
+    if mounting != "horizontal":
+        under = resting(limb.gravity, mass)
+    else:
+        # A thread pulls across the limb, whose own weight the plate carries.
+        under = resting((0.0, -9.81e-3, 0.0), 1e3 * MASS)
+    held = under - held_by * np.sign(under - before)
+    hung = HungWeight.found(recorded(before, held), mass, AT)
+    assert not hung.rows[:200].any()
+    assert hung.rows[-300:-20].all()
+    rubbing = with_segments(
+        limb,
+        friction_moment=lambda s: held_by * s.bending_stiffness / s.length,
+        friction_curvature=lambda s: 0.1 / s.length,
+    )
+    change, deviation = hung.stiffness_change(limb, rubbing)
+    assert np.exp(change) == pytest.approx(STIFFER, rel=0.08)
+    assert np.all((deviation > 0.03) & (deviation < 0.2))
+
+
+def test_what_was_not_hung_on_or_hardly_bends_is_named():
+    none = np.zeros(2)
+    with pytest.raises(LogError, match="hang on a heavier weight"):
+        HungWeight.found(recorded(none, none + 0.01), MASS, AT)
+    with pytest.raises(LogError, match="no 12 s without pressure"):
+        HungWeight.found(recorded(none, none + 0.3, rest=5.0), MASS, AT)
+
+
+def test_a_segment_that_friction_holds_tells_nothing():
+    hung = HungWeight.found(recorded(np.zeros(2), np.array([-0.2, -0.04])), MASS, AT)
+    rubbing = with_segments(
+        LIMB,
+        friction_moment=lambda s: 0.05 * s.bending_stiffness / s.length,
+        friction_curvature=lambda s: 0.1 / s.length,
+    )
+    _, deviation = hung.stiffness_change(LIMB, rubbing)
+    assert np.isfinite(deviation).tolist() == [True, False]
