@@ -160,6 +160,14 @@ class Prepared:
     usable: NDArray[np.bool_]
     warnings: tuple[str, ...]
 
+    def without(self, rows: NDArray[np.bool_]) -> Prepared:
+        """Return the log with rows (K,) more that are not fitted to."""
+        missing = np.where(rows, np.nan, 0.0)[:, None]
+        log = replace(
+            self.log, bend_angles=self.log.bend_angles + missing, tip=self.log.tip + missing
+        )
+        return replace(self, log=log, usable=self.usable & ~rows)
+
 
 def prepare(
     log: CalibrationLog, limb: Limb, longest_gap: float = LONGEST_GAP, *, to_fit: bool = True

@@ -13,25 +13,25 @@ import datetime
 import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from itertools import compress
 
 import numpy as np
-from numpy.typing import NDArray
 
 from der_planner.arrays import Array
 from der_planner.identification.bends import (
     COLUMN,
     CORRELATION,
+    LEAST_ERRORS,
+    MOST_FITS,
     NODES,
     BendFit,
     FreeTerms,
     to_limb,
     values_of,
 )
-from der_planner.identification.fit import UNTOLD
 from der_planner.identification.least_squares import LeastSquares, Rows, with_differences
 from der_planner.identification.log import CalibrationLog, LogError, Prepared, prepare
 from der_planner.identification.report import LEAST_MOTION, readable
+from der_planner.identification.told import UNTOLD
 from der_planner.limb import Limb, Term
 from der_planner.limb.parameters import REST_SPREAD
 from der_planner.model import RodModel
@@ -57,8 +57,6 @@ LEAST_DURATION = 5.0
 """Least duration of all runs together [s]."""
 CALIBRATE_AGAIN = math.radians(3.0)
 """Root mean square error that a limb file should not leave [rad]."""
-MOST_FITS = 3
-"""Largest number of fits, each with the weights and without the untold unknowns of the last."""
 
 FAR = 3e-3
 """Mean distance of measured and expected tip beyond which a model is adapted [m]."""
@@ -87,11 +85,6 @@ class DayTerms(FreeTerms):
         return replace(
             free, terms=tuple(map(_of_days, free.terms, free.at_places(values).tolist()))
         )
-
-    def only(self, chosen: NDArray[np.bool_]) -> DayTerms:
-        """Return those of the terms that are chosen (P,)."""
-        places, terms = compress(self.places, chosen), compress(self.terms, chosen)
-        return replace(self, places=tuple(places), terms=tuple(terms))
 
     def limb_with(self, free: Array) -> Limb:
         """Return the limb with values (P,) of the free terms put in place.
@@ -258,13 +251,16 @@ def update(limb: Limb, logs: CalibrationLog | Sequence[CalibrationLog]) -> tuple
 
 def _solve(every: DayTerms, runs: Sequence[Prepared]) -> tuple[Array, Array]:
     """Return the values (P,) and their deviations (P,), both as known before where not told."""
-    known, factor = every.unknowns, 1.0
+    known, errors = every.unknowns, None
     values, deviation, told = known.prior, known.spread, np.ones(len(known.prior), dtype=bool)
     for _ in range(MOST_FITS):
         problem = BendFit(every.only(told), RodModel(every.limb, NODES), runs)
-        found = problem.search.solve(values[told], factor)
-        factor = max(1.0, problem.excess(problem.remaining(found)))
-        of_found = np.sqrt(np.diag(problem.search.covariance(found, factor)))
+        if errors is not None:
+            problem.weigh(errors)
+        found = problem.search.solve(values[told])
+        errors = np.maximum(problem.errors_left(found), LEAST_ERRORS)
+        problem.weigh(errors)
+        of_found = np.sqrt(np.diag(problem.search.covariance(found)))
         better = of_found <= UNTOLD * known.spread[told]
         told[told] = better
         values, deviation = known.prior.copy(), known.spread.copy()
