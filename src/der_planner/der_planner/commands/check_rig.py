@@ -108,15 +108,16 @@ def _main(given: argparse.Namespace) -> int:
             frame = found_frame(clamp, told)
             lines.append("limb_base: found from the limb, for a map without fixed bodies")
     print("\n".join(lines))
-    driver = dict(hardware.driver) if hardware else {}
+    before = hardware.driver.get("wiring", "") if hardware else ""
     try:
-        driver["wiring"] = played_wiring(finding, str(driver.get("wiring", "")))
+        wiring = played_wiring(finding, str(before))
     except (HoseError, RigError) as error:
         print(f"no file is written: {error}", file=sys.stderr)
         return 3
     if given.out is not None:
         content = yaml.safe_load(given.hardware.read_text()) if given.hardware else {}
-        content |= {"driver": driver, "found": lines}
+        content["driver"] = {**content.get("driver", {}), "wiring": wiring}
+        content["found"] = lines
         given.out.parent.mkdir(parents=True, exist_ok=True)
         if frame is not None and hardware is not None and hardware.poses is not None:
             mapped = yaml.safe_load(Path(hardware.poses["body_map"]).read_text())
