@@ -23,9 +23,9 @@ from typing import Self
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 
-from der_planner.arrays import Array
+from der_planner.arrays import Array, interpolate
 from der_planner.model import ArcModel, Initial, Model, RodModel, State
-from der_planner.model.bending import coordinates, inverse_kinematics
+from der_planner.model.bending import TipNearPoses, TipOfBend, coordinates, inverse_kinematics
 from der_planner.model.rod import PoseFinder, Poses
 from der_planner.planning.loads import (
     BucklingError,
@@ -85,6 +85,14 @@ class Configuration(ABC):
         other = copy.copy(self)
         other.model = model
         return other
+
+    def near(self, time: Array) -> TipOfBend:  # noqa: ARG002 - evenly bent, it is always the same
+        """Return the tip for bend angles (K, M) near those of the motion at instants (K,) [s]."""
+        return self.model.kinematics
+
+    def curves(self, time: Array) -> Array:
+        """Return the centreline (K, P, 2) [m] at instants (K,) [s]."""
+        return np.stack([self.model.kinematics.curve(bend) for bend in self.bend_at(time)])
 
     @property
     def initial(self) -> Initial:
@@ -255,6 +263,22 @@ class LoadedConfiguration(RodConfiguration):
             return self.model.rest
         q, v, _ = sample_spline(self._shape, 0.0)
         return self.model.rod.state(q, v, like=self._poses.states[0])
+
+    def near(self, time: Array) -> TipOfBend:
+        """Return the tip for bend angles near those of the poses, see `Configuration.near`."""
+        slopes = self._poses.tip_by_bend(self.model.rod)
+        slope = interpolate(time, self._time, slopes.reshape(len(slopes), -1))
+        return TipNearPoses(
+            self.model.kinematics,
+            self.bend_at(time),
+            self.curves(time)[:, -1],
+            slope.reshape(len(time), 2, -1),
+        )
+
+    def curves(self, time: Array) -> Array:
+        """Return the centreline of the poses, see `Configuration.curves`."""
+        q = sample_spline(self._shape, time)[0]
+        return np.stack([q[:, 0::4], q[:, 1::4]], axis=-1)
 
     def pressures(self, method: str, time: Array) -> Array:
         """Return effective pressures (K, M) [Pa] along the poses, see the module.
