@@ -57,11 +57,19 @@ sphinx_gallery_conf = {
 }
 
 
-def keep_bars(app, what, name, obj, options, lines):  # noqa: ARG001 - Sphinx calls it so
+def keep_bars(app, what, name, obj, options, lines):
     """Let |x| in a docstring be a magnitude, not a substitution."""
     lines[:] = [re.sub(r"(`[^`]*`)|\|", lambda m: m[1] or r"\|", line) for line in lines]
+
+
+def stay_inside(app, name, source):
+    """Turn links that lead out of docs/ in the repository: to pages here, or folders to their names."""
+    pages = r"\]\((?:\.\./)+(CONTRIBUTING|CHANGELOG)\.md"
+    text = re.sub(pages, lambda m: f"](/{m[1].lower()}.md", source[0])
+    source[0] = re.sub(r"\[([^\]]*)\]\((?:\.\./)+(?:src|scripts|test)/[^).]*\)", r"\1", text)
 
 
 def setup(app):
     """Connect what this site adds to Sphinx."""
     app.connect("autodoc-process-docstring", keep_bars)
+    app.connect("source-read", stay_inside)
