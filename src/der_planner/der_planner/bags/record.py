@@ -26,6 +26,7 @@ SETPOINT_TYPE = "der_msgs/msg/PressureSetpoint"
 PRESSURE_TYPE = "der_msgs/msg/PressureState"
 STATE_TYPE = "der_msgs/msg/LimbState"
 ESTIMATE_TYPE = "der_msgs/msg/LimbEstimate"
+DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 TRUTH_SUFFIX = "twin/ground_truth"
 BOARD_SUFFIX = "twin/board_commands"
 FAULT_MODE = 5
@@ -118,6 +119,7 @@ class LimbRecord:
         commanded, measured: differential pressures [Pa].
         faults: reasons of the driver with their stamps [ns].
         board: commands as the board received them [Pa] (twin only).
+        ahead: by which a state or pressure is stamped later than it arrived, at the most [ns].
     """
 
     plans: dict[str, tuple[int, Any]] = field(default_factory=dict)
@@ -131,6 +133,7 @@ class LimbRecord:
     measured: Columns = field(default_factory=Columns)
     faults: list[tuple[int, str]] = field(default_factory=list)
     board: Columns = field(default_factory=Columns)
+    ahead: int = 0
 
     @property
     def usable_plans(self) -> dict[str, tuple[int, Any]]:
@@ -195,7 +198,7 @@ class BagRecord:
     Attributes:
         path: of the bag.
         limbs: by the namespace of their topics, e.g. ``/limb``; a bag may hold several.
-        run: what the recorder was told of the run.
+        run: what the recorder was told of the run, and ``clocks``: how far each node's was off.
     """
 
     path: Path
@@ -239,7 +242,7 @@ def read_record(path: str | Path) -> BagRecord:
     """
     with BagReader(path) as bag:
         try:
-            limbs = _collect(bag)
+            limbs, clocks = _collect(bag)
         except BagError:
             raise
         except Exception as error:  # rosbags raises many kinds for damaged content
@@ -247,7 +250,7 @@ def read_record(path: str | Path) -> BagRecord:
                 f"the bag {path} is damaged: {error}. scripts/recover_bag.py {path} saves what is "
                 "whole"
             ) from error
-        return BagRecord(Path(path), limbs, bag.run())
+        return BagRecord(Path(path), limbs, bag.run() | ({"clocks": clocks} if clocks else {}))
 
 
 def namespace_of(topic: str) -> str:
@@ -261,18 +264,38 @@ def header_stamp(message: Any) -> int:
     return int(message.header.stamp.sec) * NANOSECONDS + int(message.header.stamp.nanosec)
 
 
-def _collect(bag: BagReader) -> dict[str, LimbRecord]:
-    """Return what the bag holds of each limb; every topic counts for its own namespace only."""
+def _collect(bag: BagReader) -> tuple[dict[str, LimbRecord], str]:
+    """Return what the bag holds of each limb, and what its nodes said last of their clocks.
+
+    Every topic counts for its own namespace only.
+    """
     limbs: dict[str, LimbRecord] = {}
     receivers: dict[str, Callable[[Any], None]] = {}
+    watchers: dict[str, LimbRecord] = {}
+    clocks: dict[str, str] = {}
     for name, topic in bag.topics.items():
         method = _method(name, topic.type_name)
         if method is not None:
             limb = limbs.setdefault(namespace_of(name), LimbRecord())
             receivers[name] = partial(method, limb)
-    for name, _, message in bag.messages(list(receivers)):
+            if method in (LimbRecord.add_state, LimbRecord.add_pressure):
+                watchers[name] = limb
+        elif topic.type_name == DIAGNOSTICS_TYPE:
+            receivers[name] = partial(_note_clocks, clocks)
+    for name, arrival, message in bag.messages(list(receivers)):
         receivers[name](message)
-    return limbs
+        if name in watchers:
+            watchers[name].ahead = max(watchers[name].ahead, header_stamp(message) - arrival)
+    return limbs, ", ".join(f"{node} {offset}" for node, offset in sorted(clocks.items()))
+
+
+def _note_clocks(clocks: dict[str, str], message: Any) -> None:
+    """Take what nodes say of their clocks in a `DiagnosticArray`, in ms of the driver's."""
+    for status in message.status:
+        told = {pair.key: pair.value for pair in status.values}
+        if "clock_offset_s" in told:
+            offset, error = (1e3 * float(told[f"clock_{n}_s"]) for n in ("offset", "uncertainty"))
+            clocks[status.name] = f"{-offset:+.2f} ± {error:.2f} ms"
 
 
 def _method(topic: str, type_name: str) -> Callable[[LimbRecord, Any], None] | None:

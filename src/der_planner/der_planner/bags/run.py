@@ -126,6 +126,7 @@ class RunSeries:
         faults: reasons that the driver gave during the motion.
         finished: the motion was played to its last setpoint.
         origin: ROS time of the first setpoint [ns]; 0 for a run without a bag.
+        ahead: by which a stamp was later than the arrival of its message, at the most [s].
     """
 
     description: Description
@@ -142,6 +143,7 @@ class RunSeries:
     faults: tuple[str, ...] = ()
     finished: bool = True
     origin: int = 0
+    ahead: float = 0.0
 
     @classmethod
     def from_arrays(
