@@ -16,7 +16,7 @@ from der_planner.limb import Limb
 from der_planner.model import Material, Model
 from der_planner.results import evaluate_run, format_table, load_run, summarise
 
-folder = Path(__file__).resolve().parent
+folder = Path("docs/tutorials") if Path("docs/tutorials").is_dir() else Path()
 run = load_run(folder / "figure_eight.mcap")
 print(run.description.motion, run.description.model, run.description.method, run.description.bag)
 

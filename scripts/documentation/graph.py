@@ -17,13 +17,15 @@ from rclpy.parameter import parameter_value_to_python
 from der_planner.experiment.client import GraphClient
 from der_planner.experiment.console import Progress
 from der_planner.experiment.graph_run import running_graph
-from der_planner.experiment.processes import GraphSetup
+from der_planner.experiment.processes import GraphSetup, NodeProcess
 from limb_interfaces import topics
 from workspace_setup.basics import ROOT
 
 FILE = ROOT / "docs" / "reference" / "graph.json"
 OF_ROS = ("qos_overrides.", "start_type_description_service", "use_sim_time")
 """Beginnings of the names of parameters that every node has."""
+BODIES = "pose_tracker"
+"""A node that is not part of the experiment on the twin."""
 OF_EVERY_NODE = ("/rosout", "/parameter_events")
 
 
@@ -33,7 +35,11 @@ def text() -> str:
     setup = GraphSetup(folder / "bag", {}, planner={}, page=0)
     given = {item.executable: item.parameters for item in setup.nodes("")}
     with GraphClient("reference") as client, running_graph(client, setup, folder, Progress()):
-        found = {name: _node(client, name, given[name]) for name in sorted(given)}
+        bodies = NodeProcess("apriltag_tracker", BODIES, {}, folder)
+        try:
+            found = {name: _node(client, name, given.get(name, {})) for name in [*given, BODIES]}
+        finally:
+            bodies.stop()
     return json.dumps(found, indent=1, sort_keys=True) + "\n"
 
 
