@@ -25,7 +25,7 @@ from der_planner.limb import Limb, PointMass
         (["--page", "--offline"], "does not go with --offline"),
         (["--library", "/nowhere"], "/nowhere is no folder"),
         (["--board", "arduino"], "unknown board 'arduino'"),
-        (["--board", "festo", "--offline"], "--offline has no board"),
+        (["--board", "festo", "--offline"], "--board is about the twin.s nodes"),
     ],
 )
 def test_a_bad_option_is_refused_by_its_name(arguments, named):

@@ -269,12 +269,9 @@ def parse(arguments: Sequence[str]) -> Options:
             "--offline simulates everything: it does not go with --hardware",
         ),
         (
-            hardware is not None and given.board != BOARDS[0],
-            "--board is about the twin: with --hardware, driver.protocol of the file says it",
-        ),
-        (
-            given.offline and given.board != BOARDS[0],
-            "--offline has no board: it does not go with --board",
+            given.board != BOARDS[0] and (given.offline or hardware is not None),
+            "--board is about the twin's nodes: not for --offline; a file of --hardware names its "
+            "own as driver.protocol",
         ),
         (
             hardware is not None and limb is None,
