@@ -173,8 +173,8 @@ class FestoHost(HostProtocol):
 
     def _interpret(self, frame: ModbusFrame) -> list[Event]:
         if frame.function == WRITE and len(frame.data) == BLOCK.size:
-            asked = BLOCK.pack(FIRST_INPUT, INPUTS * self._places)
-            self._follow_up = encode(self._next(), READ, asked)
+            block = BLOCK.pack(FIRST_INPUT, INPUTS * self._places)
+            self._follow_up = encode(self._next(), READ, block)
             return [Echo(frame.transaction)]
         if frame.function in (READ | FAILED, WRITE | FAILED) and len(frame.data) == 1:
             asked = "read" if frame.function == READ | FAILED else "write"

@@ -79,8 +79,10 @@ class WatchedBoard:
         for command in self._firmware.decode(data):
             if command.kind in ("setpoint", "vent"):
                 self._valid_until = now + (command.valid_for or math.inf)
-                state = {"vented": command.kind == "vent", "expired": False}
-                self._reading = replace(self._reading, last_sequence=command.sequence or 0, **state)
+                vented, number = command.kind == "vent", command.sequence or 0
+                self._reading = replace(
+                    self._reading, last_sequence=number, vented=vented, expired=False
+                )
                 self._regulate(command.pressure or self._zero)
             # An answer holds readings: old ones would pass for new ones.
             fresh = now - self._measured_at < STALE
