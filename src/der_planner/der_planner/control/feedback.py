@@ -31,6 +31,7 @@ from der_planner.control.estimation import Estimator
 from der_planner.control.horizon import Horizon
 from der_planner.control.knowledge import Estimate
 from der_planner.control.nominal import ChamberLog, Nominal
+from der_planner.limb.plausible import TOO_SMALL, impossible
 from der_planner.model import CONTROL_PERIOD
 from der_planner.model.commands import within_limits
 from der_planner.planning.plan_file import Plan
@@ -42,6 +43,8 @@ REASONS = {
     "oscillation": "corrections swing by {:.0f} Pa, and neither they nor the limb come to rest",
     "saturation": "a correction is at its limit of {:.0f} Pa, and the tip far from its path",
     "late": "commands come {:.2f} s after their instant",
+    "pressures": "chambers are said to hold {:.3g} Pa, which no command has made: are pressures "
+    "told in Pa, and is the supply open?",
 }
 """Every reason with the sentence of its warning."""
 _GOES_ON = 0.7
@@ -73,6 +76,10 @@ _TURNS = 6
 """Number of turns within the window that are an oscillation, unless it begins or dies out."""
 _WINDOW = 4.0
 """Time in which the turns are counted [s]."""
+_FILLED = 0.1
+"""Command from which on chambers must hold something, as a share of the limb's pressure limit."""
+_STRANGE = 1.5
+"""Time for which chambers may be said to hold what no command has made [s]."""
 _LATE = 4.0
 """Number of commands that may come too late; one in time makes up for half of one."""
 
@@ -157,6 +164,11 @@ class Supervisor:
         distance = self._oscillation()
         if distance > 0.0 and time - self._astray_at <= _WINDOW:
             self.stop(time, "oscillation", distance)
+
+    def held(self, time: float, pressure: float, possible: bool) -> None:
+        """Look at what chambers are said to hold [Pa], and whether commands can have made it."""
+        if self._lasts("pressures", not possible, time) > _STRANGE:
+            self.stop(time, "pressures", pressure)
 
     def _lasts(self, what: str, now: bool, time: float) -> float:
         """Return for how long something has been so at an instant, without a break [s]."""
@@ -274,9 +286,15 @@ class Feedback:
         Raises:
             ValueError: another shape.
         """
-        changed = self._chambers.read(time, differential)
+        values, limb = np.asarray(differential, dtype=float), self.plan.limb
+        beyond = bool(impossible(limb, "pressures", values))
+        changed = self._chambers.read(time, np.full_like(values, np.nan) if beyond else values)
         if changed is not None:
             self._estimator.changed(changed)
+        asked = np.abs(self._chambers.sent(round(time / CONTROL_PERIOD)))
+        filled = asked > _FILLED * limb.pneumatics.pressure_limit
+        empty = bool(np.any(filled & (np.abs(values) < TOO_SMALL * asked)))
+        self._supervisor.held(time, float(np.abs(values).max()), not (beyond or empty))
 
     def measure(
         self,

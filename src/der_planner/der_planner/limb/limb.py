@@ -43,6 +43,8 @@ from der_planner.limb.loads import (
 from der_planner.limb.parameters import CalibratedRange, Pneumatics, Segment
 
 SCHEMA_VERSION = 1
+MOST_CARRIED = 10.0
+"""Largest payload over what the limb weighs: more is a mistake in the unit."""
 DEFAULT_LIMB_FILE = Path(__file__).resolve().parents[1] / "data" / "default_limb.yaml"
 
 
@@ -211,10 +213,16 @@ class Limb:
             name: of the mass.
 
         Raises:
-            LimbError: a negative mass, or a place that is not on the limb.
+            LimbError: a negative mass, one far beyond what the limb weighs itself, or a place that
+                is not on the limb.
         """
         if payload == 0:
             return self
+        if payload > MOST_CARRIED * self.mass:
+            raise LimbError(
+                f"the {name} of {payload:g} kg is {payload / self.mass:.0f} times the limb's mass: "
+                "give kg"
+            )
         place = self.length if at is None else float(at)
         if 0 < place - self.length <= BEYOND_THE_TIP:
             place = self.length
