@@ -79,5 +79,5 @@ for period in (20.0, 6.0, 3.0):
 plt.show()
 
 # %%
-# ``made.save("square.yaml")`` keeps the plan. On the graph the same path is
+# ``write_plan(made, "square.yaml")`` of ``der_planner.planning.plan_file`` keeps the plan. On the graph the same path is
 # ``python3 scripts/run_experiment.py --path my_path.csv --nearest``.
