@@ -11,7 +11,8 @@ from der_planner.control import Learner
 from der_planner.limb import Limb
 from der_planner.model import RodModel
 from der_planner.planning import Motion, plan
-from der_planner.planning.correction import carried_over, nearest
+from der_planner.planning.configuration import configure
+from der_planner.planning.correction import Correction, carried_over, nearest
 from der_planner.planning.plan_file import write_plan
 
 LIMB = Limb.default()
@@ -53,3 +54,34 @@ def test_what_is_far_or_of_another_limb_is_not_taken(library):
     assert nearest(library, planned(16.0)) is None
     assert nearest(library, planned(8.0, motion="opposite_direction")) is None
     assert nearest(library, replace(planned(8.0), body=RodModel(OTHER))) is None
+
+
+@pytest.fixture(scope="module")
+def sagging():
+    """The same motion with two amplitudes, of a limb that its weight bends unevenly."""
+    limb = LIMB.mounted("sideways")
+    motions = [Motion.named("asynchronous", size, 8.0, 1) for size in (0.25, 0.26)]
+    return [plan(limb, motion, method="projected") for motion in motions]
+
+
+@pytest.mark.slow
+def test_a_sagging_limb_is_not_asked_for_what_evenly_bent_segments_reach(sagging):
+    first, _ = sagging
+    evenly = first.body.kinematics.tip(first.bend_angles)
+    assert mean_error(first, evenly) > 1e-3
+    again = Correction(first).plan(first.differential_pressure, np.zeros_like(first.tip_reference))
+    assert again.predicted_error < 5e-4
+
+
+@pytest.mark.slow
+def test_near_its_poses_the_tip_of_a_sagging_limb_is_known(sagging):
+    first, second = sagging
+    near, even = configure(first.body, first.reference).near(first.time), first.body.kinematics
+    moved = second.tip_reference - first.tip_reference
+
+    def missed(kinematics):
+        told = kinematics.tip(second.bend_angles) - kinematics.tip(first.bend_angles)
+        return np.linalg.norm(told - moved, axis=1).mean()
+
+    assert np.linalg.norm(moved, axis=1).mean() > 1e-3
+    assert missed(near) < 0.3 * missed(even)

@@ -82,16 +82,20 @@ def _edge(q: Array, first: int, second: int) -> tuple[Array, Array, Array]:
     return dx, dy, dx * dx + dy * dy
 
 
-class Kinematics(Protocol):
+class TipOfBend(Protocol):
     """Where the tip is for given bend angles; angles are (..., M) rad, points (..., 2) m."""
-
-    segment_count: int
 
     def tip(self, bend_angles: ArrayLike) -> Array:
         """Return the tip (..., 2)."""
 
     def tip_jacobians(self, bend_angles: ArrayLike) -> Array:
         """Return ∂tip/∂bend angles (..., 2, M)."""
+
+
+class Kinematics(TipOfBend, Protocol):
+    """The whole shape of a limb for given bend angles."""
+
+    segment_count: int
 
     def curve(self, bend_angles: ArrayLike) -> Array:
         """Return the centreline (P, 2) of one configuration (M,)."""
@@ -186,6 +190,35 @@ class PolylineKinematics:
         )
 
 
+class TipNearPoses:
+    """The tip of a limb whose weight bends it unevenly, near K poses that are known.
+
+    tip(θ) = r_k + f(θ) − f(θ_k) + (J_k − f'(θ_k)) (θ − θ_k), with f of evenly bent segments: exact
+    at the poses and to first order about them.
+
+    Args:
+        even: f.
+        bend_angles: θ_k (K, M) [rad].
+        tip: r_k (K, 2) [m].
+        jacobian: J_k = ∂r_k/∂θ_k (K, 2, M) [m/rad].
+    """
+
+    def __init__(self, even: TipOfBend, bend_angles: Array, tip: Array, jacobian: Array) -> None:
+        self._even, self._bend = even, bend_angles
+        self._apart = tip - even.tip(bend_angles)
+        self._slope = jacobian - even.tip_jacobians(bend_angles)
+
+    def tip(self, bend_angles: ArrayLike) -> Array:
+        """Return the tips (K, 2) [m] for bend angles (K, M) [rad], one near each pose."""
+        away = np.asarray(bend_angles, dtype=float) - self._bend
+        moved = self._apart + np.einsum("kam,km->ka", self._slope, away)
+        return self._even.tip(bend_angles) + moved
+
+    def tip_jacobians(self, bend_angles: ArrayLike) -> Array:
+        """Return ∂tip/∂bend angles (K, 2, M) [m/rad]."""
+        return self._even.tip_jacobians(bend_angles) + self._slope
+
+
 def coordinates(nodes: Array) -> Array:
     """Return (..., 4N-1) of a rod whose nodes (..., N, 2) move in the plane without twist."""
     q = np.zeros((*nodes.shape[:-2], 4 * nodes.shape[-2] - 1))
@@ -200,7 +233,7 @@ def _points(edges: NDArray[np.complex128]) -> Array:
 
 
 def inverse_kinematics(
-    kinematics: Kinematics, tip: ArrayLike, guess: ArrayLike, prior_weight: float = PRIOR_WEIGHT
+    kinematics: TipOfBend, tip: ArrayLike, guess: ArrayLike, prior_weight: float = PRIOR_WEIGHT
 ) -> tuple[Array, Array]:
     """Return bend angles (K, M) [rad] near the guess and the distances (K,) [m] that remain.
 

@@ -23,9 +23,16 @@ from typing import Self
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 
-from der_planner.arrays import Array
+from der_planner.arrays import Array, interpolate
 from der_planner.model import ArcModel, Initial, Model, RodModel, State
-from der_planner.model.bending import coordinates, inverse_kinematics
+from der_planner.model.bending import (
+    TipNearPoses,
+    TipOfBend,
+    bend_change,
+    bend_outputs,
+    coordinates,
+    inverse_kinematics,
+)
 from der_planner.model.rod import PoseFinder, Poses
 from der_planner.planning.loads import (
     BucklingError,
@@ -85,6 +92,10 @@ class Configuration(ABC):
         other = copy.copy(self)
         other.model = model
         return other
+
+    def near(self, time: Array) -> TipOfBend:  # noqa: ARG002 - evenly bent, it is always the same
+        """Return the tip for bend angles (K, M) near those of the motion at instants (K,) [s]."""
+        return self.model.kinematics
 
     @property
     def initial(self) -> Initial:
@@ -255,6 +266,25 @@ class LoadedConfiguration(RodConfiguration):
             return self.model.rest
         q, v, _ = sample_spline(self._shape, 0.0)
         return self.model.rod.state(q, v, like=self._poses.states[0])
+
+    def near(self, time: Array) -> TipOfBend:
+        """Return the tip for bend angles near those of the poses, see `Configuration.near`."""
+        rod, poses = self.model.rod, self._poses
+        q = np.array([state.q for state in poses.states])
+        slope = np.zeros((*q.shape, self.model.inputs))
+        slope[:, rod.free] = poses.tangents
+        # ∂(bend angles)/∂pressures and ∂tip/∂pressures, and from both ∂tip/∂(bend angles).
+        outputs = np.moveaxis(slope[:, bend_outputs(rod)], 2, 0)
+        bend = np.stack([bend_change(rod, q, moved) for moved in outputs], axis=2)
+        tip = slope[:, [-3, -2]]
+        jacobian = np.swapaxes(np.linalg.solve(*(np.swapaxes(s, 1, 2) for s in (bend, tip))), 1, 2)
+        flat = interpolate(time, self._time, jacobian.reshape(len(q), -1))
+        return TipNearPoses(
+            self.model.kinematics,
+            self.bend_at(time),
+            sample_spline(self._shape, time)[0][:, -3:-1],
+            flat.reshape(len(time), 2, -1),
+        )
 
     def pressures(self, method: str, time: Array) -> Array:
         """Return effective pressures (K, M) [Pa] along the poses, see the module.

@@ -191,14 +191,14 @@ class Correction:
         return best
 
     def _reachable(self, wanted: Array) -> Array:
-        """Return the points of the tip (K, 2) [m] that evenly bent segments reach instead.
+        """Return the points (K, 2) [m] that the limb reaches in place of wanted ones of its tip.
 
-        A straight limb reaches no further, and bends to no avail where more is wanted of it.
+        A straight limb reaches no further, and bends to no avail where more is wanted of it. A limb
+        that hangs through is asked near its own poses: evenly bent ones reach elsewhere.
         """
-        angles, _ = inverse_kinematics(
-            self.model.kinematics, wanted, self._plan.bend_angles, _PRIOR
-        )
-        return self.model.kinematics.tip(angles)
+        near = self._configuration.near(self._plan.time)
+        angles, _ = inverse_kinematics(near, wanted, self._plan.bend_angles, _PRIOR)
+        return near.tip(angles)
 
 
 def _not_followed(error: ConvergenceError) -> PlanningError:
