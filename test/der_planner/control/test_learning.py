@@ -1,6 +1,7 @@
 """Learning from run to run, on limbs that are not the one of the plan."""
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from der_planner.control import Learner, LearningError
 from der_planner.limb import Limb
 from der_planner.model import simulate
 from der_planner.planning import CONTROL_PERIOD, Motion, plan
+from der_planner.planning.correction import Correction
 
 pytestmark = pytest.mark.slow
 
@@ -84,6 +86,20 @@ def test_a_chain_of_links_that_was_never_calibrated_is_learned_in_two_runs():
         check_limits(planned)
     assert errors[0] > 3e-3
     assert errors[2] < errors[0] / 4
+
+
+def test_a_plan_that_is_expected_to_be_worse_is_not_played(first, monkeypatch):
+    planned = Correction.plan
+
+    def astray(correction, commands, disturbance, pull):
+        found = planned(correction, commands, disturbance, pull)
+        return replace(found, tip_predicted=found.tip_predicted + 0.1)
+
+    monkeypatch.setattr(Correction, "plan", astray)
+    learner = Learner(first)
+    learner.add(first.time, play(first, other_limb()))
+    assert learner.next() is first
+    assert "expected to be better" in learner.stopped
 
 
 def test_arcs_learn_as_the_rod_does():

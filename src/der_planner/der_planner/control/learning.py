@@ -10,14 +10,17 @@ repeats the last runs decide; on one that does not, all runs are averaged.
 
 Guards: plans are judged by the error that all runs together say they leave. A plan that is worse
 than the best one is left, and the next step from the best one is half as long (the share α of the
-error that is asked to go) and pulled harder. Learning stops when only noise is left, when runs
-bring nothing more, or when no smaller step helps. Where the first run is far from what the model
-expects, gains and rest angles of the model are taken from it (`der_planner.identification.update`).
+error that is asked to go) and pulled harder; so it is where a new plan is expected to be worse,
+counting what its change of commands leaves in doubt. Learning stops when only noise is left, when
+runs bring nothing more, or when no smaller step helps. Where the first run is far from what the
+model expects, gains and rest angles of the model are taken from it
+(`der_planner.identification.update`).
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,6 +54,8 @@ _WORSE = 1.02
 """Share of the best plan's error that a plan may leave, beyond repeatability, and not be worse."""
 _SMALLEST_STEP = 0.1
 """α below which learning stops."""
+_TRIES = 2
+"""Plans that are tried, each with a smaller step, for one that is not expected to be worse."""
 _ENOUGH_RUNS = 4.0
 """Learning stops at the noise only when D is worth this many runs."""
 _PATIENCE = 3
@@ -188,21 +193,50 @@ class Learner:
         known = self._runs.known(best)
         if self._fresh and not self.stopped:
             self._fresh = False
-            target = known.value - (1.0 - self._step) * self._runs.error(best)
-            following = self._correction.plan(best.commands, target, self._pull)
-            # What is expected is the disturbance itself, whatever share of the error is to go.
-            tip = following.tip_predicted - target + known.value
-            self._plan = dataclasses.replace(following, tip_predicted=tip)
-        elif not np.array_equal(best.commands, self._plan.differential_pressure):
-            self._plan = dataclasses.replace(
-                self._plan,
-                differential_pressure=best.commands,
-                tip_predicted=best.expected.tip + known.value,
-                method=LEARNED,
-            )
+            self._plan = self._following(best, known.value)
+        else:
+            self._plan = self._again(best, known.value)
         if self._beyond is not None:
             self._plan = dataclasses.replace(self._plan, chambers_beyond=self._beyond)
         return self._plan
+
+    def _following(self, best: PlayedRun, expected: Array) -> Plan:
+        """Return a plan that is not expected to be worse than the best one, or that one again.
+
+        What is expected counts with its doubt, which a smaller change of commands makes less.
+
+        Args:
+            best: run.
+            expected: the disturbance (K, 2) [m].
+        """
+        level = self._runs.level(best)
+        for _ in range(_TRIES):
+            target = expected - (1.0 - self._step) * self._runs.error(best)
+            following = self._correction.plan(best.commands, target, self._pull)
+            # What is expected is the disturbance itself, whatever share of the error is to go.
+            tip = following.tip_predicted - target + expected
+            following = dataclasses.replace(following, tip_predicted=tip)
+            doubt = self._runs.doubt(following.differential_pressure - best.commands)
+            if math.hypot(following.predicted_error, doubt) <= _WORSE * level + self.repeatability:
+                return following
+            self._smaller_step()
+        self.stopped = "no plan is expected to be better than the best one"
+        return self._again(best, expected)
+
+    def _again(self, best: PlayedRun, expected: Array) -> Plan:
+        """Return the plan of the best run, with what is expected of it now if it is not the last."""
+        if np.array_equal(best.commands, self._plan.differential_pressure):
+            return self._plan
+        return dataclasses.replace(
+            self._plan,
+            differential_pressure=best.commands,
+            tip_predicted=best.expected.tip + expected,
+            method=LEARNED,
+        )
+
+    def _smaller_step(self) -> None:
+        self._step /= 2
+        self._pull = min(self._pull * _HARDER, _HARDEST)
 
     # One run ---------------------------------------------------------------------------------
 
@@ -307,8 +341,7 @@ class Learner:
         if same:
             said += ", the same plan again"
         elif new > _WORSE * old + min(margin, old):
-            self._step /= 2
-            self._pull = min(self._pull * _HARDER, _HARDEST)
+            self._smaller_step()
             said += f": worse than the best plan, back to it with a step of {self._step:.2f}"
         else:
             self._step = min(1.0, 2 * self._step)

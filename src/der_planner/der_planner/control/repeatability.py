@@ -194,6 +194,15 @@ class Runs:
         from_others = _rms((one.shown.value - known.value)[both & known.seen])
         return _rms((one.shown.value - other.shown.value)[both]) > 0.5 * from_others
 
+    def doubt(self, change: Array) -> float:
+        """Return how far the tip may be, on average, from what is expected of other commands [m].
+
+        Args:
+            change: (K, M) of the commands [Pa].
+        """
+        movement = float((change**2).sum(axis=1).mean()) / 2 * self._tip_per_pressure**2
+        return float(np.sqrt(np.pi / 2 * movement)) * self.repeats.share
+
     def _movement(self, one: PlayedRun, other: PlayedRun) -> float:
         """Return how far a change of commands moves the tip, segment by segment, squared [m²]."""
         change = one.expected.pressure - other.expected.pressure
