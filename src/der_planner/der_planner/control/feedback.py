@@ -28,6 +28,7 @@ from threadpoolctl import ThreadpoolController
 
 from der_planner.arrays import Array
 from der_planner.control.estimation import Estimator
+from der_planner.control.foresight import Foresight
 from der_planner.control.horizon import Horizon
 from der_planner.control.knowledge import Estimate
 from der_planner.control.nominal import ChamberLog, Nominal
@@ -229,6 +230,7 @@ class Feedback:
             self._nominal = Nominal(plan)
             self._chambers = ChamberLog(self._nominal)
             self._estimator = Estimator(self._nominal, self._chambers)
+            self._foresight = Foresight(self._nominal, self._estimator)
             self._horizon = Horizon(self._nominal, self._chambers, authority)
             self._horizon.warm_up(self._estimator.beginning(0))
 
@@ -248,6 +250,14 @@ class Feedback:
         return self._supervisor.share
 
     @property
+    def trust(self) -> Array:
+        """How far swing, slow and fast disturbances of each segment were predicted (3, M), 0 … 1.
+
+        Corrections act on this share of each, see `der_planner.control.foresight`.
+        """
+        return self._foresight.trust.weights.copy()
+
+    @property
     def innovations(self) -> list[tuple[float, float, int]]:
         """(time [s], squared normalised distance, coordinates) of every measurement."""
         return self._estimator.innovations
@@ -265,6 +275,7 @@ class Feedback:
         self._chambers.take_over(other._chambers, round(time / CONTROL_PERIOD))
         with _THREADS.limit(limits=1, user_api="blas"):
             self._estimator.take_over(other._estimator, time)
+        self._foresight.take_over(other._foresight)
         # What ended the other's feedback does not count here.
         self._supervisor.share = other.share
 
@@ -317,11 +328,13 @@ class Feedback:
             # Matrices of some ten rows: more threads only get into other processes' way.
             with _THREADS.limit(limits=1, user_api="blas"):
                 known = self._estimator.at(instant)
+                self._foresight.learn()
                 age = instant - self._estimator.newest
                 swing = float(np.linalg.norm(known.parts[1]))
                 missed = self._estimator.missed(known, k)
                 share = supervisor.advance(instant, age, known.strange)
                 if share > 0.0:
+                    known = self._foresight.weighed(known, k)
                     correction = share * self._horizon.solve(k, known)
         except np.linalg.LinAlgError:
             correction[:] = np.nan
