@@ -1,0 +1,257 @@
+"""Touch: what pressures, loads and friction do not explain of the shape is a force.
+
+The estimator (`der_planner.control.estimation`) says per segment the pressure that the model lacks,
+and a displacement b of the tip that the bend angles do not explain. A force f at a place s makes
+both, by the compliance of the rod (`der_planner.model.compliance`): with C_θ and C_r of bend and tip
+by the force, C_w of the bend by pressure, and J = ∂tip/∂θ of evenly bent segments,
+
+    lacking pressure = C_w⁻¹ C_θ(s) f        b = (C_r(s) − J C_θ(s)) f
+
+These are M + 2 numbers for the three unknowns of a force in the plane. For every place the force of
+the largest likelihood is linear; the likelihood of the places, each with its force, gives place and
+force with what is in doubt of them.
+
+Without contact the same numbers are not zero either: gains, friction and the camera are a little
+wrong. Their mean and covariance, watched while nothing is touched, are the free level. A distance
+from it that noise would pass once in an hour is a touch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import gammainccinv
+
+from der_planner.arrays import Array
+from der_planner.control.knowledge import Knowledge
+from der_planner.model import RodModel
+from der_planner.model.compliance import compliance
+
+_HOUR = 3600.0
+_CORRELATED = 0.3
+"""Time after which what the model lacks says something new [s]."""
+_RELEASED = 0.5
+"""Share of the threshold below which a touch ends."""
+_PRESSURE_FREE = 400.0
+"""Standard deviation of the lacking pressure of a limb that nothing is known of yet [Pa]."""
+_TIP_FREE = 1e-3
+"""The same of the tip's displacement that bend angles do not explain [m]."""
+_FIRST_WORTH = 5.0
+"""Time of watching that this guess is worth [s]."""
+_WATCHED = 120.0
+"""Time in which what was watched is forgotten [s]."""
+_LARGEST_FORCE = 2.0
+"""Standard deviation of forces that are expected [N]: what the data cannot tell stays that wide."""
+_PLACES = 60
+"""Places along the limb that are tried."""
+_PLACE_TOLD = 0.1
+"""Standard deviation of the place, over the limb's length, up to which it is told."""
+_UNLIKELY = 1e-3
+"""Probability of what is left of the data below which it is not one force."""
+
+
+@dataclass(frozen=True)
+class Lacking:
+    """What the model lacks of the limb at an instant.
+
+    Attributes:
+        time: [s].
+        bend_angles: (M,) [rad].
+        value: (M + 2,) pressure that the model lacks, its gain's error included [Pa], and the tip's
+            displacement that the bend angles do not explain [m].
+        covariance: of value.
+    """
+
+    time: float
+    bend_angles: Array
+    value: Array
+    covariance: Array
+
+    @staticmethod
+    def of(time: float, bend_angles: Array, known: Knowledge, friction: Array) -> Lacking:
+        """Return what the estimator says that the model lacks.
+
+        Args:
+            time: [s].
+            bend_angles: (M,) [rad].
+            known: the filter's state then.
+            friction: (M,) pressure by which friction may differ from its model, a standard
+                deviation [Pa].
+        """
+        inputs = len(bend_angles)
+        _, _, missing, gain, offset = known.parts
+        rows = np.zeros((inputs + 2, len(known.mean)))
+        rows[:inputs, 2 * inputs : 3 * inputs] = np.eye(inputs)
+        rows[:inputs, 3 * inputs : 4 * inputs] = np.diag(known.effective)
+        rows[inputs:, 4 * inputs :] = np.eye(2)
+        spread = rows @ known.covariance @ rows.T
+        spread[:inputs, :inputs] += np.diag(friction**2)
+        value = np.concatenate([missing + gain * known.effective, offset])
+        return Lacking(time, bend_angles, value, spread)
+
+
+@dataclass(frozen=True)
+class Touch:
+    """What is known of a touch at an instant.
+
+    Attributes:
+        time: [s].
+        touched: whether something touches the limb.
+        since: when it began [s]; NaN: nothing touches.
+        distance: squared distance from the free level over that of one false alarm in an hour.
+        place: along the limb from its clamp [m]; NaN: it cannot be told.
+        place_deviation: its standard deviation, told or not [m].
+        force: (2,) on the limb [N]; NaN: it cannot be told.
+        force_covariance: (2, 2), told or not [N²].
+        said: a sentence on what is told; empty while nothing touches.
+    """
+
+    time: float
+    touched: bool
+    since: float
+    distance: float
+    place: float
+    place_deviation: float
+    force: Array
+    force_covariance: Array
+    said: str
+
+
+def untouched(time: float, distance: float = 0.0) -> Touch:
+    """Return that nothing touches the limb at an instant [s]."""
+    nothing = np.full(2, np.nan)
+    unknown = np.full((2, 2), np.nan)
+    return Touch(time, False, np.nan, distance, np.nan, np.nan, nothing, unknown, "")
+
+
+class FreeLevel:
+    """Mean and covariance of what the model lacks of a limb that nothing touches.
+
+    Args:
+        inputs: M segments.
+
+    Attributes:
+        mean: (M + 2,) [Pa], [m].
+        covariance: of it.
+    """
+
+    def __init__(self, inputs: int) -> None:
+        self.mean = np.zeros(inputs + 2)
+        self.covariance = np.diag(np.repeat([_PRESSURE_FREE, _TIP_FREE], [inputs, 2]) ** 2)
+        self._worth = _FIRST_WORTH
+
+    def learn(self, value: Array, duration: float) -> None:
+        """Take in a value (M + 2,) that held for a time [s] without contact."""
+        share = duration / (self._worth + duration)
+        away = value - self.mean
+        self.mean = self.mean + share * away
+        spread = (1.0 - share) * np.outer(away, away)
+        self.covariance = (1.0 - share) * self.covariance + share * spread
+        self._worth = min(self._worth + duration, _WATCHED)
+
+
+class TouchSense:
+    """Watches what the model lacks of a limb; see the module.
+
+    Args:
+        model: rod of the limb.
+        free: what is known of the limb without contact.
+    """
+
+    def __init__(self, model: RodModel, free: FreeLevel | None = None) -> None:
+        self._model = model
+        self.free = free or FreeLevel(model.inputs)
+        limb = model.limb
+        self._places = np.linspace(limb.base_length, limb.length, _PLACES + 1)[1:]
+        self.threshold = _chance(_CORRELATED / _HOUR, model.inputs + 2)
+        self.newest = untouched(-np.inf)
+
+    def look(self, lacking: Lacking) -> Touch:
+        """Return what a newer instant says of a touch."""
+        before = self.newest
+        value = lacking.value - self.free.mean
+        noise = self.free.covariance + lacking.covariance
+        distance = float(value @ np.linalg.solve(noise, value)) / self.threshold
+        touched = distance > (_RELEASED if before.touched else 1.0)
+        if touched:
+            since = before.since if before.touched else lacking.time
+            found = locate(self._model, replace(lacking, value=value), noise, self._places)
+            self.newest = replace(found, since=since, distance=distance)
+        else:
+            self.newest = untouched(lacking.time, distance)
+            if distance < _RELEASED and np.isfinite(before.time):
+                self.free.learn(lacking.value, max(0.0, lacking.time - before.time))
+        return self.newest
+
+
+def locate(model: RodModel, lacking: Lacking, noise: Array, places: Array) -> Touch:
+    """Return the force that explains what the model lacks, and where it acts.
+
+    Args:
+        model: rod of the limb.
+        lacking: of the model, less the free level.
+        noise: covariance of it (M + 2, M + 2).
+        places: (P,) evenly spaced, where the force may act [m].
+    """
+    effect = effects(model, lacking.bend_angles, places)
+    weight = np.linalg.inv(noise)
+    seen = np.swapaxes(effect, 1, 2) @ weight
+    told = seen @ effect + np.eye(2) / _LARGEST_FORCE**2
+    pull = seen @ lacking.value
+    forces = np.linalg.solve(told, pull[..., None])[..., 0]
+    left = lacking.value @ weight @ lacking.value - (pull * forces).sum(axis=1)
+    likely = -0.5 * (left + np.linalg.slogdet(told)[1])
+    share = np.exp(likely - likely.max())
+    share /= share.sum()
+    place = float(share @ places)
+    deviation = float(np.sqrt(share @ (places - place) ** 2 + (places[1] - places[0]) ** 2 / 12))
+    force = share @ forces
+    apart = forces - force
+    spread = np.linalg.inv(told) + apart[:, :, None] * apart[:, None, :]
+    covariance = np.einsum("p,pab->ab", share, spread)
+    known = Touch(
+        lacking.time, True, lacking.time, np.nan, place, deviation, force, covariance, ""
+    )
+    return _told(known, float(left.min()), model)
+
+
+def effects(model: RodModel, bend_angles: Array, places: Array) -> Array:
+    """Return what a unit force makes the model lack (P, M + 2, 2) [Pa/N], [m/N], see the module."""
+    limp = compliance(model, bend_angles, places)
+    jacobian = model.kinematics.tip_jacobians(bend_angles)
+    lacking = np.linalg.solve(limp.bend_by_pressure, limp.bend)
+    return np.concatenate([lacking, limp.tip - jacobian @ limp.bend], axis=1)
+
+
+def _told(found: Touch, left: float, model: RodModel) -> Touch:
+    """Say what can be told of a force, and leave out what cannot.
+
+    Args:
+        found: place and force of the largest likelihood.
+        left: squared distance of the data from the best force.
+        model: of the limb.
+    """
+    nothing = np.full(2, np.nan)
+    spare = max(1, model.inputs - 1)
+    if left > _chance(_UNLIKELY, spare):
+        return replace(
+            found, place=np.nan, force=nothing, said="at more than one point, or not by a force"
+        )
+    deviations, directions = np.linalg.eigh(found.force_covariance)
+    size = float(np.linalg.norm(found.force))
+    said = f"{size:.2f} N"
+    where = f"at {found.place * 100:.1f} cm (± {found.place_deviation * 100:.1f})"
+    if found.place_deviation > _PLACE_TOLD * model.limb.length:
+        found, where = replace(found, place=np.nan), "where cannot be told"
+    widest = float(np.sqrt(deviations[-1]))
+    if widest > size:
+        x, y = directions[:, -1]
+        said = f"how strong along ({x:.2f}, {y:.2f}) cannot be told (± {widest:.2f} N)"
+        found = replace(found, force=nothing)
+    return replace(found, said=f"{said}, {where}")
+
+
+def _chance(probability: float, count: int) -> float:
+    """Return what the sum of ``count`` squares of normal numbers exceeds with a probability."""
+    return float(2.0 * gammainccinv(count / 2, probability))
