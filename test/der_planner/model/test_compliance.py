@@ -51,12 +51,8 @@ def test_a_bent_limb_gives_way_as_the_rod_does():
     np.testing.assert_allclose(found.bend[0] @ force, model.bend_of(pushed) - bend, rtol=0.03)
 
 
-def test_a_follower_force_at_the_tip_turns_with_the_pose(model):
-    """About a pose bent by θ evenly a force across the tip moves the tip as the arc's geometry says.
-
-    With R = L / θ the tip moves across itself by ∫ (R (1 − cos(θ − φ)))-like arms: here by
-    F / EI ∫ ((x_L − x) cos θ + (y_L − y) sin θ)² ds.
-    """
+def test_a_force_across_the_tip_of_a_bent_limb(model):
+    """Of a circular arc: F / EI ∫ arm² ds, with the arms along the tip's own heading."""
     bend = np.array([0.4, 0.4])
     found = compliance(model, bend, [LENGTH])
     across = np.array([-np.sin(0.8), np.cos(0.8)])

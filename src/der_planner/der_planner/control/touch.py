@@ -1,9 +1,10 @@
 """Touch: what pressures, loads and friction do not explain of the shape is a force.
 
 The estimator (`der_planner.control.estimation`) says per segment the pressure that the model lacks,
-and a displacement b of the tip that the bend angles do not explain. A force f at a place s makes
-both, by the compliance of the rod (`der_planner.model.compliance`): with C_θ and C_r of bend and tip
-by the force, C_w of the bend by pressure, and J = ∂tip/∂θ of evenly bent segments,
+where an error of its gain does not explain it, and a displacement b of the tip that the bend angles
+do not explain. A force f at a place s makes both, by the compliance of the rod
+(`der_planner.model.compliance`): with C_θ and C_r of bend and tip by the force, C_w of the bend by
+pressure, and J = ∂tip/∂θ of evenly bent segments,
 
     lacking pressure = C_w⁻¹ C_θ(s) f        b = (C_r(s) − J C_θ(s)) f
 
@@ -58,8 +59,8 @@ class Lacking:
     Attributes:
         time: [s].
         bend_angles: (M,) [rad].
-        value: (M + 2,) pressure that the model lacks, its gain's error included [Pa], and the tip's
-            displacement that the bend angles do not explain [m].
+        value: (M + 2,) pressure that the model lacks, beside the error of its gain [Pa], and the
+            tip's displacement that the bend angles do not explain [m].
         covariance: of value.
     """
 
@@ -80,15 +81,13 @@ class Lacking:
                 deviation [Pa].
         """
         inputs = len(bend_angles)
-        _, _, missing, gain, offset = known.parts
+        _, _, missing, _, offset = known.parts
         rows = np.zeros((inputs + 2, len(known.mean)))
         rows[:inputs, 2 * inputs : 3 * inputs] = np.eye(inputs)
-        rows[:inputs, 3 * inputs : 4 * inputs] = np.diag(known.effective)
         rows[inputs:, 4 * inputs :] = np.eye(2)
         spread = rows @ known.covariance @ rows.T
         spread[:inputs, :inputs] += np.diag(friction**2)
-        value = np.concatenate([missing + gain * known.effective, offset])
-        return Lacking(time, bend_angles, value, spread)
+        return Lacking(time, bend_angles, np.concatenate([missing, offset]), spread)
 
 
 @dataclass(frozen=True)
@@ -99,6 +98,8 @@ class Touch:
         time: [s].
         touched: whether something touches the limb.
         since: when it began [s]; NaN: nothing touches.
+        pressure: (M,) effective pressure that bends the limb as the touch does [Pa]; NaN: nothing
+            touches.
         distance: squared distance from the free level over that of one false alarm in an hour.
         place: along the limb from its clamp [m]; NaN: it cannot be told.
         place_deviation: its standard deviation, told or not [m].
@@ -110,6 +111,7 @@ class Touch:
     time: float
     touched: bool
     since: float
+    pressure: Array
     distance: float
     place: float
     place_deviation: float
@@ -118,11 +120,12 @@ class Touch:
     said: str
 
 
-def untouched(time: float, distance: float = 0.0) -> Touch:
+def untouched(time: float, inputs: int, distance: float = 0.0) -> Touch:
     """Return that nothing touches the limb at an instant [s]."""
     nothing = np.full(2, np.nan)
     unknown = np.full((2, 2), np.nan)
-    return Touch(time, False, np.nan, distance, np.nan, np.nan, nothing, unknown, "")
+    pressure = np.full(inputs, np.nan)
+    return Touch(time, False, np.nan, pressure, distance, np.nan, np.nan, nothing, unknown, "")
 
 
 class FreeLevel:
@@ -165,7 +168,7 @@ class TouchSense:
         limb = model.limb
         self._places = np.linspace(limb.base_length, limb.length, _PLACES + 1)[1:]
         self.threshold = _chance(_CORRELATED / _HOUR, model.inputs + 2)
-        self.newest = untouched(-np.inf)
+        self.newest = untouched(-np.inf, model.inputs)
 
     def look(self, lacking: Lacking) -> Touch:
         """Return what a newer instant says of a touch."""
@@ -179,7 +182,7 @@ class TouchSense:
             found = locate(self._model, replace(lacking, value=value), noise, self._places)
             self.newest = replace(found, since=since, distance=distance)
         else:
-            self.newest = untouched(lacking.time, distance)
+            self.newest = untouched(lacking.time, self._model.inputs, distance)
             if distance < _RELEASED and np.isfinite(before.time):
                 self.free.learn(lacking.value, max(0.0, lacking.time - before.time))
         return self.newest
@@ -210,8 +213,15 @@ def locate(model: RodModel, lacking: Lacking, noise: Array, places: Array) -> To
     apart = forces - force
     spread = np.linalg.inv(told) + apart[:, :, None] * apart[:, None, :]
     covariance = np.einsum("p,pab->ab", share, spread)
-    known = Touch(
-        lacking.time, True, lacking.time, np.nan, place, deviation, force, covariance, ""
+    known = replace(
+        untouched(lacking.time, model.inputs),
+        touched=True,
+        since=lacking.time,
+        pressure=lacking.value[:-2],
+        place=place,
+        place_deviation=deviation,
+        force=force,
+        force_covariance=covariance,
     )
     return _told(known, float(left.min()), model)
 
