@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from der_planner.control.reaction import Reaction
-from der_planner.control.touch import FreeLevel, Lacking, TouchSense, untouched
+from der_planner.control.touch import FreeLevel, Lacking, TouchSense
 from der_planner.limb import Limb
 from der_planner.model import RodModel
 from der_planner.model.compliance import compliance
@@ -121,8 +121,8 @@ def test_yielding_gives_way_and_does_not_press_again(model, touch):
     np.testing.assert_array_equal(reaction.allowed(less, found, bend, less), less)
     kept = reaction.allowed(CHAMBERS, found, bend, less)
     assert found.pressure @ (kept - less) == pytest.approx(0.0, abs=1e-3)
-    free = untouched(2.0, 2)
-    np.testing.assert_array_equal(reaction.allowed(harder, free, bend, less), harder)
+    reaction.release()
+    np.testing.assert_array_equal(reaction.allowed(less, found, bend, harder), less)
 
 
 def test_a_limit_lets_the_force_come_to_it(model, touch):

@@ -51,6 +51,15 @@ class Reaction:
         self._least = math.inf
 
     @property
+    def acts(self) -> bool:
+        """Whether it changes commands."""
+        return self.kind != "warn"
+
+    def release(self) -> None:
+        """Forget the touch: it has ended."""
+        self._held, self._least = None, math.inf
+
+    @property
     def vents(self) -> bool:
         """Whether the limb is to be vented."""
         return self.kind == "vent" and self._held is not None
@@ -60,14 +69,11 @@ class Reaction:
 
         Args:
             wanted: (M,) [Pa].
-            touch: as it is known now.
+            touch: as it is known now, of a limb that is touched.
             bend_angles: (M,) [rad].
             chambers: (M,) differential pressures in them now [Pa].
         """
-        if not touch.touched:
-            self._held, self._least = None, math.inf
-            return wanted
-        if self.kind == "warn":
+        if not self.acts:
             return wanted
         if self._held is None:
             self._held = chambers
