@@ -48,7 +48,6 @@ class Reaction:
         self.kind, self.limit = kind, limit
         self._model = model
         self._held: Array | None = None
-        self._least = math.inf
 
     @property
     def acts(self) -> bool:
@@ -57,7 +56,7 @@ class Reaction:
 
     def release(self) -> None:
         """Forget the touch: it has ended."""
-        self._held, self._least = None, math.inf
+        self._held = None
 
     @property
     def vents(self) -> bool:
@@ -79,7 +78,10 @@ class Reaction:
             self._held = chambers
         if self.kind != "yield":
             return self._held
-        harder, bound = self._yielding(touch, chambers)
+        harder = -touch.pressure / max(float(np.linalg.norm(touch.pressure)), _SMALLEST)
+        if harder @ chambers < harder @ self._held:
+            self._held = chambers
+        bound = float(harder @ self._held)
         if self.limit is not None and np.isfinite([touch.place, *touch.force]).all():
             harder, bound = self._limited(touch, bend_angles, chambers, self.limit)
         square = float(harder @ harder)
@@ -87,17 +89,10 @@ class Reaction:
             return wanted
         return wanted - harder * (max(0.0, float(harder @ wanted) - bound) / square)
 
-    def _yielding(self, touch: Touch, chambers: Array) -> tuple[Array, float]:
-        """Return the direction (M,) of pressures that press harder, and how far they may go."""
-        size = float(np.linalg.norm(touch.pressure))
-        harder = -touch.pressure / max(size, _SMALLEST)
-        self._least = min(self._least, float(harder @ chambers))
-        return harder, self._least
-
     def _limited(
         self, touch: Touch, bend_angles: Array, chambers: Array, limit: float
     ) -> tuple[Array, float]:
-        """Return the same for a limit of the force [N], with the direction in N/Pa."""
+        """Return how pressures raise the force (M,) [N/Pa], and how far that may go [N]."""
         limp = compliance(self._model, bend_angles, [touch.place])
         size = float(np.linalg.norm(touch.force))
         along = touch.force / size
