@@ -47,7 +47,7 @@ def test_solutions_that_take_too_long_never_hold_up_the_plan():
     motion = Motion.named("same_direction", period=60.0, cycles=2)
     planned = plan(Limb.default(), motion, method="projected")
     slow = Slow(planned)
-    corrector = Corrector(Output(), warn, lambda: now[0])
+    corrector = Corrector(Output(), warn, lambda: now[0], lambda _: None)
     schedule = Schedule("slow", planned, now[0] - 1_000_000_000)
     corrector.follow(schedule, slow)
     assert slow.busy.wait(60.0)

@@ -63,7 +63,8 @@ class PlannerNode(Node):
         self._streamer = Streamer(
             self._now, self._send, self._ended, self._driver.obstacle, self._options.lead
         )
-        self._corrector = Corrector(self._output, self.get_logger().warning, self._now)
+        vent = self.create_client(Trigger, "pressure_driver/vent").call_async
+        self._corrector = Corrector(self._output, self.get_logger().warning, self._now, vent)
         self._action = MotionAction(
             self, self._checked, self._accept, self._stop_plan, self._streamer.find
         )
@@ -148,7 +149,7 @@ class PlannerNode(Node):
             response.message = obstacle.reason
         else:
             plan_id, result, corrected = newest
-            feedback = Feedback(result) if corrected else None
+            feedback = self._options.corrected(result) if corrected else None
             schedule = self._play(self._streamer.unspent(plan_id), result, 0, feedback)
             response.success = True
             response.message = (
@@ -226,7 +227,7 @@ class PlannerNode(Node):
             for method in methods:
                 found = plan(self._options.limb, quick, model, method, nodes=self._options.nodes)
         # The last of them has compiled whatever feedback calls as well.
-        Feedback(found)
+        self._options.corrected(found)
 
     def _plan(self, request: Request) -> None:
         """Plan what was asked for and play it.
@@ -236,7 +237,7 @@ class PlannerNode(Node):
         """
         self._status = Status("planning", request.plan_id)
         stamp, result = self._make(request)
-        feedback = Feedback(result) if request.feedback else None
+        feedback = self._options.corrected(result) if request.feedback else None
         if feedback is not None:
             result = dataclasses.replace(result, method=f"{result.method} + feedback")
         for warning in result.warnings:

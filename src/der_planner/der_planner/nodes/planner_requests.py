@@ -20,6 +20,8 @@ from rclpy.node import Node
 from der_msgs.action import PlayMotion
 from der_msgs.msg import LimbState, MotionCommand
 from der_planner.arrays import Array
+from der_planner.control.feedback import Feedback
+from der_planner.control.reaction import KINDS, Kind
 from der_planner.limb import HEAVIEST, Limb
 from der_planner.methods import LEARNED
 from der_planner.planning import METHODS, Motion, PathLimits, choose_method
@@ -58,6 +60,12 @@ class PlannerOptions:
     driver_timeout: float
     learned_plans: str
     feedback: bool
+    reaction: Kind
+    force_limit: float
+
+    def corrected(self, planned: Plan) -> Feedback:
+        """Return feedback on a plan, with the reaction to a touch that is set."""
+        return Feedback(planned, self.reaction, self.force_limit or None)
 
 
 def read_parameters(node: Node) -> PlannerOptions:
@@ -126,6 +134,14 @@ def read_parameters(node: Node) -> PlannerOptions:
         feedback=read(
             "feedback", False, "correct plans of the rod while they are played, where a command "
             "does not ask for it"
+        ),
+        reaction=read(
+            "reaction", "warn", "what feedback does where something touches the limb",
+            choices=KINDS
+        ),
+        force_limit=read(
+            "force_limit", 0.0, "force [N] that the reaction 'yield' allows; 0: none more than "
+            "there is when the touch is noticed", at_least=0.0, at_most=100.0
         ),
     )  # fmt: skip
 
