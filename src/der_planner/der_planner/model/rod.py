@@ -251,6 +251,17 @@ class Poses:
     misses: Array
     smallest_stiffness: Array
 
+    def tip_by_bend(self, rod: Rod) -> Array:
+        """Return ∂tip/∂bend angles (K, 2, M) [m/rad], both as pressures change them."""
+        q = np.array([state.q for state in self.states])
+        slope = np.zeros((*q.shape, rod.segment_count))
+        slope[:, rod.free] = self.tangents
+        outputs = np.moveaxis(slope[:, bend_outputs(rod)], 2, 0)
+        bend = np.stack([bend_change(rod, q, moved) for moved in outputs], axis=2)
+        tip = slope[:, [-3, -2]]
+        found: Array = np.linalg.solve(np.swapaxes(bend, 1, 2), np.swapaxes(tip, 1, 2))
+        return np.swapaxes(found, 1, 2)
+
 
 class PoseFinder:
     """Finds poses of one rod.

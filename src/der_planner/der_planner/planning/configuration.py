@@ -25,14 +25,7 @@ from scipy.interpolate import BSpline, make_interp_spline
 
 from der_planner.arrays import Array, interpolate
 from der_planner.model import ArcModel, Initial, Model, RodModel, State
-from der_planner.model.bending import (
-    TipNearPoses,
-    TipOfBend,
-    bend_change,
-    bend_outputs,
-    coordinates,
-    inverse_kinematics,
-)
+from der_planner.model.bending import TipNearPoses, TipOfBend, coordinates, inverse_kinematics
 from der_planner.model.rod import PoseFinder, Poses
 from der_planner.planning.loads import (
     BucklingError,
@@ -96,6 +89,10 @@ class Configuration(ABC):
     def near(self, time: Array) -> TipOfBend:  # noqa: ARG002 - evenly bent, it is always the same
         """Return the tip for bend angles (K, M) near those of the motion at instants (K,) [s]."""
         return self.model.kinematics
+
+    def curves(self, time: Array) -> Array:
+        """Return the centreline (K, P, 2) [m] at instants (K,) [s]."""
+        return np.stack([self.model.kinematics.curve(bend) for bend in self.bend_at(time)])
 
     @property
     def initial(self) -> Initial:
@@ -269,22 +266,19 @@ class LoadedConfiguration(RodConfiguration):
 
     def near(self, time: Array) -> TipOfBend:
         """Return the tip for bend angles near those of the poses, see `Configuration.near`."""
-        rod, poses = self.model.rod, self._poses
-        q = np.array([state.q for state in poses.states])
-        slope = np.zeros((*q.shape, self.model.inputs))
-        slope[:, rod.free] = poses.tangents
-        # ∂(bend angles)/∂pressures and ∂tip/∂pressures, and from both ∂tip/∂(bend angles).
-        outputs = np.moveaxis(slope[:, bend_outputs(rod)], 2, 0)
-        bend = np.stack([bend_change(rod, q, moved) for moved in outputs], axis=2)
-        tip = slope[:, [-3, -2]]
-        jacobian = np.swapaxes(np.linalg.solve(*(np.swapaxes(s, 1, 2) for s in (bend, tip))), 1, 2)
-        flat = interpolate(time, self._time, jacobian.reshape(len(q), -1))
+        slopes = self._poses.tip_by_bend(self.model.rod)
+        slope = interpolate(time, self._time, slopes.reshape(len(slopes), -1))
         return TipNearPoses(
             self.model.kinematics,
             self.bend_at(time),
-            sample_spline(self._shape, time)[0][:, -3:-1],
-            flat.reshape(len(time), 2, -1),
+            self.curves(time)[:, -1],
+            slope.reshape(len(time), 2, -1),
         )
+
+    def curves(self, time: Array) -> Array:
+        """Return the centreline of the poses, see `Configuration.curves`."""
+        q = sample_spline(self._shape, time)[0]
+        return np.stack([q[:, 0::4], q[:, 1::4]], axis=-1)
 
     def pressures(self, method: str, time: Array) -> Array:
         """Return effective pressures (K, M) [Pa] along the poses, see the module.
