@@ -46,22 +46,18 @@ def test_a_motion_into_a_peg_is_refused_with_instant_place_and_clearance(free, s
     plan(LIMB, MOTION, method="projected", obstacles=circle(point, allowed=1.1 * error.force))
 
 
+def edge(y, normal):
+    item = {"half_plane_m": [0.0, y], "normal": [0.0, normal]}
+    return Obstacles.from_mapping({"limb_radius_m": RADIUS, "obstacles": [item]})
+
+
 def test_what_is_beside_the_motion_changes_nothing(free):
     point, _ = beside(free, 0.8, -0.002)
-    edge = {"half_plane_m": [0.0, -RADIUS - 0.001], "normal": [0.0, 2.0]}
-    way = circle(point)
-    way = Obstacles(
-        RADIUS,
-        (
-            *way.items,
-            *Obstacles.from_mapping({"limb_radius_m": RADIUS, "obstacles": [edge]}).items,
-        ),
-    )
-    kept = plan(LIMB, MOTION, method="projected", obstacles=way)
-    np.testing.assert_array_equal(kept.differential_pressure, free.differential_pressure)
+    for way in (circle(point), edge(-RADIUS - 0.001, 2.0)):
+        kept = plan(LIMB, MOTION, method="projected", obstacles=way)
+        np.testing.assert_array_equal(kept.differential_pressure, free.differential_pressure)
     with pytest.raises(ObstacleError, match="the edge at"):
-        back = Motion.named("same_direction", amplitude=-0.4, period=4.0, cycles=1)
-        plan(LIMB, back, method="projected", obstacles=way)
+        plan(LIMB, MOTION, method="projected", obstacles=edge(0.05, -1.0))
 
 
 def test_a_file_says_what_is_wrong_with_it(tmp_path):
