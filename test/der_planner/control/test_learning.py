@@ -216,6 +216,8 @@ def test_arrays_that_do_not_fit_are_refused(first):
         (first.time[:-1], tip, None, "rising times"),
         (first.time[::-1], tip, None, "rising times"),
         (first.time, tip, np.eye(2), "covariance must have shape"),
+        (first.time, 1000.0 * tip, None, "give metres"),
+        (1000.0 * first.time, tip, None, "give seconds"),
     ):
         with pytest.raises(LearningError, match=said):
             learner.add(time, given, covariance)

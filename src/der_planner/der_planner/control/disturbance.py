@@ -24,6 +24,10 @@ _REACH = 3.0
 """Number of standard deviations beyond which samples do not count."""
 _SEEN_WITHIN = 0.1
 """Distance of the nearest image up to which a setpoint counts as seen [s]."""
+_FARTHEST = 3.0
+"""A tip farther from the clamp, over the limb's length, is told in another unit."""
+_LONGEST = 30.0
+"""So is a run that takes longer, over its plan's duration."""
 _LEAST_NOISE = 1e-5
 """Standard deviation of the best tip that is believed [m]."""
 _BEHIND_SHARE = 0.6
@@ -90,6 +94,29 @@ class Measured:
         variance = np.trace(spread, axis1=1, axis2=2) / 2
         seen &= np.isfinite(variance) & (variance >= 0)
         return cls(clock[seen], place[seen], np.maximum(variance[seen], _LEAST_NOISE**2))
+
+    def check_units(self, length: float, duration: float) -> None:
+        """Refuse tips and instants that no run can have: in millimetres, or milliseconds.
+
+        Args:
+            length: of the limb [m].
+            duration: of the plan [s].
+
+        Raises:
+            LearningError: names what was given and what is expected.
+        """
+        if not len(self.time):
+            return
+        far = float(np.median(np.linalg.norm(self.tip, axis=1)))
+        if far > _FARTHEST * length:
+            raise LearningError(
+                f"the tips are {far:.3g} m from the clamp of a limb of {length:.3g} m: give metres"
+            )
+        span = float(self.time[-1] - self.time[0])
+        if span > _LONGEST * duration:
+            raise LearningError(
+                f"the run takes {span:.3g} s, its plan {duration:.3g} s: give seconds"
+            )
 
 
 @dataclass(frozen=True)

@@ -164,9 +164,10 @@ class Learner:
                 not known. Feedback on the learned plan then does not correct the same again.
 
         Raises:
-            LearningError: the arrays do not fit together or to the plan.
+            LearningError: the arrays do not fit together, to the plan or to the limb's length.
         """
         measured = Measured.build(time, tip, covariance)
+        measured.check_units(self._correction.model.limb.length, float(self._plan.time[-1]))
         played, missed, astray = self._played(measured, commands)
         seen = float(played.shown.seen.mean())
         beyond = None
