@@ -27,7 +27,7 @@ from der_planner.control.knowledge import Estimate
 from der_planner.control.nominal import ChamberLog, Nominal
 from der_planner.control.reaction import Kind, Reaction
 from der_planner.control.supervisor import Supervisor, Warned
-from der_planner.control.touch import Lacking, Touch, TouchSense
+from der_planner.control.touch import Touch, TouchSense
 from der_planner.model import CONTROL_PERIOD, STEPS
 from der_planner.model.commands import within_limits
 from der_planner.planning.plan_file import Plan
@@ -202,15 +202,11 @@ class Feedback:
 
     def _feel(self) -> None:
         """Look at what the newest picture says of a touch."""
-        time, model = self._estimator.newest, self._nominal.model
-        if not np.isfinite(time) or time <= self._sense.newest.time:
-            return
-        known = self._estimator.at(time)
-        # Where friction turns round, the model knows least of what it takes.
-        rubs = np.array([s.friction_moment / s.moment_gain for s in model.limb.segments])
-        friction = rubs * (1.0 - known.memory.friction**2)
-        self._bend = self._nominal.at(time)[0] + known.parts[0]
-        self._sense.look(Lacking.of(time, self._bend, known, friction))
+        time = self._estimator.newest
+        if np.isfinite(time) and time > self._sense.newest.time:
+            known = self._estimator.at(time)
+            self._bend = self._nominal.at(time)[0] + known.parts[0]
+            self._sense.feel(time, self._bend, known)
 
     def _allowed(self, k: int, wanted: Array) -> Array:
         """Return the command (M,) [Pa] of control period ``k`` that a touch allows."""

@@ -170,6 +170,20 @@ class TouchSense:
         self.threshold = _chance(_CORRELATED / _HOUR, model.inputs + 2)
         self.newest = untouched(-np.inf, model.inputs)
 
+    def feel(self, time: float, bend_angles: Array, known: Knowledge) -> Touch:
+        """Return what a newer state of the estimator says of a touch.
+
+        Args:
+            time: [s].
+            bend_angles: (M,) [rad].
+            known: the filter's state then.
+        """
+        # Where friction turns round, the model knows least of what it takes.
+        segments = self._model.limb.segments
+        rubs = np.array([s.friction_moment / s.moment_gain for s in segments])
+        friction = rubs * (1.0 - known.memory.friction**2)
+        return self.look(Lacking.of(time, bend_angles, known, friction))
+
     def look(self, lacking: Lacking) -> Touch:
         """Return what a newer instant says of a touch."""
         before = self.newest
