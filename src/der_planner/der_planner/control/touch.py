@@ -34,7 +34,7 @@ _CORRELATED = 0.3
 """Time after which what the model lacks says something new [s]."""
 _RELEASED = 0.5
 """Share of the threshold below which a touch ends."""
-_PRESSURE_FREE = 400.0
+_PRESSURE_FREE = 800.0
 """Standard deviation of the lacking pressure of a limb that nothing is known of yet [Pa]."""
 _TIP_FREE = 1e-3
 """The same of the tip's displacement that bend angles do not explain [m]."""
