@@ -40,7 +40,7 @@ _TIP_FREE = 1e-3
 """The same of the tip's displacement that bend angles do not explain [m]."""
 _FIRST_WORTH = 5.0
 """Time of watching that this guess is worth [s]."""
-_WATCHED = 120.0
+_WATCHED = 600.0
 """Time in which what was watched is forgotten [s]."""
 _LARGEST_FORCE = 2.0
 """Standard deviation of forces that are expected [N]: what the data cannot tell stays that wide."""
