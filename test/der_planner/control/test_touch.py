@@ -114,10 +114,10 @@ CHAMBERS = np.array([6000.0, 3000.0])
 def test_yielding_gives_way_and_does_not_press_again(model, touch):
     found, bend = touch
     reaction = Reaction(model, "yield")
-    harder = CHAMBERS + [2000.0, 2000.0]
+    harder = CHAMBERS + 2000.0
     kept = reaction.allowed(harder, found, bend, CHAMBERS)
     assert found.pressure @ (kept - CHAMBERS) == pytest.approx(0.0, abs=1e-3)
-    less = CHAMBERS - [2000.0, 2000.0]
+    less = CHAMBERS - 2000.0
     np.testing.assert_array_equal(reaction.allowed(less, found, bend, less), less)
     kept = reaction.allowed(CHAMBERS, found, bend, less)
     assert found.pressure @ (kept - less) == pytest.approx(0.0, abs=1e-3)

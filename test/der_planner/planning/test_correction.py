@@ -60,7 +60,7 @@ def test_what_is_far_or_of_another_limb_is_not_taken(library):
 def sagging():
     """The same motion with two amplitudes, of a limb that its weight bends unevenly."""
     limb = LIMB.mounted("sideways")
-    motions = [Motion.named("asynchronous", size, 8.0, 1) for size in (0.25, 0.26)]
+    motions = [Motion.named("asynchronous", size, 8.0, 1) for size in (0.25, 0.28)]
     return [plan(limb, motion, method="projected") for motion in motions]
 
 

@@ -147,7 +147,8 @@ class Foresight:
         """Return ∂(δθ, δθ̇)/∂w (2M, M) of a limb that has come to rest, about control period k."""
         row = self._nominal.periods(k)
         move = self._nominal.transition[row]
-        return np.linalg.solve(np.eye(len(move)) - move, self._nominal.input[row])
+        still = np.linalg.solve(np.eye(len(move)) - move, self._nominal.input[row])
+        return np.asarray(still, dtype=np.float64)
 
     def _predicted(self, first: int, states: Sequence[Knowledge]) -> Array:
         """Return the parts (4, M) of δθ [rad] that were predicted for the last of some states.

@@ -212,7 +212,8 @@ class TipNearPoses:
         """Return the tips (K, 2) [m] for bend angles (K, M) [rad], one near each pose."""
         away = np.asarray(bend_angles, dtype=float) - self._bend
         moved = self._apart + np.einsum("kam,km->ka", self._slope, away)
-        return self._even.tip(bend_angles) + moved
+        found: Array = self._even.tip(bend_angles) + moved
+        return found
 
     def tip_jacobians(self, bend_angles: ArrayLike) -> Array:
         """Return ∂tip/∂bend angles (K, 2, M) [m/rad]."""

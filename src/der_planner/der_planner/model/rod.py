@@ -259,8 +259,8 @@ class Poses:
         outputs = np.moveaxis(slope[:, bend_outputs(rod)], 2, 0)
         bend = np.stack([bend_change(rod, q, moved) for moved in outputs], axis=2)
         tip = slope[:, [-3, -2]]
-        found: Array = np.linalg.solve(np.swapaxes(bend, 1, 2), np.swapaxes(tip, 1, 2))
-        return np.swapaxes(found, 1, 2)
+        found = np.linalg.solve(np.swapaxes(bend, 1, 2), np.swapaxes(tip, 1, 2))
+        return np.asarray(np.swapaxes(found, 1, 2), dtype=np.float64)
 
 
 class PoseFinder:
