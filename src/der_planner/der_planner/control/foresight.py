@@ -1,4 +1,4 @@
-"""How far feedback trusts what it knows: the errors of its own predictions, as far ahead as it acts.
+"""How far feedback trusts what it knows: errors of its predictions, as far ahead as it acts.
 
 A correction that is sent now bends the limb half a second after the newest picture. What was known
 so long ago is rolled forward under the pressures that the chambers truly had, and compared with the

@@ -225,7 +225,7 @@ class Learner:
         return self._again(best, expected)
 
     def _again(self, best: PlayedRun, expected: Array) -> Plan:
-        """Return the plan of the best run, with what is expected of it now if it is not the last."""
+        """Return the plan of the best run; where it is not the last, with what is expected now."""
         if np.array_equal(best.commands, self._plan.differential_pressure):
             return self._plan
         return dataclasses.replace(

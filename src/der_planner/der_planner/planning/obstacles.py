@@ -1,4 +1,4 @@
-"""Things in the way of a limb: how far a motion keeps from them, and with what force it would touch.
+"""Things in the way of a limb: how far a motion keeps from them, with what force it touches.
 
 A file names circles and half-planes in `limb_base`, in metres and newtons:
 
