@@ -107,12 +107,8 @@ def test_a_drawing_is_previewed_played_and_kept(
     assert client.newest[topics.PLAN].payload == pytest.approx(0.02)
     bench.wait_mode(PressureState.TRACKING)
 
-    slow = {
-        "offline": False,
-        "latency": 600,
-        "downloadThroughput": 40000,
-        "uploadThroughput": 40000,
-    }
+    slow = {"offline": False, "latency": 600, "downloadThroughput": 5000, "uploadThroughput": 5000}
+    browser.execute_cdp_cmd("Network.enable", {})
     browser.execute_cdp_cmd("Network.emulateNetworkConditions", slow)
     wait("return document.querySelector('#view .age').textContent.endsWith('s old')", "the age")
     assert browser.execute_script(

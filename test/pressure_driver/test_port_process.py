@@ -21,7 +21,8 @@ from pressure_driver.emulator.board import EmulatedBoard, Faults
 from pressure_driver.emulator.firmware import BOARDS
 from pressure_driver.emulator.pneumatics import BoardPneumatics
 from pressure_driver.emulator.runner import BoardRunner, EmulatedPort
-from pressure_driver.port_process import Channel, PortError, PortProcess, explain, open_port
+from pressure_driver.lines import Channel, open_port
+from pressure_driver.port_process import PortError, PortProcess, explain
 from pressure_driver.protocols import NAMES
 from pressure_driver.safety import Mode
 from pressure_driver.settings import Settings
@@ -362,3 +363,11 @@ def test_a_port_is_kept_by_its_stable_name(tmp_path, monkeypatch):
     assert port_process.stable_name(str(stable)) == str(stable)
     assert port_process.stable_name(str(other)) == str(other)
     assert str(stable) in port_process.available_ports()
+
+
+def test_the_process_of_the_port_loads_neither_ros_nor_the_part_of_the_node():
+    listed = [sys.executable, "-c", "import sys, pressure_driver.board; print(*sys.modules)"]
+    loaded = subprocess.run(listed, capture_output=True, text=True, check=True).stdout.split()
+    assert "pressure_driver.core" in loaded
+    node = {"pressure_driver.settings", "pressure_driver.port_process", "pressure_driver.entry"}
+    assert not {"rclpy", "numpy", "numba", *node} & set(loaded)

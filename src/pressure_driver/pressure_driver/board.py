@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING, Any, cast
 
 import serial
 
-from pressure_driver import port_process
+from pressure_driver import lines
 from pressure_driver.core import DriverCore
 from pressure_driver.following import Duration
-from pressure_driver.port_process import Channel
+from pressure_driver.lines import Channel
 from pressure_driver.protocols import host_protocol
 from pressure_driver.schedule import Origin, Setpoint, TickGrid, Verdict
 
@@ -81,7 +81,7 @@ class BoardProcess:
         self._heard_at = self._said_at = self.core.clock()
         self._refused_at = 0.0
         self._node_is_silent = False
-        self._real_time = port_process.prefer_thread(settings.real_time_priority)
+        self._real_time = lines.prefer_thread(settings.real_time_priority)
 
     def end(self, *_: object) -> None:
         """End in order, after the present turn of the loop: a handler of signals."""
@@ -90,9 +90,7 @@ class BoardProcess:
     def run(self) -> int:
         """Serve the port until the end; return the exit code."""
         try:
-            self._device = port_process.open_port(
-                self._port, self._baud_rate, port_process.RELEASE_TIME
-            )
+            self._device = lines.open_port(self._port, self._baud_rate, lines.RELEASE_TIME)
         except (OSError, ValueError) as error:
             self._send("failed", getattr(error, "errno", None), str(error))
             return 1
@@ -105,14 +103,14 @@ class BoardProcess:
                 self._turn()
             problem = self._empty()
         except EOFError:
-            duration, node_has_ended = port_process.VENT_TIME, True
+            duration, node_has_ended = lines.VENT_TIME, True
         finally:
             unreached = self._send_last_words(duration)
         if unreached:
             alone = " (a board with a watchdog vents by itself)"
             problem = (
                 f"the board on {self._port} cannot be reached and may hold its pressures"
-                f"{alone if self.core.protocol.has_watchdog else ''}: {port_process.ADVICE}"
+                f"{alone if self.core.protocol.has_watchdog else ''}: {lines.ADVICE}"
             )
         self._send("ended", problem)
         if node_has_ended:
@@ -236,7 +234,7 @@ class BoardProcess:
         if os.path.exists(self._port):
             self._retry_at = time.monotonic() + RETRY_TIME
             with contextlib.suppress(OSError, ValueError):
-                self._device = port_process.open_port(self._port, self._baud_rate)
+                self._device = lines.open_port(self._port, self._baud_rate)
                 self._reconnects += 1
                 self._log(f"{self._port} is back", True)
                 self._opened()
@@ -310,7 +308,7 @@ class BoardProcess:
         if self._bytes_waiting is not None:
             self._bytes_waiting.close()
         if self._device is not None:
-            port_process.release_port(self._device, drop)
+            lines.release_port(self._device, drop)
         self._bytes_waiting = self._device = None
 
     # ------------------------------------------------------------------------------- the end
@@ -322,7 +320,7 @@ class BoardProcess:
         while self.core.highest_pressure() > EMPTYING_SHARE * before:
             if self.core.clock() > deadline:
                 left = self.core.highest_pressure()
-                return f"the chambers on {self._port} keep {left:.0f} Pa: {port_process.ADVICE}"
+                return f"the chambers on {self._port} keep {left:.0f} Pa: {lines.ADVICE}"
             self._turn()
         return ""
 
@@ -330,9 +328,9 @@ class BoardProcess:
         """Repeat the vent command and leave the port; return what is left to be done."""
         if self._device is None and os.path.exists(self._port):
             with contextlib.suppress(OSError, ValueError):
-                self._device = port_process.open_port(self._port, self._baud_rate)
+                self._device = lines.open_port(self._port, self._baud_rate)
         descriptor = -1 if self._device is None else self._device.fileno()
-        problem = port_process.vent_port(descriptor, self.core.emergency(), duration)
+        problem = lines.vent_port(descriptor, self.core.emergency(), duration)
         self._release(drop=bool(problem))
         return problem
 

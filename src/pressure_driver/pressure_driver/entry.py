@@ -15,7 +15,8 @@ from collections import deque
 from typing import Any
 
 from pressure_driver.board import BoardProcess
-from pressure_driver.port_process import Channel, explain, stable_name
+from pressure_driver.lines import Channel
+from pressure_driver.port_process import explain, stable_name
 from pressure_driver.safety import Mode
 from pressure_driver.settings import SettingError, Settings, declarations
 

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pressure_driver.emulator.board import EmulatedBoard, Faults, ReceivedCommand
-from pressure_driver.port_process import prefer_thread
+from pressure_driver.lines import prefer_thread
 from pressure_driver.schedule import NANOSECONDS
 
 TELEMETRY_PERIOD = 50_000_000
