@@ -8,9 +8,11 @@ pressure, and J = ∂tip/∂θ of evenly bent segments,
 
     lacking pressure = C_w⁻¹ C_θ(s) f        b = (C_r(s) − J C_θ(s)) f
 
-These are M + 2 numbers for the three unknowns of a force in the plane. For every place the force of
-the largest likelihood is linear; the likelihood of the places, each with its force, gives place and
-force with what is in doubt of them.
+These are M + 2 numbers for the three unknowns of a force in the plane. What a force along the limb
+does to it is hardly seen, and what touches the limb from its side pushes across it, with some
+friction: the part along the limb is expected to be a share of that across. For every place the
+force of the largest likelihood is then linear; the likelihood of the places, each with its force,
+gives place and force with what is in doubt of them.
 
 Without contact the same numbers are not zero either: gains, friction and the camera are a little
 wrong. Their mean and covariance, watched while nothing is touched, are the free level. A distance
@@ -43,7 +45,11 @@ _FIRST_WORTH = 5.0
 _WATCHED = 600.0
 """Time in which what was watched is forgotten [s]."""
 _LARGEST_FORCE = 2.0
-"""Standard deviation of forces that are expected [N]: what the data cannot tell stays that wide."""
+"""Standard deviation of the forces across the limb that are expected [N]."""
+_RUBS = 0.3
+"""Standard deviation of a force along the limb, over the force across it at the same place."""
+_LEAST_ALONG = 0.01
+"""Force along the limb that is expected anyway, a standard deviation [N]."""
 _PLACES = 60
 """Places along the limb that are tried."""
 _PLACE_TOLD = 0.1
@@ -211,21 +217,27 @@ def locate(model: RodModel, lacking: Lacking, noise: Array, places: Array) -> To
         noise: covariance of it (M + 2, M + 2).
         places: (P,) evenly spaced, where the force may act [m].
     """
-    effect = effects(model, lacking.bend_angles, places)
+    axes = _axes(model, lacking.bend_angles, places)
+    effect = effects(model, lacking.bend_angles, places) @ axes
     weight = np.linalg.inv(noise)
     seen = np.swapaxes(effect, 1, 2) @ weight
-    told = seen @ effect + np.eye(2) / _LARGEST_FORCE**2
-    pull = seen @ lacking.value
+    square, pull = seen @ effect, seen @ lacking.value
+    across = pull[:, 1] / (square[:, 1, 1] + 1.0 / _LARGEST_FORCE**2)
+    expected = np.full_like(pull, _LARGEST_FORCE)
+    expected[:, 0] = _LEAST_ALONG + _RUBS * np.abs(across)
+    told = square + (expected**-2.0)[:, :, None] * np.eye(2)
     forces = np.linalg.solve(told, pull[..., None])[..., 0]
     left = lacking.value @ weight @ lacking.value - (pull * forces).sum(axis=1)
-    likely = -0.5 * (left + np.linalg.slogdet(told)[1])
+    likely = -0.5 * (left + np.linalg.slogdet(told)[1]) - np.log(expected[:, 0])
     share = np.exp(likely - likely.max())
     share /= share.sum()
     place = float(share @ places)
     deviation = float(np.sqrt(share @ (places - place) ** 2 + (places[1] - places[0]) ** 2 / 12))
-    force = share @ forces
-    apart = forces - force
-    spread = np.linalg.inv(told) + apart[:, :, None] * apart[:, None, :]
+    turned = np.einsum("pab,pb->pa", axes, forces)
+    force = share @ turned
+    apart = turned - force
+    spread = axes @ np.linalg.inv(told) @ np.swapaxes(axes, 1, 2)
+    spread = spread + apart[:, :, None] * apart[:, None, :]
     covariance = np.einsum("p,pab->ab", share, spread)
     known = replace(
         untouched(lacking.time, model.inputs),
@@ -246,6 +258,15 @@ def effects(model: RodModel, bend_angles: Array, places: Array) -> Array:
     jacobian = model.kinematics.tip_jacobians(bend_angles)
     lacking = np.linalg.solve(limp.bend_by_pressure, limp.bend)
     return np.concatenate([lacking, limp.tip - jacobian @ limp.bend], axis=1)
+
+
+def _axes(model: RodModel, bend_angles: Array, places: Array) -> Array:
+    """Return the directions along and across the limb at places, as columns (P, 2, 2)."""
+    even = model.kinematics
+    edges = np.searchsorted(np.cumsum(even.rest_lengths[:-1]) + even.base, places)
+    heading = even.turning[edges] @ bend_angles
+    cosine, sine = np.cos(heading), np.sin(heading)
+    return np.moveaxis(np.array([[cosine, -sine], [sine, cosine]]), 2, 0)
 
 
 def _told(found: Touch, left: float, model: RodModel) -> Touch:
