@@ -1,4 +1,4 @@
-"""Write the driver's parameter files and its README's table from their declaration.
+"""Write the driver's parameter files and its page's table from their declaration.
 
 python3 scripts/write_driver_parameters.py
 """
@@ -12,7 +12,7 @@ from workspace_setup.basics import ROOT
 
 PACKAGE = ROOT / "src" / "pressure_driver"
 BEGIN, END = "<!-- parameters: begin -->\n", "<!-- parameters: end -->\n"
-"""Around the table in the README."""
+"""Around the table in the page."""
 
 
 def parameter_file(node: str) -> str:
@@ -30,7 +30,7 @@ def parameter_file(node: str) -> str:
 
 
 def table() -> str:
-    """Return the README's table of the driver's parameters."""
+    """Return the page's table of the driver's parameters."""
     lines = ["| parameter | default | range | meaning |", "|---|---|---|---|"]
     for name, declaration, default in declarations(Settings):
         limits = ", ".join(declaration.choices)
@@ -42,7 +42,7 @@ def table() -> str:
 
 
 def with_table(readme: str) -> str:
-    """Return the text of the README with its table as it should be."""
+    """Return the text of the page with its table as it should be."""
     before, _, rest = readme.partition(BEGIN)
     return before + BEGIN + table() + END + rest.partition(END)[2]
 
@@ -57,6 +57,6 @@ def main() -> int:
     """Write the files of the package."""
     for node in NODES:
         (PACKAGE / "config" / f"{node}.yaml").write_text(parameter_file(node), encoding="utf-8")
-    readme = PACKAGE / "README.md"
+    readme = ROOT / "docs" / "guide" / "driver.md"
     readme.write_text(with_table(readme.read_text(encoding="utf-8")), encoding="utf-8")
     return 0

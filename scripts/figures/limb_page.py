@@ -1,4 +1,4 @@
-"""Write the page of a limb's parameters, doc/limb_parameters.md, from their declaration.
+"""Write docs/reference/limb_parameters.md, the page of a limb's parameters, from its declaration.
 
 python3 scripts/write_limb_page.py
 """
@@ -21,18 +21,18 @@ from der_planner.limb import (
 from der_planner.results.tables import Table
 from workspace_setup.basics import ROOT
 
-PAGE = ROOT / "src" / "der_planner" / "doc" / "limb_parameters.md"
+PAGE = ROOT / "docs" / "reference" / "limb_parameters.md"
 _HEAD = """\
 # The parameters of a limb
 
-Written by `python3 scripts/write_limb_page.py` from
-[parameters.py](../der_planner/limb/parameters.py), [limb.py](../der_planner/limb/limb.py) and
-[loads.py](../der_planner/limb/loads.py): change them there.
+Written by `python3 scripts/write_limb_page.py` from `parameters.py`, `limb.py` and `loads.py` in
+`src/der_planner/der_planner/limb`: change them there.
 
 All values are SI. A key without a default has to be in the limb file. "Fit" is the unknown by
-which the [calibration](identification.md) finds the value: its unit, its bounds, and ± the standard
-deviation of what is known before any data. A relative one is ln(value / the prior's). Without an
-entry there, the fit of the bend angles keeps the value; lengths and air have fits of their own.
+which the [calibration](../guide/identification.md) finds the value: its unit, its bounds, and ±
+the standard deviation of what is known before any data. A relative one is ln(value / the prior's).
+Without an entry there, the fit of the bend angles keeps the value; lengths and air have fits of
+their own.
 """
 _SECTIONS: tuple[tuple[str, Any], ...] = (
     ("`segments`, `pcc_segments`: one entry per segment", Segment),

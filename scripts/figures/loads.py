@@ -25,7 +25,7 @@ from workspace_setup.basics import ROOT
 matplotlib.use("Agg")
 
 DPI = 80
-FOLDER = ROOT / "src" / "der_planner" / "doc"
+FOLDER = ROOT / "docs" / "pictures"
 MODELS = ("der", "pcc")
 MOUNTINGS = ("hanging", "sideways")
 PAYLOADS = (0.0, 0.05)

@@ -1,4 +1,4 @@
-"""Draw the pictures of src/der_planner/doc/page.md: the page on a twin, in the machine's Chromium.
+"""Draw the pictures of docs/guide/page.md: the page on a twin, in the machine's Chromium.
 
 python3 scripts/draw_figures.py page [FOLDER]
 """
@@ -16,7 +16,7 @@ from der_msgs.msg import PressureState
 from der_planner.experiment.console import folder_argument
 from workspace_setup.basics import ROOT
 
-DOC = ROOT / "src" / "der_planner" / "doc"
+DOC = ROOT / "docs" / "pictures"
 DESKTOP = {"width": 1280, "height": 800, "deviceScaleFactor": 1, "mobile": False}
 TELEPHONE = {"width": 390, "height": 844, "deviceScaleFactor": 2, "mobile": True}
 SETTLING = 1.5

@@ -23,7 +23,7 @@ from workspace_setup.basics import ROOT
 matplotlib.use("Agg")
 
 DPI = 68
-FOLDER = ROOT / "src" / "der_planner" / "doc"
+FOLDER = ROOT / "docs" / "pictures"
 CASES = ("asynchronous", "same_direction", "opposite_direction")
 COLORS = {
     ("der", "paper"): "tab:orange",

@@ -1,4 +1,4 @@
-"""Draw the checks of the rod that src/der_planner/doc/rod.md shows.
+"""Draw the checks of the rod that docs/guide/rod.md shows.
 
 python3 scripts/draw_figures.py rod [FOLDER]
 """
@@ -20,7 +20,7 @@ from workspace_setup.basics import ROOT
 
 matplotlib.use("Agg")
 
-FOLDER = ROOT / "src" / "der_planner" / "doc"
+FOLDER = ROOT / "docs" / "pictures"
 ELASTICA_TIP_MM = 66.3753  # exact inextensible elastica, see test_statics
 
 

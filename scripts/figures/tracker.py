@@ -1,4 +1,4 @@
-"""Draw the picture of src/apriltag_tracker/README.md: python3 scripts/draw_figures.py tracker."""
+"""Draw the picture of docs/guide/tracker.md: python3 scripts/draw_figures.py tracker."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def main() -> int:
     tracker = LimbTracker(tags, model.intrinsics)
     picture = draw_observation(image, tracker.observe(image, 0.0), tracker)
     small = cv2.resize(picture, (960, 540), interpolation=cv2.INTER_AREA)
-    path = PACKAGE / "doc" / "tracking.png"
+    path = ROOT / "docs" / "pictures" / "tracking.png"
     # Few grey levels keep the file small.
     cv2.imwrite(str(path), (small // 6) * 6, [cv2.IMWRITE_PNG_COMPRESSION, 9])
     print(path, path.stat().st_size // 1000, "kB")

@@ -13,8 +13,9 @@ from pressure_driver.protocols import BoardFailure, BoardText, Telemetry
 from pressure_driver.protocols.native import NativeHost
 
 PACKAGE = Path(__file__).resolve().parents[2] / "src" / "pressure_driver"
-README = (PACKAGE / "README.md").read_text(encoding="utf-8")
-PROTOCOL = (PACKAGE / "doc" / "native_protocol.md").read_text(encoding="utf-8")
+DOCS = PACKAGE.parents[1] / "docs"
+DRIVER = (DOCS / "guide" / "driver.md").read_text(encoding="utf-8")
+PROTOCOL = (DOCS / "reference" / "native_protocol.md").read_text(encoding="utf-8")
 VECTOR = re.compile(r"^\| (\w+) \|.*\| `([0-9a-f ]+)` \|$", re.MULTILINE)
 
 
@@ -27,7 +28,7 @@ def test_the_parameter_file_is_what_the_declaration_says(name):
 
 
 def test_the_table_of_parameters_is_what_the_declaration_says():
-    assert driver_parameters.with_table(README) == README
+    assert driver_parameters.with_table(DRIVER) == DRIVER
 
 
 @pytest.mark.parametrize(
@@ -78,7 +79,7 @@ def test_the_vectors_of_the_board_are_understood():
 
 
 def test_every_rule_of_the_safety_table_names_tests_that_exist():
-    table = README.split("| what fails |")[1].split("\n\n")[0].splitlines()[2:]
+    table = DRIVER.split("| what fails |")[1].split("\n\n")[0].splitlines()[2:]
     assert len(table) >= 30
     for row in table:
         named = row.rstrip("| ").split("| ")[-1].strip().strip("`")

@@ -10,7 +10,7 @@ import pytest
 from der_planner.model.bending import bend_angles
 
 FOLDER = Path(__file__).resolve().parents[3] / "src" / "der_planner" / "examples"
-PAGE = FOLDER.parent / "doc" / "rod_alone.md"
+PAGE = FOLDER.parents[2] / "docs" / "guide" / "rod_alone.md"
 
 
 def example(name: str):

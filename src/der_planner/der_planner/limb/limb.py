@@ -327,7 +327,7 @@ class Limb:
     def to_yaml(self, path: str | Path) -> None:
         """Write a limb file that `from_yaml` reads back as an equal limb, whole or not at all."""
         text = yaml.safe_dump(self.to_mapping(), sort_keys=False, allow_unicode=True)
-        head = "# A limb, in SI units. How to choose each: src/der_planner/doc/limb_parameters.md\n"
+        head = "# A limb, in SI units. How to choose each: docs/reference/limb_parameters.md\n"
         file = Path(path)
         unfinished = file.with_name(f".{file.name}.part")
         unfinished.write_text(head + commented(text, sections()), encoding="utf-8")

@@ -2,7 +2,8 @@
 
 Frames are stuffed (Cheshire and Baker 1999) so that they hold no zero byte, and end with one.
 
-The specification, for authors of firmware and with test vectors, is doc/native_protocol.md.
+The specification, for authors of firmware and with test vectors, is
+docs/reference/native_protocol.md.
 """
 
 from __future__ import annotations
