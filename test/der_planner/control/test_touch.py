@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from der_planner.control.reaction import Reaction
-from der_planner.control.touch import FreeLevel, Lacking, TouchSense
+from der_planner.control.touch import FreeLevel, Lacking, TouchSense, untouched
 from der_planner.limb import Limb
 from der_planner.model import RodModel
 from der_planner.model.compliance import compliance
@@ -23,7 +23,10 @@ def model():
 def calibrated() -> FreeLevel:
     """Return the free level of a limb that is well known."""
     free = FreeLevel(2)
-    free.covariance = np.diag(DEVIATION**2)
+    still = Lacking(0.0, np.zeros(2), np.zeros(2), np.zeros(4), 1e-12 * np.eye(4))
+    for k in range(4000):
+        away = DEVIATION * (-1) ** k
+        free.learn(replace(still, effective=np.array([k % 7, k % 5]) * 1e3, value=away), 0.5)
     return free
 
 
@@ -38,7 +41,9 @@ def lacking(model, forces, pressure=(6000.0, 3000.0)) -> Lacking:
     missing = np.linalg.solve(compliance(model, bend, [0.1]).bend_by_pressure, bend - before)
     even = model.kinematics
     offset = (pushed.q - free.q)[-3:-1] - (even.tip(bend) - even.tip(before))
-    return Lacking(1.0, bend, np.concatenate([missing, offset]), np.diag((DEVIATION / 4) ** 2))
+    return Lacking(
+        1.0, bend, pressures, np.concatenate([missing, offset]), np.diag((DEVIATION / 4) ** 2)
+    )
 
 
 def frame(model, node, bend) -> np.ndarray:
@@ -97,7 +102,7 @@ def test_a_touch_ends_and_the_next_one_has_a_time_of_its_own(model):
 def test_noise_is_taken_for_a_touch_about_once_in_an_hour(model):
     draw = np.random.default_rng(8)
     sense, spread = TouchSense(model), np.array([700.0, 300.0, 2e-3, 1e-3])
-    still = Lacking(0.0, np.zeros(2), np.zeros(4), 1e-6 * np.diag(spread**2))
+    still = Lacking(0.0, np.zeros(2), np.zeros(2), np.zeros(4), 1e-6 * np.diag(spread**2))
     for k in range(400):
         value = 0.5 * spread * draw.standard_normal(4)
         sense.look(replace(still, time=0.3 * k, value=value))
@@ -122,25 +127,34 @@ def touch(model):
 CHAMBERS = np.array([6000.0, 3000.0])
 
 
+def reacted(reaction, wanted, planned, touch, chambers):
+    """Return the command in place of a wanted one."""
+    found, bend = touch
+    reaction.follow(planned, found, bend, chambers)
+    return reaction.allowed(wanted)
+
+
 def test_yielding_gives_way_and_does_not_press_again(model, touch):
     found, bend = touch
-    reaction = Reaction(model, "yield")
+    reaction, less = Reaction(model, "yield"), CHAMBERS - 2000.0
     harder = CHAMBERS + 2000.0
-    kept = reaction.allowed(harder, found, bend, CHAMBERS)
+    kept = reacted(reaction, harder, harder, touch, CHAMBERS)
     assert found.pressure @ (kept - CHAMBERS) == pytest.approx(0.0, abs=1e-3)
-    less = CHAMBERS - 2000.0
-    np.testing.assert_array_equal(reaction.allowed(less, found, bend, less), less)
-    kept = reaction.allowed(CHAMBERS, found, bend, less)
+    np.testing.assert_array_equal(reacted(reaction, less, less, touch, less), less)
+    kept = reacted(reaction, CHAMBERS, CHAMBERS, touch, less)
     assert found.pressure @ (kept - less) == pytest.approx(0.0, abs=1e-3)
-    reaction.release()
-    np.testing.assert_array_equal(reaction.allowed(less, found, bend, harder), less)
+    # What corrections pressed before the touch was noticed is taken back.
+    kept = reacted(Reaction(model, "yield"), CHAMBERS, less, touch, CHAMBERS)
+    assert found.pressure @ (kept - less) == pytest.approx(0.0, abs=1e-3)
+    ended = untouched(2.0, 2), bend
+    np.testing.assert_array_equal(reacted(reaction, harder, harder, ended, less), harder)
 
 
 def test_a_limit_lets_the_force_come_to_it(model, touch):
     found, bend = touch
     for limit in (0.1, 0.4):
         reaction = Reaction(model, "yield", limit)
-        kept = reaction.allowed(CHAMBERS + 9000.0, found, bend, CHAMBERS)
+        kept = reacted(reaction, CHAMBERS + 9000.0, CHAMBERS, touch, CHAMBERS)
         # Something that does not move: the force by which the place stays where it is.
         limp = compliance(model, bend, [found.place])
         along = found.force / np.linalg.norm(found.force)
@@ -150,16 +164,16 @@ def test_a_limit_lets_the_force_come_to_it(model, touch):
 
 
 def test_holding_and_venting_keep_what_the_chambers_had(model, touch):
-    found, bend = touch
+    wanted = CHAMBERS + 2000.0
     for kind in ("hold", "vent"):
         reaction = Reaction(model, kind)
         assert not reaction.vents
         for now in (CHAMBERS, 0.5 * CHAMBERS):
-            kept = reaction.allowed(CHAMBERS + 2000.0, found, bend, now)
+            kept = reacted(reaction, wanted, CHAMBERS, touch, now)
             np.testing.assert_array_equal(kept, CHAMBERS)
         assert reaction.vents == (kind == "vent")
-    unchanged = Reaction(model, "warn").allowed(CHAMBERS + 2000.0, found, bend, CHAMBERS)
-    np.testing.assert_array_equal(unchanged, CHAMBERS + 2000.0)
+    unchanged = reacted(Reaction(model, "warn"), wanted, CHAMBERS, touch, CHAMBERS)
+    np.testing.assert_array_equal(unchanged, wanted)
 
 
 def test_what_is_no_reaction_is_refused(model):

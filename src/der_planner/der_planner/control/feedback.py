@@ -191,7 +191,9 @@ class Feedback:
             supervisor.stop(instant, "inconsistent", np.inf)
             correction = np.zeros_like(planned)
         air = self._nominal.model.air
-        wanted = self._allowed(k, planned + correction)
+        chambers = self._chambers.during(np.array([k * STEPS - 1]))[0]
+        self._reaction.follow(planned, self.touch, self._bend, chambers)
+        wanted = self._reaction.allowed(planned + correction)
         command: Array = within_limits(wanted[None], air, CONTROL_PERIOD, before)[0][0]
         if self.touch.touched and self._reaction.acts:
             missed = 0.0  # What is in the way keeps the tip away.
@@ -208,14 +210,6 @@ class Feedback:
             self._bend = self._nominal.at(time)[0] + known.parts[0]
             self._sense.feel(time, self._bend, known)
 
-    def _allowed(self, k: int, wanted: Array) -> Array:
-        """Return the command (M,) [Pa] of control period ``k`` that a touch allows."""
-        if not self.touch.touched:
-            self._reaction.release()
-            return wanted
-        chambers = self._chambers.during(np.array([k * STEPS - 1]))[0]
-        return self._reaction.allowed(wanted, self.touch, self._bend, chambers)
-
     def coming(self) -> tuple[int, Array]:
         """Return the control period of the newest command, and corrections (W, M) [Pa] from it on.
 
@@ -226,8 +220,7 @@ class Feedback:
         if self.touch.touched and self._reaction.acts:
             planned = self._nominal.commands[self._nominal.periods(first + np.arange(_SOON))]
             for ahead, each in enumerate(planned):
-                allowed = self._allowed(first, each + corrections[ahead])
-                corrections[ahead] = allowed - each
+                corrections[ahead] = self._reaction.allowed(each + corrections[ahead]) - each
         return first, corrections
 
     def sent(self, time: float, command: ArrayLike) -> None:

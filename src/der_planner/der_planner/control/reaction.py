@@ -2,10 +2,11 @@
 
 A touch is worth an effective pressure ℓ per segment (`Touch.pressure`): bending further against it
 raises the force. A change δu of the pressures in the chambers does so as far as −ℓ·δu > 0. While
-something is touched, `yield` gives no command u with −ℓ·u above the least that the chambers have
-held since: what the plan and its corrections want is moved to the nearest command on that side. The
-limb retreats as the plan does, does not follow when the plan presses again, and is free once the
-touch has ended. With a limit in N the bound is where the force would reach it: against something
+something is touched, `yield` gives no command u with −ℓ·u above the least that the plan has asked
+for and the chambers have held since: what the plan and its corrections want is moved to the nearest
+command on that side. What corrections pressed before the touch was noticed is taken back, the limb
+retreats as the plan does, does not follow when the plan presses again, and is free once the touch
+has ended. With a limit in N the bound is where the force would reach it: against something
 that does not move, pressures raise the force at a place with compliance C_p by
 −f̂ᵀ (∂p/∂u) δu / (f̂ᵀ C_p f̂).
 """
@@ -48,45 +49,48 @@ class Reaction:
         self.kind, self.limit = kind, limit
         self._model = model
         self._held: Array | None = None
+        self._bound = np.zeros(0), 0.0
 
     @property
     def acts(self) -> bool:
-        """Whether it changes commands."""
+        """Whether it may change commands."""
         return self.kind != "warn"
-
-    def release(self) -> None:
-        """Forget the touch: it has ended."""
-        self._held = None
 
     @property
     def vents(self) -> bool:
         """Whether the limb is to be vented."""
         return self.kind == "vent" and self._held is not None
 
-    def allowed(self, wanted: Array, touch: Touch, bend_angles: Array, chambers: Array) -> Array:
-        """Return the command (M,) [Pa] in place of a wanted one.
+    def follow(self, planned: Array, touch: Touch, bend_angles: Array, chambers: Array) -> None:
+        """Look at a touch, or that there is none, before a command is asked for.
 
         Args:
-            wanted: (M,) [Pa].
-            touch: as it is known now, of a limb that is touched.
+            planned: (M,) the plan's own command [Pa].
+            touch: as it is known now.
             bend_angles: (M,) [rad].
             chambers: (M,) differential pressures in them now [Pa].
         """
-        if not self.acts:
-            return wanted
+        if not (touch.touched and self.acts):
+            self._held = None
+            return
         if self._held is None:
             self._held = chambers
         if self.kind != "yield":
-            return self._held
+            return
         harder = -touch.pressure / max(float(np.linalg.norm(touch.pressure)), _SMALLEST)
-        if harder @ chambers < harder @ self._held:
-            self._held = chambers
-        bound = float(harder @ self._held)
+        self._held = min(self._held, chambers, planned, key=lambda each: float(harder @ each))
+        self._bound = harder, float(harder @ self._held)
         if self.limit is not None and np.isfinite([touch.place, *touch.force]).all():
-            harder, bound = self._limited(touch, bend_angles, chambers, self.limit)
-        square = float(harder @ harder)
-        if square < _SMALLEST**2:
+            self._bound = self._limited(touch, bend_angles, chambers, self.limit)
+
+    def allowed(self, wanted: Array) -> Array:
+        """Return the command (M,) [Pa] in place of a wanted one."""
+        if self._held is None:
             return wanted
+        if self.kind != "yield":
+            return self._held
+        harder, bound = self._bound
+        square = max(float(harder @ harder), _SMALLEST**2)
         return wanted - harder * (max(0.0, float(harder @ wanted) - bound) / square)
 
     def _limited(

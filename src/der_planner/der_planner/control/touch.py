@@ -1,10 +1,9 @@
 """Touch: what pressures, loads and friction do not explain of the shape is a force.
 
-The estimator (`der_planner.control.estimation`) says per segment the pressure that the model lacks,
-where an error of its gain does not explain it, and a displacement b of the tip that the bend angles
-do not explain. A force f at a place s makes both, by the compliance of the rod
-(`der_planner.model.compliance`): with C_θ and C_r of bend and tip by the force, C_w of the bend by
-pressure, and J = ∂tip/∂θ of evenly bent segments,
+The estimator (`der_planner.control.estimation`) says per segment the pressure d + g w that the
+model lacks, and a displacement b of the tip that the bend angles do not explain. A force f at a
+place s makes both, by the compliance of the rod (`der_planner.model.compliance`): with C_θ and C_r
+of bend and tip by the force, C_w of the bend by pressure, and J = ∂tip/∂θ of evenly bent segments,
 
     lacking pressure = C_w⁻¹ C_θ(s) f        b = (C_r(s) − J C_θ(s)) f
 
@@ -15,12 +14,14 @@ force of the largest likelihood is then linear; the likelihood of the places, ea
 gives place and force with what is in doubt of them.
 
 Without contact the same numbers are not zero either: gains, friction and the camera are a little
-wrong. Their mean and covariance, watched while nothing is touched, are the free level. A distance
-from it that noise would pass once in an hour is a touch.
+wrong. A segment then lacks c + γ w and some noise, and more where friction turns round; the tip is
+off by a constant and some noise. These are learned while nothing is touched: they are the free
+level. A distance from it that noise would pass once in an hour is a touch.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,14 +37,24 @@ _CORRELATED = 0.3
 """Time after which what the model lacks says something new [s]."""
 _RELEASED = 0.5
 """Share of the threshold below which a touch ends."""
-_PRESSURE_FREE = 800.0
-"""Standard deviation of the lacking pressure of a limb that nothing is known of yet [Pa]."""
-_TIP_FREE = 1e-3
-"""The same of the tip's displacement that bend angles do not explain [m]."""
-_FIRST_WORTH = 5.0
-"""Time of watching that this guess is worth [s]."""
+_FREE_PRESSURE = 250.0
+"""Standard deviation of c and of the noise, of a limb that nothing is known of yet [Pa]."""
+_FREE_GAIN = 0.15
+"""The same of γ."""
+_FREE_TIP = 5e-4
+"""The same of the tip's displacement and of its noise [m]."""
+_FIRST_WORTH = 10.0
+"""Time of watching that the guess of the noise is worth [s]."""
 _WATCHED = 600.0
-"""Time in which what was watched is forgotten [s]."""
+"""Time in which noise that was watched is forgotten [s]."""
+_SAYS_NEW = 0.5
+"""Time after which noise says something new of c, γ and the tip's displacement [s]."""
+_LEARNED_AFTER = 1.0
+"""What no touch follows for so long is learned: contact that begins slowly is not [s]."""
+_FRICTION_WRONG = 0.5
+"""Standard deviation of friction from its model where it turns round, over its largest."""
+_FRICTION_SLIDING = 0.1
+"""Variance elsewhere, over that."""
 _LARGEST_FORCE = 2.0
 """Standard deviation of the forces across the limb that are expected [N]."""
 _RUBS = 0.3
@@ -65,13 +76,15 @@ class Lacking:
     Attributes:
         time: [s].
         bend_angles: (M,) [rad].
-        value: (M + 2,) pressure that the model lacks, beside the error of its gain [Pa], and the
-            tip's displacement that the bend angles do not explain [m].
-        covariance: of value.
+        effective: (M,) pressure w of the model [Pa].
+        value: (M + 2,) pressure that the model lacks [Pa], and the tip's displacement that the
+            bend angles do not explain [m].
+        covariance: of value, with what friction may differ from its model.
     """
 
     time: float
     bend_angles: Array
+    effective: Array
     value: Array
     covariance: Array
 
@@ -83,17 +96,17 @@ class Lacking:
             time: [s].
             bend_angles: (M,) [rad].
             known: the filter's state then.
-            friction: (M,) pressure by which friction may differ from its model, a standard
-                deviation [Pa].
+            friction: (M,) the largest that the model knows [Pa].
         """
         inputs = len(bend_angles)
-        _, _, missing, _, offset = known.parts
         rows = np.zeros((inputs + 2, len(known.mean)))
         rows[:inputs, 2 * inputs : 3 * inputs] = np.eye(inputs)
+        rows[:inputs, 3 * inputs : 4 * inputs] = np.diag(known.effective)
         rows[inputs:, 4 * inputs :] = np.eye(2)
         spread = rows @ known.covariance @ rows.T
-        spread[:inputs, :inputs] += np.diag(friction**2)
-        return Lacking(time, bend_angles, np.concatenate([missing, offset]), spread)
+        turning = np.minimum(1.0, _FRICTION_SLIDING + 1.0 - known.memory.friction**2)
+        spread[:inputs, :inputs] += np.diag((_FRICTION_WRONG * friction) ** 2 * turning)
+        return Lacking(time, bend_angles, known.effective, rows @ known.mean, spread)
 
 
 @dataclass(frozen=True)
@@ -135,29 +148,45 @@ def untouched(time: float, inputs: int, distance: float = 0.0) -> Touch:
 
 
 class FreeLevel:
-    """Mean and covariance of what the model lacks of a limb that nothing touches.
+    """What the model lacks of a limb that nothing touches: c + γ w, the tip's displacement, noise.
 
     Args:
         inputs: M segments.
-
-    Attributes:
-        mean: (M + 2,) [Pa], [m].
-        covariance: of it.
     """
 
     def __init__(self, inputs: int) -> None:
-        self.mean = np.zeros(inputs + 2)
-        self.covariance = np.diag(np.repeat([_PRESSURE_FREE, _TIP_FREE], [inputs, 2]) ** 2)
+        first = np.repeat([_FREE_PRESSURE, _FREE_TIP], [inputs, 2])
+        self._mean = np.zeros((inputs + 2, 2))
+        slope = np.repeat([_FREE_GAIN, 0.0], [inputs, 2])
+        self._covariance = np.square([first, slope]).T[:, None] * np.eye(2)
+        self.noise = first**2
         self._worth = _FIRST_WORTH
 
-    def learn(self, value: Array, duration: float) -> None:
-        """Take in a value (M + 2,) that held for a time [s] without contact."""
-        share = duration / (self._worth + duration)
-        away = value - self.mean
-        self.mean = self.mean + share * away
-        spread = (1.0 - share) * np.outer(away, away)
-        self.covariance = (1.0 - share) * self.covariance + share * spread
+    def expected(self, effective: Array) -> tuple[Array, Array]:
+        """Return mean and variance (M + 2,) under an effective pressure (M,) [Pa]; noise counts."""
+        by = self._by(effective)
+        unknown = np.einsum("ia,iab,ib->i", by, self._covariance, by)
+        return (by * self._mean).sum(axis=1), unknown + self.noise
+
+    def learn(self, lacking: Lacking, duration: float) -> None:
+        """Take in what held for a time [s] without contact."""
+        by, other = self._by(lacking.effective), np.diag(lacking.covariance)
+        mean, variance = self.expected(lacking.effective)
+        away = lacking.value - mean
+        seen = np.einsum("iab,ib->ia", self._covariance, by)
+        old = _SAYS_NEW / duration * (self.noise + other)
+        gain = seen / (variance - self.noise + old)[:, None]
+        self._mean = self._mean + gain * away[:, None]
+        self._covariance = self._covariance - gain[:, :, None] * seen[:, None, :]
+        # How much of what is away is noise, by what is expected of each.
+        part = self.noise / (variance + other)
+        found = (part * away) ** 2 + self.noise * (1.0 - part)
+        self.noise = self.noise + duration / (self._worth + duration) * (found - self.noise)
         self._worth = min(self._worth + duration, _WATCHED)
+
+    def _by(self, effective: Array) -> Array:
+        """Return what c and γ are multiplied by (M + 2, 2)."""
+        return np.column_stack([np.ones(len(self.noise)), np.append(effective, np.zeros(2))])
 
 
 class TouchSense:
@@ -175,6 +204,7 @@ class TouchSense:
         self._places = np.linspace(limb.base_length, limb.length, _PLACES + 1)[1:]
         self.threshold = _chance(_CORRELATED / _HOUR, model.inputs + 2)
         self.newest = untouched(-np.inf, model.inputs)
+        self._recent: deque[tuple[Lacking, float]] = deque()
 
     def feel(self, time: float, bend_angles: Array, known: Knowledge) -> Touch:
         """Return what a newer state of the estimator says of a touch.
@@ -184,27 +214,28 @@ class TouchSense:
             bend_angles: (M,) [rad].
             known: the filter's state then.
         """
-        # Where friction turns round, the model knows least of what it takes.
         segments = self._model.limb.segments
-        rubs = np.array([s.friction_moment / s.moment_gain for s in segments])
-        friction = rubs * (1.0 - known.memory.friction**2)
+        friction = np.array([s.friction_moment / s.moment_gain for s in segments])
         return self.look(Lacking.of(time, bend_angles, known, friction))
 
     def look(self, lacking: Lacking) -> Touch:
         """Return what a newer instant says of a touch."""
         before = self.newest
-        value = lacking.value - self.free.mean
-        noise = self.free.covariance + lacking.covariance
+        mean, variance = self.free.expected(lacking.effective)
+        value, noise = lacking.value - mean, lacking.covariance + np.diag(variance)
         distance = float(value @ np.linalg.solve(noise, value)) / self.threshold
         touched = distance > (_RELEASED if before.touched else 1.0)
         if touched:
             since = before.since if before.touched else lacking.time
             found = locate(self._model, replace(lacking, value=value), noise, self._places)
             self.newest = replace(found, since=since, distance=distance)
-        else:
-            self.newest = untouched(lacking.time, self._model.inputs, distance)
-            if distance < _RELEASED and np.isfinite(before.time):
-                self.free.learn(lacking.value, max(0.0, lacking.time - before.time))
+            self._recent.clear()
+            return self.newest
+        self.newest = untouched(lacking.time, self._model.inputs, distance)
+        if distance < _RELEASED and 0.0 < lacking.time - before.time < _LEARNED_AFTER:
+            self._recent.append((lacking, lacking.time - before.time))
+        while self._recent and self._recent[0][0].time < lacking.time - _LEARNED_AFTER:
+            self.free.learn(*self._recent.popleft())
         return self.newest
 
 
