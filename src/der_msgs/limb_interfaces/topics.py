@@ -13,6 +13,7 @@ CAMERA_INFO = "camera/camera_info"
 TAGS = "tags"
 LIMB_STATE = "state"
 ESTIMATE = "estimate"
+CONTACT = "contact"
 SHAPE_MARKERS = "shape_markers"
 DIAGNOSTICS = "/diagnostics"
 

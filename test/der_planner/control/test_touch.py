@@ -120,8 +120,7 @@ def test_noise_is_taken_for_a_touch_about_once_in_an_hour(model):
 @pytest.fixture(scope="module")
 def touch(model):
     """Something in the way of a limb that bends to the left."""
-    found = TouchSense(model, calibrated()).look(lacking(model, {15: (0.0, -0.2)}))
-    return found, lacking(model, {15: (0.0, -0.2)}).bend_angles
+    return TouchSense(model, calibrated()).look(lacking(model, {15: (0.0, -0.2)}))
 
 
 CHAMBERS = np.array([6000.0, 3000.0])
@@ -129,37 +128,34 @@ CHAMBERS = np.array([6000.0, 3000.0])
 
 def reacted(reaction, wanted, planned, touch, chambers):
     """Return the command in place of a wanted one."""
-    found, bend = touch
-    reaction.follow(planned, found, bend, chambers)
+    reaction.follow(planned, touch, chambers)
     return reaction.allowed(wanted)
 
 
 def test_yielding_gives_way_and_does_not_press_again(model, touch):
-    found, bend = touch
     reaction, less = Reaction(model, "yield"), CHAMBERS - 2000.0
     harder = CHAMBERS + 2000.0
     kept = reacted(reaction, harder, harder, touch, CHAMBERS)
-    assert found.pressure @ (kept - CHAMBERS) == pytest.approx(0.0, abs=1e-3)
+    assert touch.pressure @ (kept - CHAMBERS) == pytest.approx(0.0, abs=1e-3)
     np.testing.assert_array_equal(reacted(reaction, less, less, touch, less), less)
     kept = reacted(reaction, CHAMBERS, CHAMBERS, touch, less)
-    assert found.pressure @ (kept - less) == pytest.approx(0.0, abs=1e-3)
+    assert touch.pressure @ (kept - less) == pytest.approx(0.0, abs=1e-3)
     # What corrections pressed before the touch was noticed is taken back.
     kept = reacted(Reaction(model, "yield"), CHAMBERS, less, touch, CHAMBERS)
-    assert found.pressure @ (kept - less) == pytest.approx(0.0, abs=1e-3)
-    ended = untouched(2.0, 2), bend
+    assert touch.pressure @ (kept - less) == pytest.approx(0.0, abs=1e-3)
+    ended = untouched(2.0, touch.bend_angles)
     np.testing.assert_array_equal(reacted(reaction, harder, harder, ended, less), harder)
 
 
 def test_a_limit_lets_the_force_come_to_it(model, touch):
-    found, bend = touch
     for limit in (0.1, 0.4):
         reaction = Reaction(model, "yield", limit)
         kept = reacted(reaction, CHAMBERS + 9000.0, CHAMBERS, touch, CHAMBERS)
         # Something that does not move: the force by which the place stays where it is.
-        limp = compliance(model, bend, [found.place])
-        along = found.force / np.linalg.norm(found.force)
+        limp = compliance(model, touch.bend_angles, [touch.place])
+        along = touch.force / np.linalg.norm(touch.force)
         moved = along @ limp.place_by_pressure[0] @ (kept - CHAMBERS)
-        force = np.linalg.norm(found.force) - moved / (along @ limp.place[0] @ along)
+        force = np.linalg.norm(touch.force) - moved / (along @ limp.place[0] @ along)
         assert force == pytest.approx(limit, abs=1e-6)
 
 

@@ -68,7 +68,6 @@ class Feedback:
             self._horizon = Horizon(self._nominal, self._chambers, authority)
             self._sense = TouchSense(self._nominal.model)
             self._reaction = Reaction(self._nominal.model, reaction, force_limit)
-            self._bend = self._nominal.bend[0]
             self._horizon.warm_up(self._estimator.beginning(0))
 
     @property
@@ -192,7 +191,7 @@ class Feedback:
             correction = np.zeros_like(planned)
         air = self._nominal.model.air
         chambers = self._chambers.during(np.array([k * STEPS - 1]))[0]
-        self._reaction.follow(planned, self.touch, self._bend, chambers)
+        self._reaction.follow(planned, self.touch, chambers)
         wanted = self._reaction.allowed(planned + correction)
         command: Array = within_limits(wanted[None], air, CONTROL_PERIOD, before)[0][0]
         if self.touch.touched and self._reaction.acts:
@@ -207,8 +206,7 @@ class Feedback:
         time = self._estimator.newest
         if np.isfinite(time) and time > self._sense.newest.time:
             known = self._estimator.at(time)
-            self._bend = self._nominal.at(time)[0] + known.parts[0]
-            self._sense.feel(time, self._bend, known)
+            self._sense.feel(time, self._nominal.at(time)[0] + known.parts[0], known)
 
     def coming(self) -> tuple[int, Array]:
         """Return the control period of the newest command, and corrections (W, M) [Pa] from it on.

@@ -61,13 +61,12 @@ class Reaction:
         """Whether the limb is to be vented."""
         return self.kind == "vent" and self._held is not None
 
-    def follow(self, planned: Array, touch: Touch, bend_angles: Array, chambers: Array) -> None:
+    def follow(self, planned: Array, touch: Touch, chambers: Array) -> None:
         """Look at a touch, or that there is none, before a command is asked for.
 
         Args:
             planned: (M,) the plan's own command [Pa].
             touch: as it is known now.
-            bend_angles: (M,) [rad].
             chambers: (M,) differential pressures in them now [Pa].
         """
         if not (touch.touched and self.acts):
@@ -81,7 +80,7 @@ class Reaction:
         self._held = min(self._held, chambers, planned, key=lambda each: float(harder @ each))
         self._bound = harder, float(harder @ self._held)
         if self.limit is not None and np.isfinite([touch.place, *touch.force]).all():
-            self._bound = self._limited(touch, bend_angles, chambers, self.limit)
+            self._bound = self._limited(touch, chambers, self.limit)
 
     def allowed(self, wanted: Array) -> Array:
         """Return the command (M,) [Pa] in place of a wanted one."""
@@ -93,11 +92,9 @@ class Reaction:
         square = max(float(harder @ harder), _SMALLEST**2)
         return wanted - harder * (max(0.0, float(harder @ wanted) - bound) / square)
 
-    def _limited(
-        self, touch: Touch, bend_angles: Array, chambers: Array, limit: float
-    ) -> tuple[Array, float]:
+    def _limited(self, touch: Touch, chambers: Array, limit: float) -> tuple[Array, float]:
         """Return how pressures raise the force (M,) [N/Pa], and how far that may go [N]."""
-        limp = compliance(self._model, bend_angles, [touch.place])
+        limp = compliance(self._model, touch.bend_angles, [touch.place])
         size = float(np.linalg.norm(touch.force))
         along = touch.force / size
         slack = float(along @ limp.place[0] @ along)

@@ -115,6 +115,7 @@ class Touch:
 
     Attributes:
         time: [s].
+        bend_angles: (M,) of the limb then [rad].
         touched: whether something touches the limb.
         since: when it began [s]; NaN: nothing touches.
         pressure: (M,) effective pressure that bends the limb as the touch does [Pa]; NaN: nothing
@@ -128,6 +129,7 @@ class Touch:
     """
 
     time: float
+    bend_angles: Array
     touched: bool
     since: float
     pressure: Array
@@ -139,12 +141,13 @@ class Touch:
     said: str
 
 
-def untouched(time: float, inputs: int, distance: float = 0.0) -> Touch:
-    """Return that nothing touches the limb at an instant [s]."""
+def untouched(time: float, bend_angles: Array, distance: float = 0.0) -> Touch:
+    """Return that nothing touches a limb of bend angles (M,) [rad] at an instant [s]."""
     nothing = np.full(2, np.nan)
     unknown = np.full((2, 2), np.nan)
-    pressure = np.full(inputs, np.nan)
-    return Touch(time, False, np.nan, pressure, distance, np.nan, np.nan, nothing, unknown, "")
+    pressure, never = np.full(len(bend_angles), np.nan), np.nan
+    about = pressure, distance, np.nan, np.nan, nothing, unknown, ""
+    return Touch(time, bend_angles, False, never, *about)
 
 
 class FreeLevel:
@@ -203,7 +206,7 @@ class TouchSense:
         limb = model.limb
         self._places = np.linspace(limb.base_length, limb.length, _PLACES + 1)[1:]
         self.threshold = _chance(_CORRELATED / _HOUR, model.inputs + 2)
-        self.newest = untouched(-np.inf, model.inputs)
+        self.newest = untouched(-np.inf, np.zeros(model.inputs))
         self._recent: deque[tuple[Lacking, float]] = deque()
 
     def feel(self, time: float, bend_angles: Array, known: Knowledge) -> Touch:
@@ -231,7 +234,7 @@ class TouchSense:
             self.newest = replace(found, since=since, distance=distance)
             self._recent.clear()
             return self.newest
-        self.newest = untouched(lacking.time, self._model.inputs, distance)
+        self.newest = untouched(lacking.time, lacking.bend_angles, distance)
         if distance < _RELEASED and 0.0 < lacking.time - before.time < _LEARNED_AFTER:
             self._recent.append((lacking, lacking.time - before.time))
         while self._recent and self._recent[0][0].time < lacking.time - _LEARNED_AFTER:
@@ -271,7 +274,7 @@ def locate(model: RodModel, lacking: Lacking, noise: Array, places: Array) -> To
     spread = spread + apart[:, :, None] * apart[:, None, :]
     covariance = np.einsum("p,pab->ab", share, spread)
     known = replace(
-        untouched(lacking.time, model.inputs),
+        untouched(lacking.time, lacking.bend_angles),
         touched=True,
         since=lacking.time,
         pressure=lacking.value[:-2],

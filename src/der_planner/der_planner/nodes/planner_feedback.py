@@ -54,7 +54,7 @@ class _Corrected:
         self.coming: tuple[int, Array] = feedback.coming()
         self.revisions: dict[int, int] = {}
         self.warned = 0
-        self.touched = -math.inf
+        self.touched = self.felt = -math.inf
         self.vented = False
 
     def time_of(self, stamp: int) -> float:
@@ -262,6 +262,9 @@ class Corrector:
     def _react(self, each: _Corrected) -> None:
         """Say that something touches the limb, once for each touch, and vent it if that is set."""
         touch = each.feedback.touch
+        if touch.time > each.felt:
+            each.felt = touch.time
+            self._output.contact(each.schedule, touch)
         if touch.touched and touch.since > each.touched:
             each.touched = touch.since
             text = f"plan {each.schedule.plan_id}, {touch.since:.2f} s: something touches the limb"

@@ -27,7 +27,14 @@ from apriltag_tracker.camera import CameraError, Intrinsics
 from apriltag_tracker.camera.images import ImageError, to_grey
 from apriltag_tracker.detection import Tag
 from apriltag_tracker.tag_map import TagMap
-from der_msgs.msg import LimbEstimate, LimbState, PressurePlan, PressureState, TagDetectionArray
+from der_msgs.msg import (
+    LimbContact,
+    LimbEstimate,
+    LimbState,
+    PressurePlan,
+    PressureState,
+    TagDetectionArray,
+)
 from der_planner.limb import Limb
 from der_planner.page.access import Binding, Desk
 from der_planner.page.commands import Commands, Load
@@ -131,6 +138,7 @@ class PageNode(Node):
         subscribe(CameraInfo, topics.CAMERA_INFO, self._on_camera, qos.LATCHED)
         subscribe(CameraInfo, topics.CAMERA_INFO, self._on_camera, qos.IMAGES)
         subscribe(LimbEstimate, topics.ESTIMATE, self._on_estimate, qos.STATES)
+        subscribe(LimbContact, topics.CONTACT, situation.put_contact, qos.STATES)
         subscribe(DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, qos.STATES)
 
     def _subscribe(
