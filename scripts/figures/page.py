@@ -1,6 +1,6 @@
 """Draw the pictures of docs/guide/page.md: the page on a twin, in the machine's Chromium.
 
-python3 scripts/draw_figures.py page [FOLDER]
+python3 scripts/draw_figures.py page [FOLDER] [--states]
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ from workspace_setup.basics import ROOT
 
 DOC = ROOT / "docs" / "pictures"
 DESKTOP = {"width": 1280, "height": 800, "deviceScaleFactor": 1, "mobile": False}
+TABLET = {"width": 820, "height": 1180, "deviceScaleFactor": 1, "mobile": True}
 TELEPHONE = {"width": 390, "height": 844, "deviceScaleFactor": 2, "mobile": True}
+SCREENS = {"desktop": DESKTOP, "tablet": TABLET, "phone": TELEPHONE}
 SETTLING = 1.5
 """[s] for a window to lay itself out in another size."""
 CENTRE = """
@@ -88,19 +90,61 @@ def draw_ring(photographer: Photographer) -> None:
     photographer.wait("return !!page.drawing.preview", "a preview")
 
 
+def draw_states(photographer: Photographer) -> None:
+    """Show the page in every state of the limb and of the nodes, on every screen."""
+    graph, window = photographer.graph, photographer.window
+
+    def take(state: str) -> None:
+        for name, screen in SCREENS.items():
+            photographer.resize(screen)
+            photographer.take(f"page_{state}_{name}.png")
+        photographer.resize(DESKTOP)
+
+    def says(words: str) -> None:
+        photographer.wait(
+            f"return document.getElementById('notices').textContent.includes('{words}')", words
+        )
+
+    photographer.press("take")
+    take("disarmed")
+    graph.arm()
+    take("armed")
+    photographer.press("play")
+    graph.wait_mode(PressureState.TRACKING)
+    graph.client.spin(6.0)
+    take("playing")
+    window.find_element("id", "vent").click()
+    graph.wait_mode(PressureState.DISARMED)
+    take("vented")
+    graph.arm()
+    graph.break_board("supply:105000")
+    graph.wait_mode(PressureState.FAULT)
+    take("fault")
+    graph.kill("pressure_driver")
+    says("The driver is dead")
+    take("driver_dead")
+    graph.kill("page")
+    says("No connection")
+    take("page_dead")
+
+
 def main() -> int:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("folder", nargs="?", type=folder_argument, default=DOC)
-    folder = parser.parse_args().folder
-    folder.mkdir(parents=True, exist_ok=True)
+    parser.add_argument("--states", action="store_true", help="every state on every screen instead")
+    given = parser.parse_args()
+    given.folder.mkdir(parents=True, exist_ok=True)
     with page_graph() as graph:
-        photographer = Photographer(graph, folder)
+        photographer = Photographer(graph, given.folder)
+        if given.states:
+            draw_states(photographer)
+            return 0
         press = photographer.press
         press("take")
         press("arm")
         draw_ring(photographer)
-        press("play-drawing")
+        press("play")
         graph.wait_mode(PressureState.TRACKING)
         graph.client.spin(6.0)
         photographer.take("page_desktop.png")

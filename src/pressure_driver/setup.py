@@ -30,6 +30,7 @@ setup(
             "pressure_driver = pressure_driver.entry:pressure_driver",
             "board = pressure_driver.entry:board",
             "board_emulator = pressure_driver.entry:board_emulator",
+            "topic_board = pressure_driver.entry:topic_board",
         ],
     },
 )

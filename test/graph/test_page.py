@@ -6,7 +6,7 @@ import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from urllib.parse import urljoin
+from urllib.parse import urljoin, urlsplit
 
 import pytest
 from browsers import (
@@ -16,6 +16,7 @@ from browsers import (
     start_page,
     webdriver,
 )
+from cable import Cable
 from driver_bench import Bench
 
 from der_msgs.msg import PressurePlan, PressureState
@@ -34,12 +35,12 @@ return true;
 class WatchedPage(Bench):
     """A board, a driver and the page; browsers that look at it."""
 
-    def __init__(self, graph: Any, folder: Path) -> None:
-        super().__init__(graph, bounds={})
+    def __init__(self, graph: Any, folder: Path, **driver: object) -> None:
+        super().__init__(graph, bounds={}, on_lost_operator="vent", **driver)
         self.client.watch([])
         self.folder = folder
         self.browsers: list[Any] = []
-        self.page, self.url = start_page(graph, on_lost_operator="vent")
+        self.page, self.url = start_page(graph)
         self.client.wait_ready(["page"])
 
     def open(self) -> Any:
@@ -89,7 +90,7 @@ def test_one_arms_and_everybody_vents(rig: WatchedPage) -> None:
     assert not enabled(first, "arm")
     press(rig, first, "take")
     arm(rig, first)
-    first.refresh()  # it is the same tab of the same browser: on_lost_operator=vent does nothing
+    first.refresh()  # the same tab of the same browser: nobody is lost
     rig.wait(lambda: first.find_elements("id", "arm") and enabled(first, "arm"), "the operator")
     rig.wait(lambda: not enabled(second, "take"), "the second window to see the first one command")
     assert not enabled(second, "arm")
@@ -118,6 +119,32 @@ def test_one_arms_and_everybody_vents(rig: WatchedPage) -> None:
     assert abs(rig.states[-1].measured_differential[0]) < 1000.0
 
 
+def test_a_limb_whose_operator_is_lost_is_vented(graph: Any, tmp_path: Path) -> None:
+    """The cable between browser and page is pulled, the page hangs, the page is killed."""
+    rig = WatchedPage(graph, tmp_path, hold_time=60.0)
+    cable = Cable(urlsplit(rig.url).port)
+    rig.url = rig.url.replace(f":{urlsplit(rig.url).port}", f":{cable.port}")
+    try:
+        browser = rig.open()
+        press(rig, browser, "take")
+        for lose, return_ in (
+            (cable.pull, cable.plug),
+            (lambda: rig.page.signal(signal.SIGSTOP), lambda: rig.page.signal(signal.SIGCONT)),
+            (lambda: rig.page.signal(signal.SIGKILL), lambda: None),
+        ):
+            rig.wait(lambda: enabled(browser, "arm"), "the desk, which is kept")
+            arm(rig, browser)
+            rig.play(10, lambda k: (min(900.0 * (k + 1), 6000.0), 0.0))
+            rig.wait_mode(PressureState.HOLDING)  # for a minute, while somebody watches
+            lose()
+            rig.wait_mode(PressureState.DISARMED)
+            return_()
+        assert rig.driver.log.read_text().count("is lost") >= 3
+    finally:
+        cable.close()
+        rig.close()
+
+
 def test_what_died_is_not_shown_as_live(rig: WatchedPage) -> None:
     browser = rig.open()
 
@@ -138,12 +165,15 @@ def test_what_died_is_not_shown_as_live(rig: WatchedPage) -> None:
     wait(f"{row('page')}.includes('could not be used')", "the page to say so")
     rig.driver.signal(signal.SIGSTOP)
     wait(old, "the driver's silence")
-    assert "ago" in browser.find_element("id", "faults").text
+    assert "ago" in browser.find_element("id", "meaning").text
+    assert browser.find_element("id", "mode").text == "NOT KNOWN"
     rig.driver.signal(signal.SIGCONT)
     wait(f"!{old}", "the driver's state again")
     rig.driver.signal(signal.SIGKILL)
     wait(old, "the driver's death")
-    wait(f"{row('pressure_driver')}.includes('its process has ended')", "its row to say why")
+    wait(notice("The driver is dead: its process has ended"), "the alarm to say why")
+    wait(notice("--params-file"), "the command that starts it again")
+    assert "limb was without pressure, in mode disarmed" in browser.find_element("id", "alarm").text
     browser.find_element("id", "vent").click()
     wait(notice("VENT FAILED"), "the failure to show")
 

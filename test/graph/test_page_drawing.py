@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import signal
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from browsers import (
 from driver_bench import Bench
 
 from der_msgs.msg import PressurePlan, PressureState
+from der_planner.limb import Limb
 from limb_interfaces import qos, topics
 
 pytestmark = [pytest.mark.graph, pytest.mark.slow, NEEDS_CHROMIUM]
@@ -43,8 +45,10 @@ def rig(graph: Any, tmp_path: Path) -> tuple[Bench, str]:
     graph.start("der_planner", "limb_twin")
     graph.start("apriltag_tracker", "synthetic_camera")
     graph.start("apriltag_tracker", "apriltag_tracker")
-    graph.start("der_planner", "planner", default_method="projected")
-    _, url = start_page(graph, drawings=str(tmp_path / "drawings"), on_lost_operator="stop")
+    limb_file = tmp_path / "limb.yaml"
+    replace(Limb.default(), name="the planner's own").to_yaml(limb_file)
+    graph.start("der_planner", "planner", default_method="projected", limb_file=str(limb_file))
+    _, url = start_page(graph, drawings=str(tmp_path / "drawings"), lease_period=3.0)
     graph.client.wait_ready([process.executable for process in graph.processes])
     return bench, url
 
@@ -71,6 +75,8 @@ def test_a_drawing_is_previewed_played_and_kept(
         client.wait_for(browser.find_element("id", name).is_enabled, 120.0, f"the button {name}")
         browser.execute_script(f"document.getElementById('{name}').click()")
 
+    limb_drawn = "return page.data.nodes.find((node) => node.own === 'page').values.limb"
+    wait(f'{limb_drawn} === "the planner\'s own"', "the page to draw with the planner's limb")
     wait("return page.pictures > 0 && !!document.getElementById('draw')", "pictures")
     press("take")
 
@@ -102,7 +108,7 @@ def test_a_drawing_is_previewed_played_and_kept(
     browser.execute_script(SELECT, "Payload [g]")
     browser.switch_to.active_element.send_keys("20")
     wait("return page.drawing.load.startsWith('payload=0.02&')", "the load to be reckoned with")
-    press("play-drawing")  # once it is planned anew
+    press("play")  # once it is planned anew
     client.wait_for(lambda: topics.PLAN in client.newest, 60.0, "the plan")
     assert client.newest[topics.PLAN].payload == pytest.approx(0.02)
     bench.wait_mode(PressureState.TRACKING)
@@ -116,8 +122,5 @@ def test_a_drawing_is_previewed_played_and_kept(
     )  # the way is slow, not it
 
     signal_browser(browser, signal.SIGKILL)
-    client.wait_for(
-        lambda: client.diagnostic_values("planner").get("reason") == "stopped as asked",
-        90.0,
-        "the planner to stop when the operator's browser is gone",
-    )
+    bench.wait_mode(PressureState.DISARMED)  # the driver lets the limb down without an operator
+    assert "is lost" in bench.driver.log.read_text()

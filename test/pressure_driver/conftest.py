@@ -10,12 +10,14 @@ from pressure_driver.emulator.pneumatics import BoardPneumatics
 from pressure_driver.protocols import host_protocol
 from pressure_driver.safety import Mode
 from pressure_driver.schedule import Setpoint, Verdict
-from pressure_driver.settings import Settings
+from pressure_driver.settings import EmulatorSettings, Settings
 
 PERIOD = 50_000_000
 START = 1_700_000_000_000_000_000
 VENTED = 500.0
 """[Pa] gauge that counts as vented."""
+SENSORS = {"pneudrive": {"sensor_range": 100_000.0}}
+"""Parameters of both ends: with the nominal range, a step of the readings is 842 Pa."""
 
 
 class Simulation:
@@ -28,15 +30,26 @@ class Simulation:
     def __init__(self, protocol="ezloop", seed=0, **settings):
         self.time = 0
         self.clock_error = 0
-        self.settings = Settings(protocol=protocol, **settings)
-        self.core = DriverCore(host_protocol(protocol), self.settings, steady=lambda: self.steady)
-        self.board = EmulatedBoard(BOARDS[protocol](), BoardPneumatics(2, seed), seed)
+        shared = {"protocol": protocol, **SENSORS.get(protocol, {})}
+        for name in {"terminal", "sensor_range"} & set(settings):
+            shared[name] = settings.pop(name)
+        self.settings = Settings(**shared, **settings)
+        host = host_protocol(protocol, 4, self.settings)
+        self.core = DriverCore(host, self.settings, steady=lambda: self.steady)
+        self._other_end = EmulatorSettings(**shared)
+        self.board = EmulatedBoard(self.firmware(), BoardPneumatics(2, seed), seed)
         self.plugged = True
         self.sent = []
         self.received = []
         self.modes = []
         self.armings = 0
         self._receive(self.core.opening())
+
+    def firmware(self):
+        """Return a board's end that has heard nothing yet."""
+        board = BOARDS[self.core.protocol.name]()
+        board.configure(self._other_end)
+        return board
 
     @property
     def steady(self):
@@ -64,31 +77,30 @@ class Simulation:
 
     def is_vent(self, data):
         """Tell whether the bytes of a tick ask the board to open every chamber."""
-        name = self.core.protocol.name
-        commands = [c for c in BOARDS[name]().decode(data) if c.kind in ("setpoint", "vent")]
+        board = self.firmware()
+        commands = [c for c in board.decode(data) if c.kind in ("setpoint", "vent")]
         return bool(commands) and all(
             c.kind == "vent"
             or (
                 np.ptp(np.reshape(c.pressure, (-1, 2)), axis=1).max() == 0.0
-                and (name != "ctrlp" or max(c.pressure) == 0.0)
+                and (not board.gauge or max(c.pressure) <= 0.0)
             )
             for c in commands
         )
 
     def _receive(self, data):
-        if data and self.plugged:
+        while data and self.plugged:
             commands, answer = self.board.receive(data, self.wall)
             self.received += commands
-            if answer:
-                self.core.received(answer)
+            data = self.core.received(answer) if answer else b""
 
     def tick(self):
         """Advance by one period."""
         self.time += PERIOD
         data = self.core.tick(self.wall)
         self.sent.append(data)
-        self._receive(data)
         self.core.sent()
+        self._receive(data)
         self.board.step(PERIOD / 1e9)
         report = self.board.telemetry()
         if report and self.plugged:

@@ -20,18 +20,26 @@ from pressure_driver import port_process
 from pressure_driver.emulator.board import EmulatedBoard, Faults
 from pressure_driver.emulator.firmware import BOARDS
 from pressure_driver.emulator.pneumatics import BoardPneumatics
-from pressure_driver.emulator.runner import BoardRunner, EmulatedPort
-from pressure_driver.lines import Channel, open_port
+from pressure_driver.emulator.runner import BoardRunner, emulated_line
+from pressure_driver.lines import Channel, numeric_address, open_line, tcp_address
 from pressure_driver.port_process import PortError, PortProcess, explain
 from pressure_driver.protocols import NAMES
 from pressure_driver.safety import Mode
-from pressure_driver.settings import Settings
+from pressure_driver.settings import EmulatorSettings, Settings
 
 pytestmark = pytest.mark.slow
 
 PERIOD = 50_000_000
 COUNT = itertools.count(1)
 """Of messages, as the middleware counts them."""
+SENSOR_RANGE = 100_000.0
+"""[Pa] of PneuDrive boards: with the nominal range, a step of the readings is 842 Pa."""
+
+
+def network_address():
+    """Return an address of this computer at which nobody listens."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return f"tcp://127.0.0.1:{free.getsockname()[1]}"
 
 
 class Rig:
@@ -39,17 +47,21 @@ class Rig:
 
     def __init__(self, folder, protocol):
         self.commands = []
-        self.port = EmulatedPort(str(folder / f"board_{protocol}"), 115_200)
+        link = network_address() if protocol == "festo" else str(folder / f"board_{protocol}")
+        self.port = emulated_line(link, 115_200)
         air = BoardPneumatics(2, 1)
         # Valves ten times as wide, so that nobody waits for the air.
         air._fill_rate, air._vent_coefficient = 10 * air._fill_rate, 10 * air._vent_coefficient
-        self.board = EmulatedBoard(BOARDS[protocol](), air, 1)
+        firmware = BOARDS[protocol]()
+        firmware.configure(EmulatorSettings(sensor_range=SENSOR_RANGE))
+        self.board = EmulatedBoard(firmware, air, 1)
         self.runner = BoardRunner(self.board, self.port, on_command=self.commands.append)
         self.runner.start()
         self.settings = Settings(
             port=str(self.port.link),
             protocol=protocol,
             atmosphere=self.board.atmosphere,
+            sensor_range=SENSOR_RANGE,
             slew_limit=1e6,
             vent_rate=2e4,
             hold_time=0.2,
@@ -190,7 +202,7 @@ def test_vent_is_at_once_and_the_end_leaves_the_port(rig):
     wait_for(lambda: rig.vents()[-3:] == [True] * 3, "the last commands")
     rig.wait_vented()
     wait_for(lambda: not rig.port.host_present, "the port to be left")
-    open_port(str(rig.port.link), 115_200).close()
+    open_line(str(rig.port.link), 115_200).close(drop=True)
 
 
 def test_by_hand_it_takes_lines_from_a_terminal(rig):
@@ -333,6 +345,22 @@ def test_an_end_that_may_not_have_vented_says_so(rig, fault, told):
     assert re.search(f"{told}.*close the air supply", rig.driver.close())
 
 
+def test_a_connection_that_ends_is_a_fault_and_the_next_one_vents(make_rigs):
+    (rig,) = make_rigs("festo")
+    rig.pressurise()
+    with pytest.raises(OSError, match="in use") as raised:
+        open_line(rig.settings.port, 0)
+    assert "end it" in explain(rig.settings.port, raised.value)
+    rig.have("unplug:0.5")
+    wait_for(lambda: rig.mode == Mode.FAULT, "the fault")
+    assert "link lost" in rig.state["faults"][0]
+    wait_for(lambda: any("is back" in text for text in rig.said), "the connection")
+    rig.have()
+    rig.wait_vented()
+    assert rig.mode == Mode.FAULT
+    rig.pressurise()
+
+
 # ---------------------------------------------------------------------------- names and rights
 
 
@@ -345,7 +373,7 @@ def test_ports_that_do_not_open_are_named_with_the_remedy(rig, tmp_path):
         (str(file), "is no serial port"),
     ):
         with pytest.raises(SerialException) as raised:
-            open_port(port, 115_200)
+            open_line(port, 115_200)
         assert re.search(told, explain(port, raised.value))
     with pytest.raises(PortError, match="no serial device"):
         PortProcess(Settings(port=missing), lambda: None).start()
@@ -363,6 +391,16 @@ def test_a_port_is_kept_by_its_stable_name(tmp_path, monkeypatch):
     assert port_process.stable_name(str(stable)) == str(stable)
     assert port_process.stable_name(str(other)) == str(other)
     assert str(stable) in port_process.available_ports()
+
+
+def test_a_board_that_nobody_reaches_is_named_with_the_remedy():
+    address = network_address()
+    with pytest.raises(PortError, match=f"no board answers at {re.escape(address)}"):
+        PortProcess(Settings(port=address, protocol="festo"), lambda: None).start()
+    for text in ("tcp://host", "tcp://a:b:1", "tcp://host:70000"):
+        with pytest.raises(OSError, match="write tcp://host:port"):
+            tcp_address(text)
+    assert numeric_address("tcp://localhost:502") in ("tcp://127.0.0.1:502", "tcp://[::1]:502")
 
 
 def test_the_process_of_the_port_loads_neither_ros_nor_the_part_of_the_node():

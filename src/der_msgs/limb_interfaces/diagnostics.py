@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import socket
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.duration import Duration
 from rclpy.node import Node
 
+from der_msgs import msg
 from limb_interfaces import qos, topics
+from limb_interfaces.clocks import ClockWatch
+
+ENDED_IN_ORDER = "ended in order"
+"""What a node says last, unless something ended it: its silence is then no alarm."""
 
 
 @dataclass
@@ -37,8 +45,18 @@ _FIRST_READY = 2.0
 """Time for which a node that is ready goes on to speak more often [s]."""
 _FIRST_TIME = 20.0
 """Longest time for which a node that starts speaks more often [s]."""
+_LAST_WORDS = Duration(seconds=0.2)
+"""Listeners have this long to receive what a node says last."""
 _CPU_INTERVAL = 0.5
 """Shortest time over which the CPU time is measured [s]: over less, its own ticks show."""
+
+
+@cache
+def message_version() -> str:
+    """Return a short digest of all messages of the project: nodes with another do not hear this."""
+    kinds = [kind for name, kind in sorted(vars(msg).items()) if name[0].isupper()]
+    fields = [(kind.__name__, sorted(kind.get_fields_and_field_types().items())) for kind in kinds]
+    return hashlib.sha256(repr(fields).encode()).hexdigest()[:8]
 
 
 class DiagnosticsPublisher:
@@ -52,12 +70,20 @@ class DiagnosticsPublisher:
         node: the node that the status is about.
         report: returns the present health; its ``level`` is ok, warning, error or stale.
         hardware_id: what the node is connected to, if anything.
+        clock_of_all: the clocks of all others are compared with this node's.
     """
 
-    def __init__(self, node: Node, report: Callable[[], Health], hardware_id: str = "") -> None:
+    def __init__(
+        self,
+        node: Node,
+        report: Callable[[], Health],
+        hardware_id: str = "",
+        clock_of_all: bool = False,
+    ) -> None:
         self._node = node
         self._report = report
         self._hardware_id = hardware_id
+        self._clock = ClockWatch(node, clock_of_all)
         self._publisher = node.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, qos.STATES)
         self._process, self._started = f"{socket.gethostname()}:{os.getpid()}", time.time()
         self._others = node.create_subscription(
@@ -67,6 +93,7 @@ class DiagnosticsPublisher:
         self._cpu = 0.0
         self._slow_from = time.monotonic() + _FIRST_TIME
         self._timer = node.create_timer(_FIRST_INTERVAL, self._publish_first)
+        node.conclude = self.conclude  # for `limb_interfaces.runner`
 
     def _publish_first(self) -> None:
         now = time.monotonic()
@@ -90,26 +117,38 @@ class DiagnosticsPublisher:
                     "ROS_DOMAIN_ID"
                 )
 
+    def conclude(self) -> None:
+        """Say that the node ends in order, and wait shortly until it has been heard."""
+        self._report = lambda: Health("stale", ENDED_IN_ORDER)
+        self.publish()
+        self._publisher.wait_for_all_acked(_LAST_WORDS)
+
     def publish(self) -> str:
         """Publish now, without waiting for the next second; return the level."""
         health = self._report()
-        values = {
-            **health.values,
+        level, text, values = health.level, health.message, dict(health.values)
+        if offset := self._clock.look():
+            values["clock_offset_s"] = f"{offset.seconds:.6f}"
+            values["clock_uncertainty_s"] = f"{offset.uncertainty:.6f}"
+            if offset.warning and level == "ok":
+                level, text = "warning", offset.warning
+        values |= {
             "cpu_percent": f"{self._measure_cpu():.0f}",
             "process": self._process,
             "started": f"{self._started:.3f}",
+            "messages": message_version(),
         }
         status = DiagnosticStatus(
-            level=_LEVELS[health.level],
+            level=_LEVELS[level],
             name=self._node.get_fully_qualified_name(),
-            message=health.message,
+            message=text,
             hardware_id=self._hardware_id,
             values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
         )
         message = DiagnosticArray(status=[status])
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)
-        return health.level
+        return level
 
     def _measure_cpu(self) -> float:
         """Return this process's share of one core [%] since it was last measured."""

@@ -37,8 +37,14 @@ LATCHED = QoSProfile(
 )
 """The last one is kept for those who come later: plans, calibration."""
 
+CLOCKS = QoSProfile(depth=20, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Questions for the time: one that comes late because it was sent again says nothing."""
+
 IMAGES = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """A subscriber of images takes the newest and never queues."""
 
 SENSOR_DATA = qos_profile_sensor_data
 """A publisher of images and camera calibration."""
+
+LEASES = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Signs of an operator: one that a network held up must not come later in place of a newer one."""

@@ -78,7 +78,7 @@ def run_node(
         exit_code = 1
         _complain(node, error)
     finally:
-        exit_code = max(exit_code, _close(node))
+        exit_code = _close(node, exit_code)
         with contextlib.suppress(Exception):
             rclpy.try_shutdown()
     return exit_code
@@ -102,11 +102,10 @@ def _complain(node: Node | None, error: Exception) -> None:
         print(f"error: {text}", file=sys.stderr, flush=True)
 
 
-def _close(node: Node | None) -> int:
-    """Close and destroy a node; return 1 if it could not leave all in order."""
+def _close(node: Node | None, exit_code: int) -> int:
+    """Close and destroy a node; return the exit code, 1 if it could not leave all in order."""
     if node is None:
-        return 0
-    exit_code = 0
+        return exit_code
     try:
         if hasattr(node, "close"):
             node.close()
@@ -114,6 +113,8 @@ def _close(node: Node | None) -> int:
         exit_code = 1
         _complain(node, error)
     with contextlib.suppress(Exception):
+        if exit_code == 0 and hasattr(node, "conclude"):
+            node.conclude()
         node.destroy_node()
     return exit_code
 

@@ -19,12 +19,10 @@ import time
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
-import serial
-
 from pressure_driver import lines
 from pressure_driver.core import DriverCore
 from pressure_driver.following import Duration
-from pressure_driver.lines import Channel
+from pressure_driver.lines import Channel, Line, may_open, open_line, vent_line
 from pressure_driver.protocols import host_protocol
 from pressure_driver.schedule import Origin, Setpoint, TickGrid, Verdict
 
@@ -62,7 +60,7 @@ class BoardProcess:
     """
 
     def __init__(self, settings: Settings, channel: Channel, patience: float) -> None:
-        protocol = host_protocol(settings.protocol, 2 * settings.segment_count)
+        protocol = host_protocol(settings.protocol, 2 * settings.segment_count, settings)
         self.core = DriverCore(protocol, settings, log=self._log)
         self.grid = TickGrid(self.core.machine.schedule.period)
         self.ending = False
@@ -71,7 +69,7 @@ class BoardProcess:
         self._patience = patience
         self._port = settings.port
         self._baud_rate = settings.baud_rate or protocol.baud_rate
-        self._device: serial.Serial | None = None
+        self._line: Line | None = None
         self._bytes_waiting: select.epoll | None = None
         self._bytes_sent = self._bytes_received = self._reconnects = 0
         self._unsent = b""
@@ -90,7 +88,7 @@ class BoardProcess:
     def run(self) -> int:
         """Serve the port until the end; return the exit code."""
         try:
-            self._device = lines.open_port(self._port, self._baud_rate, lines.RELEASE_TIME)
+            self._line = open_line(self._port, self._baud_rate, lines.RELEASE_TIME)
         except (OSError, ValueError) as error:
             self._send("failed", getattr(error, "errno", None), str(error))
             return 1
@@ -184,6 +182,8 @@ class BoardProcess:
             self._send("answer", *self.core.arm())
         elif word == "vent":
             self._send("answer", *self._vent_now())
+        elif word == "lease":
+            self._renew_lease(*content)
         elif word == "end":
             self.end()
 
@@ -194,11 +194,16 @@ class BoardProcess:
             self._refused_at = now
             self._log(f"{verdict.value}: {self.core.machine.schedule.reason}", True)
 
+    def _renew_lease(self, source: str, period: float) -> None:
+        core = self.core
+        if problem := core.machine.leases.renew(source, period, core.clock()):
+            self._log(problem, True)
+
     def _vent_now(self) -> tuple[bool, str]:
         """Vent before the next tick, and before all that waits to be sent."""
         answer = self.core.vent()
         self._drop_unsent()
-        self._write(self.core.emergency())
+        self._write(self.core.emergency()[0])
         return answer
 
     def _show_life(self) -> None:
@@ -216,36 +221,37 @@ class BoardProcess:
     # ------------------------------------------------------------------------------ the port
 
     def _opened(self) -> None:
-        assert self._device is not None
+        assert self._line is not None
         # Edge-triggered: to ask a terminal that has no bytes (as `select` on it does) makes the
         # kernel finish pending deliveries first, which on busy cores takes milliseconds.
         self._bytes_waiting = select.epoll()
-        self._bytes_waiting.register(self._device.fileno(), select.EPOLLIN | select.EPOLLET)
+        self._bytes_waiting.register(self._line.fileno(), select.EPOLLIN | select.EPOLLET)
         self._unread = Duration()
         self._write(self.core.opening())
-        if self._device is not None:
-            command = self.core.emergency().hex()
-            self._send("port", command, descriptor=self._device.fileno())
+        if self._line is not None:
+            commands = [command.hex() for command in self.core.emergency()]
+            descriptor = self._line.fileno() if self._line.shared else None
+            self._send("port", commands, descriptor=descriptor)
 
     def _look_for_port(self) -> None:
         """Open a port that was lost as soon as its name is there again."""
-        if self._device is not None or time.monotonic() < self._retry_at:
+        if self._line is not None or time.monotonic() < self._retry_at:
             return
-        if os.path.exists(self._port):
+        if may_open(self._port):
             self._retry_at = time.monotonic() + RETRY_TIME
             with contextlib.suppress(OSError, ValueError):
-                self._device = lines.open_port(self._port, self._baud_rate)
+                self._line = open_line(self._port, self._baud_rate)
                 self._reconnects += 1
                 self._log(f"{self._port} is back", True)
                 self._opened()
 
     def _watch_queue(self) -> None:
         """Lose the port if what has been written stays where it is: the board does not read."""
-        if self._device is None:
+        if self._line is None:
             return
         now, waiting = self.core.clock(), len(self._unsent)
         with contextlib.suppress(OSError):
-            waiting += self._device.out_waiting
+            waiting += self._line.waiting()
         self._unread.note(waiting > 0, now)
         if self._unread.until(now) > UNREAD_TIME:
             self._lose(
@@ -256,38 +262,37 @@ class BoardProcess:
     def _drop_unsent(self) -> None:
         """Throw away what waits to be sent; a frame may be cut, so a separator must follow."""
         self._unsent = b""
-        if self._device is not None:
-            with contextlib.suppress(Exception):
-                self._device.reset_output_buffer()
+        if self._line is not None:
+            self._line.drop()
 
     def _read(self) -> None:
         """Take the bytes that are there; none means that the device has gone."""
-        assert self._device is not None
+        assert self._line is not None
         assert self._bytes_waiting is not None
         self._bytes_waiting.poll(0)
         try:
-            data = self._device.read(max(self._device.in_waiting, 1))
-        except (serial.SerialException, OSError) as error:
+            data = self._line.read()
+        except OSError as error:
             self._lose(f"reading from {self._port} failed: {error}")
             return
         self._bytes_received += len(data)
-        self.core.received(data)
+        self._write(self.core.received(data))
 
     def _write(self, data: bytes) -> None:
         """Hand bytes to the operating system without ever waiting for it.
 
         What it does not take is sent before the next command; if that is not taken either, the
-        port counts as lost. (pyserial's own `write` waits for the terminal after each write.)
+        port counts as lost.
         """
-        if self._device is None or not data:
+        if self._line is None or not data:
             return
         left_over = len(self._unsent)
         pending = self._unsent + data
         try:
-            count = os.write(self._device.fileno(), pending)
+            count = self._line.write(pending)
         except BlockingIOError:
             count = 0
-        except (serial.SerialException, OSError) as error:
+        except OSError as error:
             self._lose(f"writing to {self._port} failed: {error}")
             return
         self._bytes_sent += count
@@ -307,9 +312,9 @@ class BoardProcess:
     def _release(self, drop: bool) -> None:
         if self._bytes_waiting is not None:
             self._bytes_waiting.close()
-        if self._device is not None:
-            lines.release_port(self._device, drop)
-        self._bytes_waiting = self._device = None
+        if self._line is not None:
+            self._line.close(drop)
+        self._bytes_waiting = self._line = None
 
     # ------------------------------------------------------------------------------- the end
 
@@ -326,11 +331,11 @@ class BoardProcess:
 
     def _send_last_words(self, duration: float) -> str:
         """Repeat the vent command and leave the port; return what is left to be done."""
-        if self._device is None and os.path.exists(self._port):
+        if self._line is None and may_open(self._port):
             with contextlib.suppress(OSError, ValueError):
-                self._device = lines.open_port(self._port, self._baud_rate)
-        descriptor = -1 if self._device is None else self._device.fileno()
-        problem = lines.vent_port(descriptor, self.core.emergency(), duration)
+                self._line = open_line(self._port, self._baud_rate)
+        descriptor = -1 if self._line is None else self._line.fileno()
+        problem = vent_line(descriptor, self.core.emergency(), duration)
         self._release(drop=bool(problem))
         return problem
 

@@ -141,6 +141,7 @@ class DriverCore:
         """What the board has said last in plain words."""
         self.clock = RunningClock(2.0 / settings.rate, steady)
         """Counts the seconds of every patience."""
+        protocol.clock = self.clock
         self.monitor = TelemetryMonitor(protocol, settings)
         self.machine = SafetyMachine(settings, self.monitor, self._conditions)
         self.board = BoardWatch(protocol, settings)
@@ -200,7 +201,7 @@ class DriverCore:
     def highest_pressure(self) -> float:
         """Return the highest gauge pressure [Pa] that was measured; 0 where it counts as none."""
         pressure = max(self.monitor.gauge)
-        return pressure if pressure > self._settings.vented_tolerance else 0.0
+        return pressure if pressure > self.monitor.vented_tolerance else 0.0
 
     def state(self) -> dict[str, Any]:
         """Return the driver at this tick, by the names of `der_msgs/PressureState`, and more."""
@@ -230,6 +231,8 @@ class DriverCore:
             "setpoints_waiting": machine.schedule.waiting,
             "setpoints_of_other_publishers": machine.publishers.refused,
             "last_refusal": machine.schedule.reason,
+            "operators": str(machine.leases),
+            "lost_operator": machine.lost_operator,
             "obstacles_to_arming": self.obstacles(),
             "board": self.board.identity.firmware if self.board.identity else self.last_text,
             "atmosphere_pa": monitor.rest.mean,
@@ -275,9 +278,9 @@ class DriverCore:
         if self._texts:
             self._log(f"board: {self._texts.popleft()}", False)
 
-    def emergency(self) -> bytes:
-        """Return the vent command, complete after any half-sent bytes."""
-        return self.protocol.separator + self._vent_bytes()
+    def emergency(self) -> list[bytes]:
+        """Return the vent commands, complete after any half-sent bytes, to be sent in turn."""
+        return self.protocol.emergency(self._wire_atmosphere())
 
     def _wire_atmosphere(self) -> float:
         return self.monitor.rest.mean if self.monitor.rest.known else STANDARD_ATMOSPHERE
@@ -298,8 +301,8 @@ class DriverCore:
 
     # --------------------------------------------------------------------- from the board
 
-    def received(self, data: bytes) -> None:
-        """Decode what the board has sent."""
+    def received(self, data: bytes) -> bytes:
+        """Decode what the board has sent; return what is to be sent to it at once."""
         now = self.clock()
         rejected = self.protocol.rejected
         events = self.protocol.decode(data)
@@ -307,6 +310,7 @@ class DriverCore:
             self._serve(event, now)
         readings = sum(isinstance(event, Telemetry) for event in events)
         self.monitor.count_lines(readings, self.protocol.rejected - rejected, now)
+        return self.protocol.follow_up()
 
     def lost(self, reason: str) -> None:
         """The port is gone: everything that was armed faults."""
@@ -352,6 +356,9 @@ class DriverCore:
     def _note_mode(self) -> None:
         mode = self.machine.mode
         if mode is not self._last_mode:
-            reasons = ": " + "; ".join(self.machine.faults) if mode is Mode.FAULT else ""
-            self._log(f"{self._last_mode.name} -> {mode.name}{reasons}", mode is Mode.FAULT)
+            lost = self.machine.lost_operator
+            reasons = f": the operator ({lost}) is lost" if lost else ""
+            if mode is Mode.FAULT:
+                reasons = ": " + "; ".join(self.machine.faults)
+            self._log(f"{self._last_mode.name} -> {mode.name}{reasons}", bool(reasons))
             self._last_mode = mode

@@ -31,6 +31,11 @@ def board_emulator() -> int:
     return _run_node("pressure_driver.emulator.node")
 
 
+def topic_board() -> int:
+    """Run the board that a lab's own driver of valves is."""
+    return _run_node("pressure_driver.topic_board.node")
+
+
 def _run_node(module: str) -> int:
     """Run a node, so that what comes is served soon, also while other nodes come and go.
 

@@ -1,4 +1,9 @@
-"""The two lines of the process of the port: the serial one to the board, the socket to the node."""
+"""The lines of the process of the port: to the board, serial or `tcp://`, and to the node.
+
+The line to the board is a descriptor that the process waits for and never waits in. A serial port
+is handed to the driver's node beside the process, which vents through it. A connection is not: what
+the process has sent by halves would be in it, so whoever vents opens one of its own.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +12,7 @@ import errno
 import fcntl
 import json
 import os
+import re
 import socket
 import struct
 import termios
@@ -20,10 +26,13 @@ RELEASE_TIME = 4.0
 VENT_TIME = 1.0
 """[s] for which one process of the driver vents in the place of the other."""
 VENT_PERIOD = 0.05
-"""[s] between two of its vent commands."""
+"""[s] in which each vent command is sent once, by a process that vents in the place of another."""
+CONNECT_TIME = 0.1
+"""[s] for a connection: a board in the same room answers in 0.001 s, and meanwhile nothing runs."""
 ADVICE = "close the air supply"
-IN_USE = (errno.EAGAIN, errno.EBUSY)
-"""Error numbers of a port that another program has."""
+IN_USE = (errno.EAGAIN, errno.EBUSY, errno.EADDRINUSE)
+"""Error numbers of a line that another program has."""
+_ADDRESS = re.compile(r"tcp://(\[[0-9A-Fa-f:.]+\]|[^:/\[\]]+):(\d{1,5})")
 
 
 class Channel:
@@ -63,12 +72,147 @@ class Channel:
         return json.loads(data), descriptors[0] if descriptors else None
 
 
-def open_port(port: str, baud_rate: int, patience: float = 0.0) -> serial.Serial:
-    """Open a serial port for this program alone.
+class Line:
+    """An open line to a board: a serial port, or a connection to a board or to what has its port.
 
     Args:
-        port: its path.
-        baud_rate: [baud].
+        port: path of a serial port, or `tcp://host:port`.
+        baud_rate: [baud] of a serial port.
+        alone: keep other programs of this computer from the same board in a network; the boards
+            themselves listen to several hosts at once. A serial port is always kept.
+
+    Attributes:
+        shared: the descriptor may be given to another process, which vents through it.
+
+    Raises:
+        OSError, ValueError: it does not exist, is in use, or may not be opened; nobody answers.
+    """
+
+    def __init__(self, port: str, baud_rate: int = 0, alone: bool = True) -> None:
+        self.shared = not is_tcp(port)
+        self._device: Any = None
+        self._claim = socket.socket(socket.AF_UNIX)
+        try:
+            if self.shared:
+                options = {"timeout": 0, "write_timeout": 0.05, "exclusive": True}
+                self._device = serial.Serial(port, baud_rate, **options)
+                with contextlib.suppress(OSError):
+                    fcntl.ioctl(self._device.fileno(), termios.TIOCEXCL)
+                return
+            if alone:
+                # A name without a file: the kernel forgets it with the process.
+                self._claim.bind(f"\0limb board at {port}")
+            self._device = socket.create_connection(tcp_address(port), CONNECT_TIME)
+            self._device.setblocking(False)
+            # A command is never held back to wait for more.
+            self._device.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        except (OSError, ValueError):
+            self._claim.close()
+            raise
+
+    def fileno(self) -> int:
+        """Return the descriptor to wait for."""
+        return int(self._device.fileno())
+
+    def read(self) -> bytes:
+        """Return the bytes that are there.
+
+        Raises:
+            OSError: the board has gone.
+        """
+        if self.shared:
+            return bytes(self._device.read(max(self._device.in_waiting, 1)))
+        with contextlib.suppress(BlockingIOError):
+            data: bytes = self._device.recv(1 << 16)
+            if data:
+                return data
+            raise ConnectionResetError(errno.ECONNRESET, "the board has closed the connection")
+        return b""
+
+    def write(self, data: bytes) -> int:
+        """Hand bytes to the operating system without waiting; return how many it has taken.
+
+        Raises:
+            BlockingIOError: it takes none.
+            OSError: the board has gone, or a connection is full: half a frame cannot be taken back.
+        """
+        # pyserial's own `write` waits for the terminal after each write.
+        count = os.write(self.fileno(), data)
+        if count < len(data) and not self.shared:
+            raise OSError(errno.ENOBUFS, "the connection takes no bytes")
+        return count
+
+    def waiting(self) -> int:
+        """Return how many bytes have not left, or over TCP have not been acknowledged."""
+        return _waiting(self.fileno())
+
+    def drop(self) -> None:
+        """Throw away what has not left; of a connection, the kernel gives nothing back."""
+        _flush(self.fileno())
+
+    def close(self, drop: bool) -> None:
+        """Leave the line without waiting for the board.
+
+        The lock of a port is taken off by name: another descriptor of it may live a little longer.
+
+        Args:
+            drop: throw away what has not left; a connection is reset. Not after the last words: a
+                board on a pseudo-terminal may not have read them yet.
+        """
+        with contextlib.suppress(Exception):
+            if drop and self.shared:
+                self.drop()
+            elif drop:
+                now = struct.pack("ii", 1, 0)
+                self._device.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, now)
+        if self.shared:
+            with contextlib.suppress(Exception):
+                release_descriptor(os.dup(self.fileno()))
+        with contextlib.suppress(Exception):
+            self._device.close()
+        self._claim.close()
+
+
+def is_tcp(port: str) -> bool:
+    """Return whether a line is a connection and no serial port."""
+    return port.startswith("tcp:")
+
+
+def tcp_address(port: str) -> tuple[str, int]:
+    """Return host and number of `tcp://host:port`.
+
+    Raises:
+        OSError: it is written otherwise.
+    """
+    found = _ADDRESS.fullmatch(port)
+    if not found or not 0 < int(found[2]) < 1 << 16:
+        raise OSError(errno.EINVAL, f"'{port}' is no address: write tcp://host:port")
+    return found[1].strip("[]"), int(found[2])
+
+
+def numeric_address(port: str) -> str:
+    """Return `tcp://host:port` with the number of the host, so that nobody waits for a name again.
+
+    Raises:
+        OSError: the name of the host is not known.
+    """
+    host, number = tcp_address(port)
+    family, _, _, _, address = socket.getaddrinfo(host, number, type=socket.SOCK_STREAM)[0]
+    host = f"[{address[0]}]" if family == socket.AF_INET6 else str(address[0])
+    return f"tcp://{host}:{number}"
+
+
+def may_open(port: str) -> bool:
+    """Return whether it is worth while to try to open a line: a serial port must have its file."""
+    return is_tcp(port) or os.path.exists(port)
+
+
+def open_line(port: str, baud_rate: int, patience: float = 0.0) -> Line:
+    """Open a line for this program alone.
+
+    Args:
+        port: path of a serial port, or `tcp://host:port`.
+        baud_rate: [baud] of a serial port.
         patience: [s] to wait for another program to leave it.
 
     Raises:
@@ -77,43 +221,21 @@ def open_port(port: str, baud_rate: int, patience: float = 0.0) -> serial.Serial
     deadline = time.monotonic() + patience
     while True:
         try:
-            device = serial.Serial(port, baud_rate, timeout=0, write_timeout=0.05, exclusive=True)
-            break
+            return Line(port, baud_rate)
         except OSError as error:
             if error.errno not in IN_USE or time.monotonic() >= deadline:
                 raise
         time.sleep(0.1)
-    with contextlib.suppress(OSError):
-        fcntl.ioctl(device.fileno(), termios.TIOCEXCL)
-    return device
 
 
-def release_port(device: serial.Serial, drop: bool = True) -> None:
-    """Close a port without waiting for the board.
-
-    The lock is taken off by name: another descriptor of the same port may live a little longer.
+def vent_line(descriptor: int, commands: list[bytes], duration: float) -> str:
+    """Send the vent commands again and again, before all that waits to be sent.
 
     Args:
-        device: the port.
-        drop: throw away what waits in its output queue, for which the kernel would wait. Not after
-            the last words: a board on a pseudo-terminal may not have read them yet.
-    """
-    if drop:
-        with contextlib.suppress(Exception):
-            device.reset_output_buffer()
-    with contextlib.suppress(Exception):
-        release_descriptor(os.dup(device.fileno()))
-    with contextlib.suppress(Exception):
-        device.close()
-
-
-def vent_port(descriptor: int, command: bytes, duration: float) -> str:
-    """Send the vent command again and again, before all that waits to be sent.
-
-    Args:
-        descriptor: of the open port; −1 if there is none.
-        command: opens every chamber, complete after any half-sent bytes.
-        duration: [s] for which it is repeated: bytes may be damaged.
+        descriptor: of the open line; −1 if there is none.
+        commands: open every chamber, complete after any half-sent bytes. They are sent in turn: a
+            board on a bus must have answered before the next is spoken to.
+        duration: [s] for which they are repeated: bytes may be damaged.
 
     Returns:
         What is left to be done, or nothing if the last command has left.
@@ -122,22 +244,34 @@ def vent_port(descriptor: int, command: bytes, duration: float) -> str:
         return f"the board cannot be reached: {ADVICE}"
     taken, end = False, time.monotonic() + duration
     try:
-        termios.tcflush(descriptor, termios.TCOFLUSH)
+        _flush(descriptor)
         while time.monotonic() < end:
-            try:
-                taken = os.write(descriptor, command) == len(command)
-            except BlockingIOError:
-                taken = False
-                termios.tcflush(descriptor, termios.TCOFLUSH)
-            time.sleep(VENT_PERIOD)
-        (waiting,) = struct.unpack("i", fcntl.ioctl(descriptor, termios.TIOCOUTQ, bytes(4)))
+            for command in commands:
+                try:
+                    taken = os.write(descriptor, command) == len(command)
+                except BlockingIOError:
+                    taken = False
+                    _flush(descriptor)
+                time.sleep(VENT_PERIOD / len(commands))
+        waiting = _waiting(descriptor)
     except (OSError, termios.error) as error:
         return f"the port is gone ({error}): {ADVICE}"
     return "" if taken and not waiting else f"the board takes no bytes: {ADVICE}"
 
 
+def vent_anew(port: str, commands: list[bytes], duration: float) -> str:
+    """Vent over a connection of its own, as `vent_line` does; return what is left to be done."""
+    try:
+        line = Line(port, alone=False)
+    except OSError as error:
+        return f"the board cannot be reached ({error}): {ADVICE}"
+    problem = vent_line(line.fileno(), commands, duration)
+    line.close(drop=bool(problem))
+    return problem
+
+
 def release_descriptor(descriptor: int) -> None:
-    """Close a descriptor of a port, if there is one, and take off the locks of the port."""
+    """Close a descriptor of a serial port, if there is one, and take off the locks of the port."""
     if descriptor < 0:
         return
     with contextlib.suppress(OSError):
@@ -146,6 +280,18 @@ def release_descriptor(descriptor: int) -> None:
         fcntl.flock(descriptor, fcntl.LOCK_UN)
     with contextlib.suppress(OSError):
         os.close(descriptor)
+
+
+def _flush(descriptor: int) -> None:
+    """Throw away what is in the output queue of a terminal; a connection has none to throw away."""
+    with contextlib.suppress(termios.error):
+        termios.tcflush(descriptor, termios.TCOFLUSH)
+
+
+def _waiting(descriptor: int) -> int:
+    """Return how many bytes have not left a terminal, or have not been acknowledged over TCP."""
+    (waiting,) = struct.unpack("i", fcntl.ioctl(descriptor, termios.TIOCOUTQ, bytes(4)))
+    return int(waiting)
 
 
 def prefer_thread(priority: int) -> bool:

@@ -13,7 +13,7 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
-from der_msgs.msg import PressureSetpoint, PressureState
+from der_msgs.msg import OperatorLease, PressureSetpoint, PressureState
 from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.parameters import ParameterError, check_overrides, declare
@@ -34,6 +34,8 @@ CALLS = QoSProfile(depth=1000)
 """Of `arm` and `vent`: the middleware's depth of 10 loses requests that come at once."""
 STATE_FIELDS = set(PressureState.get_fields_and_field_types()) - {"header", "setpoint_stamp"}
 """Of the message, by the names of the state; what else the state has is for the diagnostics."""
+LONGEST_NAME = 100
+"""Characters of the source of a lease that are kept."""
 LATE_TICKS = 1200
 """Ticks over which it is told how late their bytes are written: a minute."""
 
@@ -73,7 +75,7 @@ class PressureDriver(Node):
                 "parameter 'use_sim_time' is true: the driver moves air in real time; leave it out"
             )
         settings = read_settings(self, Settings)
-        self._protocol = host_protocol(settings.protocol, 2 * settings.segment_count)
+        self._protocol = host_protocol(settings.protocol, 2 * settings.segment_count, settings)
         self._state: dict[str, Any] = {}
         self._late: deque[float] = deque(maxlen=LATE_TICKS)
         self._state_publisher = self.create_publisher(
@@ -92,9 +94,10 @@ class PressureDriver(Node):
             self._on_setpoint,
             qos.SETPOINTS,
         )
+        self.create_subscription(OperatorLease, topics.OPERATOR_LEASE, self._on_lease, qos.LEASES)
         if settings.accept_cmd_u_t:
             self.create_subscription(Float64MultiArray, CMD_U_T, self._on_cmd_u_t, qos.SETPOINTS)
-        DiagnosticsPublisher(self, self._report, hardware_id=settings.port)
+        DiagnosticsPublisher(self, self._report, settings.port, clock_of_all=True)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(LIFE_PERIOD, self._show_life, clock=steady)
         self.get_logger().info(
@@ -117,6 +120,9 @@ class PressureDriver(Node):
         """Untimed differences in hPa, as labs publish them from MATLAB."""
         differential = [value * PASCAL_PER_HECTOPASCAL for value in message.data]
         self._offer((0, differential, "", 0, 0), CMD_U_T, info)
+
+    def _on_lease(self, message: OperatorLease) -> None:
+        self._port.send("lease", message.source[:LONGEST_NAME], message.period)
 
     def _offer(self, setpoint: tuple[object, ...], topic: str, info: dict[str, int]) -> None:
         alone = self.count_publishers(topic) <= 1
@@ -178,6 +184,9 @@ class PressureDriver(Node):
         }
         if state["faults"]:
             return Health("error", f"FAULT: {_written(state['faults'])}", values)
+        if state["lost_operator"]:
+            said = f"{mode}; the operator ({state['lost_operator']}) is lost: arm to go on"
+            return Health("warning", said, values)
         if mode == "DISARMED" and state["obstacles_to_arming"]:
             level = "error" if math.isfinite(state["atmosphere_pa"]) else "stale"
             return Health(level, f"waiting for: {_written(state['obstacles_to_arming'])}", values)

@@ -1,10 +1,10 @@
 """The node's end of the process of the port: it starts it, talks with it, and vents if it dies.
 
 Messages are JSON lists that begin with a word. From the node: ``setpoint``, ``arm``, ``vent``,
-``alive``, ``end``. To the node:
+``lease``, ``alive``, ``end``. To the node:
 
 =========== ==================================================================================
-``port``    the port has been opened: vent command (hexadecimal), with the port's descriptor
+``port``    the line is open: vent commands (hexadecimal), with the descriptor of a serial port
 ``lost``    the port is gone
 ``failed``  the port cannot be opened: the number of the error or null, its text
 ``state``   the state at each tick, by names
@@ -35,7 +35,7 @@ from typing import Any
 from serial.tools import list_ports
 
 from pressure_driver import lines
-from pressure_driver.lines import Channel
+from pressure_driver.lines import Channel, is_tcp, numeric_address
 from pressure_driver.settings import Settings
 
 STABLE_NAMES = Path("/dev/serial/by-id")
@@ -54,7 +54,7 @@ END_TIME = 6.0
 
 
 class PortError(RuntimeError):
-    """The serial port cannot be used; the message names it, the cause and the remedy."""
+    """The line to the board cannot be used; the message names it, the cause and the remedy."""
 
 
 def available_ports() -> list[str]:
@@ -67,7 +67,14 @@ def available_ports() -> list[str]:
 
 
 def stable_name(port: str) -> str:
-    """Return the by-id name of a port, which survives re-plugging, or the name itself."""
+    """Return the by-id name of a serial port, which survives re-plugging, or a host's number.
+
+    A name that nobody knows is returned as it is.
+    """
+    if is_tcp(port):
+        with contextlib.suppress(OSError):
+            return numeric_address(port)
+        return port
     if STABLE_NAMES.is_dir():
         for path in sorted(STABLE_NAMES.iterdir()):
             if os.path.realpath(path) == os.path.realpath(port):
@@ -78,6 +85,8 @@ def stable_name(port: str) -> str:
 def explain(port: str, error: OSError) -> str:
     """Return a sentence with the cause and the remedy of a port that does not open."""
     number = error.errno
+    if is_tcp(port):
+        return _explain_connection(port, error)
     ports = ", ".join(available_ports()) or "none"
     if not Path(port).exists() or number == errno.ENOENT:
         return (
@@ -94,6 +103,17 @@ def explain(port: str, error: OSError) -> str:
     if number in (errno.EACCES, errno.EPERM):
         return f"no permission to open {port}: sudo usermod -a -G dialout $USER, then log in again"
     return f"cannot open serial port {port}: {error}; ports that exist: {ports}"
+
+
+def _explain_connection(port: str, error: OSError) -> str:
+    if error.errno in lines.IN_USE:
+        return f"another program of this computer has the board at {port}: end it"
+    if error.errno == errno.EINVAL or (error.errno or 0) < 0:  # of the look-up of a name
+        return f"{port}: {error.strerror}; set the parameter 'port'"
+    return (
+        f"no board answers at {port} ({error}): look at its power, its cable and whether this "
+        "computer has an address in its network, or set the parameter 'port'"
+    )
 
 
 class PortProcess:
@@ -114,7 +134,7 @@ class PortProcess:
         self._settings = replace(settings, port=stable_name(settings.port))
         self._on_message = on_message
         self._answers: queue.Queue[tuple[bool, str]] = queue.Queue()
-        self._vent_command = b""
+        self._vent_commands: list[bytes] = []
         self._descriptor = -1
         self._outcome: str | None = None
         self._thread = threading.Thread(target=self._listen, name="port process", daemon=True)
@@ -206,7 +226,10 @@ class PortProcess:
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(LOOK)
         if self._outcome is None:
-            problem = lines.vent_port(self._descriptor, self._vent_command, lines.VENT_TIME)
+            if is_tcp(self._settings.port):
+                problem = lines.vent_anew(self._settings.port, self._vent_commands, lines.VENT_TIME)
+            else:
+                problem = lines.vent_line(self._descriptor, self._vent_commands, lines.VENT_TIME)
             told = f"the vent command was sent for {lines.VENT_TIME:g} s; see that it has vented"
             self.error = f"{reason}: {problem or told}"
         lines.release_descriptor(self._descriptor)
@@ -219,7 +242,7 @@ class PortProcess:
                 os.close(self._descriptor)
             self._descriptor = -1 if descriptor is None else descriptor
         if word == "port":
-            self._vent_command = bytes.fromhex(content[0])
+            self._vent_commands = [bytes.fromhex(text) for text in content[0]]
         elif word == "state":
             self.states.append(content[0])
         elif word == "log":

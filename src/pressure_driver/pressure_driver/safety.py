@@ -8,6 +8,7 @@
         |               |                        +---------setpoint due------- VENTING (ramp) <-+
         |               +-------------------------------at zero differential------+
         |
+        |  a lost operator: hold or ramp, then as after vent
         +--chambers are down-- VENTING (latched) <--vent-- any state but FAULT and DISARMED
 
     any state --something failed--> FAULT (vented) --arm, once the cause is gone--> ARMED
@@ -51,6 +52,43 @@ class Mode(IntEnum):
 MOST_FAULTS = 16
 """Reasons that are kept; more would only be more of the same."""
 LIVE = (Mode.ARMED, Mode.TRACKING, Mode.HOLDING, Mode.VENTING)
+MOST_LEASES = 16
+"""Operators that are known at once."""
+LONGEST_LEASE = 60.0
+"""[s] A longer promise says nothing."""
+
+
+class OperatorLeases:
+    """Who has promised to be heard again soon, because somebody watches the limb there."""
+
+    def __init__(self) -> None:
+        self._until: dict[str, float] = {}
+
+    def renew(self, source: str, period: float, now: float) -> str:
+        """Take a promise to be heard again within a period [s]; 0 gives it up on purpose.
+
+        Returns:
+            Why it is not taken, or nothing.
+        """
+        if not 0.0 <= period <= LONGEST_LEASE:
+            return f"the lease of '{source}' lasts {period:g} s: give 0 to {LONGEST_LEASE:g} s"
+        if period == 0.0:
+            self._until.pop(source, None)
+        elif source in self._until or len(self._until) < MOST_LEASES:
+            self._until[source] = now + period
+        else:
+            return f"the lease of '{source}' would be one of more than {MOST_LEASES}"
+        return ""
+
+    def ended(self, now: float) -> list[str]:
+        """Return, once, who has not been heard again (steady clock [s])."""
+        ended = [source for source, until in self._until.items() if now > until]
+        for source in ended:
+            del self._until[source]
+        return ended
+
+    def __str__(self) -> str:
+        return ", ".join(self._until) or "none"
 
 
 class SafetyMachine:
@@ -75,6 +113,9 @@ class SafetyMachine:
         self.faults: list[str] = []
         """Why the mode is FAULT, worst first."""
         self.publishers = PublisherGate()
+        self.leases = OperatorLeases()
+        self.lost_operator = ""
+        """Whose lease has ended since the last arming: until the next, nothing is taken."""
         self.limited_ticks = 0
         """Ticks at which the output was held back by the slew limit."""
         self._settings = settings
@@ -100,7 +141,7 @@ class SafetyMachine:
         Returns:
             Whether the driver is armed, and a sentence.
         """
-        if self.mode in LIVE and not self._latched:
+        if self.mode in LIVE and not self._latched and not self.lost_operator:
             if self.mode is Mode.ARMED:
                 self.publishers.release()
             return True, f"already armed ({self.mode.name})"
@@ -108,7 +149,7 @@ class SafetyMachine:
         if obstacles:
             return False, "not armed: " + "; ".join(obstacles)
         self.faults = []
-        self._latched = False
+        self._latched, self.lost_operator = False, ""
         self.schedule.clear()
         self.publishers.release()
         self.monitor.restart_following(now)
@@ -144,10 +185,12 @@ class SafetyMachine:
             origin: where it came from; None inside one program.
         """
         plan = setpoint.plan_id
-        if self.mode not in LIVE or self._latched:
+        if self.mode not in LIVE or self._latched or self.lost_operator:
             self._spent.hear(plan, now)
             self._spent.spend()
-            return self.schedule.refuse(setpoint, f"refused while {self.mode.name}: arm first")
+            lost = f", the operator ({self.lost_operator}) is lost" if self.lost_operator else ""
+            reason = f"refused while {self.mode.name}{lost}: arm first"
+            return self.schedule.refuse(setpoint, reason)
         reason = self._spent.refuse(plan, now)
         if not reason and origin is not None:
             reason = self.publishers.refuse(origin)
@@ -159,6 +202,23 @@ class SafetyMachine:
     def fail(self, reason: str) -> None:
         """Go to FAULT for a reason from outside (the line, the board's own report)."""
         self._fault([reason])
+
+    def _lose_operator(self, source: str, now: float) -> None:
+        """Hold, let down or vent as `on_lost_operator` says, until DISARMED; take nothing more."""
+        if self.mode not in LIVE or self._latched:
+            return
+        self.lost_operator = source
+        policy = self._settings.on_lost_operator
+        if policy == "vent" or self.mode is Mode.ARMED:
+            self.vent(now)
+            return
+        self._spent.spend()
+        self.schedule.clear()
+        if policy == "ramp":
+            self.mode = Mode.VENTING
+        elif self.mode is Mode.TRACKING:
+            self.mode = Mode.HOLDING
+            self._fresh_at = now - self._settings.setpoint_timeout
 
     def _drop_plans(self) -> None:
         """Forget every setpoint, and refuse the rest of their plans from now on."""
@@ -182,6 +242,8 @@ class SafetyMachine:
         Returns:
             Whether the board is to be told to vent instead.
         """
+        if lost := self.leases.ended(now):
+            self._lose_operator(", ".join(lost), now)
         sample = self.schedule.sample(tick, self.differential)
         self._look_for_faults(now)
         if self.mode in (Mode.DISARMED, Mode.FAULT):
@@ -214,6 +276,8 @@ class SafetyMachine:
             self.mode = Mode.VENTING
         if self.mode is Mode.VENTING:
             self._ramp_down()
+        if self.lost_operator and self.mode is Mode.ARMED:
+            self.vent(now)
 
     def _approach_target(self) -> None:
         """Move what is commanded to what is wanted, by no more than the slew limit allows a tick.

@@ -14,6 +14,10 @@ from typing import Any, NamedTuple, TypeVar
 
 from pressure_driver.protocols import NAMES
 
+TERMINALS = ("vtem", "mpa")
+TERMINAL = "valves of a `festo` terminal: a motion terminal, or VPPM regulators"
+SENSOR_RANGE = "of the sensors of a `pneudrive` board, whose counts are a thousandth of it"
+
 
 class SettingError(ValueError):
     """A parameter has a value that the driver cannot work with; the message names both."""
@@ -57,11 +61,15 @@ class Settings:
 
     port: str = _other(
         "/dev/ttyACM0",
-        "serial port of the board; better its name under /dev/serial/by-id, which survives "
-        "re-plugging",
+        "serial port of the board, better its name under /dev/serial/by-id, which survives "
+        "re-plugging; or tcp://host:port",
     )
     protocol: str = _other("ezloop", "language of the board", NAMES)
-    baud_rate: int = _number(0, "baud", 0, 4_000_000, "0: what the protocol says, 115200")
+    baud_rate: int = _number(
+        0, "baud", 0, 4_000_000, "0: what the protocol says, 1000000 for `pneudrive`, else 115200"
+    )
+    terminal: str = _other("vtem", TERMINAL, TERMINALS)
+    sensor_range: float = _number(689_500.0, "Pa", 1e3, 1e7, SENSOR_RANGE)
     rate: float = _number(20.0, "Hz", 1.0, 100.0, "ticks, on an absolute grid")
     real_time_priority: int = _number(
         10, "", 0, 90, "SCHED_FIFO of the port's process; 0: none; ignored without the right to it"
@@ -84,6 +92,13 @@ class Settings:
     )
     setpoint_timeout: float = _number(0.2, "s", 0.05, 60.0, "without a next setpoint until HOLDING")
     hold_time: float = _number(1.0, "s", 0.0, 600.0, "of HOLDING until the ramp down")
+    on_lost_operator: str = _other(
+        "ramp",
+        "when an operator's lease ends while armed: keep the pressures for hold_time and then let "
+        "them down; let them down; vent at once. DISARMED afterwards; without a lease nothing "
+        "changes",
+        ("hold", "ramp", "vent"),
+    )
     vent_rate: float = _number(10_000.0, "Pa/s", 100.0, 1e6, "of the ramp down")
     vent_timeout: float = _number(10.0, "s", 0.5, 120.0, "a vent may take before it is a fault")
     telemetry_timeout: float = _number(0.5, "s", 0.06, 60.0, "without chamber pressures")
@@ -147,9 +162,14 @@ class Settings:
 class EmulatorSettings:
     """The parameters of the emulated board."""
 
-    port_link: str = _other("/tmp/der_limb_board_0", "symbolic link to the pseudo-terminal")
+    port_link: str = _other(
+        "/tmp/der_limb_board_0",
+        "symbolic link to the pseudo-terminal, or tcp://host:port to listen at",
+    )
     protocol: str = _other("ezloop", "language of the board", NAMES)
     baud_rate: int = _number(115_200, "baud", 0, 4_000_000, "pace of the bytes; 0: none")
+    terminal: str = _other("vtem", TERMINAL, TERMINALS)
+    sensor_range: float = _number(689_500.0, "Pa", 1e3, 1e7, SENSOR_RANGE)
     segment_count: int = _number(2, "", 1, 16, "pairs of chambers")
     seed: int = _number(0, "", 0, 2**62, "of sensors, valves and the day's atmosphere")
     reset_on_open: bool = _other(True, "opening the port restarts the board")
@@ -157,17 +177,40 @@ class EmulatorSettings:
     faults: str = _other("", 'e.g. "stick:1,leak:2"; may be set while it runs', changeable=True)
 
 
-NODES: dict[str, type[Settings] | type[EmulatorSettings]] = {
+@dataclass(frozen=True)
+class TopicBoardSettings:
+    """The parameters of the board that a lab's own driver of valves is."""
+
+    listen: str = _other("tcp://127.0.0.1:5021", "where the driver finds it, as its port")
+    message: str = _other(
+        "Float64MultiArray",
+        "of both topics: one array, or one `FluidPressure` for each chamber",
+        ("Float64MultiArray", "FluidPressure"),
+    )
+    command_topic: str = _other(
+        "/valves/command", "pressures to regulate to; {} stands for the place of a chamber"
+    )
+    measured_topic: str = _other("/valves/measured", "pressures that are measured, as above")
+    scale: float = _number(1.0, "1/Pa", 1e-9, 1e9, "of the topics: 0.001 where they are in kPa")
+    offset: float = _number(0.0, "", -1e9, 1e9, "added to scaled pressures")
+    absolute: bool = _other(False, "the topics have absolute pressures")
+    order: str = _other("0,1,2,3", "the chamber at each place of the topics")
+    atmosphere: float = _number(101_325.0, "Pa", 5e4, 1.1e5, "of the room")
+    segment_count: int = _number(2, "", 1, 16, "pairs of chambers")
+    largest_pressure: float = _number(30_000.0, "Pa", 0.0, 1e6, "gauge, that the valves take")
+
+
+NodeSettings = Settings | EmulatorSettings | TopicBoardSettings
+NODES: dict[str, type[NodeSettings]] = {
     "pressure_driver": Settings,
     "board_emulator": EmulatorSettings,
+    "topic_board": TopicBoardSettings,
 }
 """The parameters of each node."""
-Declared = TypeVar("Declared", Settings, EmulatorSettings)
+Declared = TypeVar("Declared", Settings, EmulatorSettings, TopicBoardSettings)
 
 
-def declarations(
-    settings: type[Settings] | type[EmulatorSettings],
-) -> Iterator[tuple[str, Declaration, Any]]:
+def declarations(settings: type[NodeSettings]) -> Iterator[tuple[str, Declaration, Any]]:
     """Yield name, declaration and default of each parameter."""
     each: Field[Any]
     for each in fields(settings):

@@ -68,14 +68,20 @@ class RestPressures:
     Args:
         chamber_count: 2M.
         atmosphere: [Pa] absolute if it is known; 0 to measure it.
+        resolution: [Pa] of one step of the readings, which may flicker by as much.
     """
 
-    def __init__(self, chamber_count: int, atmosphere: float = 0.0) -> None:
+    def __init__(
+        self, chamber_count: int, atmosphere: float = 0.0, resolution: float = 0.0
+    ) -> None:
         self.pressure = [atmosphere or math.nan] * chamber_count
         """(2M,) [Pa] absolute, what each sensor reads when vented; NaN until measured."""
         self.mean = fmean(self.pressure)
         """[Pa] of them; NaN until they are all known."""
         self._given = bool(atmosphere)
+        self._largest_spread = REST_SPREAD + resolution
+        self._largest_drift = REST_DRIFT + resolution / 2.0
+        self._largest_offset = LARGEST_OFFSET + resolution
         self._window: deque[tuple[float, Sequence[float]]] = deque()
         self._problem = NOT_STEADY
         self._lowest = [math.inf] * chamber_count
@@ -109,7 +115,8 @@ class RestPressures:
         half = len(window) // 2
         chambers = list(zip(*(each for _, each in window), strict=True))
         if now - window[0][0] < REST_TIME or any(
-            abs(fmean(values[half:]) - fmean(values[:half])) > REST_DRIFT for values in chambers
+            abs(fmean(values[half:]) - fmean(values[:half])) > self._largest_drift
+            for values in chambers
         ):
             self._problem = NOT_STEADY
             return
@@ -127,16 +134,16 @@ class RestPressures:
                 f"{high:.0f} Pa): let trapped air out, or set the parameter 'atmosphere' to what a "
                 "barometer reads"
             )
-        if most - least > LARGEST_OFFSET:
+        if most - least > self._largest_offset:
             return (
                 f"chambers read {least:.0f} to {most:.0f} Pa: vented they agree within "
-                f"{LARGEST_OFFSET:.0f} Pa"
+                f"{self._largest_offset:.0f} Pa"
             )
         chambers = zip(*(each for _, each in self._window), strict=True)
-        if any(max(values) - min(values) > REST_SPREAD for values in chambers):
+        if any(max(values) - min(values) > self._largest_spread for values in chambers):
             return NOT_STEADY
         higher = max(now - before for now, before in zip(newest, self._lowest, strict=True))
-        if higher > LARGEST_OFFSET:
+        if higher > self._largest_offset:
             return (
                 f"chambers rest {higher:.0f} Pa higher than before: let trapped air out, or start "
                 "the driver again"
@@ -154,8 +161,10 @@ class TelemetryMonitor:
 
     def __init__(self, protocol: HostProtocol, settings: Settings) -> None:
         count = protocol.chamber_count
-        self.rest = RestPressures(count, settings.atmosphere)
+        self.rest = RestPressures(count, settings.atmosphere, protocol.resolution)
         self.valve_opening = [math.nan] * count
+        self.vented_tolerance = max(settings.vented_tolerance, 1.5 * protocol.resolution)
+        """[Pa] gauge that counts as vented."""
         self.supply_pressure = math.nan
         self._settings = settings
         self._protocol = protocol
@@ -193,7 +202,7 @@ class TelemetryMonitor:
 
     def vented(self) -> bool:
         """Tell whether every chamber reads about its rest pressure."""
-        return all(abs(value) <= self._settings.vented_tolerance for value in self.gauge)
+        return all(abs(value) <= self.vented_tolerance for value in self.gauge)
 
     # ---------------------------------------------------------------------------- readings
 
@@ -248,7 +257,7 @@ class TelemetryMonitor:
         else:
             self.rest.forget_readings()
         gauge = self.gauge
-        self._below_rest.note(min(gauge) < -BELOW_REST, now)
+        self._below_rest.note(min(gauge) < -(BELOW_REST + self._protocol.resolution), now)
         for chamber, value, opening in zip(self._following, gauge, self.valve_opening, strict=True):
             chamber.receive(value, opening, now)
 

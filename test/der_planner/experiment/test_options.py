@@ -7,6 +7,7 @@ import pytest
 from der_planner.commands.run_experiment import Ledger
 from der_planner.experiment.console import OptionError
 from der_planner.experiment.options import parse
+from der_planner.experiment.processes import GraphSetup, Hardware
 from der_planner.limb import Limb, PointMass
 
 
@@ -23,6 +24,8 @@ from der_planner.limb import Limb, PointMass
         (["--page", "70000"], "--page is 70000"),
         (["--page", "--offline"], "does not go with --offline"),
         (["--library", "/nowhere"], "/nowhere is no folder"),
+        (["--board", "arduino"], "unknown board 'arduino'"),
+        (["--board", "festo", "--offline"], "--offline has no board"),
     ],
 )
 def test_a_bad_option_is_refused_by_its_name(arguments, named):
@@ -38,6 +41,27 @@ def test_hardware_without_its_serial_device_is_refused(tmp_path: Path):
     rig.write_text("pump: {}\n")
     with pytest.raises(OptionError, match="unknown key 'pump'"):
         parse(["--hardware", str(rig)])
+
+
+def test_a_node_of_another_computer_is_marked_and_keeps_its_parameters_there(tmp_path: Path):
+    rig = tmp_path / "rig.yaml"
+    rig.write_text("driver: {port: tcp://valves:502}\ntracker: {host: camera-pc}\n")
+    hardware = Hardware.from_yaml(rig)
+    nodes = GraphSetup(tmp_path, {}, hardware=hardware).nodes("")
+    assert {node.executable: node.host for node in nodes if node.host} == {
+        "apriltag_tracker": "camera-pc"
+    }
+    rig.write_text("driver: {host: valve-pc}\n")
+    assert Hardware.from_yaml(rig).place == "valve-pc"
+    rig.write_text("driver: {host: valve-pc, port: /dev/ttyACM0}\n")
+    with pytest.raises(OptionError, match=r"on valve-pc: give its parameters \(port\) there"):
+        Hardware.from_yaml(rig)
+
+
+def test_the_twin_has_the_board_that_is_named(tmp_path: Path):
+    board, driver, *_ = GraphSetup(tmp_path, {}, board="festo").nodes("tcp://127.0.0.1:5020")
+    assert board.parameters["protocol"] == driver.parameters["protocol"] == "festo"
+    assert board.parameters["port_link"] == driver.parameters["port"] == "tcp://127.0.0.1:5020"
 
 
 def test_trials_share_seeds_between_models_and_differ_between_trials():

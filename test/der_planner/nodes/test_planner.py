@@ -177,3 +177,54 @@ def test_the_action_tells_how_it_goes_and_how_it_ended(planner):
     handle.cancel_goal_async()
     assert result_of(cut).result.outcome == "stopped"
     assert len(node.received("cut")) < len(node.wait_plan("cut").time)
+
+
+def test_a_plan_belongs_to_the_arming_in_which_it_was_asked_for(planner):
+    """Asked for while disarmed, by topic or action, it is refused at once and never plays."""
+    from rclpy.action import ActionClient
+
+    from der_msgs.action import PlayMotion
+    from der_msgs.msg import MotionCommand, PressureState
+    from limb_interfaces import qos, topics
+
+    node = planner()
+    client = node.client
+    mode = PressureState.DISARMED
+    driver = client.node.create_publisher(PressureState, topics.PRESSURE_STATE, qos.STATES)
+
+    def tick():
+        state = PressureState(mode=mode)
+        state.header.stamp = client.node.get_clock().now().to_msg()
+        driver.publish(state)
+
+    def hears(name):
+        client.wait_for(lambda: node.state()["driver"] == name, 30.0, f"the planner to hear {name}")
+
+    client.node.create_timer(0.05, tick)
+    hears("DISARMED")
+    node.command(plan_id="early", period=60.0)
+    refused = "early: the driver is DISARMED"
+    client.wait_for(lambda: refused in node.state()["last_refusal"], 30.0, "the refusal")
+    action = ActionClient(client.node, PlayMotion, "planner/play_motion")
+    client.wait_for(action.server_is_ready, 30.0, "the action")
+    command = MotionCommand(motion="asynchronous", amplitude=0.3, period=60.0, cycles=1)
+    sent = action.send_goal_async(PlayMotion.Goal(command=command))
+    client.wait_for(sent.done, 30.0, "the goal to be accepted")
+    answer = sent.result().get_result_async()
+    client.wait_for(answer.done, 30.0, "the result")
+    assert answer.result().result.outcome == "refused"
+    assert "DISARMED" in answer.result().result.reason
+
+    mode = PressureState.ARMED
+    hears("ARMED")
+    node.command(plan_id="halted", period=600.0)  # it takes longer to plan than to disarm
+    client.wait_for(lambda: node.state()["plan_id"] == "halted", 30.0, "it to be planned")
+    mode = PressureState.FAULT
+    refused = "halted: the driver is in FAULT"
+    client.wait_for(lambda: refused in node.state()["last_refusal"], 30.0, "it to be refused")
+    mode = PressureState.ARMED
+    hears("ARMED")
+    node.command(plan_id="later", period=2.0)
+    node.wait_state("done")
+    assert {message.plan_id for _, message in node.setpoints} == {"later"}
+    assert {plan.plan_id for plan in node.plans} == {"later"}

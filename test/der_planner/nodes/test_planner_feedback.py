@@ -8,6 +8,25 @@ import pytest
 pytestmark = pytest.mark.graph
 
 
+def test_pictures_from_the_future_are_left_out_and_named_once():
+    from der_msgs.msg import LimbState
+    from der_planner.nodes.planner_feedback import Corrector
+    from limb_interfaces.stamps import stamp_from_nanoseconds
+
+    said = []
+    corrector = Corrector(None, said.append, lambda: 1_700_000_000_000_000_000)
+    taken = []
+    corrector._post = taken.append
+    for ahead in (9, 30, 31):
+        state = LimbState(valid=True, bend_angle=[0.1, 0.1])
+        state.header.stamp = stamp_from_nanoseconds(1_700_000_000_000_000_000 + ahead * 1_000_000)
+        corrector.add_state(state)
+    corrector.close()
+    assert len(taken) == 1
+    (text,) = said
+    assert "pictures come from 30 ms in the future" in text
+
+
 def test_solutions_that_take_too_long_never_hold_up_the_plan():
     """Every command comes too late: setpoints go out meanwhile, and then the plan is left alone."""
     from der_msgs.msg import LimbState

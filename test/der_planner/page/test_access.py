@@ -8,8 +8,16 @@ import pytest
 from fastapi import FastAPI, WebSocket
 from fastapi.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
+from waiting import Clock
 
-from der_planner.page.access import AccessError, AccessFilter, Binding, Desk
+from der_planner.page.access import (
+    KEPT,
+    MOST_WINDOWS,
+    AccessError,
+    AccessFilter,
+    Binding,
+    Desk,
+)
 
 TOKEN = "a token of this test"
 HOST = "127.0.0.1:8080"
@@ -111,21 +119,47 @@ def test_other_pages_read_nothing_but_may_link_here(access: AccessFilter) -> Non
 
 
 def test_one_commands_and_others_watch() -> None:
-    lost: list[str] = []
-    desk = Desk(lambda: lost.append("operator"))
-    desk.connected("a", "tab 1")
-    desk.connected("b", "tab 2")
+    clock = Clock()
+    desk = Desk(clock)
+    desk.hear("a", "tab 1")
+    desk.hear("b", "tab 2")
+    assert desk.silence is None
     assert desk.take("a")
     assert not desk.take("b")
     assert (desk.may_command("a"), desk.may_command("b")) == (True, False)
-    desk.disconnected("b")
-    desk.connected("c", "tab 1")  # the window was loaded anew
+    clock.now += 1.0
+    desk.hear("b", "tab 2")
+    assert desk.silence == 1.0
+    desk.hear("c", "tab 1")  # the window was loaded anew
+    assert (desk.operator, desk.silence) == ("c", 0.0)
+    desk.hear("a", "tab 1")  # a copy of the tab: the older window does not take over again
     assert desk.operator == "c"
-    desk.disconnected("a")
-    assert not lost
-    desk.disconnected("c")
-    assert lost == ["operator"]
+    desk.leave("c")
+    assert (desk.operator, desk.silence) == (None, None)
+
+
+def test_the_desk_is_kept_for_a_while() -> None:
+    clock = Clock()
+    desk = Desk(clock)
+    desk.hear("a", "tab 1")
+    desk.take("a")
+    clock.now += KEPT - 0.1
+    assert not desk.take("b")
+    desk.hear("again", "tab 1")
+    assert desk.operator == "again"
+    clock.now += KEPT + 0.1
+    assert desk.operator is None
     assert desk.take("b")
-    desk.leave("b")
-    desk.disconnected("b")
-    assert (lost, desk.operator) == (["operator"], None)
+    desk.hear("again", "tab 1")
+    assert desk.operator == "b"
+
+
+def test_the_desk_knows_a_bounded_number_of_windows() -> None:
+    desk = Desk()
+    desk.hear("operator", "tab")
+    desk.take("operator")
+    for number in range(3 * MOST_WINDOWS):
+        desk.hear(f"window {number}", "another tab")
+    assert len(desk._tabs) == MOST_WINDOWS
+    desk.hear("loaded anew", "tab")
+    assert desk.may_command("loaded anew")

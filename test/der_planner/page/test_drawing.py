@@ -59,6 +59,8 @@ def test_a_load_decides_what_is_reached_and_what_draws() -> None:
     height = [np.ptp(np.vstack(outlines)[:, 1]) for outlines in (lying, sideways)]
     assert height[1] < 0.9 * height[0]  # the weight is lifted on one side
     assert previewer.region(Load(0.03)) is previewer.region(Load(0.03))
+    previewer.follow(LIMB.mounted("sideways"))  # as the planner's own limb turns out to be
+    assert previewer.region(Load(0.03))[0] == pytest.approx(sideways[0])
     with pytest.raises(LimbError, match="arc_length"):
         previewer.limb_under(Load(0.02, 9.0))
 
@@ -86,6 +88,10 @@ def test_a_preview_says_what_would_be_played_or_why_not() -> None:
     json.dumps([pose.tolist() for pose in found.poses])
     slow = preview(LIMB, ring, PathLimits(speed=1e-6), "pcc", "paper")
     assert "the longest is 3600 s" in summary(slow)
+    hanging = LIMB.mounted("hanging").carrying(0.1)
+    heavy = preview(hanging, ring, PathLimits(), "der", "projected")
+    assert "kPa are allowed" in heavy.problem
+    assert np.linalg.norm(ring - heavy.place, axis=1).min() < 0.1  # on the way there
 
 
 @pytest.mark.parametrize("name", ["../up", "a/b", ".hidden", "/etc/passwd", "star\x00", "Über 1"])

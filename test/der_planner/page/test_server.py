@@ -53,7 +53,7 @@ def parts(driver: Driver) -> Parts:
         situation=Situation(),
         picture=PictureFeed(15.0),
         overlay=Overlay(TagMap((0.12, 0.12), (LimbTag(0, 0.2, 0.03, 0.015),), ())),
-        desk=Desk(lambda: None),
+        desk=Desk(),
         commands=driver,  # type: ignore[arg-type]
         previewer=Previewer(Limb.default(), PathLimits(), Load()),
         drawings=DrawingFolder(Path("nowhere")),
@@ -92,6 +92,15 @@ def test_live_data_come_ten_times_a_second_and_tell_their_age(client: TestClient
             assert 0.0 <= answer["waited"] <= time.monotonic() - begun
         assert time.monotonic() - begun >= 0.39
     assert not answer["sources"]["driver"]["fresh"]
+
+
+def test_live_data_are_a_sign_of_life_of_the_operator(client: TestClient, parts: Parts) -> None:
+    with client.websocket_connect("/live") as live:
+        for request in ("1 window tab", "2 another other", "3 again tab", "4 again tab"):
+            live.send_text(request)
+            live.receive_json()
+            assert parts.desk.take("window") == ("again" not in request)
+    assert parts.desk.operator == "again"
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ class GuidedSetup:
     def __init__(self) -> None:
         self.now = 0.0
         self.situation = Situation(lambda: self.now)
-        self.guide = SetupGuide(2, "shipped")
+        self.guide = SetupGuide(2)
 
     def drive(self, pressures: tuple[float, ...], telemetry_age: float = 0.05, **what: Any) -> None:
         """Let the driver say what it does and measures [Pa]."""
@@ -29,9 +29,10 @@ class GuidedSetup:
             setattr(message, name, value)
         self.situation.put_driver(message)
 
-    def plan_for(self, limb: str) -> None:
-        """Let the planner say for which limb it plans."""
-        values = [KeyValue(key="limb", value=limb)]
+    def plan_for(self, limb: str, identified: str) -> None:
+        """Let the planner say for which limb it plans, and when that was identified."""
+        told = {"limb": limb, "limb_identified": identified}
+        values = [KeyValue(key=key, value=value) for key, value in told.items()]
         self.situation.put_status(DiagnosticStatus(name="/limb/planner", values=values))
 
     def steps(self, problem: str = "", calibrated: bool = True) -> list[Step]:
@@ -51,7 +52,7 @@ def test_a_running_rig_passes_until_it_falls_silent() -> None:
     rig = GuidedSetup()
     rig.drive(VENTED)
     rig.situation.put_limb(LimbState(valid=True))
-    rig.plan_for("ours")
+    rig.plan_for("a name", "2026-02-01, bags/run")
     assert rig.done() == [True, True, False, True, True, True, True, True]
     rig.now = 6.0
     assert rig.done() == [False, False, False, True, True, False, False, False]
@@ -70,10 +71,10 @@ def test_each_chamber_counts_only_if_it_is_driven_alone() -> None:
     assert rig.steps()[2].done
 
 
-def test_pressure_that_stays_and_the_shipped_limb_are_no_success() -> None:
+def test_pressure_that_stays_and_a_limb_that_nobody_identified_are_no_success() -> None:
     rig = GuidedSetup()
     rig.drive((1500.0, 0.0))
-    rig.plan_for("shipped")
+    rig.plan_for("our limb", "")
     steps = rig.steps()
     assert not steps[1].done
     assert "1.50 kPa" in steps[1].seen

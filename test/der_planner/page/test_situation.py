@@ -16,7 +16,7 @@ from geometry_msgs.msg import Point
 from waiting import Clock, wait_for
 
 from der_msgs.msg import LimbState, PressurePlan, PressureState
-from der_planner.page.situation import DEAD, FRESH, LATE, Situation
+from der_planner.page.situation import DEAD, FORGOTTEN, FRESH, LATE, MOST_NODES, Situation
 from limb_interfaces.stamps import stamp_from_nanoseconds
 
 
@@ -72,17 +72,31 @@ def test_numbers_come_in_kilopascal_and_unknown_ones_as_null(situation: Situatio
 
 
 def test_nodes_turn_late_and_dead(situation: Situation, clock: Clock) -> None:
+    def shown() -> list[tuple[str, str]]:
+        return [(node["name"], node["state"]) for node in situation.snapshot()["nodes"]]
+
+    situation.put_status(status("/a/b", "running"))
+    situation.put_status(status("/limb/recorder", "running"))
     situation.put_status(status("/limb/planner", "refused: too far", b"\1"))
-    situation.put_status(status("/limb/a", "running"))
-    first, second = situation.snapshot()["nodes"]
-    assert (first["name"], second["name"]) == ("a", "planner")
-    assert second["state"] == "warning"
+    others = [("/limb/recorder", "ok"), ("/a/b", "ok")]
+    assert shown() == [("/limb/planner", "warning"), *others]  # the worst first
     clock.now += LATE + 0.1
-    situation.put_status(status("/limb/a", "running"))
-    first, second = situation.snapshot()["nodes"]
-    assert (first["state"], second["state"]) == ("ok", "late")
+    situation.put_status(status("/limb/recorder", "running"))
+    situation.put_status(status("/a/b", "running"))
+    assert shown() == [("/limb/planner", "late"), *others]
     clock.now += DEAD
-    assert situation.snapshot()["nodes"][1]["state"] == "dead"
+    assert shown()[0] == ("/limb/planner", "dead")
+
+
+def test_strangers_are_forgotten_and_are_never_many(situation: Situation, clock: Clock) -> None:
+    for number in range(1000):
+        situation.put_status(status(f"/stranger/{number}", "here"))
+    situation.put_status(status("/limb/planner", "idle"))
+    nodes = situation.snapshot()["nodes"]
+    assert nodes[0]["name"] == "/limb/planner"
+    assert len(nodes) == MOST_NODES + 1
+    clock.now += FORGOTTEN + 1.0
+    assert [node["name"] for node in situation.snapshot()["nodes"]] == ["/limb/planner"]
 
 
 def test_a_process_that_ends_or_stops_is_dead_at_once(situation: Situation) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from der_planner.page.window import FormError, read_mounting, read_number
+from der_planner.page.forms import FormError, read_mounting, read_number
 
 
 @pytest.mark.parametrize(("text", "value"), [("12,5", 12.5), (" 2.5 ", 2.5), ("0", 0.0), (3, 3.0)])

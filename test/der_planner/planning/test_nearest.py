@@ -8,6 +8,7 @@ import pytest
 from der_planner.limb import Limb
 from der_planner.model import ArcModel, RodModel
 from der_planner.planning import Motion, Workspace, plan
+from der_planner.planning.configuration import configure
 
 LIMB = Limb.default()
 ARCS = ArcModel(LIMB)
@@ -100,3 +101,41 @@ def test_the_plan_says_how_far_it_is_from_the_drawing(model):
     assert "nearest path leaves" in planned.warnings[0]
     assert np.abs(planned.differential_pressure).max() <= LIMB.pneumatics.pressure_limit
     assert planned.predicted_error < 2e-3
+
+
+def uneven_limb(random):
+    """Return the limb as a calibration may find it: segments of other gains, bent at rest."""
+    segments = (
+        replace(
+            each,
+            moment_gain=each.moment_gain * random.uniform(0.8, 1.4),
+            rest_curvature=random.normal(0.0, 0.4),
+        )
+        for each in LIMB.segments
+    )
+    return replace(LIMB, segments=tuple(segments))
+
+
+def scrawl(random):
+    """Return a small line (P, 2) [m] as a hand scrawls it, mostly where no tip comes."""
+    waves = random.normal(0.0, 0.006, (3, 2)) / np.arange(1, 4)[:, None]
+    phases = random.uniform(0.0, 2 * np.pi, (3, 2))
+    turns = np.arange(1, 4)[:, None, None] * np.linspace(0.0, 2 * np.pi, 40)[:, None]
+    middle = random.uniform([-0.05, -0.28], [0.3, 0.28])
+    return middle + (waves[:, None] * np.sin(turns + phases[:, None])).sum(axis=0)
+
+
+@pytest.mark.slow
+def test_no_scrawl_is_refused():
+    """The nearest path that is shown is one that the rod can be planned along."""
+    left = []
+    for seed in range(200):
+        random = np.random.default_rng(seed)
+        body = RodModel(uneven_limb(random))
+        space = Workspace(body)
+        reference = Motion.from_tip_path(None, scrawl(random), nearest=True).reference(space)
+        angles = configure(body, reference).bend_at(reference.time)
+        assert np.all((angles > space.low - 1e-6) & (angles < space.high + 1e-6))
+        left.append(np.linalg.norm(body.kinematics.tip(angles) - reference.tip, axis=1).max())
+    assert max(left) < 5e-3, "the rod stays where it is shown"
+    assert np.mean(np.array(left) > 1e-4) > 0.1, "many of them are at the edge"

@@ -62,6 +62,8 @@ class BagOfRun:
         self.types = store(*types, *(f"der_msgs/msg/{name}" for name in OURS))
         self.bag = writer or BagWriter(folder, {RUN_KEY: run})
         self.start = START + 7 * SECOND
+        self.travel = 0.03
+        """[s] from a stamp to the arrival: less than nothing if the stamp's clock is ahead."""
 
     def stamp(self, seconds: float) -> int:
         return self.start + round(seconds * SECOND)
@@ -80,9 +82,8 @@ class BagOfRun:
         made = self.make(name, header=self.header(seconds), **fields)
         data = bytes(self.types.serialize_cdr(made, name))
         # A message arrives some time after its stamp; the evaluation must go by the stamp.
-        self.bag.write(
-            spec(topic, name, latched), self.stamp(seconds + 0.03), self.stamp(seconds + 0.02), data
-        )
+        arrival = self.stamp(seconds + self.travel)
+        self.bag.write(spec(topic, name, latched), arrival, arrival - SECOND // 100, data)
 
     def plan(self, plan_id="p", model="der", stamp=0.0, **fields) -> None:
         """Write a plan of no pressure, or with other fields than that."""

@@ -1,7 +1,7 @@
 """Runs read from bags: ours, rosbags' own, split and killed ones."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -93,6 +93,22 @@ def test_bag_in_rosbags_own_layout_evaluates_the_same(folder: Path, tmp_path: Pa
         one.pop(key)
         two.pop(key)
     assert one == two
+
+
+def test_clocks_that_are_off_are_named_in_the_report(tmp_path: Path):
+    bag = BagOfRun(tmp_path / "run")
+    pairs = {"clock_offset_s": "-0.030000", "clock_uncertainty_s": "0.000200"}
+    told = [
+        bag.make("diagnostic_msgs/msg/KeyValue", key=key, value=value)
+        for key, value in pairs.items()
+    ]
+    silent = bag.make("diagnostic_msgs/msg/DiagnosticStatus")
+    status = [replace(silent, name="/limb/tracker", values=told), silent]
+    bag.write("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", 0.0, status=status)
+    bag.travel = -0.025
+    result = evaluate_bag(bag.still_run())
+    assert result.extra == {"clocks": "/limb/tracker +30.00 ± 0.20 ms"}
+    assert result.problems == ("stamps come from up to 25 ms in the future: see `clocks`",)
 
 
 def test_what_was_not_yet_measured_is_left_out(tmp_path: Path):

@@ -27,6 +27,7 @@ PRESSURE_TYPE = "der_msgs/msg/PressureState"
 STATE_TYPE = "der_msgs/msg/LimbState"
 ESTIMATE_TYPE = "der_msgs/msg/LimbEstimate"
 CONTACT_TYPE = "der_msgs/msg/LimbContact"
+DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 TRUTH_SUFFIX = "twin/ground_truth"
 BOARD_SUFFIX = "twin/board_commands"
 FAULT_MODE = 5
@@ -120,6 +121,7 @@ class LimbRecord:
         faults: reasons of the driver with their stamps [ns].
         touches: by plan id and when one began [ns]: how far it was from a free limb, what it said.
         board: commands as the board received them [Pa] (twin only).
+        ahead: by which a state or pressure is stamped later than it arrived, at the most [ns].
     """
 
     plans: dict[str, tuple[int, Any]] = field(default_factory=dict)
@@ -134,6 +136,7 @@ class LimbRecord:
     faults: list[tuple[int, str]] = field(default_factory=list)
     touches: dict[tuple[str, int], tuple[float, str]] = field(default_factory=dict)
     board: Columns = field(default_factory=Columns)
+    ahead: int = 0
 
     @property
     def usable_plans(self) -> dict[str, tuple[int, Any]]:
@@ -204,7 +207,7 @@ class BagRecord:
     Attributes:
         path: of the bag.
         limbs: by the namespace of their topics, e.g. ``/limb``; a bag may hold several.
-        run: what the recorder was told of the run.
+        run: what the recorder was told of the run, and ``clocks``: how far each node's was off.
     """
 
     path: Path
@@ -248,7 +251,7 @@ def read_record(path: str | Path) -> BagRecord:
     """
     with BagReader(path) as bag:
         try:
-            limbs = _collect(bag)
+            limbs, clocks = _collect(bag)
         except BagError:
             raise
         except Exception as error:  # rosbags raises many kinds for damaged content
@@ -256,7 +259,7 @@ def read_record(path: str | Path) -> BagRecord:
                 f"the bag {path} is damaged: {error}. scripts/recover_bag.py {path} saves what is "
                 "whole"
             ) from error
-        return BagRecord(Path(path), limbs, bag.run())
+        return BagRecord(Path(path), limbs, bag.run() | ({"clocks": clocks} if clocks else {}))
 
 
 def namespace_of(topic: str) -> str:
@@ -275,18 +278,38 @@ def nanoseconds_of(stamp: Any) -> int:
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
 
 
-def _collect(bag: BagReader) -> dict[str, LimbRecord]:
-    """Return what the bag holds of each limb; every topic counts for its own namespace only."""
+def _collect(bag: BagReader) -> tuple[dict[str, LimbRecord], str]:
+    """Return what the bag holds of each limb, and what its nodes said last of their clocks.
+
+    Every topic counts for its own namespace only.
+    """
     limbs: dict[str, LimbRecord] = {}
     receivers: dict[str, Callable[[Any], None]] = {}
+    watchers: dict[str, LimbRecord] = {}
+    clocks: dict[str, str] = {}
     for name, topic in bag.topics.items():
         method = _method(name, topic.type_name)
         if method is not None:
             limb = limbs.setdefault(namespace_of(name), LimbRecord())
             receivers[name] = partial(method, limb)
-    for name, _, message in bag.messages(list(receivers)):
+            if method in (LimbRecord.add_state, LimbRecord.add_pressure):
+                watchers[name] = limb
+        elif topic.type_name == DIAGNOSTICS_TYPE:
+            receivers[name] = partial(_note_clocks, clocks)
+    for name, arrival, message in bag.messages(list(receivers)):
         receivers[name](message)
-    return limbs
+        if name in watchers:
+            watchers[name].ahead = max(watchers[name].ahead, header_stamp(message) - arrival)
+    return limbs, ", ".join(f"{node} {offset}" for node, offset in sorted(clocks.items()))
+
+
+def _note_clocks(clocks: dict[str, str], message: Any) -> None:
+    """Take what nodes say of their clocks in a `DiagnosticArray`, in ms of the driver's."""
+    for status in message.status:
+        told = {pair.key: pair.value for pair in status.values}
+        if "clock_offset_s" in told:
+            offset, error = (1e3 * float(told[f"clock_{n}_s"]) for n in ("offset", "uncertainty"))
+            clocks[status.name] = f"{-offset:+.2f} ± {error:.2f} ms"
 
 
 def _method(topic: str, type_name: str) -> Callable[[LimbRecord, Any], None] | None:

@@ -127,6 +127,7 @@ class RunSeries:
         touches: what feedback said of what touched the limb, a sentence each.
         finished: the motion was played to its last setpoint.
         origin: ROS time of the first setpoint [ns]; 0 for a run without a bag.
+        ahead: by which a stamp was later than the arrival of its message, at the most [s].
     """
 
     description: Description
@@ -144,6 +145,7 @@ class RunSeries:
     touches: tuple[str, ...] = ()
     finished: bool = True
     origin: int = 0
+    ahead: float = 0.0
 
     @classmethod
     def from_arrays(

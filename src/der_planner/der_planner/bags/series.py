@@ -128,6 +128,7 @@ def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
         ),
         finished=played == len(times) - 1 and tip.time[-1] >= end - 1.0,
         origin=origin,
+        ahead=limb.ahead / NANOSECONDS,
     )
 
 

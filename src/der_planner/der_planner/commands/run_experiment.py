@@ -13,6 +13,7 @@ Everything else is one path.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -78,11 +79,24 @@ def _main() -> int:
     options = parse(sys.argv[1:])
     if not options.offline:
         interrupt_once()
-    run(options)
+    if options.page is None or options.dry_run:
+        run(options)
+        return 0
+    # ROS is imported only by who needs it.
+    from der_planner.experiment.graph_page import experiment_page  # noqa: PLC0415
+
+    progress = Progress()
+    check_folder(options.out)
+    with experiment_page(options, progress) as page:
+        run(options, progress)
+        progress.say("done; the page stays with the report until Ctrl-C")
+        with contextlib.suppress(KeyboardInterrupt):
+            while page.alive:
+                time.sleep(0.5)
     return 0
 
 
-def run(options: Options) -> None:
+def run(options: Options, progress: Progress | None = None) -> None:
     """Play what the options say and leave results.json, figures, bags and logs in the folder.
 
     Raises:
@@ -91,7 +105,7 @@ def run(options: Options) -> None:
         PlanningError, LearningError: a motion cannot be planned, or cannot be learned.
         GraphError, NodeError: a trial failed; finished trials stay finished.
     """
-    progress = Progress()
+    progress = progress or Progress()
     try:
         limb = options.loads.loaded(_read(options.limb))
     except LimbError as error:
@@ -137,7 +151,8 @@ class Ledger:
             "payload_at": options.loads.payload_at or "",
             "calibrate": options.calibrate,
             "offline": options.offline,
-            "hardware": options.hardware.driver.get("port") if options.hardware else "",
+            "hardware": options.hardware.place if options.hardware else "",
+            "board": options.board,
         }
 
     def finished(self, trial: Trial) -> dict[str, Any] | None:
@@ -288,8 +303,8 @@ def _read(limb: Path | None) -> Limb:
 
 def _stage(options: Options) -> str:
     if options.hardware is not None:
-        return f"the hardware at {options.hardware.driver['port']}"
-    return "the twin, offline" if options.offline else "the twin"
+        return f"the hardware at {options.hardware.place}"
+    return "the twin, offline" if options.offline else f"the twin, with a {options.board} board"
 
 
 def _describe(

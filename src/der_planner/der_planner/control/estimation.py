@@ -195,15 +195,6 @@ class Estimator:
         known = [self._updated(j, k) for j, k in zip(range(first, last + 1), expected, strict=True)]
         return expected, known
 
-    def kept(self, first: int, last: int) -> list[Knowledge] | None:
-        """Return the states at fine steps ``first`` … ``last``; None: they are not all kept.
-
-        Each is without the measurements of its own instant.
-        """
-        if not self._known or first < self._oldest or last > self._last:
-            return None
-        return [self._known[j] for j in range(first, last + 1)]
-
     def move(self, j: int, felt: Array) -> Array:
         """Return F (4M + 2, 4M + 2) of fine step ``j`` under an effective pressure (M,) [Pa]."""
         k = int(self.nominal.periods(j // STEPS))

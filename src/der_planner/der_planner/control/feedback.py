@@ -21,7 +21,6 @@ from threadpoolctl import ThreadpoolController
 
 from der_planner.arrays import Array
 from der_planner.control.estimation import Estimator
-from der_planner.control.foresight import Foresight
 from der_planner.control.horizon import Horizon
 from der_planner.control.knowledge import Estimate
 from der_planner.control.nominal import ChamberLog, Nominal
@@ -64,7 +63,6 @@ class Feedback:
             self._nominal = Nominal(plan)
             self._chambers = ChamberLog(self._nominal)
             self._estimator = Estimator(self._nominal, self._chambers)
-            self._foresight = Foresight(self._nominal, self._estimator)
             self._horizon = Horizon(self._nominal, self._chambers, authority)
             self._sense = TouchSense(self._nominal.model)
             self._reaction = Reaction(self._nominal.model, reaction, force_limit)
@@ -84,14 +82,6 @@ class Feedback:
     def share(self) -> float:
         """Share of the corrections that is sent, 0 … 1."""
         return self._supervisor.share
-
-    @property
-    def trust(self) -> Array:
-        """How far swing, slow and fast disturbances of each segment were predicted (3, M), 0 … 1.
-
-        Corrections act on this share of each, see `der_planner.control.foresight`.
-        """
-        return self._foresight.trust.weights.copy()
 
     @property
     def touch(self) -> Touch:
@@ -121,7 +111,6 @@ class Feedback:
         self._chambers.take_over(other._chambers, round(time / CONTROL_PERIOD))
         with _THREADS.limit(limits=1, user_api="blas"):
             self._estimator.take_over(other._estimator, time)
-        self._foresight.take_over(other._foresight)
         self._sense.free = other._sense.free
         # What ended the other's feedback does not count here.
         self._supervisor.share = other.share
@@ -175,14 +164,12 @@ class Feedback:
             # Matrices of some ten rows: more threads only get into other processes' way.
             with _THREADS.limit(limits=1, user_api="blas"):
                 known = self._estimator.at(instant)
-                self._foresight.learn()
                 self._feel()
                 age = instant - self._estimator.newest
                 swing = float(np.linalg.norm(known.parts[1]))
                 missed = self._estimator.missed(known, k)
                 share = supervisor.advance(instant, age, known.strange)
                 if share > 0.0:
-                    known = self._foresight.weighed(known, k)
                     correction = share * self._horizon.solve(k, known)
         except np.linalg.LinAlgError:
             correction[:] = np.nan

@@ -47,7 +47,7 @@ class Plant(Protocol):
 class Sensors:
     """What camera and board show, and when it is known.
 
-    The noise is twice that of the tracker on rendered pictures (`docs/guide/tracker.md`).
+    The noise is twice that of the tracker on rendered pictures (`docs/measurements/tracking.md`).
 
     Attributes:
         frame_rate: of the camera [Hz].

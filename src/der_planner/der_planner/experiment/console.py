@@ -29,14 +29,18 @@ class Progress:
         self._terminal = sys.stderr.isatty()
         self._last_shown = -1e9
         self._open_line = False
+        self.newest = "begins"
+        """What has been said last, for who shows it elsewhere."""
 
     def say(self, text: str) -> None:
         """Print one line."""
+        self.newest = text.strip()
         self._end_bar()
         print(text, file=sys.stderr, flush=True)
 
     def bar(self, done: float, total: float, text: str, unit: str = "s") -> None:
         """Show that ``done`` of ``total`` seconds, or of another unit, are over."""
+        self.newest = f"{text} {max(done, 0.0):.0f} of {total:.0f} {unit}"
         now = time.monotonic()
         finished = done >= total
         if now - self._last_shown < (0.2 if self._terminal else 15.0) and not finished:

@@ -14,20 +14,26 @@ from der_msgs.msg import PressureState
 from der_planner.experiment.client import GraphClient
 from der_planner.experiment.console import Progress
 from der_planner.experiment.processes import (
-    PAGE_TOKEN,
     STOP_ORDER,
     GraphError,
     GraphSetup,
     NodeError,
     NodeProcess,
     NodeSpec,
+    board_line,
 )
 from limb_interfaces import qos, topics
+from limb_interfaces.clocks import LARGEST, Offset
+from limb_interfaces.diagnostics import message_version
 
 DISCOVERY = 1.0
 """The orchestrator listens for another graph this long [s] before it starts nodes."""
 ARMING = 5.0
 """The driver may refuse to be armed this long [s] before the run is given up."""
+COMPARING = 20.0
+"""Clocks of other computers are compared with the driver's for this long [s] at the most."""
+ELSEWHERE = 30.0
+"""Nodes that somebody else starts are waited for this long [s]."""
 PORT_VENTS = 3.0
 """The process of a dead driver's port has vented the limb after this time [s]."""
 VENTED_PRESSURE = 1000.0
@@ -54,7 +60,7 @@ def running_graph(
     graph = RunningGraph(client, progress)
     client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES)
     with tempfile.TemporaryDirectory(prefix="der_limb_") as folder:
-        port = str(Path(folder) / "board")
+        port = board_line(setup.board, folder)
         specs = setup.nodes(port)
         client.spin(DISCOVERY)
         _refuse_second_graph(client, specs)
@@ -63,6 +69,7 @@ def running_graph(
             # A graph that was not seen at once, or that began meanwhile, is known by now.
             _refuse_second_graph(client, specs, own=1)
             graph.bag = Path(client.call("recorder/start"))
+            graph.check_clocks(bool((setup.planner or {}).get("feedback")))
             graph.arm()
             yield graph
         except BaseException:
@@ -82,7 +89,10 @@ def running_graph(
 def _refuse_second_graph(client: GraphClient, specs: list[NodeSpec], own: int = 0) -> None:
     """Raise `GraphError` if nodes of another graph are seen beside ``own`` of each name."""
     count = client.count_nodes()
-    others = [spec.executable for spec in specs if count[spec.executable] > own]
+    # Of a node that somebody else starts there is one from the beginning.
+    others = [
+        spec.executable for spec in specs if count[spec.executable] > (1 if spec.host else own)
+    ]
     if others:
         raise GraphError(
             f"another graph is running in this ROS domain (node '{min(others)}'): stop it, or "
@@ -98,6 +108,7 @@ class RunningGraph:
         client: of the graph.
         progress: shows what happens.
         processes: of the nodes, by executable.
+        elsewhere: the computers of nodes that somebody else has started, by executable.
         bag: folder of the bag.
         real_time_factor: simulated over real seconds of the twin; NaN on hardware.
     """
@@ -105,25 +116,92 @@ class RunningGraph:
     client: GraphClient
     progress: Progress
     processes: dict[str, NodeProcess] = field(default_factory=dict)
+    elsewhere: dict[str, str] = field(default_factory=dict)
     bag: Path = Path()
     real_time_factor: float = float("nan")
 
     def start(self, specs: list[NodeSpec], port: str, logs: Path, remap: dict[str, str]) -> None:
         """Start every node and wait until all are ready; the emulated board is at ``port``."""
         begin = time.monotonic()
+        self.elsewhere = {spec.executable: spec.host for spec in specs if spec.host}
+        specs = [spec for spec in specs if not spec.host]
         self.progress.say(f"  starting {', '.join(spec.executable for spec in specs)}")
         for spec in specs:
             self.processes[spec.executable] = NodeProcess(
                 spec.package, spec.executable, spec.parameters, logs, remap
             )
             self.client.watch(self.processes.values())
-            if spec.executable == "board_emulator":
+            if spec.executable == "board_emulator" and port.startswith("tcp:"):
+                self.client.wait_ready([spec.executable])
+            elif spec.executable == "board_emulator":
                 self.client.wait_for(lambda: os.path.exists(port), 60.0, "the port of the board")
+        self._wait_elsewhere()
         self.client.wait_ready(self.processes)
         self.progress.say(f"  ready after {time.monotonic() - begin:.1f} s")
-        if "page" in self.processes:
-            address = self.client.diagnostic_values("page").get("url", "unknown")
-            self.progress.say(f"  the operator's page is at {address}?token={PAGE_TOKEN}")
+
+    def _wait_elsewhere(self) -> None:
+        """Wait for the nodes that somebody else starts, and see that they speak as these do.
+
+        Raises:
+            GraphError: names those that are missing, not ready, or of another version.
+        """
+        if not self.elsewhere:
+            return
+        told = ", ".join(f"{name} on {host}" for name, host in self.elsewhere.items())
+        self.progress.say(f"  waiting for {told}")
+        seen = self.client.diagnostics
+        try:
+            self.client.wait_for(
+                lambda: self.elsewhere.keys() <= seen.keys(), ELSEWHERE, "nodes elsewhere"
+            )
+        except GraphError as error:
+            missing = [f"{n} on {host}" for n, host in self.elsewhere.items() if n not in seen]
+            raise GraphError(
+                f"nothing was heard of {', '.join(missing)} for {ELSEWHERE:.0f} s: is it started, "
+                "with the same ROS_DOMAIN_ID, ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET on both "
+                "computers and no firewall between them (docs/guide/two_computers.md)?"
+            ) from error
+        self.client.wait_ready(self.elsewhere)
+        for name, host in self.elsewhere.items():
+            theirs = self.client.diagnostic_values(name).get("messages", "unknown")
+            if theirs != message_version():
+                raise GraphError(
+                    f"node '{name}' on {host} has other messages ({theirs}) than this computer "
+                    f"({message_version()}): bring both to the same version of the project"
+                )
+
+    def check_clocks(self, feedback: bool) -> None:
+        """Say whose clock is off the driver's.
+
+        Args:
+            feedback: commands are to be corrected by what is measured: that wants stamps which are
+                true.
+
+        Raises:
+            GraphError: a clock is too far off for feedback, or not known where there are several.
+        """
+        names = [name for name in (*self.processes, *self.elsewhere) if name != "pressure_driver"]
+        if self.elsewhere:
+            self.client.wait_for(
+                lambda: all(self._offset(name).uncertainty < LARGEST for name in names),
+                COMPARING,
+                "the clocks of all nodes",
+            )
+        for name in names:
+            offset = self._offset(name)
+            if offset.warning:
+                self.progress.say(f"  warning: {name}: {offset.warning}")
+            if feedback and offset.too_far:
+                raise GraphError(
+                    f"not armed: feedback needs clocks that agree within {1e3 * LARGEST:.0f} ms, "
+                    f"and {name} says: {offset.warning}. Without --feedback it is played"
+                )
+
+    def _offset(self, name: str) -> Offset:
+        """Return what a node has said of its clock."""
+        told = self.client.diagnostic_values(name)
+        keys = ("clock_offset_s", "nan"), ("clock_uncertainty_s", "inf")
+        return Offset(*(float(told.get(key, unknown)) for key, unknown in keys))
 
     def arm(self) -> None:
         """Arm the driver; what forbids it for a moment, as a late report of the board, may pass."""
@@ -180,12 +258,12 @@ class RunningGraph:
     def vent_after_error(self) -> None:
         """Vent; where the driver has died, the process of its port does it by itself."""
         driver = self.processes.get("pressure_driver")
-        if driver is None:
+        if driver is None and "pressure_driver" not in self.elsewhere:
             return
         self.progress.say("  venting the limb")
         self.client.watch(())
         try:
-            if driver.alive:
+            if driver is None or driver.alive:
                 self._vent()
             else:
                 self.client.spin(PORT_VENTS)

@@ -50,9 +50,9 @@ def play_on_graph(run: TrialRun, progress: Progress) -> dict[str, Any]:
         run=run.trial.run - 1,
         limb=run.limb,
         hardware=options.hardware,
+        board=options.board,
         planner=_planner_parameters(run),
         record_images=options.record_images,
-        page=options.page,
     )
     drawn = options.path if run.learned is None else None
     asked = _path(drawn) if drawn is not None else _command(run)
@@ -199,7 +199,7 @@ def play_calibration(
         GraphError, NodeError: as `play_on_graph`.
     """
     count = len(excitation.time)
-    stage = f"the hardware at {hardware.driver['port']}" if hardware else f"the twin of seed {seed}"
+    stage = f"the hardware at {hardware.place}" if hardware else f"the twin of seed {seed}"
     progress.say(f"playing {excitation.duration:.0f} s on {stage}, into {folder}")
     metadata = {
         "motion": "calibration",

@@ -26,6 +26,7 @@ from der_planner.planning.motions import (
     JOINT_MOTIONS,
 )
 from der_planner.planning.motions import NAMES as MOTIONS
+from pressure_driver.protocols import NAMES as BOARDS
 
 MODELS = tuple(METHODS_BY_MODEL)
 METHODS = METHODS_BY_MODEL["der"]
@@ -133,6 +134,7 @@ class Options:
         1, "of the first trial's twin; the next trial has the next seed", (0, 2**31 - 1000)
     )
     loads: Loads = field(default_factory=Loads)
+    board: str = _option(BOARDS[0], f"of the twin: of {', '.join(BOARDS)}", metavar="BOARD")
     hardware: Hardware | None = _option(
         None, "a real valve board and camera instead of the twin", type=Path, metavar="FILE"
     )
@@ -149,8 +151,8 @@ class Options:
     )
     page: int | None = _option(
         None,
-        f"serve the operator's page while the graph runs, at port {DEFAULT_PAGE_PORT} of this "
-        "machine if none is given",
+        f"serve the operator's page from the first second until Ctrl-C after the last run, at port "
+        f"{DEFAULT_PAGE_PORT} of this machine if none is given",
         (1, 65535),
         type=int,
         nargs="?",
@@ -253,6 +255,7 @@ def parse(arguments: Sequence[str]) -> Options:
     models = tuple(dict.fromkeys(given.models))
     _check_names("model", models, MODELS)
     _check_names("method", (given.method,), METHODS)
+    _check_names("board", (given.board,), BOARDS)
     hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
     limb = given.limb or (Path(hardware.limb) if hardware and hardware.limb else None)
     for wrong, said in (
@@ -264,6 +267,14 @@ def parse(arguments: Sequence[str]) -> Options:
         (
             hardware is not None and given.offline,
             "--offline simulates everything: it does not go with --hardware",
+        ),
+        (
+            hardware is not None and given.board != BOARDS[0],
+            "--board is about the twin: with --hardware, driver.protocol of the file says it",
+        ),
+        (
+            given.offline and given.board != BOARDS[0],
+            "--offline has no board: it does not go with --board",
         ),
         (
             hardware is not None and limb is None,

@@ -9,10 +9,11 @@ import json
 import os
 import secrets
 import signal
+import socket
 import subprocess
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,10 @@ STOP_ORDER = (
     "page",
     "board_emulator",
 )
+MOVABLE = {"driver": "pressure_driver", "tracker": "apriltag_tracker"}
+"""Nodes that may run on another computer, by their keys in a hardware file."""
+BOARD_PARAMETERS = {"pneudrive": {"sensor_range": 103_400.0}}
+"""Of boards of the twin: with sensors of 15 psi, a step is 0.13 kPa and not 0.84."""
 PAGE_TOKEN = secrets.token_urlsafe()
 """Opens the page of each run's graph, so that a window that is open stays let in."""
 _PR_SET_PDEATHSIG = 1
@@ -55,6 +60,8 @@ class Hardware:
     Attributes:
         driver, tracker, planner, recorder: parameters by name for each node.
         remap: new names of topics by their old ones, for all nodes.
+        hosts: computers on which somebody else starts a node, by its name; in the file, `host`
+            stands in the place of the node's parameters.
         limb: the limb file, or None for the one on the command line.
     """
 
@@ -63,7 +70,13 @@ class Hardware:
     planner: dict[str, Any] = field(default_factory=dict)
     recorder: dict[str, Any] = field(default_factory=dict)
     remap: dict[str, str] = field(default_factory=dict)
+    hosts: dict[str, str] = field(default_factory=dict)
     limb: str | None = None
+
+    @property
+    def place(self) -> str:
+        """Where the valve board is: its port, or the computer of its driver."""
+        return str(self.driver.get("port") or self.hosts.get("pressure_driver", ""))
 
     @classmethod
     def from_yaml(cls, path: Path) -> Hardware:
@@ -76,18 +89,40 @@ class Hardware:
             content = yaml.safe_load(path.read_text())
         except (OSError, yaml.YAMLError) as error:
             raise OptionError(f"cannot read hardware file {path}: {error}") from error
-        known = [item.name for item in dataclasses.fields(cls)]
+        known = [item.name for item in dataclasses.fields(cls) if item.name != "hosts"]
         for key in content if isinstance(content, dict) else ["not a mapping"]:
             if key not in known:
                 raise OptionError(f"hardware file {path}: unknown key '{key}'; known: {known}")
         hardware = cls(**{key: value for key, value in content.items() if value is not None})
+        hardware.hosts.update(_hosts(hardware, path))
         port = str(hardware.driver.get("port", ""))
-        if not port or not Path(port).exists():
+        here = "pressure_driver" not in hardware.hosts and not port.startswith("tcp://")
+        if here and not (port and Path(port).exists()):
             raise OptionError(
                 f"hardware file {path}: no serial device '{port}' (driver.port); is the valve "
                 "board plugged in? `ls /dev/serial/by-id` shows what is there"
             )
         return hardware
+
+
+def _hosts(hardware: Hardware, path: Path) -> dict[str, str]:
+    """Return the nodes that are marked with `host`, and take the mark from their parameters.
+
+    Raises:
+        OptionError: parameters stand beside the mark, which nobody would hand over.
+    """
+    hosts = {}
+    for key, node in MOVABLE.items():
+        parameters = getattr(hardware, key)
+        if "host" not in parameters:
+            continue
+        hosts[node] = str(parameters.pop("host"))
+        if parameters:
+            raise OptionError(
+                f"hardware file {path}: {key} is started on {hosts[node]}: give its parameters "
+                f"({', '.join(parameters)}) there, and leave them out here"
+            )
+    return hosts
 
 
 @dataclass(frozen=True)
@@ -97,6 +132,8 @@ class NodeSpec:
     package: str
     executable: str
     parameters: dict[str, Any] = field(default_factory=dict)
+    host: str = ""
+    """Computer on which somebody else starts it; empty: it is started here."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +147,7 @@ class GraphSetup:
         run: of the same twin: its rest angles wander in each in a way of their own.
         limb: whose gravity and masses the twin gets; None: no loads.
         hardware: in place of the twin.
+        board: protocol of the twin's board.
         planner: parameters of the planner; None for a graph without one.
         record_images: whether the bag holds the raw images, too.
         page: port of the operator's page; None for a graph without one.
@@ -121,6 +159,7 @@ class GraphSetup:
     run: int = 0
     limb: Limb | None = None
     hardware: Hardware | None = None
+    board: str = "ezloop"
     planner: dict[str, Any] | None = None
     record_images: bool = False
     page: int | None = None
@@ -128,9 +167,10 @@ class GraphSetup:
     def nodes(self, port: str) -> list[NodeSpec]:
         """Return the nodes in the order in which they start; the emulated board is at ``port``."""
         rig = self.hardware or Hardware()
-        board = {"port_link": port, "seed": self.seed}
+        language = {"protocol": self.board, **BOARD_PARAMETERS.get(self.board, {})}
+        board = {"port_link": port, "seed": self.seed, **language}
         twin = {"seed": self.seed, "run": self.run, **_twin_loads(self.limb)}
-        driver = {"port": port, "protocol": "ezloop", **rig.driver}
+        driver = {"port": port, **(language if self.hardware is None else {}), **rig.driver}
         recorder = {
             "output": str(self.bag),
             "metadata": json.dumps(self.metadata),
@@ -156,7 +196,7 @@ class GraphSetup:
             page |= {name: value for name, value in rig.tracker.items() if name == "tag_map"}
             page |= {"port": self.page, "token": PAGE_TOKEN}
             specs.append(NodeSpec("der_planner", "page", page))
-        return specs
+        return [replace(spec, host=rig.hosts.get(spec.executable, "")) for spec in specs]
 
 
 def _twin_loads(limb: Limb | None) -> dict[str, Any]:
@@ -168,6 +208,14 @@ def _twin_loads(limb: Limb | None) -> dict[str, Any]:
         parameters["masses"] = [item.mass for item in limb.masses]
         parameters["masses_at"] = [item.arc_length for item in limb.masses]
     return parameters
+
+
+def board_line(board: str, folder: str) -> str:
+    """Return where the twin's board is: a terminal in the network, others on a serial port."""
+    if board != "festo":
+        return str(Path(folder) / "board")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return f"tcp://127.0.0.1:{free.getsockname()[1]}"
 
 
 # Processes ---------------------------------------------------------------------------------------

@@ -234,7 +234,11 @@ def _points(edges: NDArray[np.complex128]) -> Array:
 
 
 def inverse_kinematics(
-    kinematics: TipOfBend, tip: ArrayLike, guess: ArrayLike, prior_weight: float = PRIOR_WEIGHT
+    kinematics: TipOfBend,
+    tip: ArrayLike,
+    guess: ArrayLike,
+    prior_weight: float = PRIOR_WEIGHT,
+    bounds: tuple[Array, Array] | None = None,
 ) -> tuple[Array, Array]:
     """Return bend angles (K, M) [rad] near the guess and the distances (K,) [m] that remain.
 
@@ -245,10 +249,12 @@ def inverse_kinematics(
         tip: (K, 2) points r [m].
         guess: (K, M) first guess, which also chooses the branch [rad].
         prior_weight: w [m/rad].
+        bounds: least and largest bend angles (M,) [rad]; None: any.
     """
     target = np.atleast_2d(np.asarray(tip, dtype=float))
     prior = np.atleast_2d(np.asarray(guess, dtype=float))
-    angles = prior.copy()
+    low, high = bounds or (np.full(prior.shape[1], -np.inf), np.full(prior.shape[1], np.inf))
+    angles = np.clip(prior, low, high)
     damping = np.full(len(angles), 1e-9)
     identity = np.eye(angles.shape[1])
     weight = prior_weight**2
@@ -265,12 +271,17 @@ def inverse_kinematics(
         normal = np.einsum("kai,kaj->kij", jacobian, jacobian)
         normal = normal + (weight + damping)[:, None, None] * identity
         slope = np.einsum("kai,ka->ki", jacobian, miss) + weight * (angles - prior)
+        # An angle at its bound stays there while the slope pushes it outward.
+        tied = ((angles <= low) & (slope > 0)) | ((angles >= high) & (slope < 0))
+        normal = np.where(tied[:, :, None] | tied[:, None, :], identity, normal)
+        slope = np.where(tied, 0.0, slope)
         step = -np.linalg.solve(normal, slope[..., None])[..., 0]
         length = np.linalg.norm(step, axis=-1, keepdims=True)
         step = step * np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))
-        trial = cost(angles + step)
+        moved = np.clip(angles + step, low, high)
+        trial = cost(moved)
         better = trial <= present
-        angles = np.where(better[:, None], angles + step, angles)
+        angles = np.where(better[:, None], moved, angles)
         present = np.where(better, trial, present)
         damping = np.where(better, np.maximum(damping / 10, 1e-16), damping * 10 + 1e-12)
         if np.all(length < _SMALLEST_STEP):

@@ -15,33 +15,30 @@ from std_srvs.srv import Trigger
 
 from der_msgs.msg import LimbState, MotionCommand, PressureState
 from der_planner.control.feedback import Feedback
-from der_planner.nodes.planner_feedback import Corrector
+from der_planner.nodes.planner_feedback import Corrector, warm_up
 from der_planner.nodes.planner_requests import (
+    Cancelled,
     MotionAction,
-    PlannerOptions,
     Request,
     from_command,
     from_path,
+    identified,
     new_plan_id,
     read_parameters,
 )
-from der_planner.nodes.planner_topics import DriverWatch, PlannerPublishers, Status
-from der_planner.planning import METHODS, Motion, Plan, plan
-from der_planner.planning.streaming import MARGIN, Schedule, Streamer, first_stamp
+from der_planner.nodes.planner_topics import DriverWatch, PlannerPublishers, Status, told_of
+from der_planner.planning import Plan, plan
+from der_planner.planning.streaming import MARGIN, Ending, Schedule, Streamer, first_stamp
 from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.parameters import check_overrides
 from limb_interfaces.runner import run_node
-from limb_interfaces.stamps import NANOSECONDS
+from limb_interfaces.stamps import NANOSECONDS, nanoseconds
 
 _ARMING_PATIENCE = 0.5
 """The state of a driver that was armed just now is waited for this long [s]."""
 _FEEDBACK_MARGIN = 500_000_000
 """Making feedback ready for a plan takes less than this [ns]."""
-
-
-class Cancelled(Exception):  # noqa: N818 - not an error
-    """A newer command or `stop` made this plan useless."""
 
 
 class PlannerNode(Node):
@@ -84,6 +81,7 @@ class PlannerNode(Node):
         ending = self._driver.update(message, self._streamer.begun)
         if ending is not None:
             self._streamer.abandon(ending)
+            self._drop_request(ending, nanoseconds(message.header.stamp))
         self._corrector.add_pressures(message)
 
     def _on_limb(self, message: LimbState) -> None:
@@ -110,16 +108,10 @@ class PlannerNode(Node):
                     f"plan '{wanted}' was ended by the driver, which takes no more of it: "
                     "give the command another plan_id, or none"
                 )
-            return from_command(message, self._current_options(), self._now())
+            return from_command(message, self._options.as_now(self), self._now())
         except ValueError as error:
             self._refuse(message.plan_id, str(error))
             return None
-
-    def _current_options(self) -> PlannerOptions:
-        """Return the parameters with what may be changed while the node runs as it is now."""
-        changeable = ("nearest_path", "payload", "payload_at")
-        now: dict[str, Any] = {name: self.get_parameter(name).value for name in changeable}
-        return dataclasses.replace(self._options, **now)
 
     def _is_busy(self, plan_id: str) -> bool:
         """Tell whether a plan of this id is being planned or played."""
@@ -131,7 +123,7 @@ class PlannerNode(Node):
     def _on_path(self, message: PathMessage) -> None:
         plan_id = new_plan_id()
         try:
-            self._accept(from_path(message, plan_id, self._current_options(), self._now()))
+            self._accept(from_path(message, plan_id, self._options.as_now(self), self._now()))
         except (ValueError, IndexError) as error:
             self._refuse(plan_id, str(error))
 
@@ -184,7 +176,24 @@ class PlannerNode(Node):
         asked = f"{request.motion.name}, {request.model} {request.method}"
         self.get_logger().info(f"plan {request.plan_id} accepted: {asked}")
         self._status = Status("planning", request.plan_id)
+        self._diagnostics.publish()
         self._work.put(request)
+
+    def _drop_request(self, ending: Ending, stamp: int) -> None:
+        """Refuse what was asked for before an instant [ns] at which the driver took nothing.
+
+        A request belongs to the arming in which it was made: it never plays after a later one.
+        """
+        with self._streamer.lock:
+            request = self._request
+            # Without auto_start it is only planned, and waits to be started.
+            if request is None or not self._options.auto_start or request.asked > stamp:
+                return
+            if request.cancelled.is_set():
+                return
+            request.cancelled.set()
+            self._request = None
+        self._refuse(request.plan_id, ending.reason)
 
     def _refuse(self, plan_id: str, reason: str) -> None:
         """Refuse a plan; what is being planned or played meanwhile stays the state of the node."""
@@ -200,7 +209,7 @@ class PlannerNode(Node):
     def _run(self) -> None:
         """Plan one request after the other; every failure becomes a refusal with its reason."""
         try:
-            self._warm_up()
+            warm_up(self._options.limb, self._options.nodes)
             if self._status == Status():
                 self._status = Status("idle")
         except Exception as error:
@@ -220,21 +229,14 @@ class PlannerNode(Node):
             if failure and not request.cancelled.is_set():
                 self._refuse(request.plan_id, failure)
 
-    def _warm_up(self) -> None:
-        """Compile every kernel, so that no plan has to wait for it."""
-        quick = Motion.named("asynchronous", amplitude=0.1, period=2.0, cycles=1)
-        for model, methods in METHODS.items():
-            for method in methods:
-                found = plan(self._options.limb, quick, model, method, nodes=self._options.nodes)
-        # The last of them has compiled whatever feedback calls as well.
-        self._options.corrected(found)
-
     def _plan(self, request: Request) -> None:
         """Plan what was asked for and play it.
 
         Raises:
             ValueError: it cannot be planned, or not be played; says why.
         """
+        if request.cancelled.is_set():
+            raise Cancelled
         self._status = Status("planning", request.plan_id)
         stamp, result = self._make(request)
         feedback = self._options.corrected(result) if request.feedback else None
@@ -365,16 +367,14 @@ class PlannerNode(Node):
             "last_refusal": self._last_refusal,
             "progress": f"{self._progress:.3f}",
             "limb": self._options.limb.name,
+            "limb_file": self._options.limb_file,
+            "limb_identified": identified(self._options.limb),
             "driver": self._driver.mode or "not heard",
             "feedback": self._corrector.reason,
             "learned_plans": self._options.learned_plans,
         }
         if self._newest is not None:
-            newest = self._newest[1]
-            values["predicted_error_m"] = f"{newest.predicted_error:.6f}"
-            values["pressure_margin_pa"] = f"{newest.pressure_margin:.0f}"
-            values["slew_margin_pa_per_s"] = f"{newest.slew_margin:.0f}"
-            values["solve_time_s"] = f"{newest.solve_time:.3f}"
+            values |= told_of(self._newest[1])
         return self._status.health(self._last_refusal, values)
 
     def _show(self) -> None:

@@ -19,8 +19,11 @@ from std_srvs.srv import Trigger
 from der_msgs.msg import LimbState, PressureState
 from der_planner.arrays import Array
 from der_planner.control.feedback import Feedback
+from der_planner.limb import Limb
 from der_planner.nodes.planner_topics import PlannerPublishers
+from der_planner.planning import METHODS, Motion, plan
 from der_planner.planning.streaming import GRID, Schedule
+from limb_interfaces.clocks import LARGEST
 from limb_interfaces.stamps import NANOSECONDS, nanoseconds
 
 _TRAVEL = 0.015
@@ -123,7 +126,7 @@ class Corrector:
         self._wake = threading.Condition()
         self._inbox: deque[Callable[[_Corrected], None]] = deque(maxlen=200)
         self._open: list[_Corrected] = []
-        self._seen = self._closed = False
+        self._seen = self._closed = self._was_ahead = False
         self._took = 0.01
         self._thread = threading.Thread(target=self._run, name="feedback", daemon=True)
         self._thread.start()
@@ -170,6 +173,15 @@ class Corrector:
         if not state.valid:
             return
         stamp = nanoseconds(state.header.stamp)
+        ahead = (stamp - self._now()) / NANOSECONDS
+        if ahead > LARGEST:
+            if not self._was_ahead:
+                self._warn(
+                    f"pictures come from {1e3 * ahead:.0f} ms in the future and are left out: the "
+                    "clock of their computer is off (docs/guide/two_computers.md)"
+                )
+            self._was_ahead = True
+            return
         bend, tip = np.array(state.bend_angle), np.array([state.tip.x, state.tip.y])
         size, told = len(bend), np.array(state.bend_angle_sigma)
         sigma = np.full(size, _SMALLEST_BEND)
@@ -279,3 +291,13 @@ class Corrector:
         with self._wake:
             later = self._open[self._open.index(each) + 1 :] if each in self._open else []
         return any(other.schedule.start <= stamp for other in later)
+
+
+def warm_up(limb: Limb, nodes: int) -> None:
+    """Compile every kernel that planning and feedback call, so that no plan has to wait for it."""
+    quick = Motion.named("asynchronous", amplitude=0.1, period=2.0, cycles=1)
+    for model, methods in METHODS.items():
+        for method in methods:
+            found = plan(limb, quick, model, method, nodes=nodes)
+    # The last of them has compiled whatever feedback calls as well.
+    Feedback(found)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 import threading
@@ -47,6 +48,7 @@ class PlannerOptions:
     """
 
     limb: Limb
+    limb_file: str
     payload: float
     payload_at: float
     model: str
@@ -66,6 +68,12 @@ class PlannerOptions:
     def corrected(self, planned: Plan) -> Feedback:
         """Return feedback on a plan, with the reaction to a touch that is set."""
         return Feedback(planned, self.reaction, self.force_limit or None)
+
+    def as_now(self, node: Node) -> PlannerOptions:
+        """Return the parameters with what may be changed while the node runs as it is now."""
+        changeable = ("nearest_path", "payload", "payload_at")
+        now: dict[str, Any] = {name: node.get_parameter(name).value for name in changeable}
+        return dataclasses.replace(self, **now)
 
 
 def read_parameters(node: Node) -> PlannerOptions:
@@ -88,6 +96,7 @@ def read_parameters(node: Node) -> PlannerOptions:
     )  # fmt: skip
     return PlannerOptions(
         limb=limb.mounted(mounting) if mounting else limb,
+        limb_file=str(Path(limb_file).absolute()) if limb_file else "",
         payload=read(
             "payload", 0.0, "mass [kg] carried beside the limb's own masses, where a command names "
             "none", at_least=0.0, at_most=HEAVIEST, read_only=False
@@ -155,6 +164,7 @@ class Request:
 
     `limb` is mounted as asked for and carries the payload; a plan that was learned is played as it
     is.
+    `asked` is when it came [ns of ROS time]: no arming after that makes it play.
     """
 
     plan_id: str
@@ -163,9 +173,20 @@ class Request:
     model: str
     method: str
     start: int
+    asked: int = 0
     learned: Plan | None = None
     feedback: bool = False
     cancelled: threading.Event = field(default_factory=threading.Event)
+
+
+class Cancelled(Exception):  # noqa: N818 - not an error
+    """A newer command, `stop` or the driver made this plan useless."""
+
+
+def identified(limb: Limb) -> str:
+    """Return when and on what a limb was identified; empty if its file tells of no such thing."""
+    told = limb.provenance
+    return f"{told['date']}, {told.get('source', 'no source given')}" if "date" in told else ""
 
 
 def new_plan_id() -> str:
@@ -266,7 +287,8 @@ def _request(
             f"feedback corrects plans of the rod, not of the model {model}: ask for der"
         )
     feedback = message.feedback or (options.feedback and model == "der")
-    return Request(message.plan_id, limb, motion, model, method, start, learned, feedback)
+    plan_id = message.plan_id
+    return Request(plan_id, limb, motion, model, method, start, now, learned, feedback)
 
 
 # The action --------------------------------------------------------------------------------------

@@ -23,6 +23,7 @@ from der_msgs.msg import (
 from der_planner.arrays import Array, interpolate
 from der_planner.control.knowledge import Estimate
 from der_planner.control.touch import Touch
+from der_planner.planning import Plan
 from der_planner.planning.streaming import GRID, Ending, Schedule
 from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import Health
@@ -204,6 +205,16 @@ class Status(NamedTuple):
             return Health("warning", f"{state}; refused {refusal}", values)
         warned = state == "streaming" and reason
         return Health("warning" if warned else "ok", reason or state, values)
+
+
+def told_of(plan: Plan) -> dict[str, object]:
+    """Return the figures of a plan that the diagnostics tell."""
+    return {
+        "predicted_error_m": f"{plan.predicted_error:.6f}",
+        "pressure_margin_pa": f"{plan.pressure_margin:.0f}",
+        "slew_margin_pa_per_s": f"{plan.slew_margin:.0f}",
+        "solve_time_s": f"{plan.solve_time:.3f}",
+    }
 
 
 # The driver --------------------------------------------------------------------------------------

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hmac
 import ipaddress
+import math
 import secrets
 import socket
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from urllib.parse import urlsplit
@@ -19,6 +21,10 @@ SHORTEST_TOKEN = 12
 """A token that somebody sets has at least this many characters."""
 LOOPBACK_NAMES = ("127.0.0.1", "localhost", "::1")
 SAFE_METHODS = ("GET", "HEAD")
+KEPT = 15.0
+"""The desk is kept for an operator whose browser is silent for this time [s]."""
+MOST_WINDOWS = 100
+"""Windows whose tabs are known."""
 HEADERS = (
     (b"x-frame-options", b"DENY"),
     (b"x-content-type-options", b"nosniff"),
@@ -222,42 +228,54 @@ def _host_name(host: str) -> str | None:
 class Desk:
     """The place of the one window that commands the limb; all others watch.
 
-    A window takes the desk if it is free, and loses it when it leaves or its connection stays away.
-    A window that is loaded anew in its tab of the browser gets another name and keeps the desk.
+    A window takes the desk if it is free, and loses it when it leaves, or when its browser has not
+    been heard for `KEPT`. A window that is loaded anew in its tab has another name and keeps it.
 
     Args:
-        lost: called when the operator's connection is lost.
+        clock: steady [s].
     """
 
-    def __init__(self, lost: Callable[[], None]) -> None:
-        self._lost = lost
-        self._tabs: dict[str, str] = {}
-        self.operator: str | None = None
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._tabs: dict[str, str] = {}  # of each window, in the order in which they were loaded
+        self._holder = ""
+        self._heard = -math.inf
+
+    @property
+    def operator(self) -> str | None:
         """Name of the window that commands; None: nobody does."""
+        return self._holder if self._holder and self._age <= KEPT else None
+
+    @property
+    def silence(self) -> float | None:
+        """Time [s] since the operator's browser has shown life; None: nobody commands."""
+        return None if self.operator is None else self._age
+
+    @property
+    def _age(self) -> float:
+        return self._clock() - self._heard
 
     def take(self, window: str) -> bool:
         """Take the desk if it is free; tell whether the window now has it."""
         if self.operator is None:
-            self.operator = window
+            self._holder, self._heard = window, self._clock()
         return self.operator == window
 
-    def connected(self, window: str, tab: str) -> None:
-        """Note the browser's tab of a window, which replaces an earlier window there."""
-        if self.operator is not None and self._tabs.get(self.operator) == tab:
-            self.operator = window
-        self._tabs[window] = tab
+    def hear(self, window: str, tab: str) -> None:
+        """Note that a window's browser has answered just now, and the window's tab."""
+        if window not in self._tabs:
+            if self.operator is not None and self._tabs.get(self._holder) == tab:
+                self._holder = window
+            self._tabs[window] = tab
+            if len(self._tabs) > MOST_WINDOWS:
+                del self._tabs[next(name for name in self._tabs if name != self._holder)]
+        if window == self._holder:
+            self._heard = self._clock()
 
     def leave(self, window: str) -> None:
         """Give the desk up on purpose: nothing is lost."""
-        if self.operator == window:
-            self.operator = None
-
-    def disconnected(self, window: str) -> None:
-        """Note that a window has gone without leaving, which frees the desk if it had it."""
-        self._tabs.pop(window, None)
-        if self.operator == window:
-            self.operator = None
-            self._lost()
+        if self._holder == window:
+            self._holder = ""
 
     def may_command(self, window: str) -> bool:
         """Tell whether a window has the desk."""

@@ -16,6 +16,7 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from der_msgs.msg import MotionCommand, PressureSetpoint
+from der_planner.page.alarm import SUPPLY
 from der_planner.page.situation import Situation
 from der_planner.planning.plan_file import learned_names
 from limb_interfaces import qos, topics
@@ -32,6 +33,10 @@ SERVICES = {
 """Services by what the page calls them, each with the node that serves it."""
 PATIENCE = 3.0
 """A service's answer is waited for during this time [s]."""
+LOOK = 0.05
+"""The planner's diagnostics are looked at again after this time [s]."""
+DECISION = 0.3
+"""A command that was taken is refused within this time [s], if the driver takes nothing."""
 FILLING = 3.0
 """One chamber alone is filled for this time [s]; then the driver lets it down by itself."""
 TICK = NANOSECONDS // 20
@@ -91,7 +96,7 @@ class Commands:
         if not client.service_is_ready():
             text = f"{_owner(service)} does not run or cannot be reached"
             if service == "vent":
-                text += ": NOT VENTED; close the supply and open the valves by hand"
+                text += f": NOT VENTED; {SUPPLY}"
             answer.set_result(Answer(False, text))
             return answer
 
@@ -125,15 +130,28 @@ class Commands:
         self._recorder_parameters.call_async(request).add_done_callback(start)
         return answer
 
-    def play(self, command: MotionCommand) -> Answer:
-        """Publish a motion command; the planner's answer is seen in its diagnostics."""
+    async def play(self, command: MotionCommand) -> Answer:
+        """Publish a motion command under a new plan id, and return what the planner says of it."""
         listeners = self._node.get_subscriptions_info_by_topic(self._motions.topic_name)
         # The recorder listens to commands without following them.
         if all(listener.node_name == "recorder" for listener in listeners):
             return Answer(False, "no planner listens: start it")
+        command.plan_id = f"page-{uuid.uuid4().hex[:8]}"
         self._motions.publish(command)
         what = command.motion or f"a path of {len(command.path)} points"
-        return Answer(True, f"asked the planner for {what} with {command.model}")
+        end, taken = time.monotonic() + PATIENCE, False
+        while time.monotonic() < end:
+            await asyncio.sleep(LOOK)
+            refused = self._situation.value_of("planner", "last_refusal")
+            plan_id, _, refusal = refused.partition(": ")
+            if plan_id == f"plan {command.plan_id}":
+                return Answer(False, f"refused: {refusal}")
+            if not taken and self._situation.value_of("planner", "plan_id") == command.plan_id:
+                # The driver's next state decides whether it is refused.
+                taken, end = True, time.monotonic() + DECISION
+        if taken:
+            return Answer(True, f"the planner plans {what} with {command.model}")
+        return Answer(False, f"the planner has not answered within {PATIENCE:.0f} s")
 
     def fill(self, segment: int, side: int, pressure: float) -> Answer:
         """Fill one chamber alone for `FILLING`, if the driver is armed and nothing is played.
@@ -178,7 +196,5 @@ async def answer_of(service: str, pending: Future[Answer]) -> Answer:
     except Exception as error:  # whatever failed, the operator must read it
         text = f"{owner}: {error or type(error).__name__}"
     if service == "vent":
-        text += (
-            ": NOT VENTED as far as the page knows; close the supply and open the valves by hand"
-        )
+        text += f": NOT VENTED as far as the page knows; {SUPPLY}"
     return Answer(False, text)

@@ -26,7 +26,13 @@ from der_planner.arrays import Array
 from der_planner.limb import Limb
 from der_planner.model import ArcModel
 from der_planner.page.commands import Load
-from der_planner.planning import Motion, PathLimits, PlanningError, Workspace, plan
+from der_planner.planning import (
+    Motion,
+    PathLimits,
+    PlanningError,
+    Workspace,
+    plan,
+)
 from der_planner.planning.paths import read_csv
 
 MOST_POINTS = 20_000
@@ -137,6 +143,7 @@ class Preview:
         deviation_mean, deviation_largest: of the path from the drawing [m].
         warnings: of the plan, without the deviation.
         problem: why there is no plan; empty if there is one.
+        place: (x, y) of the point of the drawing that is the reason [m]; None: it is none.
     """
 
     path: Array
@@ -148,6 +155,7 @@ class Preview:
     deviation_largest: float = 0.0
     warnings: tuple[str, ...] = ()
     problem: str = ""
+    place: tuple[float, float] | None = None
 
 
 def preview(limb: Limb, tip: Array, limits: PathLimits, model: str, method: str) -> Preview:
@@ -156,7 +164,9 @@ def preview(limb: Limb, tip: Array, limits: PathLimits, model: str, method: str)
         motion = Motion.from_tip_path(None, tip, limits=limits, nearest=True)
         planned = plan(limb, motion, model, method)
     except PlanningError as error:
-        return Preview(np.empty((0, 2)), problem=str(error))
+        # Of a point that is out of reach, and of a load that is too much there.
+        place: tuple[float, float] | None = getattr(error, "point", None)
+        return Preview(np.empty((0, 2)), problem=str(error), place=place)
     deviation = planned.reference.deviation
     frames = np.linspace(0, len(planned.time) - 1, min(FRAMES, len(planned.time))).astype(int)
     return Preview(
@@ -190,6 +200,11 @@ class Previewer:
         self._process: ProcessPoolExecutor | None = None
         self.region = lru_cache(REGIONS_KEPT)(lambda load: reachable_region(self.limb_under(load)))
         self.limb_under(carried)
+
+    def follow(self, limb: Limb) -> None:
+        """Draw from now on with another limb, mounted as the planner's."""
+        self.limb = limb
+        self.region.cache_clear()
 
     def limb_under(self, load: Load) -> Limb:
         """Return the limb as the planner would have it for a command of this load.

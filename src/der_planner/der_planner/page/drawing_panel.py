@@ -15,8 +15,9 @@ from nicegui.events import GenericEventArguments
 
 from der_msgs.msg import MotionCommand
 from der_planner.arrays import Array
-from der_planner.page.commands import Answer, Load
+from der_planner.page.commands import Load
 from der_planner.page.drawing import DrawingError, Preview, drawn_pixels
+from der_planner.page.forms import FormError
 from der_planner.page.server import Parts
 from der_planner.page.situation import centimetres
 
@@ -34,8 +35,7 @@ class DrawingPanel:
         parts: what the page shows and commands.
         conditions: returns a command with what to plan with; raises `ValueError` where that makes
             no sense.
-        may_command: tells whether this window commands, and says so if not.
-        show: shows an answer.
+        on_change: is called when there is a drawing that can be played, or none any more.
     """
 
     def __init__(
@@ -43,11 +43,10 @@ class DrawingPanel:
         client: Client,
         parts: Parts,
         conditions: Callable[[], MotionCommand],
-        may_command: Callable[[], bool],
-        show: Callable[[str, Answer], None],
+        on_change: Callable[[], None],
     ) -> None:
         self._client, self._parts = client, parts
-        self._conditions, self._may_command, self._show = conditions, may_command, show
+        self._conditions, self._on_change = conditions, on_change
         self._drawn: Array | None = None
         """What was drawn last (P, 2) [m], whether it can be played or not."""
         self._playable: MotionCommand | None = None
@@ -57,7 +56,6 @@ class DrawingPanel:
             self._switch = ui.switch("Draw on the picture", on_change=self._on_switch)
             self._switch.props('id="draw"')
             ui.button("Clear", on_click=self._clear).props('id="clear" flat')
-            self.play = ui.button("Play drawing", on_click=self._on_play).props('id="play-drawing"')
         with ui.row().classes("line"):
             self._kept = ui.select(parts.drawings.names(), label="Kept drawings")
             ui.button("Show", on_click=self._on_load).props('id="load-drawing" flat')
@@ -94,6 +92,7 @@ class DrawingPanel:
         if self._pending is not None:
             self._pending.cancel()
             self._pending = None
+        self._on_change()
 
     async def _on_drawn(self, event: GenericEventArguments) -> None:
         sent = event.args.get("points") if isinstance(event.args, dict) else None
@@ -123,7 +122,6 @@ class DrawingPanel:
         """Plan a drawing (P, 2) [m] beside the page and show what comes of it."""
         self._forget_preview()
         self._drawn = tip
-        self.play.set_enabled(False)
         previewer = self._parts.previewer
         try:
             command = self._conditions()
@@ -147,6 +145,7 @@ class DrawingPanel:
             command.path = [Point(x=float(x), y=float(y)) for x, y in tip]
             command.nearest_path = True
             self._playable = command
+            self._on_change()
         self._result.set_text(summary(found))
         self._show_preview(tip, found)
 
@@ -158,16 +157,19 @@ class DrawingPanel:
             "path": pixels_of(found.path),
             "poses": [pixels_of(pose) for pose in thinned],
             "duration": found.duration,
+            "place": pixels_of(np.array(found.place).reshape(-1, 2)) if found.place else [],
         }
         self._run("show", preview)
 
-    def _on_play(self) -> None:
-        if not self._may_command():
-            return
+    def command(self) -> MotionCommand:
+        """Return the command that plays the drawing with what it was previewed with.
+
+        Raises:
+            FormError: there is no drawing, or no preview yet.
+        """
         if self._playable is None:
-            ui.notify("draw a line first, and wait for its preview", type="warning")
-            return
-        self._show("play drawing", self._parts.commands.play(self._playable))
+            raise FormError("draw a line first, and wait for its preview")
+        return self._playable
 
     async def _on_load(self) -> None:
         if not self._kept.value:

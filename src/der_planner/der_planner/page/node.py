@@ -14,6 +14,7 @@ import numpy as np
 from ament_index_python.packages import get_package_share_directory
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
+from rcl_interfaces.msg import Log
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.node import Node
@@ -31,11 +32,12 @@ from der_msgs.msg import (
     LimbContact,
     LimbEstimate,
     LimbState,
+    OperatorLease,
     PressurePlan,
     PressureState,
     TagDetectionArray,
 )
-from der_planner.limb import Limb
+from der_planner.limb import Limb, LimbError
 from der_planner.page.access import Binding, Desk
 from der_planner.page.commands import Commands, Load
 from der_planner.page.drawing import DrawingFolder, Previewer
@@ -51,7 +53,9 @@ from limb_interfaces.runner import run_node
 from limb_interfaces.stamps import nanoseconds
 
 LIMB_MARKER = "planner/limb"
-POLICIES = ("continue", "stop", "vent")
+ROSOUT = "/rosout"
+LEASE_LOOK = 0.2
+"""Time between two promises to the driver [s]."""
 
 
 class PageNode(Node):
@@ -65,36 +69,45 @@ class PageNode(Node):
         read: Callable[..., Any] = functools.partial(declare, self)
         binding = self._read_binding(read)
         previewer = self._read_previewer(read)
+        report = read(
+            "report", "", "folder of an experiment's report: shown as soon as it is there"
+        )
         drawings = read("drawings", "~/limb_drawings", "folder of kept drawings")
         share = Path(get_package_share_directory("apriltag_tracker")) / "config"
         tag_map = read("tag_map", str(share / "tags.yaml"), "YAML file: where the tags are")
         rate = read(
             "picture_rate", 15.0, "pictures a second at most [Hz]", at_least=1.0, at_most=30.0
         )
-        self._policy: str = read(
-            "on_lost_operator",
-            "continue",
-            "what to do when the operator's browser goes away while it commands",
-            choices=POLICIES,
+        self._lease_period: float = read(
+            "lease_period",
+            2.0,
+            "the driver does as its `on_lost_operator` says when the operator's browser has been "
+            "silent for this time [s]; 0: it is never told",
+            at_least=0.0,
+            at_most=10.0,  # less than the desk is kept, which would give the lease up
         )
+        self._leased = False
         # A misspelt name of a protection must not leave the page without it.
         check_overrides(self, refuse=True)
-        self._situation = Situation()
+        self._situation = Situation(namespace=self.get_namespace())
         self._parts = Parts(
             situation=self._situation,
             picture=PictureFeed(rate),
             overlay=Overlay(TagMap.from_yaml(tag_map)),
-            desk=Desk(self._on_lost_operator),
+            desk=Desk(),
             commands=Commands(self, self._situation, previewer.limb.segment_count),
             previewer=previewer,
             drawings=DrawingFolder(Path(drawings).expanduser()),
+            report=Path(report).absolute() if report else None,
         )
         self._picture, self._overlay = self._parts.picture, self._parts.overlay
         self._server = PageServer(binding, self._parts, lay_out)
         self._images: Subscription | None = None
         self._subscribe_all()
         self._diagnostics = DiagnosticsPublisher(self, self._health)
+        self._leases = self.create_publisher(OperatorLease, topics.OPERATOR_LEASE, qos.LEASES)
         self.create_timer(0.2, self._watch)
+        self.create_timer(LEASE_LOOK, self._renew_lease)
         self._server.start()
         self.get_logger().info(f"the page is at {self._server.url}?token={binding.token}")
         if not binding.loopback:
@@ -114,16 +127,20 @@ class PageNode(Node):
         )
 
     def _read_previewer(self, read: Callable[..., Any]) -> Previewer:
-        limb_file = read("limb_file", "", "the planner's limb file; empty: the default limb")
-        limb = Limb.from_yaml(limb_file) if limb_file else Limb.default()
-        mounting = read("mounting", "", "as the planner's; empty: as in the limb file")
+        limb_file = read(
+            "limb_file", "", "the planner's limb file until it is heard; empty: the default limb"
+        )
+        self._mounting: str = read("mounting", "", "as the planner's; empty: as in the limb file")
         payload = read("payload", 0.0, "as the planner's [kg]", at_least=0.0)
         place = read("payload_at", 0.0, "as the planner's [m]; 0: the tip", at_least=0.0)
         speed = read("path_speed", 0.03, "as the planner's [m/s]", at_least=1e-3)
         most = read("path_acceleration", 0.05, "as the planner's [m/s^2]", at_least=1e-3)
-        if mounting:
-            limb = limb.mounted(mounting)
-        return Previewer(limb, PathLimits(speed, most), Load(payload, place))
+        return Previewer(self._read_limb(limb_file), PathLimits(speed, most), Load(payload, place))
+
+    def _read_limb(self, file: str) -> Limb:
+        self._limb_file = file
+        limb = Limb.from_yaml(file) if file else Limb.default()
+        return limb.mounted(self._mounting) if self._mounting else limb
 
     # What comes in -------------------------------------------------------------------------
 
@@ -139,6 +156,7 @@ class PageNode(Node):
         subscribe(CameraInfo, topics.CAMERA_INFO, self._on_camera, qos.IMAGES)
         subscribe(LimbEstimate, topics.ESTIMATE, self._on_estimate, qos.STATES)
         subscribe(LimbContact, topics.CONTACT, situation.put_contact, qos.STATES)
+        subscribe(Log, ROSOUT, situation.put_log, qos.STATES)
         subscribe(DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, qos.STATES)
 
     def _subscribe(
@@ -229,7 +247,13 @@ class PageNode(Node):
         self._picture.put(nanoseconds(message.header.stamp), grey)
 
     def _watch(self) -> None:
-        """Subscribe to images while somebody looks; end with the server."""
+        """Draw with the planner's limb, take images while somebody looks, end with the server."""
+        file = self._situation.value_of("planner", "limb_file")
+        if file not in ("", self._limb_file):
+            try:
+                self._parts.previewer.follow(self._read_limb(file))
+            except LimbError as error:  # as on another computer
+                self.get_logger().warning(f"drawings are not planned as the planner does: {error}")
         if self._server.error is not None:
             self.fatal_error = f"the page's server ended: {self._server.error}"
         if self._picture.watched and self._images is None:
@@ -240,10 +264,19 @@ class PageNode(Node):
             self.destroy_subscription(self._images)
             self._images = None
 
-    def _on_lost_operator(self) -> None:
-        self.get_logger().warning(f"the operator's browser is gone: {self._policy}")
-        if self._policy != "continue":
-            self._parts.commands.call(self._policy)
+    def _renew_lease(self) -> None:
+        """Promise the driver that the operator watches on; each promise ends with the browser's.
+
+        Nothing is promised that the browser has not answered for: whatever dies on the way from
+        there to here, or the page itself, the driver hears of no operator any more.
+        """
+        silence = self._parts.desk.silence
+        if silence is None and self._leased:
+            self._leases.publish(OperatorLease(source=self._server.url))  # given up on purpose
+        left = -1.0 if silence is None else self._lease_period - silence
+        if left > 0.0:
+            self._leases.publish(OperatorLease(source=self._server.url, period=left))
+        self._leased = silence is not None and self._lease_period > 0.0
 
     # What it says of itself ----------------------------------------------------------------
 
@@ -251,10 +284,11 @@ class PageNode(Node):
         values = {
             "url": self._server.url,
             "operator": "yes" if self._parts.desk.operator else "no",
+            "limb": self._parts.previewer.limb.name,
             "picture": "watched" if self._picture.watched else "nobody looks",
             "refused_requests": self._server.access.refused,
             "refused_messages": self._refused,
-            "on_lost_operator": self._policy,
+            "lease_period_s": self._lease_period,
             "threads": threading.active_count(),
         }
         if not self._server.ready:

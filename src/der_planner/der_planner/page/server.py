@@ -30,12 +30,14 @@ from der_planner.page.situation import Situation
 STATIC = Path(__file__).parent / "static"
 RATE = 10.0
 """Live data are sent at this rate [Hz]."""
-LONGEST_TIME = 30
-"""The time that a window says has at most this many characters."""
+LONGEST_ASK = 200
+"""What a window asks with has at most this many characters."""
 LONGEST_WAIT = 1.0
 """A request for a picture may wait for the next one during this time [s]."""
 PICTURE_POLL = 0.01
 """A waiting request looks for a new picture at this interval [s]."""
+REPORT = "report.html"
+"""The file of an experiment's report in its folder."""
 UNCACHED = {"Cache-Control": "no-store"}
 
 
@@ -50,13 +52,16 @@ class Parts:
     commands: Commands
     previewer: Previewer
     drawings: DrawingFolder
+    report: Path | None = None
 
 
 def create_app(parts: Parts) -> FastAPI:
     """Return the application without its layout."""
     app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
     app.mount("/static", StaticFiles(directory=STATIC))
-    _add_live_data(app, parts.situation)
+    if parts.report is not None:
+        app.mount("/report", StaticFiles(directory=parts.report, check_dir=False))
+    _add_live_data(app, parts)
     _add_picture(app, parts)
 
     @app.post("/vent")
@@ -68,12 +73,13 @@ def create_app(parts: Parts) -> FastAPI:
     return app
 
 
-def _add_live_data(app: FastAPI, situation: Situation) -> None:
+def _add_live_data(app: FastAPI, parts: Parts) -> None:
     """Add the websocket of the live data.
 
-    A window sends the time of its own clock, and asks again when it has the answer: a slow
-    connection delays data, but does not pile them up. The time and how long the request waited here
-    go back with the answer: what else has passed on the window's clock is how old the data can be.
+    A window sends the time of its own clock, its name and its tab, and asks again when it has the
+    answer: a slow connection delays data, but does not pile them up. The time and how long the
+    request waited here go back with the answer: what else has passed on the window's clock is how
+    old the data can be. Each request is a sign of life of the browser.
     """
 
     @app.websocket("/live")
@@ -83,25 +89,28 @@ def _add_live_data(app: FastAPI, situation: Situation) -> None:
         # Either is raised when the browser has gone.
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):
             while True:
-                asked = _window_time(await websocket.receive_text())
+                asked, window, tab = _read_request(await websocket.receive_text())
                 if asked is None:
                     continue
+                parts.desk.hear(window, tab)
                 came = time.monotonic()
                 await asyncio.sleep(due - came)
                 waited = round(time.monotonic() - came, 4)
-                data = {"asked": asked, "waited": waited, **situation.snapshot()}
+                data = {"asked": asked, "waited": waited, **parts.situation.snapshot()}
+                data["report"] = bool(parts.report and (parts.report / REPORT).is_file())
                 await websocket.send_text(json.dumps(data, separators=(",", ":"), allow_nan=False))
                 # On a grid, so that what sending takes does not add up; nothing is made up for.
                 due = max(due + 1.0 / RATE, time.monotonic())
 
 
-def _window_time(text: str) -> float | None:
-    """Return the time that a window sent; None if no clock shows that."""
+def _read_request(text: str) -> tuple[float | None, str, str]:
+    """Return the time that a window sent, None if no clock shows that; its name, and its tab."""
+    said, window, tab = [*text[:LONGEST_ASK].split(" "), "", ""][:3]
     try:
-        sent = float(text[:LONGEST_TIME])
+        sent = float(said)
     except ValueError:
-        return None
-    return sent if math.isfinite(sent) else None
+        sent = math.nan
+    return sent if math.isfinite(sent) else None, window, tab
 
 
 def _add_picture(app: FastAPI, parts: Parts) -> None:

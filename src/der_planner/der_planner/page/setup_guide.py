@@ -10,12 +10,13 @@ from typing import Any
 
 from nicegui import Client, ui
 
-from der_planner.limb import Limb
 from der_planner.page.commands import FILLING, Answer, answer_of
 from der_planner.page.server import STATIC, Parts
 from der_planner.page.situation import PASCAL_PER_KILOPASCAL
 
 ADDRESS = "/setup"
+RECONNECT = 60.0
+"""What a window's panels hold is kept for this time [s] while its connection is away."""
 INTERVAL = 0.5
 """The steps are judged at this interval [s]."""
 DRIVEN = 3.0
@@ -26,6 +27,8 @@ VENTED = 1.0
 """A segment counts as vented below this differential pressure [kPa]."""
 BOARD_SILENT = 0.5
 """A valve board counts as silent after this time [s] without telemetry."""
+CHAMBERS = "Each chamber has been filled alone"
+"""Title of the step with the buttons that fill chambers."""
 CALIBRATION = "calibration-"
 """The plans of `calibrate_limb.py` have names that begin so."""
 
@@ -52,11 +55,9 @@ class SetupGuide:
 
     Args:
         segments: of the limb.
-        default: name of the limb that comes with the package, which is nobody's own.
     """
 
-    def __init__(self, segments: int, default: str) -> None:
-        self._default = default
+    def __init__(self, segments: int) -> None:
         self._chambers = [(segment, side) for segment in range(segments) for side in (1, -1)]
         self._driven: set[tuple[int, int]] = set()
         self._calibrating = self._calibrated = False
@@ -72,7 +73,8 @@ class SetupGuide:
         sources = data["sources"]
         driver = data["driver"] if sources["driver"]["fresh"] else None
         limb = data["limb"] if sources["tracker"]["fresh"] else None
-        planned = _planned_limb(data["nodes"])
+        planned, identified = _planned_limb(data["nodes"])
+        told = f"identified on {identified}" if identified else "which nobody identified"
         self._watch(driver)
         return [
             _board(driver),
@@ -93,11 +95,11 @@ class SetupGuide:
                 else limb["reason"] or "tip at ({:.1f}, {:.1f}) cm".format(*limb["tip_cm"]),
                 "Light it evenly; tags should be 25 px wide or more.",
             ),
-            self._calibration(planned),
+            self._calibration(identified),
             Step(
                 "The planner has this limb's own file",
-                planned not in ("", self._default),
-                f"it plans for '{planned}'" if planned else "no planner is heard",
+                bool(identified),
+                f"it plans for '{planned}', {told}" if planned else "no planner is heard",
                 "scripts/calibrate_limb.py makes it from a calibration run; start the planner with "
                 "limb_file:=FILE.",
             ),
@@ -117,23 +119,22 @@ class SetupGuide:
     def _each_chamber(self) -> Step:
         left = [chamber(*place) for place in self._chambers if place not in self._driven]
         return Step(
-            "Each chamber has been filled alone",
+            CHAMBERS,
             not left,
             f"not yet: {', '.join(left)}" if left else "all of them, since this page was opened",
-            "Arm and fill each with the buttons below; look whether the limb bends to the side "
+            "Arm and fill each with these buttons; look whether the limb bends to the side "
             "that is said.",
         )
 
-    def _calibration(self, planned: str) -> Step:
-        own = planned not in ("", self._default)
+    def _calibration(self, identified: str) -> Step:
         seen = "none has been played since this page was opened"
         if self._calibrated:
             seen = "one is being played" if self._calibrating else "one has been played"
-        elif own:
-            seen = "there is a limb file"
+        elif identified:
+            seen = f"the planner's limb was identified on {identified}"
         return Step(
             "A calibration run has been played",
-            own or (self._calibrated and not self._calibrating),
+            bool(identified) or (self._calibrated and not self._calibrating),
             seen,
             "`python3 scripts/calibrate_limb.py --graph --hardware RIG.yaml --out LIMB.yaml` plays "
             "and records one with nodes of its own: end all nodes but this page first.",
@@ -184,12 +185,13 @@ def _camera(live: bool, calibrated: bool) -> Step:
     )
 
 
-def _planned_limb(nodes: Sequence[dict[str, Any]]) -> str:
-    """Return the name of the limb that the planner plans for; empty if it is not heard."""
-    planner = next((node for node in nodes if node["name"] == "planner"), None)
-    if planner is None or planner["state"] in ("late", "dead"):
-        return ""
-    return str(planner["values"].get("limb", ""))
+def _planned_limb(nodes: Sequence[dict[str, Any]]) -> tuple[str, str]:
+    """Return the limb that the planner plans for, and when and on what it was identified."""
+    planner = next((node for node in nodes if node["own"] == "planner"), None)
+    if planner is None or planner["state"] in ("late", "dead", "ended"):
+        return "", ""
+    values = planner["values"]
+    return str(values.get("limb", "")), str(values.get("limb_identified", ""))
 
 
 def show_answer(client: Client, answer: Answer) -> None:
@@ -198,31 +200,45 @@ def show_answer(client: Client, answer: Answer) -> None:
         ui.notify(answer.message, type="positive" if answer.success else "negative", timeout=6000)
 
 
+def add_frame(client: Client) -> None:
+    """Add what every window has beside its panels, plain HTML: alarm, state, vent, live data."""
+    name = f"<script>window.limbWindow = '{client.id}';</script>"
+    ui.add_body_html(name + (STATIC / "frame.html").read_text())
+
+
 def add_setup_guide(parts: Parts) -> None:
     """Add the page at `ADDRESS`."""
 
-    @ui.page(ADDRESS, title="Limb: set-up", favicon="🦑")
+    @ui.page(ADDRESS, title="Limb: set-up", favicon="🦑", reconnect_timeout=RECONNECT)
     def show_guide(client: Client) -> None:
         ui.add_head_html('<link rel="stylesheet" href="/static/page.css">')
-        ui.add_body_html((STATIC / "frame.html").read_text())
-        guide = SetupGuide(parts.previewer.limb.segment_count, Limb.default().name)
-        with ui.element("main").props('id="setup"'):
+        add_frame(client)
+        guide = SetupGuide(parts.previewer.limb.segment_count)
+        with ui.element("main").props('id="setup"') as main:
             ui.html("<h2>First power-up</h2>", sanitize=False)
-            ui.label("From top to bottom; every line is checked twice a second.")
-            lines = ui.column().classes("fill")
-            _add_buttons(client, parts)
-        client.on_delete(lambda: parts.desk.disconnected(client.id))
+            ui.label("From top to bottom; every step is checked twice a second.")
+            shown: list[tuple[ui.step, ui.label]] = []
+
+        def read() -> list[Step]:
+            calibrated, problem = parts.overlay.camera_problem()
+            return guide.steps(parts.situation.snapshot(), problem, calibrated)
 
         def judge() -> None:
-            calibrated, problem = parts.overlay.camera_problem()
-            steps = guide.steps(parts.situation.snapshot(), problem, calibrated)
-            lines.clear()
-            with lines:
-                for number, step in enumerate(steps, 1):
-                    with ui.element("div").classes("step done" if step.done else "step"):
-                        ui.label(f"{'✔' if step.done else '○'} {number}. {step.title}")
-                        ui.label(step.seen if step.done else f"{step.seen}. {step.advice}")
+            for (line, label), step in zip(shown, read(), strict=True):
+                label.set_text(step.seen if step.done else f"{step.seen}. {step.advice}")
+                title = f"{'✔' if step.done else '○'} {step.title}"
+                if line.props["title"] != title:
+                    line.props["title"] = title
 
+        first = next((step.title for step in read() if not step.done), None)
+        with main, ui.stepper(value=first).props("vertical header-nav").classes("fill") as stepper:
+            for step in read():
+                with ui.step(step.title) as line:
+                    shown.append((line, ui.label()))
+                    if step.title == CHAMBERS:
+                        _add_buttons(client, parts)
+                    with ui.stepper_navigation():
+                        ui.button("Next", on_click=stepper.next).props("flat")
         judge()
         ui.timer(INTERVAL, judge)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 import socket
 import threading
 import time
@@ -13,9 +14,12 @@ from typing import Any
 
 import psutil
 from diagnostic_msgs.msg import DiagnosticStatus
+from rcl_interfaces.msg import Log
 
 from der_msgs.msg import LimbContact, LimbEstimate, LimbState, PressurePlan, PressureState
 from der_planner.limb import mounting_of
+from der_planner.page.alarm import NODES, alarms, describe_limb, missing, worst_first
+from limb_interfaces.diagnostics import ENDED_IN_ORDER
 from limb_interfaces.stamps import NANOSECONDS, nanoseconds
 
 PASCAL_PER_KILOPASCAL = 1000.0
@@ -29,9 +33,24 @@ LATE = 1.6
 DEAD = 5.0
 """A node counts as dead after this time [s] without diagnostics."""
 ENDED, STOPPED = "its process has ended", "its process is stopped"
-MODES = ("disarmed", "armed", "tracking", "holding", "venting", "fault")
+MODES = {
+    "disarmed": "vented: it does not move",
+    "armed": "may move",
+    "tracking": "moves",
+    "holding": "keeps its pressures",
+    "venting": "lets its pressures down",
+    "fault": "vented: something failed",
+}
+"""The driver's modes, in the order of their numbers, and what each means for the limb."""
+FORGOTTEN = 60.0
+"""A node that is none of this limb's is forgotten after this time [s] without diagnostics."""
+MOST_NODES = 30
+"""Nodes that are known at once."""
+FATAL = 50
+"""Level of a node's last words in the log."""
 LEVELS = ("ok", "warning", "error", "stale")
 REFERENCES_KEPT = 200
+_UNKNOWN: tuple[str, psutil.Process | None, str] = ("", None, "")
 GAP = NANOSECONDS // 5
 """No reference is interpolated between two that are further apart than this [ns]."""
 
@@ -43,17 +62,22 @@ class Situation:
 
     Args:
         clock: steady [s].
+        namespace: of this limb's nodes.
     """
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, clock: Callable[[], float] = time.monotonic, namespace: str = "/limb"
+    ) -> None:
+        self._own = {f"{namespace}/{name}": name for name in NODES}
         self._clock = clock
+        self._last_words: dict[str, str] = {}
         self._lock = threading.Lock()
         self._heard: dict[str, float] = {}
         self._values: dict[str, dict[str, Any]] = {}
         self._plan = ""
         self._tip: tuple[int, tuple[float, float]] | None = None
         self._nodes: dict[str, tuple[dict[str, Any], float]] = {}
-        self._processes: dict[str, tuple[str, psutil.Process | None]] = {}
+        self._processes: dict[str, tuple[str, psutil.Process | None, str]] = {}
         self._references: deque[tuple[int, float, float]] = deque(maxlen=REFERENCES_KEPT)
 
     # What comes in -------------------------------------------------------------------------
@@ -67,9 +91,11 @@ class Situation:
 
     def put_driver(self, message: PressureState) -> None:
         """Take the driver's state."""
-        known = 0 <= message.mode < len(MODES)
+        known = dict(enumerate(MODES.items()))
+        mode, meaning = known.get(message.mode, (f"unknown mode {message.mode}", "unknown"))
         values = {
-            "mode": MODES[message.mode] if known else f"unknown mode {message.mode}",
+            "mode": mode,
+            "meaning": meaning,
             "faults": list(message.faults),
             "plan_id": message.plan_id,
             "commanded_kpa": _kilopascal(message.commanded_differential),
@@ -132,16 +158,36 @@ class Situation:
         level = int.from_bytes(status.level, "little")
         values = {entry.key: entry.value for entry in status.values}
         node = {
-            "name": status.name.rsplit("/", 1)[-1],
+            "name": status.name,
+            "own": self._own.get(status.name, ""),
             "state": LEVELS[level] if level < len(LEVELS) else "error",
             "message": status.message,
             "values": values,
         }
         process = values.get("process", "")
         with self._lock:
+            self._forget_nodes()
+            known = node["own"] or status.name in self._nodes
+            if not known and len(self._nodes) >= MOST_NODES:
+                return
             self._nodes[status.name] = node, self._clock()
-            if self._processes.get(status.name, (None, None))[0] != process:
-                self._processes[status.name] = process, _process(process)
+            if process != self._processes.get(status.name, _UNKNOWN)[0]:
+                self._processes[status.name] = (process, *_process(process))
+                self._last_words.pop(status.name, None)
+
+    def put_log(self, message: Log) -> None:
+        """Take the last words of a node of this limb that ends for a reason of its own."""
+        name = "/" + message.name.replace(".", "/")
+        if message.level >= FATAL and name in self._own:
+            self._last_words[name] = message.msg
+
+    def _forget_nodes(self) -> None:
+        """Forget nodes of others that have said nothing for long."""
+        oldest = self._clock() - FORGOTTEN
+        gone = [name for name, (node, at) in self._nodes.items() if at < oldest and not node["own"]]
+        for name in gone:
+            del self._nodes[name]
+            self._processes.pop(name, None)
 
     # What is known -------------------------------------------------------------------------
 
@@ -153,9 +199,9 @@ class Situation:
             return str(self._values["driver"]["mode"]) if age <= FRESH["driver"] else ""
 
     def value_of(self, node: str, key: str) -> str:
-        """Return what a node's newest diagnostics say under a key; empty where they do not."""
+        """Return what the newest diagnostics of a node of this limb say under a key, or nothing."""
         with self._lock:
-            found = [entry["values"] for entry, _ in self._nodes.values() if entry["name"] == node]
+            found = [entry["values"] for entry, _ in self._nodes.values() if entry["own"] == node]
         return str(found[0].get(key, "")) if found else ""
 
     def reference_at(self, stamp: int) -> tuple[float, float] | None:
@@ -181,9 +227,14 @@ class Situation:
         with self._lock:
             now = self._clock()
             heard, values = dict(self._heard), dict(self._values)
+            self._forget_nodes()
             nodes = [
-                _with_age(node, now - at, _trouble(self._processes[name][1]))
-                for name, (node, at) in sorted(self._nodes.items())
+                _with_age(node, now - at, _trouble(self._processes.get(name, _UNKNOWN)[1]))
+                | {
+                    "command": self._processes.get(name, _UNKNOWN)[2],
+                    "last_words": self._last_words.get(name, ""),
+                }
+                for name, (node, at) in self._nodes.items()
             ]
         ages = {
             source: {
@@ -194,15 +245,18 @@ class Situation:
             for source, limit in FRESH.items()
         }
         limb = values.get("tracker")
-        return {
+        found = {
             "sources": ages,
             "driver": values.get("driver"),
             "limb": limb and {**limb, "error_cm": self._tip_error()},
             "plan": self._plan,
             "estimate": values.get("estimate"),
             "contact": values.get("contact"),
-            "nodes": nodes,
+            "nodes": worst_first(nodes),
+            "missing": missing(nodes),
+            "limb_is": describe_limb(values.get("driver")),
         }
+        return found | {"alarms": [alarm._asdict() for alarm in alarms(found)]}
 
     def _tip_error(self) -> float | None:
         """Return the newest tip's distance from its reference [cm]; None where one is missing."""
@@ -229,26 +283,29 @@ def _kilopascal(values: Sequence[float]) -> list[float | None]:
 
 def _with_age(node: dict[str, Any], age: float, trouble: str) -> dict[str, Any]:
     """Return what is shown of a node that spoke some seconds ago."""
-    shown = {**node, "age": round(age, 1)}
-    if trouble or age > LATE:
+    shown = {**node, "age": round(age, 1), "trouble": trouble or "nothing is heard of it"}
+    if node["message"] == ENDED_IN_ORDER:
+        shown["state"] = "ended"
+    elif trouble or age > LATE:
         shown["state"] = "dead" if trouble or age > DEAD else "late"
         shown["message"] = trouble or node["message"]
     return shown
 
 
-def _process(identity: str) -> psutil.Process | None:
-    """Return the process that a node names as ``HOST:NUMBER``, if it runs on this computer.
+def _process(identity: str) -> tuple[psutil.Process | None, str]:
+    """Return the process that a node names as ``HOST:NUMBER``, and the command that started it.
 
-    A process that is not seen here, as on another computer or in another container, is never said
-    to have ended.
+    Neither is known of a process that does not run on this computer. One that is not seen here, as
+    on another computer or in another container, is never said to have ended.
     """
     host, _, number = identity.rpartition(":")
     if host != socket.gethostname() or not number.isdigit():
-        return None
+        return None, ""
     try:
-        return psutil.Process(int(number))
+        process = psutil.Process(int(number))
+        return process, shlex.join(process.cmdline())
     except psutil.Error:
-        return None
+        return None, ""
 
 
 def _trouble(process: psutil.Process | None) -> str:

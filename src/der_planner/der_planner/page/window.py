@@ -1,35 +1,41 @@
-"""The page of one window: what it looks like, its motion form, and what its buttons do."""
+"""The page of one window: what it looks like, and what its buttons do."""
 
 from __future__ import annotations
 
-import math
-import re
+import json
 from collections.abc import Awaitable, Callable
+from typing import Any
 
 from fastapi import FastAPI
 from nicegui import Client, ui
 
 from der_msgs.msg import MotionCommand
-from der_planner.limb import MOUNTINGS, LimbError, gravity_of
-from der_planner.methods import LEARNED
 from der_planner.page.commands import Answer, answer_of
 from der_planner.page.drawing_panel import DrawingPanel
+from der_planner.page.forms import FormError, MotionForm
 from der_planner.page.server import STATIC, Parts
 from der_planner.page.setup_guide import ADDRESS as SETUP_ADDRESS
-from der_planner.page.setup_guide import add_setup_guide, show_answer
-from der_planner.page.situation import CENTIMETRES, GRAMS
-from der_planner.planning import METHODS
-from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD, NAMES
+from der_planner.page.setup_guide import RECONNECT, add_frame, add_setup_guide, show_answer
 
-RECONNECT = 3.0
-"""A browser's connection may be away for this time [s] before it counts as lost."""
+PING = 3.0
+"""The framework notices a connection that is gone within about this time [s]."""
 DESK_INTERVAL = 0.3
-"""A window looks who commands at this interval [s]."""
+"""A window looks who commands, and what can be done, at this interval [s]."""
 LEARNED_INTERVAL = 2.0
 """A window looks which plans have been learned at this interval [s]."""
-NO_PLANS = "No learned plans"
-_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
-"""Such a text is a thousand in one country and one in another."""
+MOTION, LEARNED_PLAN, DRAWING, AGAIN = "motion", "learned", "drawing", "again"
+SOURCES = {
+    MOTION: "Named motion", LEARNED_PLAN: "Learned plan", DRAWING: "Drawing", AGAIN: "Last plan",
+}  # fmt: skip
+"""What the one play button plays."""
+CURVES = {
+    "pressure": ("Differential pressure", "kPa", ("measured", "commanded")),
+    "bend": ("Bend angle", "°", ("measured",)),
+    "error": ("Tip error", "cm", ()),
+}
+"""The curves: title, unit, and what there is for each segment; nothing: one curve of the tip."""
+COLOURS = ("#2367c9", "#d2601a", "#3c8a3c", "#8a3c8a")
+"""Of the segments."""
 
 
 def lay_out(app: FastAPI, parts: Parts) -> None:
@@ -40,7 +46,7 @@ def lay_out(app: FastAPI, parts: Parts) -> None:
         OperatorWindow(client, parts)
 
     add_setup_guide(parts)
-    ui.run_with(app, show_welcome_message=False, reconnect_timeout=RECONNECT, tailwind=False)
+    ui.run_with(app, show_welcome_message=False, reconnect_timeout=PING, tailwind=False)
 
 
 class OperatorWindow:
@@ -49,20 +55,20 @@ class OperatorWindow:
     def __init__(self, client: Client, parts: Parts) -> None:
         self._client = client
         self._parts = parts
-        self._buttons: list[ui.button] = []
+        self._buttons: dict[str, tuple[ui.element, ui.button]] = {}
+        self._reasons: dict[str, str] = {}
         ui.add_head_html('<link rel="stylesheet" href="/static/page.css">')
-        ui.add_body_html((STATIC / "frame.html").read_text())
+        add_frame(client)
         with ui.element("main").props('id="panels"'):
+            with ui.element("section").props('id="act"'):
+                self._add_desk()
             with self._panel("view", "Camera", "camera"):
-                self._drawing = DrawingPanel(
-                    client, parts, self._conditions, self._may_command, self._show
-                )
+                self._drawing = DrawingPanel(client, parts, self._conditions, self._on_drawing)
             with self._panel("do", "Command"):
                 self._add_controls()
-            self._panel("numbers", "Last 30 s", "driver")
+            with self._panel("numbers", "Last 30 s", "driver"):
+                add_curves(parts.previewer.limb.segment_count)
             self._panel("nodes", "Nodes")
-        client.on_connect(lambda: parts.desk.connected(client.id, str(client.tab_id)))
-        client.on_delete(lambda: parts.desk.disconnected(client.id))
         ui.timer(DESK_INTERVAL, self._show_desk)
         ui.timer(LEARNED_INTERVAL, lambda: self._form.offer(parts.commands.learned_plans()))
 
@@ -74,19 +80,20 @@ class OperatorWindow:
             ui.html(content.read_text(), sanitize=False).classes("fill")
         return panel
 
-    def _add_controls(self) -> None:
+    def _add_desk(self) -> None:
         with ui.row().classes("line"):
             self._take = ui.button("Take control", on_click=self._on_take).props('id="take"')
-            self._who = ui.label().props('id="who"')
-            ui.link("Set-up guide", SETUP_ADDRESS, new_tab=True)
-        with ui.row().classes("line"):
             self._add_button("Arm", "arm", lambda: self._call("arm"), "positive")
             self._add_button("Stop motion", "stop", lambda: self._call("stop"), "warning")
-            self._add_button("Play last plan again", "start", lambda: self._call("start"))
-        self._form = MotionForm(
-            lambda: self._add_button("Play motion", "play", self._on_play),
-            self._drawing.plan_again,
-        )
+            ui.link("Set-up guide", SETUP_ADDRESS, new_tab=True)
+            self._who = ui.label().props('id="who"')
+
+    def _add_controls(self) -> None:
+        with ui.row().classes("line"):
+            self._source = ui.toggle(SOURCES, value=MOTION).props('id="source" dense')
+            self._add_button("Play", "play", self._on_play)
+        self._why = ui.label().props('id="why"')
+        self._form = MotionForm(self._drawing.plan_again)
         with ui.row().classes("line"):
             self._note = ui.input("Note for the recording")
             self._add_button("Record", "record", self._on_record)
@@ -95,15 +102,43 @@ class OperatorWindow:
     def _add_button(
         self, text: str, name: str, action: Callable[[], Awaitable[None]], colour: str = "primary"
     ) -> None:
-        button = ui.button(text, on_click=action, color=colour).props(f'id="{name}"')
-        self._buttons.append(button)
+        # A disabled button tells nothing to a pointer: what is around it does.
+        with ui.element("span") as around:
+            button = ui.button(text, on_click=action, color=colour).props(f'id="{name}"')
+        self._buttons[name] = around, button
+
+    def _on_drawing(self) -> None:
+        """Choose a drawing as soon as it can be played."""
+        if self._drawing.ready:
+            self._source.set_value(DRAWING)
+        self._show_desk()
+
+    def _obstacle(self, name: str) -> str:
+        """Return why a button can do nothing now; empty if it can."""
+        if not self._parts.desk.may_command(self._client.id):
+            return "take control first"
+        if name != "play":
+            return ""
+        mode = self._parts.situation.driver_mode
+        if mode in ("disarmed", "fault"):
+            return f"the limb is {mode}: arm first"
+        if self._source.value == DRAWING and not self._drawing.ready:
+            return "draw on the picture first, and wait for the preview"
+        if self._source.value == LEARNED_PLAN and not self._form.learned:
+            return "choose a learned plan first"
+        return ""
 
     def _show_desk(self) -> None:
         desk = self._parts.desk
         mine = desk.may_command(self._client.id)
-        for button in self._buttons:
-            button.set_enabled(mine)
-        self._drawing.play.set_enabled(mine and self._drawing.ready)
+        for name, (around, button) in self._buttons.items():
+            reason = self._obstacle(name)
+            if self._reasons.get(name) != reason:
+                self._reasons[name] = reason
+                button.set_enabled(not reason)
+                around.props(f'title="{reason}"')
+        reason = self._obstacle("play")
+        self._why.set_text(f"Play: {reason}." if reason and mine else "")
         self._take.set_text("Give up control" if mine else "Take control")
         self._take.set_enabled(mine or desk.operator is None)
         if mine:
@@ -121,32 +156,40 @@ class OperatorWindow:
             ui.notify("another window commands", type="warning")
         self._show_desk()
 
-    def _may_command(self) -> bool:
-        """Tell whether this window commands: a button that is greyed is no protection."""
-        if self._parts.desk.may_command(self._client.id):
-            return True
-        ui.notify("take control first", type="warning")
-        return False
+    def _may_do(self, name: str) -> bool:
+        """Tell whether a button can act now: one that is greyed is no protection."""
+        if reason := self._obstacle(name):
+            ui.notify(reason, type="warning")
+        return not reason
 
     async def _call(self, service: str) -> None:
-        if self._may_command():
+        if self._may_do(service):
             answer = await answer_of(service, self._parts.commands.call(service))
             self._show(service.replace("_", " "), answer)
 
     async def _on_record(self) -> None:
-        if self._may_command():
+        if self._may_do("record"):
             pending = self._parts.commands.record(str(self._note.value or ""))
             self._show("record", await answer_of("record_start", pending))
 
     async def _on_play(self) -> None:
-        if not self._may_command():
+        if not self._may_do("play"):
+            return
+        if self._source.value == AGAIN:
+            self._show("play", await answer_of("start", self._parts.commands.call("start")))
             return
         try:
-            command = self._form.command()
+            command = self._command()
         except FormError as error:
             ui.notify(str(error), type="negative")
             return
-        self._show("play", self._parts.commands.play(command))
+        self._show("play", await self._parts.commands.play(command))
+
+    def _command(self) -> MotionCommand:
+        """Return the command of the chosen source; raises `FormError` where there is none."""
+        if self._source.value == DRAWING:
+            return self._drawing.command()
+        return self._form.command(learned=self._source.value == LEARNED_PLAN)
 
     def _show(self, what: str, answer: Answer) -> None:
         show_answer(self._client, Answer(answer.success, f"{what}: {answer.message}"))
@@ -155,157 +198,40 @@ class OperatorWindow:
         return self._form.conditions()
 
 
-class FormError(ValueError):
-    """What was entered is no motion; the message names the field and what it takes."""
-
-
-class MotionForm:
-    """The fields of a motion command: which motion and model, how far, how fast, what load.
-
-    Args:
-        add_play: adds the button that plays the motion, in its place among the fields.
-        conditions_changed: is called when `conditions` may return something else.
-    """
-
-    def __init__(
-        self, add_play: Callable[[], None], conditions_changed: Callable[[], object]
-    ) -> None:
-        with ui.row().classes("line"):
-            self._motion = ui.select(list(NAMES), value=NAMES[0], label="Motion")
-            self._model = ui.select(list(METHODS), value="der", label="Model")
-            self._model.on_value_change(self._offer_methods)
-            self._method = ui.select({}, label="Method")
-            self._offer_methods()
-        with ui.row().classes("line"):
-            degrees = round(math.degrees(DEFAULT_AMPLITUDE), 3)
-            self._amplitude = NumberField("Amplitude [°]", degrees, 1, 90)
-            self._period = NumberField("Period [s]", DEFAULT_PERIOD, 1, 600)
-            self._cycles = NumberField("Cycles", DEFAULT_CYCLES, 1, 100, whole=True)
-            add_play()
-        with ui.row().classes("line"):
-            self._payload = NumberField("Payload [g]", 0, 0, 10_000)
-            self._place = NumberField("at [cm], 0: tip", 0, 0, 1000)
-            mountings = {"": "planner's", **{name: name for name in MOUNTINGS}}
-            self._mounting = ui.select(
-                mountings, value="", label="Mounting or tilt [°]", new_value_mode="add-unique"
-            ).props('id="mounting"')
-        with ui.row().classes("line"):
-            self._learned = ui.select([], label=NO_PLANS, clearable=True).props('id="learned"')
-            self._feedback = ui.switch("Feedback").props('id="feedback"')
-        fields = (self._payload.field, self._place.field, self._model, self._method)
-        for element in (*fields, self._mounting, self._feedback):
-            element.on_value_change(conditions_changed)
-
-    def command(self) -> MotionCommand:
-        """Return the motion that is asked for, or the learned plan where one is chosen.
-
-        Raises:
-            FormError: a field holds what it cannot.
-        """
-        command = self.conditions()
-        command.motion = str(self._motion.value)
-        command.amplitude = math.radians(self._amplitude.read())
-        command.period = self._period.read()
-        command.cycles = int(self._cycles.read())
-        if self._learned.value:
-            command.motion, command.method = str(self._learned.value), LEARNED
-        return command
-
-    def conditions(self) -> MotionCommand:
-        """Return a command of no motion yet, with what motions and drawings are planned with.
-
-        Raises:
-            FormError: a field holds what it cannot.
-        """
-        return MotionCommand(
-            model=str(self._model.value),
-            method=str(self._method.value),
-            feedback=bool(self._feedback.value),
-            payload=self._payload.read() / GRAMS,
-            payload_at=self._place.read() / CENTIMETRES,
-            mounting=read_mounting(self._mounting.value),
+def add_curves(segments: int) -> None:
+    """Add the curves of the last 30 s, which `plots.js` fills; each by its name."""
+    numbers = {}
+    for name, (title, unit, kinds) in CURVES.items():
+        series: list[dict[str, Any]] = [
+            {
+                "name": f"segment {segment} {kind}", "type": "line", "showSymbol": False,
+                "color": COLOURS[segment % len(COLOURS)],
+                "lineStyle": {"type": "dotted" if kind == "commanded" else "solid"},
+            }
+            for kind in kinds
+            for segment in range(segments)
+        ]  # fmt: skip
+        tip = {"name": "tip", "type": "line", "showSymbol": False, "color": COLOURS[0]}
+        chart = ui.echart(
+            {
+                "animation": False,
+                "title": {"text": f"{title} [{unit}]", "left": 0, "textStyle": {"fontSize": 12}},
+                "legend": {
+                    "top": 16,
+                    "left": 0,
+                    "type": "scroll",
+                    "itemHeight": 8,
+                    "itemGap": 6,
+                    "textStyle": {"fontSize": 10},
+                },
+                "grid": {"left": 36, "right": 14, "top": 40, "bottom": 20},
+                "xAxis": {"type": "value", "min": -30, "max": 0, "name": "s", "nameGap": 4},
+                # Noise of a limb at rest is not drawn as if it were motion.
+                "yAxis": {"type": "value", "splitNumber": 3, "minInterval": 1 if kinds else 0.1},
+                "tooltip": {"trigger": "axis"},
+                "dataZoom": [{"type": "inside"}],
+                "series": series or [tip],
+            }
         )
-
-    def offer(self, learned: list[str]) -> None:
-        """Offer the plans that are in the planner's folder now; a chosen one that is gone goes."""
-        if learned != self._learned.options:
-            chosen = self._learned.value if self._learned.value in learned else None
-            self._learned.set_options(learned, value=chosen)
-            self._learned.props(f'label="{"Learned plan instead" if learned else NO_PLANS}"')
-
-    def _offer_methods(self) -> None:
-        names = METHODS[str(self._model.value)]
-        self._method.set_options({"": "the best", **{name: name for name in names}}, value="")
-
-
-class NumberField:
-    """A text field for a number; a browser's own field for numbers swallows decimal commas.
-
-    Args:
-        label: with the unit.
-        value: at first.
-        least, most: what it may be.
-        whole: whether it must be a whole number.
-    """
-
-    def __init__(
-        self, label: str, value: float, least: float, most: float, whole: bool = False
-    ) -> None:
-        self._label, self._least, self._most, self._whole = label, least, most, whole
-        self.field = ui.input(label, value=f"{value:g}", validation=self._objection)
-        # Telephones show digits, and the space bar vents here, too: no number has a space.
-        self.field.props(f"inputmode={'numeric' if whole else 'decimal'} hide-bottom-space")
-
-    def read(self) -> float:
-        """Return the number.
-
-        Raises:
-            FormError: there is none, or it is out of range.
-        """
-        try:
-            return read_number(self.field.value, self._least, self._most, self._whole)
-        except FormError as error:
-            text = f"{self._label}: {error}, not '{self.field.value}'"
-            raise FormError(text) from error
-
-    def _objection(self, text: object) -> str | None:
-        try:
-            read_number(text, self._least, self._most, self._whole)
-        except FormError as error:
-            return str(error)
-        return None
-
-
-def read_number(text: object, least: float, most: float, whole: bool = False) -> float:
-    """Return a number as people write it, with a point or a comma before its decimals.
-
-    Raises:
-        FormError: it is none, not from ``least`` to ``most``, or not a whole one.
-    """
-    given = str(text or "").strip()
-    if _THOUSANDS.fullmatch(given):
-        raise FormError("a point before decimals, and no mark of thousands")
-    try:
-        value = float(given.replace(",", ".").replace("_", "?"))
-    except ValueError:
-        value = math.nan
-    if not least <= value <= most:
-        raise FormError(f"a number from {least:g} to {most:g}")
-    if whole and value != round(value):
-        raise FormError("a whole number")
-    return value
-
-
-def read_mounting(given: object) -> str:
-    """Return a mounting as a motion command has it: a name, degrees, or nothing for the planner's.
-
-    Raises:
-        FormError: it is neither.
-    """
-    text = str(given or "").strip().removesuffix("°").strip().replace(",", ".")
-    try:
-        if text:
-            gravity_of(text)
-    except LimbError as error:
-        raise FormError(str(error)) from error
-    return text
+        numbers[name] = chart.classes("curve").id
+    ui.add_body_html(f"<script>page.curves = {json.dumps(numbers)};</script>")

@@ -55,6 +55,8 @@ REFERENCE_PRIOR = 2e-3
 """Pull of the rod's bend angles toward the arcs' [m/rad]. The rod's polyline reaches a little less
 far than the arcs: the pull keeps its angles smooth where the reference touches its fold, and costs
 0.03 mm."""
+_INSIDE = 1e-9
+"""Bend angles this far [rad] within their limits are within them, whatever is rounded."""
 _FALLEN = 1.0
 """Arcs that rest this far from the rod have buckled [rad]."""
 _POSE_TOLERANCE = 0.01
@@ -235,9 +237,14 @@ def _evenly_along(model: RodModel, reference: Reference) -> RodConfiguration:
         # One angle cannot follow two coordinates: the rod bends as the arc does.
         bend = resting_spline(time, guess, reference.start)
         return RodConfiguration(model, bend, reference.start)
-    angles, misses = inverse_kinematics(model.kinematics, tip, guess, REFERENCE_PRIOR)
-    tolerance = TOLERANCE if reference.deviation is None else NEAREST_TOLERANCE
-    Workspace(model).check_reach(time, tip, angles, misses, tolerance, model.kinematics)
+    space, shape = Workspace(model), model.kinematics
+    bounds, tolerance = None, TOLERANCE
+    if reference.deviation is not None:
+        # At the edge of what arcs reach the polyline would need more than the pressure limit for
+        # the last millimetres: they are left out, and the predicted error shows them.
+        bounds, tolerance = (space.low + _INSIDE, space.high - _INSIDE), NEAREST_TOLERANCE
+    angles, misses = inverse_kinematics(shape, tip, guess, REFERENCE_PRIOR, bounds)
+    space.check_reach(time, tip, angles, misses, tolerance, shape)
     return RodConfiguration(model, resting_spline(time, angles, reference.start), reference.start)
 
 

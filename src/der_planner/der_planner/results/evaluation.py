@@ -38,6 +38,8 @@ GAP = 0.5
 LEAST_VALID = 0.9
 """Least share of valid images of such a run."""
 REFERENCE_POINTS = 25
+LARGEST_AHEAD = 1e-3
+"""Stamps may be this far [s] from the future in such a run."""
 
 
 @dataclass(frozen=True)
@@ -209,6 +211,8 @@ def _problems(run: RunSeries, valid: float, longest: float) -> tuple[str, ...]:
         found.append(f"only {valid:.0%} of the images have a valid limb state")
     if longest > GAP:
         found.append(f"{longest:.1f} s without a valid limb state")
+    if run.ahead > LARGEST_AHEAD:
+        found.append(f"stamps come from up to {1e3 * run.ahead:.0f} ms in the future: see `clocks`")
     return tuple(found)
 
 

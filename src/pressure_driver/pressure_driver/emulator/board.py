@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pressure_driver.emulator.firmware import BoardCommand, BoardProtocol, BoardReading
+from pressure_driver.emulator.device import BoardCommand, BoardProtocol, BoardReading
 from pressure_driver.emulator.pneumatics import SUPPLY_PRESSURE, BoardPneumatics
 
 SENSOR_OFFSET = 200.0
@@ -27,6 +27,7 @@ WORDS = {
     "mute": ("mute (no telemetry)", 0, 0),
     "deaf": ("deaf (every command is ignored)", 0, 0),
     "echoless": ("echoless (commands are executed and not repeated)", 0, 0),
+    "hold": ("hold (a terminal that loses its bus keeps its outputs)", 0, 0),
     "reset": ("reset[:SECONDS] (the board loses power for SECONDS, 0.2 if not given)", 0, 1),
     "stick": ("stick:CHAMBER (its valves stop moving)", 1, 1),
     "leak": ("leak:CHAMBER[:RATE] (a hole drains it at RATE 1/s, 3 if not given)", 1, 2),
@@ -56,6 +57,7 @@ class Faults:
     mute: bool = False
     deaf: bool = False
     echoless: bool = False
+    hold: bool = False
     reset: float | None = None
     stick: list[int] = field(default_factory=list)
     leak: dict[int, float] = field(default_factory=dict)
@@ -196,7 +198,7 @@ class EmulatedBoard:
         received: list[ReceivedCommand] = []
         answer = b""
         for command in self.protocol.decode(data):
-            if self.faults.deaf:
+            if self.faults.deaf and command.kind != "read":
                 continue
             answer += self._execute(command)
             if command.kind in ("setpoint", "vent"):
@@ -231,11 +233,14 @@ class EmulatedBoard:
             self._vent()
             self._expired = False
         elif command.kind == "setpoint" and command.pressure is not None:
-            self._regulate(np.asarray(command.pressure))
+            self._regulate(np.asarray(self.protocol.target(command.pressure, self._time)))
             self._expired = False
             if command.valid_for is not None:
-                self._valid_until = self._time + command.valid_for
-        return b"" if self.faults.echoless else self.protocol.reply(command, self.reading())
+                hold = self.faults.hold
+                self._valid_until = None if hold else self._time + command.valid_for
+        if self.faults.echoless and command.kind != "read":
+            return b""
+        return self.protocol.reply(command, self.reading())
 
     def _vent(self) -> None:
         self._target = np.full(self.pneumatics.chamber_count, self.pneumatics.atmosphere)

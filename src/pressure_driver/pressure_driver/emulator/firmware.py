@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 import re
 import struct
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar
 
+from pressure_driver.emulator.device import BoardCommand, BoardProtocol, BoardReading
+from pressure_driver.emulator.polled import FestoBoard, PneudriveBoard
 from pressure_driver.protocols import LineSplitter
 from pressure_driver.protocols.ctrlp import PASCAL_PER_KILOPASCAL
 from pressure_driver.protocols.ezloop import (
@@ -33,73 +32,6 @@ from pressure_driver.protocols.native import (
 UNITS = {"psi": 6894.757, "kPa": PASCAL_PER_KILOPASCAL}
 """[Pa] Units of a ctrlp board by the number of the command UNITS; it starts with psi."""
 _COMMAND = re.compile(r"[A-Z]{2,12}(?:;-?\d{1,6}(?:\.\d{1,6})?)*")
-
-
-@dataclass(frozen=True)
-class BoardCommand:
-    """A command as the board understood it."""
-
-    kind: str
-    """``setpoint``, ``vent``, ``hello`` or another word of the protocol."""
-    first_byte: int
-    """Place of its first byte in the stream, counted from 0."""
-    pressure: tuple[float, ...] | None = None
-    """(2M,) [Pa] as sent: absolute or gauge after the protocol's ``gauge``."""
-    valid_for: float | None = None
-    """[s] after which the board vents by itself."""
-    sequence: int | None = None
-    text: str = ""
-
-
-@dataclass(frozen=True)
-class BoardReading:
-    """What the firmware tells at one instant."""
-
-    time: float
-    """[s] since boot."""
-    chamber_pressure: tuple[float, ...]
-    """(2M,) [Pa] absolute, with the sensors' errors."""
-    atmosphere: float
-    """[Pa] that the board took for the room's when it booted."""
-    valve_opening: tuple[float, ...]
-    supply_pressure: float
-    last_sequence: int = 0
-    vented: bool = True
-    expired: bool = False
-    """The board has vented since no setpoint came in time."""
-
-
-class BoardProtocol(ABC):
-    """The firmware's end, for emulators and tests of firmware."""
-
-    gauge: ClassVar[bool] = False
-    """Whether the wire carries pressures above the atmosphere."""
-    pairwise: ClassVar[bool] = False
-    """Whether the board reads a pair of pressures as a difference."""
-
-    def __init__(self, chamber_count: int = 4) -> None:
-        self.chamber_count = chamber_count
-        self.rejected = 0
-
-    def boot(self, atmosphere: float) -> bytes:  # noqa: ARG002 - most boards say nothing
-        """Return what the board says after power-up."""
-        return b""
-
-    @abstractmethod
-    def decode(self, data: bytes) -> list[BoardCommand]:
-        """Take the next bytes from the host and return the commands that became complete."""
-
-    @abstractmethod
-    def telemetry(self, reading: BoardReading) -> bytes:
-        """Return the bytes of one telemetry report."""
-
-    def reply(self, command: BoardCommand, reading: BoardReading) -> bytes:  # noqa: ARG002
-        """Return what the board answers to a command at once."""
-        return b""
-
-    def expired(self) -> bytes:
-        """Return what the board says when it has vented since no setpoint came in time."""
-        return b""
 
 
 class EzloopBoard(BoardProtocol):
@@ -243,8 +175,14 @@ class NativeBoard(BoardProtocol):
 
     _FIRMWARE = b"emulator 1"
 
-    def __init__(self, chamber_count: int = 4, largest_pressure: int = 30_000) -> None:
+    def __init__(
+        self,
+        chamber_count: int = 4,
+        largest_pressure: int = 30_000,
+        known: int = StatusFlag.SUPPLY_KNOWN | StatusFlag.VALVES_KNOWN,
+    ) -> None:
         super().__init__(chamber_count)
+        self._known = known
         self._frames = FrameSplitter()
         self._largest = largest_pressure
         self._sequence = 0
@@ -289,7 +227,7 @@ class NativeBoard(BoardProtocol):
 
     def telemetry(self, reading: BoardReading) -> bytes:
         """One STATUS frame."""
-        flags = StatusFlag.SUPPLY_KNOWN | StatusFlag.VALVES_KNOWN
+        flags = self._known
         flags |= StatusFlag.VENTED if reading.vented else 0
         flags |= StatusFlag.EXPIRED if reading.expired else 0
         atmosphere = round(reading.atmosphere)
@@ -329,5 +267,7 @@ BOARDS: dict[str, type[BoardProtocol]] = {
     "ezloop": EzloopBoard,
     "ctrlp": CtrlpBoard,
     "native": NativeBoard,
+    "festo": FestoBoard,
+    "pneudrive": PneudriveBoard,
 }
 """The board's end of each protocol."""

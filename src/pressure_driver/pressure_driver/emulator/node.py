@@ -19,7 +19,7 @@ from limb_interfaces.stamps import stamp_from_nanoseconds
 from pressure_driver.emulator.board import EmulatedBoard, FaultError, Faults, ReceivedCommand
 from pressure_driver.emulator.firmware import BOARDS
 from pressure_driver.emulator.pneumatics import BoardPneumatics
-from pressure_driver.emulator.runner import BoardRunner, EmulatedPort
+from pressure_driver.emulator.runner import BoardRunner, emulated_line
 from pressure_driver.node import read_settings
 from pressure_driver.settings import EmulatorSettings
 
@@ -33,9 +33,10 @@ class BoardEmulator(Node):
         settings = read_settings(self, EmulatorSettings)
         pneumatics = BoardPneumatics(settings.segment_count, settings.seed)
         protocol = BOARDS[settings.protocol](2 * settings.segment_count)
+        protocol.configure(settings)
         self._board = EmulatedBoard(protocol, pneumatics, settings.seed)
         faults = self._parse(settings.faults)  # before the port stands where others see it
-        self._port = EmulatedPort(settings.port_link, settings.baud_rate)
+        self._port = emulated_line(settings.port_link, settings.baud_rate)
         self._unpublished: deque[tuple[str, int, Sequence[float]]] = deque(maxlen=1000)
         self._sequences: Counter[str] = Counter()
         self._guard = self.create_guard_condition(self._publish)

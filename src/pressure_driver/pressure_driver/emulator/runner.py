@@ -22,8 +22,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pressure_driver.board_socket import BoardSocket
 from pressure_driver.emulator.board import EmulatedBoard, Faults, ReceivedCommand
-from pressure_driver.lines import prefer_thread
+from pressure_driver.lines import is_tcp, prefer_thread
 from pressure_driver.schedule import NANOSECONDS
 
 TELEMETRY_PERIOD = 50_000_000
@@ -249,6 +250,11 @@ class EmulatedPort:
             os.close(self._claim_file)
 
 
+def emulated_line(link: str, baud_rate: int) -> EmulatedPort | BoardSocket:
+    """Return the board's end of `tcp://host:port`, or of a serial port with a symbolic link."""
+    return BoardSocket(link) if is_tcp(link) else EmulatedPort(link, baud_rate)
+
+
 class BoardRunner:
     """Keeps the firmware, the air and the line going.
 
@@ -265,7 +271,7 @@ class BoardRunner:
     def __init__(
         self,
         board: EmulatedBoard,
-        port: EmulatedPort,
+        port: EmulatedPort | BoardSocket,
         on_air: Callable[[int, NDArray[np.float64]], None] = lambda *_: None,
         on_command: Callable[[ReceivedCommand], None] = lambda *_: None,
         real_time_priority: int = 0,

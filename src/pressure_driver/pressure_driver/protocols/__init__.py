@@ -7,13 +7,17 @@ are those of the emulator.
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-NAMES = ("ezloop", "ctrlp", "native")
+if TYPE_CHECKING:
+    from pressure_driver.settings import Settings
+
+NAMES = ("ezloop", "ctrlp", "native", "festo", "pneudrive")
 """The protocols that can be chosen, which are the names of their modules."""
 STANDARD_ATMOSPHERE = 101_325.0
 """[Pa]"""
@@ -116,6 +120,33 @@ class StreamCutter:
         self._overlong = False
 
 
+class FrameBuffer:
+    """Bytes that are cut into frames whose length is known, and how often some were skipped."""
+
+    def __init__(self) -> None:
+        self.rejected = 0
+        """Places at which bytes had to be skipped."""
+        self.position = 0
+        """Of the first byte that is kept, in the stream."""
+        self.kept = bytearray()
+
+    def take(self, count: int) -> bytes:
+        """Return the first bytes and forget them."""
+        taken = bytes(self.kept[:count])
+        del self.kept[:count]
+        self.position += len(taken)
+        return taken
+
+    def skip_to(self, begin: int) -> None:
+        """Skip bytes that are no frame, up to a place or, if it is not behind them, all of them."""
+        self.rejected += 1
+        self.take(begin if begin > 0 else len(self.kept))
+
+    def reset(self) -> None:
+        """Forget a half-received frame."""
+        self.take(len(self.kept))
+
+
 class LineSplitter:
     """Collects bytes and returns complete lines with the place of their first byte.
 
@@ -165,15 +196,23 @@ class HostProtocol(ABC):
     """Whether pressures are told finely enough that those of a working sensor always tremble."""
     assumed_atmosphere: float = STANDARD_ATMOSPHERE
     """[Pa] added to the reports of boards that only know gauge pressures."""
+    resolution: float = 0.0
+    """[Pa] of one step of its readings, where that is coarser than their noise."""
+    clock: Callable[[], float]
+    """[s] steady."""
 
     def __init__(self, chamber_count: int = 4) -> None:
         self.chamber_count = chamber_count
+        self.clock = time.monotonic
         self.rejected = 0
         """Frames or lines that were damaged and thrown away."""
         self.last_damaged = ""
         """The newest of them, where the protocol has lines."""
         self.unsettled = ""
         """Why no pressure may be commanded yet, though the board talks; empty if it may."""
+
+    def configure(self, settings: Settings) -> None:  # noqa: B027 - most boards have no parameters
+        """Take over the parameters that are for this board alone."""
 
     def doubt(self) -> None:  # noqa: B027 - most boards have no settings
         """Trust no setting of the board any more, as after it has been silent."""
@@ -200,6 +239,18 @@ class HostProtocol(ABC):
     @abstractmethod
     def vent(self, atmosphere: float) -> tuple[bytes, int | None]:
         """Encode the command that opens every chamber to the atmosphere."""
+
+    def emergency(self, atmosphere: float) -> list[bytes]:
+        """Return what empties a board in any state, for a process that knows nothing about it.
+
+        Each is complete after any half-sent bytes. A board on a bus must have answered one before
+        the next is sent.
+        """
+        return [self.separator + self.vent(atmosphere)[0]]
+
+    def follow_up(self) -> bytes:
+        """Return what is to be sent at once because of what has been decoded."""
+        return b""
 
     @abstractmethod
     def decode(self, data: bytes) -> list[Event]:
@@ -238,8 +289,13 @@ class LineHost(HostProtocol):
         self._lines.reset()
 
 
-def host_protocol(name: str, chamber_count: int = 4) -> HostProtocol:
+def host_protocol(
+    name: str, chamber_count: int = 4, settings: Settings | None = None
+) -> HostProtocol:
     """Return the driver's end of one of the `NAMES`; only its module is loaded."""
     module = import_module(f"pressure_driver.protocols.{name}")
     host: type[HostProtocol] = getattr(module, f"{name.capitalize()}Host")
-    return host(chamber_count)
+    protocol = host(chamber_count)
+    if settings is not None:
+        protocol.configure(settings)
+    return protocol

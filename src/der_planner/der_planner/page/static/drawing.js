@@ -32,6 +32,13 @@ page.drawing = (() => {
       const inside = !reachable || context.isPointInPath(reachable, ...points[k]);
       drawLine(context, [points[k - 1], points[k]], { colour: inside ? INSIDE : OUTSIDE, width: 4 });
     }
+    for (const [x, y] of preview?.place || []) { // where the drawing cannot be followed
+      context.strokeStyle = OUTSIDE;
+      context.lineWidth = 5;
+      context.beginPath();
+      context.arc(x, y, 22, 0, 2 * Math.PI);
+      context.stroke();
+    }
     if (!preview || !preview.path.length) return;
     drawLine(context, preview.path, { colour: "#ffe14a", width: 3, dash: [9, 6] });
     const share = ((seconds() - begun) / Math.max(preview.duration, 1)) % 1;

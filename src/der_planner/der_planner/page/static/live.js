@@ -8,6 +8,7 @@ const page = {
   received: 0,
   onData: [], // called with new data
   onShow: [], // called with the data, how long ago they were true [s], and whether the server is lost
+  onState: [], // called always: how long ago the data were true, whether the server is lost, its silence [s]
   find: (id) => document.getElementById(id),
   seconds: () => performance.now() / 1000,
   // Writes only what changed, since the browser lays out and paints an element anew with it.
@@ -24,7 +25,9 @@ const page = {
 };
 (() => {
   const LOST = 0.7; // s without live data after which the connection counts as lost
-  const { find, put, seconds } = page;
+  const { put, seconds } = page;
+  // Of this tab, also after it has been loaded anew: the desk is its.
+  const tab = sessionStorage.limbTab ||= Math.random().toString(36).slice(2) + Date.now().toString(36);
   let socket = null, opened = -Infinity, heard = -Infinity;
   let ahead = Date.now() / 1000 - seconds();
   document.documentElement.lang = "en"; // for screen readers
@@ -34,7 +37,7 @@ const page = {
     const mine = new WebSocket(location.origin.replace(/^http/, "ws") + "/live");
     socket = mine;
     // The server answers each request once: a slow connection delays data and does not pile them up.
-    const ask = () => mine.send(String(seconds()));
+    const ask = () => mine.send(`${seconds()} ${window.limbWindow} ${tab}`);
     mine.onopen = ask;
     mine.onmessage = (event) => {
       if (socket !== mine) return;
@@ -52,26 +55,9 @@ const page = {
   function show() {
     const silence = seconds() - page.at, lost = silence > LOST;
     document.body.classList.toggle("lost", lost);
-    showConnection(silence, lost);
     for (const panel of document.querySelectorAll("#panels > section")) showAge(panel, silence, lost);
-    const driver = page.ageOf("driver") === null ? null : page.data.driver;
-    const old = lost || page.isOld("driver");
-    const since = driver && old ? `${page.ageOf("driver").toFixed(1)} s ago  ` : "";
-    put(find("mode"), driver ? driver.mode : "no driver");
-    put(find("faults"), driver ? since + driver.faults.join("; ") : "");
-    find("mode").classList.toggle("fault", driver?.mode === "fault");
-    find("summary").classList.toggle("old", old);
+    page.onState.forEach((listener) => listener(silence, lost, seconds() - heard));
     if (page.data) page.onShow.forEach((listener) => listener(page.data, silence, lost));
-  }
-
-  function showConnection(silence, lost) {
-    const notice = find("connection-notice");
-    notice.hidden = !lost;
-    if (!Number.isFinite(silence)) return;
-    const slow = seconds() - heard <= LOST;
-    put(notice, slow
-      ? `The connection is slow: what is shown below was so ${silence.toFixed(1)} s ago.`
-      : `No connection to the page's server for ${silence.toFixed(1)} s: nothing below is live.`);
   }
 
   function showAge(panel, silence, lost) {
@@ -102,6 +88,23 @@ const page = {
     page.pictureAt -= slept;
     heard -= slept;
   }
+
+  // The panels' framework would load the window anew whenever it cannot connect for a while, and state and
+  // vent would be away for as long. It connects again by itself; where the server does not know the panels
+  // any more, they are loaded anew once live data have come for a while.
+  const AGAIN = 3000; // ms
+  let unknown = false, alive = 0;
+  const hold = setInterval(() => {
+    if (!window.socket) return;
+    clearInterval(hold);
+    window.socket.off("connect_error");
+    window.socket.on("connect_error", (error) => { unknown = error.message.startsWith("Implicit"); });
+    window.socket.on("connect", () => { unknown = false; });
+  }, 50);
+  setInterval(() => {
+    alive = seconds() - page.at > LOST ? 0 : alive + 200;
+    if (unknown && alive >= AGAIN) location.reload();
+  }, 200);
 
   setInterval(() => {
     // A connection that says nothing is given up, since a dead server's may stay open for minutes.

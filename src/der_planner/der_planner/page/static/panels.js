@@ -7,6 +7,8 @@
   page.onShow.push((data, waited, lost) => {
     showNodes(data.nodes, waited);
     showWork(data, lost);
+    const missing = data.missing.length ? `Not heard yet; to start it: ${data.missing.join(" · ")}` : "";
+    put(find("missing-line"), missing);
     if (data.driver) showSupply(data.driver);
     showEstimate(data.estimate);
     showContact(data.contact);
@@ -21,7 +23,7 @@
       body.replaceChildren(...nodes.map((node) => {
         const row = document.createElement("tr");
         for (let cell = 0; cell < 5; cell += 1) row.insertCell();
-        row.dataset.node = node.name;
+        row.dataset.node = node.own || node.name;
         return row;
       }));
     }
@@ -39,10 +41,13 @@
   function showWork(data, lost) {
     const plan = find("plan-line");
     if (plan) { plan.hidden = !data.plan; put(plan, `Newest plan: ${data.plan}`); }
+    const experiment = data.nodes.find((one) => one.own === "experiment"), told = find("experiment-line");
+    if (told) { told.hidden = !experiment; put(told, `Experiment: ${experiment?.message}`); }
+    find("report-link")?.toggleAttribute("hidden", !data.report);
     for (const [id, title, describe] of [["planner", "Planner", planning], ["recorder", "Recorder", recording]]) {
-      const line = find(`${id}-line`), node = data.nodes.find((one) => one.name === id);
+      const line = find(`${id}-line`), node = data.nodes.find((one) => one.own === id);
       if (!line) continue;
-      const gone = !node || ["late", "dead"].includes(node.state);
+      const gone = !node || ["late", "dead", "ended"].includes(node.state);
       const away = node ? `${node.state}, last heard ${node.age.toFixed(1)} s ago` : "not heard";
       put(line, `${title}: ${gone ? away : describe(node.message, node.values)}`);
       line.className = gone || lost ? "gone" : node.state;

@@ -3,6 +3,7 @@
 "use strict";
 (() => {
   const PRESS = 1000; // ms after a press during which the click that ends it is no second press
+  const CONFIRMED = 900; // ms after which a vent that nobody has confirmed is said to be none
   const find = (id) => document.getElementById(id);
   const button = find("vent"), notice = find("vent-notice");
   let pressed = -Infinity, hiding = 0;
@@ -10,17 +11,24 @@
   async function vent() {
     let good = false, text;
     button.classList.add("sent");
+    // Whoever waits for an answer must not wait longer than the limb may.
+    const late = setTimeout(() => tell("VENT NOT CONFIRMED yet: close the valve at the air supply now.", false), CONFIRMED);
     try {
       const answer = await fetch("/vent", { method: "POST", signal: AbortSignal.timeout(4000) });
       const result = answer.ok ? await answer.json() : { message: await answer.text() };
       good = result.success === true;
       text = `${good ? "Vented" : "VENT FAILED"}: ${result.message}`;
     } catch (error) {
-      text = `VENT FAILED: the page's server does not answer (${error.message}). Close the supply by hand.`;
+      text = `VENT FAILED: the page's server does not answer (${error.message}). Close the valve at the air supply.`;
     }
+    clearTimeout(late);
     button.classList.remove("sent");
+    tell(text, good);
+  }
+
+  function tell(text, good) {
     notice.textContent = text;
-    notice.className = good ? "good" : "";
+    notice.className = good ? "good" : "danger";
     notice.hidden = false;
     clearTimeout(hiding);
     hiding = setTimeout(() => { notice.hidden = true; }, good ? 4000 : 30000);

@@ -1,0 +1,159 @@
+"""What is wrong, worst first, in plain words: what it is, what the limb does, what to do now."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+SUPPLY = "close the valve at the air supply"
+"""What is left where no program can vent the limb."""
+PRESSED = 1.0
+"""A limb counts as under pressure from this differential pressure [kPa] on."""
+NODES = {
+    "pressure_driver": "nothing watches the pressures of the limb",
+    "planner": "no motion can be asked for",
+    "apriltag_tracker": "the limb is not tracked",
+    "recorder": "nothing is recorded",
+    "page": "",
+    "experiment": "the experiment has stopped",
+    "board_emulator": "the twin's valve board stands still",
+    "limb_twin": "the twin stands still",
+    "synthetic_camera": "the twin's camera stands still",
+}
+"""Nodes of a limb, worst first, with what their end means."""
+DRIVER = "pressure_driver"
+WANTED = (DRIVER, "planner", "apriltag_tracker", "recorder")
+"""Without these a limb is not played, seen and recorded."""
+ORDER = ("dead", "error", "late", "warning", "stale", "ok", "ended")
+"""States of nodes, worst first."""
+
+
+class Alarm(NamedTuple):
+    """One line of the alarm.
+
+    Attributes:
+        level: ``danger``: red, somebody must act; ``notice``: something to know.
+        text: what is wrong.
+        since: [s] for how long; None where no time belongs to it.
+        advice: what to do; may be empty.
+    """
+
+    level: str
+    text: str
+    since: float | None
+    advice: str
+
+
+def worst_first(nodes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return nodes in the order in which they are shown: this limb's worst first, then others."""
+    ranks = list(NODES)
+
+    def rank(node: dict[str, Any]) -> tuple[int, int, str]:
+        if not node["own"]:
+            return len(ORDER), 0, node["name"]
+        return ORDER.index(node["state"]), ranks.index(node["own"]), node["name"]
+
+    return sorted(nodes, key=rank)
+
+
+def missing(nodes: Sequence[dict[str, Any]]) -> list[str]:
+    """Return the commands that start what has never been heard of a whole graph."""
+    heard = {node["own"] for node in nodes}
+    return [start_of(name, None) for name in WANTED if name not in heard]
+
+
+def describe_limb(driver: dict[str, Any] | None) -> str:
+    """Return what the limb does by the driver's newest state, to be said after "the limb is"."""
+    if driver is None:
+        return "in an unknown state"
+    measured, commanded = driver["measured_kpa"], driver["commanded_kpa"]
+    known = [abs(value) for value in (*measured, *commanded) if value is not None]
+    largest = max(known, default=0.0)
+    if largest > PRESSED:
+        return f"under pressure ({largest:.1f} kPa)"
+    return "of unknown pressure" if not measured or None in measured else "without pressure"
+
+
+def alarms(snapshot: dict[str, Any]) -> list[Alarm]:
+    """Return what is wrong, worst first.
+
+    Args:
+        snapshot: `Situation.snapshot`, with nodes and sources.
+    """
+    own = {node["own"]: node for node in snapshot["nodes"] if node["own"]}
+    found = list(_of_nodes(own))
+    if not _between_runs(own):
+        found[:0] = _of_driver(snapshot, own.get(DRIVER))
+    return sorted(found, key=lambda alarm: alarm.level != "danger")
+
+
+def _between_runs(own: dict[str, dict[str, Any]]) -> bool:
+    """Tell whether an experiment will start the driver, which has not run or was ended in order."""
+    driver, experiment = own.get(DRIVER), own.get("experiment")
+    waits = driver is None or driver["state"] == "ended"
+    return waits and experiment is not None and experiment["state"] == "ok"
+
+
+def _of_driver(snapshot: dict[str, Any], node: dict[str, Any] | None) -> Iterator[Alarm]:
+    source, driver = snapshot["sources"]["driver"], snapshot["driver"]
+    if driver is None:
+        if node is None:
+            yield Alarm("notice", "No driver is heard", None, "start it: " + start_of(DRIVER, None))
+            return
+    elif not source["fresh"] and node is not None and node["state"] == "ended":
+        told = "The driver has been ended in order, and has vented the limb"
+        yield Alarm("notice", told, None, "start it again: " + start_of(DRIVER, node))
+        return
+    elif not source["fresh"]:
+        yield Alarm("danger", *_silence(source, driver, node))
+        return
+    if node is not None and node["state"] == "dead":
+        since = None if driver is None else source["age"]
+        yield Alarm("danger", f"The driver is dead: {_reason(node)}", since, _restart(node))
+    if driver is None:
+        return
+    limb = describe_limb(driver)
+    if driver["mode"] == "fault":
+        faults = "; ".join(driver["faults"]) or "no reason given"
+        told = f"The driver has vented after a fault: {faults}. The limb is {limb}"
+        yield Alarm("danger", told, None, "remove the cause, then arm")
+    elif node is not None and (lost := node["values"].get("lost_operator", "none")) != "none":
+        told = f"The operator was lost ({lost}): the driver stopped the limb, which is {limb}"
+        yield Alarm("notice", told, None, "arm to go on")
+
+
+def _silence(
+    source: dict[str, Any], driver: dict[str, Any], node: dict[str, Any] | None
+) -> tuple[str, float, str]:
+    """Return text, time and advice for a driver that was heard and is not heard any more."""
+    told = "The driver says nothing"
+    if node is not None and node["state"] == "dead":
+        told = f"The driver is dead: {_reason(node)}"
+    limb = f"When last heard, the limb was {describe_limb(driver)}, in mode {driver['mode']}"
+    return f"{told}. {limb}", source["age"], _restart(node)
+
+
+def _restart(node: dict[str, Any] | None) -> str:
+    return f"{SUPPLY}; then start the driver again: {start_of(DRIVER, node)}"
+
+
+def _reason(node: dict[str, Any]) -> str:
+    """Return why a node is dead, with its last words if it had any."""
+    return " — ".join(text for text in (node["trouble"], node["last_words"]) if text)
+
+
+def start_of(name: str, node: dict[str, Any] | None) -> str:
+    """Return the command that starts a node: as it was started, where that is known."""
+    known = "" if node is None else node["command"]
+    package = {DRIVER: DRIVER, "apriltag_tracker": "apriltag_tracker"}.get(name, "der_planner")
+    return known or f"scripts/ros2 run {package} {name}"
+
+
+def _of_nodes(own: dict[str, dict[str, Any]]) -> Iterator[Alarm]:
+    """Yield the other nodes of this limb that are dead."""
+    for name, meaning in NODES.items():
+        node = own.get(name)
+        if name != DRIVER and node is not None and node["state"] == "dead":
+            told = f"The {name} is dead: {_reason(node)}"
+            advice = f"start it again: {start_of(name, node)}"
+            yield Alarm("danger", f"{told}; {meaning}" if meaning else told, node["age"], advice)

@@ -1,0 +1,72 @@
+// The alarm over the whole width, and the state: what the limb does, and nothing old as if it were so.
+"use strict";
+(() => {
+  const SLOW = 1.5; // s since the server was last heard, up to which a connection is slow and not dead
+  const { find, put } = page;
+  const rounded = (value) => value.toFixed(1).replace(/^-(0\.0)$/, "$1");
+  const ago = (age) => `${age.toFixed(age < 10 ? 1 : 0)} s`;
+
+  page.onState.push((silence, lost, unheard) => {
+    const driver = page.ageOf("driver") === null ? null : page.data.driver;
+    const old = lost || page.isOld("driver");
+    showAlarms(lost ? [ofServer(silence, unheard, driver)] : page.data?.alarms ?? [], silence);
+    showState(driver, old);
+  });
+
+  // What is wrong with the page itself, which only this window can tell.
+  function ofServer(silence, unheard, driver) {
+    if (!page.data) return { level: "notice", text: "Waiting for the page's server…" };
+    if (unheard <= SLOW) {
+      return { level: "notice", text: `The connection is slow: what is shown below was so ${ago(silence)} ago.` };
+    }
+    const limb = driver
+      ? `When last heard, ${ago(page.ageOf("driver"))} ago, the limb was ${page.data.limb_is}, in mode ${driver.mode}`
+      : "Nothing is known of the limb";
+    return {
+      level: "danger",
+      text: `No connection to the page's server for ${ago(silence)}: nothing below is live. ${limb}`,
+      advice: "VENT may not reach it from here: close the valve at the air supply",
+    };
+  }
+
+  function showAlarms(alarms, silence) {
+    const place = find("alarm");
+    while (place.children.length > alarms.length) place.lastChild.remove();
+    alarms.forEach((alarm, index) => {
+      const line = place.children[index] ?? place.appendChild(document.createElement("div"));
+      const since = alarm.since == null ? "" : ` (for ${ago(alarm.since + Math.max(silence, 0))})`;
+      const advice = alarm.advice ? ` → ${alarm.advice[0].toUpperCase()}${alarm.advice.slice(1)}.` : "";
+      const full = alarm.text.endsWith("…") || alarm.text.endsWith(".") ? "" : ".";
+      put(line, `${alarm.text}${since}${full}${advice}`); // as text, never as HTML
+      if (line.className !== alarm.level) line.className = alarm.level;
+    });
+    const height = `${find("notices").offsetHeight}px`; // it must cover nothing
+    if (document.body.style.paddingTop !== height) document.body.style.paddingTop = height;
+  }
+
+  function showState(driver, old) {
+    const known = driver && !old;
+    const word = find("mode"), state = known ? driver.mode : "unknown";
+    put(word, known ? driver.mode : "not known");
+    if (word.className !== state) word.className = state;
+    find("summary").classList.toggle("old", !known);
+    let meaning = known ? driver.meaning : "no driver is heard";
+    if (driver && !known) meaning = `${ago(page.ageOf("driver"))} ago: ${driver.mode}, ${page.data.limb_is}`;
+    put(find("meaning"), meaning);
+    put(find("figures"), known ? figures(driver) : "");
+  }
+
+  // Present numbers: pressures, tip error, progress of the plan.
+  function figures(driver) {
+    const pressures = driver.measured_kpa.map((value) => (value === null ? "?" : rounded(value))).join(" / ");
+    const error = page.isOld("tracker") ? null : page.data.limb?.error_cm ?? null;
+    const planner = page.data.nodes.find((node) => node.own === "planner");
+    const busy = planner && ["ok", "warning"].includes(planner.state)
+      && ["planning", "streaming"].includes(planner.values.state);
+    return [
+      `${pressures} kPa`,
+      error === null ? "" : `tip error ${error.toFixed(2)} cm`,
+      busy ? `${planner.values.state} ${(100 * Number(planner.values.progress)).toFixed(0)} %` : "",
+    ].filter(Boolean).join(" · ");
+  }
+})();

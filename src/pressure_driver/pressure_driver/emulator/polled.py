@@ -1,0 +1,216 @@
+"""Boards that speak when they are spoken to: a Festo terminal and PneuDrive boards."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from pressure_driver.emulator.device import BoardCommand, BoardProtocol, BoardReading
+from pressure_driver.protocols import modbus, pneudrive
+from pressure_driver.protocols.festo import (
+    ACKNOWLEDGE,
+    BOTH_VALVES,
+    FIRST_INPUT,
+    FIRST_OUTPUT,
+    INACTIVE,
+    INPUTS,
+    LARGEST_SETPOINT,
+    PASCAL_PER_MILLIBAR,
+    REGULATE,
+    RUNNING,
+    slot_word,
+)
+
+if TYPE_CHECKING:
+    from pressure_driver.settings import EmulatorSettings
+
+BUS_PATIENCE = 1.0
+"""[s] without a write, after which a terminal takes the bus for lost and resets its outputs."""
+SLOT_START_TIME = 1.5
+"""[s] from the mode to a slot that runs."""
+PNEUDRIVE_BOOT_TIME = 2.0
+"""[s] for which a PneuDrive board vents at its start, whatever it is told."""
+NOT_READY, TO_BE_CONFIGURED = 0, 1
+ILLEGAL_FUNCTION, ILLEGAL_ADDRESS = 1, 2
+"""Exceptions of Modbus."""
+
+
+class Slot:
+    """Two valves of a motion terminal: they regulate once they have been started."""
+
+    def __init__(self) -> None:
+        self.mode = 0
+        self.state = TO_BE_CONFIGURED
+        self._started_at: float | None = None
+
+    def tell(self, word: int) -> None:
+        """Take over the first register of the slot."""
+        mode, control = word & 0x3F, word >> 6
+        if mode in (ACKNOWLEDGE, INACTIVE):
+            self.mode, self.state = INACTIVE, TO_BE_CONFIGURED
+        elif (mode, control, self.mode) == (REGULATE, BOTH_VALVES, INACTIVE):
+            self.mode, self.state, self._started_at = REGULATE, NOT_READY, None
+
+    def look(self, time: float) -> None:
+        """Go on with the start (time since boot [s])."""
+        if self.state == NOT_READY:
+            self._started_at = time if self._started_at is None else self._started_at
+            if time - self._started_at >= SLOT_START_TIME:
+                self.state = RUNNING
+
+
+class FestoBoard(BoardProtocol):
+    """The terminal's end of ``festo``."""
+
+    gauge = True
+
+    def __init__(self, chamber_count: int = 4) -> None:
+        super().__init__(chamber_count)
+        self._frames = modbus.ModbusReader()
+        self._motion_terminal = True
+        self.boot(0.0)
+
+    def configure(self, settings: EmulatorSettings) -> None:
+        """Take over which valves the terminal has."""
+        self._motion_terminal = settings.terminal == "vtem"
+        self.boot(0.0)
+
+    def boot(self, atmosphere: float) -> bytes:  # noqa: ARG002 - the wire has gauge pressures
+        """All registers are zero, and slots have to be started."""
+        self.slots = [Slot() for _ in range(self.chamber_count // 2 * self._motion_terminal)]
+        self._outputs = [0] * (3 * len(self.slots) or self.chamber_count)
+        return b""
+
+    def decode(self, data: bytes) -> list[BoardCommand]:
+        """Return reads and writes; what is not there comes back as ``refused``."""
+        before = self._frames.rejected
+        commands = [self._interpret(place, frame) for place, frame in self._frames.feed(data)]
+        self.rejected += self._frames.rejected - before
+        return commands
+
+    def _interpret(self, place: int, frame: modbus.ModbusFrame) -> BoardCommand:
+        function, data, number = frame.function, frame.data, frame.transaction
+        first, count = modbus.BLOCK.unpack(data[:4].ljust(4, b"\0"))
+        if function == modbus.READ and self._registers(first, count, None):
+            return BoardCommand("read", place, sequence=number, text=f"{first} {count}")
+        words, offset = modbus.to_words(data[5:]), first - FIRST_OUTPUT
+        inside = 0 <= offset <= len(self._outputs) - count
+        if function == modbus.WRITE and inside and len(words) == count:
+            self._outputs[offset : offset + count] = words
+            for slot, word in zip(self.slots, self._outputs[0::3], strict=False):
+                slot.tell(word)
+            return BoardCommand(
+                "setpoint",
+                place,
+                pressure=self._setpoints(),
+                valid_for=BUS_PATIENCE,
+                sequence=number,
+                text=f"{first} {count}",
+            )
+        self.rejected += 1
+        known = function in (modbus.READ, modbus.WRITE)
+        problem = ILLEGAL_ADDRESS if known else ILLEGAL_FUNCTION
+        return BoardCommand("refused", place, sequence=number, text=f"{function} {problem}")
+
+    def _setpoints(self) -> tuple[float, ...]:
+        values = [v for place, v in enumerate(self._outputs) if place % 3 or not self.slots]
+        millibar = (modbus.signed(value) for value in values)
+        # Regulators of an MPA terminal that are told less than nothing open wide.
+        wild = 0 if self.slots else LARGEST_SETPOINT
+        return tuple(PASCAL_PER_MILLIBAR * (value if value >= 0 else wild) for value in millibar)
+
+    def target(self, pressure: Sequence[float], time: float) -> Sequence[float]:
+        """Return setpoints of slots that run; the others are vented."""
+        if not self.slots:
+            return pressure
+        for slot in self.slots:
+            slot.look(time)
+        return [
+            value if self.slots[chamber // 2].state == RUNNING else 0.0
+            for chamber, value in enumerate(pressure)
+        ]
+
+    def _registers(self, first: int, count: int, reading: BoardReading | None) -> list[int]:
+        """Return what registers hold, or nothing if there are none of these numbers."""
+        inputs = [0] * (INPUTS * (len(self.slots) or self.chamber_count))
+        if reading is not None:
+            inputs = self._inputs(reading)
+        for begin, registers in ((FIRST_OUTPUT, self._outputs), (FIRST_INPUT, inputs)):
+            if begin <= first and first + count <= begin + len(registers):
+                return registers[first - begin : first - begin + count]
+        return []
+
+    def _inputs(self, reading: BoardReading) -> list[int]:
+        measured = [
+            round((pressure - reading.atmosphere) / PASCAL_PER_MILLIBAR)
+            for pressure in reading.chamber_pressure
+        ]
+        if not self.slots:
+            pairs = zip(measured, self._outputs, strict=True)
+            return [word for value, told in pairs for word in (value, told, 0)]
+        words: list[int] = []
+        for place, slot in enumerate(self.slots):
+            slot.look(reading.time)
+            words += [slot_word(slot.mode, slot.state), *measured[2 * place : 2 * place + 2]]
+        return words
+
+    def reply(self, command: BoardCommand, reading: BoardReading) -> bytes:
+        """Registers to a read, first register and their number to a write, else an exception."""
+        number, (first, second) = command.sequence or 0, map(int, command.text.split())
+        if command.kind == "refused":
+            return modbus.encode(number, first | modbus.FAILED, bytes([second]))
+        if command.kind == "setpoint":
+            return modbus.encode(number, modbus.WRITE, modbus.BLOCK.pack(first, second))
+        data = modbus.to_bytes(self._registers(first, second, reading))
+        return modbus.encode(number, modbus.READ, bytes([len(data)]) + data)
+
+    def expired(self) -> bytes:
+        """The bus is lost: all outputs are zero, and slots have to be started again."""
+        return self.boot(0.0)
+
+
+class PneudriveBoard(BoardProtocol):
+    """The boards' end of ``pneudrive``: all those on the bus."""
+
+    gauge = True
+
+    def __init__(self, chamber_count: int = 4) -> None:
+        super().__init__(chamber_count)
+        self._frames = pneudrive.TargetReader()
+        self._range = pneudrive.NOMINAL_RANGE
+        self._counts = [0] * chamber_count
+
+    def configure(self, settings: EmulatorSettings) -> None:
+        """Take over the range of the sensors."""
+        self._range = settings.sensor_range
+
+    def decode(self, data: bytes) -> list[BoardCommand]:
+        """Return targets, those that other boards were told before with them."""
+        before = self._frames.rejected
+        commands = []
+        for place, board, counts in self._frames.feed(data):
+            first = pneudrive.VALVES * board
+            if first >= self.chamber_count:
+                self.rejected += 1  # nobody has this address
+                continue
+            used = min(pneudrive.VALVES, self.chamber_count - first)
+            self._counts[first : first + used] = counts[:used]
+            pressure = tuple(pneudrive.gauge_of(count, self._range) for count in self._counts)
+            commands.append(BoardCommand("setpoint", place, pressure=pressure, text=str(board)))
+        self.rejected += self._frames.rejected - before
+        return commands
+
+    def target(self, pressure: Sequence[float], time: float) -> Sequence[float]:
+        """Return the targets; nothing while the boards start."""
+        return pressure if time >= PNEUDRIVE_BOOT_TIME else [0.0] * len(pressure)
+
+    def reply(self, command: BoardCommand, reading: BoardReading) -> bytes:
+        """What the board measures, in the layout of its targets."""
+        board = int(command.text)
+        first = pneudrive.VALVES * board
+        counts = [
+            max(pneudrive.counts_of(pressure - reading.atmosphere, self._range), 0)
+            for pressure in reading.chamber_pressure[first : first + pneudrive.VALVES]
+        ]
+        counts += [0] * (pneudrive.VALVES - len(counts))
+        return pneudrive.FRAME.pack(0xFFFF - board, *counts)

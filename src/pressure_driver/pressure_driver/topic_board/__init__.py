@@ -1,0 +1,1 @@
+"""A lab's own driver of valves as a board."""

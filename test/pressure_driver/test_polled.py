@@ -1,0 +1,170 @@
+"""Boards that are asked: how a terminal is started, its registers, and boards that share a bus."""
+
+import struct
+
+import numpy as np
+import pytest
+from waiting import Clock
+
+from pressure_driver.emulator.device import BoardReading
+from pressure_driver.emulator.polled import FestoBoard, PneudriveBoard
+from pressure_driver.protocols import BoardFailure, Echo, Telemetry, host_protocol, modbus
+from pressure_driver.safety import Mode
+from pressure_driver.settings import Settings
+
+RUNNING = 3 | 2 << 6
+ROOM = 101_325.0
+
+
+def answer(host, *words):
+    """Have a terminal say what its registers hold."""
+    data = modbus.to_bytes(words)
+    return host.decode(modbus.encode(7, modbus.READ, bytes([len(data)]) + data))
+
+
+def told(data):
+    """Return first register and words of a write, which is alone: servers lose a second request."""
+    ((_, write),) = modbus.ModbusReader().feed(data)
+    first, count = struct.unpack(">HH", write.data[:4])
+    words = modbus.to_words(write.data[5:])
+    assert len(words) == count
+    return first, words
+
+
+# --------------------------------------------------------------------------------- terminals
+
+
+def test_setpoints_of_a_motion_terminal_stand_behind_the_mode_of_their_slot():
+    host = host_protocol("festo")
+    data, number = host.setpoint([7_540.0, -20_000.0], ROOM, 0.25)
+    assert told(data) == (40003, (0xC3, 75, 0, 0xC3, 0, 200))
+    assert host.follow_up() == b""
+    assert host.decode(modbus.encode(number, modbus.WRITE, struct.pack(">HH", 40003, 6))) == [
+        Echo(number)
+    ]
+    assert host.follow_up()[7:] == struct.pack(">BHH", modbus.READ, 45395, 6)
+    assert host.follow_up() == b""
+
+
+def test_slots_are_acknowledged_for_half_a_second_before_they_are_started():
+    host = host_protocol("festo")
+    clock = host.clock = Clock()
+
+    def mode():
+        return told(host.vent(ROOM)[0])[1][0]
+
+    host.start()
+    assert mode() == 0xC3, "a terminal that runs already is vented first"
+    answer(host, 1 << 6, 0, 0, 1 << 6, 0, 0)
+    assert "slot 0 does not run: mode 0" in host.unsettled
+    host.start()
+    assert mode() == 62 | 1 << 6
+    answer(host, 61 | 1 << 6, 0, 0, 61 | 1 << 6, 0, 0)
+    assert mode() == 62 | 1 << 6
+    clock.now += 0.5
+    answer(host, 61 | 1 << 6, 0, 0, 61 | 1 << 6, 0, 0)
+    assert mode() == 0xC3
+    answer(host, 3, 0, 0, RUNNING, 0, 0)
+    assert "slot 0 does not run: mode 3, state 0 (not ready)" in host.unsettled
+    # It is given twenty seconds to start, and then another turn.
+    clock.now += 19.0
+    host.start()
+    assert mode() == 0xC3
+    clock.now += 1.0
+    host.start()
+    assert mode() == 62 | 1 << 6
+    assert answer(host, RUNNING, -3, 75, RUNNING, 0, 200) == [
+        Telemetry(chamber_pressure=(ROOM - 300.0, ROOM + 7_500.0, ROOM, ROOM + 20_000.0))
+    ]
+    assert host.unsettled == ""
+
+
+def test_a_slot_that_ceases_to_run_is_a_failure_once():
+    host = host_protocol("festo")
+    answer(host, RUNNING, 0, 0, RUNNING, 0, 0)
+    events = answer(host, RUNNING, 0, 0, 9 << 8 | 3 << 6 | 3, 0, 0)
+    assert events[0] == BoardFailure("slot 1 does not run: mode 3, state 3 (failed), application 9")
+    assert len(answer(host, RUNNING, 0, 0, 9 << 8 | 3 << 6 | 3, 0, 0)) == 1
+
+
+def test_a_refusal_of_the_terminal_is_named():
+    host, board = host_protocol("festo", 8), FestoBoard(4)
+    commands = board.decode(host.vent(ROOM)[0])
+    reading = BoardReading(0.0, (ROOM,) * 4, ROOM, (0.0,) * 4, 0.0)
+    (event,) = host.decode(b"".join(board.reply(command, reading) for command in commands))
+    assert isinstance(event, BoardFailure)
+    assert "a write of registers, exception 2; look at 'terminal'" in event.text
+
+
+def test_a_terminal_with_regulators_is_played(simulate):
+    sim = simulate("festo", terminal="mpa")
+    sim.arm()
+    sim.stream(4.0)
+    assert sim.mode is Mode.TRACKING, sim.faults
+    assert sim.gauge[0] > 2_000.0
+    first, words = told(sim.sent[-1])
+    assert (first, len(words)) == (40003, 4)
+    assert all(modbus.signed(word) >= 0 for word in words)
+
+
+def test_a_diagnosis_of_a_regulator_is_a_failure():
+    host = host_protocol("festo", 4, Settings(protocol="festo", terminal="mpa"))
+    answer(host, *(0, 0, 0) * 4)
+    assert host.unsettled == ""
+    failure, _ = answer(host, *(0, 0, 0) * 3, 0, 0, 5)
+    assert failure == BoardFailure("valve 3 reports: diagnosis 5")
+
+
+# ---------------------------------------------------------------------------- boards on a bus
+
+
+def test_frames_of_a_pneudrive_board():
+    host = host_protocol("pneudrive")
+    data, _ = host.setpoint([68_950.0, 0.0], ROOM, 0.25)
+    assert data == bytes.fromhex("ffff 00b8 0066 0066 0066")
+    assert host.setpoint([1e6, 0.0], ROOM, 0.25)[0][2:4] == (1023).to_bytes(2, "big")
+    (reading,) = [
+        event
+        for event in host.decode(bytes.fromhex("ffff 00b8 0066 0066 0066"))
+        if isinstance(event, Telemetry)
+    ]
+    assert reading.chamber_pressure == pytest.approx((ROOM + 68_950.0, ROOM, ROOM, ROOM), abs=700.0)
+
+
+def served(host, boards, data, silent=()):
+    """Pass frames to and fro until nobody speaks; return the boards that were spoken to."""
+    asked, events = [], []
+    reading = BoardReading(5.0, (ROOM,) * 12, ROOM, (0.0,) * 12, 0.0)
+    while data:
+        asked.append(0xFFFF - int.from_bytes(data[:2], "big"))
+        assert len(data) == 10, "two boards must not be spoken to at once"
+        (command,) = boards.decode(data)
+        answers = b"" if asked[-1] in silent else boards.reply(command, reading)
+        events += host.decode(answers)
+        data = host.follow_up()
+    return asked, events
+
+
+def test_a_board_on_the_bus_is_spoken_to_when_the_one_before_has_answered():
+    host, boards = host_protocol("pneudrive", 12), PneudriveBoard(12)
+    asked, events = served(host, boards, host.vent(ROOM)[0])
+    assert asked == [0, 1, 2]
+    assert [type(event) for event in events] == [Echo, Telemetry]
+    assert len(events[1].chamber_pressure) == 12
+
+
+def test_a_silent_board_on_the_bus_keeps_no_other_from_its_targets():
+    host, boards = host_protocol("pneudrive", 12), PneudriveBoard(12)
+    rounds = [served(host, boards, host.vent(ROOM)[0], silent=[1]) for _ in range(3)]
+    assert [asked for asked, _ in rounds] == [[0, 1], [2, 0, 1], [2, 0, 1]]
+    assert not [event for _, events in rounds for event in events], "no telemetry: a fault"
+    assert [frame[:2] for frame in host.emergency(ROOM)] == [b"\xff\xff", b"\xff\xfe", b"\xff\xfd"]
+
+
+def test_a_limb_on_coarse_sensors_is_armed_and_played(simulate):
+    """A count is 0.84 kPa: readings at rest flicker by one."""
+    sim = simulate("pneudrive", leak_tolerance=2_500.0, sensor_range=689_500.0)
+    sim.arm()
+    sim.stream(20.0)
+    assert sim.mode is Mode.TRACKING
+    assert np.max(sim.gauge) > 500.0

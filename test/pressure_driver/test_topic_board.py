@@ -1,0 +1,66 @@
+"""A lab's own driver of valves as a board: numbers and order of its topics, and what is watched."""
+
+import pytest
+
+from pressure_driver.emulator.firmware import NativeBoard
+from pressure_driver.protocols import BoardFailure, BoardIdentity, Echo, Telemetry, host_protocol
+from pressure_driver.settings import SettingError, TopicBoardSettings
+from pressure_driver.topic_board.board import STALE, Scale, WatchedBoard
+
+ROOM = 101_325.0
+READING = (7_000.0, 0.0, 0.0, 3_000.0)
+
+
+class Bench:
+    """The driver's end, the board, and what it regulates to."""
+
+    def __init__(self):
+        self.told = []
+        self.host = host_protocol("native")
+        self.board = WatchedBoard(NativeBoard(4, 30_000, known=0), ROOM, self.told.append)
+
+    def say(self, data, now):
+        return self.host.decode(self.board.receive(data, now))
+
+
+def test_the_topics_have_their_own_unit_zero_and_order():
+    scale = Scale(TopicBoardSettings(scale=0.01, offset=-5.0, absolute=True, order="2,3,0,1"))
+    told = scale.to_topic((100.0, 200.0, 300.0, 400.0))
+    assert told == pytest.approx([1011.25, 1012.25, 1009.25, 1010.25])
+    assert scale.from_topic(told) == pytest.approx([100.0, 200.0, 300.0, 400.0])
+
+
+@pytest.mark.parametrize("order", ["0,1,2", "0,1,2,2", "1,2,3,4", "a,b,c,d", ""])
+def test_an_order_that_does_not_name_every_chamber_is_refused(order):
+    with pytest.raises(SettingError, match="'order'"):
+        Scale(TopicBoardSettings(order=order))
+
+
+def test_setpoints_are_passed_on_and_readings_come_back():
+    bench = Bench()
+    (identity,) = bench.say(bench.host.start(), 0.0)
+    assert isinstance(identity, BoardIdentity)
+    data, number = bench.host.setpoint([7_000.0, -3_000.0], ROOM, 0.25)
+    assert bench.say(data, 1.0) == [], "nothing has been measured"
+    assert bench.told == [READING]
+    telemetry, echo = bench.host.decode(bench.board.measured(READING, 1.1))
+    assert telemetry == Telemetry(chamber_pressure=tuple(ROOM + value for value in READING))
+    assert echo == Echo(number)
+
+
+def test_readings_that_stop_are_not_told_again():
+    bench = Bench()
+    bench.board.measured(READING, 1.0)
+    command = bench.host.vent(ROOM)[0]
+    assert bench.say(command, 1.0 + 0.5 * STALE)
+    assert bench.say(command, 1.0 + 1.5 * STALE) == []
+
+
+def test_it_vents_by_itself_when_setpoints_cease():
+    bench = Bench()
+    bench.say(bench.host.setpoint([7_000.0, -3_000.0], ROOM, 0.25)[0], 1.0)
+    assert bench.board.look(1.25) == b""
+    (failure,) = bench.host.decode(bench.board.look(1.26))
+    assert isinstance(failure, BoardFailure)
+    assert bench.told == [READING, (0.0,) * 4]
+    assert bench.board.look(2.0) == b""
