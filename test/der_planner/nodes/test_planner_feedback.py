@@ -55,6 +55,8 @@ def test_solutions_that_take_too_long_never_hold_up_the_plan():
         def estimate(self, *arguments, **about):
             pass
 
+        contact = estimate
+
     said, taken_back = [], threading.Event()
     now = [1_700_000_000_000_000_000]
 
